@@ -265,7 +265,7 @@ class SystemSimulator(Simulator):
         run_constants = _expand_rows([self.run_constants(s) for s in distinct], object_index)
         constants = {name: values[:, None] for name, values in run_constants.items()}
         states = _expand_rows([self.run_initial(s) for s in distinct], object_index)
-        states = self._checked("initial state", states, initial)
+        states = self._check_values("initial state", states, initial)
         x = _stack_states(states, self.system.coordinates, object_index.size)
         v = _stack_states(states, self.system.rates, object_index.size)
         return constants, x, v

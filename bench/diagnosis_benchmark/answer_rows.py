@@ -26,11 +26,11 @@ def build_answer_rows(answered: AnswersByCase, diagnosers: Sequence[str]) -> pd.
         answered: stored answers.
         diagnosers: names of the diagnosers.
     """
-    rows = [row for name in diagnosers for row in _of(name, answered)]
+    rows = [row for name in diagnosers for row in _iterate_rows(name, answered)]
     return pd.DataFrame(rows)
 
 
-def _of(diagnoser: str, answered: AnswersByCase) -> Iterator[dict[str, Any]]:
+def _iterate_rows(diagnoser: str, answered: AnswersByCase) -> Iterator[dict[str, Any]]:
     """Yield the result rows of one diagnoser, ordered by the name of the case.
 
     A case is left out if it was not drawn (its stored document has no hidden effects) or if this

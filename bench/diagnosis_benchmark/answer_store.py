@@ -34,7 +34,7 @@ class AnswerStore:
         self._path = folder / ANSWERS_FILE
         self._file: IO[str] = self._path.open("a", encoding="utf-8")
         try:
-            _lock(self._file)
+            _lock_file(self._file)
         except OSError:
             self._file.close()
             raise InputError(
@@ -60,7 +60,7 @@ class AnswerStore:
         """
         self._file.write(json.dumps(one) + "\n")
         self._file.flush()
-        _enter(self.answered, one)
+        _add_line(self.answered, one)
 
     def close(self) -> None:
         """Close the file and release its lock."""
@@ -86,11 +86,11 @@ def read_answers(folder: Path) -> AnswersByCase:
                 one = json.loads(line)
             except ValueError:
                 continue  # incomplete line of a killed process
-            _enter(answered, one)
+            _add_line(answered, one)
     return answered
 
 
-def _enter(answered: AnswersByCase, one: Mapping[str, Any]) -> None:
+def _add_line(answered: AnswersByCase, one: Mapping[str, Any]) -> None:
     """Add one line of the file of the answers to the answers in memory.
 
     A case has several lines if diagnosers were asked in different sessions. The newest line
@@ -107,7 +107,7 @@ def _enter(answered: AnswersByCase, one: Mapping[str, Any]) -> None:
         held["rows"][row["diagnoser"]] = row
 
 
-def _lock(file: IO[str]) -> None:
+def _lock_file(file: IO[str]) -> None:
     """Lock the file until it is closed or this process ends."""
     try:
         import fcntl

@@ -125,11 +125,11 @@ def evaluate_case(
             "seconds": limits.seconds,
             "seed": make_seed_words("diagnosis", one.label, asked.name).tolist(),
         }
-        rows.append(_row(one, given, asked.name, limits, hidden))
+        rows.append(_evaluate_case(one, given, asked.name, limits, hidden))
     return {"question": asked.name, "item": item.to_json(), "rows": rows}
 
 
-def _row(
+def _evaluate_case(
     one: EvaluatedDiagnoser,
     given: dict[str, Any],
     question: str,
@@ -150,7 +150,7 @@ def _row(
         The row as it is stored: status (done, skipped, or how the process ended), answer and costs.
     """
     row: dict[str, Any] = {"question": question, "diagnoser": one.label, "trusted": one.trusted}
-    learned = _learned(one.learned.get(given["system"]))
+    learned = _load_trained_arrays(one.learned.get(given["system"]))
     begun = perf_counter()
     try:
         if one.trusted:
@@ -162,12 +162,12 @@ def _row(
         skipped = said.pop("skipped", "")
         end = {"status": "skipped" if skipped else "done", "reason": skipped, **said}
     except RunEndedError as ended:
-        end = {"status": ended.status, "reason": _reason(ended.reason)}
+        end = {"status": ended.status, "reason": _format_failure_reason(ended.reason)}
     nothing = {"answer": None, "simulations": 0, "processor_seconds": None, "seconds": None}
     return {**row, **nothing, "seconds": perf_counter() - begun, **end}
 
 
-def _reason(text: str) -> str:
+def _format_failure_reason(text: str) -> str:
     """Return the reason why a diagnoser failed, marked if it exceeded its simulation budget.
 
     Args:
@@ -218,7 +218,7 @@ def _diagnose_isolated(
         RunEndedError: the diagnoser failed.
     """
     robots = ("mujoco",) if given["beside"] else ()
-    child = _started(code, limits.memory, hidden, robots)
+    child = _start_process(code, limits.memory, hidden, robots)
     try:
         if learned:
             deadline = perf_counter() + START_TIMEOUT_SECONDS
@@ -264,7 +264,7 @@ def _validate_answer(said: Any, limits: AnswerLimits) -> dict[str, Any]:
     return {"answer": answer, "simulations": simulations, "processor_seconds": seconds}
 
 
-def _started(
+def _start_process(
     code: TunerSpec, memory: int, hidden: tuple[str, ...], more: tuple[str, ...] = ()
 ) -> IsolatedProcess:
     """Start the isolated process of a diagnoser from the fork server, and wait until it is ready.
@@ -292,7 +292,7 @@ def _started(
     return child
 
 
-def _learned(path: Path | None) -> dict[str, Array]:
+def _load_trained_arrays(path: Path | None) -> dict[str, Array]:
     """Load trained arrays; return an empty dictionary if there is no file."""
     if path is None:
         return {}
@@ -322,7 +322,7 @@ def train_isolated(
     if trusted:
         arrays, used = diagnoser_process.train_diagnoser(lesson)
         return dict(arrays), used, perf_counter() - begun
-    child = _started(code, 0, hidden)
+    child = _start_process(code, 0, hidden)
     try:
         deadline = begun + seconds
         child.send(b"F", json.dumps(lesson).encode(), deadline=deadline)

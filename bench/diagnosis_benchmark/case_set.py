@@ -80,14 +80,14 @@ class CaseSpec:
         Returns:
             The first case whose hidden cause is observable; None if all attempts fail.
         """
-        first = self._first(seed, salt)
+        first = self._get_first_seed(seed, salt)
         items = (
             draw_case(self.kind, self.system, first + k, self.effect, self.size, self.asked)
             for k in range(MAX_DRAW_ATTEMPTS)
         )
         return next((item for item in items if item is not None), None)
 
-    def _first(self, seed: int, salt: str) -> int:
+    def _get_first_seed(self, seed: int, salt: str) -> int:
         """Return the seed of the first attempt to draw the case; attempt k uses this seed plus k.
 
         Args:
@@ -115,7 +115,7 @@ def build_case_set(settings: BenchmarkConfig) -> list[CaseSpec]:
     numbers: dict[tuple[Any, ...], int] = {}
     questions = []
     for asked in settings.case_requests:
-        for kind, system, effect, size, circumstances in _combined(asked):
+        for kind, system, effect, size, circumstances in _iterate_combinations(asked):
             key = kind, system, effect, size, circumstances
             # Sizes are not part of the key, so cases of two sizes have different seeds.
             for _ in range(asked.count):
@@ -129,7 +129,7 @@ def build_case_set(settings: BenchmarkConfig) -> list[CaseSpec]:
     return [questions[i] for i in sorted(chosen.tolist())]
 
 
-def _combined(
+def _iterate_combinations(
     asked: CaseRequest,
 ) -> Iterator[tuple[str, str, str | None, float | None, RequestedConditions]]:
     """Yield every combination of the values that one table of the experiment lists.
@@ -144,7 +144,7 @@ def _combined(
         Kind, system, effect, size, and recording conditions.
     """
     for system in asked.systems:
-        effects = _effects(asked, system)
+        effects = _list_hidden_effects(asked, system)
         combinations = product(
             effects,
             asked.sizes or (None,),
@@ -156,7 +156,7 @@ def _combined(
             yield asked.kind, system, effect, size, RequestedConditions(rate, runs, noise)
 
 
-def _effects(asked: CaseRequest, system: str) -> list[str | None]:
+def _list_hidden_effects(asked: CaseRequest, system: str) -> list[str | None]:
     """List the effects that cases of one system hide; None stands for an effect that is drawn.
 
     Raises:

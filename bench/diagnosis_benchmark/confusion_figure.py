@@ -32,7 +32,7 @@ def draw_confusion_matrices(rows: pd.DataFrame, order: Sequence[str], title: str
         title: title of the figure.
     """
     asked = select_graded_answers(rows[rows["kind"] != "double"])
-    asked = asked.assign(family=_hidden(asked), answer=_answers(asked))
+    asked = asked.assign(family=_list_hidden_families(asked), answer=_list_answer_families(asked))
     hidden = sorted(set(asked["family"]), key=lambda name: (name in _LAST, name))
     said = [name for name in hidden if name not in _LAST]
     said += sorted(set(asked["answer"]) - {*said, *_FAMILY_LABELS})
@@ -49,7 +49,7 @@ def draw_confusion_matrices(rows: pd.DataFrame, order: Sequence[str], title: str
         counts = pd.crosstab(own["family"], own["answer"]).reindex(
             index=hidden, columns=said, fill_value=0
         )
-        _panel(axis, counts, order[place])
+        _draw_confusion_matrix(axis, counts, order[place])
     figure.suptitle(title, fontsize=11)
     figure.supylabel("hidden", fontsize=9)
     many = asked.drop_duplicates("question")
@@ -69,7 +69,7 @@ _RIGHT = {"(clean)": ("nothing",), "(foreign)": ("unknown",)}
 """Correct answers for the rows of clean recordings and unmodelled causes."""
 
 
-def _hidden(rows: pd.DataFrame) -> pd.Series[str]:
+def _list_hidden_families(rows: pd.DataFrame) -> pd.Series[str]:
     """Return the row of the confusion matrix of each answer: the family of the hidden effect.
 
     The family is the part of the name before the dot. Clean recordings and unmodelled causes have
@@ -79,7 +79,7 @@ def _hidden(rows: pd.DataFrame) -> pd.Series[str]:
     return family.where(rows["kind"] == "single", "(" + rows["kind"] + ")")
 
 
-def _answers(rows: pd.DataFrame) -> list[str]:
+def _list_answer_families(rows: pd.DataFrame) -> list[str]:
     """Return the column of the confusion matrix of each answer.
 
     It is the family that the answer names, or one of `_FAMILY_LABELS`.
@@ -89,11 +89,12 @@ def _answers(rows: pd.DataFrame) -> list[str]:
     """
     good = is_correct(rows)
     return [
-        _answer(row, is_right) for row, is_right in zip(rows.to_dict("records"), good, strict=True)
+        _get_answer_family(row, is_right)
+        for row, is_right in zip(rows.to_dict("records"), good, strict=True)
     ]
 
 
-def _answer(row: dict[Any, Any], is_right: bool) -> str:
+def _get_answer_family(row: dict[Any, Any], is_right: bool) -> str:
     """Return the family that an answer names, or the label of an answer without a family.
 
     An answer that is correct because its small set contains the cause counts as the hidden family,
@@ -117,7 +118,7 @@ def _answer(row: dict[Any, Any], is_right: bool) -> str:
     return "several" if " + " in named else named.partition("|")[0].partition(".")[0]
 
 
-def _panel(axis: Axes, counts: pd.DataFrame, name: str) -> None:
+def _draw_confusion_matrix(axis: Axes, counts: pd.DataFrame, name: str) -> None:
     """Draw the confusion matrix of one diagnoser in per cent; frames mark correct answers.
 
     Args:

@@ -65,8 +65,8 @@ def draw_leaderboard(table: pd.DataFrame, order: Sequence[str], title: str) -> F
         axis.errorbar(
             100 * x["share"],
             100 * y["share"],
-            xerr=_bars(x),
-            yerr=_bars(y),
+            xerr=_compute_error_bars(x),
+            yerr=_compute_error_bars(y),
             markersize=7,
             linewidth=1.0,
             elinewidth=1.0,
@@ -286,7 +286,7 @@ def draw_cost(costs: pd.DataFrame, table: pd.DataFrame, order: Sequence[str], ti
                 middle,
                 100 * y["share"],
                 xerr=[[0.0], [max(high - middle, 0.0)]],
-                yerr=_bars(y),
+                yerr=_compute_error_bars(y),
                 markersize=7,
                 elinewidth=0.9,
                 capsize=2,
@@ -314,7 +314,7 @@ def draw_cost(costs: pd.DataFrame, table: pd.DataFrame, order: Sequence[str], ti
     return figure
 
 
-def _bars(line: TableRow) -> list[list[float]]:
+def _compute_error_bars(line: TableRow) -> list[list[float]]:
     """Return the lower and upper length of an error bar, in per cent, as matplotlib expects them.
 
     Args:

@@ -112,8 +112,8 @@ class DiagnosisStudy:
         if new.jobs:
             _refuse_unreachable(settings.diagnosers)
         for name in settings.diagnosers:
-            _announced(name, new.experiment.trusted)
-        return cls(new.create_folder(_fingerprint(new.experiment, new.plugins)))
+            _register_stub(name, new.experiment.trusted)
+        return cls(new.create_folder(_compute_fingerprint(new.experiment, new.plugins)))
 
     @classmethod
     def resume(cls, folder: Path, plugins: Sequence[str] = ()) -> DiagnosisStudy:
@@ -129,8 +129,10 @@ class DiagnosisStudy:
         study.plugins = held.plugins + sorted(given - set(held.plugins))
         load_plugins_for_experiment(study.plugins, held.experiment)
         for name in study.config.diagnosers:
-            _announced(name, held.experiment.trusted)
-        check_unchanged(folder, held.fingerprint, _fingerprint(held.experiment, study.plugins))
+            _register_stub(name, held.experiment.trusted)
+        check_unchanged(
+            folder, held.fingerprint, _compute_fingerprint(held.experiment, study.plugins)
+        )
         return study
 
     @cached_property
@@ -178,14 +180,14 @@ class DiagnosisStudy:
         try:
             _EvaluationRun(self, self._kept, progress or no_progress).run(jobs, pool)
         except KeyboardInterrupt:
-            return self._made(interrupted=True)
+            return self._finish_study(interrupted=True)
         except PoolLostError as error:
-            return self._made(stopped=str(error))
+            return self._finish_study(stopped=str(error))
         finally:
             self.close()
-        return self._made()
+        return self._finish_study()
 
-    def _made(self, **why: Any) -> StudyOutcome:
+    def _finish_study(self, **why: Any) -> StudyOutcome:
         """Return the outcome of a run of the study; reveal its salt if no answer is missing.
 
         A secret salt stays hidden as long as answers are missing, because it determines the cases.
@@ -286,24 +288,24 @@ class _EvaluationRun:
         Raises:
             PoolLostError: the workers are no longer available.
         """
-        open_questions = [q for q in self._mixed() if self._open(q)]
+        open_questions = [q for q in self._shuffle_cases() if self._list_unanswered(q)]
         if not open_questions:
             return
         # The truths are in the memory of this process, and a diagnoser's process may run as the
         # same user.
         trusted = self._experiment.trusted
         with nullcontext() if trusted else not_dumpable(), pool or make_pool(jobs) as workers:
-            examined, taught = self._learn(workers)
+            examined, taught = self._train_diagnosers(workers)
             write_training_costs(self._study.folder, taught)
-            self._ask(workers, open_questions, examined)
+            self._evaluate_open_cases(workers, open_questions, examined)
 
-    def _mixed(self) -> list[CaseSpec]:
+    def _shuffle_cases(self) -> list[CaseSpec]:
         """Return the cases in a fixed random order, so that a partial result is a fair sample."""
         questions = self._study.cases
         order = make_rng("diagnosis", "order", len(questions)).permutation(len(questions))
         return [questions[place] for place in order.tolist()]
 
-    def _open(self, question: CaseSpec) -> list[str]:
+    def _list_unanswered(self, question: CaseSpec) -> list[str]:
         """Return the names of the usable diagnosers that have not answered a case.
 
         The list is empty if the sensors cannot show the hidden cause: such a case has an empty
@@ -315,7 +317,9 @@ class _EvaluationRun:
         rows = one["rows"] if one else {}
         return [name for name in self._study.usable_diagnosers if name not in rows]
 
-    def _learn(self, workers: Pool) -> tuple[dict[str, EvaluatedDiagnoser], list[TrainingCost]]:
+    def _train_diagnosers(
+        self, workers: Pool
+    ) -> tuple[dict[str, EvaluatedDiagnoser], list[TrainingCost]]:
         """Train the diagnosers that learn, once for each system, or load them from the cache.
 
         A training that fails does not stop the study: its error is stored with the costs, and the
@@ -368,7 +372,7 @@ class _EvaluationRun:
         examined = {n: EvaluatedDiagnoser(n, code, files[n], trusted) for n, code in codes.items()}
         return examined, taught
 
-    def _ask(
+    def _evaluate_open_cases(
         self, workers: Pool, questions: Sequence[CaseSpec], examined: dict[str, EvaluatedDiagnoser]
     ) -> None:
         """Let the workers evaluate the open cases, and store the answers of each finished case.
@@ -384,7 +388,7 @@ class _EvaluationRun:
         calls: list[Call] = []
         for question in questions:
             one = self._kept.answered.get(question.name)
-            asked = [examined[name] for name in self._open(question)]
+            asked = [examined[name] for name in self._list_unanswered(question)]
             known = one["item"] if one else None
             given = (question.to_json(), self._study.config.seed, self._salt, known, asked)
             calls.append((evaluate_case, (*given, self._limits, self._hidden)))
@@ -392,12 +396,16 @@ class _EvaluationRun:
         longest = _CASE_DRAW_SECONDS + len(examined) * (self._limits.seconds + _CASE_DRAW_SECONDS)
         for place, result in workers.iterate_results(calls, longest):
             if isinstance(result, BaseException):
-                result = _lost(questions[place], [one.label for one in calls[place][1][4]], result)
+                result = _make_failed_answers(
+                    questions[place], [one.label for one in calls[place][1][4]], result
+                )
             self._kept.append(result)
             step()
 
 
-def _lost(question: CaseSpec, labels: Sequence[str], error: BaseException) -> dict[str, Any]:
+def _make_failed_answers(
+    question: CaseSpec, labels: Sequence[str], error: BaseException
+) -> dict[str, Any]:
     """Make failed answers for a case whose worker died or exceeded its time limit.
 
     Raises:
@@ -452,7 +460,7 @@ def _refuse_unreachable(names: Sequence[str]) -> None:
             raise unreachable("diagnoser", name, added.part)
 
 
-def _announced(name: str, trusted: bool) -> None:
+def _register_stub(name: str, trusted: bool) -> None:
     """Register a stub for a diagnoser of another package, without importing its code here.
 
     The true causes of the cases are in the memory of this process, so foreign code must not run
@@ -482,7 +490,7 @@ def _announced(name: str, trusted: bool) -> None:
         )
 
 
-def _fingerprint(experiment: Experiment, plugins: Sequence[str]) -> dict[str, str]:
+def _compute_fingerprint(experiment: Experiment, plugins: Sequence[str]) -> dict[str, str]:
     """Compute hashes of everything that must not change while the study is incomplete.
 
     Returns:

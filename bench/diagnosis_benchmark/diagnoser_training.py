@@ -86,7 +86,7 @@ def train_or_load(
     )
     path = get_weights_folder() / CACHE_SUBFOLDER / f"{code.name}-{system}-{key}.npz"
     told = path.with_suffix(".json")
-    if (cost := _cost(told)) is not None and zipfile.is_zipfile(path):
+    if (cost := _read_training_cost(told)) is not None and zipfile.is_zipfile(path):
         return TrainedDiagnoser(path, *cost, found=True)
     lesson: dict[str, Any] = {
         "wanted": {"name": code.name, "module": code.module, "file": code.file},
@@ -106,7 +106,7 @@ def train_or_load(
     return TrainedDiagnoser(path, used, spent, found=False)
 
 
-def _cost(path: Path) -> tuple[int, float] | None:
+def _read_training_cost(path: Path) -> tuple[int, float] | None:
     """Read the cost of a cached training.
 
     Args:

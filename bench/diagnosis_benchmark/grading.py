@@ -221,10 +221,12 @@ def _count_covered_intervals(
                 said[f"{cause['effect']}.{name}"] = cause["coefficients"].get(name)
     if not set(item.effects) <= led:
         return {}  # parameters fitted together with a wrong cause are not comparable
-    return {name: _holds(said[name], value) for name, value in truth.items() if said.get(name)}
+    return {
+        name: _contains_value(said[name], value) for name, value in truth.items() if said.get(name)
+    }
 
 
-def _holds(estimate: Mapping[str, float | None], value: float) -> bool | None:
+def _contains_value(estimate: Mapping[str, float | None], value: float) -> bool | None:
     """Return whether a 95 % interval contains a value; None if the interval is open.
 
     Args:

@@ -14,47 +14,51 @@ from bench.diagnosis_benchmark.result_tables import PRIMARY_METRIC
 from bench.diagnosis_benchmark.wrong_answers import FAILURE_COLUMNS as FAILED
 
 
-def _text(name: str) -> ColumnSpec:
+def _declare_text_column(name: str) -> ColumnSpec:
     """Declare a text column whose cells may be empty."""
     return ColumnSpec(name, str, empty=EmptyCellRule.MAY)
 
 
-def _count(name: str) -> ColumnSpec:
+def _declare_count_column(name: str) -> ColumnSpec:
     """Declare a column of counts, at least 0."""
     return ColumnSpec(name, int, low=0)
 
 
-def _size(name: str) -> ColumnSpec:
+def _declare_size_column(name: str) -> ColumnSpec:
     """Declare a column of numbers of at least 0, whose cells may be empty."""
     return ColumnSpec(name, float, low=0.0, empty=EmptyCellRule.MAY)
 
 
-def _share(name: str) -> ColumnSpec:
+def _declare_fraction_column(name: str) -> ColumnSpec:
     """Declare a column of fractions from 0 to 1, whose cells may be empty."""
     return ColumnSpec(name, float, low=0.0, high=1.0, empty=EmptyCellRule.MAY)
 
 
-_COUNTED = (_count("count"), _count("of"), *(_share(name) for name in ("share", "low", "high")))
+_COUNTED = (
+    _declare_count_column("count"),
+    _declare_count_column("of"),
+    *(_declare_fraction_column(name) for name in ("share", "low", "high")),
+)
 _KIND = ColumnSpec("kind", str, words=CASE_KINDS)
 _ITEM: Columns = (
     *(ColumnSpec(name, str) for name in ("question", "diagnoser")),
     _KIND,
     ColumnSpec("system", str),
-    _text("hidden"),
+    _declare_text_column("hidden"),
     ColumnSpec("noise", str),
     ColumnSpec("stated", bool),
-    _count("rate"),
-    _count("runs"),
+    _declare_count_column("rate"),
+    _declare_count_column("runs"),
     ColumnSpec("source", str),
     ColumnSpec("driven", bool),
-    *(_size(name) for name in ("size", "beyond", "run_seconds")),
-    *(_text(name) for name in ("channels", "status", "reason", "verdict", "named")),
+    *(_declare_size_column(name) for name in ("size", "beyond", "run_seconds")),
+    *(_declare_text_column(name) for name in ("channels", "status", "reason", "verdict", "named")),
     ColumnSpec("outcome", str),
-    *(_count(name) for name in ("set_size", "class_size", "largest_set")),
+    *(_declare_count_column(name) for name in ("set_size", "class_size", "largest_set")),
     *(ColumnSpec(name, bool) for name in ("found", "found_class", "alarm")),
-    _share("p_value"),
-    *(_count(name) for name in ("intervals", "holding", "simulations")),
-    *(_size(name) for name in ("seconds", "processor_seconds")),
+    _declare_fraction_column("p_value"),
+    *(_declare_count_column(name) for name in ("intervals", "holding", "simulations")),
+    *(_declare_size_column(name) for name in ("seconds", "processor_seconds")),
     ColumnSpec("trusted", bool),
 )
 _BY_NAME = {column.name: column for column in _ITEM} | {"right_by": ColumnSpec("right_by", str)}
@@ -71,25 +75,30 @@ TABLE_COLUMNS: Mapping[str, Columns] = {
         *(ColumnSpec(name, str) for name in ("diagnoser", "metric", "by", "value")),
         *_COUNTED,
     ),
-    "power": (ColumnSpec("diagnoser", str), _size("size"), ColumnSpec("metric", str), *_COUNTED),
+    "power": (
+        ColumnSpec("diagnoser", str),
+        _declare_size_column("size"),
+        ColumnSpec("metric", str),
+        *_COUNTED,
+    ),
     "confusion": (
         *(ColumnSpec(name, str) for name in ("diagnoser", "hidden", "said")),
-        _count("count"),
+        _declare_count_column("count"),
     ),
-    "calibration": (ColumnSpec("diagnoser", str), _share("level"), *_COUNTED),
+    "calibration": (ColumnSpec("diagnoser", str), _declare_fraction_column("level"), *_COUNTED),
     "sets": (ColumnSpec("diagnoser", str), ColumnSpec("largest_set", str), *_COUNTED),
     "costs": (
         ColumnSpec("diagnoser", str),
-        _count("answers"),
-        *(_size(name) for name in _QUANTILES),
-        _count("training_simulations"),
-        _size("training_seconds"),
+        _declare_count_column("answers"),
+        *(_declare_size_column(name) for name in _QUANTILES),
+        _declare_count_column("training_simulations"),
+        _declare_size_column("training_seconds"),
     ),
     "pairs": (
         ColumnSpec("metric", str),
         ColumnSpec("diagnoser", str),
-        *(_count(name) for name in ("questions", "only_simgap", "only_other")),
-        *(_share(name) for name in ("p_value", "p_holm")),
+        *(_declare_count_column(name) for name in ("questions", "only_simgap", "only_other")),
+        *(_declare_fraction_column(name) for name in ("p_value", "p_holm")),
     ),
     "items": _ITEM,
 }

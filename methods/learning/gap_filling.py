@@ -58,7 +58,7 @@ def fill_gaps(channel: Array, simulated: Array) -> Array:
     x = _scale_like(simulated, simulated[is_present])
     y = _scale_like(channel, channel[is_present])
     table = np.stack([np.ones_like(x), x, -x * y], axis=1)[is_present]
-    a, b, c = _fitted(table, y[is_present])
+    a, b, c = _fit_camera_line(table, y[is_present])
     below = 1 + c * x
     # A change of sign would put a part of the run behind the camera.
     if not (below > _MIN_DENOMINATOR).all():
@@ -69,7 +69,7 @@ def fill_gaps(channel: Array, simulated: Array) -> Array:
     return result
 
 
-def _fitted(table: Array, values: Array) -> Array:
+def _fit_camera_line(table: Array, values: Array) -> Array:
     """Fit the numbers a, b, c (3,) of (2), the linear form of the camera's line, robustly.
 
     The method is iteratively reweighted least squares with Cauchy's weights, so that a few wrong

@@ -81,11 +81,13 @@ class GaussianProcess:
         # Two points, or equal values, give no information about a length scale.
         if fit and len(points) > 2 and np.ptp(values) > 0.0:
             self.hyper = self._most_probable()
-        k, _ = self._correlation(self._squares)
-        self._lower = _cholesky(k, float(np.exp(self.hyper[-1])))
+        k, _ = self._compute_correlation(self._squares)
+        self._lower = _compute_cholesky_factor(k, float(np.exp(self.hyper[-1])))
         self.mean, self.variance, self._alpha = _compute_mean_and_variance(self._lower, values)
 
-    def _correlation(self, squares: Array, hyper: Array | None = None) -> tuple[Array, Array]:
+    def _compute_correlation(
+        self, squares: Array, hyper: Array | None = None
+    ) -> tuple[Array, Array]:
         """Compute the correlation of pairs, and its derivative by their scaled squared distance.
 
         Args:
@@ -121,7 +123,7 @@ class GaussianProcess:
 
             `hyper` (dim + 1,) are the logarithms of the length scales and of the noise.
             """
-            value, slope = self._evidence(hyper)
+            value, slope = self._compute_negative_evidence(hyper)
             # The priors are normal distributions of the logarithms.
             z = (hyper - self._centre) / self._width
             return value + 0.5 * float(z @ z), slope + z / self._width
@@ -139,7 +141,7 @@ class GaussianProcess:
         )
         return np.asarray(optimum.x)
 
-    def _evidence(self, hyper: Array) -> tuple[float, Array]:
+    def _compute_negative_evidence(self, hyper: Array) -> tuple[float, Array]:
         """Compute the negative log marginal likelihood and its gradient (dim + 1,).
 
         These are (2.30) and (5.9) of Rasmussen and Williams. Constant terms are left out, and mean
@@ -148,8 +150,8 @@ class GaussianProcess:
         from scipy.linalg import cho_solve
 
         n = len(self.values)
-        k, slope = self._correlation(self._squares, hyper)
-        lower = _cholesky(k, float(np.exp(hyper[-1])))
+        k, slope = self._compute_correlation(self._squares, hyper)
+        lower = _compute_cholesky_factor(k, float(np.exp(hyper[-1])))
         _, variance, alpha = _compute_mean_and_variance(lower, self.values)
         # (2.30) with the profiled variance: its quadratic term is the constant n / 2.
         half_determinant = np.log(np.diag(lower)).sum()
@@ -166,7 +168,7 @@ class GaussianProcess:
     def predict(self, points: Array) -> Array:
         """Compute the posterior mean (m,) of the function at points (m, dim), eq. (2.25)."""
         squares = (points[:, None] - self.points) ** 2
-        k, _ = self._correlation(squares)
+        k, _ = self._compute_correlation(squares)
         mean: Array = self.mean + k @ self._alpha  # (2.25)
         return mean
 
@@ -185,17 +187,17 @@ class GaussianProcess:
 
         to_known = (points[:, None] - self.points) ** 2
         among = (points[:, None] - points) ** 2
-        cross, _ = self._correlation(to_known)
-        prior, _ = self._correlation(among)
+        cross, _ = self._compute_correlation(to_known)
+        prior, _ = self._compute_correlation(among)
         explained = solve_triangular(self._lower, cross.T, lower=True)
-        spread = _cholesky(prior - explained.T @ explained, 1e-10)  # (2.26)
+        spread = _compute_cholesky_factor(prior - explained.T @ explained, 1e-10)  # (2.26)
         noise = rng.standard_normal((draws, len(points)))
         centre = self.mean + cross @ self._alpha  # (2.25)
         samples = centre + self.variance**0.5 * (noise @ spread.T)
         return np.asarray(samples, dtype=np.float64)
 
 
-def _cholesky(matrix: Array, jitter: float) -> Array:
+def _compute_cholesky_factor(matrix: Array, jitter: float) -> Array:
     """Return the lower Cholesky factor of matrix + jitter, with more jitter if it is needed."""
     while True:
         shifted = matrix + jitter * np.eye(len(matrix))

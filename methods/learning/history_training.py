@@ -101,12 +101,14 @@ def train_history_transformer(
     with deterministic_training(), torch.enable_grad():
         generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
         named = get_weight_shapes(material.shown.shape[-1], material.parameters.shape[-1], design)
-        w = _initial(named, generator)
-        _descend(w, material, drawn, design, rng, watched)
+        w = _draw_initial_weights(named, generator)
+        _minimise_loss(w, material, drawn, design, rng, watched)
         return {name: v.detach().numpy().astype(np.float64) for name, v in w.items()}
 
 
-def _initial(named: dict[str, tuple[int, ...]], generator: torch.Generator) -> dict[str, Any]:
+def _draw_initial_weights(
+    named: dict[str, tuple[int, ...]], generator: torch.Generator
+) -> dict[str, Any]:
     """Draw initial weights uniform in +- gain / sqrt(inputs); biases are zero.
 
     `named` has the shape of each array. Layers whose output is added to another value (names that
@@ -125,7 +127,7 @@ def _initial(named: dict[str, tuple[int, ...]], generator: torch.Generator) -> d
     return w
 
 
-def _descend(
+def _minimise_loss(
     w: dict[str, Any],
     material: TrainingHistories,
     drawn: Callable[[np.random.Generator], HistoryIndices],
@@ -155,7 +157,7 @@ def _descend(
         for first in range(0, len(order), design.batch):
             batch = order[first : first + design.batch]
             optimiser.zero_grad()
-            error = _loss(w, design, [part[batch] for part in parts], drawn(rng))
+            error = _compute_loss(w, design, [part[batch] for part in parts], drawn(rng))
             error.backward()
             optimiser.step()
             losses.append(error.detach())
@@ -163,12 +165,12 @@ def _descend(
             # A separate random stream keeps the training independent of the evaluation.
             chosen = drawn(np.random.default_rng(0))
             with torch.no_grad():
-                held_out = float(_loss(w, design, apart, chosen))
+                held_out = float(_compute_loss(w, design, apart, chosen))
                 training = float(torch.stack(losses).mean())
             watched.epoch(epoch + 1, design.epochs, training, held_out)
 
 
-def _loss(
+def _compute_loss(
     w: dict[str, Any], design: HistoryTransformerDesign, parts: list[Any], chosen: HistoryIndices
 ) -> Any:
     """Compute the mean squared error of the proposals: loss (1), or (2) if published.

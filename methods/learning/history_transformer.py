@@ -120,12 +120,16 @@ def predict_proposals(
     unit = far / size  # (1)
     known = [unit, xp.log(size + _SIGMA_ZERO), tried, xp.broadcast_to(here, far.shape)]
     tokens = xp.concatenate([*known, *_compute_step_features(xp, far, tried)], axis=-1)  # (3)
-    h = xp.concatenate([_linear(w, "first", here), _linear(w, "token", tokens)], axis=-2)
+    h = xp.concatenate(
+        [_apply_linear_layer(w, "first", here), _apply_linear_layer(w, "token", tokens)], axis=-2
+    )
     for block in range(design.blocks):
         h = h + _causal_attention(xp, w, block, h)  # (4)
-        h = h + _linear(w, f"outer{block}", _swish(xp, _linear(w, f"inner{block}", h)))
-    guess = _linear(w, "guess", h[..., :1, :])
-    following = _linear(w, "next", h[..., 1:, :])
+        h = h + _apply_linear_layer(
+            w, f"outer{block}", _compute_swish(xp, _apply_linear_layer(w, f"inner{block}", h))
+        )
+    guess = _apply_linear_layer(w, "guess", h[..., :1, :])
+    following = _apply_linear_layer(w, "next", h[..., 1:, :])
     if not design.published:
         gain = following.reshape(*tried.shape, unit.shape[-1] + 1)
         along = (gain[..., :-1] * unit[..., None, :]).sum(axis=-1)
@@ -158,7 +162,7 @@ def _causal_attention(xp: Any, w: dict[str, Any], block: int, h: Any) -> Any:
     tokens.
     """
     count, width = h.shape[-2:]
-    heard = _linear(w, f"heard{block}", h)
+    heard = _apply_linear_layer(w, f"heard{block}", h)
     query, key = heard[..., :width], heard[..., width : 2 * width]
     lag = np.arange(count)[:, None] - np.arange(count)
     later = xp.asarray(np.where(lag < 0, _CAUSAL_MASK_OFFSET, 0.0).astype(np.float32))
@@ -167,13 +171,13 @@ def _causal_attention(xp: Any, w: dict[str, Any], block: int, h: Any) -> Any:
     # The largest score is subtracted, so that the exponentials do not overflow.
     share = xp.exp(score - xp.amax(score, -1)[..., None])
     share = share / share.sum(axis=-1, keepdims=True)
-    return _linear(w, f"mixed{block}", share @ heard[..., 2 * width :])
+    return _apply_linear_layer(w, f"mixed{block}", share @ heard[..., 2 * width :])
 
 
-def _linear(w: dict[str, Any], layer: str, x: Any) -> Any:
+def _apply_linear_layer(w: dict[str, Any], layer: str, x: Any) -> Any:
     return x @ w[f"{layer}.weight"] + w[f"{layer}.bias"]
 
 
-def _swish(xp: Any, x: Any) -> Any:
+def _compute_swish(xp: Any, x: Any) -> Any:
     """Compute x times its logistic function (swish), with a tanh that does not overflow."""
     return x * (1.0 + xp.tanh(x / 2.0)) / 2.0

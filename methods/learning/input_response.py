@@ -64,11 +64,11 @@ def compute_response_coefficients(
         # Resampling to the run's own length fills missing samples and changes nothing else.
         whole = resample_runs(observations[:, run], (length,), length)
         series = np.nan_to_num(whole).transpose(0, 2, 1)
-        coefficients.append(_response(series, inputs[run]))
+        coefficients.append(_compute_run_response(series, inputs[run]))
     return np.concatenate(coefficients, axis=1)
 
 
-def _response(series: Array, inputs: Array) -> Array:
+def _compute_run_response(series: Array, inputs: Array) -> Array:
     """Compute the coefficients (n, C * R) of one run from series (n, T, C) and inputs (T, U)."""
     half = max(3, series.shape[1] // (2 * _BUMPS_PER_RUN))
     width = half + 1
@@ -95,7 +95,7 @@ def _response(series: Array, inputs: Array) -> Array:
     )
     regressors = np.concatenate([integral(plain, bump), -integral(series, slope)], axis=2)  # (2)
     accelerations = integral(series, bend)  # (2)
-    return _fitted(regressors, accelerations).reshape(len(series), -1)
+    return _fit_ridge_regression(regressors, accelerations).reshape(len(series), -1)
 
 
 def _smoothed_velocity_signs(series: Array) -> Array:
@@ -110,7 +110,7 @@ def _smoothed_velocity_signs(series: Array) -> Array:
     return np.asarray(np.tanh(_STEEPNESS * rates / typical), dtype=np.float64)
 
 
-def _fitted(regressors: Array, values: Array) -> Array:
+def _fit_ridge_regression(regressors: Array, values: Array) -> Array:
     """Compute ridge least squares (n, R, C) of values (n, J, C) on regressors (n, J, R).
 
     Each of the n observations is fitted separately.

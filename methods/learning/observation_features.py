@@ -76,11 +76,11 @@ def resample_runs(observations: Array, lengths: tuple[int, ...], points: int) ->
         at = np.linspace(0, length - 1, points)
         for i in range(n):
             for c in range(channels):
-                out[i, run, c] = _interpolated(at, samples, series[i, c])
+                out[i, run, c] = _interpolate_channel(at, samples, series[i, c])
     return out.reshape(n, len(lengths) * channels, points)
 
 
-def _interpolated(at: Array, samples: NDArray[np.intp], values: Array) -> Array:
+def _interpolate_channel(at: Array, samples: NDArray[np.intp], values: Array) -> Array:
     """Interpolate linearly between available samples of one channel of one run.
 
     Args:
@@ -187,7 +187,7 @@ class ObservationFeatures:
         """
         if not self.chosen.size:
             return np.empty((len(observations), 0))
-        rows = _rows(observations, lengths, self.points, self.plain)
+        rows = _compute_feature_rows(observations, lengths, self.points, self.plain)
         chosen = self.chosen.astype(np.intp)
         if chosen.max() >= rows.shape[1]:
             raise ValueError(
@@ -201,7 +201,9 @@ class ObservationFeatures:
         return np.nan_to_num(scaled)
 
 
-def _rows(observations: Array, lengths: tuple[int, ...], points: int, plain: bool) -> Array:
+def _compute_feature_rows(
+    observations: Array, lengths: tuple[int, ...], points: int, plain: bool
+) -> Array:
     """Compute all candidate numbers (n, D) of observations (n, T, C)."""
     series = resample_runs(observations, lengths, points)
     return series.reshape(len(series), -1) if plain else compute_descriptors(series)
@@ -217,7 +219,7 @@ def make_raw_features(
         lengths: number of samples of each run.
         points: number of points to which each run is resampled.
     """
-    size = _rows(observations[:1], lengths, points, plain=True).shape[1]
+    size = _compute_feature_rows(observations[:1], lengths, points, plain=True).shape[1]
     every = np.arange(size, dtype=np.float64)
     return ObservationFeatures(points, True, every, np.zeros(size), np.ones(size))
 
@@ -243,7 +245,7 @@ def make_weighted_features(
     Returns:
         The inputs; their mean square over the training data is 1.
     """
-    rows = _rows(data.flattened_observations, data.lengths, points, plain=False)
+    rows = _compute_feature_rows(data.flattened_observations, data.lengths, points, plain=False)
     grouped = rows.reshape(*data.parameters.shape[:2], -1)
     spread, explained, left = _compute_sensitivities(data.parameters, grouped)
     deviation = rows.std(axis=0)
@@ -257,8 +259,8 @@ def make_weighted_features(
     # A stable sort chooses the same numbers on every machine if weights are equal.
     order = np.argsort(-np.maximum(following, context), kind="stable")
     chosen = np.sort(order[:most])
-    by_parameters = _per(following[chosen], spread[chosen])
-    by_context = _per(context[chosen], deviation[chosen])
+    by_parameters = _compute_weight_per_deviation(following[chosen], spread[chosen])
+    by_context = _compute_weight_per_deviation(context[chosen], deviation[chosen])
     gain = np.maximum(by_parameters, by_context)
     # The network's initial weights and learning rate assume inputs of mean square 1.
     size = np.sqrt(np.mean((gain * deviation[chosen]) ** 2)) if most else 1.0
@@ -271,7 +273,7 @@ def make_weighted_features(
     )
 
 
-def _per(weight: Array, deviation: Array) -> Array:
+def _compute_weight_per_deviation(weight: Array, deviation: Array) -> Array:
     """Return the weight per unit of deviation, limited for small deviations."""
     least = _LEAST_DEVIATION * deviation.max(initial=0.0)
     scaled: Array = weight / (deviation + least + _ZERO)

@@ -211,11 +211,11 @@ def train_pair_network(
     with deterministic_training(), torch.enable_grad():
         generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
         inputs = (rows.proposed.shape[-1], rows.target.shape[-1])
-        weights = _initial(inputs, parameters.shape[-1], design, generator)
+        weights = _draw_initial_weights(inputs, parameters.shape[-1], design, generator)
         _run_optimiser(
-            _loss(design, weights, alone),
+            _make_loss(design, weights, alone),
             list(weights.values()),
-            _data(rows, parameters),
+            _convert_to_tensors(rows, parameters),
             design,
             generator,
             watched,
@@ -243,7 +243,7 @@ def deterministic_training() -> Iterator[None]:
         torch.set_num_threads(threads)
 
 
-def _data(rows: PairInputs, parameters: Array) -> tuple[Any, Any, Any]:
+def _convert_to_tensors(rows: PairInputs, parameters: Array) -> tuple[Any, Any, Any]:
     """Convert input rows of both sides and parameters to float32 tensors.
 
     If both sides have the same rows, they share one tensor, which saves memory.
@@ -259,7 +259,7 @@ def _data(rows: PairInputs, parameters: Array) -> tuple[Any, Any, Any]:
     return proposed, target, tensor(parameters)
 
 
-def _initial(
+def _draw_initial_weights(
     inputs: tuple[int, int], dim: int, design: PairNetworkDesign, generator: torch.Generator
 ) -> dict[str, Any]:
     """Draw initial weights uniform in +- gain / sqrt(inputs); biases too (published), or zero."""
@@ -280,7 +280,7 @@ def _initial(
     return weights
 
 
-def _loss(
+def _make_loss(
     design: PairNetworkDesign, w: dict[str, Any], alone: bool
 ) -> Callable[[Any, Any, Any], Any]:
     """Return a function that computes the loss (3) without the penalty on the weights.
@@ -304,7 +304,7 @@ def _loss(
         return torch.tanh(out) if design.bounded else out
 
     def objective(x: Any, seen: Any, y: Any) -> Any:
-        """Compute the mean squared error of the estimated parameter differences; see `_loss`.
+        """Compute the mean squared error of the estimated parameter differences; see `_make_loss`.
 
         All m (m - 1) / 2 pairs of the m simulations of a scenario are used. With `alone` (one
         input), the network estimates the parameters y themselves from the target's side.
@@ -348,13 +348,14 @@ def _run_optimiser(
     """Minimise the loss (3) by gradient descent; the weights are changed in place.
 
     The method is Adam with a learning rate that falls along half a cosine, or as published plain
-    gradient descent with a rate that falls exponentially. `data` are the tensors of `_data`.
-    `watched` gets the losses on training and held-out data after each epoch; None for none.
+    gradient descent with a rate that falls exponentially. `data` are the tensors of
+    `_convert_to_tensors`. `watched` gets the losses on training and held-out data after each epoch;
+    None for none.
     """
     import torch
 
     x, seen, y = data
-    held_out = watched and _data(watched.rows, watched.parameters)
+    held_out = watched and _convert_to_tensors(watched.rows, watched.parameters)
     kind = torch.optim.Adam if design.adam else torch.optim.SGD
     optimiser: Any = kind(weights, lr=design.rate)
     for epoch in range(design.epochs):

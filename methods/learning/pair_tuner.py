@@ -89,9 +89,9 @@ class TrainedPairNetwork:
         watched = None
         if look is not None:
             held_out = look.held_out
-            rows = _sides(proposed, read, held_out)
+            rows = _compute_input_rows(proposed, read, held_out)
             watched = PairValidationMonitor(rows, held_out.parameters, look.epoch)
-        rows = _sides(proposed, read, data)
+        rows = _compute_input_rows(proposed, read, data)
         weights = train_pair_network(rows, data.parameters, design, rng, alone, watched)
         return cls(design, read, weights, proposed)
 
@@ -129,7 +129,7 @@ class TrainedPairNetwork:
             proposed = self.proposed(observations, task.lengths, task.scene, hidden)[0]
             target = row
             if target is None:
-                whole = _bridged(task, observations[0], self)
+                whole = _fill_target_gaps(task, observations[0], self)
                 target = self.read(whole[None], task.lengths, task.scene)[0]
             return self.predict_difference(proposed, target)
 
@@ -174,14 +174,16 @@ class TrainedPairNetwork:
         return cls(design, read, check_shapes(arrays, expected), proposed)
 
 
-def _sides(proposed: InputFeatures, target: InputFeatures, data: TrainingData) -> PairInputs:
+def _compute_input_rows(
+    proposed: InputFeatures, target: InputFeatures, data: TrainingData
+) -> PairInputs:
     """Compute input rows of both sides; separate inputs of the proposed side have no noise."""
     rows = target.compute_rows(data)
     own = rows if proposed is target else proposed.compute_rows(data.without_noise)
     return PairInputs(own, rows)
 
 
-def _bridged(task: Task, shown: Array, network: TrainedPairNetwork) -> Array:
+def _fill_target_gaps(task: Task, shown: Array, network: TrainedPairNetwork) -> Array:
     """Fill the gaps of the target (T, C) from a simulation (T, C), run by run.
 
     This is done only if one channel is compared.

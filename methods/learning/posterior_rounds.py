@@ -66,7 +66,7 @@ class PosteriorRounds:
         if self._components is None:
             self._fit_components(residuals)
         with isolated_library_call(rng):
-            return self._train(points, self._compute_features(residuals), count)
+            return self._train_round(points, self._compute_features(residuals), count)
 
     def _fit_components(self, residuals: Array) -> None:
         """Compute the principal components of the first round's residuals (n, N).
@@ -87,7 +87,7 @@ class PosteriorRounds:
         features: Array = (residuals - self._centre) @ self._components / self._widths
         return features
 
-    def _train(self, points: Array, features: Array, count: int) -> Array:
+    def _train_round(self, points: Array, features: Array, count: int) -> Array:
         """Add one round of simulations, train the posterior, and draw `count` points (count, dim).
 
         The posterior is that of a residual of zero, the features of a perfect simulation. It is

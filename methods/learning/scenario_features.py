@@ -53,9 +53,9 @@ class ScenarioFeatures:
             The map; None if all scenarios are equal.
         """
         initial = np.array([scene.initial for scene in scenes])
-        driven = _vary(np.array([scene.inputs for scene in scenes]))
+        driven = _differs_between_scenarios(np.array([scene.inputs for scene in scenes]))
         # Equal scenarios give constant inputs, which carry no information.
-        if not driven and not _vary(initial):
+        if not driven and not _differs_between_scenarios(initial):
             return None
         count = initial.shape[1]
         # A preliminary map for the raw numbers: one number beyond the initial values marks varying
@@ -124,7 +124,7 @@ class ScenarioFeatures:
         return np.asarray(np.arcsinh((numbers - self.centre) * scale), dtype=np.float64)
 
 
-def _vary(numbers: Array) -> bool:
+def _differs_between_scenarios(numbers: Array) -> bool:
     """Return whether any number of an array (scenarios, ...) differs between scenarios."""
     if not numbers.size:
         return False

@@ -129,13 +129,15 @@ class EntropySearch(Tuner):
             fit = n < _REFIT_INTERVAL_THRESHOLD or n % self.refit == 0
             process = GaussianProcess(points, values, self.process, hyper, fit=fit)
             hyper = process.hyper
-            candidates = self._candidates(process, points[values.argmin()], rng)
+            candidates = self._choose_candidates(process, points[values.argmin()], rng)
             p = compute_minimiser_probability(process, candidates, self.draws, rng)
             score = compute_entropy_terms(p)  # (1)
             # The first candidate has already been simulated.
             proposal = candidates[score[1:].argmax() + 1]
 
-    def _candidates(self, process: GaussianProcess, best: Array, rng: np.random.Generator) -> Array:
+    def _choose_candidates(
+        self, process: GaussianProcess, best: Array, rng: np.random.Generator
+    ) -> Array:
         """Choose the best point, quasi-random points, and points around likely minimisers.
 
         The latter have distances of all orders of magnitude.

@@ -234,13 +234,13 @@ class InContextTransformer(Tuner):
             design = self.make_network_design()
             material = _build_training_histories(read, shown, box)
             weights = train_history_transformer(
-                material, partial(self._histories, each), design, rng, watched
+                material, partial(self._draw_histories, each), design, rng, watched
             )
             return TrainedHistoryNetwork(design, read, weights, box)
 
         self._prepared = NoiseMatchedNetworks.train(data, rng, self.make_feature_config(), learned)
 
-    def _histories(self, each: int, rng: np.random.Generator) -> HistoryIndices:
+    def _draw_histories(self, each: int, rng: np.random.Generator) -> HistoryIndices:
         """Draw the histories of a batch from `each` simulations per scenario.
 
         A history is a sequence of simulations and a target among the others, given by their

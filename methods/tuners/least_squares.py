@@ -123,7 +123,7 @@ class LeastSquares(Tuner):
         (residual,) = yield from run.simulate(point[None])
         # Without a residual there is nothing to differentiate.
         if not np.isnan(residual).any():
-            model = yield from self._differentiate(run, point, residual, self.difference)
+            model = yield from self._compute_differences(run, point, residual, self.difference)
             yield from self.fit_from_model(run, model)
 
     def fit_from_model(
@@ -139,11 +139,11 @@ class LeastSquares(Tuner):
             chosen = run.select_samples(share)
             # Before the first impact the samples may not depend on the parameters.
             if share >= 1.0 or model.is_sensitive(chosen):
-                model = yield from self._descend(run, model, chosen)
+                model = yield from self._run_levenberg_marquardt(run, model, chosen)
             if run.finished:
                 return
 
-    def _differentiate(
+    def _compute_differences(
         self, run: EvaluationHistory, point: Array, residual: Array, longest: float
     ) -> SimulationGenerator[LinearModel]:
         """Compute one-sided differences, inward at the upper bound.
@@ -161,7 +161,7 @@ class LeastSquares(Tuner):
         # If both sides fail, the column stays zero.
         return LinearModel(point, residual, np.nan_to_num(slopes).T)
 
-    def _descend(
+    def _run_levenberg_marquardt(
         self, run: EvaluationHistory, model: LinearModel, chosen: Mask
     ) -> SimulationGenerator[LinearModel]:
         """Run Levenberg-Marquardt on the chosen samples until convergence or lack of progress.
@@ -206,7 +206,9 @@ class LeastSquares(Tuner):
             stale = failed == 2 and len(step) > 1
             if stale or (better and not self.secant):
                 longest = float(np.abs(step).max())
-                model = yield from self._differentiate(run, model.point, model.residual, longest)
+                model = yield from self._compute_differences(
+                    run, model.point, model.residual, longest
+                )
         return model
 
 

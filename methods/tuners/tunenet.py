@@ -223,7 +223,7 @@ class BroydenSearch:
             refuge = self._fallback if self._residual is None else self.best
             return (point + refuge) / 2.0
         if self._last is not None:
-            self._learn(point - self._last[0], residual - self._last[1])
+            self._update_slope(point - self._last[0], residual - self._last[1])
         self._last = point, residual
         if self._residual is None or residual @ residual < self._residual @ self._residual:
             self.best = point
@@ -231,10 +231,10 @@ class BroydenSearch:
             self._setbacks = 0
         else:
             self._setbacks += 1
-        guess: Array = np.clip(self.best + self._step(self._residual), 0.0, 1.0)
-        return self._bracketed(guess, point, residual) if len(point) == 1 else guess
+        guess: Array = np.clip(self.best + self._compute_step(self._residual), 0.0, 1.0)
+        return self._limit_to_bracket(guess, point, residual) if len(point) == 1 else guess
 
-    def _learn(self, step: Array, change: Array) -> None:
+    def _update_slope(self, step: Array, change: Array) -> None:
         """Correct the slope by Broyden's update (3), so that it explains the last step.
 
         `step` (dim,) is the difference of two points and `change` (dim,) that of their estimates h.
@@ -245,7 +245,7 @@ class BroydenSearch:
             missed = change - self._slope @ step
             self._slope = self._slope + np.outer(missed, step) / square
 
-    def _step(self, residual: Array) -> Array:
+    def _compute_step(self, residual: Array) -> Array:
         """Compute Broyden's step from the best point, at most twice as long as Algorithm 1's.
 
         If it points against the estimate, Algorithm 1's step is used. After the first setback the
@@ -264,7 +264,7 @@ class BroydenSearch:
         share = min(1.0, longest) / 2.0 ** max(self._setbacks - 1, 0)
         return np.asarray(step * share, dtype=np.float64)
 
-    def _bracketed(self, guess: Array, point: Array, residual: Array) -> Array:
+    def _limit_to_bracket(self, guess: Array, point: Array, residual: Array) -> Array:
         """Limit the guess in one dimension to the interval between a low and a high point.
 
         This is done after a setback. The step to the middle of the interval is limited, because the

@@ -105,11 +105,11 @@ def bind_checked(
     Raises:
         InputError: An argument is wrong, unknown or missing, or there are too many.
     """
-    bound = _bind(called, signature, hints, args, kwargs)
+    bound = _bind_arguments(called, signature, hints, args, kwargs)
     for name, value in bound.arguments.items():
         if name in hints:
             try:
-                bound.arguments[name] = _convert(name, value, hints[name])
+                bound.arguments[name] = _convert_value(name, value, hints[name])
             except _MismatchError as error:
                 raise InputError(
                     f"{error.place}: expected {error.words}, found {_format_value(error.value)}"
@@ -138,7 +138,7 @@ def get_hints(annotated: Hashable) -> dict[str, Any]:
     return get_type_hints(annotated, include_extras=True)
 
 
-def _bind(
+def _bind_arguments(
     called: str,
     signature: inspect.Signature,
     hints: Mapping[str, Any],
@@ -168,7 +168,7 @@ def _bind(
         raise InputError(f"{called}: {found}; name the others, as {names[-1]}=...") from None
 
 
-def _convert(place: str, value: Any, hint: Any) -> Any:
+def _convert_value(place: str, value: Any, hint: Any) -> Any:
     """Convert a value to the type of its annotation.
 
     `place` names the argument or its entry in messages, such as ``runs[2]``. The result may
@@ -201,7 +201,7 @@ def _convert_annotated(place: str, value: Any, hint: Any) -> Any:
     """Convert a value annotated with `Expected`, whose words replace the default ones."""
     inner, expected = get_args(hint)[:2]
     try:
-        converted = _convert(place, value, inner)
+        converted = _convert_value(place, value, inner)
     except _MismatchError as error:
         if error.place != place:
             raise
@@ -220,7 +220,7 @@ def _convert_to_union(place: str, value: Any, hint: Any) -> Any:
     entry_errors = []
     for kind in get_args(hint):
         try:
-            return _convert(place, value, kind)
+            return _convert_value(place, value, kind)
         except _MismatchError as error:
             if error.place != place:
                 entry_errors.append(error)
@@ -274,13 +274,13 @@ def _convert_to_list(place: str, value: Any, hint: Any) -> Any:
         return _NO_MATCH
     if isinstance(value, str) and not all(_is_convertible(part, entry) for part in parts):
         return _NO_MATCH
-    return [_convert(f"{place}[{number}]", part, entry) for number, part in enumerate(parts)]
+    return [_convert_value(f"{place}[{number}]", part, entry) for number, part in enumerate(parts)]
 
 
 def _is_convertible(value: Any, hint: Any) -> bool:
     """Return whether a value has the annotated type, or can be converted to it."""
     try:
-        _convert("", value, hint)
+        _convert_value("", value, hint)
     except _MismatchError:
         return False
     return True
@@ -291,7 +291,8 @@ def _convert_to_dict(place: str, value: Any, hint: Any) -> Any:
     if not isinstance(value, Mapping) or not all(isinstance(key, str) for key in value):
         return _NO_MATCH
     return {
-        key: _convert(f"{place}[{key!r}]", entry, get_args(hint)[1]) for key, entry in value.items()
+        key: _convert_value(f"{place}[{key!r}]", entry, get_args(hint)[1])
+        for key, entry in value.items()
     }
 
 
@@ -300,7 +301,9 @@ def _convert_to_tuple(place: str, value: Any, hint: Any) -> Any:
     inner = get_args(hint)
     if not isinstance(value, list | tuple | np.ndarray) or len(value) != len(inner):
         return _NO_MATCH
-    return tuple(_convert(place, entry, kind) for entry, kind in zip(value, inner, strict=True))
+    return tuple(
+        _convert_value(place, entry, kind) for entry, kind in zip(value, inner, strict=True)
+    )
 
 
 def _convert_to_function(_place: str, value: Any, _hint: Any) -> Any:

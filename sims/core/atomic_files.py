@@ -45,10 +45,10 @@ def require_file(path: Path, wanted: str = "") -> None:
         raise InputError(f"{truncate_text(str(path))}: not a path ({why})") from None
     if exists:
         raise InputError(f"{path}: not a file{expected}")
-    raise InputError(f"{path}: no such file{expected}{_similar(path)}")
+    raise InputError(f"{path}: no such file{expected}{_format_similar_names(path)}")
 
 
-def _similar(path: Path) -> str:
+def _format_similar_names(path: Path) -> str:
     """Format the names of similar files in the folder as the end of a message."""
     from difflib import get_close_matches
 
@@ -69,7 +69,7 @@ def write_atomically(path: Path, content: Content) -> None:
         content: Content of the file.
     """
     with atomic_replacement(path) as partial:
-        partial.write_bytes(_bytes(content))
+        partial.write_bytes(_encode_content(content))
 
 
 def write_all_atomically(contents: Mapping[Path, Content]) -> None:
@@ -77,7 +77,7 @@ def write_all_atomically(contents: Mapping[Path, Content]) -> None:
     with ExitStack() as places:
         # No file is renamed before all are complete.
         for path, content in contents.items():
-            places.enter_context(atomic_replacement(path)).write_bytes(_bytes(content))
+            places.enter_context(atomic_replacement(path)).write_bytes(_encode_content(content))
 
 
 @contextmanager
@@ -90,7 +90,7 @@ def atomic_replacement(path: Path, *, keep_ending: bool = False) -> Iterator[Pat
             format from it. By default it has another ending, so that the file is not listed as one
             of its kind.
     """
-    partial = _beside(path, keep_ending)
+    partial = _make_temporary_path(path, keep_ending)
     try:
         yield partial
         _to_disk(partial)
@@ -106,21 +106,21 @@ def write_new_files(contents: Mapping[Path, Content]) -> None:
         OSError: A file cannot be written, or exists (`FileExistsError`); its filename says which.
     """
     with ExitStack() as cleaning, ExitStack() as undoing:
-        partials = {path: _beside(path) for path in contents}
+        partials = {path: _make_temporary_path(path) for path in contents}
         for path, partial in partials.items():
             cleaning.callback(partial.unlink, missing_ok=True)
-            with _naming(path):
-                partial.write_bytes(_bytes(contents[path]))
+            with _set_file_name_in_errors(path):
+                partial.write_bytes(_encode_content(contents[path]))
                 _to_disk(partial)
         for path, partial in partials.items():
-            with _naming(path):
-                _place(partial, path)
+            with _set_file_name_in_errors(path):
+                _rename_if_free(partial, path)
             undoing.callback(path.unlink)
         # All files are in place: keep them.
         undoing.pop_all()
 
 
-def _place(partial: Path, path: Path) -> None:
+def _rename_if_free(partial: Path, path: Path) -> None:
     """Give a complete file its final name, unless a file with this name exists.
 
     Raises:
@@ -138,7 +138,7 @@ def _place(partial: Path, path: Path) -> None:
 
 
 @contextmanager
-def _naming(path: Path) -> Iterator[None]:
+def _set_file_name_in_errors(path: Path) -> Iterator[None]:
     """Set the file name of an OSError to `path`, whichever temporary file caused it."""
     try:
         yield
@@ -154,7 +154,7 @@ def atomic_new_folder(folder: Path) -> Iterator[Path]:
     Raises:
         OSError: The folder cannot be made, or `folder` is not empty.
     """
-    partial = _beside(folder)
+    partial = _make_temporary_path(folder)
     try:
         partial.mkdir(parents=True)
         yield partial
@@ -195,7 +195,7 @@ def get_first_line(error: BaseException) -> str:
     return (str(error).strip().splitlines() or [type(error).__name__])[0]
 
 
-def _beside(path: Path, keep_ending: bool = False) -> Path:
+def _make_temporary_path(path: Path, keep_ending: bool = False) -> Path:
     """Return the temporary name next to a file, under which it is written before it is renamed."""
     # The name contains the process id, so that two processes do not write to the same file.
     if keep_ending:
@@ -203,7 +203,7 @@ def _beside(path: Path, keep_ending: bool = False) -> Path:
     return path.with_name(f".{path.name}.{os.getpid()}.partial")
 
 
-def _bytes(content: Content) -> bytes:
+def _encode_content(content: Content) -> bytes:
     return content.encode() if isinstance(content, str) else content
 
 

@@ -69,12 +69,12 @@ class Registry(Generic[T]):
         self._imported: dict[str, Any] = {}
 
     @cached_property
-    def _entries(self) -> Mapping[str, EntryPoint]:
+    def _entry_points(self) -> Mapping[str, EntryPoint]:
         return {entry.name: entry for entry in entry_points(group=self.group)}
 
     def names(self) -> list[str]:
         """Return all registered names, sorted."""
-        return sorted({*self._entries, *self._announced, *self._added})
+        return sorted({*self._entry_points, *self._announced, *self._added})
 
     def get(self, name: str) -> type[T]:
         """Return the class registered as `name`.
@@ -89,8 +89,8 @@ class Registry(Generic[T]):
             part: Any = self._added[name].part
         elif name in self._announced:
             part = self._announced[name].part
-        elif name in self._entries:
-            part = self._installed(name)
+        elif name in self._entry_points:
+            part = self._load_entry_point(name)
         else:
             error = make_unknown_name_error(self.kind, name, self.names())
             raise InputError(f"{error}; one of your own needs its file: --plugin FILE.py")
@@ -106,11 +106,11 @@ class Registry(Generic[T]):
         result: type[T] = part
         return result
 
-    def _installed(self, name: str) -> Any:
+    def _load_entry_point(self, name: str) -> Any:
         """Load the entry point `name`; it is imported once."""
         if name not in self._imported:
             try:
-                part = self._entries[name].load()
+                part = self._entry_points[name].load()
             except Exception as error:  # a plugin may fail in any way during import
                 reason = f"{type(error).__name__}: {error}"
                 raise PartUnavailableError(self.kind, name, reason) from error
@@ -152,7 +152,7 @@ class Registry(Generic[T]):
             wanted = f"a complete subclass of {self.base.__name__}"
             raise InputError(f"{where}{self.kind}: expected {wanted}, found {part!r:.80}")
         name = _name_of(part, where)
-        if self._holds(name, part):
+        if self._is_registered(name, part):
             return part
         # The loaded class replaces the stub of the same file.
         if name in self._announced and self._announced[name].path == path:
@@ -177,24 +177,26 @@ class Registry(Generic[T]):
         name = _name_of(part, where)
         other = self._announced.get(name) or self._added.get(name)
         taken = other is not None and other.path != path
-        if taken or (path is not None and name in self._entries):
+        if taken or (path is not None and name in self._entry_points):
             raise InputError(f"{where}{self.kind} '{name}' exists already; give it another name")
         self._announced[name] = AddedPart(part, path)
 
     def entry(self, name: str) -> str | None:
         """Return the ``module:class`` of an installed part; None if no package has this name."""
-        return self._entries[name].value if name in self._entries else None
+        return self._entry_points[name].value if name in self._entry_points else None
 
     def place(self, name: str) -> Path | None:
         """Return the plugin file of a loaded part or stub; None if it is not from a file."""
         added = self._added.get(name) or self._announced.get(name)
         return added.path if added else None
 
-    def _holds(self, name: str, part: type[T]) -> bool:
+    def _is_registered(self, name: str, part: type[T]) -> bool:
         """Return whether this class is registered under the name."""
         if name in self._added:
             return self._added[name].part is part
-        return name in self._entries and self._entries[name].value == ":".join(_qualified(part))
+        return name in self._entry_points and self._entry_points[name].value == ":".join(
+            _get_qualified_name(part)
+        )
 
     def _may_replace(self, name: str, part: type[T], path: Path | None) -> bool:
         """Return whether the registered class is an earlier version of this class."""
@@ -202,7 +204,11 @@ class Registry(Generic[T]):
         # Only classes from Python: files of the same name in two folders give equal qualified
         # names.
         from_python = old is not None and old.path is None and path is None
-        return old is not None and from_python and _qualified(old.part) == _qualified(part)
+        return (
+            old is not None
+            and from_python
+            and _get_qualified_name(old.part) == _get_qualified_name(part)
+        )
 
     def paths(self) -> set[Path]:
         """Return the plugin files of all loaded parts."""
@@ -218,7 +224,7 @@ class Registry(Generic[T]):
         self._announced = {}
 
 
-def _qualified(part: type) -> tuple[str, str]:
+def _get_qualified_name(part: type) -> tuple[str, str]:
     return part.__module__, part.__qualname__
 
 

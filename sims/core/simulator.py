@@ -288,7 +288,7 @@ class UnitCube:
         self._any_log = bool(self._log.any())
         pairs = [p.bounds for p in self.parameters]
         bounds = np.array(pairs, dtype=np.float64).reshape(-1, 2)  # also without parameters
-        self._low, self._high = self._scaled(bounds.T)
+        self._low, self._high = self._apply_log_scale(bounds.T)
         self._span = self._high - self._low
         self.training: Array = make_read_only(
             self.to_unit_cube(np.array([p.training_range for p in self.parameters]).T)
@@ -299,7 +299,7 @@ class UnitCube:
         """Number of parameters."""
         return len(self.parameters)
 
-    def _scaled(self, theta: Array) -> Array:
+    def _apply_log_scale(self, theta: Array) -> Array:
         """Return parameters (..., dim) with logarithms of those that are log-scaled."""
         if not self._any_log:
             return theta
@@ -319,7 +319,9 @@ class UnitCube:
 
     def to_unit_cube(self, theta: Array) -> Array:
         """Map physical parameter vectors (..., dim) to unit-cube points."""
-        result: Array = (self._scaled(np.asarray(theta, dtype=np.float64)) - self._low) / self._span
+        result: Array = (
+            self._apply_log_scale(np.asarray(theta, dtype=np.float64)) - self._low
+        ) / self._span
         return result
 
     def compute_training_widths(self) -> Array:
@@ -373,7 +375,7 @@ class Simulator(ABC):
             InputError: A constant or channel does not exist, or a value is impossible.
         """
         defaults = {c.name: c.value for c in self.constants}
-        self.constant_values = self._constants(defaults, constants or {})
+        self.constant_values = self._check_constants(defaults, constants or {})
         names = [c.name for c in self.channels]
         chosen = names if observe is None else list(observe)
         for name in chosen:
@@ -411,18 +413,18 @@ class Simulator(ABC):
 
     def run_constants(self, scenario: Scenario) -> dict[str, float]:
         """Return the constants of one run: the simulator's, overridden by the scenario's."""
-        return self._constants(self.constant_values, scenario.constants)
+        return self._check_constants(self.constant_values, scenario.constants)
 
     def run_initial(self, scenario: Scenario) -> dict[str, float]:
         """Return the initial state of one run: the defaults, overridden by the scenario's."""
-        return self._checked("initial state", self.states, scenario.initial)
+        return self._check_values("initial state", self.states, scenario.initial)
 
     def run_inputs(self, scenario: Scenario) -> dict[str, Array]:
         """Return the input signals of one run, each (T,); missing inputs are zero."""
         known = {c.name: np.zeros(scenario.times.size) for c in self.inputs}
-        return self._checked("input", known, scenario.inputs)
+        return self._check_values("input", known, scenario.inputs)
 
-    def _constants(
+    def _check_constants(
         self, known: Mapping[str, float], given: Mapping[str, float]
     ) -> dict[str, float]:
         """Return the constants with their given values, after checking their limits.
@@ -434,7 +436,7 @@ class Simulator(ABC):
         Raises:
             InputError: a constant is unknown, not finite, or outside its limits.
         """
-        values = self._checked("constant", known, given)
+        values = self._check_values("constant", known, given)
         for c in self.constants:
             value = values[c.name]
             if c.positive and value <= 0:
@@ -447,7 +449,7 @@ class Simulator(ABC):
             raise InputError(f"{who} must {wanted}, found {value}")
         return values
 
-    def _checked(
+    def _check_values(
         self, kind: str, known: Mapping[str, Any], given: Mapping[str, Any]
     ) -> dict[str, Any]:
         """Return known values, replaced by the given ones.

@@ -284,14 +284,14 @@ def check_annotation(source: Source, where: str, value: Any, declared: Any) -> A
     if declared is Any:
         return value  # checked where it is used, for example settings by a simulator
     if origin in (Union, UnionType):
-        return check_annotation(source, where, value, _chosen(value, inner))
+        return check_annotation(source, where, value, _choose_union_member(value, inner))
     if declared == Range:  # before other tuples, which may have any length
         return check_range(source, where, value)
     if origin is tuple:
         items = check_type(source, where, value, list)
         return tuple(check_annotation(source, where, item, inner[0]) for item in items)
     if origin is not None:
-        return _mapping(source, where, value, inner[1])
+        return _check_table(source, where, value, inner[1])
     if isinstance(declared, type) and is_dataclass(declared):
         return declared(**check_entries(source, where, value, get_type_hints_of(declared)))
     if is_typeddict(declared):
@@ -301,7 +301,7 @@ def check_annotation(source: Source, where: str, value: Any, declared: Any) -> A
     return check_type(source, where, value, declared)
 
 
-def _mapping(source: Source, where: str, value: Any, declared: Any) -> dict[str, Any]:
+def _check_table(source: Source, where: str, value: Any, declared: Any) -> dict[str, Any]:
     """Check a table with arbitrary names whose entries are all of one type."""
     result = {}
     for key, item in check_table(source, where, value).items():
@@ -342,7 +342,7 @@ def get_type_hints_of(kind: type) -> dict[str, Any]:
     return get_type_hints(kind)
 
 
-def _chosen(value: Any, among: Sequence[Any]) -> Any:
+def _choose_union_member(value: Any, among: Sequence[Any]) -> Any:
     """Return the type of a union to check a value against: a tuple for a list, else the first."""
     # TOML has no null: entries that may be None are left out.
     kinds = [kind for kind in among if kind is not NoneType]

@@ -84,15 +84,15 @@ class Wind(Force):
             c: (K, L, 1) coefficients.
             moment: state snapshot of L batch elements.
         """
-        return -c[0] * _squared(moment.v - _air(c, moment))  # (3)
+        return -c[0] * _compute_signed_square(moment.v - _compute_air_velocity(c, moment))  # (3)
 
 
-def _squared(v: Array) -> Array:
+def _compute_signed_square(v: Array) -> Array:
     """Return |v| v, (L, D)."""
     return np.sqrt((v * v).sum(axis=1, keepdims=True)) * v
 
 
-def _air(c: Array, moment: StateSnapshot) -> Array:
+def _compute_air_velocity(c: Array, moment: StateSnapshot) -> Array:
     """Return the velocity (L, D) of the air along the system's coordinates."""
     # `push` is the force of 1 m/s^2 of acceleration: divided by the mass, it gives the direction of
     # the axis

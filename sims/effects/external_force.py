@@ -75,7 +75,9 @@ class ForceRipple(Force):
             c: (K, L, 1) coefficients.
             moment: state snapshot of L batch elements.
         """
-        return moment.along_primary(_wave(c, moment.primary / np.maximum(c[2], _MIN_PERIOD)))  # (2)
+        return moment.along_primary(
+            _compute_wave(c, moment.primary / np.maximum(c[2], _MIN_PERIOD))
+        )  # (2)
 
 
 class PeriodicForce(Force):
@@ -98,10 +100,10 @@ class PeriodicForce(Force):
             c: (K, L, 1) coefficients.
             moment: state snapshot of L batch elements.
         """
-        return moment.along_primary(_wave(c, moment.t * c[2]))  # (3)
+        return moment.along_primary(_compute_wave(c, moment.t * c[2]))  # (3)
 
 
-def _wave(c: Array, cycles: Array) -> Array:
+def _compute_wave(c: Array, cycles: Array) -> Array:
     """Return c[0] sin + c[1] cos (L, 1) at a phase given in cycles."""
     angle = 2 * np.pi * cycles
     wave: Array = c[0] * np.sin(angle) + c[1] * np.cos(angle)

@@ -177,7 +177,7 @@ class QuadraticLoadFriction(Friction):
             c: (K, L, 1) coefficients.
             moment: state snapshot of L batch elements.
         """
-        through = _transmitted(*moment.sides)
+        through = _limit_to_opposing(*moment.sides)
         return np.maximum(c[0] * moment.load + c[1] * through**2, 0.0)  # (5)
 
 
@@ -243,7 +243,7 @@ class DirectionalViscousFriction(Force):
         return -c[0] * ahead - c[1] * back  # (8)
 
 
-def _transmitted(drive: Array, against: Array) -> Array:
+def _limit_to_opposing(drive: Array, against: Array) -> Array:
     """Return the smaller of two opposing forces (L, 1); zero where they do not oppose."""
     low, high = np.minimum(drive, against), np.maximum(drive, against)
     return np.maximum(low, 0.0) - np.minimum(high, 0.0)

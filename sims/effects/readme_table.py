@@ -24,22 +24,22 @@ def render_effects_table() -> str:
         effect = effects.get_effect(name)
         # effects of installed plugins use the same entry points and have their own documentation
         if effect.__module__.startswith("sims.effects."):
-            rows += _rows(effect)
+            rows += _format_effect_rows(effect)
     return "\n".join(rows) + "\n"
 
 
-def _rows(effect: type[Effect]) -> list[str]:
+def _format_effect_rows(effect: type[Effect]) -> list[str]:
     """Return the rows of one effect in the Markdown table, one for each of its coefficients."""
     head = f"`{effect.name}` ({effect.hook}): {effect.says}"
     rows = []
     for c in effect.coefficients:
-        ranges = [_range(c, place) for place in range(len(SYSTEM_KINDS))]
+        ranges = [_format_range(c, place) for place in range(len(SYSTEM_KINDS))]
         rows.append(f"| {head} | {c.name} | " + " | ".join(ranges) + " |")
         head = ""  # the description is only in the row of the first coefficient
     return rows
 
 
-def _range(c: Coefficient, place: int) -> str:
+def _format_range(c: Coefficient, place: int) -> str:
     """Format the plausible range of a coefficient for one kind of system.
 
     `place` is the index of the kind in `SYSTEM_KINDS`. A dash means that the effect does not exist

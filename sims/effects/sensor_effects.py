@@ -138,7 +138,7 @@ class SensorLag(Sensor):
             signal: signal (L, S) over the steps.
         """
         # (4); without a lag the reading itself, bit for bit
-        return np.where(c[0] > 0, _lagged(signal, c[0]), signal.values)
+        return np.where(c[0] > 0, _apply_lag(signal, c[0]), signal.values)
 
 
 class SensorDrift(Sensor):
@@ -229,7 +229,7 @@ def _smooth_step(instant: Array, now: Array) -> Array:
     return share
 
 
-def _lagged(signal: Signal, lag: Array) -> Array:
+def _apply_lag(signal: Signal, lag: Array) -> Array:
     """Return a signal (L, S) after a first-order lag (4), at the end of each step.
 
     The signal counts as linear within a step. `lag` (L, 1) is the time constant in seconds.

@@ -75,7 +75,7 @@ class ServoDerivativeAction(Input):
         """
         lead = np.maximum(c[0], 0.0)
         return np.where(
-            lead > 0, 2.0 * signal.values - _earlier(signal, lead), signal.values
+            lead > 0, 2.0 * signal.values - _average_earlier_signal(signal, lead), signal.values
         )  # (2)
 
 
@@ -132,7 +132,7 @@ def _apply_acceleration_limit(signal: Signal, most: Array) -> Array:
     return means.T
 
 
-def _earlier(signal: Signal, late: Array) -> Array:
+def _average_earlier_signal(signal: Signal, late: Array) -> Array:
     """Return means (L, S) over each step of the signal `late` (L, 1) seconds earlier.
 
     Before the run, the signal has its initial value.
@@ -145,14 +145,16 @@ def _earlier(signal: Signal, late: Array) -> Array:
         # integral of the signal, beginning long before the run
         knots = np.concatenate([[begins[lane, 0] - 1.0, begins[lane, 0]], ends[lane]])
         whole = np.concatenate([[-signal.start[lane, 0], 0.0], gained[lane]])
-        first, last = (_integral(knots, whole, t[lane] - late[lane]) for t in (begins, ends))
+        first, last = (
+            _integrate_signal(knots, whole, t[lane] - late[lane]) for t in (begins, ends)
+        )
         steps = signal.steps[lane]
         long = steps > 0
         result[lane, long] = (last - first)[long] / steps[long]
     return result
 
 
-def _integral(knots: Array, whole: Array, t: Array) -> Array:
+def _integrate_signal(knots: Array, whole: Array, t: Array) -> Array:
     """Return the integral at times t, extrapolated linearly before the first knot."""
     inside: Array = np.interp(t, knots, whole)
     slope = (whole[1] - whole[0]) / (knots[1] - knots[0])

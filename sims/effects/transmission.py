@@ -125,7 +125,9 @@ class DrivenLoad(HiddenStateEffect):
             c: (K, L, 1) coefficients.
             moment: state snapshot of L batch elements.
         """
-        away = self.compute_static_deflection(c, _fall(moment, moment.primary))
+        away = self.compute_static_deflection(
+            c, _compute_gravity_acceleration(moment, moment.primary)
+        )
         return HiddenState(moment.primary + away, moment.v[:, :1])
 
     def act(self, c: Array, moment: StateSnapshot, state: HiddenState) -> tuple[Array, Array]:
@@ -138,8 +140,12 @@ class DrivenLoad(HiddenStateEffect):
         """
         pull, share = self.compute_coupling_force(c, moment, state), self.behind(c)
         # The load carries its share of the weight.
-        near = -share * moment.inertia * (pull + _fall(moment, moment.primary))  # (1)
-        return moment.along_primary(near), pull + _fall(moment, state.x)  # (2)
+        near = (
+            -share * moment.inertia * (pull + _compute_gravity_acceleration(moment, moment.primary))
+        )  # (1)
+        return moment.along_primary(near), pull + _compute_gravity_acceleration(
+            moment, state.x
+        )  # (2)
 
     def compute_static_deflection(self, c: Array, fall: Array) -> Array:
         """Return the static deflection (L, 1) of the load under an acceleration of gravity.
@@ -224,7 +230,7 @@ class JointBacklash(DrivenLoad):
         return np.where(beyond > 0, np.maximum(pull, 0.0), np.minimum(pull, 0.0))
 
 
-def _fall(moment: StateSnapshot, y: Array) -> Array:
+def _compute_gravity_acceleration(moment: StateSnapshot, y: Array) -> Array:
     """Return the acceleration (L, 1) by gravity alone at positions y (L, 1)."""
     there = replace(moment, x=moment.along_primary(y))
     weight = moment.system.weight(there)[:, moment.system.primary, None]

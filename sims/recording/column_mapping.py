@@ -123,7 +123,7 @@ def read_sources(
         second = compute_unit_scale(unit, "s").gain
     except InputError as error:
         raise InputError(f"{path}: time.unit: {error}") from None
-    rate = _rate(path, time)
+    rate = _read_sampling_rate(path, time)
     signals = {name: _read_source(path, name, table) for name, table in columns.items()}
     folders, run_files = {}, {}
     for name, marks in check_table(path, "runs", meta.get("runs", {})).items():
@@ -186,7 +186,7 @@ def _read_source(
     return SignalSource(file, names, weights)
 
 
-def _rate(path: Path, time: Mapping[str, Any]) -> float:
+def _read_sampling_rate(path: Path, time: Mapping[str, Any]) -> float:
     """Return the sampling rate of logs without stamps, Hz; 0 if the logs have stamps."""
     if "rate" not in time:
         return 0.0
@@ -211,8 +211,10 @@ def list_mapped_files(description: Path) -> list[Path]:
         meta = read_toml(description)
     except InputError:
         return []
-    signals = [_named(meta.get(kind), "file") for kind in ("channels", "inputs", "extra", "runs")]
-    folders = _named(meta.get("runs"), "folder") or [""]
+    signals = [
+        _collect_texts(meta.get(kind), "file") for kind in ("channels", "inputs", "extra", "runs")
+    ]
+    folders = _collect_texts(meta.get("runs"), "folder") or [""]
     # A signal without a file is in the table that has the description's name, in each folder.
     usual = description.with_suffix(".csv").name
     files = dict.fromkeys([usual, *(name for names in signals for name in names)])
@@ -221,12 +223,12 @@ def list_mapped_files(description: Path) -> list[Path]:
     return [*paths, *(description.parent / name for name in model)]
 
 
-def _named(tables: Any, word: str) -> list[str]:
+def _collect_texts(tables: Any, word: str) -> list[str]:
     """Collect all texts under the key `word` in nested tables, such as all stated file names."""
     if not isinstance(tables, dict):
         return []
     own = [tables[word]] if isinstance(tables.get(word), str) else []
-    return own + [name for inner in tables.values() for name in _named(inner, word)]
+    return own + [name for inner in tables.values() for name in _collect_texts(inner, word)]
 
 
 def read_logs(
@@ -353,7 +355,7 @@ class _FolderLogs:
         columns = {}
         for channel in self._channels:
             log = self._logs[channel]
-            values = self._read(channel, rows_of[log.path])
+            values = self._read_signal(channel, rows_of[log.path])
             if not np.isfinite(values).any():
                 raise InputError(f"{log.path}: column {channel} has no sample; leave it out")
             stamps = rows_of[log.path].stamps
@@ -363,7 +365,9 @@ class _FolderLogs:
             cells[places[inside]] = values[inside]
             columns[channel] = make_read_only(cells)
         for name in (*self._inputs, *self._extra):
-            columns[name] = make_read_only(self._hold(name, rows_of, times, name in linear))
+            columns[name] = make_read_only(
+                self._resample_signal(name, rows_of, times, name in linear)
+            )
         return CsvRun(run, times, columns, tuple(notes))
 
     def _select_rows(self, run_rows: Mask | None) -> tuple[dict[Path, _LogRows], list[str]]:
@@ -376,7 +380,7 @@ class _FolderLogs:
         for log in self._logs.values():
             if log.path in rows_of:
                 continue
-            stamps, is_first = self._stamps(log, run_rows)
+            stamps, is_first = self._read_stamps(log, run_rows)
             numbers = np.arange(stamps.size) if run_rows is None else np.flatnonzero(run_rows)
             rows_of[log.path] = _LogRows(stamps[is_first], numbers[is_first])
             if not is_first.all():
@@ -408,7 +412,7 @@ class _FolderLogs:
             raise InputError(f"{path}: run {run!r}: expected at least two instants, found one")
         return make_read_only(times)
 
-    def _read(self, signal: str, rows: _LogRows) -> Array:
+    def _read_signal(self, signal: str, rows: _LogRows) -> Array:
         """Return the values (N,) of a signal in the rows of a run, in the unit of the log."""
         log = self._logs[signal]
 
@@ -428,7 +432,7 @@ class _FolderLogs:
 
         return self._sources[signal].combine(read_column)
 
-    def _hold(
+    def _resample_signal(
         self, signal: str, rows_of: Mapping[Path, _LogRows], times: Array, is_linear: bool
     ) -> Array:
         """Return the values of an input or an extra column at all times of a run.
@@ -447,7 +451,7 @@ class _FolderLogs:
         """
         log = self._logs[signal]
         rows = rows_of[log.path]
-        values = self._read(signal, rows)
+        values = self._read_signal(signal, rows)
         missing = np.flatnonzero(~np.isfinite(values))
         if missing.size and signal in self._inputs:
             row = int(rows.rows[missing[0]]) + log.first
@@ -462,7 +466,7 @@ class _FolderLogs:
         held: Array = values[np.maximum(places, 0)]
         return held
 
-    def _stamps(self, log: LogFile, run_rows: Mask | None) -> tuple[Array, Mask]:
+    def _read_stamps(self, log: LogFile, run_rows: Mask | None) -> tuple[Array, Mask]:
         """Return the stamps (N,) of a log in its own unit, and a mask of the unrepeated ones.
 
         Raises:

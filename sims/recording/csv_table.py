@@ -114,26 +114,31 @@ class Table:
 
     def read(self) -> list[CsvRun]:
         """Return the runs of the file."""
-        records = self._records()
-        header = self._header(next(records, []))
+        records = self._iterate_records()
+        header = self._check_header(next(records, []))
         quick = None
         if self.path.stat().st_size >= MIN_FAST_PARSE_BYTES:
             quick = read_csv_fast(self.path, header, self.wanted[1:], self.gaps)
         # If the fast reader gives up, read cell by cell to locate the error.
-        names, columns = quick or self._cells(header, records)
+        names, columns = quick or self._convert_cells(header, records)
         return self.runs(names, columns)
 
-    def _cells(
+    def _convert_cells(
         self, header: list[str], records: Iterator[list[str]]
     ) -> tuple[list[str], dict[str, Array]]:
         """Convert the rows below the header to run names and numeric columns (T,)."""
         names: list[str] = []
         parts: list[list[Array]] = []
         while rows := list(islice(records, _CHUNK)):
-            even = self._even(rows, len(header), len(names))
+            even = self._check_row_widths(rows, len(header), len(names))
             by_column = zip(*even, strict=True)
             cells = dict(zip(header, by_column, strict=True))
-            parts.append([self._numbers(name, cells[name], len(names)) for name in self.wanted[1:]])
+            parts.append(
+                [
+                    self._convert_to_numbers(name, cells[name], len(names))
+                    for name in self.wanted[1:]
+                ]
+            )
             names += [name.strip() for name in cells["run"]]
         numeric = self.wanted[1:]
         if not parts:
@@ -141,7 +146,7 @@ class Table:
         columns = map(np.concatenate, zip(*parts, strict=True))
         return names, dict(zip(numeric, columns, strict=True))
 
-    def _records(self) -> Iterator[list[str]]:
+    def _iterate_records(self) -> Iterator[list[str]]:
         """Iterate over header and rows; skip blank lines."""
         with self.path.open(encoding="utf-8-sig", newline="") as file:
             reader = csv.reader(file, strict=True, skipinitialspace=True)
@@ -152,7 +157,7 @@ class Table:
                     f"{self.path}, row {reader.line_num}: not a CSV table: {error}"
                 ) from None
 
-    def _header(self, cells: list[str]) -> list[str]:
+    def _check_header(self, cells: list[str]) -> list[str]:
         """Check the names of the columns against the declared ones, and return them."""
         header = [cell.strip() for cell in cells]
         # A single column is most likely due to another separator.
@@ -172,17 +177,19 @@ class Table:
         for name in self.wanted:
             if name not in header:
                 raise InputError(
-                    f"{self.path}: expected column '{name}', found columns {_listed(header)}"
+                    f"{self.path}: expected column '{name}', found columns {_join_names(header)}"
                 )
         for name in header:
             if name not in self.wanted:
-                there = f"{self.path.with_suffix('.toml').name} declares {_listed(self.wanted[2:])}"
+                there = (
+                    f"{self.path.with_suffix('.toml').name} declares {_join_names(self.wanted[2:])}"
+                )
                 raise InputError(
                     f"{self.path}: column {format_value(name)} is not declared; {there}"
                 )
         return header
 
-    def _even(self, rows: list[list[str]], width: int, first: int) -> list[list[str]]:
+    def _check_row_widths(self, rows: list[list[str]], width: int, first: int) -> list[list[str]]:
         """Check that all rows have as many cells as the header, and return them.
 
         Args:
@@ -193,12 +200,12 @@ class Table:
         if set(map(len, rows)) != {width}:
             record, row = next((i, row) for i, row in enumerate(rows) if len(row) != width)
             raise InputError(
-                f"{self.path}, row {self._line(first + record)}: "
+                f"{self.path}, row {self._find_line_number(first + record)}: "
                 f"expected {width} cells as in the header, found {len(row)}"
             )
         return rows
 
-    def _numbers(self, name: str, cells: Sequence[str], first: int) -> Array:
+    def _convert_to_numbers(self, name: str, cells: Sequence[str], first: int) -> Array:
         """Convert the cells of a column to numbers (T,); empty ones to NaN where gaps are allowed.
 
         Args:
@@ -217,10 +224,10 @@ class Table:
             suspects = range(len(cells))
         for i in suspects:
             if cells[i].strip() or name not in self.gaps:
-                self._check(name, cells[i], first + i)
+                self._check_cell(name, cells[i], first + i)
         return values
 
-    def _check(self, name: str, cell: str, record: int) -> None:
+    def _check_cell(self, name: str, cell: str, record: int) -> None:
         """Check that a cell holds a finite number.
 
         Raises:
@@ -249,7 +256,7 @@ class Table:
             if np.isnan(columns[name]).all():
                 raise InputError(f"{self.path}: column {name} has no sample; leave the channel out")
         edges = [0, *(i + 1 for i, (a, b) in enumerate(pairwise(names)) if a != b), len(names)]
-        self._increasing(columns["t"], edges)
+        self._check_times_increase(columns["t"], edges)
         runs: dict[str, CsvRun] = {}
         for begin, end in pairwise(edges):
             name = names[begin]
@@ -276,11 +283,11 @@ class Table:
                     self.channels[0],
                     f"run {format_value(name)} has no sample of any channel",
                 )
-            self._seconds(columns["t"], begin, end - 1)
+            self._check_seconds(columns["t"], begin, end - 1)
             runs[name] = CsvRun(name, make_read_only(columns["t"][begin:end]), part)
         return list(runs.values())
 
-    def _seconds(self, t: Array, first: int, last: int) -> None:
+    def _check_seconds(self, t: Array, first: int, last: int) -> None:
         """Check that the stamps of a run can be seconds, and not milliseconds."""
         latest = max(-t[first], t[last])
         if latest > MAX_TIMESTAMP_SECONDS:
@@ -292,7 +299,7 @@ class Table:
         if lasts < MIN_RUN_SECONDS:
             self.fault(last, "t", f"expected seconds, found a run of {lasts:.3g} s")
 
-    def _increasing(self, t: Array, edges: list[int]) -> None:
+    def _check_times_increase(self, t: Array, edges: list[int]) -> None:
         """Check that the times increase within each run.
 
         Args:
@@ -322,9 +329,9 @@ class Table:
 
     def row(self, record: int) -> str:
         """Return the location of row `record` (counted from 0) for a message."""
-        return f"{self.path}, row {self._line(record)}"
+        return f"{self.path}, row {self._find_line_number(record)}"
 
-    def _line(self, record: int) -> int:
+    def _find_line_number(self, record: int) -> int:
         """Return the line on which row `record` (counted from 0) ends; reads the file again."""
         with self.path.open(encoding="utf-8-sig", newline="") as file:
             reader = csv.reader(file, strict=True, skipinitialspace=True)
@@ -333,7 +340,7 @@ class Table:
             return reader.line_num
 
 
-def _listed(names: Sequence[str], most: int = 12) -> str:
+def _join_names(names: Sequence[str], most: int = 12) -> str:
     """Join names for a message; only the first `most` of many."""
     text = ", ".join(names[:most])
     if len(names) > most:

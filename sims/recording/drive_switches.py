@@ -172,7 +172,7 @@ def switched_runs(path: Path, runs: Sequence[Run], switches: Sequence[DriveSwitc
         if any(mask.any() for mask in off):
             note = f"where {switch.condition}: {spans_of_runs(runs, off)}"
             notes.setdefault(note, []).append(switch.actuator)
-    said = [f"{_subject(names)} nothing {note}" for note, names in notes.items()]
+    said = [f"{_make_subject_and_verb(names)} nothing {note}" for note, names in notes.items()]
     switched = tuple(
         replace(run, off=masks) if masks else run for run, masks in zip(runs, by_run, strict=True)
     )
@@ -187,7 +187,7 @@ def spans_of_runs(runs: Sequence[Run], off: Sequence[Mask]) -> str:
         off: Mask (T,) of each run.
     """
     told = [
-        f"run {run.name}, {_spans(run.times, mask)}"
+        f"run {run.name}, {_describe_time_spans(run.times, mask)}"
         for run, mask in zip(runs, off, strict=True)
         if mask.any()
     ]
@@ -195,14 +195,14 @@ def spans_of_runs(runs: Sequence[Run], off: Sequence[Mask]) -> str:
     return f"{'; '.join(told[:MOST_RUNS])}{more}"
 
 
-def _subject(names: Sequence[str]) -> str:
+def _make_subject_and_verb(names: Sequence[str]) -> str:
     """Return subject and verb of a sentence about actuators."""
     if len(names) == 1:
         return f"actuator {names[0]} exerts"
     return f"actuators {', '.join(names)} exert"
 
 
-def _spans(times: Array, off: Mask) -> str:
+def _describe_time_spans(times: Array, off: Mask) -> str:
     """Describe the time spans in which a mask (T,) is set."""
     return ", ".join(f"{times[first]:.4g} to {times[end - 1]:.4g} s" for first, end in spans(off))
 

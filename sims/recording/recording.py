@@ -121,10 +121,10 @@ class Run:
             initial={} if rows.start else self.initial,
             extra=cut(self.extra),
             off=cut(self.off),
-            before={name: self._before(name, rows.start or 0) for name in self.inputs},
+            before={name: self._get_input_history(name, rows.start or 0) for name in self.inputs},
         )
 
-    def _before(self, name: str, row: int) -> Array:
+    def _get_input_history(self, name: str, row: int) -> Array:
         """Return the stored history of an input before a sample.
 
         Args:
@@ -222,8 +222,10 @@ def read_recording(
         table = own
         parts = read_table(own, *columns, list(about.extra))
     check_run_names(description, about.runs, [part.name for part in parts])
-    switched = switched_runs(table, [_run(table, part, about) for part in parts], about.switches)
-    kept = switched.runs if whole else _split(description, switched.runs, folds)
+    switched = switched_runs(
+        table, [_make_run(table, part, about) for part in parts], about.switches
+    )
+    kept = switched.runs if whole else _split_runs(description, switched.runs, folds)
     return Recording(
         table,
         about.system,
@@ -303,7 +305,7 @@ def recording_of_frame(
     about = check_description(path, stated, declared)
     parts = read_frame(path, whole, about)
     check_run_names(path, about.runs, [part.name for part in parts])
-    switched = switched_runs(path, [_run(path, part, about) for part in parts], about.switches)
+    switched = switched_runs(path, [_make_run(path, part, about) for part in parts], about.switches)
     return Recording(
         path,
         about.system,
@@ -332,7 +334,7 @@ def split_held_out(recording: Recording, folds: bool = False) -> Recording:
     """
     path = recording.path
     description = path.with_suffix(".toml") if path.suffix == ".csv" else path
-    return replace(recording, runs=_split(description, recording.runs, folds))
+    return replace(recording, runs=_split_runs(description, recording.runs, folds))
 
 
 MAX_FOLDS = 3
@@ -343,11 +345,11 @@ _HELD_OUT_STRIDE = 3
 """Every third run, or the last third of the samples of a single run, is held out."""
 
 
-def _run(table: Path, part: CsvRun, about: RecordingDescription) -> Run:
+def _make_run(table: Path, part: CsvRun, about: RecordingDescription) -> Run:
     """Make a run in SI units from its table and the metadata of the description."""
     marks = about.runs.get(part.name, _UNMARKED)
-    channels = {n: _converted(table, part, n, s) for n, s in about.channels.items()}
-    inputs = {n: _converted(table, part, n, s) for n, s in about.inputs.items()}
+    channels = {n: _convert_column(table, part, n, s) for n, s in about.channels.items()}
+    inputs = {n: _convert_column(table, part, n, s) for n, s in about.inputs.items()}
     for name, command in about.wrapped.items():
         channels[name] = make_read_only(unwrapped(channels[name], inputs.get(command)))
     # Extra columns keep their unit, because no system reads them.
@@ -372,7 +374,7 @@ def _run(table: Path, part: CsvRun, about: RecordingDescription) -> Run:
     )
 
 
-def _converted(table: Path, part: CsvRun, name: str, scale: UnitScale) -> Array:
+def _convert_column(table: Path, part: CsvRun, name: str, scale: UnitScale) -> Array:
     """Convert a column to SI units.
 
     Raises:
@@ -392,7 +394,7 @@ def _converted(table: Path, part: CsvRun, name: str, scale: UnitScale) -> Array:
     return make_read_only(result)
 
 
-def _split(path: Path, runs: Sequence[Run], folds: bool) -> tuple[Run, ...]:
+def _split_runs(path: Path, runs: Sequence[Run], folds: bool) -> tuple[Run, ...]:
     """Divide the runs into runs for fitting and held-out runs; see `split_held_out`."""
     runs = [replace(run, fold=None) for run in runs]
     if any(run.held_out for run in runs):

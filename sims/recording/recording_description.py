@@ -164,10 +164,12 @@ def model_in(
         model = description.parent / check_text(description, "model", meta["model"])
     actuators = without_switches(check_table(description, "actuators", meta.get("actuators", {})))
     engine = check_table(description, "engine", meta.get("engine", {}))
-    return ModelFileReference(Path(model), actuators, engine, _free(description, meta))
+    return ModelFileReference(
+        Path(model), actuators, engine, _read_free_parameters(description, meta)
+    )
 
 
-def _free(path: Path, meta: Mapping[str, Any]) -> tuple[str, ...]:
+def _read_free_parameters(path: Path, meta: Mapping[str, Any]) -> tuple[str, ...]:
     """Return the names of the robot parameters that the description leaves free."""
     given = meta.get("free", [])
     if not isinstance(given, list) or not all(isinstance(name, str) for name in given):
@@ -184,7 +186,7 @@ def read_system_name(path: str | Path) -> str:
     Raises:
         InputError: The description is missing or malformed, or states no system.
     """
-    return _system(*read_meta(Path(path)))
+    return _read_system_name(*read_meta(Path(path)))
 
 
 def get_description_path(table: Path) -> Path:
@@ -217,8 +219,8 @@ def stated_columns(path: Path, declared: DeclaredSignals) -> dict[str, tuple[str
     description = get_description_path(path)
     meta = read_toml(description)
     columns = {
-        **_columns(description, "channel", meta, declared.channels),
-        **_columns(description, "input", meta, declared.inputs),
+        **_read_columns(description, "channel", meta, declared.channels),
+        **_read_columns(description, "input", meta, declared.inputs),
     }
     return {
         name: (str(c.table["unit"]), c.scale.gain, float(c.table.get("scale", 1.0)))
@@ -269,25 +271,25 @@ def check_description(
     Raises:
         InputError: The description is malformed; the message is one line.
     """
-    _known(path, "", meta, _KEYS)
+    _check_known_names(path, "", meta, _KEYS)
     if "free" in meta and "model" not in meta:
         raise make_error(path, "free", "it with model = FILE alone (else --free A,B)", meta["free"])
     title = check_text(path, "title", meta.get("title", path.stem))
     _refuse_poses(path, meta, declared)
-    channels = _columns(path, "channel", meta, declared.channels)
+    channels = _read_columns(path, "channel", meta, declared.channels)
     _refuse_inputs(path, meta, declared)
-    inputs = _columns(path, "input", meta, declared.inputs)
+    inputs = _read_columns(path, "input", meta, declared.inputs)
     if not channels:
         raise InputError(f"{path}: expected at least one [channels.NAME] table, found none")
-    constants = _constants(path, "constants", meta.get("constants", {}), declared)
-    _possible(path, "constants", constants, declared)
+    constants = _read_constants(path, "constants", meta.get("constants", {}), declared)
+    _check_constants_possible(path, "constants", constants, declared)
     # The names of the runs are checked after the table was read (`check_run_names`).
     marks = check_table(path, "runs", meta.get("runs", {}))
-    runs = {name: _run(path, name, own, declared) for name, own in marks.items()}
+    runs = {name: _read_run(path, name, own, declared) for name, own in marks.items()}
     # A robot has no system name: its model file is stated instead.
     robotic = declared.has_model
-    extra = _extra(path, meta, declared)
-    switches = _switches(path, meta, declared)
+    extra = _read_extra_columns(path, meta, declared)
+    switches = _read_drive_switches(path, meta, declared)
     extra = {**{switch.column: {"unit": "1"} for switch in switches}, **extra}
     sources = read_sources(
         path,
@@ -297,23 +299,25 @@ def check_description(
     )
     extra_units = {name: str(table["unit"]) for name, table in extra.items()}
     return RecordingDescription(
-        system=declared.name if robotic else _system(path, meta),
+        system=declared.name if robotic else _read_system_name(path, meta),
         title=title,
         channels={name: column.scale for name, column in channels.items()},
         inputs={name: column.scale for name, column in inputs.items()},
-        noise=_noises(path, channels, declared),
+        noise=_read_noises(path, channels, declared),
         constants=constants,
         runs=runs,
         extra=extra_units,
-        initial_pose_scales=_begins(path, extra_units, declared),
-        linear=frozenset(name for name, column in inputs.items() if _hold(path, name, column)),
+        initial_pose_scales=_read_pose_columns(path, extra_units, declared),
+        linear=frozenset(
+            name for name, column in inputs.items() if _read_interpolation(path, name, column)
+        ),
         sources=sources,
         switches=switches,
-        wrapped=_wrapped(path, channels, inputs, declared),
+        wrapped=_read_wrapped_channels(path, channels, inputs, declared),
     )
 
 
-def _wrapped(
+def _read_wrapped_channels(
     path: Path,
     channels: Mapping[str, _Column],
     inputs: Mapping[str, _Column],
@@ -343,7 +347,7 @@ def _wrapped(
     return result
 
 
-def _switches(
+def _read_drive_switches(
     path: Path, meta: Mapping[str, Any], declared: DeclaredSignals
 ) -> tuple[DriveSwitch, ...]:
     """Read and check the columns that say when drives are on."""
@@ -365,14 +369,16 @@ def check_run_names(path: Path, marked: Iterable[str], there: Iterable[str]) -> 
     Raises:
         InputError: The description mentions another run.
     """
-    _known(path, "runs", marked, there)
+    _check_known_names(path, "runs", marked, there)
 
 
-def _known(path: Path, where: str, given: Iterable[str], allowed: Iterable[str]) -> None:
+def _check_known_names(
+    path: Path, where: str, given: Iterable[str], allowed: Iterable[str]
+) -> None:
     check_known_names(f"entry {f'in [{where}] ' if where else ''}of {path}", given, allowed)
 
 
-def _system(path: Path, meta: Mapping[str, Any]) -> str:
+def _read_system_name(path: Path, meta: Mapping[str, Any]) -> str:
     """Return the name of the system that a description states."""
     system = meta.get("system")
     if not isinstance(system, str):
@@ -410,14 +416,14 @@ def _refuse_poses(path: Path, meta: Mapping[str, Any], declared: DeclaredSignals
         )
 
 
-def _columns(
+def _read_columns(
     path: Path, kind: str, meta: Mapping[str, Any], declared: Sequence[Channel]
 ) -> dict[str, _Column]:
     """Return the conversion of each column of one kind ("channel" or "input")."""
     units = {signal.name: signal.unit for signal in declared}
     given = dotted(check_table(path, f"{kind}s", meta.get(f"{kind}s", {})), units)
     check_known_names(f"{kind} in {path}", given, units)
-    return {name: _column(path, kind, name, own, units[name]) for name, own in given.items()}
+    return {name: _read_column(path, kind, name, own, units[name]) for name, own in given.items()}
 
 
 def dotted(given: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
@@ -444,7 +450,7 @@ def dotted(given: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
     return result
 
 
-def _column(path: Path, kind: str, name: str, value: Any, unit: str) -> _Column:
+def _read_column(path: Path, kind: str, name: str, value: Any, unit: str) -> _Column:
     """Check the table of one channel or input, and compute its conversion to SI units.
 
     Args:
@@ -469,7 +475,7 @@ def _column(path: Path, kind: str, name: str, value: Any, unit: str) -> _Column:
         "file",
         *(("noise", "unwrap") if kind == "channel" else ("hold",)),
     )
-    _known(path, f"{kind}s.{name}", own, allowed)
+    _check_known_names(path, f"{kind}s.{name}", own, allowed)
     # The unit is required: a log in degrees without a unit would be read as radians.
     stated = check_text(path, where, own.get("unit"), f"{usual} or one that converts to it")
     try:
@@ -487,7 +493,7 @@ def _column(path: Path, kind: str, name: str, value: Any, unit: str) -> _Column:
     return _Column(UnitScale(gain, converted.gain * offset + converted.offset), own)
 
 
-def _hold(path: Path, name: str, column: _Column) -> bool:
+def _read_interpolation(path: Path, name: str, column: _Column) -> bool:
     """Return whether an input is interpolated linearly between samples."""
     hold = column.table.get("hold", "zero")
     if hold not in HOLD_MODES:
@@ -497,7 +503,7 @@ def _hold(path: Path, name: str, column: _Column) -> bool:
     return bool(hold == "linear")
 
 
-def _noises(
+def _read_noises(
     path: Path, channels: Mapping[str, _Column], declared: DeclaredSignals
 ) -> dict[str, float]:
     """Return the noise of each channel where stated, SI units.
@@ -511,14 +517,14 @@ def _noises(
         if "noise" not in column.table:
             continue
         # A standard deviation has no offset and no sign.
-        noises[name] = abs(column.scale.gain) * _noise(path, name, column.table["noise"])
+        noises[name] = abs(column.scale.gain) * _read_noise(path, name, column.table["noise"])
         if not 1 / _NEVER < noises[name] / sizes[name] < _NEVER:
             wanted = f"that of values of about {sizes[name]:g} in SI units"
             raise make_error(path, f"channels.{name}.noise", wanted, column.table["noise"])
     return noises
 
 
-def _noise(path: Path, name: str, value: Any) -> float:
+def _read_noise(path: Path, name: str, value: Any) -> float:
     """Check the stated standard deviation of a channel's noise, in the unit of the column."""
     where = f"channels.{name}.noise"
     noise = check_finite(path, where, value)
@@ -527,7 +533,7 @@ def _noise(path: Path, name: str, value: Any) -> float:
     return noise
 
 
-def _extra(
+def _read_extra_columns(
     path: Path, meta: Mapping[str, Any], declared: DeclaredSignals
 ) -> dict[str, Mapping[str, Any]]:
     """Return the tables of the columns that belong to no channel or input."""
@@ -544,12 +550,12 @@ def _extra(
         unit = entry.get("unit") if isinstance(entry, dict) else None
         if not isinstance(unit, str):
             raise make_error(path, f"extra {name}", 'a table with unit = "TEXT"', entry)
-        _known(path, f"extra.{name}", entry, ("unit", "file", "column"))
+        _check_known_names(path, f"extra.{name}", entry, ("unit", "file", "column"))
         tables[name] = entry
     return tables
 
 
-def _begins(
+def _read_pose_columns(
     path: Path, extra: Mapping[str, str], declared: DeclaredSignals
 ) -> dict[str, UnitScale]:
     """Return the conversion to SI units of the columns with initial poses of floating bodies."""
@@ -563,39 +569,43 @@ def _begins(
     return begins
 
 
-def _run(path: Path, name: str, value: Any, declared: DeclaredSignals) -> RunMetadata:
+def _read_run(path: Path, name: str, value: Any, declared: DeclaredSignals) -> RunMetadata:
     """Check the table of one run: its constants, its initial state, and whether it is held out."""
     where = f"runs.{name}"
     own = check_table(path, where, value)
     allowed = [c.name for c in declared.constants]
-    _known(path, where, own, ("constants", "initial", "held_out", "folder", "file", *allowed))
+    _check_known_names(
+        path, where, own, ("constants", "initial", "held_out", "folder", "file", *allowed)
+    )
     held_out = own.get("held_out")
     if held_out is not None:
         check_type(path, f"{where}.held_out", held_out, bool, "true or false")
     # The constants of a run may be in a table of their own or among its other entries.
-    constants = _constants(path, f"{where}.constants", own.get("constants", {}), declared)
+    constants = _read_constants(path, f"{where}.constants", own.get("constants", {}), declared)
     direct = {key: number for key, number in own.items() if key in allowed}
     for twice in constants.keys() & direct.keys():
         raise InputError(f"{path}: {where}: constant {twice} stands twice")
-    constants |= _constants(path, where, direct, declared)
-    _possible(path, where, constants, declared)
+    constants |= _read_constants(path, where, direct, declared)
+    _check_constants_possible(path, where, constants, declared)
     states = [*declared.states, *getattr(_system_of(declared), "activations", ())]
-    initial = _numbers(path, f"{where}.initial", own.get("initial", {}), states)
+    initial = _read_numbers(path, f"{where}.initial", own.get("initial", {}), states)
     return RunMetadata(constants, initial, held_out)
 
 
-def _constants(path: Path, where: str, value: Any, declared: DeclaredSignals) -> dict[str, float]:
-    return _numbers(path, where, value, [c.name for c in declared.constants])
+def _read_constants(
+    path: Path, where: str, value: Any, declared: DeclaredSignals
+) -> dict[str, float]:
+    return _read_numbers(path, where, value, [c.name for c in declared.constants])
 
 
-def _numbers(path: Path, where: str, value: Any, allowed: Collection[str]) -> dict[str, float]:
+def _read_numbers(path: Path, where: str, value: Any, allowed: Collection[str]) -> dict[str, float]:
     """Check a table of finite numbers, whose names must be among the allowed ones."""
     given = dotted(check_table(path, where, value), allowed)
-    _known(path, where, given, allowed)
+    _check_known_names(path, where, given, allowed)
     return {name: check_finite(path, f"{where}.{name}", number) for name, number in given.items()}
 
 
-def _possible(
+def _check_constants_possible(
     path: Path, where: str, constants: Mapping[str, float], declared: DeclaredSignals
 ) -> None:
     """Check that constants are physically possible, such as a positive mass."""

@@ -96,7 +96,7 @@ def described(
     Raises:
         InputError: A column belongs to no signal, or a unit is missing.
     """
-    result: dict[str, Any] = _plain(meta)
+    result: dict[str, Any] = _copy_plain(meta)
     poses = get_floating_state_units(declared)
     usual = {**poses, **{s.name: s.unit for s in (*declared.channels, *declared.inputs)}}
     columns = [name for name in frame.columns if name != "run"]
@@ -111,14 +111,14 @@ def described(
     tables = {"channels": channels, "inputs": inputs, "extra": extra, "time": time}
 
     switches = [switch.column for switch in read_switches(path, result)]
-    stamps = _columns("t", time)[0]
+    stamps = _list_signal_columns("t", time)[0]
     taken = {stamps, *extra}
     for name, own in (*channels.items(), *inputs.items(), *extra.items()):
-        taken.update(_columns(name, own))
+        taken.update(_list_signal_columns(name, own))
     for name in (name for name in columns if name not in taken):
-        if name in _names(declared.channels):
+        if name in _list_names(declared.channels):
             channels[name] = {}
-        elif name in _names(declared.inputs):
+        elif name in _list_names(declared.inputs):
             inputs[name] = {}
         elif name in poses:
             extra[name] = {}
@@ -133,7 +133,7 @@ def described(
     missing = {}
     for name, own in (*channels.items(), *inputs.items(), *extra.items()):
         # Entries that are not tables are refused when the description is checked.
-        column = _columns(name, own)[0]
+        column = _list_signal_columns(name, own)[0]
         if isinstance(own, dict) and not _state_unit(own, column, units, noted):
             missing[column] = usual.get(name, "1")
     if missing:
@@ -144,7 +144,7 @@ def described(
     return {**result, **{key: entries for key, entries in tables.items() if entries}}
 
 
-def _columns(name: str, own: Any) -> list[str]:
+def _list_signal_columns(name: str, own: Any) -> list[str]:
     """Return the columns of a signal; entries of a wrong type are refused elsewhere."""
     column = own.get("column") if isinstance(own, dict) else None
     columns = column if isinstance(column, list) else [column]
@@ -162,22 +162,22 @@ def _state_unit(
     return "unit" in own
 
 
-def _plain(value: Any) -> Any:
+def _copy_plain(value: Any) -> Any:
     """Copy a value with plain Python dicts, lists and numbers, as TOML gives them."""
     if isinstance(value, Mapping):
-        return {key: _plain(entry) for key, entry in value.items()}
+        return {key: _copy_plain(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(entry) for entry in value]
+        return [_copy_plain(entry) for entry in value]
     return value.item() if isinstance(value, np.generic) else value
 
 
-def _names(signals: Iterable[Any]) -> list[str]:
+def _list_names(signals: Iterable[Any]) -> list[str]:
     return [signal.name for signal in signals]
 
 
 def _belongs_to_nothing(path: Path, name: str, declared: DeclaredSignals) -> InputError:
     """Make the error for a column that is neither channel nor input."""
-    channels, inputs = _names(declared.channels), _names(declared.inputs)
+    channels, inputs = _list_names(declared.channels), _list_names(declared.inputs)
     there = f"channels {', '.join(channels)}"
     there += f" and inputs {', '.join(inputs)}" if inputs else " and no inputs"
     near = similar(name, [*channels, *inputs])
@@ -238,7 +238,7 @@ class _FrameTable(Table):
                         f"{self.path}: expected column '{column}', found columns "
                         f"{', '.join(map(str, frame.columns))}"
                     )
-            columns[name] = source.combine(partial(self._values, name, frame))
+            columns[name] = source.combine(partial(self._get_values, name, frame))
         if sources.second != 1.0:
             columns["t"] = sources.second * columns["t"]
         return self.runs(self._run_names(frame, len(columns["t"])), columns)
@@ -255,7 +255,7 @@ class _FrameTable(Table):
         whole = cells.dtype.kind == "f"
         return [f"{cell:g}" if whole else str(cell).strip() for cell in cells]
 
-    def _values(self, name: str, frame: Any, column: str) -> Array:
+    def _get_values(self, name: str, frame: Any, column: str) -> Array:
         """Return a column as numbers (T,); NaN where a cell is missing."""
         cells = frame[column]
         if name == "t" and cells.dtype.kind == "M":  # absolute time stamps

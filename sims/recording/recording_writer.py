@@ -49,8 +49,8 @@ def write_recording(
     if not recording.runs:
         raise InputError(f"{table}: expected at least one run, found none")
     texts: dict[Path, Content] = {
-        table: _table(recording.runs, digits),
-        get_description_path(table): _description(recording, declared, table.parent),
+        table: _format_table(recording.runs, digits),
+        get_description_path(table): _format_description(recording, declared, table.parent),
     }
     write_files({**texts, **(beside or {})})
 
@@ -65,7 +65,7 @@ def write_files(contents: Mapping[Path, Content]) -> None:
     try:
         write_new_files(contents)
     except FileExistsError as error:
-        raise _exists(error.filename) from None
+        raise _make_exists_error(error.filename) from None
     except OSError as error:
         raise InputError(f"{error.filename}: cannot be written ({error.strerror})") from None
 
@@ -78,17 +78,17 @@ def check_absent(paths: Iterable[Path]) -> None:
     """
     for path in paths:
         if path.exists():
-            raise _exists(path)
+            raise _make_exists_error(path)
 
 
-def _exists(path: Path | str) -> InputError:
+def _make_exists_error(path: Path | str) -> InputError:
     """Make the error for a recording that exists already and would be overwritten."""
     return InputError(
         f"{path}: exists already; recordings are never overwritten, name another file"
     )
 
 
-def _table(runs: Sequence[Run], digits: int) -> str:
+def _format_table(runs: Sequence[Run], digits: int) -> str:
     """Return the text of the CSV table with all runs.
 
     Args:
@@ -106,7 +106,7 @@ def _table(runs: Sequence[Run], digits: int) -> str:
         if run.name in seen:
             raise InputError(f"two runs are called {run.name!r}; expected different names")
         seen.add(run.name)
-        for names, there, kind in _signals(run, inputs, channels, extra):
+        for names, there, kind in _list_signals(run, inputs, channels, extra):
             if set(names) != set(there):
                 raise make_unknown_name_error(
                     f"{kind} of run {run.name}",
@@ -117,17 +117,21 @@ def _table(runs: Sequence[Run], digits: int) -> str:
             run.times,
             *(
                 there[n]
-                for names, there, _ in _signals(run, inputs, channels, extra)
+                for names, there, _ in _list_signals(run, inputs, channels, extra)
                 for n in names
             ),
         ]
         writer.writerows(
-            zip([run.name] * len(run.times), *(_cells(c, digits) for c in columns), strict=True)
+            zip(
+                [run.name] * len(run.times),
+                *(_format_cells(c, digits) for c in columns),
+                strict=True,
+            )
         )
     return text.getvalue()
 
 
-def _signals(
+def _list_signals(
     run: Run, inputs: list[str], channels: list[str], extra: list[str]
 ) -> tuple[tuple[list[str], Mapping[str, Array], str], ...]:
     """Return expected names, signals of the run, and a word for each kind of column."""
@@ -138,7 +142,7 @@ def _signals(
     )
 
 
-def _cells(values: Array, digits: int) -> list[str]:
+def _format_cells(values: Array, digits: int) -> list[str]:
     """Format a column of the table; a missing sample (NaN) becomes an empty cell."""
     # repr gives the shortest text that is read back as the same number; a missing sample is an
     # empty cell.
@@ -146,7 +150,7 @@ def _cells(values: Array, digits: int) -> list[str]:
     return [shortest(v) if math.isfinite(v) else "" for v in values.tolist()]
 
 
-def _of(recording: Recording, beside: Path) -> dict[str, Any]:
+def _describe_source(recording: Recording, beside: Path) -> dict[str, Any]:
     """Return the keys that state what was recorded: a system, or a model file.
 
     Args:
@@ -164,7 +168,7 @@ def _of(recording: Recording, beside: Path) -> dict[str, Any]:
     return {"model": Path(file).as_posix(), **{k: dict(v) for k, v in stated.items() if v}}
 
 
-def _description(recording: Recording, declared: DeclaredSignals, beside: Path) -> str:
+def _format_description(recording: Recording, declared: DeclaredSignals, beside: Path) -> str:
     """Return the text of the description in TOML: units, constants, and what is known of each run.
 
     `beside` is the folder of the recording; a model file is stated relative to it.
@@ -173,9 +177,9 @@ def _description(recording: Recording, declared: DeclaredSignals, beside: Path) 
 
     units = {c.name: c.unit for c in (*declared.inputs, *declared.channels)}
     first = recording.runs[0]
-    document: dict[str, Any] = {**_of(recording, beside), "title": recording.title}
+    document: dict[str, Any] = {**_describe_source(recording, beside), "title": recording.title}
     document["channels"] = {
-        n: {"unit": units[n], **_stated(recording.noise, n)} for n in first.channels
+        n: {"unit": units[n], **_get_stated_noise(recording.noise, n)} for n in first.channels
     }
     if first.inputs:
         document["inputs"] = {
@@ -188,17 +192,17 @@ def _description(recording: Recording, declared: DeclaredSignals, beside: Path) 
         document["extra"] = {n: {"unit": recording.extra.get(n, "1")} for n in first.extra}
     if recording.constants:
         document["constants"] = dict(recording.constants)
-    runs = {run.name: _marks(run) for run in recording.runs}
+    runs = {run.name: _describe_run(run) for run in recording.runs}
     if any(runs.values()):
         document["runs"] = {name: marks for name, marks in runs.items() if marks}
     return tomli_w.dumps(document)
 
 
-def _stated(noise: Mapping[str, float], name: str) -> dict[str, float]:
+def _get_stated_noise(noise: Mapping[str, float], name: str) -> dict[str, float]:
     return {"noise": noise[name]} if noise.get(name) else {}
 
 
-def _marks(run: Run) -> dict[str, Any]:
+def _describe_run(run: Run) -> dict[str, Any]:
     """Return what a description states of one run: use, constants and initial state."""
     marks: dict[str, Any] = {"held_out": True} if run.held_out else {}
     marks |= dict(run.constants)

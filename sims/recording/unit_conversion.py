@@ -52,9 +52,9 @@ def compute_unit_scale(unit: str, target: str) -> UnitScale:
     """
     if unit == target:
         return IDENTITY_SCALE
-    if len(unit) > _LONGEST or not _plain(unit):
+    if len(unit) > _LONGEST or not _is_simple_unit(unit):
         raise InputError(f"expected a unit that converts to {target}, found {unit[:_LONGEST]!r}")
-    registry = _registry()
+    registry = _get_unit_registry()
     try:
         parsed = registry.parse_units(unit or "1")
     except Exception:
@@ -80,17 +80,17 @@ def compute_unit_scale(unit: str, target: str) -> UnitScale:
 
 def is_unit(unit: str) -> bool:
     """Return whether `unit` can be converted, which means that pint knows every name in it."""
-    if len(unit) > _LONGEST or not _plain(unit):
+    if len(unit) > _LONGEST or not _is_simple_unit(unit):
         return False
     try:
-        _registry().parse_units(unit)
+        _get_unit_registry().parse_units(unit)
     except Exception:
         # The parser raises many kinds of errors.
         return False
     return True
 
 
-def _plain(unit: str) -> bool:
+def _is_simple_unit(unit: str) -> bool:
     """Return whether a text is a simple unit.
 
     A simple unit consists of names and 1, joined by * / or spaces, each with at most one small
@@ -106,7 +106,7 @@ def _plain(unit: str) -> bool:
 
 
 @lru_cache(maxsize=1)
-def _registry() -> Any:
+def _get_unit_registry() -> Any:
     """Return pint's registry of units, in which an angle has its own dimension."""
     # Imported here: it takes a second, and most recordings are in SI units.
     import pint

@@ -182,11 +182,11 @@ def estimate_camera_noise(pictures: list[RgbImage], background: RgbImage) -> flo
     """
     # A few pictures suffice, because each has many pixels.
     every = max(1, len(pictures) // 8)
-    worst = [_difference(picture, background) for picture in pictures[::every]]
+    worst = [_compute_largest_difference(picture, background) for picture in pictures[::every]]
     return float(_NORMAL * np.median(np.stack(worst)) / _WORST)
 
 
-def _difference(picture: RgbImage, background: RgbImage) -> NDArray[np.int16]:
+def _compute_largest_difference(picture: RgbImage, background: RgbImage) -> NDArray[np.int16]:
     """Return the largest difference over the colours (height, width)."""
     # Unsigned integers would wrap around.
     signed = picture.astype(np.int16)

@@ -156,14 +156,14 @@ class BallDetector:
             ghosts: Whether to include objects that only the background image has.
         """
         cv2 = import_package("cv2")
-        difference = self._difference(picture)
+        difference = self._compute_largest_difference(picture)
         grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
         brightness = cv2.absdiff(grey, self._grey)
         mask = (difference > self.level).astype(np.uint8)
         if not mask.any():
             return []
         if self.shadows:
-            shade = self._even(picture, mask) > 0
+            shade = self._compute_brightness_ratio(picture, mask) > 0
             mask[shade] = 0
             # Remove single pixels that remain from shadow and noise.
             pair = np.ones((2, 2), np.uint8)
@@ -175,17 +175,17 @@ class BallDetector:
         large = sorted(lengths, reverse=True)[:_MOST_SPOTS]
         seen = []
         for _, i in large:
-            spot = self._spot(contours[i], (brightness, difference), shade)
+            spot = self._measure_object(contours[i], (brightness, difference), shade)
             if spot is not None:
-                seen.append(self._coloured(spot, picture))
+                seen.append(self._add_colour(spot, picture))
         return seen if ghosts else [spot for spot in seen if not spot.is_ghost]
 
-    def _coloured(self, spot: BallDetection, picture: RgbImage) -> BallDetection:
+    def _add_colour(self, spot: BallDetection, picture: RgbImage) -> BallDetection:
         """Add to a detection its colour, its contrast, and whether it is a background artefact."""
-        here = _inside(picture, spot)
-        behind = _inside(self.background, spot)
-        out = _around(picture, spot)
-        out_behind = _around(self.background, spot)
+        here = _compute_centre_colour(picture, spot)
+        behind = _compute_centre_colour(self.background, spot)
+        out = _compute_surrounding_colour(picture, spot)
+        out_behind = _compute_surrounding_colour(self.background, spot)
         contrast = float(np.abs(here - behind).max())
         ghost = self._is_ghost((here, out), (behind, out_behind))
         return spot._replace(colour=tuple(here.tolist()), contrast=contrast, is_ghost=ghost)
@@ -197,8 +197,8 @@ class BallDetector:
         shadow in it. Such places are lighter in the picture than in the background.
         """
         cv2 = import_package("cv2")
-        mask = (self._difference(picture) > self.level).astype(np.uint8)
-        lighter = (self._even(picture, mask) > 1).astype(np.uint8)
+        mask = (self._compute_largest_difference(picture) > self.level).astype(np.uint8)
+        lighter = (self._compute_brightness_ratio(picture, mask) > 1).astype(np.uint8)
         count, parts, sizes, _ = cv2.connectedComponentsWithStats(lighter)
         gone = np.zeros(mask.shape, bool)
         # Component 0 is the area between the others.
@@ -213,8 +213,8 @@ class BallDetector:
             if not ring.any():
                 continue
             within = inside > 0
-            shown = _medians(picture, within, ring)
-            hidden = _medians(self.background, within, ring)
+            shown = _compute_median_colours(picture, within, ring)
+            hidden = _compute_median_colours(self.background, within, ring)
             # A pale ball is lighter, too, but it stands out in the picture.
             if self._is_ghost(shown, hidden):
                 gone |= within
@@ -231,7 +231,7 @@ class BallDetector:
         stood_out = float(np.abs(behind[0] - behind[1]).max())
         return stood_out > stands_out + self.level / 2
 
-    def _difference(self, picture: RgbImage) -> NDArray[np.uint8]:
+    def _compute_largest_difference(self, picture: RgbImage) -> NDArray[np.uint8]:
         """Return the largest difference from the background over the colours (height, width)."""
         cv2 = import_package("cv2")
         apart = cv2.absdiff(picture, self.background)
@@ -239,7 +239,7 @@ class BallDetector:
         result: NDArray[np.uint8] = cv2.max(red_green, apart[..., 2])
         return result
 
-    def _even(self, picture: RgbImage, mask: NDArray[np.uint8]) -> GreyLevels:
+    def _compute_brightness_ratio(self, picture: RgbImage, mask: NDArray[np.uint8]) -> GreyLevels:
         """Return the factor between picture and background where it is the same in all colours.
 
         The factor is below 1 in shadow, above 1 where the picture lacks a shadow, and 0 elsewhere.
@@ -261,7 +261,7 @@ class BallDetector:
         result[rows, columns] = np.where(shade, factor, 0)
         return result
 
-    def _spot(
+    def _measure_object(
         self,
         contour: Any,
         differences: tuple[NDArray[np.uint8], ...],
@@ -303,10 +303,10 @@ class BallDetector:
         cv2.drawContours(hidden, [contour], -1, 0, _RIM, offset=offset)
         windows[:, hidden > 0] = 0
         if radius < _TINY:
-            return self._tiny(windows[1], u - u0, v - v0, radius, u0, v0)
-        return self._circle(windows, (u - u0, v - v0, radius), u0, v0)
+            return self._measure_small_ball(windows[1], u - u0, v - v0, radius, u0, v0)
+        return self._fit_circle(windows, (u - u0, v - v0, radius), u0, v0)
 
-    def _circle(
+    def _fit_circle(
         self,
         windows: GreyLevels,
         start: circle_fit.Circle,
@@ -330,7 +330,7 @@ class BallDetector:
         rest = np.empty(0)
         edges = None
         for _ in range(_ROUNDS):
-            edges = self._edges(windows, u, v, radius)
+            edges = self._locate_edges(windows, u, v, radius)
             if edges is None:
                 return None
             fitted = circle_fit.fit_circle(edges, (u, v, None))
@@ -361,7 +361,7 @@ class BallDetector:
         whole = edges + np.array([u0, v0])
         return BallDetection(u + u0, v + v0, radius, agree, scatter, whole)
 
-    def _edges(self, windows: GreyLevels, u: float, v: float, radius: float) -> Array | None:
+    def _locate_edges(self, windows: GreyLevels, u: float, v: float, radius: float) -> Array | None:
         """Locate the points (n, 2) where the difference falls to half along rays from (u, v).
 
         The reference value is taken just inside the edge, because the brightness of a lit ball
@@ -379,10 +379,10 @@ class BallDetector:
         """
         begin = max(0.0, 0.7 * radius - 2)
         steps = np.arange(begin, 1.5 * radius + 2, _FINE, dtype=np.float32)
-        cos, sin = _directions()
+        cos, sin = _compute_ray_directions()
         along_u = (u + cos * steps).astype(np.float32)
         along_v = (v + sin * steps).astype(np.float32)
-        profiles = [_along(window, along_u, along_v) for window in windows]
+        profiles = [_interpolate_window(window, along_u, along_v) for window in windows]
         # Last pixels inside the edge, except those affected by blur.
         inner = steps > min(0.5 * radius, radius - 3.5)
         inner &= steps < max(0.7 * radius, radius - 1.3)
@@ -419,7 +419,7 @@ class BallDetector:
         edge_v = v + sin[has, 0] * out
         return np.stack([edge_u, edge_v], axis=1).astype(np.float64)
 
-    def _tiny(
+    def _measure_small_ball(
         self,
         window: GreyLevels,
         u: float,
@@ -448,14 +448,14 @@ class BallDetector:
         return BallDetection(u, v, equal, _MIN_RAY_AGREEMENT, 0.2)
 
 
-def _medians(picture: RgbImage, inside: Mask, around: Mask) -> tuple[Array, Array]:
+def _compute_median_colours(picture: RgbImage, inside: Mask, around: Mask) -> tuple[Array, Array]:
     """Return the median colours (3,) of two parts of a picture."""
     within: Array = np.median(picture[inside], axis=0)
     outside: Array = np.median(picture[around], axis=0)
     return within, outside
 
 
-def _inside(picture: RgbImage, spot: BallDetection) -> Array:
+def _compute_centre_colour(picture: RgbImage, spot: BallDetection) -> Array:
     """Return the mean colour (3,) at a detection's centre."""
     side = 2 * max(1, int(0.4 * spot.radius)) + 1
     patch = import_package("cv2").getRectSubPix(picture, (side, side), (spot.u, spot.v))
@@ -463,9 +463,9 @@ def _inside(picture: RgbImage, spot: BallDetection) -> Array:
     return colour
 
 
-def _around(picture: RgbImage, spot: BallDetection) -> Array:
+def _compute_surrounding_colour(picture: RgbImage, spot: BallDetection) -> Array:
     """Return the median colour (3,) on a circle around a detection, in grey levels."""
-    cos, sin = _directions()
+    cos, sin = _compute_ray_directions()
     height, width = picture.shape[:2]
     away = _AROUND * spot.radius
     half = _RAYS // 2
@@ -479,7 +479,7 @@ def _around(picture: RgbImage, spot: BallDetection) -> Array:
     return colour
 
 
-def _along(window: GreyLevels, u: GreyLevels, v: GreyLevels) -> GreyLevels:
+def _interpolate_window(window: GreyLevels, u: GreyLevels, v: GreyLevels) -> GreyLevels:
     """Interpolate a window at subpixel positions; `_OUTSIDE` outside it."""
     cv2 = import_package("cv2")
     result: GreyLevels = cv2.remap(
@@ -494,7 +494,7 @@ def _along(window: GreyLevels, u: GreyLevels, v: GreyLevels) -> GreyLevels:
 
 
 @lru_cache(maxsize=1)
-def _directions() -> tuple[Array, Array]:
+def _compute_ray_directions() -> tuple[Array, Array]:
     """Return the cosines and sines (rays, 1) of the ray directions."""
     angles = np.linspace(0, 2 * np.pi, _RAYS, endpoint=False)[:, None]
     return np.cos(angles), np.sin(angles)

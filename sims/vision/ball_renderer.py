@@ -69,17 +69,17 @@ class BallScene:
         self._client: int = p.connect(p.DIRECT)
         self.close = weakref.finalize(self, p.disconnect, self._client)
         extents = [_GROUND, _GROUND, _THICKNESS]
-        ground = self._body(p.GEOM_BOX, look.ground, halfExtents=extents)
-        self._place(ground, (0, 0, -_THICKNESS))
+        ground = self._create_body(p.GEOM_BOX, look.ground, halfExtents=extents)
+        self._move_body(ground, (0, 0, -_THICKNESS))
         width, height = camera.size
         everything = 0, 0, width, height
-        self._rays = self._directions()
-        picture, covered = self._render(everything, 1, ground)
+        self._rays = self._compute_view_directions()
+        picture, covered = self._render_body(everything, 1, ground)
         # Frames are rendered without the ground, because it does not change.
         p.removeBody(ground, physicsClientId=self._client)
-        self._still = self._background(picture, covered)
+        self._still = self._render_background(picture, covered)
         points, faces = make_sphere_mesh()
-        self._ball = self._body(
+        self._ball = self._create_body(
             p.GEOM_MESH,
             look.ball,
             vertices=(radius * points).tolist(),
@@ -104,13 +104,13 @@ class BallScene:
         # Add half a grey level, because the conversion to integers truncates.
         return (picture + 0.5).clip(0, 255).astype(np.uint8)
 
-    def _place(self, body: int, position: ArrayLike) -> None:
+    def _move_body(self, body: int, position: ArrayLike) -> None:
         """Move a body of the scene to a position in m, without rotation."""
         bullet_world.import_pybullet().resetBasePositionAndOrientation(
             body, position, (0, 0, 0, 1), physicsClientId=self._client
         )
 
-    def _body(self, shape: int, colour: tuple[float, float, float], **size: object) -> int:
+    def _create_body(self, shape: int, colour: tuple[float, float, float], **size: object) -> int:
         """Create a body that is only drawn; `size` are the arguments of Bullet's shape."""
         p = bullet_world.import_pybullet()
         visual = p.createVisualShape(
@@ -123,7 +123,7 @@ class BallScene:
         body: int = p.createMultiBody(0.0, -1, visual, physicsClientId=self._client)
         return body
 
-    def _directions(self) -> Array:
+    def _compute_view_directions(self) -> Array:
         """Return the viewing direction of each pixel as world vectors (height, width, 3)."""
         v, u = np.mgrid[: self.camera.size[1], : self.camera.size[0]]
         right, down, forward = self.camera.axes
@@ -134,7 +134,7 @@ class BallScene:
         result: Array = a[..., None] * right + b[..., None] * down + forward
         return result
 
-    def _background(self, picture: ColourArray, covered: ColourArray) -> ColourArray:
+    def _render_background(self, picture: ColourArray, covered: ColourArray) -> ColourArray:
         """Return the scene without the ball, and store the visible ground points for shadows.
 
         Args:
@@ -173,7 +173,7 @@ class BallScene:
         )
         # Slanting light stretches the disc to an ellipse.
         corners = foot + self.radius * stretch * 1.1 * signs
-        window = _window(self.camera.project(corners), self.camera.size)
+        window = _find_window(self.camera.project(corners), self.camera.size)
         if window is None:
             return
         left, top, right, bottom = window
@@ -197,17 +197,19 @@ class BallScene:
         if not np.isfinite(reach):
             return
         around = np.array([centre - reach, centre + reach])
-        window = _window(around, self.camera.size)
+        window = _find_window(around, self.camera.size)
         if window is None:
             return
-        self._place(self._ball, position)
+        self._move_body(self._ball, position)
         fine = 3 if longer < _SMALL else 2
-        ball, covered = self._render(window, fine, self._ball)
+        ball, covered = self._render_body(window, fine, self._ball)
         left, top, right, bottom = window
         place = np.s_[top:bottom, left:right]
         picture[place] = covered * ball + (1 - covered) * picture[place]
 
-    def _render(self, window: PixelWindow, fine: int, body: int) -> tuple[ColourArray, ColourArray]:
+    def _render_body(
+        self, window: PixelWindow, fine: int, body: int
+    ) -> tuple[ColourArray, ColourArray]:
         """Render a body in a window of the picture.
 
         Args:
@@ -263,7 +265,7 @@ class BallScene:
         return sums / count, share
 
 
-def _window(pixels: Array, size: tuple[int, int]) -> PixelWindow | None:
+def _find_window(pixels: Array, size: tuple[int, int]) -> PixelWindow | None:
     """Return the window of the picture that contains `pixels` (n, 2); None if they are outside."""
     if not np.isfinite(pixels).all():
         return None

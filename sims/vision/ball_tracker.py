@@ -88,7 +88,7 @@ def track_ball(frames: Iterable[tuple[float, RgbImage]]) -> BallTrack:
     numbers = [first + k for k in background_model.select_frames(survey.moved[first:end])]
     wanted = set(numbers)
     pictures = [picture for number, (_, picture) in enumerate(frames) if number in wanted]
-    finder = _finder(pictures)
+    finder = _make_detector(pictures)
     spots = []
     for number, (_, picture) in enumerate(frames):
         if first <= number < end:
@@ -100,9 +100,9 @@ def track_ball(frames: Iterable[tuple[float, RgbImage]]) -> BallTrack:
     # An object that hardly moves may be a ball, but its fall cannot be measured.
     if len(path.frames) < _LEAST_FRAMES or path.travel < path.radius:
         raise InputError(_format_no_ball_message(end - first, len(path.frames)))
-    _others(path, others, notes)
+    _note_other_objects(path, others, notes)
     shown = {n - first: p for n, p in zip(numbers, pictures, strict=True)}
-    return _measured(survey.times[first:end], path, survey.size, notes, finder, shown)
+    return _make_track(survey.times[first:end], path, survey.size, notes, finder, shown)
 
 
 class _FrameCache:
@@ -167,7 +167,7 @@ def _find_longest_shot(survey: background_model.FrameSurvey, notes: list[str]) -
     return first, end
 
 
-def _finder(pictures: list[RgbImage]) -> BallDetector:
+def _make_detector(pictures: list[RgbImage]) -> BallDetector:
     """Make a detector from a background without the ball, estimated from some pictures.
 
     It treats shadows in the way with which more round objects are found: as shadow, or as part
@@ -183,7 +183,7 @@ def _finder(pictures: list[RgbImage]) -> BallDetector:
         by_careful = [careful.detect(p, ghosts=True) for p in pictures[::every]]
         by_careless = [careless.detect(p, ghosts=True) for p in pictures[::every]]
         # A ball of the ground's hue would be removed as shadow; then shadows must be tolerated.
-        if _roundness(by_careful) >= _SHADOWS * _roundness(by_careless):
+        if _compute_roundness(by_careful) >= _SHADOWS * _compute_roundness(by_careless):
             best, known = careful, by_careful
         else:
             best, known = careless, by_careless
@@ -193,15 +193,15 @@ def _finder(pictures: list[RgbImage]) -> BallDetector:
                 found.append(known[i // every])
             else:
                 found.append(best.detect(picture, ghosts=True))
-        hiding = _hiding(found)
+        hiding = _list_hiding_circles(found)
         shaded = None
         if best.shadows:
-            shaded = _shaded([best.find_missing_shadow(picture) for picture in pictures])
+            shaded = _find_shadows([best.find_missing_shadow(picture) for picture in pictures])
         plain = background_model.compute_masked_background(pictures, hiding, plain, shaded)
     return BallDetector(plain, sigma, best.shadows)
 
 
-def _roundness(pictures: list[list[BallDetection]]) -> float:
+def _compute_roundness(pictures: list[list[BallDetection]]) -> float:
     """Return the sum over frames of the best circle's fraction of agreeing rays."""
     return sum(
         max((spot.ray_agreement for spot in spots if not spot.is_ghost), default=0.0)
@@ -209,7 +209,7 @@ def _roundness(pictures: list[list[BallDetection]]) -> float:
     )
 
 
-def _hiding(found: list[list[BallDetection]]) -> list[list[Circle]]:
+def _list_hiding_circles(found: list[list[BallDetection]]) -> list[list[Circle]]:
     """Return the circles that hide the background in each picture.
 
     A ball that rests for most of the film, or its shadow, is part of the median. Pictures without
@@ -221,7 +221,7 @@ def _hiding(found: list[list[BallDetection]]) -> list[list[Circle]]:
         balls.append([(s.u, s.v, s.radius) for s in spots if not s.is_ghost])
         ghosts.append([(s.u, s.v, s.radius) for s in spots if s.is_ghost])
     for one in [ghost for there in ghosts for ghost in there]:
-        lacking = [any(_same(one, other) for other in there) for there in ghosts]
+        lacking = [any(_is_same_object(one, other) for other in there) for there in ghosts]
         # One or two frames may miss it by mistake.
         if sum(lacking) < _FEWEST:
             continue
@@ -231,7 +231,7 @@ def _hiding(found: list[list[BallDetection]]) -> list[list[Circle]]:
     return balls
 
 
-def _shaded(lit: list[NDArray[np.bool_]]) -> NDArray[np.bool_]:
+def _find_shadows(lit: list[NDArray[np.bool_]]) -> NDArray[np.bool_]:
     """Return where a shadow hides the background in each picture (n, height, width).
 
     Args:
@@ -242,7 +242,7 @@ def _shaded(lit: list[NDArray[np.bool_]]) -> NDArray[np.bool_]:
     return result
 
 
-def _same(a: Circle, b: Circle) -> bool:
+def _is_same_object(a: Circle, b: Circle) -> bool:
     """Return whether two circles are the same object at rest.
 
     Their centres may differ by 0.3 radii and half a pixel, and their radii by a factor of 1.4.
@@ -251,7 +251,7 @@ def _same(a: Circle, b: Circle) -> bool:
     return apart < 0.3 * b[2] + 0.5 and 0.7 < a[2] / b[2] < 1.4
 
 
-def _others(path: TrackedPath, others: Sequence[TrackedPath], notes: list[str]) -> None:
+def _note_other_objects(path: TrackedPath, others: Sequence[TrackedPath], notes: list[str]) -> None:
     """Add a note if a second object of similar size moves at the same time as the ball.
 
     It must appear in at least 8 frames and a quarter of the ball's frames, and travel more than its
@@ -271,7 +271,7 @@ def _others(path: TrackedPath, others: Sequence[TrackedPath], notes: list[str]) 
             return
 
 
-def _measured(
+def _make_track(
     times: Array,
     path: TrackedPath,
     size: tuple[int, int],

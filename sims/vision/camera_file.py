@@ -58,8 +58,8 @@ def read_camera_file(path: Path) -> FilmDescription:
     """
     meta = read_toml(path)
     # All entries are required: a partly default camera would give wrong lengths silently.
-    camera = _values(path, "camera", meta, _CAMERA)
-    ball = _values(path, "ball", meta, _BALL)
+    camera = _read_section(path, "camera", meta, _CAMERA)
+    ball = _read_section(path, "ball", meta, _BALL)
     if ball["radius"] <= 0:
         raise make_error(path, "ball.radius", "more than 0 m", ball["radius"])
     # Sizes are integers, but may be written as floats in TOML.
@@ -70,7 +70,7 @@ def read_camera_file(path: Path) -> FilmDescription:
         raise InputError(f"{path}: {error}") from None
 
 
-def _values(
+def _read_section(
     path: Path, section: str, meta: Mapping[str, Any], counts: Mapping[str, int]
 ) -> dict[str, Any]:
     """Read all entries of a section, each a number or a tuple of the required length."""

@@ -70,15 +70,15 @@ def fit_circle(points: Array, start: tuple[float, float, float | None] | None) -
         away_v = y - v
         far = np.hypot(away_u, away_v)
         if radius is None:
-            radius = _middle(far)
+            radius = _compute_median(far)
         rest = far - radius  # (1)
-        width = _TUKEY * max(_NORMAL * _middle(np.abs(rest)), _FINEST)
+        width = _TUKEY * max(_NORMAL * _compute_median(np.abs(rest)), _FINEST)
         weights = np.maximum(1 - (rest / width) ** 2, 0.0) ** 2  # (3)
         np.maximum(far, 1e-9, out=far)
         rows[0] = away_u / far
         rows[1] = away_v / far
         rows[3] = rest
-        step = _step((rows * weights) @ rows.T)
+        step = _solve_gauss_newton_step((rows * weights) @ rows.T)
         if step is None:
             return None
         du, dv, dr = step
@@ -92,7 +92,7 @@ def fit_circle(points: Array, start: tuple[float, float, float | None] | None) -
     return (u, v, radius), np.hypot(x - u, y - v) - radius
 
 
-def _step(normal: Array) -> tuple[float, float, float] | None:
+def _solve_gauss_newton_step(normal: Array) -> tuple[float, float, float] | None:
     """Solve the Gauss-Newton equations (2) for (du, dv, dR); None if they are singular.
 
     `normal` (4, 4) holds the weighted sums of products of the rows (n_u, n_v, 1, rest).
@@ -183,7 +183,7 @@ def fit_arc(points: Array) -> Circle | None:
     )
 
 
-def _middle(values: Array) -> float:
+def _compute_median(values: Array) -> float:
     """Return the median; numpy's own takes ten times as long for a few numbers."""
     k = len(values) // 2
     sorted_there = np.partition(values, (k - 1, k))

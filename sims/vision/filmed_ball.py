@@ -101,10 +101,10 @@ class FilmedBall(Simulator):
         self.run_inputs(scenario)  # which refuses any: the ball does not know of these names
         fall = Scenario(scenario.times, scenario.initial, {}, self._of_ball(constants))
         places = self._ball.simulate(theta, fall)
-        camera = _camera(constants)
+        camera = _make_camera(constants)
         radius = constants["radius"]
         if self._tracked:
-            tracks = [_tracked(camera, radius, way, scenario.times) for way in places]
+            tracks = [_track_film(camera, radius, way, scenario.times) for way in places]
             rows = np.array(tracks).reshape(places.shape[:2])  # also where there are no lanes
             heights = np.full_like(rows, np.nan)
         else:
@@ -124,14 +124,14 @@ class FilmedBall(Simulator):
         return {c.name: constants[c.name] for c in BallSystem.constants}
 
 
-def _camera(constants: Mapping[str, float]) -> PinholeCamera:
+def _make_camera(constants: Mapping[str, float]) -> PinholeCamera:
     """Make the camera from the simulator's constants, with a square picture."""
     size = round(constants["pixels"])
     place = (constants["camera_azimuth"], constants["camera_distance"], constants["camera_height"])
     return PinholeCamera(*place, target=(0.0, 0.0, constants["camera_aim"]), size=(size, size))
 
 
-def _tracked(camera: PinholeCamera, radius: float, places: Array, times: Array) -> Array:
+def _track_film(camera: PinholeCamera, radius: float, places: Array, times: Array) -> Array:
     """Return the pixel rows (T,) that the tracker finds in a film of a ball at `places` (T, 3).
 
     NaN stands where it finds none.

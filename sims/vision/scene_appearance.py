@@ -62,11 +62,11 @@ class SceneAppearance:
             flat * np.sin(azimuth),
             np.sin(above),
         ]
-        ground = _colour(rng, saturation=(0.0, 0.4), value=(0.3, 0.85))
-        ball = _colour(rng, saturation=(0.0, 1.0), value=_BALL_VALUE)
+        ground = _draw_colour(rng, saturation=(0.0, 0.4), value=(0.3, 0.85))
+        ball = _draw_colour(rng, saturation=(0.0, 1.0), value=_BALL_VALUE)
         while np.max(np.abs(np.subtract(ball, ground))) < _CONTRAST:
-            ball = _colour(rng, saturation=(0.0, 1.0), value=_BALL_VALUE)
-        sky = _colour(rng, saturation=(0.0, 0.3), value=(0.7, 1.0))
+            ball = _draw_colour(rng, saturation=(0.0, 1.0), value=_BALL_VALUE)
+        sky = _draw_colour(rng, saturation=(0.0, 0.3), value=(0.7, 1.0))
         turn = 2 * np.pi
         bearing = rng.uniform(0, turn, _WAVES)
         length = rng.uniform(0.5, 6.0, _WAVES)
@@ -99,7 +99,7 @@ class SceneAppearance:
         return bright
 
 
-def _colour(
+def _draw_colour(
     rng: np.random.Generator,
     saturation: tuple[float, float],
     value: tuple[float, float],

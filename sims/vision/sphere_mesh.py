@@ -38,13 +38,13 @@ def make_sphere_mesh(divisions: int = _FACES) -> tuple[Array, tuple[int, ...]]:
     turned_again = [(c, a, b) for a, b, c in turned]
     size = np.hypot(1, golden)
     points = [np.array(p) / size for p in (*corners, *turned, *turned_again)]
-    faces = [_outward(points, face) for face in _neighbours(points)]
+    faces = [_orient_outward(points, face) for face in _find_triangles(points)]
     for _ in range(divisions):
-        faces = _divided(points, faces)
+        faces = _subdivide_faces(points, faces)
     return make_read_only(points), tuple(i for face in faces for i in face)
 
 
-def _neighbours(points: list[Array]) -> list[tuple[int, int, int]]:
+def _find_triangles(points: list[Array]) -> list[tuple[int, int, int]]:
     """Return the index triples of corners that are one side length apart, each triple once."""
     side = min(float(np.linalg.norm(points[0] - p)) for p in points[1:])
 
@@ -58,7 +58,7 @@ def _neighbours(points: list[Array]) -> list[tuple[int, int, int]]:
     return triples
 
 
-def _outward(points: list[Array], face: tuple[int, int, int]) -> tuple[int, int, int]:
+def _orient_outward(points: list[Array], face: tuple[int, int, int]) -> tuple[int, int, int]:
     """Return the face with its corners anticlockwise as seen from outside."""
     i, j, k = face
     a = points[i]
@@ -66,7 +66,9 @@ def _outward(points: list[Array], face: tuple[int, int, int]) -> tuple[int, int,
     return face if np.dot(normal, a) > 0 else (i, k, j)
 
 
-def _divided(points: list[Array], faces: list[tuple[int, int, int]]) -> list[tuple[int, int, int]]:
+def _subdivide_faces(
+    points: list[Array], faces: list[tuple[int, int, int]]
+) -> list[tuple[int, int, int]]:
     """Divide each face into four; the new points are appended to `points`."""
     numbers: dict[tuple[int, int], int] = {}
 

@@ -165,7 +165,7 @@ def link_detections(pictures: Sequence[Sequence[BallDetection]]) -> list[Tracked
     for frame, spots in enumerate(pictures):
         done += [path for path in live if frame - path.frames[-1] > _MAX_MISSED_FRAMES]
         live = [path for path in live if frame - path.frames[-1] <= _MAX_MISSED_FRAMES]
-        taken = _continued(live, frame, spots)
+        taken = _extend_paths(live, frame, spots)
         # Each remaining detection begins a new path.
         for k, spot in enumerate(spots):
             if k not in taken:
@@ -177,7 +177,9 @@ def link_detections(pictures: Sequence[Sequence[BallDetection]]) -> list[Tracked
     return sorted(paths, key=lambda path: -path.evidence * (path.travel > path.radius))
 
 
-def _continued(live: Sequence[TrackedPath], frame: int, spots: Sequence[BallDetection]) -> set[int]:
+def _extend_paths(
+    live: Sequence[TrackedPath], frame: int, spots: Sequence[BallDetection]
+) -> set[int]:
     """Append each detection in a frame to the path that it fits best, nearest pairs first.
 
     Args:

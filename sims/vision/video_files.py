@@ -56,7 +56,7 @@ def write_video(
     try:
         # FFmpeg derives the format from the name.
         with atomic_replacement(path, keep_ending=True) as partial:
-            _encode(partial, frames, times, crf)
+            _encode_frames(partial, frames, times, crf)
             # Encoding takes long; the file may have been created meanwhile.
             check_absent([path])
             write_files(beside or {})
@@ -64,7 +64,7 @@ def write_video(
         raise InputError(f"{path}: cannot be written ({error.strerror or error})") from None
 
 
-def _encode(path: Path, frames: Iterable[RgbImage], times: Array, crf: int) -> None:
+def _encode_frames(path: Path, frames: Iterable[RgbImage], times: Array, crf: int) -> None:
     """Encode frames as H.264 with their own times in s; the same frames give the same file.
 
     `crf` is the constant rate factor of x264: larger numbers mean smaller files and less
@@ -133,7 +133,7 @@ class VideoFile:
             raise InputError(f"frames a second, {fps:g}: expected {wanted}")
         self.path, self.fps = path, fps
         self.notes: list[str] = []
-        with self._open():
+        with self._open_file():
             pass
 
     def __iter__(self) -> Iterator[tuple[float, RgbImage]]:
@@ -143,9 +143,9 @@ class VideoFile:
         count = 0
         dropped = 0
         broken = False
-        with self._open() as file:
+        with self._open_file() as file:
             stated = file.streams.video[0].frames
-            for seconds, picture in self._decoded(file):
+            for seconds, picture in self._decode_frames(file):
                 if picture is None:
                     broken = True
                     break
@@ -157,9 +157,9 @@ class VideoFile:
                     continue
                 last = time
                 yield time, picture
-        self._judge(count, stated, broken, dropped)
+        self._check_pass(count, stated, broken, dropped)
 
-    def _open(self) -> Any:
+    def _open_file(self) -> Any:
         """Open the file with PyAV.
 
         Raises:
@@ -180,7 +180,7 @@ class VideoFile:
             raise InputError(f"{self.path}: expected a video, found a file without moving pictures")
         return file
 
-    def _decoded(self, file: Any) -> Iterator[tuple[float, RgbImage | None]]:
+    def _decode_frames(self, file: Any) -> Iterator[tuple[float, RgbImage | None]]:
         """Iterate over time and picture of each frame; the picture is None after an error."""
         av = import_package("av")
         stream = file.streams.video[0]
@@ -197,7 +197,7 @@ class VideoFile:
         except av.FFmpegError:
             yield np.nan, None
 
-    def _judge(self, count: int, stated: int, broken: bool, dropped: int) -> None:
+    def _check_pass(self, count: int, stated: int, broken: bool, dropped: int) -> None:
         """Add notes about faults of a pass; refuse a file without readable frames.
 
         Args:

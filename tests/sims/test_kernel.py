@@ -106,7 +106,7 @@ def test_a_compiler_that_fails_is_reported_in_one_line(monkeypatch, tmp_path, ca
 
 
 def test_code_that_cannot_be_stored_is_compiled_again(monkeypatch, tmp_path, capsys):
-    path = code_cache.get_cache_folder() / f"stepping-{kernel._key()}.bin"
+    path = code_cache.get_cache_folder() / f"stepping-{kernel._compute_cache_key()}.bin"
     code = code_cache.read_cached(path)
     (tmp_path / "file").touch()
     monkeypatch.setenv("SIMGAP_COMPILED", str(tmp_path / "file"))
@@ -116,7 +116,7 @@ def test_code_that_cannot_be_stored_is_compiled_again(monkeypatch, tmp_path, cap
 
 
 def test_code_with_a_missing_symbol_is_not_loaded():
-    path = code_cache.get_cache_folder() / f"stepping-{kernel._key()}.bin"
+    path = code_cache.get_cache_folder() / f"stepping-{kernel._compute_cache_key()}.bin"
     code = llvm_code.MachineCode.unpack(code_cache.read_cached(path))
     assert llvm_code.MachineCode.unpack(code.pack()) == code
     with pytest.raises(llvm_code.CodeNotLoadableError, match="frobnicate"):

@@ -160,7 +160,7 @@ def _check_entries(archive: Path, packed: zipfile.ZipFile) -> list[zipfile.ZipIn
     if len(entries) > _MOST:
         raise _make_refusal(archive, f"{len(entries)} files, at most {_MOST} expected")
     for entry in entries:
-        if wrong := _find_entry_fault(entry):
+        if wrong := _find_entry_error(entry):
             raise _make_refusal(archive, f"{entry.filename[:80]!r} {wrong}")
     # Two names that a file system treats as equal would overwrite each other's file.
     twice = [name for name, n in Counter(e.filename.casefold() for e in entries).items() if n > 1]
@@ -174,7 +174,7 @@ def _check_entries(archive: Path, packed: zipfile.ZipFile) -> list[zipfile.ZipIn
     return entries
 
 
-def _find_entry_fault(entry: zipfile.ZipInfo) -> str:
+def _find_entry_error(entry: zipfile.ZipInfo) -> str:
     """Return why an entry of an archive must not be unpacked; empty if it may be.
 
     An archive of unknown origin could contain paths outside its folder, links or devices, which

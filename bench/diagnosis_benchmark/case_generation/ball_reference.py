@@ -66,11 +66,13 @@ class FlightDynamics:
         return ax, ay, az
 
 
-def _drag(c: float, u: float, v: float, w: float, speed: float = 1.0) -> Acceleration:
+def _compute_quadratic_drag(
+    c: float, u: float, v: float, w: float, speed: float = 1.0
+) -> Acceleration:
     return -c * speed * u, -c * speed * v, -c * speed * w
 
 
-def _wind(
+def _compute_wind_drag(
     c: Sequence[float],
     g: float,
     t: float,
@@ -95,10 +97,12 @@ def _wind(
         w: upward velocity, m/s.
     """
     u, v = u - c[1], v - c[2]
-    return _drag(c[0], u, v, w, sqrt(u * u + v * v + w * w))
+    return _compute_quadratic_drag(c[0], u, v, w, sqrt(u * u + v * v + w * w))
 
 
-def _periodic(c: Sequence[float], g: float, t: float, *state: float) -> Acceleration:
+def _compute_periodic_acceleration(
+    c: Sequence[float], g: float, t: float, *state: float
+) -> Acceleration:
     return 0.0, 0.0, c[0] * sin(2 * pi * c[2] * t) + c[1] * cos(2 * pi * c[2] * t)
 
 
@@ -130,19 +134,19 @@ def _layer_drag(
         w: upward velocity, m/s.
     """
     share = 0.5 * (1 + tanh((z - c[1]) / 0.02))
-    return _drag(c[0] * share, u, v, w, sqrt(u * u + v * v + w * w))
+    return _compute_quadratic_drag(c[0] * share, u, v, w, sqrt(u * u + v * v + w * w))
 
 
 ACCELERATION_LAWS: dict[str, Callable[..., Acceleration]] = {
-    "drag.linear": lambda c, g, t, x, y, z, u, v, w: _drag(c[0], u, v, w),
-    "drag.quadratic": lambda c, g, t, x, y, z, u, v, w: _drag(
+    "drag.linear": lambda c, g, t, x, y, z, u, v, w: _compute_quadratic_drag(c[0], u, v, w),
+    "drag.quadratic": lambda c, g, t, x, y, z, u, v, w: _compute_quadratic_drag(
         c[0], u, v, w, sqrt(u * u + v * v + w * w)
     ),
-    "wind": _wind,
+    "wind": _compute_wind_drag,
     "gravity.scale": lambda c, g, *s: (0.0, 0.0, -c[0] * g),
     "gravity.tilt": lambda c, g, *s: (c[0] * g, c[1] * g, 0.0),
     "force.bias": lambda c, g, *s: (0.0, 0.0, c[0]),
-    "force.periodic": _periodic,
+    "force.periodic": _compute_periodic_acceleration,
     "lift.magnus": lambda c, g, t, x, y, z, u, v, w: (-c[0] * w - c[1] * v, c[1] * u, c[0] * u),
     "updraft": lambda c, g, t, x, *s: (
         0.0,
@@ -178,14 +182,16 @@ def simulate_ball(world: TrueSystem, scenario: Scenario, number: int, instants: 
         looks = not (rising or resting)
         if rising:  # the ground, where the rise after a bounce begins, is no event
             end = min(end, now + rising)
-        solved = _fly(air, now, end, state, world.constants["radius"] if looks else None, resting)
+        solved = _integrate_flight(
+            air, now, end, state, world.constants["radius"] if looks else None, resting
+        )
         reached, state = float(solved.t[-1]), solved.y[:, -1].copy()
         first, last = np.searchsorted(instants, [now, reached], side="right")
         if last > first:
             out[first:last] = solved.sol(instants[first:last]).T
         now, rising = reached, 0.0
         if looks and solved.t_events[0].size:
-            state, resting = _bounce(world, now, state)
+            state, resting = _compute_bounce(world, now, state)
             state[2] = world.constants["radius"]
             # Seconds of the rise, 0.4 of the time to its top, in which no impact is possible.
             rising = (
@@ -196,7 +202,7 @@ def simulate_ball(world: TrueSystem, scenario: Scenario, number: int, instants: 
     return out
 
 
-def _fly(
+def _integrate_flight(
     air: FlightDynamics, now: float, end: float, state: Array, floor: float | None, resting: bool
 ) -> Any:
     """Integrate a part of a flight by the Runge-Kutta method DOP853, up to an impact or a time.
@@ -240,7 +246,7 @@ def _fly(
     return solved
 
 
-def _bounce(world: TrueSystem, t: float, state: Array) -> tuple[Array, bool]:
+def _compute_bounce(world: TrueSystem, t: float, state: Array) -> tuple[Array, bool]:
     """Compute the state after an impact on the ground.
 
     Restitution reverses the vertical velocity, and contact friction slows the horizontal one by at

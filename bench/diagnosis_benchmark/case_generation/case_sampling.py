@@ -131,9 +131,9 @@ def draw_case(
             str(seed),
         ]
     )
-    rng = _rng(name, "cause")
-    hidden = _hidden(kind, system, effect, rng)
-    setting = _setting(name, system, hidden, wanted_so)
+    rng = _make_rng(name, "cause")
+    hidden = _choose_hidden_causes(kind, system, effect, rng)
+    setting = _draw_conditions(name, system, hidden, wanted_so)
     item = BenchmarkCase(
         name, system, kind, {}, 0.0, setting.noise.kind, setting.noise.stated, setting.rate,
         setting.seconds,
@@ -160,24 +160,24 @@ def count_held_out_runs(item: BenchmarkCase) -> int:
     return max(1, item.runs // 3)
 
 
-def _rng(name: str, purpose: str) -> np.random.Generator:
+def _make_rng(name: str, purpose: str) -> np.random.Generator:
     return np.random.default_rng(list(f"{name} {purpose}".encode()))
 
 
 @lru_cache(maxsize=16)
-def _setting(
+def _draw_conditions(
     name: str, system: str, hidden: tuple[str, ...], asked: RequestedConditions = ANY_CONDITIONS
 ) -> RecordingConditions:
     """Draw the recording conditions of a case from its name, and cache them."""
-    return drawn_setting(system, _rng(name, "setting"), hidden, asked=asked)
+    return drawn_setting(system, _make_rng(name, "setting"), hidden, asked=asked)
 
 
 def restore_conditions(item: BenchmarkCase) -> RecordingConditions:
     """Restore the recording conditions of a case from its name; a case stores no runs."""
-    return _setting(item.name, item.system, tuple(item.effects), item.asked)
+    return _draw_conditions(item.name, item.system, tuple(item.effects), item.asked)
 
 
-def _hidden(
+def _choose_hidden_causes(
     kind: str, system: str, effect: str | None, rng: np.random.Generator
 ) -> tuple[str, ...]:
     """Choose the names of the causes that a case hides.
@@ -391,7 +391,7 @@ def write_case(item: BenchmarkCase, folder: str | Path, truth: bool = True) -> P
         Path of the CSV file.
     """
     setting = restore_conditions(item)
-    runs = _runs(item, setting)
+    runs = _simulate_runs(item, setting)
     system = SIMULATORS[item.system].system
     noise = setting.noise.sigma if item.stated else {}
     constants = {} if item.system == "slider" else setting.constants
@@ -411,14 +411,14 @@ def write_case(item: BenchmarkCase, folder: str | Path, truth: bool = True) -> P
     return path
 
 
-def _runs(item: BenchmarkCase, setting: RecordingConditions) -> tuple[Run, ...]:
+def _simulate_runs(item: BenchmarkCase, setting: RecordingConditions) -> tuple[Run, ...]:
     """Simulate every run of a case, add sensor noise, and mark the last runs as held out.
 
     Args:
         item: the case; it states the simulator of the recording (`source`).
         setting: its recording conditions, with all runs.
     """
-    rng, held_out = _rng(item.name, "noise"), count_held_out_runs(item)
+    rng, held_out = _make_rng(item.name, "noise"), count_held_out_runs(item)
     hidden = {"foreign": item.effects} if item.kind == "foreign" else {"effects": item.effects}
     world, runs = setting.make_true_system(**hidden), []
     for number, scenario in enumerate(setting.scenarios):

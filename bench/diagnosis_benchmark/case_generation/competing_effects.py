@@ -100,7 +100,10 @@ def _rank_starts(
         guesses = [np.array([*bare.theta, share * peak]) for share in (0.9, 0.6)]
         result = [(_compute_residual(fit, observed, guess, bare), guess) for guess in guesses]
     elif name == "state.limit":  # an end stop that is not reached has no derivative either
-        guesses = [np.array([*bare.theta, *stop]) for stop in _stops(setting, observed[..., 0])]
+        guesses = [
+            np.array([*bare.theta, *stop])
+            for stop in _iterate_stop_starts(setting, observed[..., 0])
+        ]
         result = [(_compute_residual(fit, observed, guess, bare), guess) for guess in guesses]
     else:
         result = [
@@ -110,7 +113,9 @@ def _rank_starts(
     return sorted(result, key=lambda pair: pair[0])
 
 
-def _stops(setting: RecordingConditions, path: Array) -> Iterator[tuple[float, float, float]]:
+def _iterate_stop_starts(
+    setting: RecordingConditions, path: Array
+) -> Iterator[tuple[float, float, float]]:
     """Yield starting values of an end stop: stiffness, place and loss.
 
     There are soft and hard stops at either end of the travel, which the motion meets late and

@@ -68,7 +68,7 @@ def get_max_strength(name: str) -> float:
     return {"input.saturation": 0.97, "input.hold": 1.0}.get(name, MAX_STRENGTH)
 
 
-def _direction(
+def _draw_direction(
     far: float, setting: RecordingConditions, rng: np.random.Generator, *behind: float
 ) -> CoefficientFunction:
     """Draw the direction of an effect with two components, such as a horizontal or a phase angle.
@@ -88,7 +88,7 @@ def _direction(
     return lambda s: (along * s, across * s, *behind)
 
 
-def _level(
+def _draw_horizontal_direction(
     far: float, setting: RecordingConditions, rng: np.random.Generator
 ) -> CoefficientFunction:
     """Draw a horizontal direction: along x, and along y if the system has it.
@@ -102,12 +102,12 @@ def _level(
         Function from the strength to the components along x and y, or along x alone.
     """
     if setting.system == "ball":
-        return _direction(far, setting, rng)
+        return _draw_direction(far, setting, rng)
     sign = float(rng.choice([-1, 1]))
     return lambda s: (sign * far * s,)
 
 
-def _ripple(
+def _draw_ripple(
     far: float, setting: RecordingConditions, rng: np.random.Generator
 ) -> CoefficientFunction:
     """Draw a ripple whose period the motion passes several times.
@@ -123,12 +123,12 @@ def _ripple(
     Returns:
         Function from the strength to sine amplitude, cosine amplitude and period.
     """
-    travel = np.median(_ranges(setting))
+    travel = np.median(_compute_travel_ranges(setting))
     period = min(travel / rng.uniform(2.0, 8.0), 1.0 if setting.system == "slider" else 6.28)
-    return _direction(far, setting, rng, float(period))
+    return _draw_direction(far, setting, rng, float(period))
 
 
-def _periodic(
+def _draw_periodic_force(
     far: float, setting: RecordingConditions, rng: np.random.Generator
 ) -> CoefficientFunction:
     """Draw a periodic force with at least 1.5 periods in a run.
@@ -144,10 +144,10 @@ def _periodic(
         Function from the strength to sine amplitude, cosine amplitude and frequency.
     """
     low, high = 1.5 / setting.seconds, 4.0
-    return _direction(far, setting, rng, float(np.exp(rng.uniform(np.log(low), np.log(high)))))
+    return _draw_direction(far, setting, rng, float(np.exp(rng.uniform(np.log(low), np.log(high)))))
 
 
-def _wind(
+def _draw_wind(
     far: float, setting: RecordingConditions, rng: np.random.Generator
 ) -> CoefficientFunction:
     """Draw quadratic drag in moving air: the air velocity is fixed, the drag grows with s.
@@ -170,7 +170,7 @@ def _wind(
     return lambda s: (far * s, float(speed * np.cos(angle)), float(speed * np.sin(angle)))
 
 
-def _stribeck(
+def _draw_stribeck(
     far: float, setting: RecordingConditions, rng: np.random.Generator
 ) -> CoefficientFunction:
     """Draw Stribeck friction with a large static part, at speeds that often occur in the motion.
@@ -187,12 +187,12 @@ def _stribeck(
         Function from the strength to Coulomb friction, additional friction at rest, and Stribeck
         speed.
     """
-    extra, typical = rng.uniform(2.0, 6.0), np.median(np.abs(_speeds(setting)))
+    extra, typical = rng.uniform(2.0, 6.0), np.median(np.abs(_compute_speeds(setting)))
     speed = float(np.clip(typical * rng.uniform(0.15, 0.5), 0.02, 2.0))
     return lambda s: (far * s, extra * far * s, speed)
 
 
-def _saturation(
+def _draw_saturation(
     far: float, setting: RecordingConditions, rng: np.random.Generator
 ) -> CoefficientFunction:
     """Return an input limit: at strength 0 the peak of the input, at strength 1 zero.
@@ -229,7 +229,7 @@ def _one_way(
     return lambda s: (far * shares[0] * s, far * shares[1] * s)
 
 
-def _power(
+def _draw_power_law(
     far: float, setting: RecordingConditions, rng: np.random.Generator
 ) -> CoefficientFunction:
     """Return a power law of the input that keeps the peak of the input unchanged.
@@ -248,7 +248,7 @@ def _power(
     return lambda s: (float(peak**-s - 1), s)
 
 
-def _rate(
+def _draw_rate_limit(
     far: float, setting: RecordingConditions, rng: np.random.Generator
 ) -> CoefficientFunction:
     """Return a rate limit: a jump to the input's peak takes 0.8 s times the strength.
@@ -265,7 +265,7 @@ def _rate(
     return lambda s: (float(peak / (0.8 * s)),)
 
 
-def _quadratic(
+def _draw_quadratic_friction(
     far: float, setting: RecordingConditions, rng: np.random.Generator
 ) -> CoefficientFunction:
     """Draw friction whose quadratic part exceeds the linear one at the peak force.
@@ -300,7 +300,7 @@ def _draw_position_friction(
     Returns:
         Function from the strength to constant part, sine and cosine amplitude, and period.
     """
-    travel = float(np.median(_ranges(setting)))
+    travel = float(np.median(_compute_travel_ranges(setting)))
     low, high = (0.2, 5.0) if setting.system == "slider" else (0.5, 6.2832)
     period = float(np.clip(travel / rng.uniform(1.0, 4.0), low, high))
     angle, share = rng.uniform(0, 2 * np.pi), rng.uniform(0.5, 0.95)
@@ -308,7 +308,7 @@ def _draw_position_friction(
     return lambda s: (far * (1 - share) * s, sine * s, cosine * s, period)
 
 
-def _warming(
+def _draw_warm_up_friction(
     far: float, setting: RecordingConditions, rng: np.random.Generator
 ) -> CoefficientFunction:
     """Draw warm-up friction with a time constant of 0.2 to 0.8 run lengths, partly viscous.
@@ -324,11 +324,11 @@ def _warming(
         Function from the strength to Coulomb friction, viscous friction and time constant.
     """
     time = float(setting.seconds * rng.uniform(0.2, 0.8))
-    viscous = float(far * rng.uniform(0.0, 1.0) / np.median(np.abs(_speeds(setting))))
+    viscous = float(far * rng.uniform(0.0, 1.0) / np.median(np.abs(_compute_speeds(setting))))
     return lambda s: (far * s, viscous * s, max(time, 0.5))
 
 
-def _slip(
+def _draw_sensor_slip(
     far: float, setting: RecordingConditions, rng: np.random.Generator
 ) -> CoefficientFunction:
     """Draw a sensor slip at a time well within each run.
@@ -347,7 +347,7 @@ def _slip(
     return lambda s: (sign * far * s, instant)
 
 
-def _flexibility(
+def _draw_flexible_load(
     far: float, setting: RecordingConditions, rng: np.random.Generator
 ) -> CoefficientFunction:
     """Draw a flexible load: from four oscillations per run to a fifth of the sampling rate.
@@ -368,7 +368,7 @@ def _flexibility(
     return lambda s: (min(far * s, 0.95), float(np.clip(frequency, 6, 300)), ratio)
 
 
-def _play(
+def _draw_backlash(
     far: float, setting: RecordingConditions, rng: np.random.Generator
 ) -> CoefficientFunction:
     """Draw backlash between drive and load: at strength 1 the gap is 0.3 of the travel.
@@ -381,11 +381,11 @@ def _play(
     Returns:
         Function from the strength to gap and share of the load.
     """
-    share, travel = float(rng.uniform(0.2, 0.8)), float(np.median(_ranges(setting)))
+    share, travel = float(rng.uniform(0.2, 0.8)), float(np.median(_compute_travel_ranges(setting)))
     return lambda s: (0.3 * travel * s, share)
 
 
-def _hysteresis(
+def _draw_hysteresis(
     far: float, setting: RecordingConditions, rng: np.random.Generator
 ) -> CoefficientFunction:
     """Draw hysteresis with a deflection of 0.02 to 0.2 of the travel.
@@ -400,12 +400,12 @@ def _hysteresis(
     Returns:
         Function from the strength to friction limit and deflection.
     """
-    travel = float(np.median(_ranges(setting)))
+    travel = float(np.median(_compute_travel_ranges(setting)))
     deflection = float(travel * np.exp(rng.uniform(np.log(0.02), np.log(0.2))))
     return lambda s: (far * s, deflection)
 
 
-def _stop(
+def _draw_end_stop(
     far: float, setting: RecordingConditions, rng: np.random.Generator
 ) -> CoefficientFunction:
     """Draw an end stop near an end of the travel: 5 to 20 % of the samples are beyond it.
@@ -430,26 +430,26 @@ def _stop(
 
 
 SHAPE_SAMPLERS: dict[str, Callable[..., CoefficientFunction]] = {
-    "state.limit": _stop,
-    "sensor.slip": _slip,
-    "friction.hysteresis": _hysteresis,
-    "joint.backlash": _play,
-    "joint.flexibility": _flexibility,
+    "state.limit": _draw_end_stop,
+    "sensor.slip": _draw_sensor_slip,
+    "friction.hysteresis": _draw_hysteresis,
+    "joint.backlash": _draw_backlash,
+    "joint.flexibility": _draw_flexible_load,
     "friction.direction": _one_way,
     "friction.load_direction": _one_way,
-    "friction.load_quadratic": _quadratic,
+    "friction.load_quadratic": _draw_quadratic_friction,
     "friction.position": _draw_position_friction,
-    "friction.warming": _warming,
-    "input.power": _power,
-    "input.rate": _rate,
-    "sensor.eccentricity": _direction,
-    "gravity.tilt": _level,
-    "lift.magnus": _direction,
-    "force.ripple": _ripple,
-    "force.periodic": _periodic,
-    "wind": _wind,
-    "friction.stribeck": _stribeck,
-    "input.saturation": _saturation,
+    "friction.warming": _draw_warm_up_friction,
+    "input.power": _draw_power_law,
+    "input.rate": _draw_rate_limit,
+    "sensor.eccentricity": _draw_direction,
+    "gravity.tilt": _draw_horizontal_direction,
+    "lift.magnus": _draw_direction,
+    "force.ripple": _draw_ripple,
+    "force.periodic": _draw_periodic_force,
+    "wind": _draw_wind,
+    "friction.stribeck": _draw_stribeck,
+    "input.saturation": _draw_saturation,
 }
 
 
@@ -458,12 +458,12 @@ def _simulate_base_motion(setting: RecordingConditions) -> list[Array]:
     return list(simulate_observations(setting, {})[:, :, 0])
 
 
-def _ranges(setting: RecordingConditions) -> list[float]:
+def _compute_travel_ranges(setting: RecordingConditions) -> list[float]:
     """Return the travel of the first channel in each run, without hidden causes."""
     return [np.ptp(path) for path in _simulate_base_motion(setting)]
 
 
-def _speeds(setting: RecordingConditions) -> Array:
+def _compute_speeds(setting: RecordingConditions) -> Array:
     """Return the speeds of the first channel at all samples of all runs, by finite differences."""
     return np.concatenate([np.diff(path) for path in _simulate_base_motion(setting)]) * setting.rate
 
@@ -495,7 +495,9 @@ def _draw_onsets(
     return [float(rng.uniform(0.1, 0.9) * (setting.seconds - lasting)) for _ in range(MAX_RUNS)]
 
 
-def _patch(setting: RecordingConditions, rng: np.random.Generator) -> CoefficientFunction:
+def _draw_friction_patch(
+    setting: RecordingConditions, rng: np.random.Generator
+) -> CoefficientFunction:
     """Draw a region of dry friction, 0.14 to 0.3 of the central 80 % of positions wide.
 
     Args:
@@ -508,15 +510,15 @@ def _patch(setting: RecordingConditions, rng: np.random.Generator) -> Coefficien
     low, high = np.quantile(np.concatenate(_simulate_base_motion(setting)), [0.1, 0.9])
     half = float((high - low) * rng.uniform(0.07, 0.15))
     centre = float(rng.uniform(low + half, high - half))
-    return lambda s: (_force(setting) * s, centre, half)
+    return lambda s: (_get_unit_force(setting) * s, centre, half)
 
 
-def _force(setting: RecordingConditions) -> float:
+def _get_unit_force(setting: RecordingConditions) -> float:
     """Return the force of an unmodelled cause at strength 1: N m for a pendulum, N for a slider."""
     return 0.5 if setting.system == "pendulum" else 5.0
 
 
-def _gust(setting: RecordingConditions, rng: np.random.Generator) -> CoefficientFunction:
+def _draw_gust(setting: RecordingConditions, rng: np.random.Generator) -> CoefficientFunction:
     """Draw a temporary force of 0.1 to 0.3 s in each run, in either direction.
 
     Returns:
@@ -524,10 +526,12 @@ def _gust(setting: RecordingConditions, rng: np.random.Generator) -> Coefficient
     """
     lasting, sign = float(rng.uniform(0.1, 0.3)), float(rng.choice([-1, 1]))
     begins = _draw_onsets(setting, lasting, rng)
-    return lambda s: (sign * _force(setting) * s, lasting, *begins)
+    return lambda s: (sign * _get_unit_force(setting) * s, lasting, *begins)
 
 
-def _ageing(setting: RecordingConditions, rng: np.random.Generator) -> CoefficientFunction:
+def _draw_growing_damping(
+    setting: RecordingConditions, rng: np.random.Generator
+) -> CoefficientFunction:
     """Draw damping that grows in proportion to time, up to a value at the end of the run.
 
     At strength 1 this value is 0.1 N m s/rad for a pendulum and 5 N s/m for a slider.
@@ -536,7 +540,7 @@ def _ageing(setting: RecordingConditions, rng: np.random.Generator) -> Coefficie
     return lambda s: (far * s,)
 
 
-def _latch(setting: RecordingConditions, rng: np.random.Generator) -> CoefficientFunction:
+def _draw_soft_stop(setting: RecordingConditions, rng: np.random.Generator) -> CoefficientFunction:
     """Draw a soft stop in every other run, which the motion reaches for a short time.
 
     It is a spring beyond a place that 15 to 30 % of the samples pass.
@@ -555,7 +559,7 @@ def _latch(setting: RecordingConditions, rng: np.random.Generator) -> Coefficien
     return lambda s: (far * s, place)
 
 
-def _updraft(setting: RecordingConditions, rng: np.random.Generator) -> CoefficientFunction:
+def _draw_updraft(setting: RecordingConditions, rng: np.random.Generator) -> CoefficientFunction:
     """Draw a region of rising air that the balls pass; at strength 1 it accelerates by 10 m/s^2.
 
     Returns:
@@ -587,7 +591,9 @@ def _ball_gust(setting: RecordingConditions, rng: np.random.Generator) -> Coeffi
     )
 
 
-def _wear(setting: RecordingConditions, rng: np.random.Generator) -> CoefficientFunction:
+def _draw_changing_restitution(
+    setting: RecordingConditions, rng: np.random.Generator
+) -> CoefficientFunction:
     """Draw restitution that changes linearly with time: at strength 1 by all its value in a run."""
     sign = float(rng.choice([-1, 1]))
     return lambda s: (sign * s / setting.seconds,)
@@ -600,12 +606,12 @@ def _draw_drag_layer(setting: RecordingConditions, rng: np.random.Generator) -> 
 
 
 UNMODELLED_SAMPLERS: dict[tuple[bool, str], Callable[..., CoefficientFunction]] = {
-    (False, "patch"): _patch,
-    (False, "gust"): _gust,
-    (False, "ageing"): _ageing,
-    (False, "latch"): _latch,
-    (True, "updraft"): _updraft,
+    (False, "patch"): _draw_friction_patch,
+    (False, "gust"): _draw_gust,
+    (False, "ageing"): _draw_growing_damping,
+    (False, "latch"): _draw_soft_stop,
+    (True, "updraft"): _draw_updraft,
     (True, "gust"): _ball_gust,
-    (True, "wear"): _wear,
+    (True, "wear"): _draw_changing_restitution,
     (True, "layer"): _draw_drag_layer,
 }

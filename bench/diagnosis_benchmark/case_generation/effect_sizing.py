@@ -250,11 +250,13 @@ def find_strength_for_size(
             low = strength, now
         else:  # also if it is NaN or infinite
             high = strength, now
-        strength = float(min(_between(low, high, wanted), largest))
+        strength = float(min(_choose_next_strength(low, high, wanted), largest))
     return None
 
 
-def _between(low: tuple[float, float], high: tuple[float, float], wanted: float) -> float:
+def _choose_next_strength(
+    low: tuple[float, float], high: tuple[float, float], wanted: float
+) -> float:
     """Return the next strength to try.
 
     Without a strength below, the size is assumed to be proportional to it. Without a strength

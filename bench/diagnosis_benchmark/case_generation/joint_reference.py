@@ -87,7 +87,7 @@ def compute_applied_input(
         return [InputSegment(0.0, until, 0.0, effects.get("input.bias", [0.0])[0], 0.0)]
     levels, edges, lag = np.array(scenario.inputs["u"]), scenario.times - scenario.times[0], 0.0
     if "input.hold" in effects:
-        levels, edges = _straight(levels, edges, effects["input.hold"][0])
+        levels, edges = _interpolate_input(levels, edges, effects["input.hold"][0])
     for name, c in effects.items():
         if name in NONLINEAR_INPUT_EFFECTS and lag:
             raise NotImplementedError(f"{name} behind input.lag")
@@ -96,7 +96,7 @@ def compute_applied_input(
         elif name == "input.lag":
             lag = c[0]
         elif name == "input.rate":
-            levels, edges = _slewed(levels, edges, c[0])
+            levels, edges = _limit_input_rate(levels, edges, c[0])
         elif name in STEPWISE_INPUT_EFFECTS:
             levels = STEPWISE_INPUT_EFFECTS[name](levels, *c)
     changes = np.flatnonzero(np.diff(levels)) + 1
@@ -111,7 +111,7 @@ def compute_applied_input(
     return pieces
 
 
-def _straight(levels: Array, edges: Array, share: float) -> tuple[Array, Array]:
+def _interpolate_input(levels: Array, edges: Array, share: float) -> tuple[Array, Array]:
     """Divide each interval into parts, to approximate an input between hold and linear.
 
     Args:
@@ -128,7 +128,7 @@ def _straight(levels: Array, edges: Array, share: float) -> tuple[Array, Array]:
     return np.append(fine.ravel(), levels[-1]), np.append(begins.ravel(), edges[-1])
 
 
-def _slewed(levels: Array, edges: Array, most: float) -> tuple[Array, Array]:
+def _limit_input_rate(levels: Array, edges: Array, most: float) -> tuple[Array, Array]:
     """Limit the rate of an input to `most` per second, in short parts of constant level.
 
     Returns:
@@ -154,7 +154,7 @@ def _slewed(levels: Array, edges: Array, most: float) -> tuple[Array, Array]:
     return np.array(values), np.array(begins)
 
 
-def _play(levels: Array, width: float) -> Array:
+def _apply_backlash(levels: Array, width: float) -> Array:
     """Apply backlash to an input: the output follows only when the input leaves the gap around it.
 
     Args:
@@ -178,7 +178,7 @@ STEPWISE_INPUT_EFFECTS: dict[str, Callable[..., Array]] = {
     "input.deadband": lambda u, c: np.sign(u) * np.maximum(np.abs(u) - c, 0.0),
     "input.saturation": lambda u, c: np.minimum(np.maximum(u, -c), c),
     "input.power": lambda u, gain, power: (1 + gain) * np.sign(u) * np.abs(u) ** (1 + power),
-    "backlash": _play,
+    "backlash": _apply_backlash,
 }
 
 
@@ -474,7 +474,7 @@ HIDDEN_STATE_EFFECTS: dict[str, Callable[..., Any]] = {
 }
 
 
-def _wave(c: Sequence[float], cycles: float) -> float:
+def _compute_wave(c: Sequence[float], cycles: float) -> float:
     return c[0] * sin(2 * pi * cycles) + c[1] * cos(2 * pi * cycles)
 
 
@@ -494,8 +494,8 @@ FORCE_EFFECTS: dict[str, Callable[[JointDynamics, list[float]], ResistanceLaw]] 
     "spring.linear": lambda j, c: lambda t, x, v: -c[0] * x,
     "spring.cubic": lambda j, c: lambda t, x, v: -c[0] * x**3,
     "force.bias": lambda j, c: lambda t, x, v: c[0],
-    "force.ripple": lambda j, c: lambda t, x, v: _wave(c, x / c[2]),
-    "force.periodic": lambda j, c: lambda t, x, v: _wave(c, t * c[2]),
+    "force.ripple": lambda j, c: lambda t, x, v: _compute_wave(c, x / c[2]),
+    "force.periodic": lambda j, c: lambda t, x, v: _compute_wave(c, t * c[2]),
     "ageing": lambda j, c: lambda t, x, v: -c[0] * t * v,  # unmodelled: damping grows with time
     "state.limit": lambda j, c: (
         lambda t, x, v: -copysign(1.0, c[0]) * compute_end_stop_force(x, v, *c)
@@ -518,7 +518,7 @@ DRY_FRICTION_EFFECTS: dict[str, Callable[[JointDynamics, list[float]], Resistanc
         )
     ),
     "friction.position": lambda j, c: (
-        lambda t, x, v: c[0] + hypot(c[1], c[2]) + _wave(c[1:], x / c[3])
+        lambda t, x, v: c[0] + hypot(c[1], c[2]) + _compute_wave(c[1:], x / c[3])
     ),
     "friction.warming": lambda j, c: lambda t, x, v: (c[0] + c[1] * abs(v)) * exp(-t / c[2]),
     "patch": lambda j, c: (

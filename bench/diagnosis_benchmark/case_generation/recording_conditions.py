@@ -178,16 +178,22 @@ def draw_conditions(
     # These values are drawn in any case, so that later draws do not depend on the request.
     rate, runs = asked.rate or rate, asked.runs or runs
     times = np.arange(round(rate * seconds)) / rate
-    draw = {"ball": _ball, "pendulum": _pendulum, "slider": _slider}[system]
+    draw = {
+        "ball": _draw_ball_conditions,
+        "pendulum": _draw_pendulum_conditions,
+        "slider": _draw_slider_conditions,
+    }[system]
     parameters, channels, scenarios = draw(rng, times, runs, hidden)
-    noise = _noise(rng, system, channels)
+    noise = _draw_sensor_noise(rng, system, channels)
     noise = replace(noise, kind=asked.noise or noise.kind)
     return RecordingConditions(
         system, parameters, get_constants(system), channels, tuple(scenarios), noise, rate, seconds
     )
 
 
-def _noise(rng: np.random.Generator, system: str, channels: Sequence[str]) -> SensorNoise:
+def _draw_sensor_noise(
+    rng: np.random.Generator, system: str, channels: Sequence[str]
+) -> SensorNoise:
     """Draw the sensor noise: its size, kind and correlation, and whether the recording states it.
 
     The size is drawn log-uniformly. The noise of a rate (``qd``, ``v``) is that of the position
@@ -211,7 +217,7 @@ def _noise(rng: np.random.Generator, system: str, channels: Sequence[str]) -> Se
     )
 
 
-def _ball(
+def _draw_ball_conditions(
     rng: np.random.Generator, times: Array, runs: int, hidden: Sequence[str]
 ) -> DrawnConditions:
     """Draw parameters, channels and runs of a ball.
@@ -240,7 +246,7 @@ def _ball(
     return parameters, ("z",) if upright else ("x", "y", "z"), scenarios
 
 
-def _pendulum(
+def _draw_pendulum_conditions(
     rng: np.random.Generator, times: Array, runs: int, hidden: Sequence[str]
 ) -> DrawnConditions:
     """Draw parameters, channels and runs of a pendulum.
@@ -279,7 +285,7 @@ def _pendulum(
     return parameters, channels, scenarios
 
 
-def _slider(
+def _draw_slider_conditions(
     rng: np.random.Generator, times: Array, runs: int, hidden: Sequence[str]
 ) -> DrawnConditions:
     """Draw parameters, channels and runs of a slider, which always has an input.

@@ -71,11 +71,11 @@ class _ForwardSelection(Diagnoser):
         """Name the selected effects, with alternatives that the criterion cannot exclude."""
         evidence = RegressionEvidence(case)
         try:
-            return self._selected(evidence)
+            return self._select_effects(evidence)
         finally:
             evidence.close()
 
-    def _selected(self, evidence: RegressionEvidence) -> Answer:
+    def _select_effects(self, evidence: RegressionEvidence) -> Answer:
         """Add the best effect to the model, one at a time, and answer with the selected effects.
 
         The search stops if the model is sufficient, if no effect improves it, or at `MAX_EFFECTS`
@@ -110,9 +110,9 @@ class _ForwardSelection(Diagnoser):
             ]
             best = rivals[0]
             causes.append((best.fit.effects[-1], tuple(alike)))
-        return self._answer(evidence, first, best, causes, samples)
+        return self._make_answer(evidence, first, best, causes, samples)
 
-    def _answer(
+    def _make_answer(
         self,
         evidence: RegressionEvidence,
         first: RefittedModel,
@@ -133,7 +133,7 @@ class _ForwardSelection(Diagnoser):
             causes: each selected effect with its alternatives.
             samples: number of samples.
         """
-        ends = _intervals(evidence, best)
+        ends = _compute_intervals(evidence, best)
         parameters = {n: e for n, e in ends.items() if "." not in n}
         chance = self.compute_p_value(first, samples)
         if not causes:
@@ -141,7 +141,10 @@ class _ForwardSelection(Diagnoser):
             return Answer(verdict, (), parameters, chance)
         floor = float(samples - best.numbers)
         gap = max(first.squares - floor, 1e-9)
-        named = tuple(NamedCause(name, others, _of(ends, name), chance) for name, others in causes)
+        named = tuple(
+            NamedCause(name, others, _select_effect_intervals(ends, name), chance)
+            for name, others in causes
+        )
         if (
             not self.is_sufficient(best, samples)
             and (first.squares - best.squares) / gap < MIN_GAP_CLOSED
@@ -208,7 +211,7 @@ class ForwardBIC(_ForwardSelection):
         """Return None: BIC gives no p-value."""
         return None
 
-    def _answer(
+    def _make_answer(
         self,
         evidence: RegressionEvidence,
         first: RefittedModel,
@@ -228,9 +231,12 @@ class ForwardBIC(_ForwardSelection):
             causes: each selected effect with its alternatives.
             samples: number of samples; unused here.
         """
-        ends = _intervals(evidence, best)
+        ends = _compute_intervals(evidence, best)
         parameters = {n: e for n, e in ends.items() if "." not in n}
-        named = tuple(NamedCause(name, others, _of(ends, name)) for name, others in causes)
+        named = tuple(
+            NamedCause(name, others, _select_effect_intervals(ends, name))
+            for name, others in causes
+        )
         sets = any(others for _, others in causes)
         verdict = "ambiguous" if sets else "named" if named else "adequate"
         return Answer(verdict, named, parameters)
@@ -248,14 +254,14 @@ class ForwardChi2(_ForwardSelection):
 
     def is_sufficient(self, one: RefittedModel, samples: int) -> bool:
         """Return whether the chi-squared p-value of the model is above `FALSE_ALARM_RATE`."""
-        return self._chance(one, samples) > FALSE_ALARM_RATE
+        return self._compute_p_value(one, samples) > FALSE_ALARM_RATE
 
     def compute_p_value(self, first: RefittedModel, samples: int) -> float | None:
         """Compute the chi-squared p-value of the base model."""
-        return self._chance(first, samples)
+        return self._compute_p_value(first, samples)
 
     @staticmethod
-    def _chance(one: RefittedModel, samples: int) -> float:
+    def _compute_p_value(one: RefittedModel, samples: int) -> float:
         """Compute the probability that noise alone gives a sum of squares as large as this one.
 
         The sum of squares is chi-squared distributed with `samples` minus fitted numbers degrees of
@@ -306,7 +312,7 @@ def _refit_with_one_more_effect(
     starts = [
         start
         for name in order
-        for start in _starts(evidence, at, name, best[name][1], left, effects)
+        for start in _choose_starts(evidence, at, name, best[name][1], left, effects)
     ]
     if not starts:
         return []
@@ -336,7 +342,7 @@ def _with_model(evidence: RegressionEvidence, at: TrajectoryFit) -> RegressionEv
     return other
 
 
-def _starts(
+def _choose_starts(
     evidence: RegressionEvidence,
     at: TrajectoryFit,
     name: str,
@@ -373,7 +379,7 @@ def _starts(
     return starts
 
 
-def _intervals(
+def _compute_intervals(
     evidence: RegressionEvidence, one: RefittedModel
 ) -> dict[str, tuple[float | None, float | None]]:
     """Compute 95 % intervals of the fitted parameters, by name, from the curvature at the fit.
@@ -402,7 +408,7 @@ def _intervals(
     return ends
 
 
-def _of(
+def _select_effect_intervals(
     ends: dict[str, tuple[float | None, float | None]], effect: str
 ) -> dict[str, tuple[float | None, float | None]]:
     """Select the intervals of one effect's coefficients, by the name of the coefficient alone.

@@ -74,12 +74,14 @@ def summarise_case(case: DiagnosisCase) -> dict[str, Any]:
             count = len(run.times)
             described.append(
                 {
-                    "t": _thin(run.times),
-                    "inputs": {name: _thin(series) for name, series in run.inputs.items()},
-                    "measured": {name: _thin(run.channels[name]) for name in names},
-                    "residual": {name: _thin(values[:count, i]) for i, name in enumerate(names)},
+                    "t": _thin_series(run.times),
+                    "inputs": {name: _thin_series(series) for name, series in run.inputs.items()},
+                    "measured": {name: _thin_series(run.channels[name]) for name in names},
+                    "residual": {
+                        name: _thin_series(values[:count, i]) for i, name in enumerate(names)
+                    },
                     "residual_rms": {
-                        name: _round(float(np.sqrt(np.mean(values[:count, i] ** 2))))
+                        name: _round_value(float(np.sqrt(np.mean(values[:count, i] ** 2))))
                         for i, name in enumerate(names)
                     },
                 }
@@ -90,7 +92,7 @@ def summarise_case(case: DiagnosisCase) -> dict[str, Any]:
         "simulator": (case.kind.__doc__ or "").split("\n")[0],
         "constants": dict(case.recording.constants),
         "parameters": [f"{p.name} [{p.unit}]" for p in case.kind.parameters],
-        "noise": {name: _round(value) for name, value in sigma.items()},
+        "noise": {name: _round_value(value) for name, value in sigma.items()},
         "effects": {
             name: (kind.__doc__ or "").split("\n")[0] for name, kind in case.library.items()
         },
@@ -98,13 +100,13 @@ def summarise_case(case: DiagnosisCase) -> dict[str, Any]:
     }
 
 
-def _thin(series: Array) -> list[float | None]:
+def _thin_series(series: Array) -> list[float | None]:
     """Return at most `_MAX_SAMPLES` samples at equal intervals; None for a missing one."""
     step = max(-(-len(series) // _MAX_SAMPLES), 1)
-    return [_round(float(x)) if np.isfinite(x) else None for x in series[::step]]
+    return [_round_value(float(x)) if np.isfinite(x) else None for x in series[::step]]
 
 
-def _round(value: float) -> float:
+def _round_value(value: float) -> float:
     return float(f"{value:.4g}")
 
 

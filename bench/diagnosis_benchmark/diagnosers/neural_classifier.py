@@ -83,7 +83,7 @@ class NeuralClassifier(Diagnoser):
                 else str(lesson.rng.choice(classes[1:]))
             )
             try:
-                image = _example(lesson, name, number)
+                image = _simulate_example(lesson, name, number)
             except SimulationBudgetExceededError:
                 break
             except InputError:
@@ -125,7 +125,7 @@ class NeuralClassifier(Diagnoser):
         return Answer("ambiguous" if others else "named", (NamedCause(first, tuple(others)),))
 
 
-def _example(lesson: DiagnoserTrainingTask, name: str, number: int) -> Array | None:
+def _simulate_example(lesson: DiagnoserTrainingTask, name: str, number: int) -> Array | None:
     """Simulate one recording with an effect, as input of the network.
 
     Args:
@@ -146,7 +146,7 @@ def _example(lesson: DiagnoserTrainingTask, name: str, number: int) -> Array | N
     sigma = float(np.exp(rng.uniform(np.log(low), np.log(high))))
     # In SI units a rate is 5 times as noisy as a position, as in many cases of the benchmark.
     noise = {c.name: sigma * (5.0 if c.name in system.rates else 1.0) for c in kind.channels}
-    effects = {name: _coefficients(lesson, name)} if name else {}
+    effects = {name: _draw_coefficients(lesson, name)} if name else {}
     parameters = {p.name: float(rng.uniform(*p.training_range)) for p in system.parameters}
     channels = [c.name for c in kind.channels if not c.name.startswith("accel")]
     usual = system.usual_recording
@@ -182,7 +182,7 @@ def _example(lesson: DiagnoserTrainingTask, name: str, number: int) -> Array | N
     return image if shown else None
 
 
-def _coefficients(lesson: DiagnoserTrainingTask, name: str) -> tuple[float, ...]:
+def _draw_coefficients(lesson: DiagnoserTrainingTask, name: str) -> tuple[float, ...]:
     """Draw coefficients of an effect for a training example.
 
     The first coefficient, the size, is drawn log-uniformly down to 0.3 % of its maximum; the others
@@ -248,7 +248,7 @@ def _compute_network_input(
     return np.nan_to_num(image), rms
 
 
-def _network(features: int, classes: int) -> Any:
+def _make_network(features: int, classes: int) -> Any:
     """Make the network: convolutions over a run, mean over runs, and dense layers.
 
     Args:
@@ -345,7 +345,7 @@ def _train_network(
 
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        network = _network(images[0].shape[1], classes)
+        network = _make_network(images[0].shape[1], classes)
         inputs, weights = _stack_with_mask(images)
         wanted = torch.from_numpy(labels.astype(np.int64))
         split = max(1, round(VALIDATION_SHARE * len(labels)))
@@ -382,7 +382,7 @@ def _predict_probabilities(learned: Mapping[str, Array], image: Array, classes: 
 
     # Creating the network draws random weights; the global random generator is restored.
     with torch.random.fork_rng(devices=[]):
-        network = _network(image.shape[1], classes)
+        network = _make_network(image.shape[1], classes)
     network.load_state_dict({k: torch.from_numpy(np.array(v)) for k, v in learned.items()})
     network.eval()
     inputs, weights = _stack_with_mask([image])

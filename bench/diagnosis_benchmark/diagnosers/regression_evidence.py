@@ -175,7 +175,7 @@ class RegressionEvidence:
         """Build the regression r = J delta + D c + noise, equation (1), with one row per sample."""
         fit = self.base.fit
         runs, length, channels, _ = fit.jacobian.shape
-        return self._rows(
+        return self._flatten_to_rows(
             self.residual,
             self._base_columns(),
             self.sensitivity_directions.responses,
@@ -194,16 +194,18 @@ class RegressionEvidence:
         Args:
             seconds: window of the local polynomials.
         """
-        left, sigma, seen = self._filtered(self.residual[..., None], seconds)
-        base, _, _ = self._filtered(self._base_columns(), seconds)
-        effects, _, _ = self._filtered(self.sensitivity_directions.responses, seconds)
-        return self._rows(left[..., 0], base, effects, sigma, seen)
+        left, sigma, seen = self._apply_residual_operator(self.residual[..., None], seconds)
+        base, _, _ = self._apply_residual_operator(self._base_columns(), seconds)
+        effects, _, _ = self._apply_residual_operator(
+            self.sensitivity_directions.responses, seconds
+        )
+        return self._flatten_to_rows(left[..., 0], base, effects, sigma, seen)
 
     def _base_columns(self) -> Array:
         """Return the columns of parameters and initial states in equation (1), (R, T, C, B)."""
         return compute_base_jacobian(self.world, self.base.fit)
 
-    def _rows(
+    def _flatten_to_rows(
         self, left: Array, base: Array, effects: Array, sigma: Array, seen: Mask
     ) -> RegressionData:
         """Flatten arrays over runs, samples and channels into the rows of a regression.
@@ -223,7 +225,7 @@ class RegressionEvidence:
         # excluded.
         whole = seen & np.isfinite(base).all(axis=3) & np.isfinite(effects).all(axis=3)
         scale = 1.0 / sigma[whole]
-        states = self._states()
+        states = self._compute_states()
         states = np.broadcast_to(states[:, :, None], (*seen.shape, states.shape[2]))
         return RegressionData(
             left[whole] * scale,
@@ -233,7 +235,7 @@ class RegressionEvidence:
             states[whole],
         )
 
-    def _states(self) -> Array:
+    def _compute_states(self) -> Array:
         """Return time, channels of the base model and inputs, (R, T, F).
 
         They are the arguments of a discrepancy function, such as a Gaussian process.
@@ -251,7 +253,7 @@ class RegressionEvidence:
         states[..., 1 : 1 + channels] = np.nan_to_num(self.base.fit.simulated)
         return states
 
-    def _filtered(self, values: Array, seconds: float) -> tuple[Array, Array, Mask]:
+    def _apply_residual_operator(self, values: Array, seconds: float) -> tuple[Array, Array, Mask]:
         """Apply the operator L of equation (2) to trajectories: L r = r'' - A r - B r'.
 
         For a channel with a rate, the first derivative replaces the second, and the term with A is
@@ -276,8 +278,10 @@ class RegressionEvidence:
         for r, track in enumerate(world.tracks):
             size = int(world.lengths[r])
             step = float(np.median(np.diff(track.scenario.times)))
-            window = _odd(min(max(MIN_WINDOW_SAMPLES, round(seconds / step)), size // 2))
-            stiff, damped = self._linear(r)
+            window = _round_down_to_odd(
+                min(max(MIN_WINDOW_SAMPLES, round(seconds / step)), size // 2)
+            )
+            stiff, damped = self._linearise(r)
             for c, name in enumerate(world.channels):
                 rate = name in pairs
                 if not rate and name not in system.coordinates:
@@ -341,7 +345,7 @@ class RegressionEvidence:
                     good[max(0, at - half - 1) : at + half + 2] = False
         return good
 
-    def _linear(self, run: int) -> tuple[Array, Array]:
+    def _linearise(self, run: int) -> tuple[Array, Array]:
         """Compute stiffness A and damping B of equation (2), each (T, D), by finite differences.
 
         They are the derivatives of the base model's acceleration by the D coordinates and by their
@@ -391,7 +395,7 @@ _IMPACT_HEIGHT = 1.0
 """Height in metres below which a minimum of the last coordinate counts as an impact."""
 
 
-def _odd(samples: int) -> int:
+def _round_down_to_odd(samples: int) -> int:
     """Return the next lower odd number of samples, but enough for the local polynomials."""
     return max(samples - 1 + samples % 2, POLYNOMIAL_DEGREE + 2)
 

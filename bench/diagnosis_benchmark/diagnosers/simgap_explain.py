@@ -22,15 +22,15 @@ class SimgapExplain(Diagnoser):
             NamedCause(
                 cause.effect,
                 cause.alternatives,
-                {name: _ends(number) for name, number in cause.coefficients.items()},
+                {name: _get_interval(number) for name, number in cause.coefficients.items()},
                 cause.p_value,
             )
             for cause in verdict.causes
         )
-        parameters = {name: _ends(number) for name, number in verdict.parameters.items()}
+        parameters = {name: _get_interval(number) for name, number in verdict.parameters.items()}
         return Answer(verdict.verdict, causes, parameters, chance)
 
 
-def _ends(number: FittedValue) -> tuple[float | None, float | None]:
+def _get_interval(number: FittedValue) -> tuple[float | None, float | None]:
     """Return the 95 % interval of a fitted value; None for an open end."""
     return number.low, number.high

@@ -63,7 +63,9 @@ class _SparseRegression(Diagnoser):
         """
         evidence = RegressionEvidence(case)
         try:
-            found = [self._found(evidence, window) for window in POLYNOMIAL_WINDOWS_SECONDS]
+            found = [
+                self._run_regression(evidence, window) for window in POLYNOMIAL_WINDOWS_SECONDS
+            ]
         finally:
             evidence.close()
         known = [one for one in found if one is not None]
@@ -77,7 +79,9 @@ class _SparseRegression(Diagnoser):
         sets = any(cause.alternatives for cause in best.causes)
         return Answer("ambiguous" if sets else "named", best.causes)
 
-    def _found(self, evidence: RegressionEvidence, window: float) -> _RegressionResult | None:
+    def _run_regression(
+        self, evidence: RegressionEvidence, window: float
+    ) -> _RegressionResult | None:
         """Run the regression with one window of the local polynomials.
 
         One column is used for each effect, the one that explains most of the residual. Models with
@@ -111,7 +115,9 @@ class _SparseRegression(Diagnoser):
         left_out, effects_out = held_out.project_out_base()
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            models = [c for c in self._models(library / scale, left) if np.isfinite(c).all()]
+            models = [
+                c for c in self._iterate_models(library / scale, left) if np.isfinite(c).all()
+            ]
         model, sigmas = _select_by_one_standard_error(
             models, left_out, effects_out[:, places] / scale
         )
@@ -123,7 +129,7 @@ class _SparseRegression(Diagnoser):
         return _RegressionResult(sigmas, tuple(causes))
 
     @abstractmethod
-    def _models(self, library: Array, left: Array) -> Iterator[Array]:
+    def _iterate_models(self, library: Array, left: Array) -> Iterator[Array]:
         """Yield the coefficients (K,) of models with different numbers of terms.
 
         Args:
@@ -137,7 +143,7 @@ class SequentialThresholdedLeastSquares(_SparseRegression):
 
     name = "stlsq"
 
-    def _models(self, library: Array, left: Array) -> Iterator[Array]:
+    def _iterate_models(self, library: Array, left: Array) -> Iterator[Array]:
         """Yield the coefficients (K,) for 16 thresholds.
 
         They go from the largest least-squares coefficient down to 0.1 % of it. The method sets
@@ -162,7 +168,7 @@ class ForwardOrthogonalLeastSquares(_SparseRegression):
 
     name = "frols"
 
-    def _models(self, library: Array, left: Array) -> Iterator[Array]:
+    def _iterate_models(self, library: Array, left: Array) -> Iterator[Array]:
         """Yield the coefficients (K,) of models with one term, two terms, and so on.
 
         PySINDy fails if too many terms are requested for nearly dependent columns. The largest

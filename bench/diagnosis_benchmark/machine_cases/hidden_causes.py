@@ -176,7 +176,7 @@ def _per_force(bottom: Callable[[dict[str, float]], float]) -> Callable[..., Coe
     return made
 
 
-def _ripple(typical: dict[str, float], rng: np.random.Generator) -> CoefficientFunction:
+def _draw_ripple(typical: dict[str, float], rng: np.random.Generator) -> CoefficientFunction:
     """Draw a force that is periodic in the joint angle; its amplitude is twice the typical force.
 
     The motion passes 1.5 to 4 periods, and the period is between 0.08 and 1 rad.
@@ -194,7 +194,7 @@ def _ripple(typical: dict[str, float], rng: np.random.Generator) -> CoefficientF
     return lambda s: (sine * s, cosine * s, period)
 
 
-def _stribeck(typical: dict[str, float], rng: np.random.Generator) -> CoefficientFunction:
+def _draw_stribeck(typical: dict[str, float], rng: np.random.Generator) -> CoefficientFunction:
     """Draw Stribeck friction: Coulomb friction and a larger part that ends at some speed.
 
     Args:
@@ -214,9 +214,9 @@ MOTION_SCALED_EFFECTS: dict[str, Callable[..., CoefficientFunction]] = {
     "drag.linear": _per_force(lambda typical: typical["speed"]),
     "drag.quadratic": _per_force(lambda typical: typical["speed"] ** 2),
     "force.bias": _per_force(lambda typical: 1.0),
-    "force.ripple": _ripple,
+    "force.ripple": _draw_ripple,
     "friction.coulomb": _per_force(lambda typical: 2.0),
-    "friction.stribeck": _stribeck,
+    "friction.stribeck": _draw_stribeck,
     "inertia.armature": lambda typical, rng: lambda s: (2.0 * typical["inertia"] * s,),
     "spring.linear": _per_force(lambda typical: typical["position"] + 0.05),
 }

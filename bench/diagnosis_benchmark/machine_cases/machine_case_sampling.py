@@ -81,7 +81,7 @@ def draw_case(
     words = [kind, system, effect or "any", *([f"{size:g}"] if size else [])]
     words += [str(part) for part in wanted_so if part is not None]
     name = "-".join([*words, str(seed)])
-    made, rng = restore_conditions(name, system, wanted_so), _rng(name, "cause")
+    made, rng = restore_conditions(name, system, wanted_so), _make_rng(name, "cause")
     item = BenchmarkCase(
         name,
         system,
@@ -104,11 +104,15 @@ def draw_case(
         return item
     low = 3.0 if kind in ("double", "foreign") else 1.0
     wanted = size or float(np.exp(rng.uniform(np.log(low), np.log(10.0))))
-    hidden = {"single": _single, "double": _double, "foreign": _foreign}[kind]
+    hidden = {
+        "single": _hide_one_effect,
+        "double": _hide_two_effects,
+        "foreign": _hide_unmodelled_cause,
+    }[kind]
     return hidden(item, made, effect, wanted, rng)
 
 
-def _rng(name: str, purpose: str) -> np.random.Generator:
+def _make_rng(name: str, purpose: str) -> np.random.Generator:
     return np.random.default_rng(list(f"{name} {purpose}".encode()))
 
 
@@ -123,10 +127,10 @@ def restore_conditions(
         system: servo or arm2.
         asked: conditions that were not drawn.
     """
-    return drawn_setting(system, _rng(name, "setting"), asked)
+    return drawn_setting(system, _make_rng(name, "setting"), asked)
 
 
-def _placed(
+def _draw_place(
     item: BenchmarkCase, effect: str | None, rng: np.random.Generator, but: str = ""
 ) -> str:
     """Draw the effect, if it is not given, and its place: a joint, body, motor or sensor channel.
@@ -145,7 +149,7 @@ def _placed(
     return str(rng.choice(there)) if there else ""
 
 
-def _single(
+def _hide_one_effect(
     item: BenchmarkCase,
     made: MachineRecordingConditions,
     effect: str | None,
@@ -168,7 +172,7 @@ def _single(
     Returns:
         The case; None if it is rejected or no coefficients give this size.
     """
-    name = _placed(item, effect, rng)
+    name = _draw_place(item, effect, rng)
     c = _find_sized_coefficients(name, made, wanted, rng)
     if c is None:
         return None
@@ -205,7 +209,7 @@ def _find_sized_coefficients(
     return None if strength is None else of(strength)
 
 
-def _double(
+def _hide_two_effects(
     item: BenchmarkCase,
     made: MachineRecordingConditions,
     effect: str | None,
@@ -225,8 +229,8 @@ def _double(
         The case; None if it is rejected, the effects are equivalent, or no coefficients give this
         size.
     """
-    first = _placed(item, effect, rng)
-    second = _placed(item, None, rng, but=first)
+    first = _draw_place(item, effect, rng)
+    second = _draw_place(item, None, rng, but=first)
     if not second or second in find_equivalent_causes(item.system, first):
         return None
     found = {name: _find_sized_coefficients(name, made, wanted, rng) for name in (first, second)}
@@ -241,7 +245,7 @@ def _double(
     )
 
 
-def _foreign(
+def _hide_unmodelled_cause(
     item: BenchmarkCase,
     made: MachineRecordingConditions,
     cause: str | None,
@@ -363,7 +367,7 @@ class _ResidualGauge:
             own[r, :, r] = slopes[r, len(numbers) :].T
         columns = np.column_stack([shared, own.reshape(runs * slopes.shape[2], -1)])
         self.bare = seen[:, 0].reshape(runs, len(made.runs.times), joints)
-        self._basis = _orthonormal(columns)
+        self._basis = _compute_orthonormal_basis(columns)
 
     def left(self, seen: Array) -> float:
         """Compute the size of the change in readings by a hidden cause; infinite if they diverge.
@@ -371,7 +375,7 @@ class _ResidualGauge:
         Args:
             seen: readings with the hidden cause, (R, T, N).
         """
-        return self._size((seen - self.bare).ravel())
+        return self._compute_size((seen - self.bare).ravel())
 
     def projected(self, change: Array, direction: Array) -> float:
         """Compute the size of a change after a further direction is projected out.
@@ -380,24 +384,26 @@ class _ResidualGauge:
             change: change of the readings, (R, T, N).
             direction: direction of another cause, (R, T, N).
         """
-        rest, way = (self._rest(part.ravel()) for part in (change, direction))
+        rest, way = (self._project_out_parameters(part.ravel()) for part in (change, direction))
         if way @ way > 0:
             rest = rest - way * (way @ rest) / (way @ way)
         return float(np.sqrt(np.mean(rest**2)) / self.made.noise_sigmas)
 
-    def _size(self, change: Array) -> float:
+    def _compute_size(self, change: Array) -> float:
         """Return the RMS of a flattened change in units of the noise, parameters projected out."""
         if not np.isfinite(change).all():
             return float("inf")
-        return float(np.sqrt(np.mean(self._rest(change) ** 2)) / self.made.noise_sigmas)
+        return float(
+            np.sqrt(np.mean(self._project_out_parameters(change) ** 2)) / self.made.noise_sigmas
+        )
 
-    def _rest(self, change: Array) -> Array:
+    def _project_out_parameters(self, change: Array) -> Array:
         """Subtract from a change (RTN,) the part that parameters and initial states explain."""
         rest: Array = change - self._basis @ (self._basis.T @ change)
         return rest
 
 
-def _orthonormal(columns: Array) -> Array:
+def _compute_orthonormal_basis(columns: Array) -> Array:
     """Compute an orthonormal basis of the span of columns by a singular value decomposition.
 
     Directions with a singular value below 1e-6 of the largest are left out, because they come from
@@ -451,7 +457,7 @@ def record_case(item: BenchmarkCase) -> tuple[MachineRecordingConditions, Array]
     foreign = item.kind == "foreign"
     plant = made.make_machine({} if foreign else hidden, hidden if foreign else {})
     seen = read_encoders(simulate_machine(plant, made.runs), plant, made.runs.times)
-    rng = _rng(item.name, "noise")
+    rng = _make_rng(item.name, "noise")
     return made, np.array([made.noise.add_to(run, rng) for run in seen])
 
 

@@ -81,10 +81,10 @@ class MachineDynamics(ABC):
         self.acts: list[ForceLaw] = []
         for name, c in effects.items():
             effect, _, place = name.partition("@")
-            self._take(effect, place, list(c))
+            self._add_effect(effect, place, list(c))
         for name, c in foreign.items():
             cause, _, place = name.partition("@")
-            self._foreign(cause, place, list(c))
+            self._add_unmodelled_cause(cause, place, list(c))
 
     @property
     def has_dry_friction(self) -> NDArray[np.bool_]:
@@ -162,7 +162,7 @@ class MachineDynamics(ABC):
     def compute_gravity_force(self, q: Array) -> Array:
         """Compute the generalised forces (L, N) of gravity."""
 
-    def _take(self, effect: str, place: str, c: list[float]) -> None:
+    def _add_effect(self, effect: str, place: str, c: list[float]) -> None:
         """Add an effect of the library to the equations of motion.
 
         Effects on commands (``input.``) and sensors (``sensor.``) are ignored here;
@@ -199,14 +199,14 @@ class MachineDynamics(ABC):
         elif effect == "servo.deadband":
             self.dull = c[0]
         elif effect == "mass.scale":
-            self._heavier(self.bodies.index(place), 1.0 + c[0])
+            self._scale_mass(self.bodies.index(place), 1.0 + c[0])
 
-    def _heavier(self, body: int, times: float) -> None:
+    def _scale_mass(self, body: int, times: float) -> None:
         """Multiply the mass and inertia of a body by a factor."""
         for name in (f"mass{body + 1}", f"inertia{body + 1}"):
             self.numbers[name] = times * self.numbers[name]
 
-    def _foreign(self, cause: str, place: str, c: list[float]) -> None:
+    def _add_unmodelled_cause(self, cause: str, place: str, c: list[float]) -> None:
         """Add a cause that the library does not contain.
 
         Args:
@@ -350,13 +350,13 @@ class ArmDynamics(MachineDynamics):
 
     def compute_gravity_force(self, q: Array) -> Array:
         """Compute the gravity forces -g(q) of equation (5), (L, 2)."""
-        return -GRAVITY * self._lever(np.sin, q)
+        return -GRAVITY * self._compute_mass_moment(np.sin, q)
 
     def compute_base_acceleration_force(self, q: Array) -> Array:
         """Compute the forces of a unit acceleration along x; see `MachineDynamics`."""
-        return -self._lever(np.cos, q)
+        return -self._compute_mass_moment(np.cos, q)
 
-    def _lever(self, of: Callable[[Array], Array], q: Array) -> Array:
+    def _compute_mass_moment(self, of: Callable[[Array], Array], q: Array) -> Array:
         """Sum mass times lever arm of both links for each joint, as in equation (5), kg m, (L, N).
 
         Args:

@@ -171,9 +171,9 @@ def draw_conditions(
     # These values are drawn in any case, so that later draws do not depend on the request.
     rate, count = asked.rate or rate, asked.runs or count
     times = np.arange(round(rate * seconds)) / rate
-    numbers = _servo(rng) if system == "servo" else _arm(rng)
+    numbers = _draw_servo_parameters(rng) if system == "servo" else _draw_arm_parameters(rng)
     plant = MACHINES[system](numbers, {}, {})
-    runs = _runs(plant, times, count, rng)
+    runs = _draw_runs(plant, times, count, rng)
     sigma = float(np.exp(rng.uniform(*np.log(ENCODER_NOISE_RANGE))))
     noise = SensorNoise(
         dict.fromkeys(plant.channels, sigma),
@@ -187,7 +187,7 @@ def draw_conditions(
     )
 
 
-def _servo(rng: np.random.Generator) -> dict[str, float]:
+def _draw_servo_parameters(rng: np.random.Generator) -> dict[str, float]:
     """Draw the fitted parameters of a servo; its other constants are those of the simulator.
 
     Returns:
@@ -202,7 +202,7 @@ def _servo(rng: np.random.Generator) -> dict[str, float]:
     return {c.name: c.value for c in ServoSimulator.constants} | drawn
 
 
-def _arm(rng: np.random.Generator) -> dict[str, float]:
+def _draw_arm_parameters(rng: np.random.Generator) -> dict[str, float]:
     """Draw the parameters of an arm: masses, centres of mass, inertias, damping and rotor inertias.
 
     The names end with the number of the link, 1 for the upper arm and 2 for the forearm; ``length``
@@ -230,7 +230,7 @@ def _arm(rng: np.random.Generator) -> dict[str, float]:
     return {name: float(f"{value:.4g}") for name, value in numbers.items()}
 
 
-def _runs(
+def _draw_runs(
     plant: MachineDynamics, times: Array, count: int, rng: np.random.Generator
 ) -> MachineRuns:
     """Draw runs whose commands keep the joints within the angle limit.

@@ -18,7 +18,7 @@ def render_arm_mjcf(numbers: Mapping[str, float]) -> str:
         (body, joint, {k.removesuffix(end): v for k, v in numbers.items() if k.endswith(end)})
         for body, joint, end in (("upper_arm", "shoulder", "1"), ("forearm", "elbow", "2"))
     ]
-    inner, outer = (_link(*link) for link in links)
+    inner, outer = (_render_link(*link) for link in links)
     return f"""<mujoco model="arm2">
   <compiler angle="radian" autolimits="true"/>
   <option timestep="0.002" integrator="RK4" gravity="0 0 -9.81">
@@ -40,7 +40,7 @@ def render_arm_mjcf(numbers: Mapping[str, float]) -> str:
 """
 
 
-def _link(body: str, joint: str, n: Mapping[str, float]) -> str:
+def _render_link(body: str, joint: str, n: Mapping[str, float]) -> str:
     """Render the inertia and joint of a link; it is slender along its own axis.
 
     The moment of inertia about that axis is a tenth of the others. It does not matter, because the

@@ -116,21 +116,21 @@ class _MachineIntegrator:
             u: mean applied input over the step, (L, N).
         """
         if self.dry:
-            self._decide(t, u)
+            self._update_stuck_joints(t, u)
         q, v = self.q, self.v
-        a1 = self._acceleration(t, q, v, u)
+        a1 = self._compute_accelerations(t, q, v, u)
         v2 = v + 0.5 * h * a1
-        a2 = self._acceleration(t + 0.5 * h, q + 0.5 * h * v, v2, u)
+        a2 = self._compute_accelerations(t + 0.5 * h, q + 0.5 * h * v, v2, u)
         v3 = v + 0.5 * h * a2
-        a3 = self._acceleration(t + 0.5 * h, q + 0.5 * h * v2, v3, u)
+        a3 = self._compute_accelerations(t + 0.5 * h, q + 0.5 * h * v2, v3, u)
         v4 = v + h * a3
-        a4 = self._acceleration(t + h, q + h * v3, v4, u)
+        a4 = self._compute_accelerations(t + h, q + h * v3, v4, u)
         self.q = q + h / 6 * (v + 2 * v2 + 2 * v3 + v4)
         self.v = v + h / 6 * (a1 + 2 * a2 + 2 * a3 + a4)
         if self.dry:
-            self._turn(t, h, u, v)
+            self._recompute_stopped_joints(t, h, u, v)
 
-    def _acceleration(self, t: float, q: Array, v: Array, u: Array) -> Array:
+    def _compute_accelerations(self, t: float, q: Array, v: Array, u: Array) -> Array:
         """Compute the accelerations (L, N), with dry friction against the direction of motion.
 
         Args:
@@ -142,9 +142,9 @@ class _MachineIntegrator:
         force = self.plant.compute_force(t, q, v, u)
         if self.dry:
             force = force - self.way * self.plant.compute_friction_limit(q, v)
-        return self._solved(q, force)
+        return self._solve_accelerations(q, force)
 
-    def _solved(self, q: Array, force: Array) -> Array:
+    def _solve_accelerations(self, q: Array, force: Array) -> Array:
         """Solve M q'' = force for the accelerations (L, N); those of stuck joints are zero.
 
         Args:
@@ -163,7 +163,7 @@ class _MachineIntegrator:
         )
         return np.asarray(solved, dtype=np.float64)
 
-    def _decide(self, t: float, u: Array) -> None:
+    def _update_stuck_joints(self, t: float, u: Array) -> None:
         """Decide which joints at rest are stuck, and in which direction the others move.
 
         A joint breaks away if holding it needs more force than its friction limit.
@@ -179,7 +179,7 @@ class _MachineIntegrator:
             return
         limit = self.plant.compute_friction_limit(self.q, self.v)
         force = self.plant.compute_force(t, self.q, self.v, u) - self.way * limit
-        accelerations = self._solved(self.q, force)
+        accelerations = self._solve_accelerations(self.q, force)
         # Force needed to hold a joint still while the others move.
         need = force - np.einsum(
             "lij,lj->li", self.plant.compute_mass_matrix(self.q), accelerations
@@ -188,7 +188,7 @@ class _MachineIntegrator:
         self.way = np.where(loose, np.sign(need), self.way)
         self.held = resting & ~loose
 
-    def _turn(self, t: float, h: float, u: Array, before: Array) -> None:
+    def _recompute_stopped_joints(self, t: float, h: float, u: Array, before: Array) -> None:
         """Recompute the rest of the step for joints that came to rest within it.
 
         The time of rest is estimated by linear interpolation of the velocity. For the time that is
@@ -208,8 +208,8 @@ class _MachineIntegrator:
         q = self.q - np.where(turned, 0.5 * self.v * left, 0.0)
         v = np.where(turned, 0.0, self.v)
         self.q, self.v = q, v
-        self._decide(t + h, u)
-        onward = np.where(turned, self._acceleration(t + h, q, v, u), 0.0)
+        self._update_stuck_joints(t + h, u)
+        onward = np.where(turned, self._compute_accelerations(t + h, q, v, u), 0.0)
         self.q, self.v = q + 0.5 * onward * left**2, v + onward * left
 
 
@@ -240,7 +240,7 @@ def compute_applied_inputs(runs: MachineRuns, plant: MachineDynamics, times: Arr
                 levels = np.asarray(_apply_static_effects(name, c[0], levels), dtype=np.float64)
             late = own.get("input.delay", (0.0,))[0]
             lag = own.get("input.lag", (0.0,))[0]
-            felt[lane, :, joint] = _means(runs.times, levels, times, late, lag)
+            felt[lane, :, joint] = _average_input(runs.times, levels, times, late, lag)
     return felt
 
 
@@ -264,7 +264,7 @@ def _apply_static_effects(name: str, c: float, u: Array) -> Array:
     return u
 
 
-def _means(stamps: Array, levels: Array, times: Array, late: float, lag: float) -> Array:
+def _average_input(stamps: Array, levels: Array, times: Array, late: float, lag: float) -> Array:
     """Average an input over each step, with a zero-order hold, a delay and a lag.
 
     Averages are exact: they are differences of the integral of the input.

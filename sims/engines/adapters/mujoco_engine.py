@@ -162,12 +162,12 @@ def _suppress_warnings() -> Iterator[None]:
     """
     mujoco = import_mujoco()
     before = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(_ignore)
+    mujoco.set_mju_user_warning(_ignore_warning)
     try:
         yield
     finally:
         mujoco.set_mju_user_warning(before)
 
 
-def _ignore(message: str) -> None:
+def _ignore_warning(message: str) -> None:
     """Ignore a warning."""

@@ -118,11 +118,13 @@ class _BatchRunner:
             records=self.records,
         )
         if batch.system.uniform and not any(isinstance(e, (Force, Friction)) for e, _ in effects):
-            self._run(FLY_ELEMENTS, program, arrays)
+            self._run_kernel_function(FLY_ELEMENTS, program, arrays)
         else:
-            self._step(program, arrays)
+            self._integrate_steps(program, arrays)
 
-    def _step(self, program: ForceProgram | NumpyForceProgram, arrays: BatchArrays) -> None:
+    def _integrate_steps(
+        self, program: ForceProgram | NumpyForceProgram, arrays: BatchArrays
+    ) -> None:
         """Integrate elements in steps, after dividing the steps where an element moves fast.
 
         `parts` (n,) is the number of parts of each step. Elements without events whose
@@ -152,10 +154,12 @@ class _BatchRunner:
         has_events = program.arrays.flags[HAS_FRICTION:GUIDED_COUNT].any()
         if not has_events and len(self._steps) == 1 and self._patience >= 1.0:
             separate = int(np.count_nonzero(parts > 1))
-        self._run(STEP_BLOCK, program, _select(arrays, order[:separate]))
-        self._run(STEP_IN_LOCKSTEP, program, _select(arrays, order[separate:]))
+        self._run_kernel_function(STEP_BLOCK, program, _select_elements(arrays, order[:separate]))
+        self._run_kernel_function(
+            STEP_IN_LOCKSTEP, program, _select_elements(arrays, order[separate:])
+        )
 
-    def _run(
+    def _run_kernel_function(
         self, function: int, program: ForceProgram | NumpyForceProgram, arrays: BatchArrays
     ) -> None:
         """Run a function of the kernel, on several threads if there are enough elements."""
@@ -171,7 +175,7 @@ class _BatchRunner:
 
         # Every thread gets some elements with many steps and its own buffers. No two threads write
         # the same element, and the result of an element does not depend on any other.
-        parts = [_select(arrays, np.arange(k, count, threads)) for k in range(threads)]
+        parts = [_select_elements(arrays, np.arange(k, count, threads)) for k in range(threads)]
         if threads > 1:
             with ThreadPoolExecutor(threads) as pool:
                 list(pool.map(run, parts))
@@ -179,7 +183,7 @@ class _BatchRunner:
             run(arrays)
 
 
-def _select(arrays: BatchArrays, places: Indices) -> BatchArrays:
+def _select_elements(arrays: BatchArrays, places: Indices) -> BatchArrays:
     """Return the arrays with the elements at these places of their order."""
     if len(places) == len(arrays.order) and (places == np.arange(len(places))).all():
         return arrays

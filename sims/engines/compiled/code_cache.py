@@ -52,11 +52,11 @@ def make_cached(path: Path, make: Callable[[], bytes], report_wait: Callable[[],
         content = read_cached(path)
         if content is None:
             content = make()
-            _write(path, content)
+            _write_atomically(path, content)
     return content
 
 
-def _write(path: Path, content: bytes) -> None:
+def _write_atomically(path: Path, content: bytes) -> None:
     """Write a file atomically, with the hash of its content."""
     # The temporary name is fixed, so that the file of a killed process is overwritten by the next.
     partial = path.with_suffix(".part")

@@ -62,7 +62,7 @@ def get_force_program(
             try:
                 return tracer.build_program(effects)
             except NotTraceableError as reason:  # the program would be too long
-                _report("this set of effects", reason)
+                _print_once("this set of effects", reason)
     return NumpyForceProgram(batch.system, names, effects)
 
 
@@ -78,11 +78,11 @@ def _get_tracer(
         _tracers[key] = None
         try:
             tracer = SystemTracer(batch.system, names)
-            _check(tracer, batch, elements, names, None)
+            _check_program(tracer, batch, elements, names, None)
             _tracers[key] = tracer
         # A user's system may raise any error when called with traced arrays.
         except Exception as reason:
-            _report(f"system {batch.system.name}", reason)
+            _print_once(f"system {batch.system.name}", reason)
     return _tracers[key]
 
 
@@ -101,20 +101,20 @@ def _is_traceable(
     if key not in _effects:
         _effects[key] = False
         try:
-            _check(tracer, batch, elements, names, effect)
+            _check_program(tracer, batch, elements, names, effect)
             _effects[key] = True
         except Exception as reason:
-            _report(f"effect {effect.name}", reason)
+            _print_once(f"effect {effect.name}", reason)
     return _effects[key]
 
 
-def _report(subject: str, reason: Exception) -> None:
+def _print_once(subject: str, reason: Exception) -> None:
     """Write one line to the standard error output, once per process."""
     text = str(reason) or type(reason).__name__
     sys.stderr.write(f"simgap: {subject} cannot be compiled, and NumPy evaluates it: {text}\n")
 
 
-def _check(
+def _check_program(
     tracer: SystemTracer,
     batch: IntegrationBatch,
     elements: Indices,
@@ -147,14 +147,16 @@ def _check(
         for t, shift in ((0.0, 0.0), (0.37, 0.1))
     ]
     programs = tracer.build_program(effects), NumpyForceProgram(batch.system, names, effects)
-    values, expected_values = (_evaluate(program, parameters, states) for program in programs)
+    values, expected_values = (
+        _evaluate_program(program, parameters, states) for program in programs
+    )
     for value, expected in zip(values, expected_values, strict=True):
         size = _TOLERANCE * np.abs(expected).max()
         if not np.allclose(value, expected, rtol=_TOLERANCE, atol=size, equal_nan=True):
             raise NotTraceableError("its compiled form gives other numbers")
 
 
-def _evaluate(
+def _evaluate_program(
     program: ForceProgram | NumpyForceProgram, parameters: Array, states: Sequence[Array]
 ) -> list[Array]:
     """Evaluate a program at some states and two impact speeds, to compare it with NumPy.

@@ -186,7 +186,7 @@ class SystemTracer:
         self.parameters = collect_nodes(theta, *constants.values())
         self._moment = StateSnapshot(system, theta, constants, self.t, self.x, self.v, self.u)
         self._shape = 1, names.coordinates
-        self._force = self._broadcast(system.force(self._moment), self._shape)
+        self._force = self._broadcast_result(system.force(self._moment), self._shape)
         self._effects: dict[type[Effect], EffectProgram] = {}
         self._programs: dict[tuple[type[Effect], ...], ForceProgram] = {}
 
@@ -200,7 +200,7 @@ class SystemTracer:
         if key not in self._programs:
             if len(self._programs) == MAX_CACHED_PROGRAMS:
                 self._programs.clear()
-            self._programs[key] = _write_program(self._compose(effects))
+            self._programs[key] = _write_program(self._combine_traces(effects))
         return self._programs[key]
 
     def trace_effect(self, effect: Effect) -> EffectProgram:
@@ -218,13 +218,13 @@ class SystemTracer:
             c = make_input_vector(self.graph, count, LANE).T[:, :, None]
             force = limit = None
             if isinstance(effect, Force):
-                force = self._broadcast(effect.force(c, self._moment), self._shape)
+                force = self._broadcast_result(effect.force(c, self._moment), self._shape)
             elif isinstance(effect, Friction):
-                limit = self._broadcast(effect.limit(c, self._moment), (1, 1))
+                limit = self._broadcast_result(effect.limit(c, self._moment), (1, 1))
             self._effects[kind] = EffectProgram(c, force, limit)
         return self._effects[kind]
 
-    def _compose(self, effects: Sequence[Effect]) -> _ProgramNodes:
+    def _combine_traces(self, effects: Sequence[Effect]) -> _ProgramNodes:
         """Combine the traced system and effects into the inputs and outputs of one program.
 
         Forces and limits of dry friction are added up. Contact effects change the
@@ -243,8 +243,8 @@ class SystemTracer:
             if effect_limit is not None:
                 limit = effect_limit if limit is None else limit + effect_limit
             if isinstance(effect, Contact):
-                e = self._broadcast(effect.restitution(c, e, self.speed), (1, 1))
-                mu = self._broadcast(mu + effect.friction(c), (1, 1))
+                e = self._broadcast_result(effect.restitution(c, e, self.speed), (1, 1))
+                mu = self._broadcast_result(mu + effect.friction(c), (1, 1))
         return _ProgramNodes(
             inputs=[
                 *map(collect_nodes, (self.t, self.x, self.v)),
@@ -258,7 +258,7 @@ class SystemTracer:
             flags=make_flags(self._system, self._names, effects),
         )
 
-    def _broadcast(self, values: Any, shape: tuple[int, int]) -> TracedArray:
+    def _broadcast_result(self, values: Any, shape: tuple[int, int]) -> TracedArray:
         """Return the result of an array function, broadcast to its expected shape."""
         if not isinstance(values, TracedArray):
             values = TracedArray(self.graph, make_constant_nodes(self.graph, values))

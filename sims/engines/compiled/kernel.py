@@ -68,7 +68,7 @@ class CompiledKernel:
             divisions: (L,) numbers of parts, updated in place.
         """
         function = kernel_entry.CHOOSE_STEP_DIVISIONS
-        self._call(function, program, arrays, block, w, spans, max_phase, divisions)
+        self._call_function(function, program, arrays, block, w, spans, max_phase, divisions)
 
     def integrate(
         self,
@@ -87,7 +87,7 @@ class CompiledKernel:
             block: buffers of the slots.
             w: number of slots in use.
         """
-        self._call(function, program, arrays, block, w, arrays.mass, 1.0, arrays.mass)
+        self._call_function(function, program, arrays, block, w, arrays.mass, 1.0, arrays.mass)
 
     def make_instruction_runner(
         self, code: IntTable, first: int, last: int, r: FloatArray
@@ -118,13 +118,13 @@ class CompiledKernel:
         arguments = np.zeros(kernel_entry.ARGUMENT_COUNT, dtype=np.int64)
         arguments[:5] = kernel_entry.RUN_INSTRUCTIONS, first, last, 1, len(code)
         arguments[11:14] = len(r), r.shape[1], r.shape[1]
-        arguments[kernel_entry.SIZE_COUNT] = _address(code)
-        arguments[kernel_entry.SIZE_COUNT + kernel_entry.INT_ARRAY_COUNT] = _address(r)
-        run: Any = partial(self._function, ctypes.c_void_p(_address(arguments)))
+        arguments[kernel_entry.SIZE_COUNT] = _get_address(code)
+        arguments[kernel_entry.SIZE_COUNT + kernel_entry.INT_ARRAY_COUNT] = _get_address(r)
+        run: Any = partial(self._function, ctypes.c_void_p(_get_address(arguments)))
         run.owners = arguments, code, r  # keeps the memory at the addresses
         return run  # type: ignore[no-any-return]
 
-    def _call(
+    def _call_function(
         self, function: int, program: ProgramArrays, arrays: BatchArrays, block: BlockBuffers,
         w: int, spans: FloatArray, max_phase: float, divisions: FloatArray,
     ) -> None:  # fmt: skip
@@ -150,14 +150,16 @@ class CompiledKernel:
             *(arrays.inputs, arrays.max_steps, arrays.planned_counts, arrays.ground),
             *(arrays.records, spans, divisions, limits),
         ]
-        arguments = np.array([*sizes, *map(_address, ints), *map(_address, reals)], dtype=np.int64)
-        self._function(_address(arguments))
+        arguments = np.array(
+            [*sizes, *map(_get_address, ints), *map(_get_address, reals)], dtype=np.int64
+        )
+        self._function(_get_address(arguments))
 
 
 _NullArray = ctypes.c_char * 0
 
 
-def _address(array: Array) -> int:
+def _get_address(array: Array) -> int:
     """Return the address of an array; NumPy's own way takes four times as long."""
     if array.flags.writeable:
         return ctypes.addressof(_NullArray.from_buffer(array.data))
@@ -176,7 +178,7 @@ def get_kernel() -> CompiledKernel:
 
 @cache
 def _load_kernel() -> CompiledKernel:
-    return CompiledKernel(_load())
+    return CompiledKernel(_load_function())
 
 
 def load_callback(offsets: Mapping[str, int]) -> Callable[..., None]:
@@ -189,10 +191,10 @@ def load_callback(offsets: Mapping[str, int]) -> Callable[..., None]:
         InputError: the compiler or its machine code cannot be used.
     """
     with _lock:
-        return _load(offsets)
+        return _load_function(offsets)
 
 
-def _load(offsets: Mapping[str, int] | None = None) -> Callable[..., None]:
+def _load_function(offsets: Mapping[str, int] | None = None) -> Callable[..., None]:
     """Return the function of the kernel, or with offsets the callback, see `load_callback`."""
     try:
         code = llvm_code.MachineCode.unpack(_get_machine_code(offsets))
@@ -214,30 +216,32 @@ def _get_machine_code(offsets: Mapping[str, int] | None) -> bytes:
     """
     folder = code_cache.get_cache_folder()
     name = "stepping" if offsets is None else "callback"
-    path = folder / f"{name}-{_key(offsets)}.bin"
+    path = folder / f"{name}-{_compute_cache_key(offsets)}.bin"
     data = code_cache.read_cached(path)
     if data is not None:
         return data
     try:
-        return code_cache.make_cached(path, lambda: _build(offsets), _report_wait)
+        return code_cache.make_cached(path, lambda: _compile_machine_code(offsets), _report_wait)
     except OSError as error:
-        _report(
+        _print_line(
             f"machine code cannot be stored in {folder} ({error.strerror or error}), so each"
             " process compiles it; set SIMGAP_COMPILED to a folder that can be written"
         )
-        return _build(offsets)
+        return _compile_machine_code(offsets)
 
 
-def _build(offsets: Mapping[str, int] | None) -> bytes:
+def _compile_machine_code(offsets: Mapping[str, int] | None) -> bytes:
     """Compile the kernel's machine code with numba, and tell the user why this takes time.
 
     `offsets` are the positions of fields in MuJoCo's data, for the callback; None for the
     kernel of the batch engine.
     """
     if offsets is None:
-        _report(f"compiling the batch engine, once after an install: about {_COMPILE_SECONDS} s")
+        _print_line(
+            f"compiling the batch engine, once after an install: about {_COMPILE_SECONDS} s"
+        )
     else:
-        _report("compiling the forces of effects, once after an install: about 10 s")
+        _print_line("compiling the forces of effects, once after an install: about 10 s")
     from sims.engines.compiled.kernel_build import build_kernel
 
     return build_kernel(offsets)
@@ -245,19 +249,19 @@ def _build(offsets: Mapping[str, int] | None) -> bytes:
 
 def _report_wait() -> None:
     """Tell the user that another process is compiling, so that this one waits for its result."""
-    _report(
+    _print_line(
         "another process compiles the batch engine, once after an install:"
         f" {_COMPILE_SECONDS} s at most"
     )
 
 
-def _report(text: str) -> None:
+def _print_line(text: str) -> None:
     """Write one line to the standard error output."""
     sys.stderr.write(f"simgap: {text}\n")
     sys.stderr.flush()
 
 
-def _key(offsets: Mapping[str, int] | None = None) -> str:
+def _compute_cache_key(offsets: Mapping[str, int] | None = None) -> str:
     """Return a hash of everything on which the code depends: sources, compiler, processor."""
     digest = hashlib.sha256()
     for source in list_source_files():

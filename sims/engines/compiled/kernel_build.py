@@ -103,7 +103,7 @@ def emit_llvm() -> tuple[str, str]:
     numba: Any = typed
     space = _compile_functions(numba, KERNEL_MODULES)
     space.update(_names_of(kernel_entry, keep=space))
-    return _emit(numba, kernel_entry.kernel_entry, space, 1)
+    return _emit_llvm_code(numba, kernel_entry.kernel_entry, space, 1)
 
 
 def emit_callback(offsets: Mapping[str, int]) -> tuple[str, str]:
@@ -122,7 +122,7 @@ def emit_callback(offsets: Mapping[str, int]) -> tuple[str, str]:
     space["set_friction_limits"] = numba.njit(error_model="numpy")(
         FunctionType(limits.__code__, space, "set_friction_limits")
     )
-    return _emit(numba, mujoco_callback.add_effect_forces, space, 2)
+    return _emit_llvm_code(numba, mujoco_callback.add_effect_forces, space, 2)
 
 
 def _names_of(module: ModuleType, keep: Collection[str] = ()) -> dict[str, Any]:
@@ -170,7 +170,9 @@ def _compile_functions(numba: Any, modules: Sequence[ModuleType]) -> dict[str, A
     return space
 
 
-def _emit(numba: Any, function: Any, space: dict[str, Any], pointers: int) -> tuple[str, str]:
+def _emit_llvm_code(
+    numba: Any, function: Any, space: dict[str, Any], pointers: int
+) -> tuple[str, str]:
     """Return the LLVM intermediate code of a C function without result, and its name."""
     types = numba.types
     bound = FunctionType(function.__code__, space, "integrate")

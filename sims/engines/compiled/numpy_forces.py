@@ -77,7 +77,7 @@ class NumpyForces:
         self._out = out
         self._r = r
         self._snapshots: dict[int, tuple[StateSnapshot, list[Array]]] = {}
-        self.callback = _Callback(self._evaluate)
+        self.callback = _Callback(self._evaluate_part)
 
     @property
     def code(self) -> IntTable:
@@ -87,7 +87,7 @@ class NumpyForces:
             [[EXTERNAL, 0, 0, part, address] for part in range(PART_COUNT)], dtype=np.int64
         )
 
-    def _evaluate(self, part: int, width: int) -> None:
+    def _evaluate_part(self, part: int, width: int) -> None:
         """Evaluate one part of the program for the first `width` slots (called by machine code).
 
         Part 0 has nothing to evaluate, part 1 computes forces, and the last part computes
@@ -109,7 +109,7 @@ class NumpyForces:
 
     def _evaluate_forces(self, width: int) -> None:
         """Write total force and friction limit of the first `width` slots into the registers."""
-        moment, coefficients = self._view(width)
+        moment, coefficients = self._make_snapshot(width)
         force = self._system.force(moment)
         limit: Any = 0.0
         for effect, c in zip(self._effects, coefficients, strict=True):
@@ -122,8 +122,8 @@ class NumpyForces:
 
     def _evaluate_impact(self, width: int) -> None:
         """Write restitution and friction coefficient, with effects, into the registers."""
-        _, coefficients = self._view(width)
-        e, mu, speed = (self._read(row, 1, width) for row in (IN_E, IN_MU, IN_SPEED))
+        _, coefficients = self._make_snapshot(width)
+        e, mu, speed = (self._view_registers(row, 1, width) for row in (IN_E, IN_MU, IN_SPEED))
         for effect, c in zip(self._effects, coefficients, strict=True):
             if isinstance(effect, Contact):
                 e = effect.restitution(c, e, speed)
@@ -131,7 +131,7 @@ class NumpyForces:
         self._r[self._rows[OUT_E], :width] = e[:, 0]
         self._r[self._rows[OUT_MU], :width] = mu[:, 0]
 
-    def _view(self, width: int) -> tuple[StateSnapshot, list[Array]]:
+    def _make_snapshot(self, width: int) -> tuple[StateSnapshot, list[Array]]:
         """Return snapshot and coefficients (K, W, 1) of the first W = `width` slots.
 
         They are views of the registers, so that they show the present values in every
@@ -149,16 +149,16 @@ class NumpyForces:
             constants = dict(zip(names.constants, columns, strict=False))
             coefficients = [part[:, :, None] for part in parts[1 + len(names.constants) :]]
             t, x, v = (
-                self._read(row, count, width)
+                self._view_registers(row, count, width)
                 for row, count in ((IN_T, 1), (IN_X, names.coordinates), (IN_V, names.coordinates))
             )
-            u = self._read(IN_U, len(names.inputs), width)
+            u = self._view_registers(IN_U, len(names.inputs), width)
             inputs = {name: u[:, k, None] for k, name in enumerate(names.inputs)}
             moment = StateSnapshot(self._system, theta, constants, t, x, v, inputs)
             self._snapshots[width] = moment, coefficients
         return self._snapshots[width]
 
-    def _read(self, row: int, count: int, width: int) -> Array:
+    def _view_registers(self, row: int, count: int, width: int) -> Array:
         """Return a view (W, count) of input registers."""
         first = self._rows[row]
         values: Array = self._r[first : first + count, :width].T

@@ -90,7 +90,7 @@ class TracedArray(NDArrayOperatorsMixin):
             keepdims: whether to keep the axis with size one.
             **_: other options of NumPy, which are ignored.
         """
-        return self._reduce("add", axis, keepdims)
+        return self._reduce_axis("add", axis, keepdims)
 
     def max(self, axis: Any = None, keepdims: bool = False, **_: Any) -> TracedArray:
         """Return the maximum, as for a NumPy array.
@@ -100,7 +100,7 @@ class TracedArray(NDArrayOperatorsMixin):
             keepdims: whether to keep the axis with size one.
             **_: other options of NumPy, which are ignored.
         """
-        return self._reduce("maximum", axis, keepdims)
+        return self._reduce_axis("maximum", axis, keepdims)
 
     def min(self, axis: Any = None, keepdims: bool = False, **_: Any) -> TracedArray:
         """Return the minimum, as for a NumPy array.
@@ -110,7 +110,7 @@ class TracedArray(NDArrayOperatorsMixin):
             keepdims: whether to keep the axis with size one.
             **_: other options of NumPy, which are ignored.
         """
-        return self._reduce("minimum", axis, keepdims)
+        return self._reduce_axis("minimum", axis, keepdims)
 
     def clip(self, low: Any, high: Any) -> TracedArray:
         """Return the values limited to an interval, as for a NumPy array.
@@ -119,7 +119,7 @@ class TracedArray(NDArrayOperatorsMixin):
             low: lower limit; None for none.
             high: upper limit; None for none.
         """
-        return _clip(self, low, high)
+        return _trace_clip(self, low, high)
 
     def __len__(self) -> int:
         return len(self.nodes)
@@ -156,7 +156,7 @@ class TracedArray(NDArrayOperatorsMixin):
         """
         if method == "reduce" and ufunc.__name__ in {"add", "maximum", "minimum"}:
             axis = kwargs.get("axis", 0)
-            result = args[0]._reduce(ufunc.__name__, axis, bool(kwargs.get("keepdims")))
+            result = args[0]._reduce_axis(ufunc.__name__, axis, bool(kwargs.get("keepdims")))
             assert isinstance(result, TracedArray)
             return result
         out = kwargs.pop("out", None)
@@ -186,13 +186,13 @@ class TracedArray(NDArrayOperatorsMixin):
     def _make_like(self, nodes: Any) -> TracedArray:
         return TracedArray(self.graph, nodes, self.mask)
 
-    def _reduce(self, operation: str, axis: Any, keepdims: bool) -> TracedArray:
+    def _reduce_axis(self, operation: str, axis: Any, keepdims: bool) -> TracedArray:
         """Apply an operation with two operands to the elements along an axis, from first to last.
 
         An axis of None means all elements.
         """
         if axis is None:
-            whole = self.reshape(-1)._reduce(operation, 0, False)
+            whole = self.reshape(-1)._reduce_axis(operation, 0, False)
             return whole.reshape((1,) * self.ndim) if keepdims else whole
         parts = list(np.moveaxis(self.nodes, axis, 0))
         total = TracedArray(self.graph, to_node_array(parts[0]))
@@ -284,7 +284,7 @@ def _graph_of(*args: Any) -> ExpressionGraph:
     return next(arg.graph for arg in args if isinstance(arg, TracedArray))
 
 
-def _where(condition: Any, *values: Any) -> TracedArray:
+def _trace_where(condition: Any, *values: Any) -> TracedArray:
     """Trace numpy.where(condition, x, y), a choice between two numbers for each element."""
     if len(values) != 2:
         raise NotTraceableError("numpy.where with a condition alone is not traced")
@@ -292,7 +292,7 @@ def _where(condition: Any, *values: Any) -> TracedArray:
     return _apply_elementwise(graph, "where", (condition, *values))
 
 
-def _clip(x: Any, low: Any, high: Any) -> TracedArray:
+def _trace_clip(x: Any, low: Any, high: Any) -> TracedArray:
     """Trace numpy.clip as a maximum and a minimum; a limit may be None."""
     graph = _graph_of(x, low, high)
     result = x
@@ -312,11 +312,16 @@ def _fill_like(x: TracedArray, value: float) -> TracedArray:
     return TracedArray(x.graph, nodes)
 
 
-def _sum(x: TracedArray, axis: Any = None, keepdims: bool = False, **_: Any) -> TracedArray:
+def _trace_sum(x: TracedArray, axis: Any = None, keepdims: bool = False, **_: Any) -> TracedArray:
     return x.sum(axis, keepdims)
 
 
-def _norm(x: TracedArray, ord: Any = None, axis: Any = None, keepdims: bool = False) -> TracedArray:  # noqa: A002
+def _trace_norm(
+    x: TracedArray,
+    ord: Any = None,  # noqa: A002
+    axis: Any = None,
+    keepdims: bool = False,
+) -> TracedArray:
     """Trace numpy.linalg.norm as the root of the sum of squares (Euclidean or Frobenius norm)."""
     if ord is not None:
         raise NotTraceableError("numpy.linalg.norm with the argument ord is not traced")
@@ -325,10 +330,10 @@ def _norm(x: TracedArray, ord: Any = None, axis: Any = None, keepdims: bool = Fa
 
 
 _FUNCTIONS: dict[str, Callable[..., TracedArray]] = {
-    "where": _where,
-    "clip": _clip,
-    "sum": _sum,
-    "norm": _norm,
+    "where": _trace_where,
+    "clip": _trace_clip,
+    "sum": _trace_sum,
+    "norm": _trace_norm,
     "max": lambda x, axis=None, keepdims=False, **_: x.max(axis, keepdims),
     "min": lambda x, axis=None, keepdims=False, **_: x.min(axis, keepdims),
     "amax": lambda x, axis=None, keepdims=False, **_: x.max(axis, keepdims),

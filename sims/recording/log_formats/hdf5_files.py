@@ -47,13 +47,13 @@ def runs_in(path: Path) -> list[Path]:
     Raises:
         InputError: The file cannot be read, or h5py is not installed.
     """
-    with _opened(path) as file:
+    with _open_file(path) as file:
         for name in ("", "data"):
             group = file.get(name or "/")
-            groups = [key for key, own in _items(group) if hasattr(own, "items")]
+            groups = [key for key, own in _list_members(group) if hasattr(own, "items")]
             runs = [key for key in groups if _RUN.fullmatch(key)]
             if runs and len(runs) == len(groups):
-                return [path / name / run for run in sorted(runs, key=_natural)]
+                return [path / name / run for run in sorted(runs, key=_make_natural_sort_key)]
     return [path]
 
 
@@ -73,12 +73,11 @@ def read_group(path: Path, group: str) -> tuple[dict[str, Array], dict[str, list
     """
     columns: dict[str, Array] = {}
     texts: dict[str, list[str]] = {}
-    with _opened(path) as file:
+    with _open_file(path) as file:
         own = file.get(group)
         if own is None or not hasattr(own, "items"):
-            raise InputError(
-                f"{path}: unknown group '{group}'; there are: {', '.join(_groups(file)) or 'none'}"
-            )
+            known = ", ".join(_list_group_names(file)) or "none"
+            raise InputError(f"{path}: unknown group '{group}'; there are: {known}")
         datasets: dict[str, Any] = {}
         own.visititems(lambda name, one: datasets.update({name: one}))
         for name, one in datasets.items():
@@ -87,7 +86,7 @@ def read_group(path: Path, group: str) -> tuple[dict[str, Array], dict[str, list
                 continue
             wide = one.ndim > 1 and one.shape[1] > MAX_COLUMNS
             if one.dtype.kind not in "fiub" or one.ndim not in (1, 2) or wide:
-                texts[name] = _texts(one)
+                texts[name] = _read_texts(one)
             elif one.size > LARGEST_DATASET:
                 raise InputError(f"{path}: {name} has {one.size} entries; at most 250 million")
             else:
@@ -96,7 +95,7 @@ def read_group(path: Path, group: str) -> tuple[dict[str, Array], dict[str, list
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[Any]:
+def _open_file(path: Path) -> Iterator[Any]:
     """Open an HDF5 file, and convert the errors of its reader to one line."""
     try:
         import h5py
@@ -108,21 +107,21 @@ def _opened(path: Path) -> Iterator[Any]:
         yield file
 
 
-def _items(group: Any) -> list[tuple[str, Any]]:
+def _list_members(group: Any) -> list[tuple[str, Any]]:
     """Return the members of a group; empty if it is not a group."""
     members = group.items() if hasattr(group, "items") else []
     # h5py returns a name that is not UTF-8 as bytes.
     return [(name, member) for name, member in members if isinstance(name, str)]
 
 
-def _groups(file: Any) -> list[str]:
+def _list_group_names(file: Any) -> list[str]:
     """List the names of the first groups of a file."""
     found: list[str] = []
     file.visititems(lambda name, one: found.append(name) if hasattr(one, "items") else None)
     return found[:12]
 
 
-def _texts(dataset: Any) -> list[str]:
+def _read_texts(dataset: Any) -> list[str]:
     """Return the texts of a dataset that is a list of texts; empty for another dataset."""
     if dataset.ndim != 1 or dataset.dtype.kind not in "OSU" or dataset.size > MAX_COLUMNS:
         return []
@@ -132,7 +131,7 @@ def _texts(dataset: Any) -> list[str]:
     ]
 
 
-def _natural(name: str) -> tuple[str, int]:
+def _make_natural_sort_key(name: str) -> tuple[str, int]:
     """Return a sort key by the number at the end of a name: ``demo_2`` before ``demo_10``."""
     digits = re.search(r"\d+$", name)
     return (name[: digits.start()], int(digits[0])) if digits else (name, 0)

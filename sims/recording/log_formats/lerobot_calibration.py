@@ -58,7 +58,7 @@ def read_calibration(path: Path) -> dict[str, MotorRange]:
         document = json.loads(path.read_text(encoding="utf-8-sig"))
     except (OSError, ValueError, RecursionError):
         raise InputError(f"{path}: expected JSON, a calibration file of LeRobot") from None
-    motors = _motors(document)
+    motors = _get_motor_tables(document)
     if motors is None:
         raise InputError(
             f"{path}: expected a calibration file of LeRobot, a table for each motor with "
@@ -88,7 +88,7 @@ def find_calibration(folders: Iterable[Path]) -> Path | None:
                 document = json.loads(path.read_text(encoding="utf-8-sig")) if small else None
             except (OSError, ValueError, RecursionError):
                 continue
-            if _motors(document) is not None:
+            if _get_motor_tables(document) is not None:
                 found.append(path)
     return found[0] if len(found) == 1 else None
 
@@ -136,7 +136,7 @@ def range_scale(lowest: float, highest: float, from_zero: bool) -> AngleScale:
     return AngleScale(width / 200.0, (highest + lowest) / 2.0)
 
 
-def _motors(document: Any) -> Mapping[str, Mapping[str, Any]] | None:
+def _get_motor_tables(document: Any) -> Mapping[str, Mapping[str, Any]] | None:
     """Return the tables of the motors; None if the document is not a calibration."""
     if not isinstance(document, dict) or not document:
         return None

@@ -50,7 +50,10 @@ def list_episodes(dataset: Path) -> list[Path]:
     Raises:
         InputError: A file cannot be read, or has no episode numbers.
     """
-    return [dataset / f"episode_{number:06d}" / FRAMES_LOG for number in sorted(_files(dataset))]
+    return [
+        dataset / f"episode_{number:06d}" / FRAMES_LOG
+        for number in sorted(_find_episode_files(dataset))
+    ]
 
 
 def list_episode_files(dataset: Path, episode: int) -> list[Path]:
@@ -63,7 +66,7 @@ def list_episode_files(dataset: Path, episode: int) -> list[Path]:
     Raises:
         InputError: There is no such episode, or a file cannot be read.
     """
-    there = _files(dataset)
+    there = _find_episode_files(dataset)
     if episode not in there:
         span = f"{min(there)} to {max(there)}" if there else "none"
         raise InputError(f"{dataset}: no episode {episode}; there are: {span}")
@@ -102,7 +105,7 @@ def read_episode(dataset: Path, episode: int) -> tuple[dict[str, Array], list[st
     found, texts = read_numeric_columns(table)
     columns: dict[str, Array] = {}
     for name, values in found.items():
-        own = _names(about, name)
+        own = _list_feature_names(about, name)
         if values.ndim == 2 and len(own) == values.shape[1] == len(set(own)):
             columns |= {f"{name}.{one}": values[:, k] for k, one in enumerate(own)}
         else:
@@ -110,7 +113,7 @@ def read_episode(dataset: Path, episode: int) -> tuple[dict[str, Array], list[st
     return columns, texts
 
 
-def _names(about: Path, feature: str) -> list[str]:
+def _list_feature_names(about: Path, feature: str) -> list[str]:
     """Return the names of the entries of a feature; empty where the dataset states none."""
     try:
         said = json.loads(about.read_text(encoding="utf-8"))["features"][feature]["names"]
@@ -122,15 +125,15 @@ def _names(about: Path, feature: str) -> list[str]:
     return said if isinstance(said, list) and all(isinstance(one, str) for one in said) else []
 
 
-def _files(dataset: Path) -> dict[int, list[Path]]:
+def _find_episode_files(dataset: Path) -> dict[int, list[Path]]:
     """Return the files that hold each episode."""
     files = sorted((dataset / "data").rglob("*.parquet"))
     stamps = tuple((file, file.stat().st_mtime_ns, file.stat().st_size) for file in files)
-    return _episodes(stamps)
+    return _find_cached_episode_files(stamps)
 
 
 @lru_cache(maxsize=8)
-def _episodes(stamps: tuple[tuple[Path, int, int], ...]) -> dict[int, list[Path]]:
+def _find_cached_episode_files(stamps: tuple[tuple[Path, int, int], ...]) -> dict[int, list[Path]]:
     """Return the files that hold each episode; cached for unchanged files.
 
     Args:

@@ -90,15 +90,15 @@ class LogFile:
             last = values.shape[1] - 1
             entries = f"its entries are {name}[0] to {name}[{last}]"
             raise InputError(f"{self.path}: column '{name}' holds lists; {entries}")
-        base, place = self._entry(name)
+        base, place = self._find_column(name)
         values = self.columns[base]
         if place is None and values.ndim == 1:
             return values
         if place is None or values.ndim == 1 or place >= values.shape[1]:
-            raise self._none(name)
+            raise self._make_missing_column_error(name)
         return make_read_only(values[:, place])
 
-    def _entry(self, name: str) -> tuple[str, int | None]:
+    def _find_column(self, name: str) -> tuple[str, int | None]:
         """Find a column regardless of case, and the index into its lists if the name has one."""
         match = _ENTRY.fullmatch(name)
         for base, place in (
@@ -109,9 +109,9 @@ class LogFile:
                 return base, place
             if len(found) == 1:
                 return found[0], place
-        raise self._none(name)
+        raise self._make_missing_column_error(name)
 
-    def _none(self, name: str) -> InputError:
+    def _make_missing_column_error(self, name: str) -> InputError:
         """Return the error for a column that does not exist, or that holds text."""
         if name in self.texts:
             return InputError(f"{self.path}: column '{name}': expected numbers, found text")
@@ -171,7 +171,7 @@ def read_log(path: str | Path, wanted: frozenset[str] = frozenset()) -> LogFile:
     about = path.stat()
     if about.st_size > MAX_FILE_BYTES:
         raise InputError(f"{path}: has {about.st_size / 1e9:.1f} GB; at most 2 are read")
-    return _read(FileVersion(path, about.st_mtime_ns, about.st_size))
+    return _read_cached(FileVersion(path, about.st_mtime_ns, about.st_size))
 
 
 @lru_cache(maxsize=8)
@@ -203,7 +203,7 @@ def _read_group(stamp: FileVersion) -> LogFile:
 
 
 @lru_cache(maxsize=8)
-def _read(stamp: FileVersion) -> LogFile:
+def _read_cached(stamp: FileVersion) -> LogFile:
     """Read a log file; cached by file version, because logs are requested column by column."""
     path = stamp.path
     try:
@@ -219,7 +219,7 @@ def _read(stamp: FileVersion) -> LogFile:
 # -- tables of text
 
 
-def _table(path: Path) -> LogFile:
+def _read_text_table(path: Path) -> LogFile:
     """Read a text table of any layout."""
     table = read_text_table(path)
     return LogFile(
@@ -237,7 +237,7 @@ def _table(path: Path) -> LogFile:
 # -- arrays
 
 
-def _archive(path: Path) -> LogFile:
+def _read_npz(path: Path) -> LogFile:
     """Read the arrays of a NumPy archive (.npz), one row per sample.
 
     Arrays of texts may name the entries of the others, for example the joints.
@@ -273,7 +273,7 @@ def _of_arrays(path: Path, columns: dict[str, Array], texts: dict[str, list[str]
     return LogFile(path, {**columns, **named}, tuple(texts), "entry", unlisted=unlisted, first=0)
 
 
-def _tensors(path: Path) -> LogFile:
+def _read_torch_file(path: Path) -> LogFile:
     """Read the tensors of a PyTorch file, one row per sample."""
     # Imported here, because few logs are PyTorch files.
     from sims.recording.log_formats.torch_tensors import read_tensors
@@ -281,7 +281,7 @@ def _tensors(path: Path) -> LogFile:
     return _of_arrays(path, *read_tensors(path))
 
 
-def _parquet(path: Path) -> LogFile:
+def _read_parquet(path: Path) -> LogFile:
     """Read the columns of a Parquet file, including lists."""
     import pyarrow
     import pyarrow.parquet as parquet
@@ -295,14 +295,14 @@ def _parquet(path: Path) -> LogFile:
 
 
 _READERS: Mapping[str, Callable[[Path], LogFile]] = {
-    ".csv": _table,
-    ".tsv": _table,
-    ".txt": _table,
-    ".dat": _table,
-    ".npz": _archive,
-    ".parquet": _parquet,
-    ".pt": _tensors,
-    ".pth": _tensors,
+    ".csv": _read_text_table,
+    ".tsv": _read_text_table,
+    ".txt": _read_text_table,
+    ".dat": _read_text_table,
+    ".npz": _read_npz,
+    ".parquet": _read_parquet,
+    ".pt": _read_torch_file,
+    ".pth": _read_torch_file,
 }
 
 

@@ -34,7 +34,7 @@ def list_topics(path: Path) -> list[str]:
     if path.suffix.lower() != ".mcap" or not path.is_file() or find_spec("mcap") is None:
         return []
     try:
-        return sorted({topic.lstrip("/") for topic in _topics(path)})
+        return sorted({topic.lstrip("/") for topic in _list_topics(path)})
     except InputError:  # Reported by the reader of ROS bags.
         return []
 
@@ -49,16 +49,16 @@ def read_messages(path: Path, topic: str) -> Iterator[tuple[Any, int]]:
     Raises:
         InputError: A message cannot be decoded.
     """
-    names = [name for name in _topics(path) if name.lstrip("/") == topic]
+    names = [name for name in _list_topics(path) if name.lstrip("/") == topic]
     decoders: dict[int, Callable[[bytes], Any]] = {}
-    with _opened(path) as reader:
+    with _open_file(path) as reader:
         for schema, channel, message in reader.iter_messages(topics=names):
             if channel.id not in decoders:
-                decoders[channel.id] = _decoder(path, channel.message_encoding, schema)
+                decoders[channel.id] = _make_decoder(path, channel.message_encoding, schema)
             yield decoders[channel.id](message.data), message.log_time
 
 
-def _decoder(path: Path, encoding: str, schema: Any) -> Callable[[bytes], Any]:
+def _make_decoder(path: Path, encoding: str, schema: Any) -> Callable[[bytes], Any]:
     """Return the function that decodes the messages of a channel, JSON or Protobuf.
 
     Raises:
@@ -79,9 +79,9 @@ def _decoder(path: Path, encoding: str, schema: Any) -> Callable[[bytes], Any]:
     return decode
 
 
-def _topics(path: Path) -> set[str]:
+def _list_topics(path: Path) -> set[str]:
     """Return the topics with messages in JSON or Protobuf."""
-    with _opened(path) as reader:
+    with _open_file(path) as reader:
         summary = reader.get_summary()
         if summary is not None and summary.channels:
             channels = list(summary.channels.values())
@@ -91,7 +91,7 @@ def _topics(path: Path) -> set[str]:
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[Any]:
+def _open_file(path: Path) -> Iterator[Any]:
     """Open an MCAP file, and convert the errors of its reader to one line."""
     from mcap.reader import make_reader
 

@@ -59,9 +59,9 @@ class MessageTable:
             written: Time of writing in nanoseconds.
         """
         row = len(self._stamps)
-        self._stamps.append(_stamp(message))
+        self._stamps.append(_get_stamp(message))
         self._written.append(_NANO * written)
-        for name, value in _numbers("", message, 0):
+        for name, value in _iterate_numbers("", message, 0):
             if self._wanted and name.lower() not in self._wanted:
                 continue
             column = self._numbers.setdefault(name, array("d"))
@@ -91,7 +91,7 @@ class MessageTable:
         return result
 
 
-def _fields(value: Any) -> dict[str, Any] | None:
+def _get_fields(value: Any) -> dict[str, Any] | None:
     """Return the fields of a message by name; None if the value is not a message."""
     if is_dataclass(value):
         names = [field.name for field in fields(value) if field.name != "__msgtype__"]
@@ -110,12 +110,12 @@ def _fields(value: Any) -> dict[str, Any] | None:
     return None
 
 
-def _stamp(message: Any) -> float:
+def _get_stamp(message: Any) -> float:
     """Return the time stamp of a message in seconds; 0 if it has none."""
-    own = _fields(message) or {}
-    for holder in (_fields(own.get("header")) or {}, own):
+    own = _get_fields(message) or {}
+    for holder in (_get_fields(own.get("header")) or {}, own):
         for name in STAMP_FIELDS:
-            parts = _fields(holder.get(name)) or {}
+            parts = _get_fields(holder.get(name)) or {}
             seconds = [parts[key] for key in SECONDS_FIELDS if key in parts]
             nanoseconds = [parts[key] for key in NANOSECONDS_FIELDS if key in parts]
             if seconds and all(
@@ -136,7 +136,7 @@ def _to_float(number: Any) -> float:
         return np.inf
 
 
-def _numbers(path: str, value: Any, depth: int) -> Iterator[tuple[str, float]]:
+def _iterate_numbers(path: str, value: Any, depth: int) -> Iterator[tuple[str, float]]:
     """Iterate over the numbers of a message with their names.
 
     `path` is the name of the value so far, and `depth` the number of messages around it. Texts
@@ -145,7 +145,7 @@ def _numbers(path: str, value: Any, depth: int) -> Iterator[tuple[str, float]]:
     if isinstance(value, bool | int | float | np.number | np.bool_):
         yield path, _to_float(value)
         return
-    message = _fields(value)
+    message = _get_fields(value)
     if message is not None:
         if depth < MAX_MESSAGE_DEPTH:
             yield from _message_numbers(path, message, depth)
@@ -154,9 +154,9 @@ def _numbers(path: str, value: Any, depth: int) -> Iterator[tuple[str, float]]:
         return
     if 0 < len(value) <= MAX_LIST_LENGTH:
         for place, entry in enumerate(value):
-            name = (_fields(entry) or {}).get("name")
+            name = (_get_fields(entry) or {}).get("name")
             inner = f"{path}.{name}" if name and isinstance(name, str) else f"{path}[{place}]"
-            yield from _numbers(inner, entry, depth + 1)
+            yield from _iterate_numbers(inner, entry, depth + 1)
 
 
 def _message_numbers(
@@ -170,14 +170,14 @@ def _message_numbers(
     names = message.get("name") or message.get("names") or message.get("joint_names") or ()
     for field, value in message.items():
         # The stamp is the column of times.
-        if field == "header" or (field in STAMP_FIELDS and _fields(value) is not None):
+        if field == "header" or (field in STAMP_FIELDS and _get_fields(value) is not None):
             continue
         inner = f"{path}.{field}" if path else field
         if _is_named(value, names):
             for name, number in zip(names, value, strict=True):
                 yield f"{inner}.{name}", _to_float(number)
         else:
-            yield from _numbers(inner, value, depth + 1)
+            yield from _iterate_numbers(inner, value, depth + 1)
 
 
 def _is_named(values: Any, names: Any) -> bool:

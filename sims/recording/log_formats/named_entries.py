@@ -48,7 +48,7 @@ def entries_by_name(
     unlisted: set[str] = set()
     for style, places in groups.items():
         names = [list(texts[places[place]]) for place in sorted(places)]
-        for siblings, own in _numbered(columns, *style).items():
+        for siblings, own in _group_numbered_columns(columns, *style).items():
             if set(own) != set(places):
                 continue
             values = np.column_stack([columns[own[place]] for place in sorted(own)])
@@ -114,7 +114,7 @@ def arrays_by_name(
     return named, frozenset(unlisted)
 
 
-def _numbered(
+def _group_numbered_columns(
     columns: Mapping[str, Array], prefix: str, left: str, right: str
 ) -> dict[str, dict[int, str]]:
     """Group numbered columns by the text before their number.

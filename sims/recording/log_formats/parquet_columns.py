@@ -22,7 +22,7 @@ def read_numeric_columns(table: Any) -> tuple[dict[str, Array], list[str]]:
     columns: dict[str, Array] = {}
     texts = []
     for name in table.column_names:
-        values = _numbers(table.column(name))
+        values = _convert_to_numbers(table.column(name))
         if values is None:
             texts.append(name)
         else:
@@ -55,7 +55,7 @@ def _is_list(kind: Any) -> bool:
     return bool(types.is_list(kind) or types.is_large_list(kind) or types.is_fixed_size_list(kind))
 
 
-def _numbers(column: Any) -> Array | None:
+def _convert_to_numbers(column: Any) -> Array | None:
     """Return the numbers (T,) or (T, k) of a column; None if it holds none."""
     import pyarrow
 

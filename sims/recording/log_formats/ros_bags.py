@@ -49,7 +49,7 @@ def list_topics(bag: Path) -> list[str]:
     topics = mcap_messages.list_topics(bag)
     if topics:
         return topics
-    with _opened(bag) as reader:
+    with _open_bag(bag) as reader:
         return sorted({connection.topic.lstrip("/") for connection in reader.connections})
 
 
@@ -76,7 +76,7 @@ def read_topic(bag: Path, topic: str, wanted: Collection[str] = ()) -> dict[str,
         for message, stamp in mcap_messages.read_messages(bag, topic.lstrip("/")):
             table.add(message, stamp)
         return table.columns()
-    with _opened(bag) as reader:
+    with _open_bag(bag) as reader:
         connections = [c for c in reader.connections if c.topic == topic]
         if not connections:
             topics = sorted({c.topic.lstrip("/") for c in reader.connections})
@@ -93,7 +93,7 @@ def _unknown_topic(bag: Path, topic: str, topics: list[str]) -> InputError:
 
 
 @contextmanager
-def _opened(bag: Path) -> Iterator[Any]:
+def _open_bag(bag: Path) -> Iterator[Any]:
     """Open a bag for reading with rosbags, and convert the errors of its reader to one line.
 
     Raises:

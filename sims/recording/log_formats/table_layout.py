@@ -73,7 +73,7 @@ def find_layout(path: Path) -> Layout:
     with path.open("rb") as file:
         head = file.read(_HEAD_BYTES)
         whole = not file.read(1)
-    encoding = _encoding(path, head)
+    encoding = _detect_encoding(path, head)
     lines = head.decode(encoding, errors="replace").splitlines()
     if not whole and len(lines) > 1:
         lines.pop()  # the last line is incomplete
@@ -81,18 +81,20 @@ def find_layout(path: Path) -> Layout:
     if not any(line.strip() for line in lines):
         raise InputError(f"{path}: expected a table with a header and rows, found an empty file")
     body = [line for line in lines if line.strip() and not COMMENT.match(line)]
-    separator = _separator(body)
-    rows = {n: _split(line, separator) for n, line in enumerate(lines, start=1) if line.strip()}
-    width = _width([row for n, row in rows.items() if not COMMENT.match(lines[n - 1])])
+    separator = _detect_separator(body)
+    rows = {
+        n: _split_line(line, separator) for n, line in enumerate(lines, start=1) if line.strip()
+    }
+    width = _find_row_width([row for n, row in rows.items() if not COMMENT.match(lines[n - 1])])
     columns = _numeric_columns(rows.values(), width)
     first = next((n for n, row in rows.items() if _is_data(row, width, columns)), 0)
     above = [n for n in rows if n < first] if first else list(rows)
     units_row: dict[int, str] = {}
-    if above and first and (found := _units(_filled(rows[above[-1]], width), columns)):
+    if above and first and (found := _parse_units(_normalise_row(rows[above[-1]], width), columns)):
         units_row = found
         above.pop()
     for n in reversed(above):
-        names = _header(lines[n - 1], separator, width, columns)
+        names = _parse_header(lines[n - 1], separator, width, columns)
         if names is not None:
             units = {names[place]: unit for place, unit in units_row.items()}
             return Layout(encoding, separator, names, units, n, first or n + 1, width)
@@ -100,7 +102,7 @@ def find_layout(path: Path) -> Layout:
         what = format_value(lines[0].strip())
         raise InputError(f"{path}: expected a header and rows of numbers, found {what}")
     above = [n for n in above if not COMMENT.match(lines[n - 1])]
-    if not above and (own := _counted(rows, first)):
+    if not above and (own := _make_column_numbers(rows, first)):
         return Layout(encoding, separator, own, {}, first, first + 1, width)
     if above and len(rows[above[-1]]) > 1 and width > 1:
         n = above[-1]
@@ -111,7 +113,7 @@ def find_layout(path: Path) -> Layout:
     return Layout(encoding, separator, (), {}, 0, first, width)
 
 
-def _encoding(path: Path, head: bytes) -> str:
+def _detect_encoding(path: Path, head: bytes) -> str:
     """Return the encoding of a text: UTF-8, UTF-16 with a byte order mark, or Windows-1252."""
     if head[:2] in (b"\xff\xfe", b"\xfe\xff"):
         return "utf-16"
@@ -125,7 +127,7 @@ def _encoding(path: Path, head: bytes) -> str:
     return "utf-8-sig"
 
 
-def _split(line: str, separator: str) -> list[str]:
+def _split_line(line: str, separator: str) -> list[str]:
     """Split a line into its cells."""
     if separator == " ":
         return line.split()
@@ -135,12 +137,12 @@ def _split(line: str, separator: str) -> list[str]:
         return [line]
 
 
-def _separator(lines: Sequence[str]) -> str:
+def _detect_separator(lines: Sequence[str]) -> str:
     """Return the separator with which the largest share of the cells are numbers."""
     best, best_score = ",", (-1.0, 0.0)
     for separator in SEPARATORS:
-        rows = [_split(line, separator) for line in lines]
-        width = _width(rows)
+        rows = [_split_line(line, separator) for line in lines]
+        width = _find_row_width(rows)
         if width < 2:
             continue
         even = [row for row in rows if len(row) == width]
@@ -151,13 +153,13 @@ def _separator(lines: Sequence[str]) -> str:
     return best
 
 
-def _width(rows: Sequence[Sequence[str]]) -> int:
+def _find_row_width(rows: Sequence[Sequence[str]]) -> int:
     """Return the most frequent number of cells per row, including empty ones at the end."""
     counts = Counter(len(row) for row in rows)
     return max(counts, key=lambda count: (counts[count], count), default=0)
 
 
-def _filled(row: Sequence[str], width: int) -> list[str]:
+def _normalise_row(row: Sequence[str], width: int) -> list[str]:
     """Strip the cells of a row, and shorten or extend it to `width` cells."""
     return [cell.strip() for cell in [*row, *[""] * width][:width]]
 
@@ -185,7 +187,7 @@ def _is_data(row: Sequence[str], width: int, columns: Sequence[int]) -> bool:
     return any(numbers) and (not any(texts) or numbers[0])
 
 
-def _header(
+def _parse_header(
     line: str, separator: str, width: int, columns: Sequence[int]
 ) -> tuple[str, ...] | None:
     """Return the column names in a line; None if the line is not a header.
@@ -200,14 +202,14 @@ def _header(
     # `%time,field.data` of rostopic begins with a name, `% t q1` of Matlab with a comment.
     marked = comment is not None and not re.match(r"%\w", line.strip())
     text = line[comment.end() :] if comment is not None and marked else line
-    names = _split(text, separator)
+    names = _split_line(text, separator)
     while len(names) > width and not names[-1].strip():
         names.pop()
     if len(names) != width and marked:
         # NumPy writes the header as given by the user, who may use a separator other than that of
         # the rows.
         for other in SEPARATORS:
-            parts = [part.strip() for part in _split(text, other)]
+            parts = [part.strip() for part in _split_line(text, other)]
             if len(parts) == width and all(map(_NAME.fullmatch, parts)):
                 names = parts
     if len(names) != width:
@@ -223,7 +225,7 @@ def _header(
     return tuple(stripped)
 
 
-def _units(row: Sequence[str], columns: Sequence[int]) -> dict[int, str]:
+def _parse_units(row: Sequence[str], columns: Sequence[int]) -> dict[int, str]:
     """Return the units by position if a row contains units only; otherwise nothing."""
     found = {}
     for place in columns:
@@ -237,7 +239,7 @@ def _units(row: Sequence[str], columns: Sequence[int]) -> dict[int, str]:
     return found
 
 
-def _counted(rows: Mapping[int, Sequence[str]], first: int) -> tuple[str, ...]:
+def _make_column_numbers(rows: Mapping[int, Sequence[str]], first: int) -> tuple[str, ...]:
     """Return the column numbers that pandas writes for unnamed columns; otherwise nothing."""
     own = tuple(cell.strip() for cell in rows[first])
     numbers = own[1:] if own and not own[0] else own

@@ -63,13 +63,13 @@ def read_text_table(path: Path) -> TextTable:
             states the row.
     """
     layout = find_layout(path)
-    cells = _cells(path, layout)
+    cells = _read_cells(path, layout)
     columns: dict[str, Array] = {}
     texts: dict[str, list[str]] = {}
     kinds = [_CellKind(column, layout.separator) for column in cells]
     # One column may resolve an ambiguity of another: `1,234` is 1.234 in a file that has `0,5`.
     commas = any(kind.has_decimal_commas for kind in kinds)
-    for name, kind in zip(_names(layout), kinds, strict=True):
+    for name, kind in zip(_make_unique_names(layout), kinds, strict=True):
         values = kind.numbers(path, layout, name, commas)
         if values is None:
             texts[name] = kind.texts.tolist()
@@ -87,7 +87,7 @@ def read_text_table(path: Path) -> TextTable:
     )
 
 
-def _names(layout: Layout) -> list[str]:
+def _make_unique_names(layout: Layout) -> list[str]:
     """Make the column names unique as pandas does: ``q``, ``q.1``, ``Unnamed: 3``."""
     names = layout.names or tuple(f"column {place + 1}" for place in range(layout.width))
     result: list[str] = []
@@ -100,7 +100,7 @@ def _names(layout: Layout) -> list[str]:
     return result
 
 
-def _cells(path: Path, layout: Layout) -> list[Any]:
+def _read_cells(path: Path, layout: Layout) -> list[Any]:
     """Read the cells of each column as text, without comments and lines before the first row.
 
     Raises:
@@ -129,14 +129,16 @@ def _cells(path: Path, layout: Layout) -> list[Any]:
         except pandas.errors.EmptyDataError:
             return [np.array([], dtype=object)] * layout.width
         except (pandas.errors.ParserError, ValueError) as error:
-            raise _uneven(path, layout) or _not_a_table(path, layout, error) from None
+            raise _find_uneven_row(path, layout) or _not_a_table(path, layout, error) from None
     else:
         raise InputError(f"{path}: expected UTF-8 text; save it as UTF-8")
     comment = table[0].str.match(COMMENT.pattern)
     if comment.any():
         table = table[~comment.to_numpy(dtype=bool)]
     # pandas fills up rows that are too short.
-    if (table[table.columns[-1]].fillna("") == "").any() and (fault := _uneven(path, layout)):
+    if (table[table.columns[-1]].fillna("") == "").any() and (
+        fault := _find_uneven_row(path, layout)
+    ):
         raise fault
     while table.shape[1] > layout.width and (table[table.columns[-1]].fillna("") == "").all():
         table = table.iloc[:, :-1]
@@ -164,11 +166,11 @@ def _not_a_table(path: Path, layout: Layout, error: Exception) -> InputError:
     )
 
 
-def _uneven(path: Path, layout: Layout) -> InputError | None:
+def _find_uneven_row(path: Path, layout: Layout) -> InputError | None:
     """Make the error for the first row with a wrong number of cells; None if all rows are even."""
     line = layout.first
     try:
-        for line, last, row in _rows(path, layout):
+        for line, last, row in _iterate_rows(path, layout):
             filled = len(row)
             while filled > layout.width and not row[filled - 1].strip():
                 filled -= 1
@@ -195,7 +197,7 @@ def _uneven(path: Path, layout: Layout) -> InputError | None:
     return None
 
 
-def _rows(path: Path, layout: Layout) -> Iterator[tuple[int, int, list[str]]]:
+def _iterate_rows(path: Path, layout: Layout) -> Iterator[tuple[int, int, list[str]]]:
     """Iterate over the data rows with their first and last lines; skip comments and blank lines."""
     with path.open(encoding=layout.encoding, errors="replace", newline="") as file:
         if layout.separator == " ":
@@ -217,14 +219,14 @@ def _rows(path: Path, layout: Layout) -> Iterator[tuple[int, int, list[str]]]:
 def _last_line(path: Path, layout: Layout) -> int:
     """Return the line of the last data row."""
     last = 0
-    for line, *_ in _rows(path, layout):
+    for line, *_ in _iterate_rows(path, layout):
         last = line
     return last
 
 
 def _line_of(path: Path, layout: Layout, record: int) -> int:
     """Return the line of a data row, counted from 1 as in an editor."""
-    for number, (line, *_) in enumerate(_rows(path, layout)):
+    for number, (line, *_) in enumerate(_iterate_rows(path, layout)):
         if number == record:
             return line
     return layout.first + record
@@ -291,9 +293,9 @@ class _CellKind:
             if bool(((self.series == "") | switches.notna()).all()):
                 return np.asarray(switches, dtype=np.float64)
         if NUMBERS.fullmatch(first) and is_numeric(first):
-            return self._lists(path, layout, name)
+            return self._convert_lists(path, layout, name)
         if INSTANT.fullmatch(first):
-            return self._instants(path, layout, name)
+            return self._convert_dates(path, layout, name)
         texts = self.series
         if self.has_commas:
             if self.has_decimal_commas or (commas and not self.is_thousands):
@@ -302,7 +304,7 @@ class _CellKind:
                 texts = texts.str.replace(",", "", regex=False)
             else:
                 row = int(np.flatnonzero(texts.str.contains(",", regex=False))[0])
-                raise self._fault(
+                raise self._make_cell_error(
                     path, layout, name, row, "a number with a decimal point",
                     "; its comma may divide decimals or thousands",
                 )  # fmt: skip
@@ -314,7 +316,7 @@ class _CellKind:
             return result
         if bad.size > 0.5 * len(self.filled):
             return None
-        raise self._fault(path, layout, name, int(bad[0]), "a number")
+        raise self._make_cell_error(path, layout, name, int(bad[0]), "a number")
 
     def _decimal_points(self, path: Path, layout: Layout, name: str) -> Any:
         """Return the cells with decimal points instead of decimal commas.
@@ -335,12 +337,14 @@ class _CellKind:
                 row = int(points.index.to_numpy()[points.to_numpy().argmax()])
                 more = "; other cells of this column have decimal commas"
                 if not grouped[points].all():
-                    raise self._fault(path, layout, name, row, "a decimal comma", more)
-                raise self._fault(path, layout, name, row, "a number without a point", more)
+                    raise self._make_cell_error(path, layout, name, row, "a decimal comma", more)
+                raise self._make_cell_error(
+                    path, layout, name, row, "a number without a point", more
+                )
             texts = self.series
         return texts.str.replace(",", ".", n=1, regex=False)
 
-    def _instants(self, path: Path, layout: Layout, name: str) -> Array | None:
+    def _convert_dates(self, path: Path, layout: Layout, name: str) -> Array | None:
         """Convert times such as ``2026-11-26 17:24:01.123`` to (T,) seconds since 1970."""
         import pandas
 
@@ -349,14 +353,16 @@ class _CellKind:
         known = self.series.str.fullmatch(INSTANT.pattern).to_numpy(dtype=bool) | empty
         if not known.all():
             row = int(np.flatnonzero(~known)[0])
-            raise self._fault(path, layout, name, row, f"an instant as {self.filled.iloc[0]}")
+            raise self._make_cell_error(
+                path, layout, name, row, f"an instant as {self.filled.iloc[0]}"
+            )
         stamps = pandas.to_datetime(
             texts.where(texts != "", None), utc=True, format="ISO8601", errors="coerce"
         )
         whole = stamps.astype("datetime64[ns, UTC]").astype("int64").to_numpy(dtype=np.int64)
         return np.where(stamps.isna().to_numpy(), np.nan, whole * 1e-9)
 
-    def _lists(self, path: Path, layout: Layout, name: str) -> Array:
+    def _convert_lists(self, path: Path, layout: Layout, name: str) -> Array:
         """Convert cells such as ``[0.1, 0.2]`` to an array (T, k)."""
         rows: list[list[float]] = []
         for number, text in enumerate(self.texts):
@@ -368,11 +374,11 @@ class _CellKind:
                 row = None
             if row is None or (rows and len(row) != len(rows[0])) or len(row) > MAX_COLUMNS:
                 wanted = f"a list of {len(rows[0])} numbers" if rows else "a list of numbers"
-                raise self._fault(path, layout, name, number, wanted)
+                raise self._make_cell_error(path, layout, name, number, wanted)
             rows.append(row)
         return np.array(rows, dtype=np.float64).reshape(len(rows), -1)
 
-    def _fault(
+    def _make_cell_error(
         self, path: Path, layout: Layout, name: str, record: int, wanted: str, more: str = ""
     ) -> InputError:
         """Make the error for a cell that does not fit its column."""

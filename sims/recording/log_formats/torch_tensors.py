@@ -78,7 +78,7 @@ def read_tensors(path: Path) -> tuple[dict[str, Array], dict[str, list[str]]]:
     """
     try:
         with zipfile.ZipFile(path) as archive:
-            return _tensors(path, archive)
+            return _read_tensors(path, archive)
     except zipfile.BadZipFile:
         raise InputError(
             f"{path}: expected a PyTorch file as a zip archive, found another format; save it "
@@ -94,7 +94,9 @@ def read_tensors(path: Path) -> tuple[dict[str, Array], dict[str, list[str]]]:
         ) from None
 
 
-def _tensors(path: Path, archive: zipfile.ZipFile) -> tuple[dict[str, Array], dict[str, list[str]]]:
+def _read_tensors(
+    path: Path, archive: zipfile.ZipFile
+) -> tuple[dict[str, Array], dict[str, list[str]]]:
     """Read all tensors of one or two dimensions in an archive, and its lists of texts, by name.
 
     Raises:
@@ -106,12 +108,12 @@ def _tensors(path: Path, archive: zipfile.ZipFile) -> tuple[dict[str, Array], di
     if archive.getinfo(programs[0]).file_size > MAX_PROGRAM:
         raise InputError(f"{path}: data.pkl is too large for a log of tensors")
     folder = programs[0].removesuffix("data.pkl")
-    content = _content(archive.read(programs[0]))
+    content = _run_pickle_program(archive.read(programs[0]))
     columns: dict[str, Array] = {}
     texts: dict[str, list[str]] = {}
-    for name, value in _entries("", content, 0):
+    for name, value in _flatten_containers("", content, 0):
         if isinstance(value, _Tensor) and 1 <= len(value.size) <= 2:
-            columns[name] = _numbers(path, archive, folder, value)
+            columns[name] = _read_storage(path, archive, folder, value)
         elif isinstance(value, list) and all(isinstance(one, str) for one in value):
             texts[name] = value
         else:
@@ -119,7 +121,7 @@ def _tensors(path: Path, archive: zipfile.ZipFile) -> tuple[dict[str, Array], di
     return columns, texts
 
 
-def _entries(name: str, value: Any, depth: int) -> list[tuple[str, Any]]:
+def _flatten_containers(name: str, value: Any, depth: int) -> list[tuple[str, Any]]:
     """Flatten nested containers to named entries; lists of numbers and texts stay whole.
 
     Raises:
@@ -134,7 +136,7 @@ def _entries(name: str, value: Any, depth: int) -> list[tuple[str, Any]]:
         return [(name or "tensor", value)]
     entries: list[tuple[str, Any]] = []
     for key, own in inside:
-        entries += _entries(f"{name}/{key}" if name else str(key), own, depth + 1)
+        entries += _flatten_containers(f"{name}/{key}" if name else str(key), own, depth + 1)
         if len(entries) > MAX_COLUMNS:
             raise ValueError("too many entries")
     return entries
@@ -145,7 +147,7 @@ def _is_container(value: Any) -> bool:
     return isinstance(value, dict | list | _Tensor)
 
 
-def _numbers(path: Path, archive: zipfile.ZipFile, folder: str, tensor: _Tensor) -> Array:
+def _read_storage(path: Path, archive: zipfile.ZipFile, folder: str, tensor: _Tensor) -> Array:
     """Read the numbers of a tensor from its storage in the archive.
 
     Element (i, j) is the number at offset + i stride_0 + j stride_1 of the storage.
@@ -176,7 +178,7 @@ def _numbers(path: Path, archive: zipfile.ZipFile, folder: str, tensor: _Tensor)
     return make_read_only(flat[places].astype(np.float64))
 
 
-def _content(program: bytes) -> Any:
+def _run_pickle_program(program: bytes) -> Any:
     """Carry out the steps of a program that build containers and tensors.
 
     Raises:
@@ -213,7 +215,7 @@ def _content(program: bytes) -> Any:
         elif argument is not None and name.startswith(_NUMBERS_AND_TEXTS):
             stack.append(argument)
         else:
-            _build(name, stack)
+            _build_object(name, stack)
     raise ValueError("the program has no end")
 
 
@@ -225,7 +227,7 @@ _NUMBERS_AND_TEXTS = (
 """Beginnings of the names of steps that push a number or a text onto the stack."""
 
 
-def _build(name: str, stack: list[Any]) -> None:
+def _build_object(name: str, stack: list[Any]) -> None:
     """Carry out one instruction of the pickle program that builds an object from the stack.
 
     Only containers and tensors are built; nothing is imported or called.
@@ -241,9 +243,9 @@ def _build(name: str, stack: list[Any]) -> None:
         elif name == "DICT":
             stack.append(dict(zip(values[::2], values[1::2], strict=True)))
         elif name == "APPENDS":
-            _list(stack[-1]).extend(values)
+            _as_list(stack[-1]).extend(values)
         else:
-            _dict(stack[-1]).update(zip(values[::2], values[1::2], strict=True))
+            _as_dict(stack[-1]).update(zip(values[::2], values[1::2], strict=True))
     elif name in ("TUPLE1", "TUPLE2", "TUPLE3"):
         count = int(name[-1])
         values = stack[-count:]
@@ -251,24 +253,24 @@ def _build(name: str, stack: list[Any]) -> None:
         stack.append(tuple(values))
     elif name == "APPEND":
         value = stack.pop()
-        _list(stack[-1]).append(value)
+        _as_list(stack[-1]).append(value)
     elif name == "SETITEM":
         value, key = stack.pop(), stack.pop()
-        _dict(stack[-1])[key] = value
+        _as_dict(stack[-1])[key] = value
     elif name == "BINPERSID":
         # ("storage", class, key, device, number of entries)
         _, kind, key, *_ = stack.pop()
         stack.append(_Storage(kind.text.rpartition(".")[2], str(key)))
     elif name in ("REDUCE", "NEWOBJ"):
         arguments, made_by = stack.pop(), stack.pop()
-        stack.append(_made(made_by, arguments))
+        stack.append(_evaluate_call(made_by, arguments))
     elif name == "BUILD":
         stack.pop()  # attributes of an object
     else:
         raise ValueError(f"unknown step {name}")
 
 
-def _made(made_by: Any, arguments: Any) -> Any:
+def _evaluate_call(made_by: Any, arguments: Any) -> Any:
     """Return the result of a call in the program: a tensor, a dictionary, or a placeholder."""
     name = made_by.text if isinstance(made_by, _Name) else ""
     if name == "torch._utils._rebuild_tensor_v2":
@@ -281,11 +283,11 @@ def _made(made_by: Any, arguments: Any) -> Any:
     return _Other(name)
 
 
-def _list(value: Any) -> list[Any]:
+def _as_list(value: Any) -> list[Any]:
     """Return a list unchanged, and a new list, which is discarded, for any other value."""
     return value if isinstance(value, list) else []
 
 
-def _dict(value: Any) -> dict[Any, Any]:
+def _as_dict(value: Any) -> dict[Any, Any]:
     """Return a dictionary unchanged, and a new one, which is discarded, for any other value."""
     return value if isinstance(value, dict) else {}

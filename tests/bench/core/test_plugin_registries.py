@@ -75,7 +75,7 @@ def test_what_lacks_a_package_is_skipped_with_the_reason(tmp_path):
 def test_entry_that_cannot_be_imported_is_skipped_with_the_reason(monkeypatch):
     broken = Registry("tuner", "simgap.tuners", Tuner)
     entry = EntryPoint("broken", "no_such_module:Thing", "simgap.tuners")
-    monkeypatch.setattr(broken, "_entries", {"broken": entry})
+    monkeypatch.setattr(broken, "_entry_points", {"broken": entry})
     assert "No module named 'no_such_module'" in broken.describe("broken")
     with pytest.raises(InputError, match="unknown tuner 'x'; there are: broken"):
         broken.get("x")
@@ -145,7 +145,7 @@ def test_of_a_plugin_that_is_refused_nothing_is_registered(fresh_registries, tmp
 
 def test_an_effect_that_cannot_be_imported_is_left_out_and_says_why(monkeypatch):
     entry = EntryPoint("wind.broken", "no_such_module:Thing", "simgap.effects")
-    monkeypatch.setattr(effects, "_entries", {**effects._entries, "wind.broken": entry})
+    monkeypatch.setattr(effects, "_entry_points", {**effects._entry_points, "wind.broken": entry})
     with pytest.raises(
         PartUnavailableError, match=r"effect wind\.broken cannot be used here: ModuleNotF"
     ):

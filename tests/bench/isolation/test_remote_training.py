@@ -199,7 +199,7 @@ def test_an_installed_tuner_of_another_package_is_sealed_too(tmp_path, monkeypat
     (about / "entry_points.txt").write_text("[simgap.tuners]\ntheirs = their_package:Theirs\n")
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setattr(
-        tuners, "_entries", {e.name: e for e in metadata.entry_points(group="simgap.tuners")}
+        tuners, "_entry_points", {e.name: e for e in metadata.entry_points(group="simgap.tuners")}
     )
     sandboxed_tuner.close_isolated_processes()
     made = spring_experiment(tuners={"theirs": {}, "random": {}}, targets=1, ranges=["in"], seeds=1)

@@ -14,9 +14,11 @@ def test_gradient_of_the_evidence(kernel: str) -> None:
     process = GaussianProcess(POINTS, VALUES, KernelSettings(kernel=kernel), fit=False)  # type: ignore[arg-type]
     for hyper in (np.log([0.3, 0.5, 1e-2]), np.log([1.0, 0.1, 1e-3])):
         error = check_grad(
-            lambda h: process._evidence(h)[0], lambda h: process._evidence(h)[1], hyper
+            lambda h: process._compute_negative_evidence(h)[0],
+            lambda h: process._compute_negative_evidence(h)[1],
+            hyper,
         )
-        assert error < 1e-4 * np.linalg.norm(process._evidence(hyper)[1])
+        assert error < 1e-4 * np.linalg.norm(process._compute_negative_evidence(hyper)[1])
 
 
 @pytest.mark.parametrize("kernel", ["rbf", "matern"])
@@ -43,7 +45,7 @@ def test_draws_have_the_posterior_mean_and_covariance() -> None:
     new = np.array([[0.2, 0.2], [0.25, 0.2], [0.9, 0.1]])
     draws = process.sample(new, 40000, np.random.default_rng(3))
     together = np.vstack([POINTS[:8], new])
-    k = process._correlation((together[:, None] - together) ** 2)[0]
+    k = process._compute_correlation((together[:, None] - together) ** 2)[0]
     inside = k[:8, :8] + np.exp(process.hyper[-1]) * np.eye(8)
     covariance = process.variance * (k[8:, 8:] - k[8:, :8] @ np.linalg.solve(inside, k[:8, 8:]))
     assert np.allclose(

@@ -86,5 +86,5 @@ def test_what_is_no_unit_is_said_at_once(unit, target, message):
 
 
 def test_si_units_need_no_library(monkeypatch):
-    monkeypatch.setattr("sims.recording.unit_conversion._registry", None)
+    monkeypatch.setattr("sims.recording.unit_conversion._get_unit_registry", None)
     assert compute_unit_scale("N*m*s/rad^2", "N*m*s/rad^2") is IDENTITY_SCALE
