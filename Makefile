@@ -19,6 +19,8 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+# Byte code is stored whatever the environment says: without it each process compiles 300 modules.
+unexport PYTHONDONTWRITEBYTECODE
 
 EMPTY :=
 SPACE := $(EMPTY) $(EMPTY)
@@ -46,7 +48,9 @@ else
 	$(PIP) install --constraint requirements.lock -r requirements-explain.txt hatchling editables $(filter-out $(LEFT_OUT),$(LARGE))
 	$(PIP) install --no-deps --no-build-isolation --editable .
 endif
+	$(BIN)/python -m compileall -q bench methods sims simgap.py
 	$(BIN)/python -m bench.diagnosis.kalman.precompile
+	$(BIN)/python -m bench.pages.precompile
 	@echo "$(strip $(LEFT_OUT))" > $@
 
 TARGETS ?= 10

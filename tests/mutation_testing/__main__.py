@@ -62,8 +62,11 @@ def verdict_on(root: Path, tests: Sequence[str], limit: float = LIMIT) -> tuple[
     """Run tests of the tree at `root`; return the exit code of pytest and the first failure."""
     options = ["-x", "-q", "-p", "no:cacheprovider", "--rootdir", str(root)]
     threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
-    # Import the packages of the copy, not the installed ones.
-    environment = {**os.environ, **threads, "PYTHONPATH": str(root)}
+    # Import the packages of the copy, not the installed ones. Byte code is not stored: it counts as
+    # that of the source if both have the same second and size, which two mutants may share.
+    environment = {
+        **os.environ, **threads, "PYTHONPATH": str(root), "PYTHONDONTWRITEBYTECODE": "1"
+    }  # fmt: skip
     with tempfile.TemporaryFile("w+") as said:
         process = subprocess.Popen(
             [sys.executable, "-m", "pytest", *options, *tests],
