@@ -125,7 +125,7 @@ def compute_heights_by_scale(
                 "give the ball's diameter"
             )
         factor = fallen
-        how = (
+        method = (
             f"scaled by the fall (gravity {DEFAULT_GRAVITY:g} m/s^2; "
             "a drag would be taken for scale)"
         )
@@ -133,13 +133,13 @@ def compute_heights_by_scale(
         ball = diameter / 2 if diameter else factor
     else:
         factor = ball = diameter / 2
-        how = "scaled by the ball's diameter, as for a camera that looks level"
+        method = "scaled by the ball's diameter, as for a camera that looks level"
         if fallen is not None and abs(fallen / factor - 1) > _DIFFER:
             notes.append(
                 f"the fall says {fallen / factor - 1:+.0%} for all heights: the camera looks down "
                 "or up, or gravity is not 9.81 m/s^2; the scale 'fall' uses the fall"
             )
-    return BallHeights(ball + factor * (ground - q), ball, how, tuple(notes))  # Equation (2).
+    return BallHeights(ball + factor * (ground - q), ball, method, tuple(notes))  # Equation (2).
 
 
 def _compute_fall_position(track: BallTrack) -> Array:
@@ -147,8 +147,8 @@ def _compute_fall_position(track: BallTrack) -> Array:
 
     The perspective along that line is described by `_smooth_radius`.
     """
-    seen = track.visible_frames
-    points = np.stack([track.u[seen], track.v[seen]], axis=1)
+    visible_frames = track.visible_frames
+    points = np.stack([track.u[visible_frames], track.v[visible_frames]], axis=1)
     middle = points.mean(axis=0)
     # The line of the fall is the first principal axis of the points; v counts downwards.
     _, _, axes = np.linalg.svd(points - middle, full_matrices=False)
@@ -166,14 +166,14 @@ def _smooth_radius(track: BallTrack) -> Array:
 
     The outline in a single frame is too noisy. Frames far from the line get a small weight.
     """
-    s, seen = _compute_fall_position(track), track.visible_frames
-    places, radii = s[seen], track.radius[seen]
+    s, visible_frames = _compute_fall_position(track), track.visible_frames
+    places, radii = s[visible_frames], track.radius[visible_frames]
     line = np.polyfit(places, radii, 1)
     for _ in range(_FITS):
-        rest = np.abs(radii - np.polyval(line, places))
+        deviations = np.abs(radii - np.polyval(line, places))
         # A frame whose outline is far off, as at an impact, gets a small weight.
-        typical = max(float(np.median(rest)), 1e-9)
-        line = np.polyfit(places, radii, 1, w=1 / (1 + (rest / typical) ** 2))
+        typical = max(float(np.median(deviations)), 1e-9)
+        line = np.polyfit(places, radii, 1, w=1 / (1 + (deviations / typical) ** 2))
     # The line may cross zero outside the frames that show the ball; a radius may not.
     result: Array = np.maximum(np.polyval(line, s), 0.3 * float(np.median(radii)))
     return result
@@ -184,19 +184,23 @@ def _fit_free_flights(times: Array, q: Array) -> list[_Flight]:
 
     `q` (T,) is the position downwards, in ball radii; NaN where the ball was not detected.
     """
-    seen = np.flatnonzero(np.isfinite(q))
-    last = len(seen) - 1
+    visible_frames = np.flatnonzero(np.isfinite(q))
+    last = len(visible_frames) - 1
     # q counts downwards: the ball is lowest where q is largest.
-    lowest = [i for i in range(1, last) if q[seen[i - 1]] < q[seen[i]] >= q[seen[i + 1]]]
+    lowest = [
+        i
+        for i in range(1, last)
+        if q[visible_frames[i - 1]] < q[visible_frames[i]] >= q[visible_frames[i + 1]]
+    ]
     arcs = []
     for a, b in pairwise([0, *lowest, last]):
         # The frame of the bounce itself belongs to no flight.
-        inside = seen[a + (a > 0) : b - (b < last) + 1]
+        inside = visible_frames[a + (a > 0) : b - (b < last) + 1]
         if len(inside) < _MIN_FLIGHT_FRAMES or np.ptp(q[inside]) < _MIN_FLIGHT_EXTENT:
             continue
         t = times[inside]
-        curve, rest, *_ = np.polyfit(t, q[inside], 2, full=True)
-        scatter = float(np.sqrt(rest[0] / len(t))) if len(rest) else 0.0
+        curve, squared_residuals, *_ = np.polyfit(t, q[inside], 2, full=True)
+        scatter = float(np.sqrt(squared_residuals[0] / len(t))) if len(squared_residuals) else 0.0
         # A motion that is not a parabola is not a flight, but a hand, a roll or another ball.
         if scatter < 0.05 * np.ptp(q[inside]) + 0.02:
             # The variance of a parabola's curvature goes as 1 / (n T^4), for n samples in T.
@@ -219,15 +223,15 @@ def _estimate_ground_position(track: BallTrack, q: Array, arcs: list[_Flight]) -
 
     It is where two successive flights meet, or the lowest position if there is only one flight.
     """
-    meets = []
+    crossings = []
     for before, after in pairwise(arcs):
         roots = np.roots(before.curve - after.curve)
         # Two parabolas have up to two intersections: the bounce, and one outside both flights.
         begin, end = before.end - _MEETING, after.begin + _MEETING
         real = [r.real for r in roots if abs(r.imag) < 1e-9 and begin < r.real < end]
-        meets += [float(np.polyval(before.curve, r)) for r in real[:1]]
-    if meets:
-        return float(np.median(meets))
+        crossings += [float(np.polyval(before.curve, r)) for r in real[:1]]
+    if crossings:
+        return float(np.median(crossings))
     # Without two flights, use the lowest position, but ignore frames with tracking errors.
     return float(np.nanpercentile(q, 99.5)) if len(track.visible_frames) else 0.0
 
@@ -259,13 +263,13 @@ def estimate_height_noise(times: Array, z: Array) -> float:
 
 def find_release_frame(track: BallTrack) -> int:
     """Find the frame at which the ball begins to move; the first one unless it is held before."""
-    s, seen = _compute_fall_position(track), track.visible_frames
-    start = float(np.median(s[seen[:5]]))
+    s, visible_frames = _compute_fall_position(track), track.visible_frames
+    start = float(np.median(s[visible_frames[:5]]))
     # Up to a pixel, or four sigmas, is a trembling hand or an error of the outline, not a fall.
-    moved = np.flatnonzero(np.abs(s[seen] - start) > max(1.0, 4 * track.noise))
-    first = int(seen[0])
-    if not len(moved):
+    moved_places = np.flatnonzero(np.abs(s[visible_frames] - start) > max(1.0, 4 * track.noise))
+    first = int(visible_frames[0])
+    if not len(moved_places):
         return first
-    release = int(seen[moved[0]])
-    held = track.times[release] - track.times[first]
-    return first if held < _MIN_HOLD_SECONDS else release
+    release = int(visible_frames[moved_places[0]])
+    hold_seconds = track.times[release] - track.times[first]
+    return first if hold_seconds < _MIN_HOLD_SECONDS else release

@@ -72,8 +72,8 @@ def recording_of(frame: Frame, about: FrameDescription, name: str = "DataFrame")
         meta.pop("system", None)
         meta["model"] = str(about.model)
     if about.constants:
-        stated = check_table(name, "constants", meta.get("constants", {}))
-        meta["constants"] = {**stated, **about.constants}
+        stated_constants = check_table(name, "constants", meta.get("constants", {}))
+        meta["constants"] = {**stated_constants, **about.constants}
     kind = _get_simulator_class(name, meta)
     meta.setdefault("title", f"{kind.name}, {name}")
     return recording_of_frame(frame, kind, meta, about.units or {}, name)

@@ -90,89 +90,91 @@ def track_film(
     # Check this before the work, since tracking a film takes a while.
     check_absent([out, out.with_suffix(".toml"), *pictures[: 2 if pdf else 1]])
     if diameter is not None and not LENGTH_RANGE[0] <= diameter <= LENGTH_RANGE[1]:
-        wanted = f"more than 0 m, from {LENGTH_RANGE[0]:g} to {LENGTH_RANGE[1]:g} m"
-        raise InputError(f"ball diameter {diameter:g}: expected {wanted}")
+        expected = f"more than 0 m, from {LENGTH_RANGE[0]:g} to {LENGTH_RANGE[1]:g} m"
+        raise InputError(f"ball diameter {diameter:g}: expected {expected}")
 
     film = VideoFile(video, fps)
     try:
-        seen = track_ball(film)
-        heights = _convert_to_heights(seen, video, diameter, scale)
+        track = track_ball(film)
+        heights = _convert_to_heights(track, video, diameter, scale)
     except InputError as error:
         # Some error messages already name the film, others do not.
         text = str(error)
         raise InputError(text if text.startswith(str(video)) else f"{video}: {text}") from None
 
-    first, last = ball_heights.find_release_frame(seen), int(seen.visible_frames[-1])
+    first, last = ball_heights.find_release_frame(track), int(track.visible_frames[-1])
     part = slice(first, last + 1)
-    notes = [*film.notes, *seen.notes, *heights.notes]
-    if first > seen.visible_frames[0]:
-        until = f"the ball is held until {seen.times[first]:.2f} s"
+    notes = [*film.notes, *track.notes, *heights.notes]
+    if first > track.visible_frames[0]:
+        until = f"the ball is held until {track.times[first]:.2f} s"
         notes.append(f"{until}; what is before that is left out")
-    noise = _estimate_height_noise(seen, heights, part)
+    noise = _estimate_height_noise(track, heights, part)
 
     # The recording and its figures are published together, so that none exists without the others.
-    drawn = draw(seen, heights, part, f"{video.name}: {heights.method}")
-    shown = {
-        path: content for path, content in zip(pictures, drawn, strict=True) if content is not None
+    figures = draw(track, heights, part, f"{video.name}: {heights.method}")
+    figure_contents = {
+        path: content
+        for path, content in zip(pictures, figures, strict=True)
+        if content is not None
     }
-    recording = _build_recording(seen, heights, noise, part, video)
-    write_recording(out, recording, BallSystem, digits=_DIGITS, beside=shown)
+    recording = _build_recording(track, heights, noise, part, video)
+    write_recording(out, recording, BallSystem, digits=_DIGITS, beside=figure_contents)
 
     count, frames = int(np.isfinite(heights.z[part]).sum()), part.stop - part.start
     lines = (
         f"{out}: {count} of {frames} frames with the ball, z in metres {heights.method}",
-        f"noise of one sample: {seen.noise:.2g} px, {1e3 * noise:.2g} mm",
+        f"noise of one sample: {track.noise:.2g} px, {1e3 * noise:.2g} mm",
         f"{pictures[0]}: the track",
     )
     return TrackingResult(
-        tuple(notes), frames, count, heights.method, float(seen.noise), noise, lines
+        tuple(notes), frames, count, heights.method, float(track.noise), noise, lines
     )
 
 
 def _estimate_height_noise(
-    seen: BallTrack, heights: ball_heights.BallHeights, part: slice
+    track: BallTrack, heights: ball_heights.BallHeights, part: slice
 ) -> float:
     """Estimate 1 sigma of a height, m: the larger of the scatter of neighbours and of flights."""
     z = heights.z[part]
     noise = float(
         np.nanmax(
-            [estimate_roughness(z), ball_heights.estimate_height_noise(seen.times[part], z), 0.0]
+            [estimate_roughness(z), ball_heights.estimate_height_noise(track.times[part], z), 0.0]
         )
     )
     if noise > 0:
         return noise
     # A few frames give neither estimate: use the noise in pixels, scaled by the median radius.
-    return seen.noise * heights.radius / float(np.nanmedian(seen.radius))
+    return track.noise * heights.radius / float(np.nanmedian(track.radius))
 
 
 def _convert_to_heights(
-    seen: BallTrack, video: Path, diameter: float | None, scale: str | None
+    track: BallTrack, video: Path, diameter: float | None, scale: str | None
 ) -> ball_heights.BallHeights:
     """Convert the track of the ball from pixels to heights in metres.
 
     The best available scale is used unless `scale` names one: a calibrated camera whose file lies
     next to the film, the known diameter of the ball (m), or the acceleration of free fall.
     """
-    known = get_camera_file_path(video)
-    if scale == "camera" or (scale is None and known.is_file()):
-        return ball_heights.compute_heights_by_camera(seen, read_camera_file(known))
+    camera_file = get_camera_file_path(video)
+    if scale == "camera" or (scale is None and camera_file.is_file()):
+        return ball_heights.compute_heights_by_camera(track, read_camera_file(camera_file))
     if scale == "diameter" and diameter is None:
         raise InputError("scale diameter: expected the ball's diameter in metres")
-    return ball_heights.compute_heights_by_scale(seen, diameter, scale)
+    return ball_heights.compute_heights_by_scale(track, diameter, scale)
 
 
 def _build_recording(
-    seen: BallTrack, heights: ball_heights.BallHeights, noise: float, part: slice, video: Path
+    track: BallTrack, heights: ball_heights.BallHeights, noise: float, part: slice, video: Path
 ) -> Recording:
     """Build the recording: the height z of the ball (m), and its track in pixels as extra columns.
 
     `part` selects the frames after the release of the ball. `noise` is the standard deviation of z,
     m.
     """
-    pixels = {"u": seen.u, "v": seen.v, "radius_px": seen.radius}
+    pixels = {"u": track.u, "v": track.v, "radius_px": track.radius}
     run = Run(
         "1",
-        make_read_only(seen.times[part]),
+        make_read_only(track.times[part]),
         {"z": make_read_only(heights.z[part])},
         {},
         {},

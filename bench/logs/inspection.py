@@ -132,8 +132,8 @@ def check_value_sizes(recording: Recording) -> None:
         for name, values in (*run.channels.items(), *run.inputs.items()):
             largest = float(np.nanmax(np.abs(values), initial=0.0))
             if largest > MAX_NUMBER:
-                what = f"expected values within ±{MAX_NUMBER:g}, found {largest:.3g}"
-                raise InputError(f"{recording.path}: run {run.name}, column {name}: {what}")
+                problem = f"expected values within ±{MAX_NUMBER:g}, found {largest:.3g}"
+                raise InputError(f"{recording.path}: run {run.name}, column {name}: {problem}")
 
 
 def format_summary(recording: Recording, kind: type[Simulator]) -> Iterator[str]:
@@ -149,19 +149,21 @@ def format_summary(recording: Recording, kind: type[Simulator]) -> Iterator[str]
     held_out = len(recording.held_out())
     yield recording.title
     # A single run is divided into two parts with the same name.
-    whole = len({run.name for run in runs})
-    held = "its last third held out" if whole < len(runs) else f"{held_out} held out"
+    run_count = len({run.name for run in runs})
+    held_out_text = "its last third held out" if run_count < len(runs) else f"{held_out} held out"
     if recording.folds():
-        held = "each left out in turn"
-    size = f"{_format_count(whole, 'run')} ({held}), {samples} samples, {seconds:.4g} s"
+        held_out_text = "each left out in turn"
+    size = (
+        f"{_format_count(run_count, 'run')} ({held_out_text}), {samples} samples, {seconds:.4g} s"
+    )
     yield f"{recording.path}: system {recording.system}, {size}"
     yield from recording.notes
     yield ""
-    yield from _align_columns([_RUN_HEAD, *map(_run_row, runs[:_MOST_RUNS])], left=2)
+    yield from _align_columns([_RUN_HEAD, *map(_run_row, runs[:_MOST_RUNS])], left_columns=2)
     if len(runs) > _MOST_RUNS:
         yield f"... and {len(runs) - _MOST_RUNS} more runs"
     yield ""
-    yield from _align_columns([_SIGNAL_HEAD, *_signal_rows(recording, kind)], left=3)
+    yield from _align_columns([_SIGNAL_HEAD, *_signal_rows(recording, kind)], left_columns=3)
     yield _CAVEAT
     yield ""
     yield from _format_constants(recording, kind)
@@ -191,15 +193,15 @@ def _run_row(run: Run) -> tuple[str, ...]:
 def _signal_rows(recording: Recording, kind: type[Simulator]) -> Iterator[tuple[str, ...]]:
     """Yield a row of the table of signals for each channel and input: unit, range, gaps and noise.
 
-    `what` is the kind of the signal. The stated noise is "-" for a channel whose noise is not
+    `role` is the kind of the signal. The stated noise is "-" for a channel whose noise is not
     stated; steps are quantisation steps.
     """
-    for channel, what in list_recorded_signals(recording, kind):
-        facts = compute_signal_statistics(recording, channel, what)
-        not_stated = "-" if what == "channel" else ""
+    for channel, role in list_recorded_signals(recording, kind):
+        facts = compute_signal_statistics(recording, channel, role)
+        not_stated = "-" if role == "channel" else ""
         yield (
             facts.name,
-            what,
+            role,
             facts.unit,
             f"{facts.low:.4g}",
             f"{facts.high:.4g}",
@@ -214,13 +216,13 @@ def _format_constants(recording: Recording, kind: type[Simulator]) -> Iterator[s
     """Yield a line for each constant of the system, and one for the stated initial states."""
     for constant in kind.constants:
         yield _format_constant(recording, constant.name, constant.value, constant.unit)
-    known = []
+    run_texts = []
     for run in recording.runs:
         if run.initial:
             states = ", ".join(f"{name} = {value:g}" for name, value in run.initial.items())
-            known.append(f"{run.name} ({states})")
-    if known:
-        yield f"initial states stated: {', '.join(known[:_MOST_RUNS])}"
+            run_texts.append(f"{run.name} ({states})")
+    if run_texts:
+        yield f"initial states stated: {', '.join(run_texts[:_MOST_RUNS])}"
 
 
 def _format_constant(recording: Recording, name: str, default: float, unit: str) -> str:
@@ -236,25 +238,25 @@ def _format_constant(recording: Recording, name: str, default: float, unit: str)
         ]
         return f"{name} differs by run: {'; '.join(parts)}"
     value = next(iter(runs_by_value))
-    stated = name in recording.constants or any(name in run.constants for run in recording.runs)
-    note = "" if stated else " (the system's default; not stated)"
+    is_stated = name in recording.constants or any(name in run.constants for run in recording.runs)
+    note = "" if is_stated else " (the system's default; not stated)"
     return f"{name} = {value:g}{unit}{note}"
 
 
 def _format_run_names(names: Sequence[str]) -> str:
     runs = f"run{'s' * (len(names) > 1)} {', '.join(names[:_MOST_NAMES])}"
-    more = len(names) - _MOST_NAMES
-    return f"{runs} and {more} more" if more > 0 else runs
+    unnamed_count = len(names) - _MOST_NAMES
+    return f"{runs} and {unnamed_count} more" if unnamed_count > 0 else runs
 
 
-def _format_count(number: int, what: str) -> str:
-    return f"{number} {what}{'s' * (number != 1)}"
+def _format_count(number: int, noun: str) -> str:
+    return f"{number} {noun}{'s' * (number != 1)}"
 
 
-def _align_columns(rows: Sequence[Sequence[str]], left: int) -> Iterator[str]:
-    """Align a table as text, with the first `left` columns left-justified."""
+def _align_columns(rows: Sequence[Sequence[str]], left_columns: int) -> Iterator[str]:
+    """Align a table as text, with the first `left_columns` columns left-justified."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:
         cells = zip(row, widths, strict=True)
-        aligned = [c.ljust(w) if i < left else c.rjust(w) for i, (c, w) in enumerate(cells)]
+        aligned = [c.ljust(w) if i < left_columns else c.rjust(w) for i, (c, w) in enumerate(cells)]
         yield "  ".join(aligned).rstrip()

@@ -51,8 +51,8 @@ def load_joined(
     first, kind = loaded[0]
     if len(loaded) == 1:
         return split_held_out(first, folds=True), kind
-    for recording, other in loaded[1:]:
-        _refuse_other(first, kind, recording, other)
+    for recording, other_kind in loaded[1:]:
+        _refuse_other(first, kind, recording, other_kind)
     recordings = [recording for recording, _ in loaded]
     runs_of_all = [run for recording in recordings for run in recording.runs]
     folds = len(runs_of_all) <= MAX_FOLDS and not any(run.held_out for run in runs_of_all)
@@ -77,10 +77,11 @@ def load_joined(
         for name, recording in zip(names, recordings, strict=True)
         for run in recording.runs
     ]
-    more = len(loaded) - 1
+    other_count = len(loaded) - 1
     joined = replace(
         first,
-        title=f"{first.title or first.path.stem} and {more} more log{'s' * (more > 1)}",
+        title=f"{first.title or first.path.stem} and {other_count} more "
+        f"log{'s' * (other_count > 1)}",
         constants=constants,
         noise=_compute_rms_noise(recordings),
         runs=tuple(runs),
@@ -94,33 +95,34 @@ def _get_constant(key: str, recording: Recording, run: Run, usual: dict[str, flo
 
 
 def _refuse_other(
-    first: Recording, kind: type[Simulator], other: Recording, of: type[Simulator]
+    first: Recording, kind: type[Simulator], other: Recording, other_kind: type[Simulator]
 ) -> None:
     """Reject a recording that cannot be joined with the first one.
 
     Raises:
         InputError: System, model file, channels or inputs of the recordings differ.
     """
-    robots = kind.has_model and of.has_model
-    if (kind.has_model or of.has_model) != robots or of.name != kind.name:
+    robots = kind.has_model and other_kind.has_model
+    if (kind.has_model or other_kind.has_model) != robots or other_kind.name != kind.name:
         raise InputError(
-            f"{other.path}: expected a log of {kind.name} as {first.path}, found one of {of.name}; "
-            "explain it by itself"
+            f"{other.path}: expected a log of {kind.name} as {first.path}, found one of "
+            f"{other_kind.name}; explain it by itself"
         )
-    if robots and vars(of)["source_digest"] != vars(kind)["source_digest"]:
+    if robots and vars(other_kind)["source_digest"] != vars(kind)["source_digest"]:
         raise InputError(
             f"{other.path}: expected the model file, the actuators and the free numbers of "
             f"{first.path}, found others; state the same, or give --model and --free"
         )
-    ours, theirs = first.runs[0], other.runs[0]
-    for what, one, two in (
-        ("channels", set(ours.channels), set(theirs.channels)),
-        ("inputs", set(ours.inputs), set(theirs.inputs)),
+    first_run, other_run = first.runs[0], other.runs[0]
+    for signal_type, first_names, other_names in (
+        ("channels", set(first_run.channels), set(other_run.channels)),
+        ("inputs", set(first_run.inputs), set(other_run.inputs)),
     ):
-        if one != two:
+        if first_names != other_names:
             raise InputError(
-                f"{other.path}: expected the {what} of {first.path}, {', '.join(sorted(one))}, "
-                f"found {', '.join(sorted(two)) or 'none'}"
+                f"{other.path}: expected the {signal_type} of {first.path}, "
+                f"{', '.join(sorted(first_names))}, found "
+                f"{', '.join(sorted(other_names)) or 'none'}"
             )
 
 

@@ -53,25 +53,25 @@ def read_content(path: Path) -> bytes:
         except InputError:
             return b""
     bag = split_bag_path(path) or group_of(path)
-    whole = path if bag is None else bag[0]
-    files = sorted(whole.rglob("*")) if bag is not None and whole.is_dir() else [whole]
+    root = path if bag is None else bag[0]
+    files = sorted(root.rglob("*")) if bag is not None and root.is_dir() else [root]
     content = hashlib.sha256()
-    for file in files if whole.suffix.lower() != ".xml" else _with_included(whole):
+    for file in files if root.suffix.lower() != ".xml" else _with_included(root):
         if file.is_file():
-            about = file.stat()
-            content.update(_hash_file(file, about.st_mtime_ns, about.st_size))
+            file_stat = file.stat()
+            content.update(_hash_file(file, file_stat.st_mtime_ns, file_stat.st_size))
     return content.digest()
 
 
 def _with_included(model: Path) -> list[Path]:
     """Return a model file and the files that it includes, searched in the folder of the model."""
-    files, found = [model], 0
-    while found < len(files):
-        inner = files[found]
+    files, visited_count = [model], 0
+    while visited_count < len(files):
+        inner = files[visited_count]
         names = _INCLUDE.findall(inner.read_bytes()) if inner.is_file() else []
-        beside = [model.parent / name.decode(errors="replace") for name in names]
-        files += [file for file in dict.fromkeys(beside) if file not in files]
-        found += 1
+        included_files = [model.parent / name.decode(errors="replace") for name in names]
+        files += [file for file in dict.fromkeys(included_files) if file not in files]
+        visited_count += 1
     return files
 
 
@@ -83,6 +83,6 @@ def _hash_file(path: Path, _changed: int, _size: int) -> bytes:
     """
     digest = hashlib.sha256()
     with path.open("rb") as file:
-        while piece := file.read(CHUNK_BYTES):
-            digest.update(piece)
+        while chunk := file.read(CHUNK_BYTES):
+            digest.update(chunk)
     return digest.digest()

@@ -67,8 +67,8 @@ def _left_out(recording: Recording, robot: RobotModel) -> Iterator[str]:
     joints = [joint.name for joint in robot.joints if joint.has_one_coordinate]
     unseen = [name for name in joints if f"q.{name}" not in run.channels]
     if unseen:
-        where = ", ".join(unseen)
-        yield f"positions that are not in the log, and begin as the file states them: {where}"
+        joint_names = ", ".join(unseen)
+        yield f"positions that are not in the log, and begin as the file states them: {joint_names}"
 
 
 def _list_exceeded_ranges(recording: Recording, robot: RobotModel) -> Iterator[str]:
@@ -100,20 +100,20 @@ def _format_exceeded_range(
         return
     low, high = limits
     slack = LIMIT_TOLERANCE * (high - low)
-    runs, least, most = [], np.inf, -np.inf
+    runs, min_value, max_value = [], np.inf, -np.inf
     for run in recording.runs:
         signal = run.channels.get(name, run.inputs.get(name))
         if signal is None or not np.isfinite(signal).any():
             continue
-        begin, end = float(np.nanmin(signal)), float(np.nanmax(signal))
-        if begin < low - slack or end > high + slack:
+        lowest, highest = float(np.nanmin(signal)), float(np.nanmax(signal))
+        if lowest < low - slack or highest > high + slack:
             runs.append(run.name)
-            least, most = min(least, begin), max(most, end)
+            min_value, max_value = min(min_value, lowest), max(max_value, highest)
     if runs:
         named = ", ".join(dict.fromkeys(runs[:MAX_NAMED_RUNS])) + (
             " ..." if len(runs) > MAX_NAMED_RUNS else ""
         )
         states = f"{model} states {low:.4g} to {high:.4g}"
-        yield f"{name} goes from {least:.4g} to {most:.4g} {unit}".rstrip() + (
+        yield f"{name} goes from {min_value:.4g} to {max_value:.4g} {unit}".rstrip() + (
             f" in runs {named}, and {states}: another unit, sign or zero?"
         )

@@ -80,30 +80,32 @@ def segment_recording(
             "nothing says where they are when a piece begins; leave it out"
         )
     budget = np.inf if whole or not kind.has_model else _compute_affordable_seconds(kind)
-    kept: list[Run] = []
+    segments: list[Run] = []
     notes = []
     for word, runs in (("fitting", recording.training()), ("measuring", recording.held_out())):
         all_of_it = sum(map(_compute_duration, runs))
         if all_of_it <= budget and seconds is None:
-            kept += runs
+            segments += runs
             continue
         share = min(budget / all_of_it, 1.0) if all_of_it > 0 else 1.0
-        take = _take_beginning if floats else _cut_run
-        pieces = [
+        cut_run = _take_beginning if floats else _cut_run
+        new_segments = [
             p
             for run in runs
-            for p in take(run, share * _compute_duration(run), seconds or SEGMENT_SECONDS)
+            for p in cut_run(run, share * _compute_duration(run), seconds or SEGMENT_SECONDS)
         ]
-        kept += pieces
-        left = sum(map(_compute_duration, pieces))
-        notes.append(f"{left:.3g} s of {all_of_it:.4g} s for {word}, in {len(pieces)} pieces")
+        segments += new_segments
+        used_seconds = sum(map(_compute_duration, new_segments))
+        notes.append(
+            f"{used_seconds:.3g} s of {all_of_it:.4g} s for {word}, in {len(new_segments)} pieces"
+        )
     if not notes:
         return SegmentedRecording(recording, "")
-    said = " and ".join(notes)
+    summary = " and ".join(notes)
     left_out = budget < max(sum(map(_compute_duration, recording.training())), 0.0)
-    more = " from all over it (--whole takes all)" if left_out and not whole else ""
-    note = f"of the recording {said} were looked at{more}"
-    return SegmentedRecording(replace(recording, runs=tuple(kept)), note)
+    origin_note = " from all over it (--whole takes all)" if left_out and not whole else ""
+    note = f"of the recording {summary} were looked at{origin_note}"
+    return SegmentedRecording(replace(recording, runs=tuple(segments)), note)
 
 
 def _compute_affordable_seconds(kind: type[Simulator]) -> float:
@@ -133,7 +135,7 @@ def _cut_run(run: Run, seconds: float, longest: float) -> list[Run]:
     span = _compute_duration(run) / count
     length = min(length, span)
     change = _compute_command_changes(run)
-    pieces = []
+    segments = []
     for number in range(count):
         # A segment may begin anywhere in its part of the run that leaves enough room for it.
         first = run.times[0] + number * span
@@ -143,8 +145,8 @@ def _cut_run(run: Run, seconds: float, longest: float) -> list[Run]:
         # The sample at its very end is the first sample of the next segment.
         end = int(np.searchsorted(run.times, run.times[begin] + length - ROUNDING_SECONDS))
         name = f"{run.name} from {run.times[begin]:.4g} s"
-        pieces.append(run.part(slice(begin, end), name))
-    return pieces
+        segments.append(run.part(slice(begin, end), name))
+    return segments
 
 
 def _take_beginning(run: Run, seconds: float, _: float) -> list[Run]:
@@ -159,11 +161,11 @@ def _take_beginning(run: Run, seconds: float, _: float) -> list[Run]:
 
 def _compute_command_changes(run: Run) -> Array:
     """Return (T,) the change of the commands before each sample, relative to their range."""
-    back = np.searchsorted(run.times, run.times - QUIET_LEAD_SECONDS)
+    lead_places = np.searchsorted(run.times, run.times - QUIET_LEAD_SECONDS)
     total = np.zeros(run.times.size)
     for values in run.inputs.values():
         spread = float(np.ptp(values))
         if spread > 0:
             added = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(values)))]) / spread
-            total += added - added[back]
+            total += added - added[lead_places]
     return total

@@ -136,8 +136,8 @@ def to_document(recording: Recording, kind: type[Simulator]) -> dict[str, Any]:
         "title": recording.title,
         "runs": [compute_run_statistics(run)._asdict() for run in recording.runs],
         "signals": [
-            compute_signal_statistics(recording, channel, what)._asdict()
-            for channel, what in list_recorded_signals(recording, kind)
+            compute_signal_statistics(recording, channel, role)._asdict()
+            for channel, role in list_recorded_signals(recording, kind)
         ],
         "constants": {
             constant.name: {

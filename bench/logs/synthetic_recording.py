@@ -138,11 +138,13 @@ class SimulatedRecording:
         """
         import tomli_w
 
-        out = Path(path)
-        truth = _truth_of(out)
-        beside = {truth: tomli_w.dumps(dict(self.truth))}
-        write_recording(out, self.recording, type(self.simulator), digits=_DIGITS, beside=beside)
-        return [out, out.with_suffix(".toml"), truth]
+        table_path = Path(path)
+        truth = _truth_of(table_path)
+        truth_file = {truth: tomli_w.dumps(dict(self.truth))}
+        write_recording(
+            table_path, self.recording, type(self.simulator), digits=_DIGITS, beside=truth_file
+        )
+        return [table_path, table_path.with_suffix(".toml"), truth]
 
 
 def check_output_path(out: Path) -> None:
@@ -154,10 +156,10 @@ def check_output_path(out: Path) -> None:
     check_absent([out, out.with_suffix(".toml"), _truth_of(out)])
 
 
-def _truth_of(out: Path) -> Path:
-    if out.suffix != ".csv":
-        raise InputError(f"{out}: expected a name that ends in .csv")
-    return out.with_suffix(".truth.toml")
+def _truth_of(table_path: Path) -> Path:
+    if table_path.suffix != ".csv":
+        raise InputError(f"{table_path}: expected a name that ends in .csv")
+    return table_path.with_suffix(".truth.toml")
 
 
 def simulate_recording(options: SimulationSpec) -> SimulatedRecording:
@@ -204,8 +206,8 @@ class _RecordingSimulation:
         self.noise = _make_noise_table(options.noise, [c.name for c in self.simulator.channels])
         initial, inputs = options.initial or {}, options.inputs or {}
         check_known_names("initial state", initial, list(kind.states))
-        given = {name: _check_interval(name, value) for name, value in initial.items()}
-        self.ranges = {**self.usual.initial, **given}
+        stated_ranges = {name: _check_interval(name, value) for name, value in initial.items()}
+        self.ranges = {**self.usual.initial, **stated_ranges}
         check_known_names("input", inputs, [c.name for c in kind.inputs])
         inputs = {**self.usual.inputs, **inputs}
         self.inputs = {name: _signal_text(name, value) for name, value in inputs.items()}
@@ -225,14 +227,16 @@ class _RecordingSimulation:
         runs = tuple(
             self._simulate_run(int(name), scenario) for name, scenario in scenarios.items()
         )
-        stated = {name: sigma for name, sigma in self.noise.items() if sigma}
+        stated_noise = {name: sigma for name, sigma in self.noise.items() if sigma}
         constants, system = self.simulator.constant_values, self.name
         path = Path(f"{system}-simulated.csv")  # Used in messages only; there is no such file.
         model = self.options.model and ModelFileReference(
             Path(self.options.model), self.options.actuators or {}, {}
         )
         title = f"{system}, simulated"
-        recording = Recording(path, system, title, constants, stated, runs, model=model or None)
+        recording = Recording(
+            path, system, title, constants, stated_noise, runs, model=model or None
+        )
         truth = {
             "system": system,
             **({"model": str(Path(self.options.model).resolve())} if self.options.model else {}),
@@ -297,11 +301,11 @@ class _RecordingSimulation:
         held_out = number > self.options.runs - self.held_out
         # The pose of a floating body is never estimated, so it need not be hidden.
         states = {**self.kind.states, **scenario.initial}
-        begun = {name: states[name] for name in get_floating_state_units(self.kind)}
-        return Run(str(number), self.times, channels, scenario.inputs, {}, begun, held_out)
+        initial_poses = {name: states[name] for name in get_floating_state_units(self.kind)}
+        return Run(str(number), self.times, channels, scenario.inputs, {}, initial_poses, held_out)
 
-    def _make_rng(self, what: str, name: str, number: int) -> np.random.Generator:
-        return make_rng("simulate", self.name, what, name, self.options.seed, number)
+    def _make_rng(self, purpose: str, name: str, number: int) -> np.random.Generator:
+        return make_rng("simulate", self.name, purpose, name, self.options.seed, number)
 
 
 def _get_simulator_class(options: SimulationSpec) -> type[Simulator]:
@@ -311,8 +315,10 @@ def _get_simulator_class(options: SimulationSpec) -> type[Simulator]:
         InputError: It names both or neither.
     """
     if bool(options.system) == (options.model is not None):
-        found = "both" if options.system else "neither"
-        raise InputError(f"expected a system (see `simgap list systems`) or a model, found {found}")
+        found_text = "both" if options.system else "neither"
+        raise InputError(
+            f"expected a system (see `simgap list systems`) or a model, found {found_text}"
+        )
     return (
         simulators.get(options.system)
         if options.model is None
@@ -368,19 +374,20 @@ def _make_sample_times(samples: int, rate: float) -> Array:
 
 
 def _make_parameters(
-    given: Mapping[str, float] | Sequence[float], kind: type[Simulator]
+    values: Mapping[str, float] | Sequence[float], kind: type[Simulator]
 ) -> dict[str, float]:
     """Return every parameter's value by name, in the simulator's order."""
     names = [p.name for p in kind.parameters]
-    if not isinstance(given, Mapping):
-        if len(given) != len(names):
+    if not isinstance(values, Mapping):
+        if len(values) != len(names):
             raise InputError(
-                f"parameters: expected {len(names)} values ({', '.join(names)}), found {len(given)}"
+                f"parameters: expected {len(names)} values ({', '.join(names)}), found "
+                f"{len(values)}"
             )
-        given = dict(zip(names, given, strict=True))
-    check_known_names("parameter", given, names)
+        values = dict(zip(names, values, strict=True))
+    check_known_names("parameter", values, names)
     theta = {
-        p.name: _check_number("parameter", p.name, given.get(p.name, p.nominal))
+        p.name: _check_number("parameter", p.name, values.get(p.name, p.nominal))
         for p in kind.parameters
     }
     for p in kind.parameters:
@@ -392,18 +399,20 @@ def _make_parameters(
     return theta
 
 
-def _make_coefficients(name: str, given: EffectCoefficients, kind: type[Simulator]) -> list[float]:
+def _make_coefficients(
+    name: str, stated_values: EffectCoefficients, kind: type[Simulator]
+) -> list[float]:
     """Return an effect's coefficients in order; coefficients that are not named are zero."""
-    if isinstance(given, Mapping):
+    if isinstance(stated_values, Mapping):
         of_system = (
             library.find_effect(name, kind.system).on(kind.system)
             if issubclass(kind, SystemSimulator)
             else ()
         )
         names = [c.name for c in of_system]
-        check_known_names(f"coefficient of effect {name}", given, names)
-        return [_check_number(f"effect {name}:", c, given.get(c, 0.0)) for c in names]
-    values = [given] if isinstance(given, int | float) else list(given)
+        check_known_names(f"coefficient of effect {name}", stated_values, names)
+        return [_check_number(f"effect {name}:", c, stated_values.get(c, 0.0)) for c in names]
+    values = [stated_values] if isinstance(stated_values, int | float) else list(stated_values)
     return [_check_number("effect", name, value) for value in _of_family(name, values, kind)]
 
 
@@ -414,58 +423,64 @@ def _of_family(name: str, values: list[float], kind: type[Simulator]) -> list[fl
     effect = library.find_effect(name, kind.system)
     members = getattr(effect, "members", ())
     of_one = len(members[0].coefficients) if members else 0
-    alike = len(values) == of_one < len(effect.coefficients)
-    return values * len(members) if alike else values
+    is_common = len(values) == of_one < len(effect.coefficients)
+    return values * len(members) if is_common else values
 
 
 def _make_noise_table(
-    given: float | Mapping[str, float], channels: Sequence[str]
+    stated: float | Mapping[str, float], channels: Sequence[str]
 ) -> dict[str, float]:
     """Return the standard deviation of the noise of each channel, in the channel's unit.
 
-    `given` is one value for all channels, or a value for each. Channels that are not named have
+    `stated` is one value for all channels, or a value for each. Channels that are not named have
     none.
     """
-    named = given if isinstance(given, Mapping) else {ALL_CHANNELS: given}
+    named = stated if isinstance(stated, Mapping) else {ALL_CHANNELS: stated}
     check_known_names(
         "recorded channel", [name for name in named if name != ALL_CHANNELS], channels
     )
-    rest = named.get(ALL_CHANNELS, 0.0)
-    values = {name: _check_number("noise of", name, named.get(name, rest)) for name in channels}
+    default = named.get(ALL_CHANNELS, 0.0)
+    values = {name: _check_number("noise of", name, named.get(name, default)) for name in channels}
     for name, value in values.items():
         if value < 0:
             raise InputError(f"noise of {name} = {value:g}: expected at least 0")
     return values
 
 
-def _check_interval(name: str, given: float | tuple[float, float]) -> tuple[float, float]:
+def _check_interval(name: str, stated_range: float | tuple[float, float]) -> tuple[float, float]:
     """Return the interval (low, high) from which an initial state is drawn."""
-    ends = (given, given) if isinstance(given, int | float) else tuple(given)
-    if len(ends) != 2:
-        raise InputError(f"initial state {name}: expected a value or (low, high), found {given!r}")
-    low, high = (_check_number("initial state", name, end) for end in ends)
+    limits = (
+        (stated_range, stated_range)
+        if isinstance(stated_range, int | float)
+        else tuple(stated_range)
+    )
+    if len(limits) != 2:
+        raise InputError(
+            f"initial state {name}: expected a value or (low, high), found {stated_range!r}"
+        )
+    low, high = (_check_number("initial state", name, end) for end in limits)
     if low > high:
         raise InputError(f"initial state {name} = {low:g}:{high:g}: expected low <= high")
     return low, high
 
 
-def _signal_text(name: str, given: float | str) -> str:
-    return given if isinstance(given, str) else f"{_check_number('input', name, given):.17g}"
+def _signal_text(name: str, value: float | str) -> str:
+    return value if isinstance(value, str) else f"{_check_number('input', name, value):.17g}"
 
 
-def _check_number(what: str, name: str, value: object) -> float:
+def _check_number(label: str, name: str, value: object) -> float:
     """Return a value of the specification as a float if it is a plausible number.
 
-    `what` and `name` identify the value in the message of the error.
+    `label` and `name` identify the value in the message of the error.
 
     Raises:
         InputError: The value is not a number, or not a plausible one.
     """
     if isinstance(value, bool) or not isinstance(value, int | float | np.number):
-        raise InputError(f"{what} {name}: expected a number, found {value!r:.60}")
+        raise InputError(f"{label} {name}: expected a number, found {value!r:.60}")
     if not is_plausible_number(value):
         raise InputError(
-            f"{what} {name} = {truncate_text(str(value))}: "
+            f"{label} {name} = {truncate_text(str(value))}: "
             f"expected a finite number within ±{MAX_NUMBER:g}"
         )
     return float(value)

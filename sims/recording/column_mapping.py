@@ -62,8 +62,8 @@ class SignalSource(NamedTuple):
         first = read_column(self.columns[0])
         if self.weights == (1.0,):
             return first
-        rest = zip(self.columns[1:], self.weights[1:], strict=True)
-        return sum((w * read_column(name) for name, w in rest), self.weights[0] * first)
+        weighted_columns = zip(self.columns[1:], self.weights[1:], strict=True)
+        return sum((w * read_column(name) for name, w in weighted_columns), self.weights[0] * first)
 
 
 @dataclass(frozen=True)
@@ -152,37 +152,35 @@ def read_sources(
     )
 
 
-def _read_source(
-    path: Path, where: str, table: Mapping[str, Any], default: str = ""
-) -> SignalSource:
+def _read_source(path: Path, key: str, table: Mapping[str, Any], default: str = "") -> SignalSource:
     """Read the location of one signal: `file`, `column` and `matrix` of its table.
 
     Args:
         path: Path of the description, for messages.
-        where: Name of the table, for messages.
+        key: Name of the table, for messages.
         table: Content of the table.
-        default: Name of the column where none is stated; `where` if empty.
+        default: Name of the column where none is stated; `key` if empty.
     """
-    file = check_text(path, f"{where}.file", table.get("file", ""))
-    column = table.get("column", default or where)
+    file = check_text(path, f"{key}.file", table.get("file", ""))
+    column = table.get("column", default or key)
     if not isinstance(column, list):
         if "matrix" in table:
             raise make_error(
                 path,
-                f"{where}.matrix",
+                f"{key}.matrix",
                 'it with several columns (column = ["A", "B"] and matrix = [0.5, -0.5])',
                 table["matrix"],
             )
-        return SignalSource(file, (check_text(path, f"{where}.column", column),))
-    names = tuple(check_text(path, f"{where}.column", name) for name in column)
+        return SignalSource(file, (check_text(path, f"{key}.column", column),))
+    names = tuple(check_text(path, f"{key}.column", name) for name in column)
     matrix = table.get("matrix")
     if not names or not isinstance(matrix, list) or len(matrix) != len(names):
         raise make_error(
-            path, f"{where}.matrix", f"a row of {len(names)} numbers, one for each column", matrix
+            path, f"{key}.matrix", f"a row of {len(names)} numbers, one for each column", matrix
         )
-    weights = tuple(check_finite(path, f"{where}.matrix", weight) for weight in matrix)
+    weights = tuple(check_finite(path, f"{key}.matrix", weight) for weight in matrix)
     if not any(weights):
-        raise make_error(path, f"{where}.matrix", "a number that is not zero", matrix)
+        raise make_error(path, f"{key}.matrix", "a number that is not zero", matrix)
     return SignalSource(file, names, weights)
 
 
@@ -190,8 +188,8 @@ def _read_sampling_rate(path: Path, time: Mapping[str, Any]) -> float:
     """Return the sampling rate of logs without stamps, Hz; 0 if the logs have stamps."""
     if "rate" not in time:
         return 0.0
-    for other in ("column", "unit"):
-        if other in time:
+    for unused_key in ("column", "unit"):
+        if unused_key in time:
             raise InputError(
                 f"{path}: time: expected a rate, or column and unit of stamps, found both; leave "
                 "one out"
@@ -227,8 +225,8 @@ def _collect_texts(tables: Any, word: str) -> list[str]:
     """Collect all texts under the key `word` in nested tables, such as all stated file names."""
     if not isinstance(tables, dict):
         return []
-    own = [tables[word]] if isinstance(tables.get(word), str) else []
-    return own + [name for inner in tables.values() for name in _collect_texts(inner, word)]
+    texts = [tables[word]] if isinstance(tables.get(word), str) else []
+    return texts + [name for inner in tables.values() for name in _collect_texts(inner, word)]
 
 
 def read_logs(
@@ -314,12 +312,12 @@ class _FolderLogs:
         for name, source in sources.extra.items():
             (column,) = source.columns
             files[name] = source.file or _find_file(folder, column, list(files.values()))
-        wanted: dict[str, set[str]] = {}
+        columns_by_file: dict[str, set[str]] = {}
         for name, file in files.items():
-            columns = wanted.setdefault(file, set() if self._rate else {self._time})
+            columns = columns_by_file.setdefault(file, set() if self._rate else {self._time})
             columns.update(self._sources[name].columns)
         self._logs: dict[str, LogFile] = {
-            name: read_log(folder / Path(file), frozenset(wanted[file]))
+            name: read_log(folder / Path(file), frozenset(columns_by_file[file]))
             for name, file in files.items()
         }
 
@@ -463,8 +461,8 @@ class _FolderLogs:
         if is_linear:
             return np.interp(times, rows.stamps, values)
         places = np.searchsorted(rows.stamps, times + SAME_INSTANT_SECONDS, side="right") - 1
-        held: Array = values[np.maximum(places, 0)]
-        return held
+        held_values: Array = values[np.maximum(places, 0)]
+        return held_values
 
     def _read_stamps(self, log: LogFile, run_rows: Mask | None) -> tuple[Array, Mask]:
         """Return the stamps (N,) of a log in its own unit, and a mask of the unrepeated ones.
@@ -478,24 +476,24 @@ class _FolderLogs:
             return np.arange(count) / self._rate, np.ones(count, dtype=bool)
         stamps = log.get_column(self._time)
         stamps = stamps if run_rows is None else stamps[run_rows]
-        where = f"{log.path}, column {self._time}"
+        location = f"{log.path}, column {self._time}"
         if not np.isfinite(stamps).all():
             row = int(np.flatnonzero(~np.isfinite(stamps))[0]) + log.first
-            raise InputError(f"{where}, {log.rows} {row}: expected a stamp, found none")
+            raise InputError(f"{location}, {log.rows} {row}: expected a stamp, found none")
         if np.abs(stamps).max() * self._second > MAX_TIMESTAMP_SECONDS:
             raise InputError(
-                f"{where}: expected stamps in the unit that [time] states, found {stamps[0]:.12g}; "
-                "is it milliseconds or less?"
+                f"{location}: expected stamps in the unit that [time] states, found "
+                f"{stamps[0]:.12g}; is it milliseconds or less?"
             )
         steps = np.diff(stamps)
-        bad = np.flatnonzero(steps < 0)
-        if not bad.size and (steps == 0).sum() > MAX_REPEATED * stamps.size:
-            bad = np.flatnonzero(steps == 0)
-        if bad.size:
-            row = int(bad[0]) + 1 + log.first
+        bad_steps = np.flatnonzero(steps < 0)
+        if not bad_steps.size and (steps == 0).sum() > MAX_REPEATED * stamps.size:
+            bad_steps = np.flatnonzero(steps == 0)
+        if bad_steps.size:
+            row = int(bad_steps[0]) + 1 + log.first
             raise InputError(
-                f"{where}, {log.rows} {row}: expected more than {stamps[bad[0]]:.12g}, found "
-                f"{stamps[bad[0] + 1]:.12g}; take out rows that came twice or late"
+                f"{location}, {log.rows} {row}: expected more than {stamps[bad_steps[0]]:.12g}, "
+                f"found {stamps[bad_steps[0] + 1]:.12g}; take out rows that came twice or late"
             )
         is_first: Mask = np.diff(stamps, prepend=-np.inf) > 0
         return np.asarray(stamps), is_first

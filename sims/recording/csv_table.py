@@ -130,8 +130,8 @@ class Table:
         names: list[str] = []
         parts: list[list[Array]] = []
         while rows := list(islice(records, _CHUNK)):
-            even = self._check_row_widths(rows, len(header), len(names))
-            by_column = zip(*even, strict=True)
+            padded_rows = self._check_row_widths(rows, len(header), len(names))
+            by_column = zip(*padded_rows, strict=True)
             cells = dict(zip(header, by_column, strict=True))
             parts.append(
                 [
@@ -164,10 +164,10 @@ class Table:
         if len(header) < 2:
             text = "".join(header)
             marks = [name for mark, name in ((";", "semicolons"), ("\t", "tabs")) if mark in text]
-            found = f"{marks[0]} (save it with commas)" if marks else format_value(text)
+            found_text = f"{marks[0]} (save it with commas)" if marks else format_value(text)
             raise InputError(
                 f"{self.path}, row 1: expected columns {', '.join(self.wanted)} between commas, "
-                f"found {found}"
+                f"found {found_text}"
             )
         for place, name in enumerate(header):
             if not name:
@@ -181,11 +181,11 @@ class Table:
                 )
         for name in header:
             if name not in self.wanted:
-                there = (
+                declared_names = (
                     f"{self.path.with_suffix('.toml').name} declares {_join_names(self.wanted[2:])}"
                 )
                 raise InputError(
-                    f"{self.path}: column {format_value(name)} is not declared; {there}"
+                    f"{self.path}: column {format_value(name)} is not declared; {declared_names}"
                 )
         return header
 
@@ -235,8 +235,8 @@ class Table:
         """
         if not (_NUMBER.fullmatch(cell) and math.isfinite(float(cell))):
             missing = name in self.inputs and not cell.strip()
-            more = "; an input has no missing samples" if missing else ""
-            self.fault(record, name, f"expected a finite number, found {format_value(cell)}{more}")
+            note = "; an input has no missing samples" if missing else ""
+            self.fault(record, name, f"expected a finite number, found {format_value(cell)}{note}")
 
     def runs(self, names: list[str], columns: dict[str, Array]) -> list[CsvRun]:
         """Split the rows into runs, each a block of rows with the same name, and check them.
@@ -263,8 +263,8 @@ class Table:
             if not name:
                 self.fault(begin, "run", "expected the name of a run, found none")
             if len(name) > MAX_NAME_LENGTH:
-                wanted = f"a name of at most {MAX_NAME_LENGTH} characters"
-                self.fault(begin, "run", f"expected {wanted}, found {format_value(name)}")
+                expected = f"a name of at most {MAX_NAME_LENGTH} characters"
+                self.fault(begin, "run", f"expected {expected}, found {format_value(name)}")
             if name in runs:
                 self.fault(
                     begin,
@@ -306,12 +306,12 @@ class Table:
             t: (T,) times.
             edges: First row of each run, and the number of rows.
         """
-        bad = t[1:] <= t[:-1]
+        is_bad = t[1:] <= t[:-1]
         # A run may begin earlier than the previous one ended.
-        begins = np.array(edges[1:-1], dtype=int)
-        bad[begins - 1] = False
-        if bad.any():
-            i = int(np.argmax(bad))
+        run_starts = np.array(edges[1:-1], dtype=int)
+        is_bad[run_starts - 1] = False
+        if is_bad.any():
+            i = int(np.argmax(is_bad))
             self.fault(i + 1, "t", f"expected more than {t[i]:.12g} s, found {t[i + 1]:.12g} s")
 
     def fault(self, record: int, column: str, message: str) -> NoReturn:
@@ -340,9 +340,9 @@ class Table:
             return reader.line_num
 
 
-def _join_names(names: Sequence[str], most: int = 12) -> str:
-    """Join names for a message; only the first `most` of many."""
-    text = ", ".join(names[:most])
-    if len(names) > most:
-        text += f" and {len(names) - most} more"
+def _join_names(names: Sequence[str], max_count: int = 12) -> str:
+    """Join names for a message; only the first `max_count` of many."""
+    text = ", ".join(names[:max_count])
+    if len(names) > max_count:
+        text += f" and {len(names) - max_count} more"
     return text

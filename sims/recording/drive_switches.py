@@ -50,13 +50,13 @@ class DriveSwitch(NamedTuple):
         A missing cell has the value of the previous one.
         """
         values = run.extra[self.column]
-        there = np.isfinite(values)
-        last = np.maximum.accumulate(np.where(there, np.arange(values.size), -1))
+        is_recorded = np.isfinite(values)
+        last = np.maximum.accumulate(np.where(is_recorded, np.arange(values.size), -1))
         # Before its first value, the column is assumed to have that value.
-        first = int(np.argmax(there)) if there.any() else 0
+        first = int(np.argmax(is_recorded)) if is_recorded.any() else 0
         filled = values[np.where(last < 0, first, last)]
         off: Mask = (filled == 0) == self.zero_is_off
-        return off & bool(there.any())
+        return off & bool(is_recorded.any())
 
     @property
     def line(self) -> str:
@@ -83,28 +83,28 @@ def read_switches(path: Path, meta: Mapping[str, Any]) -> tuple[DriveSwitch, ...
     Raises:
         InputError: A column name is not a text, or a drive has both keys.
     """
-    found = []
-    for name, own in check_table(path, "actuators", meta.get("actuators", {})).items():
-        keys = [key for key in KEYS if isinstance(own, dict) and key in own]
+    switches = []
+    for name, table in check_table(path, "actuators", meta.get("actuators", {})).items():
+        keys = [key for key in KEYS if isinstance(table, dict) and key in table]
         if len(keys) > 1:
             raise InputError(f"{path}: actuators.{name}: expected enable or disable, found both")
         for key in keys:
-            column = check_text(path, f"actuators.{name}.{key}", own[key], "the name of a column")
-            found.append(DriveSwitch(name, column, key == "enable"))
-    return tuple(found)
+            column = check_text(path, f"actuators.{name}.{key}", table[key], "the name of a column")
+            switches.append(DriveSwitch(name, column, key == "enable"))
+    return tuple(switches)
 
 
 def without_switches(actuators: Mapping[str, Any]) -> dict[str, Any]:
     """Return the tables of actuators that the model file lacks, without the keys of this module."""
     result = {}
-    for name, own in actuators.items():
-        if not isinstance(own, dict):
-            result[name] = own
+    for name, table in actuators.items():
+        if not isinstance(table, dict):
+            result[name] = table
             continue
-        rest = {key: value for key, value in own.items() if key not in KEYS}
+        other_entries = {key: value for key, value in table.items() if key not in KEYS}
         # A table with a switch column only belongs to an actuator of the model file.
-        if rest or not own:
-            result[name] = rest
+        if other_entries or not table:
+            result[name] = other_entries
     return result
 
 
@@ -126,16 +126,16 @@ def check_switches(
         InputError: There is no such actuator, or the column is a channel or an input.
     """
     for switch in switches:
-        where = f"{path}: actuators.{switch.actuator}"
+        location = f"{path}: actuators.{switch.actuator}"
         if switch.actuator not in actuators:
             names = list(actuators) or ["none"]
             raise InputError(
-                f"{where}: {make_unknown_name_error('actuator', switch.actuator, names)}"
+                f"{location}: {make_unknown_name_error('actuator', switch.actuator, names)}"
             )
         if switch.column in taken:
             raise InputError(
-                f"{where}: expected a column that says when the drive is on, found {switch.column},"
-                " which is a channel or input; name a column of its own"
+                f"{location}: expected a column that says when the drive is on, found "
+                f"{switch.column}, which is a channel or input; name a column of its own"
             )
 
 
@@ -160,23 +160,23 @@ def switched_runs(path: Path, runs: Sequence[Run], switches: Sequence[DriveSwitc
     notes: dict[str, list[str]] = {}
     by_run: list[dict[str, Mask]] = [{} for _ in runs]
     for switch in switches:
-        off = [switch.off(run) for run in runs]
-        if all(mask.all() for mask in off):
+        off_masks = [switch.off(run) for run in runs]
+        if all(mask.all() for mask in off_masks):
             raise InputError(
                 f"{path}: {switch.condition} in all samples: actuator {switch.actuator} is never "
                 f"on; expected samples in which it is, or another column in {switch.line}"
             )
-        for masks, mask in zip(by_run, off, strict=True):
+        for masks, mask in zip(by_run, off_masks, strict=True):
             if mask.any():
                 masks[switch.actuator] = mask
-        if any(mask.any() for mask in off):
-            note = f"where {switch.condition}: {spans_of_runs(runs, off)}"
+        if any(mask.any() for mask in off_masks):
+            note = f"where {switch.condition}: {spans_of_runs(runs, off_masks)}"
             notes.setdefault(note, []).append(switch.actuator)
-    said = [f"{_make_subject_and_verb(names)} nothing {note}" for note, names in notes.items()]
+    run_notes = [f"{_make_subject_and_verb(names)} nothing {note}" for note, names in notes.items()]
     switched = tuple(
         replace(run, off=masks) if masks else run for run, masks in zip(runs, by_run, strict=True)
     )
-    return Switched(switched, tuple(said))
+    return Switched(switched, tuple(run_notes))
 
 
 def spans_of_runs(runs: Sequence[Run], off: Sequence[Mask]) -> str:
@@ -186,13 +186,13 @@ def spans_of_runs(runs: Sequence[Run], off: Sequence[Mask]) -> str:
         runs: Runs.
         off: Mask (T,) of each run.
     """
-    told = [
+    run_texts = [
         f"run {run.name}, {_describe_time_spans(run.times, mask)}"
         for run, mask in zip(runs, off, strict=True)
         if mask.any()
     ]
-    more = f"; and {len(told) - MOST_RUNS} more runs" if len(told) > MOST_RUNS else ""
-    return f"{'; '.join(told[:MOST_RUNS])}{more}"
+    suffix = f"; and {len(run_texts) - MOST_RUNS} more runs" if len(run_texts) > MOST_RUNS else ""
+    return f"{'; '.join(run_texts[:MOST_RUNS])}{suffix}"
 
 
 def _make_subject_and_verb(names: Sequence[str]) -> str:
@@ -202,9 +202,9 @@ def _make_subject_and_verb(names: Sequence[str]) -> str:
     return f"actuators {', '.join(names)} exert"
 
 
-def _describe_time_spans(times: Array, off: Mask) -> str:
+def _describe_time_spans(times: Array, mask: Mask) -> str:
     """Describe the time spans in which a mask (T,) is set."""
-    return ", ".join(f"{times[first]:.4g} to {times[end - 1]:.4g} s" for first, end in spans(off))
+    return ", ".join(f"{times[first]:.4g} to {times[end - 1]:.4g} s" for first, end in spans(mask))
 
 
 def spans(mask: Mask) -> list[tuple[int, int]]:

@@ -136,8 +136,8 @@ class Run:
         """
         earlier = self.before.get(name, np.empty((2, 0)))
         stamps = np.concatenate([earlier[0] + self.times[0], self.times[:row]]) - self.times[row]
-        known = np.stack([stamps, np.concatenate([earlier[1], self.inputs[name][:row]])])
-        return known[:, stamps >= -self.memory]
+        samples = np.stack([stamps, np.concatenate([earlier[1], self.inputs[name][:row]])])
+        return samples[:, stamps >= -self.memory]
 
 
 @dataclass(frozen=True, repr=False)
@@ -209,32 +209,34 @@ def read_recording(
         InputError: The recording is malformed; the message is one line.
     """
     table = Path(path)
-    description, meta = read_meta(table)
-    about = check_description(description, meta, declared)
-    columns = list(about.channels), list(about.inputs)
-    own = table.with_suffix(".csv") if table.suffix == ".toml" else table
-    if about.sources.is_renaming and has_run_column(own):
-        table = own
-        parts = _read_renamed(own, about.sources, *columns, list(about.extra))
-    elif about.sources.stated:
-        parts = read_logs(table.with_suffix(".csv"), about.sources, *columns, about.linear)
+    description_path, meta = read_meta(table)
+    description = check_description(description_path, meta, declared)
+    columns = list(description.channels), list(description.inputs)
+    csv_path = table.with_suffix(".csv") if table.suffix == ".toml" else table
+    if description.sources.is_renaming and has_run_column(csv_path):
+        table = csv_path
+        parts = _read_renamed(csv_path, description.sources, *columns, list(description.extra))
+    elif description.sources.stated:
+        parts = read_logs(
+            table.with_suffix(".csv"), description.sources, *columns, description.linear
+        )
     else:
-        table = own
-        parts = read_table(own, *columns, list(about.extra))
-    check_run_names(description, about.runs, [part.name for part in parts])
+        table = csv_path
+        parts = read_table(csv_path, *columns, list(description.extra))
+    check_run_names(description_path, description.runs, [part.name for part in parts])
     switched = switched_runs(
-        table, [_make_run(table, part, about) for part in parts], about.switches
+        table, [_make_run(table, part, description) for part in parts], description.switches
     )
-    kept = switched.runs if whole else _split_runs(description, switched.runs, folds)
+    runs = switched.runs if whole else _split_runs(description_path, switched.runs, folds)
     return Recording(
         table,
-        about.system,
-        about.title,
-        about.constants,
-        about.noise,
-        kept,
-        about.extra,
-        model_in(description, meta),
+        description.system,
+        description.title,
+        description.constants,
+        description.noise,
+        runs,
+        description.extra,
+        model_in(description_path, meta),
         (*(note for part in parts for note in part.notes), *switched.notes),
     )
 
@@ -263,10 +265,10 @@ def _read_renamed(
         return list(dict.fromkeys(c for name in names for c in sources.signals[name].columns))
 
     measured = columns_of(channels)
-    given = [column for column in columns_of(inputs) if column not in measured]
+    input_columns = [column for column in columns_of(inputs) if column not in measured]
     extra_columns = {name: sources.extra[name].columns[0] for name in extra}
     parts = []
-    for part in read_table(path, measured, given, list(extra_columns.values())):
+    for part in read_table(path, measured, input_columns, list(extra_columns.values())):
         values = {
             name: sources.signals[name].combine(part.columns.__getitem__)
             for name in (*channels, *inputs)
@@ -300,21 +302,23 @@ def recording_of_frame(
         InputError: The frame is malformed; the message is one line.
     """
     path = Path(name)
-    whole = with_index(path, frame)
-    stated = described(path, whole, declared, meta, units)
-    about = check_description(path, stated, declared)
-    parts = read_frame(path, whole, about)
-    check_run_names(path, about.runs, [part.name for part in parts])
-    switched = switched_runs(path, [_make_run(path, part, about) for part in parts], about.switches)
+    indexed_frame = with_index(path, frame)
+    document = described(path, indexed_frame, declared, meta, units)
+    description = check_description(path, document, declared)
+    parts = read_frame(path, indexed_frame, description)
+    check_run_names(path, description.runs, [part.name for part in parts])
+    switched = switched_runs(
+        path, [_make_run(path, part, description) for part in parts], description.switches
+    )
     return Recording(
         path,
-        about.system,
-        about.title,
-        about.constants,
-        about.noise,
+        description.system,
+        description.title,
+        description.constants,
+        description.noise,
         switched.runs,
-        about.extra,
-        model_in(path, stated),
+        description.extra,
+        model_in(path, document),
         switched.notes,
     )
 
@@ -345,32 +349,32 @@ _HELD_OUT_STRIDE = 3
 """Every third run, or the last third of the samples of a single run, is held out."""
 
 
-def _make_run(table: Path, part: CsvRun, about: RecordingDescription) -> Run:
+def _make_run(table: Path, part: CsvRun, description: RecordingDescription) -> Run:
     """Make a run in SI units from its table and the metadata of the description."""
-    marks = about.runs.get(part.name, _UNMARKED)
-    channels = {n: _convert_column(table, part, n, s) for n, s in about.channels.items()}
-    inputs = {n: _convert_column(table, part, n, s) for n, s in about.inputs.items()}
-    for name, command in about.wrapped.items():
+    marks = description.runs.get(part.name, _UNMARKED)
+    channels = {n: _convert_column(table, part, n, s) for n, s in description.channels.items()}
+    inputs = {n: _convert_column(table, part, n, s) for n, s in description.inputs.items()}
+    for name, command in description.wrapped.items():
         channels[name] = make_read_only(unwrapped(channels[name], inputs.get(command)))
     # Extra columns keep their unit, because no system reads them.
-    extra = {name: part.columns[name] for name in about.extra if name in part.columns}
+    extra = {name: part.columns[name] for name in description.extra if name in part.columns}
     first = {
         n: s.gain * extra[n][0] + s.offset
-        for n, s in about.initial_pose_scales.items()
+        for n, s in description.initial_pose_scales.items()
         if n in extra
     }
-    begins = {name: float(value) for name, value in first.items() if np.isfinite(value)}
+    initial_pose = {name: float(value) for name, value in first.items() if np.isfinite(value)}
     return Run(
         part.name,
         part.times,
         channels,
         inputs,
         marks.constants,
-        {**begins, **marks.initial},
+        {**initial_pose, **marks.initial},
         bool(marks.held_out),
         extra,
-        about.linear,
-        about.sources.offset,
+        description.linear,
+        description.sources.offset,
     )
 
 
@@ -420,10 +424,10 @@ def _split_runs(path: Path, runs: Sequence[Run], folds: bool) -> tuple[Run, ...]
 def _split_run(path: Path, run: Run) -> tuple[Run, ...]:
     """Split a run into its first two thirds and its last third, which is held out."""
     count = len(run.times)
-    cut = (2 * count) // _HELD_OUT_STRIDE
+    split_index = (2 * count) // _HELD_OUT_STRIDE
     parts = (
-        replace(run.part(slice(cut)), held_out=False),
-        replace(run.part(slice(cut, None)), held_out=True),
+        replace(run.part(slice(split_index)), held_out=False),
+        replace(run.part(slice(split_index, None)), held_out=True),
     )
     for part in parts:
         measured = any(np.isfinite(values).any() for values in part.channels.values())

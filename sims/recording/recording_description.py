@@ -171,10 +171,10 @@ def model_in(
 
 def _read_free_parameters(path: Path, meta: Mapping[str, Any]) -> tuple[str, ...]:
     """Return the names of the robot parameters that the description leaves free."""
-    given = meta.get("free", [])
-    if not isinstance(given, list) or not all(isinstance(name, str) for name in given):
-        raise make_error(path, "free", 'names, as ["damping@*"]', given)
-    return tuple(given)
+    free_names = meta.get("free", [])
+    if not isinstance(free_names, list) or not all(isinstance(name, str) for name in free_names):
+        raise make_error(path, "free", 'names, as ["damping@*"]', free_names)
+    return tuple(free_names)
 
 
 def read_system_name(path: str | Path) -> str:
@@ -285,7 +285,7 @@ def check_description(
     _check_constants_possible(path, "constants", constants, declared)
     # The names of the runs are checked after the table was read (`check_run_names`).
     marks = check_table(path, "runs", meta.get("runs", {}))
-    runs = {name: _read_run(path, name, own, declared) for name, own in marks.items()}
+    runs = {name: _read_run(path, name, run_table, declared) for name, run_table in marks.items()}
     # A robot has no system name: its model file is stated instead.
     robotic = declared.has_model
     extra = _read_extra_columns(path, meta, declared)
@@ -331,16 +331,16 @@ def _read_wrapped_channels(
     result = {}
     for name, column in channels.items():
         value = column.table.get("unwrap", False)
-        where = f"channels.{name}.unwrap"
+        key = f"channels.{name}.unwrap"
         if not isinstance(value, (bool, str)):
             raise make_error(
-                path, where, "true, or the name of the command that tells the turn", value
+                path, key, "true, or the name of the command that tells the turn", value
             )
         if isinstance(value, str):
-            check_known_names(f"{where} of {path}", [value], inputs)
+            check_known_names(f"{key} of {path}", [value], inputs)
         if value and units[name] != "rad":
             raise make_error(
-                path, where, f"it with an angle alone ({name} is in {units[name]})", value
+                path, key, f"it with an angle alone ({name} is in {units[name]})", value
             )
         if value:
             result[name] = value if isinstance(value, str) else ""
@@ -373,9 +373,11 @@ def check_run_names(path: Path, marked: Iterable[str], there: Iterable[str]) -> 
 
 
 def _check_known_names(
-    path: Path, where: str, given: Iterable[str], allowed: Iterable[str]
+    path: Path, table_name: str, entry_names: Iterable[str], allowed: Iterable[str]
 ) -> None:
-    check_known_names(f"entry {f'in [{where}] ' if where else ''}of {path}", given, allowed)
+    check_known_names(
+        f"entry {f'in [{table_name}] ' if table_name else ''}of {path}", entry_names, allowed
+    )
 
 
 def _read_system_name(path: Path, meta: Mapping[str, Any]) -> str:
@@ -400,16 +402,16 @@ def _system_of(declared: DeclaredSignals) -> object:
 def _refuse_inputs(path: Path, meta: Mapping[str, Any], declared: DeclaredSignals) -> None:
     """Refuse inputs whose effect depends on quantities that a recording does not contain."""
     reasons: Mapping[str, str] = getattr(_system_of(declared), "refused_inputs", {})
-    given = dotted(check_table(path, "inputs", meta.get("inputs", {})), reasons)
-    for name in (name for name in reasons if name in given):
+    input_tables = dotted(check_table(path, "inputs", meta.get("inputs", {})), reasons)
+    for name in (name for name in reasons if name in input_tables):
         raise InputError(f"{path}: input {name}: {reasons[name]}")
 
 
 def _refuse_poses(path: Path, meta: Mapping[str, Any], declared: DeclaredSignals) -> None:
     """Refuse poses of floating bodies among the channels, and explain where to state them."""
     units = get_floating_state_units(declared)
-    given = dotted(check_table(path, "channels", meta.get("channels", {})), units)
-    for name in (name for name in units if name in given):
+    channel_tables = dotted(check_table(path, "channels", meta.get("channels", {})), units)
+    for name in (name for name in units if name in channel_tables):
         raise InputError(
             f"{path}: channel {name}: expected a joint or a sensor, found where a body floats; as "
             f'[extra."{name}"] the column\'s first cell says where a run begins'
@@ -421,9 +423,11 @@ def _read_columns(
 ) -> dict[str, _Column]:
     """Return the conversion of each column of one kind ("channel" or "input")."""
     units = {signal.name: signal.unit for signal in declared}
-    given = dotted(check_table(path, f"{kind}s", meta.get(f"{kind}s", {})), units)
-    check_known_names(f"{kind} in {path}", given, units)
-    return {name: _read_column(path, kind, name, own, units[name]) for name, own in given.items()}
+    tables = dotted(check_table(path, f"{kind}s", meta.get(f"{kind}s", {})), units)
+    check_known_names(f"{kind} in {path}", tables, units)
+    return {
+        name: _read_column(path, kind, name, table, units[name]) for name, table in tables.items()
+    }
 
 
 def dotted(given: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
@@ -442,9 +446,9 @@ def dotted(given: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
     result: dict[str, Any] = {}
     for name, value in given.items():
         inside = isinstance(value, dict) and name not in names
-        if inside and any(known.startswith(f"{name}.") for known in names):
-            within = {f"{name}.{key}": entry for key, entry in value.items()}
-            result.update(dotted(within, names))
+        if inside and any(known_name.startswith(f"{name}.") for known_name in names):
+            flat_entries = {f"{name}.{key}": entry for key, entry in value.items()}
+            result.update(dotted(flat_entries, names))
         else:
             result[name] = value
     return result
@@ -463,8 +467,8 @@ def _read_column(path: Path, kind: str, name: str, value: Any, unit: str) -> _Co
     With scale s and offset o of the log, and the conversion of the unit x -> g x + b, a value x
     of the log becomes g (s x + o) + b.
     """
-    where, usual = f"{kind} {name}", f'unit = "{unit}"'
-    own = check_table(path, where, value, f"a table with {usual}")
+    location, usual = f"{kind} {name}", f'unit = "{unit}"'
+    table = check_table(path, location, value, f"a table with {usual}")
     # Noise of an input is not allowed, because simulations cannot use it.
     allowed = (
         "unit",
@@ -475,32 +479,34 @@ def _read_column(path: Path, kind: str, name: str, value: Any, unit: str) -> _Co
         "file",
         *(("noise", "unwrap") if kind == "channel" else ("hold",)),
     )
-    _check_known_names(path, f"{kind}s.{name}", own, allowed)
+    _check_known_names(path, f"{kind}s.{name}", table, allowed)
     # The unit is required: a log in degrees without a unit would be read as radians.
-    stated = check_text(path, where, own.get("unit"), f"{usual} or one that converts to it")
+    stated_unit = check_text(
+        path, location, table.get("unit"), f"{usual} or one that converts to it"
+    )
     try:
-        converted = compute_unit_scale(stated, unit)
+        converted = compute_unit_scale(stated_unit, unit)
     except InputError as error:
-        raise InputError(f"{path}: {where}: {error}") from None
-    if not {"scale", "offset"} & own.keys():
-        return _Column(converted, own)
-    factor = check_finite(path, f"{kind}s.{name}.scale", own.get("scale", 1.0))
+        raise InputError(f"{path}: {location}: {error}") from None
+    if not {"scale", "offset"} & table.keys():
+        return _Column(converted, table)
+    factor = check_finite(path, f"{kind}s.{name}.scale", table.get("scale", 1.0))
     if factor == 0:
-        raise make_error(path, f"{kind}s.{name}.scale", "a factor that is not zero", own["scale"])
+        raise make_error(path, f"{kind}s.{name}.scale", "a factor that is not zero", table["scale"])
     # The offset is in the stated unit, so that the zero of an encoder can be copied from its log.
-    offset = check_finite(path, f"{kind}s.{name}.offset", own.get("offset", 0.0))
+    offset = check_finite(path, f"{kind}s.{name}.offset", table.get("offset", 0.0))
     gain = factor * converted.gain
-    return _Column(UnitScale(gain, converted.gain * offset + converted.offset), own)
+    return _Column(UnitScale(gain, converted.gain * offset + converted.offset), table)
 
 
 def _read_interpolation(path: Path, name: str, column: _Column) -> bool:
     """Return whether an input is interpolated linearly between samples."""
-    hold = column.table.get("hold", "zero")
-    if hold not in HOLD_MODES:
+    hold_mode = column.table.get("hold", "zero")
+    if hold_mode not in HOLD_MODES:
         raise make_error(
-            path, f"inputs.{name}.hold", " or ".join(f'"{one}"' for one in HOLD_MODES), hold
+            path, f"inputs.{name}.hold", " or ".join(f'"{mode}"' for mode in HOLD_MODES), hold_mode
         )
-    return bool(hold == "linear")
+    return bool(hold_mode == "linear")
 
 
 def _read_noises(
@@ -519,17 +525,17 @@ def _read_noises(
         # A standard deviation has no offset and no sign.
         noises[name] = abs(column.scale.gain) * _read_noise(path, name, column.table["noise"])
         if not 1 / _NEVER < noises[name] / sizes[name] < _NEVER:
-            wanted = f"that of values of about {sizes[name]:g} in SI units"
-            raise make_error(path, f"channels.{name}.noise", wanted, column.table["noise"])
+            expected = f"that of values of about {sizes[name]:g} in SI units"
+            raise make_error(path, f"channels.{name}.noise", expected, column.table["noise"])
     return noises
 
 
 def _read_noise(path: Path, name: str, value: Any) -> float:
     """Check the stated standard deviation of a channel's noise, in the unit of the column."""
-    where = f"channels.{name}.noise"
-    noise = check_finite(path, where, value)
+    key = f"channels.{name}.noise"
+    noise = check_finite(path, key, value)
     if noise <= 0:
-        raise make_error(path, where, "more than 0 (leave it out if unknown)", value)
+        raise make_error(path, key, "more than 0 (leave it out if unknown)", value)
     return noise
 
 
@@ -538,13 +544,13 @@ def _read_extra_columns(
 ) -> dict[str, Mapping[str, Any]]:
     """Return the tables of the columns that belong to no channel or input."""
     # A forgotten channel must not be accepted as an unused column.
-    taken = ["run", "t", *(signal.name for signal in (*declared.channels, *declared.inputs))]
+    used_names = ["run", "t", *(signal.name for signal in (*declared.channels, *declared.inputs))]
     tables: dict[str, Mapping[str, Any]] = {}
-    given = dotted(
+    extra_tables = dotted(
         check_table(path, "extra", meta.get("extra", {})), get_floating_state_units(declared)
     )
-    for name, entry in given.items():
-        if name in taken:
+    for name, entry in extra_tables.items():
+        if name in used_names:
             remedy = "declare it as channel or input"
             raise InputError(f"{path}: extra.{name}: is a column of its own right; {remedy}")
         unit = entry.get("unit") if isinstance(entry, dict) else None
@@ -559,57 +565,57 @@ def _read_pose_columns(
     path: Path, extra: Mapping[str, str], declared: DeclaredSignals
 ) -> dict[str, UnitScale]:
     """Return the conversion to SI units of the columns with initial poses of floating bodies."""
-    begins = {}
+    pose_scales = {}
     for name, unit in get_floating_state_units(declared).items():
         if name in extra:
             try:
-                begins[name] = compute_unit_scale(extra[name], unit)
+                pose_scales[name] = compute_unit_scale(extra[name], unit)
             except InputError as error:
                 raise InputError(f"{path}: extra {name}: {error}") from None
-    return begins
+    return pose_scales
 
 
 def _read_run(path: Path, name: str, value: Any, declared: DeclaredSignals) -> RunMetadata:
     """Check the table of one run: its constants, its initial state, and whether it is held out."""
-    where = f"runs.{name}"
-    own = check_table(path, where, value)
+    location = f"runs.{name}"
+    table = check_table(path, location, value)
     allowed = [c.name for c in declared.constants]
     _check_known_names(
-        path, where, own, ("constants", "initial", "held_out", "folder", "file", *allowed)
+        path, location, table, ("constants", "initial", "held_out", "folder", "file", *allowed)
     )
-    held_out = own.get("held_out")
+    held_out = table.get("held_out")
     if held_out is not None:
-        check_type(path, f"{where}.held_out", held_out, bool, "true or false")
+        check_type(path, f"{location}.held_out", held_out, bool, "true or false")
     # The constants of a run may be in a table of their own or among its other entries.
-    constants = _read_constants(path, f"{where}.constants", own.get("constants", {}), declared)
-    direct = {key: number for key, number in own.items() if key in allowed}
-    for twice in constants.keys() & direct.keys():
-        raise InputError(f"{path}: {where}: constant {twice} stands twice")
-    constants |= _read_constants(path, where, direct, declared)
-    _check_constants_possible(path, where, constants, declared)
+    constants = _read_constants(path, f"{location}.constants", table.get("constants", {}), declared)
+    direct = {key: number for key, number in table.items() if key in allowed}
+    for repeated_name in constants.keys() & direct.keys():
+        raise InputError(f"{path}: {location}: constant {repeated_name} stands twice")
+    constants |= _read_constants(path, location, direct, declared)
+    _check_constants_possible(path, location, constants, declared)
     states = [*declared.states, *getattr(_system_of(declared), "activations", ())]
-    initial = _read_numbers(path, f"{where}.initial", own.get("initial", {}), states)
+    initial = _read_numbers(path, f"{location}.initial", table.get("initial", {}), states)
     return RunMetadata(constants, initial, held_out)
 
 
 def _read_constants(
-    path: Path, where: str, value: Any, declared: DeclaredSignals
+    path: Path, key: str, value: Any, declared: DeclaredSignals
 ) -> dict[str, float]:
-    return _read_numbers(path, where, value, [c.name for c in declared.constants])
+    return _read_numbers(path, key, value, [c.name for c in declared.constants])
 
 
-def _read_numbers(path: Path, where: str, value: Any, allowed: Collection[str]) -> dict[str, float]:
+def _read_numbers(path: Path, key: str, value: Any, allowed: Collection[str]) -> dict[str, float]:
     """Check a table of finite numbers, whose names must be among the allowed ones."""
-    given = dotted(check_table(path, where, value), allowed)
-    _check_known_names(path, where, given, allowed)
-    return {name: check_finite(path, f"{where}.{name}", number) for name, number in given.items()}
+    entries = dotted(check_table(path, key, value), allowed)
+    _check_known_names(path, key, entries, allowed)
+    return {name: check_finite(path, f"{key}.{name}", number) for name, number in entries.items()}
 
 
 def _check_constants_possible(
-    path: Path, where: str, constants: Mapping[str, float], declared: DeclaredSignals
+    path: Path, key: str, constants: Mapping[str, float], declared: DeclaredSignals
 ) -> None:
     """Check that constants are physically possible, such as a positive mass."""
     for c in declared.constants:
-        if c.name in constants and (wanted := c.wanted(constants[c.name])):
+        if c.name in constants and (expected := c.wanted(constants[c.name])):
             value = constants[c.name]
-            raise InputError(f"{path}: {where}.{c.name}: expected {wanted}, found {value:g}")
+            raise InputError(f"{path}: {key}.{c.name}: expected {expected}, found {value:g}")

@@ -57,18 +57,18 @@ def with_index(path: Path, frame: Frame) -> Any:
     Raises:
         InputError: The name of a column is not a text, or is not unique.
     """
-    whole: Any = frame
-    levels = [name for name in whole.index.names if name in ("run", "t")]
-    levels = [name for name in levels if name not in whole.columns]
+    indexed_frame: Any = frame
+    levels = [name for name in indexed_frame.index.names if name in ("run", "t")]
+    levels = [name for name in levels if name not in indexed_frame.columns]
     if levels:
-        whole = whole.reset_index(level=levels)
-    names = list(whole.columns)
+        indexed_frame = indexed_frame.reset_index(level=levels)
+    names = list(indexed_frame.columns)
     for place, name in enumerate(names):
         if not isinstance(name, str):
             raise InputError(f"{path}: column {format_value(name)}: expected a name, found no text")
         if name in names[:place]:
             raise InputError(f"{path}: column {format_value(name)} stands twice")
-    return whole
+    return indexed_frame
 
 
 def described(
@@ -112,10 +112,10 @@ def described(
 
     switches = [switch.column for switch in read_switches(path, result)]
     stamps = _list_signal_columns("t", time)[0]
-    taken = {stamps, *extra}
-    for name, own in (*channels.items(), *inputs.items(), *extra.items()):
-        taken.update(_list_signal_columns(name, own))
-    for name in (name for name in columns if name not in taken):
+    used_columns = {stamps, *extra}
+    for name, table in (*channels.items(), *inputs.items(), *extra.items()):
+        used_columns.update(_list_signal_columns(name, table))
+    for name in (name for name in columns if name not in used_columns):
         if name in _list_names(declared.channels):
             channels[name] = {}
         elif name in _list_names(declared.inputs):
@@ -131,10 +131,10 @@ def described(
     noted = noted if isinstance(noted, Mapping) else {}
     _state_unit(time, stamps, units, noted)
     missing = {}
-    for name, own in (*channels.items(), *inputs.items(), *extra.items()):
+    for name, table in (*channels.items(), *inputs.items(), *extra.items()):
         # Entries that are not tables are refused when the description is checked.
-        column = _list_signal_columns(name, own)[0]
-        if isinstance(own, dict) and not _state_unit(own, column, units, noted):
+        column = _list_signal_columns(name, table)[0]
+        if isinstance(table, dict) and not _state_unit(table, column, units, noted):
             missing[column] = usual.get(name, "1")
     if missing:
         raise InputError(
@@ -144,22 +144,22 @@ def described(
     return {**result, **{key: entries for key, entries in tables.items() if entries}}
 
 
-def _list_signal_columns(name: str, own: Any) -> list[str]:
+def _list_signal_columns(name: str, table: Any) -> list[str]:
     """Return the columns of a signal; entries of a wrong type are refused elsewhere."""
-    column = own.get("column") if isinstance(own, dict) else None
+    column = table.get("column") if isinstance(table, dict) else None
     columns = column if isinstance(column, list) else [column]
     return [column for column in columns if isinstance(column, str)] or [name]
 
 
 def _state_unit(
-    own: dict[str, Any], column: str, units: Mapping[str, str], noted: Mapping[str, Any]
+    table: dict[str, Any], column: str, units: Mapping[str, str], noted: Mapping[str, Any]
 ) -> bool:
     """Write the unit of a column into its table, and return whether a unit is known."""
     if column in units:
-        own["unit"] = units[column]
-    elif "unit" not in own and column in noted:
-        own["unit"] = noted[column]
-    return "unit" in own
+        table["unit"] = units[column]
+    elif "unit" not in table and column in noted:
+        table["unit"] = noted[column]
+    return "unit" in table
 
 
 def _copy_plain(value: Any) -> Any:
@@ -178,13 +178,13 @@ def _list_names(signals: Iterable[Any]) -> list[str]:
 def _belongs_to_nothing(path: Path, name: str, declared: DeclaredSignals) -> InputError:
     """Make the error for a column that is neither channel nor input."""
     channels, inputs = _list_names(declared.channels), _list_names(declared.inputs)
-    there = f"channels {', '.join(channels)}"
-    there += f" and inputs {', '.join(inputs)}" if inputs else " and no inputs"
-    near = similar(name, [*channels, *inputs])
+    declared_names = f"channels {', '.join(channels)}"
+    declared_names += f" and inputs {', '.join(inputs)}" if inputs else " and no inputs"
+    suggestion = similar(name, [*channels, *inputs])
     return InputError(
         f"{path}: column {format_value(name)}: expected a channel or input of {declared.name}, "
-        f"which has {there}{near}; rename the column, drop it, or state what it is with "
-        f"description={{'extra': {{{name!r}: {{'unit': '1'}}}}}}"
+        f"which has {declared_names}{suggestion}; rename the column, drop it, or state what it is "
+        f"with description={{'extra': {{{name!r}: {{'unit': '1'}}}}}}"
     )
 
 
@@ -252,8 +252,8 @@ class _FrameTable(Table):
         if missing.any():
             self.fault(int(np.argmax(missing)), "run", "expected the name of a run, found none")
         # A column of integers that once had missing cells has the type float.
-        whole = cells.dtype.kind == "f"
-        return [f"{cell:g}" if whole else str(cell).strip() for cell in cells]
+        is_float = cells.dtype.kind == "f"
+        return [f"{cell:g}" if is_float else str(cell).strip() for cell in cells]
 
     def _get_values(self, name: str, frame: Any, column: str) -> Array:
         """Return a column as numbers (T,); NaN where a cell is missing."""
@@ -268,10 +268,10 @@ class _FrameTable(Table):
                 if not missing[record] and not is_plausible_number(cell):
                     self.fault(record, column, f"expected a number, found {format_value(cell)}")
         values: Array = cells.to_numpy(dtype=float, na_value=np.nan)
-        bad = np.isinf(values) if name in self.gaps else ~np.isfinite(values)
-        if bad.any():
-            record = int(np.argmax(bad))
-            more = "; an input has no missing samples" if name in self.inputs else ""
-            found = "none" if missing[record] else f"{values[record]}"
-            self.fault(record, column, f"expected a finite number, found {found}{more}")
+        is_bad = np.isinf(values) if name in self.gaps else ~np.isfinite(values)
+        if is_bad.any():
+            record = int(np.argmax(is_bad))
+            note = "; an input has no missing samples" if name in self.inputs else ""
+            found_text = "none" if missing[record] else f"{values[record]}"
+            self.fault(record, column, f"expected a finite number, found {found_text}{note}")
         return values

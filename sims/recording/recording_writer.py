@@ -101,23 +101,23 @@ def _format_table(runs: Sequence[Run], digits: int) -> str:
     extra = list(runs[0].extra)
     # The columns are those of the first run, and all other runs must have the same.
     writer.writerow(["run", "t", *inputs, *channels, *extra])
-    seen: set[str] = set()
+    run_names: set[str] = set()
     for run in runs:
-        if run.name in seen:
+        if run.name in run_names:
             raise InputError(f"two runs are called {run.name!r}; expected different names")
-        seen.add(run.name)
-        for names, there, kind in _list_signals(run, inputs, channels, extra):
-            if set(names) != set(there):
+        run_names.add(run.name)
+        for names, signal_columns, kind in _list_signals(run, inputs, channels, extra):
+            if set(names) != set(signal_columns):
                 raise make_unknown_name_error(
                     f"{kind} of run {run.name}",
-                    ", ".join(set(names) ^ set(there)),
+                    ", ".join(set(names) ^ set(signal_columns)),
                     names or ["none"],
                 )
         columns = [
             run.times,
             *(
-                there[n]
-                for names, there, _ in _list_signals(run, inputs, channels, extra)
+                signal_columns[n]
+                for names, signal_columns, _ in _list_signals(run, inputs, channels, extra)
                 for n in names
             ),
         ]
@@ -150,34 +150,34 @@ def _format_cells(values: Array, digits: int) -> list[str]:
     return [shortest(v) if math.isfinite(v) else "" for v in values.tolist()]
 
 
-def _describe_source(recording: Recording, beside: Path) -> dict[str, Any]:
+def _describe_source(recording: Recording, folder: Path) -> dict[str, Any]:
     """Return the keys that state what was recorded: a system, or a model file.
 
     Args:
         recording: Recording.
-        beside: Folder to which the path of the model file is relative.
+        folder: Folder to which the path of the model file is relative.
     """
     model = recording.model
     if model is None:
         return {"system": recording.system}
     try:
-        file = os.path.relpath(model.path, beside)
+        file = os.path.relpath(model.path, folder)
     except ValueError:  # on another drive
         file = str(model.path.resolve())
-    stated = {"actuators": model.actuators, "engine": model.engine}
-    return {"model": Path(file).as_posix(), **{k: dict(v) for k, v in stated.items() if v}}
+    model_entries = {"actuators": model.actuators, "engine": model.engine}
+    return {"model": Path(file).as_posix(), **{k: dict(v) for k, v in model_entries.items() if v}}
 
 
-def _format_description(recording: Recording, declared: DeclaredSignals, beside: Path) -> str:
+def _format_description(recording: Recording, declared: DeclaredSignals, folder: Path) -> str:
     """Return the text of the description in TOML: units, constants, and what is known of each run.
 
-    `beside` is the folder of the recording; a model file is stated relative to it.
+    `folder` is the folder of the recording; a model file is stated relative to it.
     """
     import tomli_w
 
     units = {c.name: c.unit for c in (*declared.inputs, *declared.channels)}
     first = recording.runs[0]
-    document: dict[str, Any] = {**_describe_source(recording, beside), "title": recording.title}
+    document: dict[str, Any] = {**_describe_source(recording, folder), "title": recording.title}
     document["channels"] = {
         n: {"unit": units[n], **_get_stated_noise(recording.noise, n)} for n in first.channels
     }

@@ -62,7 +62,7 @@ def compute_unit_scale(unit: str, target: str) -> UnitScale:
         raise InputError(f"unknown unit {unit!r}; expected one that converts to {target}") from None
     try:
         # Three values determine gain and offset, and show whether the conversion is linear.
-        zero, one, two = (
+        value_at_zero, value_at_one, value_at_two = (
             float(registry.Quantity(v, parsed).to(target).magnitude) for v in (0.0, 1.0, 2.0)
         )
     except Exception:
@@ -71,11 +71,15 @@ def compute_unit_scale(unit: str, target: str) -> UnitScale:
         raise InputError(
             f"expected a unit that converts to {target}, found {unit!r}{hint}"
         ) from None
-    gain = one - zero
-    if abs(two - one - gain) > _ROUNDING * abs(gain):
+    gain = value_at_one - value_at_zero
+    if abs(value_at_two - value_at_one - gain) > _ROUNDING * abs(gain):
         raise InputError(f"expected a unit that converts to {target} in proportion, found {unit!r}")
     # A gain that differs from 1 by rounding is 1.
-    return IDENTITY_SCALE if zero == 0.0 and abs(gain - 1.0) < 1e-12 else UnitScale(gain, zero)
+    return (
+        IDENTITY_SCALE
+        if value_at_zero == 0.0 and abs(gain - 1.0) < 1e-12
+        else UnitScale(gain, value_at_zero)
+    )
 
 
 def is_unit(unit: str) -> bool:

@@ -93,14 +93,14 @@ class ColumnAssigner:
 
         If it cannot be decided, the user is asked to check.
         """
-        placed = [(column, joint) for column, joint, _ in self._signals.place_columns(columns)]
-        if not placed:
+        assignments = [(column, joint) for column, joint, _ in self._signals.place_columns(columns)]
+        if not assignments:
             return
         path, options = self._logs.first_path, self._options
         # An episode has one log; other runs may contain larger positions than the first.
         largest = max(
             float(np.nanmax(np.abs(values), initial=0.0))
-            for column, _ in placed
+            for column, _ in assignments
             for values in (column.values, *self._logs.read_runs(column)[1:])
         )
         calibration = None if options.calibration is None else Path(options.calibration)
@@ -110,10 +110,10 @@ class ColumnAssigner:
         elif (
             not options.position_unit
             and largest <= MAX_NORMALISED
-            and is_lerobot(path, (column.name for column, _ in placed))
+            and is_lerobot(path, (column.name for column, _ in assignments))
             and any(
                 column_guessing.guess_position_unit(column.values, joint) in ("deg", None)
-                for column, joint in placed
+                for column, joint in assignments
             )
         ):
             self._result.checks.append(
@@ -154,9 +154,9 @@ class ColumnAssigner:
         guessed_unit = column_guessing.guess_position_unit(column.values, joint)
         if guessed_unit is None:
             low, high = joint.range or (-np.inf, np.inf)
-            ends = f"{np.nanmin(column.values):.4g} to {np.nanmax(column.values):.4g}"
+            range_text = f"{np.nanmin(column.values):.4g} to {np.nanmax(column.values):.4g}"
             self._result.leave_out(
-                column, f"goes from {ends}, {joint.name} from {low:.4g} to {high:.4g}"
+                column, f"goes from {range_text}, {joint.name} from {low:.4g} to {high:.4g}"
             )
             return None
         return Signal(column, guessed_unit, placement, f"; in {guessed_unit} by its range")
@@ -218,10 +218,11 @@ class ColumnAssigner:
         name = f"u.{actuator.name}"
         if expected is not None and quantity is not None and quantity != expected:
             words = {"force": "torque" if joint.kind == "hinge" else "force"}
-            desired, taken = (words.get(word, word) for word in (quantity, expected))
+            desired, expected_quantity = (words.get(word, word) for word in (quantity, expected))
             self._result.leave_out(
                 column,
-                f"is a desired {desired} of {joint.name}, and {actuator.name} takes a {taken}",
+                f"is a desired {desired} of {joint.name}, and {actuator.name} takes a "
+                f"{expected_quantity}",
             )
         elif actuator.kind == "motor":
             self._assign_force(column, joint, name, placement)
@@ -259,8 +260,8 @@ class ColumnAssigner:
         if not is_convertible(unit, joint.force_unit):
             self._result.leave_out(column, f"is in {unit}, expected {joint.force_unit}")
             return
-        stated = "as its file states" if column.unit else "which no file states"
-        signal = Signal(column, unit, placement, f"{origin}; in {unit}, {stated}")
+        unit_origin = "as its file states" if column.unit else "which no file states"
+        signal = Signal(column, unit, placement, f"{origin}; in {unit}, {unit_origin}")
         self._add_signal(self._signals.inputs, name, column, signal)
 
     def assign_efforts(self) -> None:

@@ -96,8 +96,8 @@ class LogColumn(NamedTuple):
     @property
     def quantity(self) -> str:
         """The quantity that the stated unit measures; empty if there is no unit."""
-        found = read_unit(self.unit) if self.unit else None
-        return found[1] if found else ""
+        unit_and_quantity = read_unit(self.unit) if self.unit else None
+        return unit_and_quantity[1] if unit_and_quantity else ""
 
 
 def split_name(text: str) -> list[str]:
@@ -153,9 +153,9 @@ def _measured_role(words: set[str]) -> Role | None:
     roles: tuple[Role, ...] = ("other", "velocity", "force", "position")
     # `current` in "current position" is not an electric current, and a joint state may be a
     # velocity.
-    for some in (words - _VAGUE, words & {"current", "currents", "load", "loads"}, words):
+    for word_subset in (words - _VAGUE, words & {"current", "currents", "load", "loads"}, words):
         for role in roles:
-            if some & ROLE_KEYWORDS[role]:
+            if word_subset & ROLE_KEYWORDS[role]:
                 return role
     return None
 
@@ -234,7 +234,10 @@ def clocks(columns: Iterable[LogColumn]) -> list[LogColumn]:
         if _is_increasing(column.values, MAX_REPEATED if is_named else 0.0):
             rank = 0 if is_named and "header" in words else 1 if is_named else 2
             ranked_columns.append((rank, place, column))
-    return [column for _, _, column in sorted(ranked_columns, key=lambda one: one[:2])]
+    return [
+        column
+        for _, _, column in sorted(ranked_columns, key=lambda ranked_column: ranked_column[:2])
+    ]
 
 
 def guess_time_unit(stamps: Array) -> str | None:
@@ -264,23 +267,23 @@ def guess_position_unit(values: Array, joint: Joint) -> str | None:
     si_unit, small_unit, size = (
         ("rad", "deg", DEGREES_PER_RADIAN) if joint.kind == "hinge" else ("m", "mm", 1e3)
     )
-    ends = np.array([np.nanmin(values), np.nanmax(values)])
+    extremes = np.array([np.nanmin(values), np.nanmax(values)])
     if joint.range is None:
         return (
             si_unit
-            if joint.kind != "hinge" or np.abs(ends).max() <= MAX_UNLIMITED_POSITION_RAD
+            if joint.kind != "hinge" or np.abs(extremes).max() <= MAX_UNLIMITED_POSITION_RAD
             else small_unit
         )
     for unit, size_of_unit in ((si_unit, 1.0), (small_unit, size)):
-        if _is_within_limits(ends / size_of_unit, joint.range):
+        if _is_within_limits(extremes / size_of_unit, joint.range):
             return unit
     return None
 
 
-def _is_within_limits(ends: Array, limits: tuple[float, float]) -> bool:
+def _is_within_limits(extremes: Array, limits: tuple[float, float]) -> bool:
     """Return whether a lowest and a highest position lie within a joint's widened range."""
     slack = MAX_RANGE_EXCESS * (limits[1] - limits[0])
-    return bool(limits[0] - slack <= ends[0] and ends[1] <= limits[1] + slack)
+    return bool(limits[0] - slack <= extremes[0] and extremes[1] <= limits[1] + slack)
 
 
 def is_constant(values: Array) -> bool:

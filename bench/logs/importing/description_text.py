@@ -195,12 +195,12 @@ class DescriptionWriter:
         if position is None:
             return samples
         for run in self._logs.runs:
-            given = self._logs.read(run, command.column)
+            command_samples = self._logs.read(run, command.column)
             measured = self._logs.read(run, position.column)
-            if given is None or measured is None:
+            if command_samples is None or measured is None:
                 continue
             times, values = measured
-            u = command.convert(joint.unit, hold(*given, times))
+            u = command.convert(joint.unit, hold(*command_samples, times))
             samples.append((times, u, position.convert(joint.unit, values)))
         return samples
 

@@ -54,7 +54,7 @@ def leave_out_settling(recording: Recording, kind: type[Simulator]) -> tuple[Rec
     if not seconds:
         return recording, ""
     filters = activation_filters(robot.robot)
-    names = ", ".join(one.actuator.name for one in filters)
+    names = ", ".join(state_filter.actuator.name for state_filter in filters)
     note = (
         f"the first {seconds:.3g} s of runs are left out, in which the filters of {names} settle: "
         "their first activations are not recorded (state them if they are known: "

@@ -38,11 +38,11 @@ def order_of_commands(commands: Sequence[Array], positions: Sequence[Array]) -> 
     if distances is None:
         return None
     order = least_order(distances)
-    moved = [i for i, place in enumerate(order) if place != i]
-    if not moved:
+    moved_places = [i for i, place in enumerate(order) if place != i]
+    if not moved_places:
         return None
-    stays = float(np.sqrt(distances[moved, moved].sum()))
-    moves = float(np.sqrt(distances[moved, [order[i] for i in moved]].sum()))
+    stays = float(np.sqrt(distances[moved_places, moved_places].sum()))
+    moves = float(np.sqrt(distances[moved_places, [order[i] for i in moved_places]].sum()))
     return order if moves < MAX_DISTANCE_RATIO * stays else None
 
 

@@ -84,12 +84,12 @@ def _servo_signals(logs: RunLogs, signals: SignalAssignment) -> _ServoSignals:
         for u, name in zip(inputs, names, strict=True)
     ]
     is_guess = any(signal.placement.is_order for pair in pairs for signal in pair)
-    held = [logs.hold_command(u.column, q.column) for u, q in pairs]
+    signal_pairs = [logs.hold_command(u.column, q.column) for u, q in pairs]
     # Positions of one file share their sample times; those of several files may not.
-    if len(joints) < 2 or not is_guess or len({u.size for u, _ in held}) > 1:
+    if len(joints) < 2 or not is_guess or len({u.size for u, _ in signal_pairs}) > 1:
         return _ServoSignals(names, inputs, [], [])
     commands, positions = [], []
-    for joint, (command, position), (u, q) in zip(joints, pairs, held, strict=True):
+    for joint, (command, position), (u, q) in zip(joints, pairs, signal_pairs, strict=True):
         commands.append(command.convert(joint.unit, u))
         positions.append(position.convert(joint.unit, q))
     return _ServoSignals(names, inputs, commands, positions)
@@ -186,10 +186,11 @@ def _report_order(
     if len(names) < 2 or all(map(signals.has_number_of_joint, names)):
         return
     model, alphabet = ", ".join(names[:MAX_NAMES]), ", ".join(sorted(names)[:MAX_NAMES])
-    other = f" (sorted by name, as ROS drivers have it, they would be {alphabet})"
+    sorted_order_note = f" (sorted by name, as ROS drivers have it, they would be {alphabet})"
     subject = "columns" if positions else "commands"
     result.checks.append(
         f"order of joints: the log does not name those of its {subject}; they are taken in the "
-        f"model's order, {model}, which is a guess{other if model != alphabet else ''}; if another "
-        "order is right, exchange the `column` lines"
+        f"model's order, {model}, which is a "
+        f"guess{sorted_order_note if model != alphabet else ''}; if another order is right, "
+        "exchange the `column` lines"
     )

@@ -74,14 +74,14 @@ def preferred_order(
     Returns:
         The best order; None if the motion is too short or there are fewer than two joints.
     """
-    known = np.isfinite(commands).all(axis=0) & np.isfinite(positions).all(axis=0)
-    known &= np.diff(times, prepend=-np.inf) > 0
-    if known.sum() < 4 * WINDOW or len(driven) < 2:
+    is_usable = np.isfinite(commands).all(axis=0) & np.isfinite(positions).all(axis=0)
+    is_usable &= np.diff(times, prepend=-np.inf) > 0
+    if is_usable.sum() < 4 * WINDOW or len(driven) < 2:
         return None
     # SciPy's signal module is slow to import.
     from scipy.signal import savgol_filter
 
-    t, u, q = times[known], np.array(commands)[:, known], np.array(positions)[:, known]
+    t, u, q = times[is_usable], np.array(commands)[:, is_usable], np.array(positions)[:, is_usable]
     step = float(np.median(np.diff(t)))
     derivatives = [savgol_filter(q, WINDOW, DEGREE, deriv=k, delta=step, axis=1) for k in range(3)]
     motion = np.stack(derivatives)
@@ -113,10 +113,13 @@ def _iterate_orders(names: Sequence[str]) -> Iterator[tuple[int, ...]]:
     alphabetical = [by_name.index(j) for j in range(count)]
     for order in (as_stated, alphabetical, as_stated[::-1]):
         yield tuple(order)
-        for one, other in combinations(range(count), 2):
-            own = list(order)
-            own[one], own[other] = own[other], own[one]
-            yield tuple(own)
+        for first, second in combinations(range(count), 2):
+            exchanged_order = list(order)
+            exchanged_order[first], exchanged_order[second] = (
+                exchanged_order[second],
+                exchanged_order[first],
+            )
+            yield tuple(exchanged_order)
 
 
 def _compute_order_residual(

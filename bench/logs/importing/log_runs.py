@@ -75,9 +75,9 @@ def runs_of(logs: Sequence[Path]) -> dict[str, RunFiles]:
             raise InputError("expected the files of one run in one folder; name the folders")
         runs = {"": RunFiles(folders.pop(), files, chosen=True)}
     if not runs:
-        given = ", ".join(map(str, logs))
+        log_names = ", ".join(map(str, logs))
         kinds = ", ".join((*TABLES, *BAG_SUFFIXES))
-        raise InputError(f"{given}: expected logs ({kinds}), found none")
+        raise InputError(f"{log_names}: expected logs ({kinds}), found none")
     if len(runs) == 1:
         ((name, run),) = runs.items()
         return _one_run_a_group(run) or _one_run_a_file(run) or {name: run}

@@ -167,7 +167,7 @@ def _has_dataset_episodes(description: Path, meta: Mapping[str, object]) -> bool
     """Return whether a description's runs are episodes of a dataset."""
     runs = meta.get("runs")
     tables = runs.values() if isinstance(runs, dict) else ()
-    folders = [own.get("folder") for own in tables if isinstance(own, dict)]
+    folders = [table.get("folder") for table in tables if isinstance(table, dict)]
     return any(
         isinstance(folder, str)
         and split_episode_path(description.parent / folder / "frames") is not None

@@ -142,10 +142,11 @@ class RunLogs:
     def _no_header(self, log: LogFile) -> InputError:
         """Make the error for a table whose first row contains numbers."""
         names = ["t", *(f"{name}_pos" for name in self._joint_names)]
-        shown = ",".join(names[:MAX_NAMES])
+        example_header = ",".join(names[:MAX_NAMES])
         return InputError(
             f"{log.path}, row {log.first}: expected a header that names the "
-            f"{len(log.list_columns())} columns, found numbers; put one above, such as {shown},..."
+            f"{len(log.list_columns())} columns, found numbers; put one above, such as "
+            f"{example_header},..."
         )
 
     def _leave_out_file(self, file: str, error: InputError, path: Path) -> None:
@@ -271,8 +272,8 @@ def hold(stamps: Array, values: Array, times: Array) -> Array:
         times: (T,) times of the result, s.
     """
     places = np.searchsorted(stamps, times, side="right") - 1
-    held: Array = values[np.clip(places, 0, values.size - 1)]
-    return held
+    held_values: Array = values[np.clip(places, 0, values.size - 1)]
+    return held_values
 
 
 def _all_columns(file: str, log: LogFile) -> list[LogColumn]:

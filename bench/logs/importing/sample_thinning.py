@@ -45,12 +45,14 @@ def thin(recording: Recording, kind: type[Simulator]) -> tuple[Recording, str]:
     rate = min((_compute_sampling_rate(run) for run in recording.runs), default=0.0)
     if not kind.has_model or rate <= FASTEST:
         return recording, ""
-    every = next((k for k in range(round(rate / SLOWEST), 1, -1) if _keeps_motion(recording, k)), 1)
-    if every == 1:
+    stride = next(
+        (k for k in range(round(rate / SLOWEST), 1, -1) if _keeps_motion(recording, k)), 1
+    )
+    if stride == 1:
         return recording, ""
-    runs = tuple(_thin_run(run, every) for run in recording.runs)
+    runs = tuple(_thin_run(run, stride) for run in recording.runs)
     note = (
-        f"sampled at {rate:.4g} Hz, faster than it moves: each sample of {every} is used, "
+        f"sampled at {rate:.4g} Hz, faster than it moves: each sample of {stride} is used, "
         "and the mean of the inputs between them"
     )
     return replace(recording, runs=runs), note
@@ -61,45 +63,45 @@ def _compute_sampling_rate(run: Run) -> float:
     return float(1.0 / np.median(np.diff(run.times))) if run.times.size > 1 else 0.0
 
 
-def _keeps_motion(recording: Recording, every: int) -> bool:
-    """Return whether every k-th sample still shows the whole motion; k is `every`.
+def _keeps_motion(recording: Recording, stride: int) -> bool:
+    """Return whether every k-th sample still shows the whole motion; k is `stride`.
 
     The motion between the kept samples is interpolated by a spline. Its error may hardly be larger
     than if every second sample is kept, which is noise.
     """
     for run in recording.runs:
-        if run.times.size < FEWEST * every:
+        if run.times.size < FEWEST * stride:
             return False
         for values in run.channels.values():
             if np.isfinite(values).mean() < COMPLETE:
                 return False
-            least = PRECISION * float(np.ptp(values[np.isfinite(values)]))
-            allowed = max(LARGER * _interpolation_error(run.times, values, 2), least)
-            if _interpolation_error(run.times, values, every) > allowed:
+            min_error = PRECISION * float(np.ptp(values[np.isfinite(values)]))
+            allowed = max(LARGER * _interpolation_error(run.times, values, 2), min_error)
+            if _interpolation_error(run.times, values, stride) > allowed:
                 return False
     return True
 
 
-def _interpolation_error(times: Array, values: Array, every: int) -> float:
+def _interpolation_error(times: Array, values: Array, stride: int) -> float:
     """Return the RMS error of a cubic spline through every k-th sample at the other samples."""
     # Import SciPy here, since only fast recordings need it.
     from scipy.interpolate import CubicSpline
 
-    there = np.isfinite(values)
-    kept = there & (np.arange(times.size) % every == 0)
-    first, last = np.flatnonzero(kept)[[0, -1]]
-    others = there & ~kept
-    others[:first] = others[last:] = False
-    if not others.any():
+    is_recorded = np.isfinite(values)
+    is_node = is_recorded & (np.arange(times.size) % stride == 0)
+    first, last = np.flatnonzero(is_node)[[0, -1]]
+    is_left_out = is_recorded & ~is_node
+    is_left_out[:first] = is_left_out[last:] = False
+    if not is_left_out.any():
         return 0.0
-    missed = CubicSpline(times[kept], values[kept])(times[others]) - values[others]
+    missed = CubicSpline(times[is_node], values[is_node])(times[is_left_out]) - values[is_left_out]
     return float(np.sqrt(np.mean(np.square(missed))))
 
 
-def _thin_run(run: Run, every: int) -> Run:
+def _thin_run(run: Run, stride: int) -> Run:
     """Keep every k-th sample of a run, and average its inputs from each one to the next."""
-    part = run.part(slice(None, None, every))
-    first = np.arange(0, run.times.size, every)
+    part = run.part(slice(None, None, stride))
+    first = np.arange(0, run.times.size, stride)
     spans = np.diff(run.times, append=run.times[-1] + np.median(np.diff(run.times)))
     inputs = dict(part.inputs)
     for name in part.inputs:

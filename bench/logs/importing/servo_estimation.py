@@ -58,16 +58,16 @@ def estimate_servo_response(runs: Sequence[tuple[Array, Array, Array]]) -> Servo
     from scipy.signal import cont2discrete, lfilter
 
     step = float(np.median([np.median(np.diff(t)) for t, _, _ in moving]))
-    whole = sum(float(np.var(q)) * q.size for _, _, q in moving)
-    best, least = None, (1.0 - MIN_EXPLAINED_VARIANCE) * whole
+    total_variation = sum(float(np.var(q)) * q.size for _, _, q in moving)
+    best, smallest_residual = None, (1.0 - MIN_EXPLAINED_VARIANCE) * total_variation
     for frequency, damping in product(FREQUENCY_GRID.tolist(), DAMPING_GRID.tolist()):
         system = [frequency**2], [1.0, 2.0 * damping * frequency, frequency**2]
         over, under, _ = cont2discrete(system, step)
-        left = 0.0
+        residual = 0.0
         for _, u, q in moving:
-            left += float(np.var(q - lfilter(np.ravel(over), under, u - u[0]))) * q.size
-        if left < least:
-            best, least = ServoResponse(frequency, damping), left
+            residual += float(np.var(q - lfilter(np.ravel(over), under, u - u[0]))) * q.size
+        if residual < smallest_residual:
+            best, smallest_residual = ServoResponse(frequency, damping), residual
     return best
 
 
@@ -75,5 +75,9 @@ def _select_present_samples(
     times: Array, command: Array, position: Array
 ) -> tuple[Array, Array, Array]:
     """Return the samples that are not missing, at most the first `MAX_SAMPLES`."""
-    seen = np.isfinite(position) & np.isfinite(command)
-    return times[seen][:MAX_SAMPLES], command[seen][:MAX_SAMPLES], position[seen][:MAX_SAMPLES]
+    is_recorded = np.isfinite(position) & np.isfinite(command)
+    return (
+        times[is_recorded][:MAX_SAMPLES],
+        command[is_recorded][:MAX_SAMPLES],
+        position[is_recorded][:MAX_SAMPLES],
+    )

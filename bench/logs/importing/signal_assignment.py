@@ -120,24 +120,24 @@ class SignalAssignment:
         self, columns: Sequence[LogColumn]
     ) -> list[tuple[LogColumn, Joint, Placement]]:
         """Assign columns of one kind to joints: by their names, else by their numbers."""
-        placed = []
+        assignments = []
         numbered: dict[tuple[str, str], list[LogColumn]] = {}
         for column in columns:
             joint = column_guessing.match_joint(column, self.joints)
             if joint is not None:
-                placed.append((column, joint, Placement.NAME))
+                assignments.append((column, joint, Placement.NAME))
             else:
                 # Columns of one kind differ by the last number of their names.
                 group = column.file, re.sub(r"\d+(?=\D*$)", "", column.bare)
                 numbered.setdefault(group, []).append(column)
         for group_columns in numbered.values():
             joints = column_guessing.match_numbered_joints(group_columns, self.joints)
-            placed += [
+            assignments += [
                 (column, joints[column.name], Placement.MODEL_ORDER)
                 for column in group_columns
                 if column.name in joints
             ]
-        return placed
+        return assignments
 
     def has_number_of_joint(self, joint: str) -> bool:
         """Return whether the number in a joint's name is that of its column's name."""

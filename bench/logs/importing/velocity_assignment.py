@@ -54,12 +54,12 @@ class _Candidate(NamedTuple):
     @property
     def kind(self) -> tuple[str, ...]:
         """File and words of the column's name, without those of its joint and without numbers."""
-        own = set(column_guessing.split_name(self.joint.name))
+        joint_words = set(column_guessing.split_name(self.joint.name))
         words = column_guessing.split_name(self.column.bare)
         return (
             self.column.file,
             self.joint.kind,
-            *(word for word in words if word not in own and not word.isdigit()),
+            *(word for word in words if word not in joint_words and not word.isdigit()),
         )
 
 
@@ -75,10 +75,10 @@ def assign_velocities(
         result: Result to which messages are added.
     """
     columns = [c for c in logs.columns if column_guessing.guess_role(c) == "velocity"]
-    placed = signals.place_columns(columns)
-    by_order = {joint.name: c for c, joint, p in placed if p is Placement.MODEL_ORDER}
+    assignments = signals.place_columns(columns)
+    by_order = {joint.name: c for c, joint, p in assignments if p is Placement.MODEL_ORDER}
     kinds: dict[tuple[str, ...], list[_Candidate]] = {}
-    for own_column, joint, own_placement in placed:
+    for own_column, joint, own_placement in assignments:
         column, placement = own_column, own_placement
         if placement is Placement.MODEL_ORDER and joint.name in exchanged:
             column = by_order.get(exchanged[joint.name], own_column)
@@ -120,8 +120,8 @@ def _confirmed_unit(comparison: VelocityComparison | None, column: LogColumn, jo
     if comparison is None or comparison.correlation < MIN_CORRELATION:
         return ""
     si = f"{joint.unit}/s"
-    stated = [column.unit] if is_convertible(column.unit, si) else []
-    for unit in (*stated, *UNITS["hinge" if joint.kind == "hinge" else "slide"]):
+    stated_units = [column.unit] if is_convertible(column.unit, si) else []
+    for unit in (*stated_units, *UNITS["hinge" if joint.kind == "hinge" else "slide"]):
         gain = compute_unit_scale(unit, si).gain
         if SLOPE_RANGE[0] < gain / comparison.slope < SLOPE_RANGE[1]:
             return unit
@@ -143,7 +143,7 @@ def _assign_kind(
     delay = VelocityComparison.pool(comparisons).delay() if comparisons else None
     for column, joint, placement, position, comparison, confirmed_unit in candidates:
         name, source = f"qd.{joint.name}", position.column.name
-        stated = column.unit if is_convertible(column.unit, f"{joint.unit}/s") else ""
+        stated_unit = column.unit if is_convertible(column.unit, f"{joint.unit}/s") else ""
         unit = confirmed_unit or (usual_unit if comparison is None else "")
         if name in signals.channels:
             reason = f"{name} is {signals.channels[name].column.name} already"
@@ -158,8 +158,8 @@ def _assign_kind(
                 f"is {delay.samples:.2g} samples {delay.direction_word} the derivative of "
                 f"{source}, filtered or stamped at another time"
             )
-        elif stated and unit != stated:
-            reason = f"is in {stated} by its name and in {unit} by {source}"
+        elif stated_unit and unit != stated_unit:
+            reason = f"is in {stated_unit} by its name and in {unit} by {source}"
         else:
             origin = f"the derivative of {source}"
             if not confirmed_unit:

@@ -85,16 +85,16 @@ def check_clock_drift(recording: Recording, kind: type[Simulator]) -> Iterator[Q
     Returns:
         At most one finding.
     """
-    found = [
+    estimates = [
         estimate
         for command, position in _list_driven_positions(kind)
         for run in recording.runs
         if command in run.inputs and position in run.channels
         for estimate in _estimate_run_drifts(run, command, position)
     ]
-    if not found:
+    if not estimates:
         return
-    drift, error = _pool_estimates(found)
+    drift, error = _pool_estimates(estimates)
     if abs(drift) < max(MIN_REPORTED_DRIFT, SIGNIFICANCE_SIGMAS * error):
         return
     word = "fast" if drift > 0 else "slow"
@@ -123,33 +123,33 @@ def _estimate_run_drifts(run: Run, command: str, position: str) -> Iterator[_Est
     grow with time. Nothing is yielded if the commands explain too little of the motion.
     """
     t, u, y = run.times, run.inputs[command], run.channels[position]
-    seen = np.isfinite(y)
-    if seen.sum() < 2 * len(LAG_BIN_EDGES) or not (np.nanstd(y) > 0 and np.std(u) > 0):
+    is_recorded = np.isfinite(y)
+    if is_recorded.sum() < 2 * len(LAG_BIN_EDGES) or not (np.nanstd(y) > 0 and np.std(u) > 0):
         return
     step = max(float(np.median(np.diff(t))), float(t[-1] - t[0]) / MAX_COMPARED_INSTANTS)
     grid = np.arange(t[0], t[-1], step)
-    own = np.interp(grid, t[seen], y[seen])
+    positions = np.interp(grid, t[is_recorded], y[is_recorded])
     memory = _average_over_intervals(np.interp(grid, t, u))
     inner = slice(LAG_BIN_EDGES[-1], len(grid) + LAG_BIN_EDGES[0])
     time = (grid - grid.mean())[inner]
-    own, memory = own[inner], memory[inner]
-    if time.size < BLOCK_COUNT * LAG_BIN_EDGES[-1] or not np.std(own) > 0:
+    positions, memory = positions[inner], memory[inner]
+    if time.size < BLOCK_COUNT * LAG_BIN_EDGES[-1] or not np.std(positions) > 0:
         return
     smooth = np.column_stack([np.ones_like(time), time, memory])
-    answer, *_ = np.linalg.lstsq(smooth, own, rcond=1e-10)
-    predicted = smooth @ answer  # Equation (1).
-    if np.var(own - predicted) > (1.0 - MIN_EXPLAINED_VARIANCE) * np.var(own):
+    coefficients, *_ = np.linalg.lstsq(smooth, positions, rcond=1e-10)
+    predicted = smooth @ coefficients  # Equation (1).
+    if np.var(positions - predicted) > (1.0 - MIN_EXPLAINED_VARIANCE) * np.var(positions):
         return
     rate = np.gradient(predicted, step)
     basis, _ = np.linalg.qr(np.column_stack([smooth, rate]))
-    late = -time * rate
-    late = late - basis @ (basis.T @ late)
-    power = float(late @ late)
+    delay_response = -time * rate
+    delay_response = delay_response - basis @ (basis.T @ delay_response)
+    power = float(delay_response @ delay_response)
     if not power > 0:
         return
-    drift = float(late @ own) / power
-    rest = own - basis @ (basis.T @ own) - drift * late
-    sums = np.add.reduceat(late * rest, np.arange(0, time.size, LAG_BIN_EDGES[-1]))
+    drift = float(delay_response @ positions) / power
+    residual = positions - basis @ (basis.T @ positions) - drift * delay_response
+    sums = np.add.reduceat(delay_response * residual, np.arange(0, time.size, LAG_BIN_EDGES[-1]))
     error = (
         STUDENT_T_FACTORS[min(len(sums), len(STUDENT_T_FACTORS) - 1)]
         * float(np.sqrt(sums @ sums))
@@ -161,21 +161,21 @@ def _estimate_run_drifts(run: Run, command: str, position: str) -> Iterator[_Est
 def _average_over_intervals(u: Array) -> Array:
     """Return the (N, K) means of a command over the intervals of equation (1)."""
     total = np.concatenate([[0.0], np.cumsum(u)])
-    at = np.arange(u.size)
+    samples = np.arange(u.size)
     columns = []
     for begin, end in pairwise(LAG_BIN_EDGES):
-        first, last = (np.clip(at - bound + 1, 0, u.size) for bound in (end, begin))
+        first, last = (np.clip(samples - bound + 1, 0, u.size) for bound in (end, begin))
         columns.append((total[last] - total[first]) / (end - begin))
     return np.column_stack(columns)
 
 
-def _pool_estimates(found: list[_Estimate]) -> _Estimate:
+def _pool_estimates(estimates: list[_Estimate]) -> _Estimate:
     """Return the weighted mean; scale its error up if estimates scatter more than their errors."""
-    drifts, errors = np.array(found).T
+    drifts, errors = np.array(estimates).T
     weights = np.maximum(errors, 1e-12) ** -2.0
     drift = float(weights @ drifts / weights.sum())
     error = float(weights.sum() ** -0.5)
-    if len(found) > 1:
-        scatter = float(weights @ (drifts - drift) ** 2) / (len(found) - 1)
+    if len(estimates) > 1:
+        scatter = float(weights @ (drifts - drift) ** 2) / (len(estimates) - 1)
         error *= max(scatter, 1.0) ** 0.5
     return _Estimate(drift, error)

@@ -26,19 +26,23 @@ def find_missing_base_poses(recording: Recording, kind: type[Simulator]) -> Iter
     Returns:
         One certain anomaly for each such joint.
     """
-    own: dict[str, list[str]] = {}
+    states_by_joint: dict[str, list[str]] = {}
     for name in get_floating_state_units(kind):
         joint = name.split(".", 1)[1].rpartition(".")[0]
-        own.setdefault(joint, []).append(name)
-    for joint, states in own.items():
-        found = (run for run in recording.runs if run.initial.keys().isdisjoint(states))
-        run = next(found, None)
+        states_by_joint.setdefault(joint, []).append(name)
+    for joint, states in states_by_joint.items():
+        incomplete_runs = (run for run in recording.runs if run.initial.keys().isdisjoint(states))
+        run = next(incomplete_runs, None)
         if run is None:
             continue
-        names = [other.name for other in recording.runs]
+        names = [recorded_run.name for recorded_run in recording.runs]
         if names.count(run.name) > 1:
-            what = f"where {joint} is when the last third of a single run begins; record another"
+            missing_text = (
+                f"where {joint} is when the last third of a single run begins; record another"
+            )
         else:
-            what = f"where {joint} begins; state [runs.{run.name}.initial], of {', '.join(states)}"
-            what = f"{what} (what is left out is as in the model file, at rest)"
-        yield Anomaly(f"run {run.name}: nothing says {what}", True)
+            missing_text = (
+                f"where {joint} begins; state [runs.{run.name}.initial], of {', '.join(states)}"
+            )
+            missing_text = f"{missing_text} (what is left out is as in the model file, at rest)"
+        yield Anomaly(f"run {run.name}: nothing says {missing_text}", True)

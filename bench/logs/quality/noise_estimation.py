@@ -49,7 +49,11 @@ def estimate_noise(signals: Iterable[tuple[Array, Array]]) -> NoiseEstimate:
     Args:
         signals: (times (T,), values (T,)) of each run; NaN values are missing.
     """
-    runs = [(t[seen], y[seen]) for t, y in signals if (seen := np.isfinite(y)).any()]
+    runs = [
+        (t[is_recorded], y[is_recorded])
+        for t, y in signals
+        if (is_recorded := np.isfinite(y)).any()
+    ]
     sigmas, step = [_estimate_sigma(runs, order) for order in (2, 3)], _find_quantisation_step(runs)
     if not np.isfinite(sigmas).any():
         return NoiseEstimate(np.nan, step)
@@ -70,7 +74,12 @@ def differences_sigma(signals: Iterable[tuple[Array, Array]], order: int) -> flo
         Standard deviation; NaN if all runs are too short.
     """
     return _estimate_sigma(
-        [(t[seen], y[seen]) for t, y in signals if (seen := np.isfinite(y)).any()], order
+        [
+            (t[is_recorded], y[is_recorded])
+            for t, y in signals
+            if (is_recorded := np.isfinite(y)).any()
+        ],
+        order,
     )
 
 
@@ -88,12 +97,12 @@ def _compute_divided_differences(times: Array, values: Array, order: int) -> Arr
     """
     t, y = sliding_window_view(times, order + 1), sliding_window_view(values, order + 1)
     # Motion across a gap is no longer close to a polynomial.
-    near = t[:, -1] - t[:, 0] <= _GAP * order * np.median(np.diff(times))
-    t, y = t[near], y[near]
+    is_gapless = t[:, -1] - t[:, 0] <= _GAP * order * np.median(np.diff(times))
+    t, y = t[is_gapless], y[is_gapless]
     # The ones on the diagonal leave out the factor t_i - t_i.
-    between = t[:, :, None] - t[:, None, :] + np.eye(order + 1)
+    time_differences = t[:, :, None] - t[:, None, :] + np.eye(order + 1)
     # Equation (1): a polynomial of lower order becomes zero, white noise keeps its variance.
-    weights = 1.0 / between.prod(axis=2)
+    weights = 1.0 / time_differences.prod(axis=2)
     weights /= np.sqrt((weights * weights).sum(axis=1, keepdims=True))
     rests: Array = (weights * y).sum(axis=1)
     return rests

@@ -76,8 +76,8 @@ def _check_range(recording: Recording, joint: Any) -> Iterator[Anomaly]:
         values = run.channels.get(column)
         if values is None or not np.isfinite(values).any():
             continue
-        ends = np.array([np.nanmin(values), np.nanmax(values)])
-        extreme = float(ends[np.argmax(np.abs(ends))])
+        extremes = np.array([np.nanmin(values), np.nanmax(values)])
+        extreme = float(extremes[np.argmax(np.abs(extremes))])
         if joint.range is None:
             if joint.kind == "hinge" and abs(extreme) > MAX_PLAUSIBLE_TURNS * 2.0 * np.pi:
                 turns = f"{abs(extreme) / (2.0 * np.pi):.3g} turns"
@@ -87,18 +87,18 @@ def _check_range(recording: Recording, joint: Any) -> Iterator[Anomaly]:
             continue
         low, high = joint.range
         slack = MAX_RANGE_EXCESS * (high - low)
-        if low - slack <= ends[0] and ends[1] <= high + slack:
-            excess = np.array([low - ends[0], ends[1] - high])
+        if low - slack <= extremes[0] and extremes[1] <= high + slack:
+            excess = np.array([low - extremes[0], extremes[1] - high])
             if excess.max() > RANGE_TOLERANCE * (high - low):
                 side = int(excess.argmax())
                 stop = f"joint {joint.name} of the model stops at {(low, high)[side]:.4g}"
-                message = f"goes to {ends[side]:.4g} {unit}, and {stop}; is its range right?"
+                message = f"goes to {extremes[side]:.4g} {unit}, and {stop}; is its range right?"
                 yield Anomaly(f"run {run.name}, column {column}: {message}", False)
                 return
             continue
-        scaled = smaller * ends
-        fits = low - slack <= scaled[0] and scaled[1] <= high + slack
-        doubt = f"is the unit {name}?" if fits else "is the unit right?"
+        scaled = smaller * extremes
+        is_within_limits = low - slack <= scaled[0] and scaled[1] <= high + slack
+        doubt = f"is the unit {name}?" if is_within_limits else "is the unit right?"
         message = f"expected within {low:.4g} to {high:.4g} {unit}, the joint's range"
         yield Anomaly(
             f"run {run.name}, column {column}: {message}, found {extreme:.4g}; {doubt}", True
@@ -271,14 +271,16 @@ def _check_exchanged(
     `pairs` has slope and correlation for each pair of a command and a position.
     """
     for i, (command, position) in enumerate(servo_signals):
-        for other_command, other in servo_signals[i + 1 :]:
-            crossed = pairs[command, other], pairs[other_command, position]
-            own = pairs[command, position], pairs[other_command, other]
+        for other_command, other_position in servo_signals[i + 1 :]:
+            crossed = pairs[command, other_position], pairs[other_command, position]
+            own_pairs = pairs[command, position], pairs[other_command, other_position]
             if (
                 min(pair.correlation for pair in crossed) > MIN_FOLLOWING_CORRELATION
-                and max(abs(pair.correlation) for pair in own) < MAX_UNRELATED_CORRELATION
+                and max(abs(pair.correlation) for pair in own_pairs) < MAX_UNRELATED_CORRELATION
             ):
-                subject = f"columns {position} and {other}: each follows the other's command"
+                subject = (
+                    f"columns {position} and {other_position}: each follows the other's command"
+                )
                 yield Anomaly(f"{subject}; are they swapped?", False)
 
 

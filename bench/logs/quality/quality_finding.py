@@ -32,6 +32,8 @@ def format_names(names: Iterable[str], most: int = 4) -> str:
         names: Names, possibly repeated.
         most: Maximum number of names that are written out.
     """
-    each = list(dict.fromkeys(names))
-    more = len(each) - most
-    return ", ".join(each[:most]) + (f" and {more} more" if more > 0 else "")
+    distinct_names = list(dict.fromkeys(names))
+    unnamed_count = len(distinct_names) - most
+    return ", ".join(distinct_names[:most]) + (
+        f" and {unnamed_count} more" if unnamed_count > 0 else ""
+    )

@@ -32,38 +32,44 @@ _MAD = 1.4826
 
 def check_intervals(recording: Recording) -> Iterator[QualityFinding]:
     """Find irregular sampling intervals (jitter) and lost samples, summarised over all runs."""
-    jittered, rests, lost, whole, lossy = [], [], 0, 0, []
+    jittered, jitters, lost_count, sample_count, lossy = [], [], 0, 0, []
     for run in recording.runs:
         steps = np.diff(_select_timestamps(run))
         if steps.size < 2:
             continue
         ratios = steps / np.median(steps)
         counts = np.maximum(np.round(ratios), 1.0)
-        own = ratios - counts
-        jitter = _MAD * float(np.median(np.abs(own - np.median(own))))
-        rests.append(jitter)
+        deviations = ratios - counts
+        jitter = _MAD * float(np.median(np.abs(deviations - np.median(deviations))))
+        jitters.append(jitter)
         if jitter > JITTER_THRESHOLD:
             jittered.append(run.name)
-        gone = int((counts - 1)[np.abs(own) < max(INTEGER_INTERVAL_TOLERANCE, 3.0 * jitter)].sum())
+        run_lost_count = int(
+            (counts - 1)[np.abs(deviations) < max(INTEGER_INTERVAL_TOLERANCE, 3.0 * jitter)].sum()
+        )
         # If the clock jitters strongly, a long interval means a lost sample only if no short
         # interval compensates for it.
-        gone = min(gone, max(int(ratios.sum()) - steps.size, 0))
-        if gone < SIGNIFICANCE_SIGMAS * jitter * steps.size**0.5:
-            gone = 0
-        lost, whole = lost + gone, whole + steps.size + gone
-        if gone:
+        run_lost_count = min(run_lost_count, max(int(ratios.sum()) - steps.size, 0))
+        if run_lost_count < SIGNIFICANCE_SIGMAS * jitter * steps.size**0.5:
+            run_lost_count = 0
+        lost_count, sample_count = (
+            lost_count + run_lost_count,
+            sample_count + steps.size + run_lost_count,
+        )
+        if run_lost_count:
             lossy.append(run.name)
     if jittered:
         yield QualityFinding(
             "clock",
-            f"intervals vary by {max(rests):.0%} of one (1 sigma) in {format_names(jittered)}",
+            f"intervals vary by {max(jitters):.0%} of one (1 sigma) in {format_names(jittered)}",
             "every sample is simulated at its own stamp, so let the stamps be those of measuring "
             "and not of writing",
         )
-    if whole and lost > LOST_SAMPLE_SHARE_THRESHOLD * whole:
+    if sample_count and lost_count > LOST_SAMPLE_SHARE_THRESHOLD * sample_count:
         yield QualityFinding(
             "clock",
-            f"{lost} samples ({lost / whole:.1%}) are lost in {format_names(lossy)}",
+            f"{lost_count} samples ({lost_count / sample_count:.1%}) are lost in "
+            f"{format_names(lossy)}",
             "nothing is filled in, but a command that changed in between is not known: log "
             "commands in a file of their own, or at a lower rate",
         )
@@ -76,10 +82,16 @@ def _select_timestamps(run: Run) -> Array:
     own clocks. All sample times are returned if they are at least as regular: the missing samples
     of the sensor are then empty cells.
     """
-    seen = [np.isfinite(values) for values in run.channels.values()]
-    often = max(seen, key=lambda one: int(one.sum()), default=np.ones(run.times.size, np.bool_))
-    own = run.times[often]
-    return run.times if _compute_uneven_share(run.times) <= _compute_uneven_share(own) else own
+    recorded_masks = [np.isfinite(values) for values in run.channels.values()]
+    is_recorded = max(
+        recorded_masks, key=lambda mask: int(mask.sum()), default=np.ones(run.times.size, np.bool_)
+    )
+    sensor_times = run.times[is_recorded]
+    return (
+        run.times
+        if _compute_uneven_share(run.times) <= _compute_uneven_share(sensor_times)
+        else sensor_times
+    )
 
 
 def _compute_uneven_share(times: Array) -> float:
@@ -96,18 +108,18 @@ def check_repeated_samples(recording: Recording) -> Iterator[QualityFinding]:
 
     Such samples were not measured anew, and look like a delay.
     """
-    found, there, runs = 0, 0, []
+    repeated_count, sample_count, runs = 0, 0, []
     for run in recording.runs:
         count, expected = _count_stale_samples(run)
         if count > expected + SIGNIFICANCE_SIGMAS * np.sqrt(max(expected, 1.0)):
-            found += count
+            repeated_count += count
             runs.append(run.name)
-        there += run.times.size
-    if found > LOST_SAMPLE_SHARE_THRESHOLD * there:
+        sample_count += run.times.size
+    if repeated_count > LOST_SAMPLE_SHARE_THRESHOLD * sample_count:
         yield QualityFinding(
             "clock",
-            f"{found} samples ({found / there:.1%}) repeat the one before in every channel while "
-            f"it moves, in {format_names(runs)}",
+            f"{repeated_count} samples ({repeated_count / sample_count:.1%}) repeat the one before "
+            f"in every channel while it moves, in {format_names(runs)}",
             "leave these rows out: a value that is old by an interval passes for a delay",
         )
 
@@ -122,15 +134,17 @@ def _count_stale_samples(run: Run) -> tuple[int, float]:
     if not signals or run.times.size < 4:
         return 0, 0.0
     changes = np.array([_in_steps(values) for values in signals])
-    same = np.nan_to_num(changes, nan=0.0) == 0
-    around = np.maximum(np.abs(changes[:, :-2]), np.abs(changes[:, 2:]))
-    moving = np.nan_to_num(np.max(around, axis=0, initial=0.0), nan=0.0) >= FAST_SIGNAL_STEPS
-    stale = same.all(axis=0)[1:-1] & moving
+    is_unchanged = np.nan_to_num(changes, nan=0.0) == 0
+    neighbour_changes = np.maximum(np.abs(changes[:, :-2]), np.abs(changes[:, 2:]))
+    moving = (
+        np.nan_to_num(np.max(neighbour_changes, axis=0, initial=0.0), nan=0.0) >= FAST_SIGNAL_STEPS
+    )
+    stale = is_unchanged.all(axis=0)[1:-1] & moving
     # A signal whose noise spans several steps repeats its value half as often as it changes by one
     # step in either direction.
-    near = (np.abs(np.nan_to_num(changes, nan=9.0)) < 1.5).all(axis=0)[1:-1] & moving
-    one = int(near.sum()) - int(stale.sum())
-    return int(stale.sum()), one / max(3.0 ** len(signals) - 1.0, 1.0)
+    is_nearly_stale = (np.abs(np.nan_to_num(changes, nan=9.0)) < 1.5).all(axis=0)[1:-1] & moving
+    one_step_count = int(is_nearly_stale.sum()) - int(stale.sum())
+    return int(stale.sum()), one_step_count / max(3.0 ** len(signals) - 1.0, 1.0)
 
 
 def _in_steps(values: Array) -> Array:

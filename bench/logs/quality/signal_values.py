@@ -46,15 +46,15 @@ def check_quantisation(recording: Recording, kind: type[Simulator]) -> Iterator[
         step = estimate_noise(signals).step
         values = np.concatenate([values for _, values in signals])
         spread = float(np.nanmax(values) - np.nanmin(values)) if np.isfinite(values).any() else 0.0
-        stated = recording.noise.get(channel.name)
+        stated_noise = recording.noise.get(channel.name)
         # A rounding error is uniformly distributed over a step; its standard deviation follows.
         rounding = step / 12**0.5
         unit = channel.unit
-        if step and stated is not None and stated < rounding / 2:
+        if step and stated_noise is not None and stated_noise < rounding / 2:
             yield QualityFinding(
                 "quantisation",
                 f"{channel.name} goes in steps of {step:.3g} {unit}, whose rounding alone is "
-                f"{rounding:.2g} {unit}, and the noise stated is {stated:.2g}",
+                f"{rounding:.2g} {unit}, and the noise stated is {stated_noise:.2g}",
                 f"state noise = {rounding:.2g} or more",
             )
         elif step > QUANTISATION_SHARE_THRESHOLD * spread > 0:
@@ -78,15 +78,17 @@ def check_saturation(recording: Recording, kind: type[Simulator]) -> Iterator[Qu
     """
     for channel, signals in _iterate_channels(recording, kind):
         for sign, word in ((1.0, "highest"), (-1.0, "lowest")):
-            values = [sign * own for _, own in signals if np.isfinite(own).any()]
+            values = [
+                sign * run_values for _, run_values in signals if np.isfinite(run_values).any()
+            ]
             if not values:
                 continue
-            end = max(float(np.nanmax(own)) for own in values)
+            end = max(float(np.nanmax(run_values)) for run_values in values)
             jump = CLIPPING_STEP_THRESHOLD * estimate_noise(signals).step
-            flat = sum(_count_saturated_samples(own, end, jump) for own in values)
-            total = sum(own.size for own in values)
+            flat = sum(_count_saturated_samples(run_values, end, jump) for run_values in values)
+            total = sum(run_values.size for run_values in values)
             if flat > MIN_SATURATED_SHARE * total and not all(
-                _is_resting_value(own, end) for own in values
+                _is_resting_value(run_values, end) for run_values in values
             ):
                 yield QualityFinding(
                     "saturation",
@@ -133,31 +135,31 @@ def check_standstill(recording: Recording, kind: type[Simulator]) -> Iterator[Qu
     """
     if not issubclass(kind, SystemSimulator):
         return
-    never, seldom = [], []
+    still_channels, seldom_moving = [], []
     positions = set(kind.system.coordinates)
     for channel, signals in _iterate_channels(recording, kind):
         if channel.name not in positions:
             continue
         noise = estimate_noise(signals)
-        least = MOTION_THRESHOLD_SIGMAS * max(
+        min_motion = MOTION_THRESHOLD_SIGMAS * max(
             np.nan_to_num(noise.sigma), noise.step, 1e-9 * channel.scale
         )
-        moving = np.concatenate([_find_moving_windows(values, least) for _, values in signals])
+        moving = np.concatenate([_find_moving_windows(values, min_motion) for _, values in signals])
         share = 1.0 - float(moving.mean()) if moving.size else 0.0
         if share == 1.0:
-            never.append(channel.name)
+            still_channels.append(channel.name)
         elif share > MIN_STANDSTILL_SHARE:
-            seldom.append(f"{channel.name} ({share:.0%})")
-    if never:
+            seldom_moving.append(f"{channel.name} ({share:.0%})")
+    if still_channels:
         yield QualityFinding(
             "stillness",
-            f"{format_names(never)} never moves",
+            f"{format_names(still_channels)} never moves",
             "nothing that acts in its motion shows: move it, or leave its joint out",
         )
-    if seldom:
+    if seldom_moving:
         yield QualityFinding(
             "stillness",
-            f"{format_names(seldom)} of the samples stand still",
+            f"{format_names(seldom_moving)} of the samples stand still",
             "friction, damping and inertia show in motion alone: move more of the time",
         )
 
@@ -184,8 +186,8 @@ def _count_saturated_samples(values: Array, end: float, jump: float) -> int:
     The signal must jump into or out of a stretch: a quantised signal that reverses at its end
     changes by one step only.
     """
-    at = np.concatenate([[False], values == end, [False]]).astype(np.int8)
-    edges = np.flatnonzero(np.diff(at))
+    is_at_end = np.concatenate([[False], values == end, [False]]).astype(np.int8)
+    edges = np.flatnonzero(np.diff(is_at_end))
     first, last = edges[::2], edges[1::2]
     framed = np.concatenate([[end], values, [end]])
     jumps = np.fmax(np.abs(framed[first] - end), np.abs(framed[last + 1] - end))
@@ -195,16 +197,19 @@ def _count_saturated_samples(values: Array, end: float, jump: float) -> int:
 
 def _is_resting_value(values: Array, end: float) -> bool:
     """Return whether a run begins or ends at this value, or never takes it: it is at rest there."""
-    seen = values[np.isfinite(values)]
-    return bool(seen.size and (seen[0] == end or seen[-1] == end)) or not (values == end).any()
+    recorded_values = values[np.isfinite(values)]
+    return (
+        bool(recorded_values.size and (recorded_values[0] == end or recorded_values[-1] == end))
+        or not (values == end).any()
+    )
 
 
-def _find_moving_windows(values: Array, least: float) -> Array:
+def _find_moving_windows(values: Array, min_motion: float) -> Array:
     """Return for each window of a run whether the signal moves in it."""
     count = values.size // WINDOW_SAMPLES
     if not count:
-        return np.array([bool(np.nanmax(values) - np.nanmin(values) > least)])
+        return np.array([bool(np.nanmax(values) - np.nanmin(values) > min_motion)])
     rows = values[: count * WINDOW_SAMPLES].reshape(count, WINDOW_SAMPLES)
     rows = rows[np.isfinite(rows).any(axis=1)]
-    found: Array = (np.nanmax(rows, axis=1) - np.nanmin(rows, axis=1)) > least
-    return found
+    is_moving: Array = (np.nanmax(rows, axis=1) - np.nanmin(rows, axis=1)) > min_motion
+    return is_moving

@@ -67,7 +67,7 @@ def check_recording_plausible(
         InputError: An anomaly is certain and `force` is False; the message is one line.
     """
     # Positions first: their wrong units make stamps look implausible, but not vice versa.
-    found = [
+    anomalies = [
         *odd_logs(recording),
         *pose_check.check_poses(recording, kind),
         *find_anomalies(recording, kind),
@@ -77,10 +77,10 @@ def check_recording_plausible(
             for overlap in pose_check.find_overlaps(recording, kind)
         ),
     ]
-    for oddity in found:
+    for oddity in anomalies:
         if oddity.certain and not force:
             raise InputError(f"{recording.path}: {oddity.text}, {FORCE_HINT}")
-    return [oddity.text for oddity in found]
+    return [oddity.text for oddity in anomalies]
 
 
 def odd_logs(recording: Recording) -> Iterator[Anomaly]:
@@ -112,12 +112,14 @@ def _check_gap(run: Run) -> Anomaly | None:
     intervals = np.diff(run.times)
     place = int(intervals.argmax())
     gap = float(intervals[place])
-    rest = float(intervals.sum()) - gap
-    if gap <= MAX_GAP_RATIO * rest:
+    sampled_seconds = float(intervals.sum()) - gap
+    if gap <= MAX_GAP_RATIO * sampled_seconds:
         return None
-    where = f"{gap:.4g} s without a sample from t = {run.times[place]:.6g} s on"
-    known = f"in a run that has samples for {rest:.4g} s"
-    return Anomaly(f"run {run.name}: {where}, {known}; divide it there into two runs", True)
+    gap_text = f"{gap:.4g} s without a sample from t = {run.times[place]:.6g} s on"
+    sampled_text = f"in a run that has samples for {sampled_seconds:.4g} s"
+    return Anomaly(
+        f"run {run.name}: {gap_text}, {sampled_text}; divide it there into two runs", True
+    )
 
 
 def _check_time_scale(recording: Recording, run: Run, kind: type[Simulator]) -> Anomaly | None:
@@ -166,10 +168,10 @@ def _check_time_scale(recording: Recording, run: Run, kind: type[Simulator]) -> 
             f"{name} takes {recorded_seconds:.3g} s to move as {kind.name} would within "
             f"{expected_seconds:.2g} s"
         )
-        apart = f"samples lie {interval:.3g} s apart"
+        interval_text = f"samples lie {interval:.3g} s apart"
         remedy = f"are the stamps {_UNITS[unit]}? then divide t by {unit:g}"
         certain = not _has_inputs(run) or interval >= DRIVEN_SYSTEM_FACTOR * expected_seconds
-        first = first or Anomaly(f"run {run.name}: {moves}, and {apart}; {remedy}", certain)
+        first = first or Anomaly(f"run {run.name}: {moves}, and {interval_text}; {remedy}", certain)
     return first
 
 
@@ -183,8 +185,8 @@ def _compute_rest_accelerations(recording: Recording, run: Run, system: System) 
     The system is at rest, so drag and friction do not act; D is the number of coordinates.
     """
     count = run.times.size
-    given = {**recording.constants, **run.constants}
-    constants = {c.name: np.full((count, 1), given.get(c.name, c.value)) for c in system.constants}
+    values = {**recording.constants, **run.constants}
+    constants = {c.name: np.full((count, 1), values.get(c.name, c.value)) for c in system.constants}
     theta = np.tile([p.nominal for p in system.parameters], (count, 1))
     default = [np.full(count, system.states[name]) for name in system.coordinates]
     columns = [

@@ -133,13 +133,13 @@ class VelocityComparison(NamedTuple):
             return None
         # Long enough to exceed the noise, but no longer: over a whole oscillation both integrals
         # vanish.
-        wanted = np.ceil(MIN_POSITION_CHANGE_SIGMAS * sigma / usual_move)
-        length = int(np.clip(wanted, MIN_SEGMENT_SAMPLES, 50))
+        required_length = np.ceil(MIN_POSITION_CHANGE_SIGMAS * sigma / usual_move)
+        length = int(np.clip(required_length, MIN_SEGMENT_SAMPLES, 50))
         integrated = [part.integrate(length, MAX_INTERVAL_RATIO * interval) for part in series]
         dq, s, dv = (np.concatenate(rows) for rows in zip(*integrated, strict=True))
-        known = np.isfinite(s)
-        dq, s, dv = dq[known], s[known], dv[known]
-        if known.sum() < MIN_SEGMENTS or not (s @ s > 0 and dq @ dq > 0):
+        is_known = np.isfinite(s)
+        dq, s, dv = dq[is_known], s[is_known], dv[is_known]
+        if is_known.sum() < MIN_SEGMENTS or not (s @ s > 0 and dq @ dq > 0):
             return None
         if np.sqrt(np.mean(dq**2)) < MIN_RMS_CHANGE_SIGMAS * sigma:
             return None
@@ -205,20 +205,20 @@ class _Series(NamedTuple):
         """Return the samples of a run at which both the position and its rate are recorded."""
         q, v = run.channels[position], run.channels[rate]
         # If two publishers alternate, each row has the joints of one of them.
-        known = np.isfinite(q) & np.isfinite(v)
-        return _Series(run.times[known], q[known], v[known])
+        is_recorded = np.isfinite(q) & np.isfinite(v)
+        return _Series(run.times[is_recorded], q[is_recorded], v[is_recorded])
 
     def integrate(self, length: int, max_gap: float) -> tuple[Array, Array, Array]:
         """Return dq, s and dv of intervals of `length` samples; s is NaN across a gap in time."""
         steps = np.diff(self.times)
         areas = 0.5 * (self.velocity[1:] + self.velocity[:-1]) * steps
         areas[steps > max_gap] = np.nan
-        ends = np.arange(0, self.times.size, length)
-        if ends.size < 2:
+        edges = np.arange(0, self.times.size, length)
+        if edges.size < 2:
             return np.empty(0), np.empty(0), np.empty(0)
-        integrals = np.add.reduceat(areas, ends[:-1])
-        integrals[-1] = areas[ends[-2] : ends[-1]].sum()
-        return np.diff(self.position[ends]), integrals, np.diff(self.velocity[ends])
+        integrals = np.add.reduceat(areas, edges[:-1])
+        integrals[-1] = areas[edges[-2] : edges[-1]].sum()
+        return np.diff(self.position[edges]), integrals, np.diff(self.velocity[edges])
 
 
 def _check_pair(runs: Sequence[Run], position: str, rate: str) -> Iterator[QualityFinding]:

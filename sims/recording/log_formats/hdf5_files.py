@@ -50,7 +50,7 @@ def runs_in(path: Path) -> list[Path]:
     with _open_file(path) as file:
         for name in ("", "data"):
             group = file.get(name or "/")
-            groups = [key for key, own in _list_members(group) if hasattr(own, "items")]
+            groups = [key for key, entry in _list_members(group) if hasattr(entry, "items")]
             runs = [key for key in groups if _RUN.fullmatch(key)]
             if runs and len(runs) == len(groups):
                 return [path / name / run for run in sorted(runs, key=_make_natural_sort_key)]
@@ -74,23 +74,23 @@ def read_group(path: Path, group: str) -> tuple[dict[str, Array], dict[str, list
     columns: dict[str, Array] = {}
     texts: dict[str, list[str]] = {}
     with _open_file(path) as file:
-        own = file.get(group)
-        if own is None or not hasattr(own, "items"):
+        parent_group = file.get(group)
+        if parent_group is None or not hasattr(parent_group, "items"):
             known = ", ".join(_list_group_names(file)) or "none"
             raise InputError(f"{path}: unknown group '{group}'; there are: {known}")
         datasets: dict[str, Any] = {}
-        own.visititems(lambda name, one: datasets.update({name: one}))
-        for name, one in datasets.items():
+        parent_group.visititems(lambda name, dataset: datasets.update({name: dataset}))
+        for name, dataset in datasets.items():
             # A name that is not UTF-8 comes as bytes.
-            if not hasattr(one, "dtype") or not isinstance(name, str):
+            if not hasattr(dataset, "dtype") or not isinstance(name, str):
                 continue
-            wide = one.ndim > 1 and one.shape[1] > MAX_COLUMNS
-            if one.dtype.kind not in "fiub" or one.ndim not in (1, 2) or wide:
-                texts[name] = _read_texts(one)
-            elif one.size > LARGEST_DATASET:
-                raise InputError(f"{path}: {name} has {one.size} entries; at most 250 million")
+            is_wide = dataset.ndim > 1 and dataset.shape[1] > MAX_COLUMNS
+            if dataset.dtype.kind not in "fiub" or dataset.ndim not in (1, 2) or is_wide:
+                texts[name] = _read_texts(dataset)
+            elif dataset.size > LARGEST_DATASET:
+                raise InputError(f"{path}: {name} has {dataset.size} entries; at most 250 million")
             else:
-                columns[name] = make_read_only(np.asarray(one[()], dtype=np.float64))
+                columns[name] = make_read_only(np.asarray(dataset[()], dtype=np.float64))
     return columns, texts
 
 
@@ -116,9 +116,9 @@ def _list_members(group: Any) -> list[tuple[str, Any]]:
 
 def _list_group_names(file: Any) -> list[str]:
     """List the names of the first groups of a file."""
-    found: list[str] = []
-    file.visititems(lambda name, one: found.append(name) if hasattr(one, "items") else None)
-    return found[:12]
+    group_names: list[str] = []
+    file.visititems(lambda name, item: group_names.append(name) if hasattr(item, "items") else None)
+    return group_names[:12]
 
 
 def _read_texts(dataset: Any) -> list[str]:
@@ -126,8 +126,8 @@ def _read_texts(dataset: Any) -> list[str]:
     if dataset.ndim != 1 or dataset.dtype.kind not in "OSU" or dataset.size > MAX_COLUMNS:
         return []
     return [
-        one.decode("utf-8", errors="replace") if isinstance(one, bytes) else str(one)
-        for one in dataset[()].tolist()
+        text.decode("utf-8", errors="replace") if isinstance(text, bytes) else str(text)
+        for text in dataset[()].tolist()
     ]
 
 

@@ -65,20 +65,20 @@ def read_calibration(path: Path) -> dict[str, MotorRange]:
             "range_min and range_max"
         )
     ranges = {}
-    for name, own in motors.items():
-        lowest, highest = float(own["range_min"]), float(own["range_max"])
+    for name, motor in motors.items():
+        lowest, highest = float(motor["range_min"]), float(motor["range_max"])
         if not lowest < highest:
             raise InputError(
                 f"{path}: {name}: expected range_min below range_max, found {lowest:g} and "
                 f"{highest:g}; calibrate the robot again"
             )
-        ranges[name] = MotorRange(lowest, highest, bool(own.get("drive_mode", 0)))
+        ranges[name] = MotorRange(lowest, highest, bool(motor.get("drive_mode", 0)))
     return ranges
 
 
 def find_calibration(folders: Iterable[Path]) -> Path | None:
     """Return the only calibration file in some folders; None if there is none or more than one."""
-    found = []
+    calibration_files = []
     for folder in folders:
         if not folder.is_dir():
             continue
@@ -89,8 +89,8 @@ def find_calibration(folders: Iterable[Path]) -> Path | None:
             except (OSError, ValueError, RecursionError):
                 continue
             if _get_motor_tables(document) is not None:
-                found.append(path)
-    return found[0] if len(found) == 1 else None
+                calibration_files.append(path)
+    return calibration_files[0] if len(calibration_files) == 1 else None
 
 
 def motor_of(column: str, motors: Iterable[str]) -> str | None:
@@ -140,9 +140,9 @@ def _get_motor_tables(document: Any) -> Mapping[str, Mapping[str, Any]] | None:
     """Return the tables of the motors; None if the document is not a calibration."""
     if not isinstance(document, dict) or not document:
         return None
-    for own in document.values():
-        if not isinstance(own, dict):
+    for motor in document.values():
+        if not isinstance(motor, dict):
             return None
-        if not all(isinstance(own.get(key), int | float) for key in _KEYS):
+        if not all(isinstance(motor.get(key), int | float) for key in _KEYS):
             return None
     return document

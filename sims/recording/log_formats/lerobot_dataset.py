@@ -66,11 +66,11 @@ def list_episode_files(dataset: Path, episode: int) -> list[Path]:
     Raises:
         InputError: There is no such episode, or a file cannot be read.
     """
-    there = _find_episode_files(dataset)
-    if episode not in there:
-        span = f"{min(there)} to {max(there)}" if there else "none"
+    files_by_episode = _find_episode_files(dataset)
+    if episode not in files_by_episode:
+        span = f"{min(files_by_episode)} to {max(files_by_episode)}" if files_by_episode else "none"
         raise InputError(f"{dataset}: no episode {episode}; there are: {span}")
-    return [dataset / "meta" / "info.json", *there[episode]]
+    return [dataset / "meta" / "info.json", *files_by_episode[episode]]
 
 
 def read_episode(dataset: Path, episode: int) -> tuple[dict[str, Array], list[str]]:
@@ -89,40 +89,49 @@ def read_episode(dataset: Path, episode: int) -> tuple[dict[str, Array], list[st
     import pyarrow
     import pyarrow.parquet as parquet
 
-    about, *files = list_episode_files(dataset, episode)
+    info_file, *files = list_episode_files(dataset, episode)
     parts = []
     for file in files:
         try:
             # Images stored in the table are not loaded.
-            kept = [
+            column_names = [
                 field.name for field in parquet.read_schema(file) if is_numeric_type(field.type)
             ]
             rows = [(EPISODE_COLUMN, "==", episode)]
-            parts.append(parquet.read_table(file, columns=kept, filters=rows))
+            parts.append(parquet.read_table(file, columns=column_names, filters=rows))
             table = pyarrow.concat_tables(parts)
         except (pyarrow.ArrowException, OSError) as error:
             raise make_unreadable_error(file, error) from None
-    found, texts = read_numeric_columns(table)
+    numeric_columns, texts = read_numeric_columns(table)
     columns: dict[str, Array] = {}
-    for name, values in found.items():
-        own = _list_feature_names(about, name)
-        if values.ndim == 2 and len(own) == values.shape[1] == len(set(own)):
-            columns |= {f"{name}.{one}": values[:, k] for k, one in enumerate(own)}
+    for name, values in numeric_columns.items():
+        entry_names = _list_feature_names(info_file, name)
+        if values.ndim == 2 and len(entry_names) == values.shape[1] == len(set(entry_names)):
+            columns |= {
+                f"{name}.{entry_name}": values[:, k] for k, entry_name in enumerate(entry_names)
+            }
         else:
             columns[name] = values
     return columns, texts
 
 
-def _list_feature_names(about: Path, feature: str) -> list[str]:
+def _list_feature_names(info_file: Path, feature: str) -> list[str]:
     """Return the names of the entries of a feature; empty where the dataset states none."""
     try:
-        said = json.loads(about.read_text(encoding="utf-8"))["features"][feature]["names"]
+        entry_names = json.loads(info_file.read_text(encoding="utf-8"))["features"][feature][
+            "names"
+        ]
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return []
     # Some datasets group the names by kind: {"motors": [...]}.
-    if isinstance(said, dict) and len(said) == 1:
-        (said,) = said.values()
-    return said if isinstance(said, list) and all(isinstance(one, str) for one in said) else []
+    if isinstance(entry_names, dict) and len(entry_names) == 1:
+        (entry_names,) = entry_names.values()
+    return (
+        entry_names
+        if isinstance(entry_names, list)
+        and all(isinstance(entry_name, str) for entry_name in entry_names)
+        else []
+    )
 
 
 def _find_episode_files(dataset: Path) -> dict[int, list[Path]]:
@@ -142,7 +151,7 @@ def _find_cached_episode_files(stamps: tuple[tuple[Path, int, int], ...]) -> dic
     import pyarrow
     import pyarrow.parquet as parquet
 
-    found: dict[int, list[Path]] = {}
+    files_by_episode: dict[int, list[Path]] = {}
     for file, *_ in stamps:
         try:
             column = parquet.read_table(file, columns=[EPISODE_COLUMN]).column(EPISODE_COLUMN)
@@ -150,5 +159,5 @@ def _find_cached_episode_files(stamps: tuple[tuple[Path, int, int], ...]) -> dic
         except (pyarrow.ArrowException, OSError, KeyError, ValueError, TypeError) as error:
             raise make_unreadable_error(file, error) from None
         for number in numbers:
-            found.setdefault(number, []).append(file)
-    return found
+            files_by_episode.setdefault(number, []).append(file)
+    return files_by_episode

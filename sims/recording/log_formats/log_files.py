@@ -104,19 +104,21 @@ class LogFile:
         for base, place in (
             ((name, None), (match["base"], int(match["place"]))) if match else ((name, None),)
         ):
-            found = [own for own in self.columns if own.strip().lower() == base.strip().lower()]
+            matches = [
+                column for column in self.columns if column.strip().lower() == base.strip().lower()
+            ]
             if base in self.columns:
                 return base, place
-            if len(found) == 1:
-                return found[0], place
+            if len(matches) == 1:
+                return matches[0], place
         raise self._make_missing_column_error(name)
 
     def _make_missing_column_error(self, name: str) -> InputError:
         """Return the error for a column that does not exist, or that holds text."""
         if name in self.texts:
             return InputError(f"{self.path}: column '{name}': expected numbers, found text")
-        there = ", ".join(self.list_columns()) or "none"
-        return InputError(f"{self.path}: unknown column '{name}'; there are: {there}")
+        column_list = ", ".join(self.list_columns()) or "none"
+        return InputError(f"{self.path}: unknown column '{name}'; there are: {column_list}")
 
     def list_columns(self) -> list[str]:
         """List all numeric columns; columns of lists by their entries."""
@@ -145,42 +147,46 @@ def read_log(path: str | Path, wanted: frozenset[str] = frozenset()) -> LogFile:
     path = Path(path)
     bag = ros_bags.split_bag_path(path)
     if bag is not None:
-        about = bag[0].stat()
-        stamp = FileVersion(path, about.st_mtime_ns, about.st_size)
+        file_stat = bag[0].stat()
+        stamp = FileVersion(path, file_stat.st_mtime_ns, file_stat.st_size)
         log = _read_topic(stamp, wanted)
-        kept = {name.lower() for name in log.columns}
+        column_names = {name.lower() for name in log.columns}
         # The error for a missing column lists all columns of the log.
-        return log if {name.strip().lower() for name in wanted} <= kept else _read_topic(stamp)
+        return (
+            log if {name.strip().lower() for name in wanted} <= column_names else _read_topic(stamp)
+        )
     episode = lerobot_dataset.split_episode_path(path)
     if episode is not None:
         abouts = [file.stat() for file in lerobot_dataset.list_episode_files(*episode)]
-        changed = max(about.st_mtime_ns for about in abouts)
-        return _read_episode(FileVersion(path, changed, sum(about.st_size for about in abouts)))
+        changed = max(file_stat.st_mtime_ns for file_stat in abouts)
+        return _read_episode(
+            FileVersion(path, changed, sum(file_stat.st_size for file_stat in abouts))
+        )
     group = hdf5_files.group_of(path)
     if group is not None:
-        about = group[0].stat()
-        return _read_group(FileVersion(path, about.st_mtime_ns, about.st_size))
+        file_stat = group[0].stat()
+        return _read_group(FileVersion(path, file_stat.st_mtime_ns, file_stat.st_size))
     if ros_bags.is_bag(path):
-        there = ", ".join(ros_bags.list_topics(path))
-        raise InputError(f"{path}: a bag; name a topic of it, as {path.name}/TOPIC: {there}")
+        topics = ", ".join(ros_bags.list_topics(path))
+        raise InputError(f"{path}: a bag; name a topic of it, as {path.name}/TOPIC: {topics}")
     require_file(path)
     kind = path.suffix.lower()
     if kind not in _READERS:
         kinds = ", ".join(LOG_SUFFIXES)
         raise InputError(f"{path}: expected a log that ends in one of {kinds}, found '{kind}'")
-    about = path.stat()
-    if about.st_size > MAX_FILE_BYTES:
-        raise InputError(f"{path}: has {about.st_size / 1e9:.1f} GB; at most 2 are read")
-    return _read_cached(FileVersion(path, about.st_mtime_ns, about.st_size))
+    file_stat = path.stat()
+    if file_stat.st_size > MAX_FILE_BYTES:
+        raise InputError(f"{path}: has {file_stat.st_size / 1e9:.1f} GB; at most 2 are read")
+    return _read_cached(FileVersion(path, file_stat.st_mtime_ns, file_stat.st_size))
 
 
 @lru_cache(maxsize=8)
-def _read_topic(stamp: FileVersion, wanted: frozenset[str] = frozenset()) -> LogFile:
+def _read_topic(stamp: FileVersion, columns_to_read: frozenset[str] = frozenset()) -> LogFile:
     """Read a topic of a bag; cached by file version."""
     bag = ros_bags.split_bag_path(stamp.path)
     assert bag is not None  # the caller checked the path
-    columns = ros_bags.read_topic(*bag, wanted)
-    if (len(columns) < 2 and not wanted) or not columns[TIME_COLUMN].size:
+    columns = ros_bags.read_topic(*bag, columns_to_read)
+    if (len(columns) < 2 and not columns_to_read) or not columns[TIME_COLUMN].size:
         raise InputError(f"{stamp.path}: expected messages with numbers, found none")
     return LogFile(stamp.path, columns, (), "message")
 
@@ -257,8 +263,8 @@ def _read_npz(path: Path) -> LogFile:
                 else:
                     columns[name] = make_read_only(values.astype(np.float64))
     except (ValueError, EOFError, KeyError, OSError) as error:
-        what = " ".join(str(error).split())
-        raise InputError(f"{path}: not an archive of arrays of numbers: {what}") from None
+        reason = " ".join(str(error).split())
+        raise InputError(f"{path}: not an archive of arrays of numbers: {reason}") from None
     except Exception as error:  # numpy raises many kinds of errors
         raise InputError(f"{path}: not a NumPy archive: {type(error).__name__}") from None
     named, unlisted = arrays_by_name(columns, names)
@@ -269,7 +275,9 @@ def _of_arrays(path: Path, columns: dict[str, Array], texts: dict[str, list[str]
     """Make a log of arrays, whose entries are named by lists of names in the file."""
     if not columns:
         raise InputError(f"{path}: expected columns of numbers, found none")
-    named, unlisted = arrays_by_name(columns, {name: own for name, own in texts.items() if own})
+    named, unlisted = arrays_by_name(
+        columns, {name: name_list for name, name_list in texts.items() if name_list}
+    )
     return LogFile(path, {**columns, **named}, tuple(texts), "entry", unlisted=unlisted, first=0)
 
 

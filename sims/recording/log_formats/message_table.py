@@ -112,8 +112,8 @@ def _get_fields(value: Any) -> dict[str, Any] | None:
 
 def _get_stamp(message: Any) -> float:
     """Return the time stamp of a message in seconds; 0 if it has none."""
-    own = _get_fields(message) or {}
-    for holder in (_get_fields(own.get("header")) or {}, own):
+    fields = _get_fields(message) or {}
+    for holder in (_get_fields(fields.get("header")) or {}, fields):
         for name in STAMP_FIELDS:
             parts = _get_fields(holder.get(name)) or {}
             seconds = [parts[key] for key in SECONDS_FIELDS if key in parts]

@@ -48,14 +48,16 @@ def entries_by_name(
     unlisted: set[str] = set()
     for style, places in groups.items():
         names = [list(texts[places[place]]) for place in sorted(places)]
-        for siblings, own in _group_numbered_columns(columns, *style).items():
-            if set(own) != set(places):
+        for siblings, columns_by_number in _group_numbered_columns(columns, *style).items():
+            if set(columns_by_number) != set(places):
                 continue
-            values = np.column_stack([columns[own[place]] for place in sorted(own)])
-            found = _by_name(values, names, f"{siblings}.")
-            if found and not found.keys() & columns.keys():
-                named |= found
-                unlisted |= set(own.values())
+            values = np.column_stack(
+                [columns[columns_by_number[place]] for place in sorted(columns_by_number)]
+            )
+            entries = _by_name(values, names, f"{siblings}.")
+            if entries and not entries.keys() & columns.keys():
+                named |= entries
+                unlisted |= set(columns_by_number.values())
     return named, frozenset(unlisted)
 
 
@@ -76,14 +78,14 @@ def lists_by_name(
     for names_column, cells in texts.items():
         stem = _NAMES_COLUMN.fullmatch(names_column)
         lists = [_texts_of(cell) for cell in cells] if stem else []
-        if not lists or not lists[0] or len({len(one) for one in lists}) > 1:
+        if not lists or not lists[0] or len({len(name_list) for name_list in lists}) > 1:
             continue
-        names = [list(own) for own in zip(*lists, strict=True)]
+        names = [list(entry_names) for entry_names in zip(*lists, strict=True)]
         for name, values in columns.items():
             if values.ndim == 2 and values.shape[1] == len(names):
-                found = _by_name(values, names, f"{name}.")
-                if found and not found.keys() & columns.keys():
-                    named |= found
+                entries = _by_name(values, names, f"{name}.")
+                if entries and not entries.keys() & columns.keys():
+                    named |= entries
                     unlisted.add(name)
     return named, frozenset(unlisted)
 
@@ -102,40 +104,41 @@ def arrays_by_name(
     """
     named: dict[str, Array] = {}
     unlisted: set[str] = set()
-    for array, own in names.items():
+    for array, entry_names in names.items():
         if not re.search(r"name|joint|motor|label", array, re.IGNORECASE):
             continue
         for name, values in columns.items():
-            if values.ndim == 2 and values.shape[1] == len(own) == len(set(own)):
+            if values.ndim == 2 and values.shape[1] == len(entry_names) == len(set(entry_names)):
                 named |= {
-                    f"{name}.{one}": make_read_only(values[:, k]) for k, one in enumerate(own)
+                    f"{name}.{entry_name}": make_read_only(values[:, k])
+                    for k, entry_name in enumerate(entry_names)
                 }
                 unlisted.add(name)
     return named, frozenset(unlisted)
 
 
 def _group_numbered_columns(
-    columns: Mapping[str, Array], prefix: str, left: str, right: str
+    columns: Mapping[str, Array], prefix: str, opening: str, closing: str
 ) -> dict[str, dict[int, str]]:
     """Group numbered columns by the text before their number.
 
     Args:
         columns: Numbers by column name.
         prefix: Required beginning of the names.
-        left: Required character before the number.
-        right: Required character after the number.
+        opening: Required character before the number.
+        closing: Required character after the number.
 
     Returns:
         Column names by number, for each text before the number.
     """
-    found: dict[str, dict[int, str]] = {}
+    columns_by_stem: dict[str, dict[int, str]] = {}
     for column, values in columns.items():
         match = _PLACED.fullmatch(column)
         if match is None or values.ndim > 1 or not column.startswith(prefix):
             continue
-        if (match["left"], match["right"]) == (left, right):
-            found.setdefault(match["stem"], {})[int(match["place"])] = column
-    return found
+        if (match["left"], match["right"]) == (opening, closing):
+            columns_by_stem.setdefault(match["stem"], {})[int(match["place"])] = column
+    return columns_by_stem
 
 
 def _by_name(values: Array, names: Sequence[Sequence[str]], prefix: str) -> dict[str, Array]:
@@ -149,22 +152,22 @@ def _by_name(values: Array, names: Sequence[Sequence[str]], prefix: str) -> dict
     Returns:
         Columns (T,) by name, NaN in rows without the name; empty if a row has a name twice.
     """
-    every = list(dict.fromkeys(name for own in names for name in own if name))
-    if not every or len(every) > 4 * len(names):
+    distinct_names = list(dict.fromkeys(name for column in names for name in column if name))
+    if not distinct_names or len(distinct_names) > 4 * len(names):
         return {}
     table = np.array(names, dtype=object).T
-    found: dict[str, Array] = {}
-    for name in every:
+    columns: dict[str, Array] = {}
+    for name in distinct_names:
         mask = table == name
         if (mask.sum(axis=1) > 1).any():
             return {}
-        found[prefix + name] = make_read_only(np.where(mask, values, 0.0).sum(axis=1))
+        columns[prefix + name] = make_read_only(np.where(mask, values, 0.0).sum(axis=1))
         missing = ~mask.any(axis=1)
         if missing.any():
-            own = found[prefix + name].copy()
-            own[missing] = np.nan
-            found[prefix + name] = make_read_only(own)
-    return found
+            column = columns[prefix + name].copy()
+            column[missing] = np.nan
+            columns[prefix + name] = make_read_only(column)
+    return columns
 
 
 def _texts_of(cell: str) -> list[str]:

@@ -32,8 +32,8 @@ def read_numeric_columns(table: Any) -> tuple[dict[str, Array], list[str]]:
 
 def make_unreadable_error(path: Path, error: Exception) -> InputError:
     """Make the error for a file that pyarrow cannot read."""
-    what = " ".join(str(error).split()) or type(error).__name__
-    return InputError(f"{path}: not a Parquet file: {what[:300]}")
+    reason = " ".join(str(error).split()) or type(error).__name__
+    return InputError(f"{path}: not a Parquet file: {reason[:300]}")
 
 
 def is_numeric_type(kind: Any) -> bool:

@@ -72,10 +72,10 @@ def find_layout(path: Path) -> Layout:
     """
     with path.open("rb") as file:
         head = file.read(_HEAD_BYTES)
-        whole = not file.read(1)
+        is_complete = not file.read(1)
     encoding = _detect_encoding(path, head)
     lines = head.decode(encoding, errors="replace").splitlines()
-    if not whole and len(lines) > 1:
+    if not is_complete and len(lines) > 1:
         lines.pop()  # the last line is incomplete
     lines = lines[:_HEAD_LINES]
     if not any(line.strip() for line in lines):
@@ -90,8 +90,12 @@ def find_layout(path: Path) -> Layout:
     first = next((n for n, row in rows.items() if _is_data(row, width, columns)), 0)
     above = [n for n in rows if n < first] if first else list(rows)
     units_row: dict[int, str] = {}
-    if above and first and (found := _parse_units(_normalise_row(rows[above[-1]], width), columns)):
-        units_row = found
+    if (
+        above
+        and first
+        and (row_units := _parse_units(_normalise_row(rows[above[-1]], width), columns))
+    ):
+        units_row = row_units
         above.pop()
     for n in reversed(above):
         names = _parse_header(lines[n - 1], separator, width, columns)
@@ -99,11 +103,11 @@ def find_layout(path: Path) -> Layout:
             units = {names[place]: unit for place, unit in units_row.items()}
             return Layout(encoding, separator, names, units, n, first or n + 1, width)
     if not first:
-        what = format_value(lines[0].strip())
-        raise InputError(f"{path}: expected a header and rows of numbers, found {what}")
+        first_line = format_value(lines[0].strip())
+        raise InputError(f"{path}: expected a header and rows of numbers, found {first_line}")
     above = [n for n in above if not COMMENT.match(lines[n - 1])]
-    if not above and (own := _make_column_numbers(rows, first)):
-        return Layout(encoding, separator, own, {}, first, first + 1, width)
+    if not above and (column_numbers := _make_column_numbers(rows, first)):
+        return Layout(encoding, separator, column_numbers, {}, first, first + 1, width)
     if above and len(rows[above[-1]]) > 1 and width > 1:
         n = above[-1]
         raise InputError(
@@ -145,9 +149,11 @@ def _detect_separator(lines: Sequence[str]) -> str:
         width = _find_row_width(rows)
         if width < 2:
             continue
-        even = [row for row in rows if len(row) == width]
-        numeric = np.mean([is_numeric(cell) for row in even for cell in row if cell.strip()] or 0)
-        score = (round(float(numeric) * len(even) / len(rows), 6), float(width))
+        full_rows = [row for row in rows if len(row) == width]
+        numeric = np.mean(
+            [is_numeric(cell) for row in full_rows for cell in row if cell.strip()] or 0
+        )
+        score = (round(float(numeric) * len(full_rows) / len(rows), 6), float(width))
         if score > best_score:
             best, best_score = separator, score
     return best
@@ -166,9 +172,9 @@ def _normalise_row(row: Sequence[str], width: int) -> list[str]:
 
 def _numeric_columns(rows: Iterable[Sequence[str]], width: int) -> list[int]:
     """Return the positions of the columns in which at least half of the cells are numbers."""
-    even = [row for row in rows if len(row) == width]
+    full_rows = [row for row in rows if len(row) == width]
     # The second half of the inspected rows is data, whatever precedes it.
-    body = even[len(even) // 2 :]
+    body = full_rows[len(full_rows) // 2 :]
     result = []
     for place in range(width):
         filled = [row[place] for row in body if row[place].strip()]
@@ -208,8 +214,8 @@ def _parse_header(
     if len(names) != width and marked:
         # NumPy writes the header as given by the user, who may use a separator other than that of
         # the rows.
-        for other in SEPARATORS:
-            parts = [part.strip() for part in _split_line(text, other)]
+        for other_separator in SEPARATORS:
+            parts = [part.strip() for part in _split_line(text, other_separator)]
             if len(parts) == width and all(map(_NAME.fullmatch, parts)):
                 names = parts
     if len(names) != width:
@@ -227,7 +233,7 @@ def _parse_header(
 
 def _parse_units(row: Sequence[str], columns: Sequence[int]) -> dict[int, str]:
     """Return the units by position if a row contains units only; otherwise nothing."""
-    found = {}
+    units_by_place = {}
     for place in columns:
         text = row[place].strip("[](){}<> ") if row[place] else ""
         if not text:
@@ -235,21 +241,21 @@ def _parse_units(row: Sequence[str], columns: Sequence[int]) -> dict[int, str]:
         unit = read_unit(text)
         if unit is None or is_numeric(row[place]):
             return {}
-        found[place] = unit[0]
-    return found
+        units_by_place[place] = unit[0]
+    return units_by_place
 
 
 def _make_column_numbers(rows: Mapping[int, Sequence[str]], first: int) -> tuple[str, ...]:
     """Return the column numbers that pandas writes for unnamed columns; otherwise nothing."""
-    own = tuple(cell.strip() for cell in rows[first])
-    numbers = own[1:] if own and not own[0] else own
+    cells = tuple(cell.strip() for cell in rows[first])
+    numbers = cells[1:] if cells and not cells[0] else cells
     counts = [tuple(str(start + k) for k in range(len(numbers))) for start in (0, 1)]
     if len(numbers) < 3 or numbers not in counts:
         return ()
     # A first row 0, 1, 2, ... may also be data, unless the following rows contain fractions.
     following = [row for line, row in rows.items() if line > first]
     fractions = any("." in cell or "," in cell for row in following for cell in row)
-    return own if fractions else ()
+    return cells if fractions else ()
 
 
 def is_numeric(cell: str) -> bool:

@@ -92,11 +92,11 @@ def _make_unique_names(layout: Layout) -> list[str]:
     names = layout.names or tuple(f"column {place + 1}" for place in range(layout.width))
     result: list[str] = []
     for place, name in enumerate(names):
-        own = name or f"Unnamed: {place}"
+        unique_name = name or f"Unnamed: {place}"
         number = 1
-        while own in result:
-            own, number = f"{name}.{number}", number + 1
-        result.append(own)
+        while unique_name in result:
+            unique_name, number = f"{name}.{number}", number + 1
+        result.append(unique_name)
     return result
 
 
@@ -153,9 +153,9 @@ def _read_cells(path: Path, layout: Layout) -> list[Any]:
 
 def _not_a_table(path: Path, layout: Layout, error: Exception) -> InputError:
     """Make the error for a file whose rows pandas cannot split."""
-    opened = re.search(r"EOF inside string starting at row (\d+)", str(error))
-    if opened:
-        row = layout.first + int(opened[1])
+    quote_match = re.search(r"EOF inside string starting at row (\d+)", str(error))
+    if quote_match:
+        row = layout.first + int(quote_match[1])
         return InputError(
             f"{path}, row {row}: a quotation mark opens a cell and none closes it; close or "
             "delete it"
@@ -181,12 +181,12 @@ def _find_uneven_row(path: Path, layout: Layout) -> InputError | None:
                     f"{path}, row {line}: a quotation mark opens a cell that ends in row {last}; "
                     "close or delete it"
                 )
-            where = f"as in the header, row {layout.header}" if layout.header else "as above"
+            reference = f"as in the header, row {layout.header}" if layout.header else "as above"
             remedy = "correct or delete this row"
             if filled < layout.width and line >= _last_line(path, layout):
                 remedy = "the log was cut off there: delete this row"
             return InputError(
-                f"{path}, row {line}: expected {layout.width} cells {where}, found {filled}; "
+                f"{path}, row {line}: expected {layout.width} cells {reference}, found {filled}; "
                 f"{remedy}"
             )
     except csv.Error:  # such as a cell of more than 131,072 characters
@@ -253,9 +253,11 @@ class _CellKind:
         self.filled = self.series[self.series != ""]
         self.has_commas, self.has_decimal_commas, self.is_thousands = False, False, False
         commas = self.filled[self.filled.str.contains(",", regex=False)]
-        some = commas.iloc[:: max(len(commas) // MAX_SAMPLED_CELLS, 1)]
+        sampled_cells = commas.iloc[:: max(len(commas) // MAX_SAMPLED_CELLS, 1)]
         # Lists and texts may contain commas, too.
-        if commas.empty or 2 * sum(map(bool, map(NUMBER.fullmatch, some))) < len(some):
+        if commas.empty or 2 * sum(map(bool, map(NUMBER.fullmatch, sampled_cells))) < len(
+            sampled_cells
+        ):
             return
         self.has_commas = True
         several = (commas.str.count(",") > 1) | commas.str.contains(r",.*\.", regex=True)
@@ -310,13 +312,13 @@ class _CellKind:
                 )  # fmt: skip
         values = pandas.to_numeric(texts.where(texts != "", "nan"), errors="coerce")
         result = np.asarray(values, dtype=np.float64)
-        known = (texts == "") | texts.str.lower().isin(NO_NUMBER)
-        bad = np.flatnonzero(np.isnan(result) & ~known.to_numpy(dtype=bool))
-        if bad.size == 0:
+        is_no_number = (texts == "") | texts.str.lower().isin(NO_NUMBER)
+        bad_rows = np.flatnonzero(np.isnan(result) & ~is_no_number.to_numpy(dtype=bool))
+        if bad_rows.size == 0:
             return result
-        if bad.size > 0.5 * len(self.filled):
+        if bad_rows.size > 0.5 * len(self.filled):
             return None
-        raise self._make_cell_error(path, layout, name, int(bad[0]), "a number")
+        raise self._make_cell_error(path, layout, name, int(bad_rows[0]), "a number")
 
     def _decimal_points(self, path: Path, layout: Layout, name: str) -> Any:
         """Return the cells with decimal points instead of decimal commas.
@@ -335,11 +337,11 @@ class _CellKind:
                 # With a decimal comma, 1.234 is more than a thousand; with a decimal point, it is
                 # about one.
                 row = int(points.index.to_numpy()[points.to_numpy().argmax()])
-                more = "; other cells of this column have decimal commas"
+                note = "; other cells of this column have decimal commas"
                 if not grouped[points].all():
-                    raise self._make_cell_error(path, layout, name, row, "a decimal comma", more)
+                    raise self._make_cell_error(path, layout, name, row, "a decimal comma", note)
                 raise self._make_cell_error(
-                    path, layout, name, row, "a number without a point", more
+                    path, layout, name, row, "a number without a point", note
                 )
             texts = self.series
         return texts.str.replace(",", ".", n=1, regex=False)
@@ -350,17 +352,17 @@ class _CellKind:
 
         empty = (self.series == "").to_numpy(dtype=bool)
         texts = self.series.str.replace(",", ".", regex=False).str.replace("UTC", "Z", regex=False)
-        known = self.series.str.fullmatch(INSTANT.pattern).to_numpy(dtype=bool) | empty
-        if not known.all():
-            row = int(np.flatnonzero(~known)[0])
+        is_instant = self.series.str.fullmatch(INSTANT.pattern).to_numpy(dtype=bool) | empty
+        if not is_instant.all():
+            row = int(np.flatnonzero(~is_instant)[0])
             raise self._make_cell_error(
                 path, layout, name, row, f"an instant as {self.filled.iloc[0]}"
             )
         stamps = pandas.to_datetime(
             texts.where(texts != "", None), utc=True, format="ISO8601", errors="coerce"
         )
-        whole = stamps.astype("datetime64[ns, UTC]").astype("int64").to_numpy(dtype=np.int64)
-        return np.where(stamps.isna().to_numpy(), np.nan, whole * 1e-9)
+        nanoseconds = stamps.astype("datetime64[ns, UTC]").astype("int64").to_numpy(dtype=np.int64)
+        return np.where(stamps.isna().to_numpy(), np.nan, nanoseconds * 1e-9)
 
     def _convert_lists(self, path: Path, layout: Layout, name: str) -> Array:
         """Convert cells such as ``[0.1, 0.2]`` to an array (T, k)."""
@@ -373,17 +375,17 @@ class _CellKind:
             except ValueError:
                 row = None
             if row is None or (rows and len(row) != len(rows[0])) or len(row) > MAX_COLUMNS:
-                wanted = f"a list of {len(rows[0])} numbers" if rows else "a list of numbers"
-                raise self._make_cell_error(path, layout, name, number, wanted)
+                expected = f"a list of {len(rows[0])} numbers" if rows else "a list of numbers"
+                raise self._make_cell_error(path, layout, name, number, expected)
             rows.append(row)
         return np.array(rows, dtype=np.float64).reshape(len(rows), -1)
 
     def _make_cell_error(
-        self, path: Path, layout: Layout, name: str, record: int, wanted: str, more: str = ""
+        self, path: Path, layout: Layout, name: str, record: int, expected: str, note: str = ""
     ) -> InputError:
         """Make the error for a cell that does not fit its column."""
         line = _line_of(path, layout, record)
-        found = format_value(self.cells[record])
+        cell_text = format_value(self.cells[record])
         return InputError(
-            f"{path}, row {line}, column {name}: expected {wanted}, found {found}{more}"
+            f"{path}, row {line}, column {name}: expected {expected}, found {cell_text}{note}"
         )

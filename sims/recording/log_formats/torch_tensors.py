@@ -114,7 +114,7 @@ def _read_tensors(
     for name, value in _flatten_containers("", content, 0):
         if isinstance(value, _Tensor) and 1 <= len(value.size) <= 2:
             columns[name] = _read_storage(path, archive, folder, value)
-        elif isinstance(value, list) and all(isinstance(one, str) for one in value):
+        elif isinstance(value, list) and all(isinstance(item, str) for item in value):
             texts[name] = value
         else:
             texts[name] = []
@@ -135,8 +135,8 @@ def _flatten_containers(name: str, value: Any, depth: int) -> list[tuple[str, An
     if not inside or depth > MAX_DEPTH:
         return [(name or "tensor", value)]
     entries: list[tuple[str, Any]] = []
-    for key, own in inside:
-        entries += _flatten_containers(f"{name}/{key}" if name else str(key), own, depth + 1)
+    for key, child in inside:
+        entries += _flatten_containers(f"{name}/{key}" if name else str(key), child, depth + 1)
         if len(entries) > MAX_COLUMNS:
             raise ValueError("too many entries")
     return entries

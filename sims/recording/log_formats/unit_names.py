@@ -83,8 +83,8 @@ class NamedUnit(NamedTuple):
 
 def read_unit(text: str) -> tuple[str, Quantity] | None:
     """Return the unit that a text spells and its quantity; None if it is not a known unit."""
-    plain = re.sub(r"\s*([*/^·⋅])\s*", r"\1", text.strip().lower().replace("**", "^"))
-    return _UNITS.get(plain) or _UNITS.get(plain.replace(" ", "*"))
+    normalised_text = re.sub(r"\s*([*/^·⋅])\s*", r"\1", text.strip().lower().replace("**", "^"))
+    return _UNITS.get(normalised_text) or _UNITS.get(normalised_text.replace(" ", "*"))
 
 
 def split_unit(name: str) -> NamedUnit:
