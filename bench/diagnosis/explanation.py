@@ -103,7 +103,7 @@ class Explanation:
         with pdf_figures(pdf):
             figures = explanation_figures.render_figures(self.story)
         contents: dict[Path, Content] = {
-            folder / "verdict.json": self._json(),
+            folder / "verdict.json": self._format_json(),
             folder / "extended.toml": extending.format_extended(self.extended, folder),
         }
         if apart := build_consistency_rows(self.story):
@@ -119,7 +119,7 @@ class Explanation:
             contents[folder / f"{name}.png"] = figure.png
             if figure.pdf is not None:
                 contents[folder / f"{name}.pdf"] = figure.pdf
-        contents[folder / "report.html"] = render_report(self._told, figures, folder)
+        contents[folder / "report.html"] = render_report(self._report_data, figures, folder)
         # Everything is rendered before the first file is written: an earlier failure leaves no
         # files.
         try:
@@ -148,7 +148,7 @@ class Explanation:
         return build_robot_files(self.extended)
 
     @cached_property
-    def _told(self) -> DiagnosisReportData:
+    def _report_data(self) -> DiagnosisReportData:
         """Report data, with the changes that the diagnosis makes to a robot's model file."""
         files = self._robot_files
         if not files.contents:
@@ -159,12 +159,16 @@ class Explanation:
             unwritable_causes=files.notes,
         )
 
-    def _json(self) -> str:
+    def _format_json(self) -> str:
         return json.dumps(self.answer.to_document(), indent=1, allow_nan=False) + "\n"
 
     def __repr__(self) -> str:
         """Summarise the verdict, the causes and the share of the gap that is closed."""
-        lines = [f"{self.verdict}: {self.story.title}", self._causes_in_words(), self._gain()]
+        lines = [
+            f"{self.verdict}: {self.story.title}",
+            self._causes_in_words(),
+            self._format_gain(),
+        ]
         lines.append(format_early_stop(self.story))
         # Titles and names come from files; a long one must not fill the cell.
         return "\n".join(sanitise(line, MAX_TEXT_WIDTH) for line in lines if line)
@@ -172,7 +176,7 @@ class Explanation:
     def _causes_in_words(self) -> str:
         return "; ".join(_in_words(cause) for cause in self.causes)
 
-    def _gain(self) -> str:
+    def _format_gain(self) -> str:
         """Return the share of the gap that is closed; empty if nothing was found or measured."""
         held_out = self.story.verdict.heldout
         if not self.causes or held_out is None or not has_gap_closed(held_out):
@@ -186,7 +190,7 @@ class Explanation:
         """Return the report in a frame for a notebook cell, so that its styles stay inside."""
         # A cell has no folder with files, so none is linked.
         return make_iframe(
-            render_report(self._told, explanation_figures.render_figures(self.story))
+            render_report(self._report_data, explanation_figures.render_figures(self.story))
         )
 
 

@@ -56,7 +56,7 @@ def build_robot_files(extended: ExtendedSimulator) -> ExtendedRobotFiles:
         before = ""
     after = done.xml if done.urdf is None else done.urdf
     return ExtendedRobotFiles(
-        _named(done), (*left_out, *done.notes), before, strip_heading(after or "")
+        _collect_written_files(done), (*left_out, *done.notes), before, strip_heading(after or "")
     )
 
 
@@ -98,7 +98,7 @@ def written_causes(
     return kept, tuple(left_out)
 
 
-def _named(done: WrittenModelFiles) -> dict[str, str]:
+def _collect_written_files(done: WrittenModelFiles) -> dict[str, str]:
     """Return the content of each extended model file that was written, by file name."""
     contents = {"extended.xml": done.xml, "extended.urdf": done.urdf}
     return {name: content for name, content in contents.items() if content is not None}
@@ -117,10 +117,10 @@ def collect_causes(extended: ExtendedSimulator) -> dict[str, Mapping[str, Fitted
         if len(names) == 1:
             names = dict.fromkeys(names, effect.name)
         causes[effect.name] = {c: extended.parameters[name] for c, name in names.items()}
-    return {**causes, **extended.effects, **_numerics(kind)}
+    return {**causes, **extended.effects, **_list_numerics_causes(kind)}
 
 
-def _numerics(kind: Any) -> dict[str, Mapping[str, FittedValue]]:
+def _list_numerics_causes(kind: Any) -> dict[str, Mapping[str, FittedValue]]:
     """Return the time step and integrator as causes, if they differ from those of the model file.
 
     The step is in seconds; the integrator is its MuJoCo number. They have no intervals because they

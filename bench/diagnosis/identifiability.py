@@ -122,8 +122,8 @@ class _Identified:
 
     def numbers(self) -> tuple[ParameterIdentifiability, ...]:
         """Return the identifiability of the free parameters, then of the causes, the best first."""
-        free = self._free()
-        causes = sorted(self._causes(), key=_share_of_range)
+        free = self._assess_free_parameters()
+        causes = sorted(self._assess_causes(), key=_share_of_range)
         return (*free, *causes)
 
     def _without_states(self, columns: Array) -> Array:
@@ -136,7 +136,7 @@ class _Identified:
         runs, samples, count = left.shape
         return left.reshape(runs * samples, count)
 
-    def _free(self) -> list[ParameterIdentifiability]:
+    def _assess_free_parameters(self) -> list[ParameterIdentifiability]:
         """Assess all free parameters from their joint covariance, eq. (1)."""
         own = self.parameters
         scale = np.sqrt(np.einsum("nk,nk->k", own, own))
@@ -160,17 +160,21 @@ class _Identified:
                     mixed.append((self.world.parameters[other].name, float(abs(corr))))
             low, high = parameter.bounds
             numbers.append(
-                _number(parameter.name, True, parameter.unit, Z95 * sd, (low, high), mixed)
+                _classify_parameter(
+                    parameter.name, True, parameter.unit, Z95 * sd, (low, high), mixed
+                )
             )
         # The fit has frozen parameters to which the runs are insensitive.
         for place in sorted(set(self.world.base.tolist()) - set(self.fit.free.tolist())):
             parameter = self.world.parameters[place]
             numbers.append(
-                _number(parameter.name, True, parameter.unit, np.inf, parameter.bounds, ())
+                _classify_parameter(
+                    parameter.name, True, parameter.unit, np.inf, parameter.bounds, ()
+                )
             )
         return numbers
 
-    def _causes(self) -> list[ParameterIdentifiability]:
+    def _assess_causes(self) -> list[ParameterIdentifiability]:
         """Assess the coefficient of each possible cause, fitted with the free parameters.
 
         Effects that act at all places are represented by their members at single places. `powers`
@@ -222,21 +226,27 @@ class _Identified:
             if probe.fixed:
                 # The effect of a limit or backlash is not proportional to it; it shows if it is
                 # reached.
-                own = _number(label, False, parameter.unit, 0.0, parameter.bounds, mixed)
-                numbers.append(replace(own, half=np.nan, word=_shown(float(powers[k]))))
+                own = _classify_parameter(
+                    label, False, parameter.unit, 0.0, parameter.bounds, mixed
+                )
+                numbers.append(
+                    replace(own, half=np.nan, word=_rate_switching_effect(float(powers[k])))
+                )
                 continue
-            numbers.append(_number(label, False, parameter.unit, half, parameter.bounds, mixed))
+            numbers.append(
+                _classify_parameter(label, False, parameter.unit, half, parameter.bounds, mixed)
+            )
         return numbers
 
 
-def _shown(noises: float) -> IdentifiabilityLevel:
+def _rate_switching_effect(noises: float) -> IdentifiabilityLevel:
     """Return the level of a limit or backlash that changes the samples by this norm."""
     if noises < MIN_DETECTABLE_LIMIT_SIGMAS:
         return "not identifiable"
     return "weak" if noises < MIN_DETECTABLE_LIMIT_SIGMAS / NARROW else "identifiable"
 
 
-def _number(
+def _classify_parameter(
     name: str,
     free: bool,
     unit: str,
@@ -272,22 +282,22 @@ def format_identifiability(numbers: Sequence[ParameterIdentifiability], most: in
         most: Maximum number of causes with their own line, and of names in a list.
     """
     lines = ["what this recording can determine (95 % intervals, white noise assumed):"]
-    lines += [f"  {_line(number)}" for number in numbers if number.free]
+    lines += [f"  {_format_parameter(number)}" for number in numbers if number.free]
     causes = {word: [n for n in numbers if not n.free and n.word == word] for word in _WORDS}
     counts = [f"{len(those)} {word}" for word, those in causes.items()]
     lines.append(f"causes, each by itself, surest first: {', '.join(counts)}")
     # A limit has no interval, and follows the causes that have one.
     sure = sorted(causes["identifiable"], key=lambda number: bool(np.isnan(number.half)))
-    lines += [f"  {_line(number)}" for number in sure[:most]]
+    lines += [f"  {_format_parameter(number)}" for number in sure[:most]]
     for word, those in (("identifiable too", sure[most:]), *list(causes.items())[1:]):
         if those:
-            lines.append(f"  {word}: {listed(_effects(those), most)}")
+            lines.append(f"  {word}: {listed(_count_effects(those), most)}")
     if any(len(those) > most for those in causes.values()):
         lines.append("  every cause with its number: the same command with --json")
     return lines
 
 
-def _line(number: ParameterIdentifiability) -> str:
+def _format_parameter(number: ParameterIdentifiability) -> str:
     """Format one parameter with its level, interval, range and confounded parameters."""
     half = f"±{number.half:.2g} {number.unit}" if np.isfinite(number.half) else "untouched"
     if np.isnan(number.half):
@@ -298,7 +308,7 @@ def _line(number: ParameterIdentifiability) -> str:
     return f"{number.word:16s} {number.name}: {half} of {span}{mixed}"
 
 
-def _effects(numbers: Sequence[ParameterIdentifiability]) -> list[str]:
+def _count_effects(numbers: Sequence[ParameterIdentifiability]) -> list[str]:
     """List the effects of causes once each, with the number of their places."""
     places: dict[str, set[str]] = {}
     for number in numbers:

@@ -72,7 +72,7 @@ class DiagnosisReportDataBuilder:
             recording.title or recording.path.stem,
             recording.path,
             verdict,
-            self._channels(sigma),
+            self._list_channels(sigma),
             residual_analysis.build_data_split(world, before, after),
             held_out,
             (
@@ -80,21 +80,23 @@ class DiagnosisReportDataBuilder:
                 *held_out_places,
             ),
             tuple(residual_analysis.compute_residual_profiles(world, before, after, sigma)),
-            tuple(self._parameters()),
-            () if verdict.recording_faults else tuple(self._remains()),
-            () if verdict.recording_faults else tuple(self._why()),
+            tuple(self._list_parameter_changes()),
+            () if verdict.recording_faults else tuple(self._list_unexplained()),
+            () if verdict.recording_faults else tuple(self._list_verdict_reasons()),
             self.finding.unidentified_parameters,
             residual_analysis.get_robot(world),
-            identifiability=self._fixable(),
-            consistency=ConsistencySummary() if verdict.recording_faults else self._apart(),
-            track=self._track(),
+            identifiability=self._assess_identifiability(),
+            consistency=ConsistencySummary()
+            if verdict.recording_faults
+            else self._assess_consistency(),
+            track=self._read_track_figure(),
             logs=max(1, len({run.log for run in recording.runs})),
             thorough=self.search.thorough,
             cross_validated=self._is_cross_validated,
             share_intervals=self.assessor.share_intervals(self.finding),
         )
 
-    def _track(self) -> bytes:
+    def _read_track_figure(self) -> bytes:
         """Return the PNG figure that film tracking saved next to the recording; empty if none."""
         recording = self.assessor.recording
         path = recording.path.with_suffix(".png")
@@ -111,7 +113,7 @@ class DiagnosisReportDataBuilder:
             else b""
         )
 
-    def _apart(self) -> ConsistencySummary:
+    def _assess_consistency(self) -> ConsistencySummary:
         """Assess the consistency of runs, logs and loads for the base and the extended model."""
         if self.finding.early_stop is not None or self.finding.unidentified_parameters:
             return ConsistencySummary()
@@ -121,9 +123,9 @@ class DiagnosisReportDataBuilder:
             if self.finding.model.effects
             else before
         )
-        return ConsistencySummary(before, after, self._rival())
+        return ConsistencySummary(before, after, self._estimate_rival_by_group())
 
-    def _rival(self) -> tuple[ParameterConsistency, ...]:
+    def _estimate_rival_by_group(self) -> tuple[ParameterConsistency, ...]:
         """Return the estimates by run, log or load of the best effect other than a single cause.
 
         They let the report compare how consistent the cause and its best competitor are.
@@ -152,7 +154,7 @@ class DiagnosisReportDataBuilder:
         ]
         return tuple(group_estimates)
 
-    def _fixable(self) -> tuple[ParameterIdentifiability, ...]:
+    def _assess_identifiability(self) -> tuple[ParameterIdentifiability, ...]:
         """Assess identifiability from the directions that the search has simulated."""
         key: frozenset[str] = frozenset()
         scanned = self.search.cached_scans.get(key) or self.search.superseded_scans.get(key)
@@ -192,7 +194,7 @@ class DiagnosisReportDataBuilder:
         runs = [place for place in places if place.kind == "run"]
         return residual_analysis.build_data_split(world, before, after), runs
 
-    def _channels(self, sigma: Array) -> tuple[ChannelInfo, ...]:
+    def _list_channels(self, sigma: Array) -> tuple[ChannelInfo, ...]:
         """Return name, unit and noise of each channel.
 
         `sigma` (C,) is the noise standard deviation of each channel in its unit.
@@ -209,7 +211,7 @@ class DiagnosisReportDataBuilder:
             ChannelInfo(c.name, c.unit, size, stated, step) for c, size, stated, step in rows
         )
 
-    def _parameters(self) -> Iterator[ParameterChange]:
+    def _list_parameter_changes(self) -> Iterator[ParameterChange]:
         """Yield each base parameter with its value before and after the causes were added.
 
         A parameter is marked if the data do not determine it, so that it was kept at its nominal
@@ -224,14 +226,14 @@ class DiagnosisReportDataBuilder:
             yield ParameterChange(
                 parameter.name,
                 parameter.unit,
-                _triple(before[i]),
-                _triple(after[i]),
+                _get_value_and_interval(before[i]),
+                _get_value_and_interval(after[i]),
                 touched,
                 (before[i].at_bound, after[i].at_bound),
                 in_file(after[i]),
             )
 
-    def _remains(self) -> Iterator[str]:
+    def _list_unexplained(self) -> Iterator[str]:
         """Yield sentences on what the extended model does not explain, and further notes."""
         world = self.assessor.fitting_evaluator
         remains = self.finding.lack_of_fit
@@ -252,12 +254,12 @@ class DiagnosisReportDataBuilder:
                 f"the data do not identify {names} together with the other parameters: kept at the "
                 "nominal value"
             )
-        yield from self._bordering()
+        yield from self._warn_of_bounds()
         yield from self.notes
 
-    def _bordering(self) -> Iterator[str]:
+    def _warn_of_bounds(self) -> Iterator[str]:
         """Yield a warning for each base parameter whose fitted value is at a bound of its range."""
-        for parameter in self._parameters():
+        for parameter in self._list_parameter_changes():
             values = parameter.before[0], parameter.after[0]
             for when, value, bound in zip(
                 ("in the base fit ", ""), values, parameter.bounds, strict=True
@@ -272,7 +274,7 @@ class DiagnosisReportDataBuilder:
                 )
                 break
 
-    def _why(self) -> Iterator[str]:
+    def _list_verdict_reasons(self) -> Iterator[str]:
         """Yield the reasons for the verdict as sentences, the most important first.
 
         A search that was stopped early has no such reasons.
@@ -283,19 +285,21 @@ class DiagnosisReportDataBuilder:
         if finding.verdict == "unknown" and finding.causes:
             yield "the best effects do not close enough of the gap to explain it"
         if finding.verdict in ("partial", "unknown") and finding.lack_of_fit.has_structure:
-            yield self._structure()
+            yield self._describe_residual_structure()
         for cause in finding.causes:
             if cause.alternatives:
                 names = [cause.effect, *cause.alternatives]
                 placed = any("@" in name for name in names)
-                all_of_them = format_effect_set(names, "and") if placed else _named(names)
+                all_of_them = (
+                    format_effect_set(names, "and") if placed else _join_effect_names(names)
+                )
                 yield (
                     f"{all_of_them} have the same influence on these runs, "
                     "once parameters and initial states are fitted with each: "
                     "their likelihoods differ by odds of less than 33 to 1"
                 )
 
-    def _structure(self) -> str:
+    def _describe_residual_structure(self) -> str:
         """Say how the residual of the final model still differs from the noise of the sensors."""
         p_value = self.finding.lack_of_fit.p_value
         # Lack of fit is either a residual with a pattern, or one that is only too large.
@@ -307,12 +311,12 @@ class DiagnosisReportDataBuilder:
         return "the residual exceeds the stated noise of the sensors"
 
 
-def _named(effects: list[str]) -> str:
+def _join_effect_names(effects: list[str]) -> str:
     """Join registered names of effects."""
     return f"{effects[0]} and {', '.join(effects[1:])}"
 
 
-def _triple(number: Estimate) -> tuple[float, float, float]:
+def _get_value_and_interval(number: Estimate) -> tuple[float, float, float]:
     """Return value and interval as used by figures: NaN where the data give no bound."""
     low = np.nan if number.low is None else number.low
     high = np.nan if number.high is None else number.high

@@ -58,7 +58,7 @@ def compute_gap_locations(
         sigma: (C,) noise of each channel.
         mark: Text that is appended to the names of runs.
     """
-    parts = _parts(world, after, mark)
+    parts = _list_parts(world, after, mark)
     residuals = [(world.observed - simulated) / sigma for simulated in (before, after)]
     shown = []
     for kind, label, mask in parts:
@@ -74,7 +74,7 @@ def compute_gap_locations(
     return shown
 
 
-def _parts(world: RunEvaluator, simulated: Array, mark: str) -> list[tuple[str, str, Mask]]:
+def _list_parts(world: RunEvaluator, simulated: Array, mark: str) -> list[tuple[str, str, Mask]]:
     """List the parts of the data for which the residual is reported: runs, channels and phases.
 
     Each has its kind, its label and the mask (R, T, C) of its samples. `mark` is appended to the
@@ -113,15 +113,15 @@ def detect_phases(world: RunEvaluator, simulated: Array) -> dict[str, Mask]:
     # The lower limit avoids a division by zero if nothing moves; then all is at rest.
     largest = max(float(np.nanmax(speed)), 1e-300)
     # A reversal is slow for a moment too, so only a lasting state counts as rest.
-    still = _lasting(speed < REST_SPEED_SHARE * largest)
+    still = _find_lasting_stretches(speed < REST_SPEED_SHARE * largest)
     if system.bounces:
-        impact = _impacts(world, simulated) & ~still
+        impact = _find_impacts(world, simulated) & ~still
         masks = {"flight": ~impact & ~still, "impact": impact, "at rest": still}
     else:
         reversal = (speed < REVERSAL_SPEED_SHARE * largest) & ~still
         masks = {"motion": ~reversal & ~still, "reversal": reversal, "at rest": still}
     # This phase may overlap with the others, because an input can saturate in each of them.
-    saturated = _saturated(world)
+    saturated = _find_saturation(world)
     if saturated.any():
         masks["saturated input"] = saturated
     return masks
@@ -150,7 +150,7 @@ def compute_speeds(world: RunEvaluator, simulated: Array) -> Array | None:
     return np.sqrt(np.nan_to_num(squares)) if shown else None
 
 
-def _lasting(mask: Mask) -> Mask:
+def _find_lasting_stretches(mask: Mask) -> Mask:
     """Return where a mask is true for at least `MIN_CONSECUTIVE_SAMPLES` consecutive samples."""
     lasting = np.zeros_like(mask)
     for row, out in zip(mask, lasting, strict=True):
@@ -162,7 +162,7 @@ def _lasting(mask: Mask) -> Mask:
     return lasting
 
 
-def _impacts(world: RunEvaluator, simulated: Array) -> Mask:
+def _find_impacts(world: RunEvaluator, simulated: Array) -> Mask:
     """Return the mask (R, T) of the samples around each minimum of the simulated height."""
     name = world.simulator.system.coordinates[-1]
     mask = np.zeros(simulated.shape[:2], dtype=bool)
@@ -180,7 +180,7 @@ def _impacts(world: RunEvaluator, simulated: Array) -> Mask:
     return mask
 
 
-def _saturated(world: RunEvaluator) -> Mask:
+def _find_saturation(world: RunEvaluator) -> Mask:
     """Return the mask (R, T) of samples at which the first input stays near its largest magnitude.
 
     It is empty for an input that is there most of the time, such as a square wave.
@@ -191,7 +191,7 @@ def _saturated(world: RunEvaluator) -> Mask:
             size = np.abs(signal)
             largest = max(float(size.max()), 1e-300)
             mask[r, : signal.size] = (size >= SATURATION_SHARE * largest) & (size > 0)
-    lasting = _lasting(mask)
+    lasting = _find_lasting_stretches(mask)
     # A constant or square input is always at its extreme, which is not saturation.
     return lasting if lasting.mean() < 0.5 else np.zeros_like(mask)
 
@@ -211,16 +211,16 @@ def compute_residual_profiles(
         sigma: (C,) noise of each channel.
     """
     name = world.simulator.system.reading(world.channels)
-    followed_by = _variables(world, after)
+    followed_by = _iterate_variables(world, after)
     if get_robot(world) is not None:
-        name = _loudest(world, before, sigma)
+        name = _find_largest_residual_channel(world, before, sigma)
         followed_by = _variables_of_joint(world, after, name)
     c = world.channels.index(name)
     shown = []
     for variable, unit, values in followed_by:
         good = np.isfinite(world.observed[:, :, c]) & np.isfinite(values)
         followed = values[good]
-        edges = _edges(followed)
+        edges = _compute_bin_edges(followed)
         if edges is None:
             continue
         # Values outside the edges count in the outermost bins.
@@ -246,7 +246,7 @@ def get_robot(world: RunEvaluator) -> RobotModel | None:
     return robot
 
 
-def _loudest(world: RunEvaluator, before: Array, sigma: Array) -> str:
+def _find_largest_residual_channel(world: RunEvaluator, before: Array, sigma: Array) -> str:
     """Return the channel with the largest residual in units of its noise."""
     squares = np.square((world.observed - before) / sigma)
     sizes = []
@@ -256,7 +256,7 @@ def _loudest(world: RunEvaluator, before: Array, sigma: Array) -> str:
     return world.channels[int(np.argmax(sizes))]
 
 
-def _edges(values: Array) -> Array | None:
+def _compute_bin_edges(values: Array) -> Array | None:
     """Return bin edges (BINS + 1,) over most of the values; None if they are all equal."""
     if not values.size or np.ptp(values) == 0:
         return None
@@ -267,12 +267,12 @@ def _edges(values: Array) -> Array | None:
     return edges if edges[-1] > edges[0] else None
 
 
-def _variables(world: RunEvaluator, simulated: Array) -> Iterator[tuple[str, str, Array]]:
+def _iterate_variables(world: RunEvaluator, simulated: Array) -> Iterator[tuple[str, str, Array]]:
     """Yield the variables of residual profiles, each with name, unit and values (R, T).
 
     They are the time, the position, the speed, and each recorded input.
     """
-    times = _times(world)
+    times = _compute_run_times(world)
     yield "time", "s", times
     system = world.simulator.system
     units = {channel.name: channel.unit for channel in world.kind.channels}
@@ -285,10 +285,10 @@ def _variables(world: RunEvaluator, simulated: Array) -> Iterator[tuple[str, str
     if speed is not None:
         unit = f"{units.get(primary, 'm')}/s"
         yield "speed", unit, np.where(np.isfinite(times), speed, np.nan)
-    yield from _inputs(world, [channel.name for channel in world.kind.inputs])
+    yield from _iterate_inputs(world, [channel.name for channel in world.kind.inputs])
 
 
-def _times(world: RunEvaluator) -> Array:
+def _compute_run_times(world: RunEvaluator) -> Array:
     """Return the time (R, T) in seconds since the start of each run, whatever its clock."""
     times = np.full(world.observed.shape[:2], np.nan)
     for r, track in enumerate(world.tracks):
@@ -296,7 +296,9 @@ def _times(world: RunEvaluator) -> Array:
     return times
 
 
-def _inputs(world: RunEvaluator, names: Collection[str]) -> Iterator[tuple[str, str, Array]]:
+def _iterate_inputs(
+    world: RunEvaluator, names: Collection[str]
+) -> Iterator[tuple[str, str, Array]]:
     """Yield name, unit and values (R, T) of the recorded inputs with these names."""
     for channel in world.kind.inputs:
         values = np.full(world.observed.shape[:2], np.nan)
@@ -315,7 +317,7 @@ def _variables_of_joint(
 
     The velocity has its sign, because friction acts against it.
     """
-    times = _times(world)
+    times = _compute_run_times(world)
     yield "time", "s", times
     robot = get_robot(world)
     joints = robot.joints if robot is not None else ()
@@ -337,4 +339,4 @@ def _variables_of_joint(
         values = simulated[:, :, world.channels.index(rate)]
         yield f"velocity of {joint.name}", f"{unit}/s", values
     drives = [f"u.{a.name}" for a in robot.actuators if a.joint == joint.name]
-    yield from _inputs(world, [*drives, f"force.{joint.name}"])
+    yield from _iterate_inputs(world, [*drives, f"force.{joint.name}"])

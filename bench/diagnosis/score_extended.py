@@ -56,12 +56,12 @@ def score_model(
     # The description names the system of the recording before the table is read.
     of_robot = memory.model if memory is not None else read_model_reference(path)
     if model.suffix in MODEL_FILES:
-        extended, kind = _robot(model, of_robot)
+        extended, kind = _load_robot(model, of_robot)
     else:
         extended, kind, _ = open_extended(model, simulators.get)
         # A recording of another robot is recognised by its channels.
         if of_robot is None or extended.robot is None:
-            _check_system(path, _system(memory or path, of_robot), extended, model)
+            _check_system(path, _get_system_name(memory or path, of_robot), extended, model)
     # All runs count by default, because only initial states are fitted here.
     data = memory or read_recording(path, kind, whole=True)
     # Constants of the recording take precedence over those that the model was fitted with.
@@ -84,11 +84,11 @@ def score_model(
         candidates=list(extended.effects),
     )
     sigma = compute_noise_floor(world, data).sigma
-    squares = _squares(world, _simulated(world, extended, sigma))
+    squares = _compute_squared_errors(world, _simulate_runs(world, extended, sigma))
     world.close()
     if not np.isfinite(squares).all():
         raise InputError(f"{path}: the simulation failed with the parameters of {model}")
-    return _errors(world, squares, sigma)
+    return _summarise_errors(world, squares, sigma)
 
 
 def _check_plugin(model: Path) -> None:
@@ -112,7 +112,7 @@ def _check_plugin(model: Path) -> None:
     )
 
 
-def _robot(
+def _load_robot(
     model: Path, stated: ModelFileReference | None
 ) -> tuple[ExtendedSimulator, type[SystemSimulator]]:
     """Load a robot from its model file as a simulator, without fitted parameters and added effects.
@@ -131,7 +131,7 @@ def _robot(
     return ExtendedSimulator(kind.name, kind.name, None, "", {}, {}, {}, (), kind), kind
 
 
-def _system(recording: Path | Recording, of_robot: ModelFileReference | None) -> str:
+def _get_system_name(recording: Path | Recording, of_robot: ModelFileReference | None) -> str:
     """Return the system of a recording: the name of a robot's model file, or of a system."""
     if of_robot is not None:
         return of_robot.path.name
@@ -178,7 +178,7 @@ def build_theta(world: RunEvaluator, extended: ExtendedSimulator) -> Array:
     return theta
 
 
-def _simulated(world: RunEvaluator, extended: ExtendedSimulator, sigma: Array) -> Array:
+def _simulate_runs(world: RunEvaluator, extended: ExtendedSimulator, sigma: Array) -> Array:
     """Simulate the runs (R, T, C) with the model's numbers, from fitted initial states."""
     white = np.zeros(len(sigma))
     runs = HeldOutRuns(world, NoiseModel(sigma, white))
@@ -186,7 +186,7 @@ def _simulated(world: RunEvaluator, extended: ExtendedSimulator, sigma: Array) -
     return measured.simulated
 
 
-def _squares(world: RunEvaluator, simulated: Array) -> Array:
+def _compute_squared_errors(world: RunEvaluator, simulated: Array) -> Array:
     """Compute the squared errors (R, T, C); zero where no sample was observed."""
     seen = np.isfinite(world.observed)
     errors = world.observed - simulated
@@ -194,7 +194,7 @@ def _squares(world: RunEvaluator, simulated: Array) -> Array:
     return squares
 
 
-def _errors(world: RunEvaluator, squares: Array, sigma: Array) -> dict[str, Any]:
+def _summarise_errors(world: RunEvaluator, squares: Array, sigma: Array) -> dict[str, Any]:
     """Summarise the RMS error of each channel, and that of all in units of the noise.
 
     `squares` (R, T, C) has the squared errors, zero where no sample exists; `sigma` (C,) the noise.

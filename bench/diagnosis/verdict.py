@@ -60,7 +60,7 @@ class Cause:
             "effect": self.effect,
             "alternatives": list(self.alternatives),
             "says": self.says,
-            "coefficients": _estimates(self.coefficients),
+            "coefficients": _convert_estimates(self.coefficients),
             "p_value": self.p_value,
             **({"form": self.form} if self.form is not None else {}),
         }
@@ -72,14 +72,16 @@ class Cause:
             document["effect"],
             tuple(document["alternatives"]),
             document["says"],
-            _numbers(document["coefficients"]),
+            _read_estimates(document["coefficients"]),
             document["p_value"],
             document.get("form"),
         )
 
     def __repr__(self) -> str:
         names = " or ".join([self.effect, *self.alternatives])
-        numbers = [f"{name} = {_short(number)}" for name, number in self.coefficients.items()]
+        numbers = [
+            f"{name} = {_format_value(number)}" for name, number in self.coefficients.items()
+        ]
         return f"Cause({names}: {', '.join(numbers)})"
 
 
@@ -121,8 +123,10 @@ class HeldOutResult:
         return {**numbers, "unit": self.unit}
 
     def __repr__(self) -> str:
-        change = f"{_figure(self.rmse_base)} -> {_figure(self.rmse_extended)} {self.unit}".rstrip()
-        floor, closed = _figure(self.noise_floor), _figure(self.gap_closed)
+        before, after = _format_number(self.rmse_base), _format_number(self.rmse_extended)
+        change = f"{before} -> {after} {self.unit}".rstrip()
+        floor = _format_number(self.noise_floor)
+        closed = _format_number(self.gap_closed)
         return f"Heldout({change}, floor {floor}, closed {closed})"
 
 
@@ -277,7 +281,7 @@ class Verdict:
             "system": self.system,
             "engine": self.engine,
             "causes": [cause.to_document() for cause in self.causes],
-            "parameters": _estimates(self.parameters),
+            "parameters": _convert_estimates(self.parameters),
             "heldout": self.heldout.to_document() if self.heldout is not None else None,
             "candidates": [candidate.to_document() for candidate in self.candidates],
             "next_experiment": proposed.to_document() if proposed is not None else None,
@@ -300,7 +304,7 @@ class Verdict:
             document["system"],
             document["engine"],
             tuple(Cause.from_document(cause) for cause in document["causes"]),
-            _numbers(document["parameters"]),
+            _read_estimates(document["parameters"]),
             HeldOutResult(**heldout) if heldout is not None else None,
             tuple(Candidate(**candidate) for candidate in document["candidates"]),
             DiscriminatingRun(**proposed) if proposed is not None else None,
@@ -323,12 +327,12 @@ def to_finite_or_none(value: float) -> float | None:
     return value if np.isfinite(value) else None
 
 
-def _estimates(numbers: Mapping[str, FittedValue]) -> JsonDocument:
+def _convert_estimates(numbers: Mapping[str, FittedValue]) -> JsonDocument:
     """Return numbers as in verdict.json, by name."""
-    return {name: _estimate(number) for name, number in numbers.items()}
+    return {name: _convert_estimate(number) for name, number in numbers.items()}
 
 
-def _estimate(number: FittedValue) -> JsonDocument:
+def _convert_estimate(number: FittedValue) -> JsonDocument:
     """Return a fitted value as a JSON object with value, unit and interval."""
     found: JsonDocument = {key: getattr(number, key) for key in ("value", "unit", "low", "high")}
     # Empty fields are left out.
@@ -340,19 +344,19 @@ def _estimate(number: FittedValue) -> JsonDocument:
     return found
 
 
-def _numbers(document: Mapping[str, Any]) -> dict[str, FittedValue]:
-    return {name: _number(estimate) for name, estimate in document.items()}
+def _read_estimates(document: Mapping[str, Any]) -> dict[str, FittedValue]:
+    return {name: _read_estimate(estimate) for name, estimate in document.items()}
 
 
-def _number(estimate: Mapping[str, Any]) -> FittedValue:
+def _read_estimate(estimate: Mapping[str, Any]) -> FittedValue:
     usual = estimate.get("usual_range")
     ends = (float(usual[0]), float(usual[1])) if usual is not None else None
     return FittedValue(**{**estimate, "usual_range": ends})
 
 
-def _short(number: FittedValue) -> str:
+def _format_value(number: FittedValue) -> str:
     return f"{number.value:.3g} {number.unit}"
 
 
-def _figure(value: float | None) -> str:
+def _format_number(value: float | None) -> str:
     return "?" if value is None else f"{value:.3g}"

@@ -100,9 +100,9 @@ class VerdictBuilder:
         simulations = world.simulations
         if self.validation is not None:
             simulations += self.validation.simulations
-        heldout = self._heldout(finding, rng)
-        candidates = self._candidates(search, finding)
-        proposed = self._next(search, finding)
+        heldout = self._measure_held_out_gain(finding, rng)
+        candidates = self._list_candidates(search, finding)
+        proposed = self._propose_next_run(search, finding)
         return Verdict(
             finding.verdict,
             self.recording.system,
@@ -125,7 +125,7 @@ class VerdictBuilder:
             finding: Outcome of the search.
         """
         numbers = self.collect_parameter_estimates(search, finding.model)
-        return tuple(self._cause(cause, numbers) for cause in finding.causes)
+        return tuple(self._build_cause(cause, numbers) for cause in finding.causes)
 
     def collect_parameter_estimates(
         self, search: EffectSearch, model: FittedModel
@@ -140,7 +140,7 @@ class VerdictBuilder:
             Estimates by index in the parameter vector; those that were not fitted have no interval.
         """
         fitted = compute_intervals(search, model)
-        ranges = self._ranges(model)
+        ranges = self._get_bounds(model)
         result = {}
         for place, parameter in enumerate(self.fitting_evaluator.parameters):
             # Insensitive parameters stay nominal; effects that are not in the model are zero.
@@ -156,7 +156,7 @@ class VerdictBuilder:
             # JSON has no number for an unknown bound; at a bound the curvature gives no interval.
             bounded = np.isfinite(low) and np.isfinite(high) and at_bound is None
             ends = (low, high) if bounded else (None, None)
-            usual = self._usual(place) if place in fitted else parameter.bounds
+            usual = self._get_plausible_range(place) if place in fitted else parameter.bounds
             unusual = usual if not is_instant(parameter) and is_unusual(value, *usual) else None
             unit = parameter.unit
             low_end, high_end = ends
@@ -165,7 +165,7 @@ class VerdictBuilder:
             )
         return self._with_totals(model, result)
 
-    def _usual(self, place: int) -> tuple[float, float]:
+    def _get_plausible_range(self, place: int) -> tuple[float, float]:
         """Return the plausible range, narrower than the bounds for a robot's free numbers."""
         parameter = self.fitting_evaluator.parameters[place]
         free = self.fitting_evaluator.kind.has_model and place in self.fitting_evaluator.base
@@ -185,7 +185,7 @@ class VerdictBuilder:
         # This import is needed for robots only.
         from sims.robot.export.model_file_totals import totals
 
-        placed = list(self._placed(model))
+        placed = list(self._iterate_fitted_effects(model))
         fitted = [(effect, [numbers[i].value for i in places]) for effect, places in placed]
         for (effect, places), made in zip(placed, totals(kind.robot, fitted), strict=True):
             # The model file keeps its gravity if the bodies are gravity-compensated.
@@ -199,7 +199,9 @@ class VerdictBuilder:
                     numbers[i] = replace(numbers[i], stated=stated, total=total, total_unit=unit)
         return numbers
 
-    def _placed(self, model: FittedModel) -> Iterator[tuple[type[Effect], list[int]]]:
+    def _iterate_fitted_effects(
+        self, model: FittedModel
+    ) -> Iterator[tuple[type[Effect], list[int]]]:
         """Yield each fitted effect at one place, with the indices of its coefficients in theta.
 
         An effect that acts at all places is divided into its members.
@@ -220,7 +222,7 @@ class VerdictBuilder:
                 for member in members:
                     yield type(member), [next(places) for _ in member.coefficients]
 
-    def _ranges(self, model: FittedModel) -> dict[int, tuple[float, float]]:
+    def _get_bounds(self, model: FittedModel) -> dict[int, tuple[float, float]]:
         """Return the bounds of each fitted number, by index in the parameter vector."""
         world = self.fitting_evaluator
         ranges = {i: world.parameters[i].bounds for i in world.base.tolist()}
@@ -241,7 +243,7 @@ class VerdictBuilder:
             search: Search that produced the finding.
             finding: Outcome of the search.
         """
-        if finding.verdict == "unknown" and self._refutes(search, finding):
+        if finding.verdict == "unknown" and self._is_refuted(search, finding):
             return replace(finding, verdict="adequate")
         numbers = self.collect_parameter_estimates(search, finding.model)
         certain = [cause for cause in finding.causes if not cause.alternatives]
@@ -253,7 +255,7 @@ class VerdictBuilder:
         results = all(numbers[i].is_result for i in places) and not self._ends_at_bound(numbers)
         return replace(finding, verdict=verdict_rules.verdict_of_numbers(finding.verdict, results))
 
-    def _refutes(self, search: EffectSearch, finding: DiagnosisResult) -> bool:
+    def _is_refuted(self, search: EffectSearch, finding: DiagnosisResult) -> bool:
         """Return whether fitted models refute a missing effect that only the linear score suggests.
 
         This is so if no fitted model with effects has a higher penalised log-likelihood than the
@@ -306,7 +308,7 @@ class VerdictBuilder:
             usable & (not finding.lack_of_fit.has_structure), left, self.noise_floor.sigma
         )
 
-    def _cause(self, evidence: CauseEvidence, numbers: dict[int, FittedValue]) -> Cause:
+    def _build_cause(self, evidence: CauseEvidence, numbers: dict[int, FittedValue]) -> Cause:
         """Build a cause of the verdict from an effect found by the search.
 
         `numbers` has the fitted values by their index in the parameter vector.
@@ -331,7 +333,7 @@ class VerdictBuilder:
             says = GRAVITY_COMPENSATED
         return Cause(evidence.effect, evidence.alternatives, says, by_name, evidence.p_value, form)
 
-    def _counted(self) -> list[int]:
+    def _list_counted_channels(self) -> list[int]:
         """List the channels with the same unit as the channel that sensor effects act on."""
         world = self.fitting_evaluator
         units = [channel.unit for channel in world.simulator.channels]
@@ -342,9 +344,15 @@ class VerdictBuilder:
 
     def _floor_of(self, finding: DiagnosisResult) -> float:
         """Compute the RMS of the noise floor over the channels that count."""
-        return float(np.sqrt(np.square(self.estimate_noise_sigma(finding)[self._counted()]).mean()))
+        return float(
+            np.sqrt(
+                np.square(self.estimate_noise_sigma(finding)[self._list_counted_channels()]).mean()
+            )
+        )
 
-    def _heldout(self, finding: DiagnosisResult, rng: np.random.Generator) -> HeldOutResult | None:
+    def _measure_held_out_gain(
+        self, finding: DiagnosisResult, rng: np.random.Generator
+    ) -> HeldOutResult | None:
         """Measure by how much the causes improve the prediction of held-out runs.
 
         Return None if the prediction of the base model failed, or if no runs were predicted with
@@ -362,14 +370,16 @@ class VerdictBuilder:
         # Without a prediction of the base model there is no gap to measure.
         if not np.isfinite(before[np.isfinite(runs.observed)]).all():
             return None
-        counted = self._counted()
+        counted = self._list_counted_channels()
         given = counted, self._floor_of(finding), rng, self._by_stretches
         result = compute_held_out_gain(runs, before, after, *given)
         return _build_held_out_result(
             result, self.fitting_evaluator.simulator.channels[counted[0]].unit
         )
 
-    def _candidates(self, search: EffectSearch, finding: DiagnosisResult) -> tuple[Candidate, ...]:
+    def _list_candidates(
+        self, search: EffectSearch, finding: DiagnosisResult
+    ) -> tuple[Candidate, ...]:
         """List all effects of the library with their scores about the base model, best first.
 
         A score is reduced by the price of each coefficient beyond the first, so that an effect
@@ -390,22 +400,22 @@ class VerdictBuilder:
             p_value = float(
                 np.clip(estimate_tail_p_value(scores.null_scores, beyond_chance), 0.0, 1.0)
             )
-            share = self._share(finding, (effect,))
+            share = self._get_closed_share(finding, (effect,))
             slot = search.world.slots[effect]
             score -= search.parameter_penalty * (slot.stop - slot.start - 1)
             rows.append(Candidate(effect, max(score, 0.0), p_value, share))
         return tuple(sorted(rows, key=lambda row: -row.score))
 
-    def _share(self, finding: DiagnosisResult, names: EffectNames) -> float | None:
+    def _get_closed_share(self, finding: DiagnosisResult, names: EffectNames) -> float | None:
         """Return the share of the held-out gap that a model closes; None if it is not measured."""
         runs, measured = self.held_out_evaluator, finding.held_out_fits
         if runs is None or measured is None or names not in measured:
             return None
-        counted = self._counted()
+        counted = self._list_counted_channels()
         floor = self._floor_of(finding)
         # As for the gain of the whole model, an error below the noise floor is not a gain.
-        before = _rmse(runs, measured[()].simulated, counted)
-        after = _rmse(runs, measured[names].simulated, counted)
+        before = _compute_rmse(runs, measured[()].simulated, counted)
+        after = _compute_rmse(runs, measured[names].simulated, counted)
         share = 0.0
         # At the noise floor there is no gap, and the quotient would be a rounding error.
         if before > floor * 1.001:
@@ -427,19 +437,21 @@ class VerdictBuilder:
         before = measured[()].simulated
         found = {}
         for names, simulated in measured.items():
-            share = self._share(finding, names)
+            share = self._get_closed_share(finding, names)
             if len(names) != 1 or share is None or share <= MIN_REPORTED_GAIN:
                 continue
             # Each effect has its own random stream, so that its interval does not depend on the
             # others.
             rng = make_rng("held-out share", *names)
-            given = self._counted(), self._floor_of(finding), rng, self._by_stretches
+            given = self._list_counted_channels(), self._floor_of(finding), rng, self._by_stretches
             result = compute_held_out_gain(runs, before, simulated.simulated, *given)
             if np.isfinite(result.low) and np.isfinite(result.high):
                 found[names[0]] = result.low, result.high
         return found
 
-    def _next(self, search: EffectSearch, finding: DiagnosisResult) -> DiscriminatingRun | None:
+    def _propose_next_run(
+        self, search: EffectSearch, finding: DiagnosisResult
+    ) -> DiscriminatingRun | None:
         """Propose a run that distinguishes the strongest cause from its most plausible alternative.
 
         If the base model is not identifiable, the run should identify its parameters. Return None
@@ -459,7 +471,7 @@ class VerdictBuilder:
         return None
 
 
-def _rmse(world: RunEvaluator, simulated: Array, channels: list[int]) -> float:
+def _compute_rmse(world: RunEvaluator, simulated: Array, channels: list[int]) -> float:
     """Compute the RMS error over the channels that count, in their unit."""
     seen = np.isfinite(world.observed)[..., channels]
     error = (world.observed - simulated)[..., channels][seen]

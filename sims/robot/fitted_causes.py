@@ -79,27 +79,28 @@ class FittedCause:
         """Format as ``friction.coulomb@elbow: 0.3 N·m (95 %: 0.28 to 0.32), fitted to log.csv``."""
         several = len(self.numbers) > 1
         numbers = [
-            (f"{name} " if several else "") + _told(number) for name, number in self.numbers.items()
+            (f"{name} " if several else "") + _format_estimate(number)
+            for name, number in self.numbers.items()
         ]
         fitted = f", fitted to {recording}" if recording else ""
         return f"{self.name}: {', '.join(numbers)}{fitted}"
 
 
-def _told(number: FittedValue) -> str:
+def _format_estimate(number: FittedValue) -> str:
     """Format as ``-0.05 N·m (95 %: -0.06 to -0.04), from 0.2 to 0.15 N·m``.
 
     The last part is the number in the model file before and after.
     """
-    text = f"{number.value:.4g}{_unit(number.unit)}"
+    text = f"{number.value:.4g}{_format_unit(number.unit)}"
     if number.low is not None and number.high is not None:
         text += f" (95 %: {number.low:.4g} to {number.high:.4g})"
     if number.stated is not None and number.total is not None:
-        unit = _unit(number.total_unit or number.unit)
+        unit = _format_unit(number.total_unit or number.unit)
         text += f", from {number.stated:.4g} to {number.total:.4g}{unit}"
     return text
 
 
-def _unit(unit: str) -> str:
+def _format_unit(unit: str) -> str:
     return "" if unit == "1" else f" {unit.replace('*', '·')}"
 
 
@@ -120,13 +121,13 @@ def expand_families(
     for name, numbers in causes.items():
         effect, _, place = name.partition("@")
         if place == ALL_PLACES:
-            found += _members(robot, effect, numbers)
+            found += _list_family_causes(robot, effect, numbers)
         else:
             found.append(FittedCause(effect, place, dict(numbers)))
     return found
 
 
-def _members(
+def _list_family_causes(
     robot: RobotModel, effect: str, numbers: Mapping[str, FittedValue]
 ) -> list[FittedCause]:
     """Return the causes of an effect family, one for each place.
@@ -137,13 +138,13 @@ def _members(
     by_place: dict[str, dict[str, FittedValue]] = {}
     for key, number in numbers.items():
         coefficient, _, place = key.partition("@")
-        places = [place] if place else _places(robot, effect)
+        places = [place] if place else _list_places(robot, effect)
         for one in places:
             by_place.setdefault(one, {})[coefficient] = number
     return [FittedCause(effect, place, own) for place, own in by_place.items()]
 
 
-def _places(robot: RobotModel, effect: str) -> list[str]:
+def _list_places(robot: RobotModel, effect: str) -> list[str]:
     """List the places of an effect family that has one number for all places."""
     if effect.startswith("input."):
         return [actuator.name for actuator in robot.actuators if actuator.motion is not None]

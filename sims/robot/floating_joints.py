@@ -70,8 +70,12 @@ class FloatingJoints:
     def from_robot(cls, robot: RobotModel) -> FloatingJoints:
         """Return the floating joints of a robot."""
         joints = tuple(joint for joint in robot.joints if not joint.has_one_coordinate)
-        positions = [j.position + k for j in joints for k in range(len(_axes(j) + TURN))]
-        velocities = [j.velocity + k for j in joints for k in range(len(_axes(j) + SPIN))]
+        positions = [
+            j.position + k for j in joints for k in range(len(_list_translation_axes(j) + TURN))
+        ]
+        velocities = [
+            j.velocity + k for j in joints for k in range(len(_list_translation_axes(j) + SPIN))
+        ]
         return cls(joints, np.array(positions, np.intp), np.array(velocities, np.intp))
 
     def __bool__(self) -> bool:
@@ -79,7 +83,7 @@ class FloatingJoints:
 
     def names(self) -> tuple[list[str], list[str]]:
         """Return the names of positions and velocities, such as ``q.base.qw``, ``qd.base.wx``."""
-        axes = [(joint.name, _axes(joint)) for joint in self.joints]
+        axes = [(joint.name, _list_translation_axes(joint)) for joint in self.joints]
         positions = [f"q.{name}.{axis}" for name, own in axes for axis in own + TURN]
         velocities = [f"qd.{name}.{axis}" for name, own in axes for axis in own + SPIN]
         return positions, velocities
@@ -92,9 +96,9 @@ class FloatingJoints:
         """
         units: dict[str, str] = {}
         for joint in self.joints:
-            units |= {f"q.{joint.name}.{axis}": "m" for axis in _axes(joint)}
+            units |= {f"q.{joint.name}.{axis}": "m" for axis in _list_translation_axes(joint)}
             units |= {f"q.{joint.name}.{axis}": "1" for axis in TURN}
-            units |= {f"qd.{joint.name}.{axis}": "m/s" for axis in _axes(joint)}
+            units |= {f"qd.{joint.name}.{axis}": "m/s" for axis in _list_translation_axes(joint)}
             units |= {f"qd.{joint.name}.{axis}": "rad/s" for axis in SPIN}
         return units
 
@@ -113,7 +117,7 @@ class FloatingJoints:
         positions, velocities = self.names()
         pose = np.array([states[name] for name in positions], dtype=float)
         rate = np.array([states[name] for name in velocities], dtype=float)
-        for joint, (_, turn, _) in zip(self.joints, self._own, strict=True):
+        for joint, (_, turn, _) in zip(self.joints, self._joint_addresses, strict=True):
             length = float(np.linalg.norm(pose[turn]))
             if length < MIN_QUATERNION_NORM:
                 given = ", ".join(f"q.{joint.name}.{axis}" for axis in TURN)
@@ -133,7 +137,7 @@ class FloatingJoints:
             The displaced poses (n, P).
         """
         result = pose.copy()
-        for axes, turn, first in self._own:
+        for axes, turn, first in self._joint_addresses:
             # A free joint has its position before its quaternion.
             own = number - first - len(axes)
             if -len(axes) <= own < 0:
@@ -141,7 +145,7 @@ class FloatingJoints:
             elif 0 <= own < len(SPIN):
                 small = np.zeros(len(TURN))
                 small[0], small[1 + own] = np.cos(0.5 * by), np.sin(0.5 * by)
-                result[:, turn] = _product(pose[:, turn], small[None])
+                result[:, turn] = _multiply_quaternions(pose[:, turn], small[None])
         return result
 
     def displaced(self, pose: Array, moves: Array) -> Array:
@@ -150,7 +154,7 @@ class FloatingJoints:
         Positions move along the axes of the world; rotations are about the axes of the body.
         """
         result = pose.copy()
-        for axes, turn, first in self._own:
+        for axes, turn, first in self._joint_addresses:
             place = slice(turn.start - len(axes), turn.start)
             result[:, place] += moves[:, first : first + len(axes)]
             rotation = moves[:, first + len(axes) : first + len(axes) + len(SPIN)]
@@ -158,36 +162,36 @@ class FloatingJoints:
             # sin(a / 2) / a, whose limit is 1 / 2 at a = 0.
             half = 0.5 * np.sinc(angle / (2.0 * np.pi))
             small = np.concatenate([np.cos(0.5 * angle), half * rotation], axis=1)
-            result[:, turn] = _product(pose[:, turn], small)
+            result[:, turn] = _multiply_quaternions(pose[:, turn], small)
         return result
 
     def compute_displacement(self, pose: Array, reference: Array) -> Array:
         """Compute the displacements (n, F) from reference poses (n, P) to poses (n, P)."""
         parts = []
-        for axes, turn, _ in self._own:
+        for axes, turn, _ in self._joint_addresses:
             place = slice(turn.start - len(axes), turn.start)
             parts.append(pose[:, place] - reference[:, place])
             back = reference[:, turn] * np.array([1.0, -1.0, -1.0, -1.0])
-            parts.append(_logarithm(_product(back, pose[:, turn])))
+            parts.append(_compute_rotation_vectors(_multiply_quaternions(back, pose[:, turn])))
         return np.concatenate(parts, axis=1) if parts else np.zeros((len(pose), 0))
 
     @cached_property
-    def _own(self) -> tuple[FloatingJoint, ...]:
+    def _joint_addresses(self) -> tuple[FloatingJoint, ...]:
         """Where the pose numbers and the velocities of each joint are, in order."""
         own, end, first = [], 0, 0
-        for axes in map(_axes, self.joints):
+        for axes in map(_list_translation_axes, self.joints):
             end += len(axes + TURN)
             own.append(FloatingJoint(axes, slice(end - len(TURN), end), first))
             first += len(axes + SPIN)
         return tuple(own)
 
 
-def _axes(joint: Joint) -> tuple[str, ...]:
+def _list_translation_axes(joint: Joint) -> tuple[str, ...]:
     """Return the axes of translation of a floating joint."""
     return AXES if joint.kind == "free" else ()
 
 
-def _product(one: Array, other: Array) -> Array:
+def _multiply_quaternions(one: Array, other: Array) -> Array:
     """Compute the Hamilton products (n, 4) of `one` and `other`, quaternions (w, x, y, z)."""
     a, u = one[:, :1], one[:, 1:]
     b, v = other[:, :1], other[:, 1:]
@@ -195,7 +199,7 @@ def _product(one: Array, other: Array) -> Array:
     return np.concatenate([real, a * v + b * u + np.cross(u, v)], axis=1)
 
 
-def _logarithm(turn: Array) -> Array:
+def _compute_rotation_vectors(turn: Array) -> Array:
     """Compute rotation vectors (n, 3) of unit quaternions, with angles of at most pi."""
     sign = np.where(turn[:, :1] < 0, -1.0, 1.0)
     real, vector = sign * turn[:, :1], sign * turn[:, 1:]

@@ -285,7 +285,7 @@ def get_coupling_address(robot: RobotModel, place: str) -> int:
     return int(model.tendon_adr[model.tendon(place + COUPLING_TENDON_SUFFIX).id]) + 1
 
 
-def _couple(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
+def _set_coupling(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
     fields["wrap_prm"][:, get_coupling_address(robot, place)] = c[0]
 
 
@@ -351,7 +351,7 @@ def _add_payload(fields: Fields, robot: RobotModel, place: str, c: Array) -> Non
     fields["body_mass"][loaded, number] = total
     fields["body_ipos"][loaded, number] = middle
     fields["body_inertia"][loaded, number] = moments
-    fields["body_iquat"][loaded, number] = _quaternions(axes)
+    fields["body_iquat"][loaded, number] = _compute_quaternions(axes)
 
 
 def compute_point_inertias(arms: Array) -> Array:
@@ -382,7 +382,7 @@ def compute_inertia_tensors(quaternions: Array, moments: Array) -> Array:
     return result
 
 
-def _quaternions(matrices: Array) -> Array:
+def _compute_quaternions(matrices: Array) -> Array:
     """Return unit quaternions (L, 4), MuJoCo's w first, of rotation matrices (L, 3, 3)."""
     from scipy.spatial.transform import Rotation
 
@@ -443,7 +443,7 @@ MODEL_FIELD_EFFECTS: Mapping[str, ModelFieldEffect] = {
     ),
     "gravity.scale": ModelFieldEffect(("opt.gravity",), _scale_gravity),
     "gravity.tilt": ModelFieldEffect(("opt.gravity",), _tilt_gravity),
-    "joint.coupling": ModelFieldEffect((COUPLING_FIELD,), _couple),
+    "joint.coupling": ModelFieldEffect((COUPLING_FIELD,), _set_coupling),
     "actuator.limit": ModelFieldEffect(
         ("actuator_forcelimited", "actuator_forcerange"), _limit_force
     ),

@@ -37,25 +37,25 @@ Find = Callable[[RobotModel, str], "list[list[ModelField]]"]
 """Function that finds the elements of each coefficient, by robot and place."""
 
 
-def _dof(name: str, *index: int) -> Find:
+def _make_dof_finder(name: str, *index: int) -> Find:
     return lambda robot, place: [[ModelField(name, (robot.joint(place).velocity, *index))]]
 
 
-def _joint(name: str, *index: int) -> Find:
+def _make_joint_finder(name: str, *index: int) -> Find:
     return lambda robot, place: [[ModelField(name, (robot.joint(place).id, *index))]]
 
 
-def _body(name: str) -> Find:
+def _make_body_finder(name: str) -> Find:
     return lambda robot, place: [[ModelField(name, (robot.body(place).id,))]]
 
 
-def _center(robot: RobotModel, place: str) -> list[list[ModelField]]:
+def _find_mass_centre_fields(robot: RobotModel, place: str) -> list[list[ModelField]]:
     """Return the three fields of a body's centre of mass."""
     number = robot.body(place).id
     return [[ModelField("body_ipos", (number, axis))] for axis in range(3)]
 
 
-def _servo(term: int) -> Find:
+def _make_servo_gain_finder(term: int) -> Find:
     """Return a finder of the fields that hold a gain of a servo.
 
     `term` is the index in the actuator's bias: 1 for the stiffness, 2 for the damping. The bias
@@ -81,25 +81,25 @@ def _force_range(robot: RobotModel, place: str) -> list[list[ModelField]]:
     return [ends]
 
 
-def _gravity(*axes: int) -> Find:
+def _make_gravity_finder(*axes: int) -> Find:
     return lambda _robot, _place: [[ModelField("opt.gravity", (axis,))] for axis in axes]
 
 
 _FIELDS: Mapping[str, Find] = {
-    "drag.linear": _dof("dof_damping"),
-    "drag.quadratic": _dof("dof_dampingpoly", 0),
-    "friction.coulomb": _dof("dof_frictionloss"),
-    "inertia.armature": _dof("dof_armature"),
-    "spring.linear": _joint("jnt_stiffness"),
-    "spring.cubic": _joint("jnt_stiffnesspoly", 1),
+    "drag.linear": _make_dof_finder("dof_damping"),
+    "drag.quadratic": _make_dof_finder("dof_dampingpoly", 0),
+    "friction.coulomb": _make_dof_finder("dof_frictionloss"),
+    "inertia.armature": _make_dof_finder("dof_armature"),
+    "spring.linear": _make_joint_finder("jnt_stiffness"),
+    "spring.cubic": _make_joint_finder("jnt_stiffnesspoly", 1),
     "actuator.limit": _force_range,
-    "actuator.stiffness": _servo(1),
-    "actuator.damping": _servo(2),
-    "mass.scale": _body("body_mass"),
-    "mass.offset": _center,
-    "inertia.scale": _body("body_inertia"),
+    "actuator.stiffness": _make_servo_gain_finder(1),
+    "actuator.damping": _make_servo_gain_finder(2),
+    "mass.scale": _make_body_finder("body_mass"),
+    "mass.offset": _find_mass_centre_fields,
+    "inertia.scale": _make_body_finder("body_inertia"),
     "gravity.scale": lambda _robot, _place: [[ModelField("opt.gravity", ())]],
-    "gravity.tilt": _gravity(0, 1),
+    "gravity.tilt": _make_gravity_finder(0, 1),
 }
 _OPERATIONS: Mapping[str, Operation] = {
     "mass.offset": "add",

@@ -76,7 +76,7 @@ def strip_assets(robot: RobotModel) -> RobotModel:
     if _needs_shapes(model):
         return robot
     try:
-        stripped = _stripped(robot)
+        stripped = _strip_model(robot)
     # Any compiler error concerns the smaller model only, since the whole model has compiled.
     except (ValueError, RuntimeError):
         stripped = robot
@@ -86,7 +86,7 @@ def strip_assets(robot: RobotModel) -> RobotModel:
     return stripped
 
 
-def _stripped(robot: RobotModel) -> RobotModel:
+def _strip_model(robot: RobotModel) -> RobotModel:
     """Remove the elements of a robot's model that do not influence its motion, see `strip_assets`.
 
     Raises:

@@ -210,7 +210,7 @@ class RobotModel:
         for i in range(model.njnt):
             kind = KINDS[int(model.jnt_type[i])]
             low, high = (float(v) for v in model.jnt_range[i])
-            effort = _limit(model.jnt_actfrcrange[i], bool(model.jnt_actfrclimited[i]))
+            effort = _get_limit(model.jnt_actfrcrange[i], bool(model.jnt_actfrclimited[i]))
             joints.append(
                 Joint(
                     name=model.joint(i).name or f"joint{i}",
@@ -229,9 +229,11 @@ class RobotModel:
         """All actuators."""
         model = self.compiled
         # Before MuJoCo 4 each actuator had one control.
-        return tuple(self._actuator(i) for i in range(getattr(model, "nactuator", model.nu)))
+        return tuple(
+            self._describe_actuator(i) for i in range(getattr(model, "nactuator", model.nu))
+        )
 
-    def _actuator(self, i: int) -> Actuator:
+    def _describe_actuator(self, i: int) -> Actuator:
         """Describe actuator number i: its joint, kind of motion, control range and force range.
 
         An actuator on the tendon that couples a joint to others counts as driving that
@@ -268,9 +270,9 @@ class RobotModel:
             name=model.actuator(i).name or f"actuator{i}",
             id=i,
             joint=joint,
-            kind=_kind(model, i),
-            range=_limit(model.actuator_ctrlrange[control], True) if limited else None,
-            force=_limit(model.actuator_forcerange[i], bool(model.actuator_forcelimited[i])),
+            kind=_detect_actuator_kind(model, i),
+            range=_get_limit(model.actuator_ctrlrange[control], True) if limited else None,
+            force=_get_limit(model.actuator_forcerange[i], bool(model.actuator_forcelimited[i])),
             control=control,
             controls=controls,
             motion=motion,
@@ -316,12 +318,12 @@ class RobotModel:
         for i in range(model.nsensor):
             name = model.sensor(i).name or f"sensor{i}"
             begin, count = int(model.sensor_adr[i]), int(model.sensor_dim[i])
-            ends = [""] if count == 1 else [f".{axis}" for axis in _axes(count)]
-            unit = self._unit(i)
+            ends = [""] if count == 1 else [f".{axis}" for axis in _list_axis_suffixes(count)]
+            unit = self._get_sensor_unit(i)
             rows += [SensorRow(name + end, begin + k, unit) for k, end in enumerate(ends)]
         return tuple(rows)
 
-    def _unit(self, sensor: int) -> str:
+    def _get_sensor_unit(self, sensor: int) -> str:
         """Return the SI unit of a sensor by its number; 1 if MuJoCo does not determine it."""
         import mujoco
 
@@ -348,12 +350,14 @@ class RobotModel:
         Raises:
             InputError: there is no such joint; the message lists the existing ones.
         """
-        found: Joint = self._named("joint", name, {joint.name: joint for joint in self.joints})
+        found: Joint = self._find_by_name(
+            "joint", name, {joint.name: joint for joint in self.joints}
+        )
         return found
 
     def actuator(self, name: str) -> Actuator:
         """Return the actuator with a name; errors as in `joint`."""
-        found: Actuator = self._named("actuator", name, {a.name: a for a in self.actuators})
+        found: Actuator = self._find_by_name("actuator", name, {a.name: a for a in self.actuators})
         return found
 
     def body(self, name: str) -> Body:
@@ -364,10 +368,10 @@ class RobotModel:
         """
         bodies = {body.name: body for body in self.bodies}
         fused = (self.aliases or {}).get(name, name)
-        found: Body = self._named("body", fused if fused in bodies else name, bodies)
+        found: Body = self._find_by_name("body", fused if fused in bodies else name, bodies)
         return found
 
-    def _named(self, kind: str, name: str, known: Mapping[str, Any]) -> Any:
+    def _find_by_name(self, kind: str, name: str, known: Mapping[str, Any]) -> Any:
         """Return an element of the robot by name.
 
         Args:
@@ -410,11 +414,11 @@ def cache_per_robot(
     return asked
 
 
-def _limit(values: Any, limited: bool) -> tuple[float, float] | None:
+def _get_limit(values: Any, limited: bool) -> tuple[float, float] | None:
     return (float(values[0]), float(values[1])) if limited else None
 
 
-def _kind(model: Any, i: int) -> ActuatorKind:
+def _detect_actuator_kind(model: Any, i: int) -> ActuatorKind:
     """Return the kind of an actuator from its gain and bias (MuJoCo's shortcuts)."""
     import mujoco
 
@@ -445,7 +449,7 @@ def filters() -> tuple[int, int]:
     return int(mujoco.mjtDyn.mjDYN_FILTER), int(mujoco.mjtDyn.mjDYN_FILTEREXACT)
 
 
-def _axes(count: int) -> list[str]:
+def _list_axis_suffixes(count: int) -> list[str]:
     """Return name endings for the numbers of a sensor: axes, quaternion entries, or indices."""
     named = {3: "xyz", 4: "wxyz"}
     return list(named[count]) if count in named else [str(k) for k in range(count)]

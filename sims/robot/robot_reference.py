@@ -58,7 +58,7 @@ class RobotReference:
         Args:
             folder: folder of the TOML file; None stores the model file's name without a folder.
         """
-        where = self.path.name if folder is None else _from(folder, self.path)
+        where = self.path.name if folder is None else _make_relative_path(folder, self.path)
         document = {
             key: value for key, value in asdict(self).items() if value and key in ROBOT_KEYS
         }
@@ -114,7 +114,7 @@ def make_robot_reference(kind: type[RobotSimulator]) -> RobotReference:
     )
 
 
-def _from(folder: Path, path: Path) -> str:
+def _make_relative_path(folder: Path, path: Path) -> str:
     """Return a path relative to a folder if both are in one tree, else the absolute path."""
     folder, path = folder.resolve(), path.resolve()
     common = Path(os.path.commonpath([folder, path])) if folder.drive == path.drive else None
@@ -143,7 +143,7 @@ def read_robot_reference(source: Path, document: Mapping[str, Any]) -> RobotRefe
         check_name_list(source, "free", document.get("free", []), "a list of names"),
         check_table(source, "actuators", document.get("actuators", {})),
         check_table(source, "engine", document.get("engine", {})),
-        _numerics(source, document.get("numerics", {})),
+        _check_numerics(source, document.get("numerics", {})),
         _friction_form(source, document.get("friction_form", "stiff")),
     )
 
@@ -156,7 +156,7 @@ def _friction_form(source: Source, value: Any) -> FrictionForm:
     raise make_error(source, "friction_form", " or ".join(FRICTION_FORMS), value)
 
 
-def _numerics(source: Source, value: Any) -> dict[str, Any]:
+def _check_numerics(source: Source, value: Any) -> dict[str, Any]:
     """Check the table ``[numerics]``: a time step in seconds, and one of MuJoCo's integrators."""
     from sims.robot.integrator_settings import INTEGRATOR_IDS
 

@@ -92,7 +92,7 @@ class RobotSystem(System):
         if effect.name not in cls._placed:
             cls._placed[effect.name] = tuple(
                 effect_places.make_effect_classes(
-                    effect, cls.places, MODEL_FIELD_EFFECTS, cls._compiles
+                    effect, cls.places, MODEL_FIELD_EFFECTS, cls._compiles_with
                 )
             )
         found = [one for one in cls._placed[effect.name] if not cls.is_free(one)]
@@ -101,7 +101,7 @@ class RobotSystem(System):
         return found
 
     @classmethod
-    def _compiles(cls, effect: type[Effect]) -> bool:
+    def _compiles_with(cls, effect: type[Effect]) -> bool:
         """Return whether the model with an effect at one place compiles.
 
         If not, MuJoCo's reason is stored in `left_out`.
@@ -172,7 +172,7 @@ class RobotSystem(System):
         if name not in library.list_names():
             there = [
                 *cls.list_mujoco_words(),
-                *(other for other in library.list_names() if cls._has(other)),
+                *(other for other in library.list_names() if cls._can_have_effect(other)),
             ]
             raise make_unknown_name_error(f"number of robot {cls.name}", base, there)
         found = cls.effect(f"{name}@{place}" if place else name)
@@ -188,10 +188,10 @@ class RobotSystem(System):
     @classmethod
     def list_mujoco_words(cls) -> list[str]:
         """List MuJoCo's words for numbers that the model file specifies."""
-        return [word for word, name in MUJOCO_EFFECT_WORDS.items() if cls._has(name)]
+        return [word for word, name in MUJOCO_EFFECT_WORDS.items() if cls._can_have_effect(name)]
 
     @classmethod
-    def _has(cls, name: str) -> bool:
+    def _can_have_effect(cls, name: str) -> bool:
         """Return whether the robot can have a registered effect at any place."""
         try:
             return bool(cls.placed(library.get_effect(name)))
@@ -229,7 +229,7 @@ def make_robot_system(robot: RobotModel, free: Sequence[str] = ()) -> type[Robot
     joints = [joint for joint in robot.joints if joint.has_one_coordinate]
     if not joints:
         raise InputError(f"{robot.path}: expected a hinge or slide joint, found none that moves")
-    channels = _channels(robot)
+    channels = _list_channels(robot)
     inputs = [Channel(f"u.{a.name}", a.control_unit) for a in robot.actuators]
     inputs += [Channel(f"force.{j.name}", j.force_unit) for j in joints]
     model = robot.compiled
@@ -278,7 +278,7 @@ def make_robot_system(robot: RobotModel, free: Sequence[str] = ()) -> type[Robot
         return system
     effects = list_freed_effects(system, free)
     declared["freed_parameters"] = frozenset(effect.name for effect in effects)
-    declared["parameters"] = tuple(p for effect in effects for p in _parameters(effect))
+    declared["parameters"] = tuple(p for effect in effects for p in _make_parameters(effect))
     declared["freed_effects"] = tuple(effects)
     return type("RobotSystemOfFile", (RobotSystem,), declared)
 
@@ -303,7 +303,7 @@ FREED_GAIN_RANGE_FACTOR = 9.0
 """Upper bound of a free servo gain's relative change, as a multiple of the specified gain."""
 
 
-def _parameters(effect: type[Effect]) -> list[Parameter]:
+def _make_parameters(effect: type[Effect]) -> list[Parameter]:
     """Make parameters from an effect's coefficients; nominal values keep the file's values."""
     result = []
     for c in effect.coefficients:
@@ -325,7 +325,7 @@ def _parameters(effect: type[Effect]) -> list[Parameter]:
     return result
 
 
-def _channels(robot: RobotModel) -> tuple[Channel, ...]:
+def _list_channels(robot: RobotModel) -> tuple[Channel, ...]:
     """Return position, velocity and drive force channels of each joint, and the model's sensors."""
     joints = [joint for joint in robot.joints if joint.has_one_coordinate]
     channels = [Channel(f"q.{j.name}", j.unit, says=f"position of joint {j.name}") for j in joints]

@@ -102,16 +102,16 @@ def explain_batch(
         row = (
             result
             if isinstance(result, LogResult)
-            else LogResult(log.name, log.digest, error=_said(result))
+            else LogResult(log.name, log.digest, error=_format_error(result))
         )
         rows[log.name] = row
         ordered = [rows[each.name] for each in logs if each.name in rows]
-        _write(out, ordered)
+        _write_results(out, ordered)
         done(row)
         if stop():
             break
     ordered = [rows[log.name] for log in logs if log.name in rows]
-    _write(out, ordered)
+    _write_results(out, ordered)
     return ordered
 
 
@@ -135,7 +135,7 @@ def explain_log(log: BatchLog, settings: Mapping[str, Any], pdf: bool = False) -
     return LogResult(log.name, log.digest, document["verdict"], causes, closed, document["seconds"])
 
 
-def _said(error: object) -> str:
+def _format_error(error: object) -> str:
     """Format the error that ended a call in one line."""
     message = get_first_line(error) if isinstance(error, BaseException) else "no result"
     return message if isinstance(error, InputError) else f"{type(error).__name__}: {message}"
@@ -164,7 +164,7 @@ def _load_previous_results(out: Path, logs: Sequence[BatchLog]) -> dict[str, Log
     }
 
 
-def _write(out: Path, rows: Sequence[LogResult]) -> None:
+def _write_results(out: Path, rows: Sequence[LogResult]) -> None:
     """Write the results so far: the state, with which a later call continues, and the table."""
     try:
         out.mkdir(parents=True, exist_ok=True)

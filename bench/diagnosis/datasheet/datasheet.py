@@ -113,7 +113,7 @@ def build_datasheet(
         visible_effects = [
             effect
             for effect in absent_effects
-            if not evaluator.available_effects[effect].signal or _seen(evaluator, effect)
+            if not evaluator.available_effects[effect].signal or _is_recorded(evaluator, effect)
         ]
         rows = build_sheet_rows(
             subject,
@@ -161,7 +161,7 @@ def _is_stop(effect: Effect | type[Effect]) -> bool:
     return effect.coefficients[0].of == "stop"
 
 
-def _seen(world: RunEvaluator, effect: str) -> bool:
+def _is_recorded(world: RunEvaluator, effect: str) -> bool:
     """Return whether the signal that an effect acts on was recorded."""
     run = world.runs[0]
     return world.available_effects[effect].signal in {*run.channels, *run.inputs}

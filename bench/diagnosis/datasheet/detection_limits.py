@@ -127,7 +127,7 @@ def compute_detection_limits(
     """
     floor = compute_noise_floor(evaluator, evaluator.recording)
     white = NoiseModel(floor.sigma, np.zeros(len(floor.sigma)))
-    fit = _fitted(evaluator, extended, white)
+    fit = _linearise_extended(evaluator, extended, white)
     if not np.isfinite(fit.simulated[np.isfinite(evaluator.observed)]).all():
         raise InputError(f"{evaluator.recording.path}: the simulation of it fails")
     # The random stream is not used, because there is no search.
@@ -144,10 +144,12 @@ def compute_detection_limits(
         directions,
         models.compute_residual(fit),
     )
-    return information.shown(_another(assess_consistency(models, model)))
+    return information.shown(_compute_prediction_half_widths(assess_consistency(models, model)))
 
 
-def _another(consistencies: Sequence[ParameterConsistency]) -> dict[str, float]:
+def _compute_prediction_half_widths(
+    consistencies: Sequence[ParameterConsistency],
+) -> dict[str, float]:
     """Return half the prediction interval of each parameter for a new log, or else a new run."""
     by_run = {
         consistency.number: Z95 * consistency.prediction_sigma
@@ -197,7 +199,7 @@ def _with_small_gaps(
     )
 
 
-def _fitted(
+def _linearise_extended(
     evaluator: RunEvaluator, extended: ExtendedSimulator, noise: NoiseModel
 ) -> TrajectoryFit:
     """Simulate the runs with the extended simulator, and compute its derivatives at this point.
@@ -269,15 +271,17 @@ class _Shown:
             # At that shape a richer law may be equivalent to a simpler one that it contains.
             new_shapes = [k for k in probe_indices if not self._told_already(name, k, best)]
             if name not in limits and new_shapes:
-                reaches[name, self._coefficient(name, place)] = self._proportional(new_shapes[0])
+                reaches[name, self._get_coefficient_name(name, place)] = (
+                    self._compute_proportional_limit(new_shapes[0])
+                )
         for name in limits:
-            reaches[name, self._coefficient(name, 0)] = self._limit(name)
+            reaches[name, self._get_coefficient_name(name, 0)] = self._compute_switching_limit(name)
         return DetectionLimits(self.free, self.covariance, reaches, prediction_half_widths)
 
-    def _coefficient(self, effect: str, place: int) -> str:
+    def _get_coefficient_name(self, effect: str, place: int) -> str:
         return self.world.available_effects[effect].on(self.world.simulator.system)[place].name
 
-    def _proportional(self, k: int) -> DetectionLimit:
+    def _compute_proportional_limit(self, k: int) -> DetectionLimit:
         """Return the detection limit of direction k, whose effect is proportional to its size.
 
         The limit is half the 95 % interval, 1.96 / sqrt(power) with the power of eq. (1). It is
@@ -285,17 +289,21 @@ class _Shown:
         """
         power = self.powers[k]
         size = Z95 / np.sqrt(power) if power > 0 else np.inf
-        parameter = self.world.parameters[self._place(self.found.candidates[k])]
+        parameter = self.world.parameters[self._get_coefficient_index(self.found.candidates[k])]
         low, high = parameter.bounds
         # The interval exceeds all plausible values, so the data say nothing about the coefficient.
         if 2.0 * size > MAX_INTERVAL_WIDTH * (high - low):
-            return DetectionLimit(float(size), confounded_with=self._mixed(k), vague=True)
-        return DetectionLimit(float(size), float(self.leaning[k]), confounded_with=self._mixed(k))
+            return DetectionLimit(
+                float(size), confounded_with=self._list_confounded_parameters(k), vague=True
+            )
+        return DetectionLimit(
+            float(size), float(self.leaning[k]), confounded_with=self._list_confounded_parameters(k)
+        )
 
-    def _place(self, probe: CandidateDirection) -> int:
+    def _get_coefficient_index(self, probe: CandidateDirection) -> int:
         return self.world.get_coefficient_indices(probe.effect)[probe.place]
 
-    def _mixed(self, k: int) -> tuple[str, ...]:
+    def _list_confounded_parameters(self, k: int) -> tuple[str, ...]:
         """Return the parameters of the model that together have nearly the same influence."""
         i = self.q + k
         if self.powers[k] > (1.0 - CONFOUNDING_CORRELATION**2) * self.left[i, i]:
@@ -323,7 +331,7 @@ class _Shown:
                 return True
         return False
 
-    def _limit(self, name: str) -> DetectionLimit:
+    def _compute_switching_limit(self, name: str) -> DetectionLimit:
         """Return the detection limit of a limit or backlash, which is not proportional to its size.
 
         The search contains directions of several fixed sizes of the effect (`probes`). A size is

@@ -148,17 +148,17 @@ def compute_drive_diagram(
     return DriveDiagram(
         "N" if joint.system.kind == "linear" else "N*m",
         load,
-        _root(lambda u: ahead(u, load), search_range, LOAD_POINT_COUNT),
-        _root(lambda u: behind(u, load), search_range, LOAD_POINT_COUNT),
-        float(_root(lambda u: ahead(u, zero), search_range, 1)[0]),
-        float(_root(unpowered, search_range, 1)[0]),
+        _find_roots(lambda u: ahead(u, load), search_range, LOAD_POINT_COUNT),
+        _find_roots(lambda u: behind(u, load), search_range, LOAD_POINT_COUNT),
+        float(_find_roots(lambda u: ahead(u, zero), search_range, 1)[0]),
+        float(_find_roots(unpowered, search_range, 1)[0]),
         joint.names,
         reach,
         joint.without,
     )
 
 
-def _root(growing: Callable[[Array], Array], search_range: float, count: int) -> Array:
+def _find_roots(growing: Callable[[Array], Array], search_range: float, count: int) -> Array:
     """Find zeros (N,) of increasing functions by bisection; infinite outside the range."""
     low, high = np.full(count, -search_range), np.full(count, search_range)
     never, always = growing(high) <= 0, growing(low) > 0
@@ -210,25 +210,25 @@ class _Joint:
 
         It is the sum over all friction laws, under N pairs of drive and load force.
         """
-        moment = self._moment(drive, load)
+        moment = self._make_rest_state(drive, load)
         limits = [np.full(len(drive), self.stated)]
         for law, c in self.laws:
             if isinstance(law, Friction):
-                limits.append(law.limit(_each(c, drive), moment)[:, 0])
+                limits.append(law.limit(_expand_coefficients(c, drive), moment)[:, 0])
         holding_force: Array = np.maximum(np.sum(limits, axis=0), 0.0)
         return holding_force
 
     def pull(self, drive: Array, load: Array) -> Array:
         """Compute the sum (N,) of the other forces on the joint at rest, such as a bias."""
-        moment = self._moment(drive, load)
+        moment = self._make_rest_state(drive, load)
         forces = [np.zeros(len(drive))]
         for law, c in self.laws:
             if isinstance(law, Force):
-                forces.append(law.force(_each(c, drive), moment)[:, 0])
+                forces.append(law.force(_expand_coefficients(c, drive), moment)[:, 0])
         pull: Array = np.sum(forces, axis=0)
         return pull
 
-    def _moment(self, drive: Array, load: Array) -> StateSnapshot:
+    def _make_rest_state(self, drive: Array, load: Array) -> StateSnapshot:
         """Build the state of the joint at rest, under N pairs of drive and load force (N,).
 
         Friction and force laws are evaluated at this state.
@@ -240,6 +240,6 @@ class _Joint:
         )
 
 
-def _each(c: Array, drive: Array) -> Array:
+def _expand_coefficients(c: Array, drive: Array) -> Array:
     """Expand coefficients (K, 1, 1) to (K, N, 1), one for each force."""
     return np.broadcast_to(c, (len(c), len(drive), 1))

@@ -70,7 +70,7 @@ _STYLE: dict[Any, Any] = {
 
 def render_diagram(diagram: DriveDiagram) -> tuple[bytes, bytes | None]:
     """Render the diagram as SVG for the page, and as PDF if requested."""
-    with _styled():
+    with _apply_sheet_style():
         figure, axes = style.make_panel_grid(1, 1, (5.4, 4.6))
         draw_diagram(axes[0, 0], diagram)
         return style.render_svg(figure), style.render_pdf(figure) if is_pdf_wanted() else None
@@ -122,7 +122,7 @@ def draw_diagram(axes: Axes, diagram: DriveDiagram) -> None:
 
 def render_pdf(content: SheetContent) -> bytes:
     """Render the sheet as a PDF of one page."""
-    with _styled():
+    with _apply_sheet_style():
         return style.render_pdf(draw_sheet(content))
 
 
@@ -131,8 +131,8 @@ def draw_sheet(content: SheetContent) -> Figure:
     from bench.figures.notebook_figure import NotebookFigure
 
     figure = NotebookFigure(figsize=A4_INCHES, layout=None)
-    top = _heading(figure, content)
-    top = _shown(figure, content, top)
+    top = _draw_heading(figure, content)
+    top = _draw_number_table(figure, content, top)
     diagram = content.diagram
     if diagram is None:
         text = "\n".join(textwrap.wrap(content.without_drive(), _LETTERS))
@@ -145,11 +145,11 @@ def draw_sheet(content: SheetContent) -> Figure:
     if height > 0.1:
         width = height * A4_INCHES[1] / A4_INCHES[0]
         draw_diagram(figure.add_axes((_MARGIN + 0.09, top - height - 0.03, width, height)), diagram)
-        _beside(figure, diagram, _MARGIN + 0.13 + width, top - 0.05)
+        _draw_diagram_text(figure, diagram, _MARGIN + 0.13 + width, top - 0.05)
     return figure
 
 
-def _heading(figure: Figure, content: SheetContent) -> float:
+def _draw_heading(figure: Figure, content: SheetContent) -> float:
     """Draw name, title and verdict; return the height of the space below, as a share."""
     figure.text(_MARGIN, 0.965, sanitise(content.name, 60), fontsize=17, weight="bold", va="top")
     title = content.recording.title or content.recording.path.stem
@@ -161,7 +161,7 @@ def _heading(figure: Figure, content: SheetContent) -> float:
     return 0.938 - 0.014 * len(lines) - 0.012
 
 
-def _shown(figure: Figure, content: SheetContent, top: float) -> float:
+def _draw_number_table(figure: Figure, content: SheetContent, top: float) -> float:
     """Draw the table of identified numbers; return the height of the space below, as a share."""
     heads = ("", "quantity", "value (95 %)", "another run", "evidence")
     rows = [
@@ -176,7 +176,7 @@ def _shown(figure: Figure, content: SheetContent, top: float) -> float:
         if row.number is not None
     ]
     is_cause = [row.state == "found" for row in content.rows if row.number is not None]
-    size, columns = _columns([heads, *rows])
+    size, columns = _choose_table_layout([heads, *rows])
     for x, text in zip(columns, heads, strict=True):
         figure.text(x, top, text, weight="bold", va="top", fontsize=size)
     for cells, is_found in zip(rows, is_cause, strict=True):
@@ -187,7 +187,7 @@ def _shown(figure: Figure, content: SheetContent, top: float) -> float:
     return top - _LINE * 1.5
 
 
-def _columns(rows: Sequence[Sequence[str]]) -> tuple[float, list[float]]:
+def _choose_table_layout(rows: Sequence[Sequence[str]]) -> tuple[float, list[float]]:
     """Choose the font size of a table, and the left edges of its columns as shares of the width."""
     size = _TABLE_SIZE
     while True:
@@ -250,7 +250,7 @@ def _not_shown(figure: Figure, content: SheetContent, size: float, begins: float
     return begins + 0.02
 
 
-def _beside(figure: Figure, diagram: DriveDiagram, x: float, y: float) -> None:
+def _draw_diagram_text(figure: Figure, diagram: DriveDiagram, x: float, y: float) -> None:
     """Draw the description of the diagram next to it."""
     unit = diagram.unit
     lines = [f"starts without a load at {append_unit(format_number(diagram.breakaway), unit)}"]
@@ -266,7 +266,7 @@ def _beside(figure: Figure, diagram: DriveDiagram, x: float, y: float) -> None:
 
 
 @contextmanager
-def _styled() -> Iterator[None]:
+def _apply_sheet_style() -> Iterator[None]:
     """Apply the Matplotlib style of data sheets in a `with` block; hide missing-glyph warnings."""
     from matplotlib import rc_context
 

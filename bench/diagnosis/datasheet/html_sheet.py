@@ -39,7 +39,7 @@ def render_page(
     """
     page, still = HtmlPage(), None
     if sheet.diagram is not None and diagram_files is not None:
-        still = PrintedFigure(*diagram_files, _describe(sheet.diagram), DIAGRAM_NAME)
+        still = PrintedFigure(*diagram_files, _describe_rest_forces(sheet.diagram), DIAGRAM_NAME)
         columns = {
             "load": sheet.diagram.load.tolist(),
             "moves_forward": sheet.diagram.forward.tolist(),
@@ -67,7 +67,7 @@ def render_page(
     )
 
 
-def _describe(diagram: DriveDiagram) -> str:
+def _describe_rest_forces(diagram: DriveDiagram) -> str:
     """Describe the forces at rest in a sentence."""
     starts = append_unit(format_number(diagram.breakaway), diagram.unit)
     text = f"At rest and without a load, the joint starts to move at {starts}. "

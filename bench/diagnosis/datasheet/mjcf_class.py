@@ -73,10 +73,10 @@ def _of_robot(facts: SheetContent) -> MjcfFiles:
     kind: Any = facts.subject.kind
     causes = collect_causes(facts.extended)
     actuator = next(iter(facts.subject.actuators), None)
-    rendered = _class(
+    rendered = _render_class(
         kind.robot, causes, facts.subject.joint, actuator, make_class_name(facts.name), facts
     )
-    files = {CLASS_FILE: _file(facts, [rendered])}
+    files = {CLASS_FILE: _format_file(facts, [rendered])}
     if rendered.model:
         files["model.xml"] = rendered.model
     return MjcfFiles(files, tuple(rendered.said))
@@ -97,17 +97,17 @@ def _of_system(facts: SheetContent, folder: Path) -> MjcfFiles:
             path = Path(place) / f"{facts.subject.kind.name}.xml"
             path.write_text(model.text)
             robot = read_robot(path)
-        causes, notes = _placed(facts, setting, model)
-        rendered = _class(
+        causes, notes = _map_effects_to_model(facts, setting, model)
+        rendered = _render_class(
             robot, causes, model.joint, model.actuator, name, facts, (*model.said, *notes)
         )
         classes.append(rendered)
         stem = f"model_{setting.name}" if setting.name else "model"
         if rendered.model:
             files[f"{stem}.xml"] = rendered.model
-            files |= _described(facts, setting, model, stem, folder)
+            files |= _describe_log_for_model(facts, setting, model, stem, folder)
     lines = dict.fromkeys(line for rendered in classes for line in rendered.said)
-    return MjcfFiles({CLASS_FILE: _file(facts, classes), **files}, tuple(lines))
+    return MjcfFiles({CLASS_FILE: _format_file(facts, classes), **files}, tuple(lines))
 
 
 def _model_file(facts: SheetContent, setting: ConstantsGroup) -> RenderedModelFile | None:
@@ -122,7 +122,7 @@ def _model_file(facts: SheetContent, setting: ConstantsGroup) -> RenderedModelFi
         return None
 
 
-def _class(
+def _render_class(
     robot: Any,
     causes: Mapping[str, Mapping[str, FittedValue]],
     joint: str,
@@ -164,7 +164,7 @@ def make_class_name(name: str) -> str:
     return plain or "drive"
 
 
-def _file(facts: SheetContent, classes: Sequence[_Class]) -> str:
+def _format_file(facts: SheetContent, classes: Sequence[_Class]) -> str:
     """Format the classes as a file that MuJoCo loads and that others can include."""
     title = facts.recording.title or facts.recording.path.stem
     heading = f"{make_class_name(facts.name)}: data sheet from {title}; written by simgap datasheet"
@@ -210,7 +210,7 @@ def group_runs_by_constants(facts: SheetContent) -> list[ConstantsGroup]:
     ]
 
 
-def _placed(
+def _map_effects_to_model(
     facts: SheetContent, setting: ConstantsGroup, model: RenderedModelFile
 ) -> tuple[dict[str, Mapping[str, FittedValue]], list[str]]:
     """Map the fitted effects of a system to the joint, actuator and channel of its MJCF model.
@@ -226,7 +226,7 @@ def _placed(
     for name, numbers in facts.extended.effects.items():
         effect = library.get_effect(name)
         if issubclass(effect, Friction) and name not in MODEL_FIELD_EFFECTS:
-            mean_limit = _held(facts, setting, effect, numbers)
+            mean_limit = _compute_mean_friction_limit(facts, setting, effect, numbers)
             dry_friction += mean_limit
             notes.append(
                 f"{name}: MuJoCo has no such law; frictionloss holds its mean over these runs, "
@@ -247,19 +247,21 @@ def _placed(
     return causes, notes
 
 
-def _held(
+def _compute_mean_friction_limit(
     facts: SheetContent,
     setting: ConstantsGroup,
     effect: type[Friction],
     numbers: Mapping[str, FittedValue],
 ) -> float:
     """Compute the mean limit of a friction law over the samples of some runs."""
-    limits = [_limits(facts, setting, run, effect, numbers) for run in setting.runs]
+    limits = [
+        _compute_friction_limits(facts, setting, run, effect, numbers) for run in setting.runs
+    ]
     values = np.concatenate(limits)
     return float(values[np.isfinite(values)].mean())
 
 
-def _limits(
+def _compute_friction_limits(
     facts: SheetContent,
     setting: ConstantsGroup,
     run: Run,
@@ -292,7 +294,7 @@ def _limits(
     return limit
 
 
-def _described(
+def _describe_log_for_model(
     facts: SheetContent, setting: ConstantsGroup, model: RenderedModelFile, stem: str, folder: Path
 ) -> Iterator[tuple[str, str]]:
     """Yield a description of the log for the model, in which its runs are marked held out.
@@ -311,7 +313,9 @@ def _described(
         "title": f"{facts.name} as {stem}.xml",
         "channels": {},
         "inputs": {},
-        "runs": {run.name: {"held_out": True} for run in setting.runs if _driven(run, model)},
+        "runs": {
+            run.name: {"held_out": True} for run in setting.runs if _is_motor_always_on(run, model)
+        },
     }
     for kind in ("channels", "inputs"):
         for name, description in stated.get(kind, {}).items():
@@ -320,7 +324,7 @@ def _described(
     yield f"{stem}.toml", tomli_w.dumps(document)
 
 
-def _driven(run: Run, model: RenderedModelFile) -> bool:
+def _is_motor_always_on(run: Run, model: RenderedModelFile) -> bool:
     """Return whether the inputs that switch the motor are on all the time."""
     switches = [values for name, values in run.inputs.items() if name not in model.signals]
     return all(bool((values > MOTOR_ON_THRESHOLD).all()) for values in switches)

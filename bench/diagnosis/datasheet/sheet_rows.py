@@ -69,7 +69,7 @@ class SheetRow:
         if self.stated is not None:
             row["stated"] = self.stated
         if self.detection_limit is not None:
-            row |= _reached(self.detection_limit)
+            row |= _make_limit_keys(self.detection_limit)
         if self.p_value is not None:
             row["p_value"] = self.p_value
         if self.share is not None:
@@ -79,7 +79,7 @@ class SheetRow:
         return row
 
 
-def _reached(reach: DetectionLimit) -> dict[str, Any]:
+def _make_limit_keys(reach: DetectionLimit) -> dict[str, Any]:
     """Return the TOML keys of a detection limit in the row of a data sheet.
 
     `resolved` is the detectable size of a proportional effect; `none_above` and `none_below`
@@ -162,7 +162,7 @@ class _Rows:
                 # A parameter that is not in the file has its nominal value.
                 number = self.extended.parameters.get(parameter.name, nominal)
                 says = parameter.says or parameter.name
-                row = _row(parameter.name, says, "system", "fitted", number, None)
+                row = _make_fitted_row(parameter.name, says, "system", "fitted", number, None)
                 yield replace(
                     row, prediction_half_width=self.shown.prediction_half_widths.get(parameter.name)
                 )
@@ -171,11 +171,16 @@ class _Rows:
             # The coefficient of an effect with several has its name after a point.
             effect, _, place = name.partition("@")
             local_place = next(
-                (p for p in self.subject.places if place in (p, f"{p}.{_tail(place)}")), ""
+                (
+                    p
+                    for p in self.subject.places
+                    if place in (p, f"{p}.{_get_coefficient_part(place)}")
+                ),
+                "",
             )
             if local_place:
                 row = self._of_effect(f"{effect}@{local_place}", name, number, "fitted")
-                yield self._apart(row, f"{effect}@{local_place}", name)
+                yield self._add_prediction_interval(row, f"{effect}@{local_place}", name)
 
     def causes(self) -> Iterator[SheetRow]:
         """Yield the diagnosed causes; members of a family that may be zero here are not shown."""
@@ -188,17 +193,17 @@ class _Rows:
                     continue
                 has_several = sum(other == effect for other, _, _ in local_coefficients) > 1
                 label = f"{effect} {coefficient}" if has_several else effect
-                row = self._of_effect(effect, label, number, "found", self._cause(name))
+                row = self._of_effect(effect, label, number, "found", self._find_cause(name))
                 if _is_nothing(number):
-                    yield self._nothing(row, effect, number)
+                    yield self._make_hidden_row(row, effect, number)
                     continue
                 place = (
                     "" if name.partition("@")[2] != ALL_PLACES else f"@{effect.partition('@')[2]}"
                 )
                 parameter = name if len(numbers) == 1 else f"{name}.{coefficient}{place}"
-                yield self._apart(row, effect, parameter)
+                yield self._add_prediction_interval(row, effect, parameter)
 
-    def _apart(self, row: SheetRow, effect: str, parameter: str) -> SheetRow:
+    def _add_prediction_interval(self, row: SheetRow, effect: str, parameter: str) -> SheetRow:
         """Add to a row the interval of its value for a run that is not yet recorded.
 
         It is known only if several runs or logs identify the value. For a number of the model file
@@ -212,7 +217,7 @@ class _Rows:
             return replace(row, prediction_half_width=half)
         return replace(row, prediction_half_width=stated.compute_half_width(half))
 
-    def _nothing(self, row: SheetRow, effect: str, number: FittedValue) -> SheetRow:
+    def _make_hidden_row(self, row: SheetRow, effect: str, number: FittedValue) -> SheetRow:
         """Build the row of a cause at other places that is not shown here."""
         reach = _of_number(number, self.subject.get_model_file_value(effect))
         return SheetRow(
@@ -233,9 +238,11 @@ class _Rows:
             placed = library.find_effect(effect, self.subject.kind.system)
             c = next(c for c in placed.coefficients if c.name == coefficient)
             unit = c.unit_on(self.subject.kind.system, self.extended.observe) or "1"
-            yield self._absent(effect, label, unit, reach)
+            yield self._make_absent_effect_row(effect, label, unit, reach)
 
-    def _absent(self, effect: str, label: str, unit: str, reach: DetectionLimit) -> SheetRow:
+    def _make_absent_effect_row(
+        self, effect: str, label: str, unit: str, reach: DetectionLimit
+    ) -> SheetRow:
         """Build the row of an effect that is not in the model, with its detection limit.
 
         If the effect changes a number of the model file, the limit is converted to the unit of that
@@ -286,7 +293,7 @@ class _Rows:
         stated = self.subject.get_model_file_value(effect)
         if stated is not None:
             number = stated.compute_total(number)
-        row = _row(
+        row = _make_fitted_row(
             label, format_effect_name(effect.partition("@")[0]), placed.at, state, number, stated
         )
         if cause is None:
@@ -295,11 +302,11 @@ class _Rows:
         share = next(iter(gains), None)
         return replace(row, p_value=cause.p_value, share=share, alternatives=cause.alternatives)
 
-    def _cause(self, name: str) -> Cause | None:
+    def _find_cause(self, name: str) -> Cause | None:
         return next((c for c in self.verdict.causes if c.effect == name), None)
 
 
-def _row(
+def _make_fitted_row(
     name: str, says: str, part: str, state: QuantityState, number: FittedValue, stated: Any
 ) -> SheetRow:
     """Build a row with a fitted value and, unless `stated` is None, the model file's value."""
@@ -307,7 +314,7 @@ def _row(
     return SheetRow(name, says, part, state, number.unit, number, value)
 
 
-def _tail(place: str) -> str:
+def _get_coefficient_part(place: str) -> str:
     return place.rpartition(".")[2]
 
 

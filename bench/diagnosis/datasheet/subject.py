@@ -36,14 +36,19 @@ class ModelFileValue(NamedTuple):
         """Return the value of the model file with an effect's coefficient applied."""
         low, high = number.low, number.high
         if low is None or high is None:
-            return FittedValue(self._with(number.value), self.unit, None, None)
-        return FittedValue(self._with(number.value), self.unit, self._with(low), self._with(high))
+            return FittedValue(self._add_correction(number.value), self.unit, None, None)
+        return FittedValue(
+            self._add_correction(number.value),
+            self.unit,
+            self._add_correction(low),
+            self._add_correction(high),
+        )
 
     def compute_half_width(self, half: float) -> float:
         """Convert half an interval of the coefficient to half an interval of the total."""
         return half * self.value if self.share else half
 
-    def _with(self, c: float) -> float:
+    def _add_correction(self, c: float) -> float:
         return self.value * (1.0 + c) if self.share else self.value + c
 
 
@@ -64,14 +69,16 @@ class SheetSubject:
     @property
     def actuators(self) -> tuple[str, ...]:
         """Names of the actuators that drive the joint."""
-        return tuple(spot.name for spot in self._spots().get("actuator", ()) if self._on(spot))
+        return tuple(
+            spot.name for spot in self._get_spots().get("actuator", ()) if self._is_on_joint(spot)
+        )
 
     @property
     def is_prismatic(self) -> bool:
         """Return whether the joint is prismatic, not rotary."""
         if not self.joint:
             return self.kind.system.kind != "rotary"
-        (joint,) = (s for s in self._spots()["joint"] if s.name == self.joint)
+        (joint,) = (s for s in self._get_spots()["joint"] if s.name == self.joint)
         return bool(joint.kind == "slide")
 
     def is_driven(self, recording: Recording) -> bool:
@@ -131,12 +138,12 @@ class SheetSubject:
         """Return the value in the model file that an effect changes; None if there is none."""
         base, _, place = effect.partition("@")
         for kind in ("joint", "actuator"):
-            for spot in self._spots().get(kind, ()):
+            for spot in self._get_spots().get(kind, ()):
                 if spot.name == place and base in spot.stated:
-                    return self._stated(base, spot)
+                    return self._get_file_value(base, spot)
         return None
 
-    def _stated(self, base: str, spot: Any) -> ModelFileValue:
+    def _get_file_value(self, base: str, spot: Any) -> ModelFileValue:
         """Return the model file's value of the number that an effect changes here.
 
         `base` is the name of the effect without its place, and `spot` the joint or actuator. A
@@ -151,12 +158,12 @@ class SheetSubject:
         value = abs(spot.stated[base])
         return ModelFileValue(value, unit.format(force=force, length=length), share)
 
-    def _spots(self) -> Mapping[str, Any]:
+    def _get_spots(self) -> Mapping[str, Any]:
         spots: Mapping[str, Any] = getattr(self.kind.system, "places", {})
         return spots
 
-    def _on(self, spot: Any) -> bool:
-        (joint,) = (s for s in self._spots()["joint"] if s.name == self.joint)
+    def _is_on_joint(self, spot: Any) -> bool:
+        (joint,) = (s for s in self._get_spots()["joint"] if s.name == self.joint)
         return bool(spot.coordinate == joint.coordinate)
 
 

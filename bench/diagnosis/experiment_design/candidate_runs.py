@@ -98,9 +98,9 @@ class RigModel:
             self.rest[name] = middle
         self.driven = tuple(name for name in self.old.inputs if self.largest[name] > 0)
         self.limits = stated_limits(world)
-        self.begin = self._begin()
+        self.begin = self._get_initial_state()
 
-    def _begin(self) -> Array:
+    def _get_initial_state(self) -> Array:
         """Return the initial state of the first run, at rest and within joint ranges.
 
         A robot cannot be started in motion.
@@ -108,10 +108,10 @@ class RigModel:
         states = self.world.tracks[0].initial_state_guess.copy()
         rates = set(self.world.simulator.system.rates)
         for i, name in enumerate(self.world.states):
-            states[i] = 0.0 if name in rates else self._reachable(name, float(states[i]))
+            states[i] = 0.0 if name in rates else self._clip_to_joint_range(name, float(states[i]))
         return states
 
-    def _reachable(self, name: str, value: float) -> float:
+    def _clip_to_joint_range(self, name: str, value: float) -> float:
         """Clip a state to the range of its joint."""
         return float(np.clip(value, *self.limits.positions.get(name, UNLIMITED)))
 
@@ -122,7 +122,7 @@ class RigModel:
 
         Plans that only release the system from other initial states are included.
         """
-        for state in self._beginnings():
+        for state in self._iterate_initial_states():
             yield RunPlan(states=(state,))
         groups = [(name,) for name in self.driven]
         for driven in [*groups, self.driven] if len(groups) > 1 else groups:
@@ -132,9 +132,9 @@ class RigModel:
 
     def list_variants(self, plan: RunPlan) -> Iterator[RunPlan]:
         """Yield variants of a plan with one property changed, to improve the best plans."""
-        for name, value in self._beginnings():
+        for name, value in self._iterate_initial_states():
             yield replace(plan, states=tuple((dict(plan.states) | {name: value}).items()))
-        for name, values in self._knobs().items():
+        for name, values in self._list_adjustable_constants().items():
             rest = tuple(pair for pair in plan.constants if pair[0] != name)
             for value in values:
                 yield replace(plan, constants=(*rest, (name, value)))
@@ -147,7 +147,7 @@ class RigModel:
             if self.seconds / (self.step * coarser) >= MIN_SAMPLES:
                 yield replace(plan, hold_factor=coarser)
 
-    def _beginnings(self) -> Iterator[tuple[str, float]]:
+    def _iterate_initial_states(self) -> Iterator[tuple[str, float]]:
         """Yield other initial states, each as a name and a value.
 
         They are shares of the usual initial coordinates, and, except for robots, the largest
@@ -161,7 +161,7 @@ class RigModel:
                 share * base if abs(base) > REST_STATE else share for share in INITIAL_STATE_FACTORS
             ]
             # Outside its range a joint begins at the limit, which is tried only once.
-            reachable = dict.fromkeys(self._reachable(name, value) for value in values)
+            reachable = dict.fromkeys(self._clip_to_joint_range(name, value) for value in values)
             for value in reachable if name not in unseen else ():
                 yield name, value
         if world.kind.has_model:
@@ -171,7 +171,7 @@ class RigModel:
             for value in (fastest, -fastest) if fastest > REST_RATE and name not in unseen else ():
                 yield name, value
 
-    def _knobs(self) -> dict[str, list[float]]:
+    def _list_adjustable_constants(self) -> dict[str, list[float]]:
         """Return the constants that differ between runs, with their values, which are available."""
         values: dict[str, set[float]] = {}
         for run in self.world.runs:
@@ -185,27 +185,31 @@ class RigModel:
         """Turn a plan into a run that can be simulated: commands, constants and initial state."""
         times = np.arange(0.0, self.seconds, self.step * plan.hold_factor)
         inputs = {
-            name: self._limited(name, np.full(times.size, self.rest[name]))
+            name: self._limit_command(name, np.full(times.size, self.rest[name]))
             for name in self.old.inputs
         }
         states = self.begin.copy()
         limited = []
         for number, name in enumerate(plan.driven_inputs):
-            own = plan.size * _command(plan.form, times, self.step, np.random.default_rng(number))
+            own = plan.size * _compute_command(
+                plan.form, times, self.step, np.random.default_rng(number)
+            )
             wanted = self.rest[name] + self.largest[name] * (own + plan.level)
-            inputs[name] = self._limited(name, wanted)
+            inputs[name] = self._limit_command(name, wanted)
             limited += [name] if (inputs[name] != wanted).any() else []
         for name, value in plan.states:
             states[self.world.states.index(name)] = value
         constants = {**self.old.constants, **dict(plan.constants)}
         scenario = replace(self.old, times=times, inputs=inputs, constants=constants)
-        return CandidateRun(plan, self._says(plan, inputs, limited), scenario, states)
+        return CandidateRun(plan, self._describe_plan(plan, inputs, limited), scenario, states)
 
-    def _limited(self, name: str, values: Array) -> Array:
+    def _limit_command(self, name: str, values: Array) -> Array:
         """Clip a command to the limits of its actuator and its joint."""
         return np.asarray(np.clip(values, *self.limits.commands.get(name, UNLIMITED)))
 
-    def _says(self, plan: RunPlan, inputs: Mapping[str, Array], limited: Sequence[str]) -> str:
+    def _describe_plan(
+        self, plan: RunPlan, inputs: Mapping[str, Array], limited: Sequence[str]
+    ) -> str:
         """Describe a plan in words that tell the user how to record the run.
 
         Args:
@@ -248,11 +252,13 @@ COMMAND_FORMS: Mapping[str, str] = {
     "holds": "",
     "a push, then let go": "",
 }
-"""Signal specifications of unit size, by name of the form; an empty one is computed by `_command`.
+"""Signal specifications of unit size, by name of the form.
+
+An empty one is computed by `_compute_command`.
 """
 
 
-def _command(form: str, times: Array, step: float, rng: np.random.Generator) -> Array:
+def _compute_command(form: str, times: Array, step: float, rng: np.random.Generator) -> Array:
     """Compute the command signal (T,) of a form, such as a chirp or steps, with magnitude one.
 
     It is scaled to the size of the recorded commands later. `step` is the sampling interval in

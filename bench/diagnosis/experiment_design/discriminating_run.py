@@ -98,7 +98,7 @@ def propose_discriminating_run(
     largest = 0.0
     apart = [
         (_compute_discrimination(world, run, model, rival, models.noise.sigma), run)
-        for run in _runs(world)
+        for run in _iterate_changed_runs(world)
     ]
     # A run that cannot be simulated with both models is not proposed.
     apart = [(size, run) for size, run in apart if np.isfinite(size) and size > 0.0]
@@ -170,17 +170,17 @@ def _explain_no_run(world: RunEvaluator, mine: str, other: str, is_limited: bool
     )
 
 
-def _runs(world: RunEvaluator) -> Iterator[_Run]:
+def _iterate_changed_runs(world: RunEvaluator) -> Iterator[_Run]:
     """Yield runs like the first one with one changed duration, initial state or input."""
     limits = stated_limits(world)
-    first = _first(world, limits)
+    first = _get_first_run(world, limits)
     # If several runs discriminate equally well, the first one is proposed.
-    yield _longer(first)
-    yield from _elsewhere(world, first, limits)
-    yield from _driven(world, first, limits)
+    yield _lengthen_run(first)
+    yield from _change_initial_states(world, first, limits)
+    yield from _scale_inputs(world, first, limits)
 
 
-def _first(world: RunEvaluator, limits: StatedLimits) -> _Run:
+def _get_first_run(world: RunEvaluator, limits: StatedLimits) -> _Run:
     """Return the first fitted run, as the basis of the proposals.
 
     A robot starts at rest, because it cannot be started in motion, and with commands and positions
@@ -191,22 +191,22 @@ def _first(world: RunEvaluator, limits: StatedLimits) -> _Run:
         return _Run("", {}, track.scenario, track.initial_state_guess)
     rates = set(world.simulator.system.rates)
     states = [
-        0.0 if name in rates else _limited(value, limits.states.get(name))
+        0.0 if name in rates else _clip(value, limits.states.get(name))
         for name, value in zip(world.states, track.initial_state_guess, strict=True)
     ]
     given = track.scenario.inputs
-    inputs = {name: _limited(values, limits.commands.get(name)) for name, values in given.items()}
+    inputs = {name: _clip(values, limits.commands.get(name)) for name, values in given.items()}
     is_limited = any((inputs[name] != values).any() for name, values in given.items())
     says = ", with commands limited as the model file states" if is_limited else ""
     return _Run(says, {}, replace(track.scenario, inputs=inputs), np.array(states))
 
 
-def _limited(values: Any, limits: Interval | None) -> Any:
+def _clip(values: Any, limits: Interval | None) -> Any:
     """Clip a number or an array to an interval."""
     return values if limits is None else np.clip(values, *limits)
 
 
-def _longer(first: _Run) -> _Run:
+def _lengthen_run(first: _Run) -> _Run:
     """Return the run recorded for twice the time, with its inputs repeated from the beginning."""
     times = first.scenario.times
     later = times[1:] - times[0]
@@ -221,14 +221,16 @@ def _longer(first: _Run) -> _Run:
     return _Run(f"Record twice as long{first.says}", change, scenario, first.states)
 
 
-def _elsewhere(world: RunEvaluator, first: _Run, limits: StatedLimits) -> Iterator[_Run]:
+def _change_initial_states(
+    world: RunEvaluator, first: _Run, limits: StatedLimits
+) -> Iterator[_Run]:
     """Yield runs that differ from the first one in one initial state.
 
     The initial velocities of a robot are not changed, because it starts at rest.
     """
     system = world.simulator.system
     height = len(system.coordinates) - 1
-    named = zip(world.states, _units(world), strict=True)
+    named = zip(world.states, _list_state_units(world), strict=True)
     for place, (name, unit) in enumerate(named):
         above_ground = system.bounces and place == height
         if world.kind.has_model and name not in system.coordinates:
@@ -243,13 +245,13 @@ def _elsewhere(world: RunEvaluator, first: _Run, limits: StatedLimits) -> Iterat
             value = share * value if moving else share
             if above_ground:
                 value = max(value, MIN_DROP_HEIGHT)
-            value = float(_limited(value, limits.states.get(name)))
+            value = float(_clip(value, limits.states.get(name)))
             states[place] = value
             says = f"Start with {name} = {value:.3g} {unit}{first.says}"
             yield _Run(says, {name: value}, first.scenario, states)
 
 
-def _driven(world: RunEvaluator, first: _Run, limits: StatedLimits) -> Iterator[_Run]:
+def _scale_inputs(world: RunEvaluator, first: _Run, limits: StatedLimits) -> Iterator[_Run]:
     """Yield runs that differ from the first one in the size of one input.
 
     An input is never scaled beyond the limits of its command.
@@ -282,7 +284,7 @@ def _largest_share(signal: Array, limits: Interval) -> float:
     return float(np.floor(1e3 * min(factors)) / 1e3) if factors else np.inf
 
 
-def _units(world: RunEvaluator) -> list[str]:
+def _list_state_units(world: RunEvaluator) -> list[str]:
     """List the units of the states: coordinates, their rates, and further states."""
     system = world.simulator.system
     units = {channel.name: channel.unit for channel in world.kind.channels}

@@ -118,7 +118,7 @@ class RunRanker:
         (s,) marks the initial states that have to be estimated.
         """
         self.models, self.world = models, models.world
-        self.known = [_known(models, one) for one in rivals]
+        self.known = [_compute_prior_covariance(models, one) for one in rivals]
         self.noise: NoiseModel = compute_fisher_blocks(models, rivals[0]).noise
         self.limits = RigLimits(self.world, rivals[0])
         count = len(rivals)
@@ -134,15 +134,15 @@ class RunRanker:
         stands = self.known[0].model
         able = [run for run, may in zip(runs, self.limits(stands, runs), strict=True) if may]
         if self.world.kind.has_model:
-            able = self._plainest(able)
+            able = self._select_distinct_runs(able)
         entries = []
         for run in able:
-            slopes = [self._slopes(run, one, one.model.fit.theta) for one in self.known]
+            slopes = [self._linearise_run(run, one, one.model.fit.theta) for one in self.known]
             if all(one is not None for one in slopes):
-                entries.append(self._entry(run, [one for one in slopes if one is not None]))
+                entries.append(self._rank_run(run, [one for one in slopes if one is not None]))
         return sorted(entries, key=get_sort_key)
 
-    def _entry(self, run: CandidateRun, slopes: Sequence[_LinearisedRun]) -> RunValue:
+    def _rank_run(self, run: CandidateRun, slopes: Sequence[_LinearisedRun]) -> RunValue:
         """Value a run with linearised models, one per model of the ranker.
 
         With several models the value is the discrimination T of eq. (1), for each pair of a true
@@ -154,8 +154,10 @@ class RunRanker:
         values = np.zeros((len(slopes), len(slopes)))
         for true, rival in self.pairs:
             gap = slopes[true].centre - slopes[rival].centre
-            values[true, rival] = _left(gap, slopes[rival], self.known[rival])[0]
-        return RunValue(run, values, _worth(values))
+            values[true, rival] = _compute_remaining_difference(
+                gap, slopes[rival], self.known[rival]
+            )[0]
+        return RunValue(run, values, _sum_discrimination(values))
 
     def evaluate_exactly(self, entry: RunValue) -> RunValue:
         """Compute (1) exactly, because the competing model may be far from linear on the run."""
@@ -163,14 +165,16 @@ class RunRanker:
             return entry._replace(is_exact=True)
         values = entry.values.copy()
         for true, rival in self.pairs:
-            values[true, rival] = self._told(entry.run, self.known[true], self.known[rival])
+            values[true, rival] = self._compute_discrimination(
+                entry.run, self.known[true], self.known[rival]
+            )
         # The run must be within the limits, whichever model is true.
         for one in self.known[1:]:
             if not self.limits(one.model, [entry.run])[0]:
                 values[:] = 0.0
-        return RunValue(entry.run, values, _worth(values), is_exact=True)
+        return RunValue(entry.run, values, _sum_discrimination(values), is_exact=True)
 
-    def _plainest(self, runs: Sequence[CandidateRun]) -> list[CandidateRun]:
+    def _select_distinct_runs(self, runs: Sequence[CandidateRun]) -> list[CandidateRun]:
         """Select the runs of a robot with the largest difference of the models before any refit.
 
         The exact evaluation of a robot's run is slow.
@@ -178,7 +182,7 @@ class RunRanker:
         sizes = []
         for run in runs:
             thetas = [one.model.fit.theta for one in self.known]
-            seen = self._whitened(self._simulated(run, thetas, [run.states] * len(thetas)))
+            seen = self._whiten(self._simulate_run(run, thetas, [run.states] * len(thetas)))
             gaps = [seen[b] - seen[a] for a, b in combinations(range(len(seen)), 2)]
             gaps = gaps or [seen[0] - seen[0].mean()]
             size = float(sum(np.log1p(np.square(gap).sum()) for gap in gaps))
@@ -188,21 +192,21 @@ class RunRanker:
 
     # -- one run
 
-    def _simulated(
+    def _simulate_run(
         self, run: CandidateRun, thetas: Sequence[Array], states: Sequence[Array]
     ) -> Array:
         """Simulate the run (L, T, C) with each parameter vector and initial state."""
         scenarios = [run.scenario] * len(thetas)
         return self.world.simulate_scenarios(np.array(thetas), scenarios, np.array(states))
 
-    def _whitened(self, values: Array) -> Array:
+    def _whiten(self, values: Array) -> Array:
         """Whiten observations, or differences of them, to (L, n)."""
         seen = np.ones((1, *values.shape[1:]), dtype=np.bool_)
         lanes = np.moveaxis(values, 0, -1)[None]
         result: Array = np.moveaxis(whiten(lanes, seen, self.noise)[0], -1, 0)
         return result.reshape(len(values), -1)
 
-    def _slopes(
+    def _linearise_run(
         self, run: CandidateRun, known: _Known, at: Array, states: Array | None = None
     ) -> _LinearisedRun | None:
         """Linearise a run at a parameter vector and an initial state.
@@ -220,39 +224,41 @@ class RunRanker:
             thetas[1 + row] = moved
         shifts = STATE_STEP_SHARE * np.eye(begin.size)[self.free]
         begins = [begin] * (1 + len(free)) + [begin + shift for shift in shifts]
-        seen = self._simulated(run, thetas, begins)
+        seen = self._simulate_run(run, thetas, begins)
         if not np.isfinite(seen).all():
             return None
         apart = np.abs(seen[1 + len(free) :] - seen[0])
         sizes = np.array([channel.scale for channel in self.world.simulator.channels])
         if apart.size and (apart / sizes).max() > MAX_STATE_STEP_GROWTH * STATE_STEP_SHARE:
             return None
-        lanes = self._whitened(np.concatenate([seen[:1], seen[1:] - seen[0]]))
+        lanes = self._whiten(np.concatenate([seen[:1], seen[1:] - seen[0]]))
         numbers, initial = lanes[1 : 1 + len(free)], lanes[1 + len(free) :]
         return _LinearisedRun(lanes[0], numbers.T, initial.T / STATE_STEP_SHARE)
 
-    def _told(self, run: CandidateRun, true: _Known, rival: _Known) -> float:
+    def _compute_discrimination(self, run: CandidateRun, true: _Known, rival: _Known) -> float:
         """Compute the discrimination T of eq. (1) of a run, to which the competitor is refitted.
 
         The prediction of the model `true` takes the place of the recording. The fit of `rival` by
         Levenberg-Marquardt may move its parameters as far as the present data allow.
         """
         fit = rival.model.fit
-        shown = self._simulated(run, [true.model.fit.theta], [run.states])
-        aim = self._whitened(shown)[0]
+        shown = self._simulate_run(run, [true.model.fit.theta], [run.states])
+        aim = self._whiten(shown)[0]
         at, states, gone = fit.theta.copy(), run.states.copy(), np.zeros(fit.free.size)
-        slopes, damping = self._slopes(run, rival, at), 1e-6
+        slopes, damping = self._linearise_run(run, rival, at), 1e-6
         if slopes is None or not np.isfinite(aim).all():
             return 0.0
         least = float(np.square(aim - slopes.centre).sum())
         for _ in range(MAX_FIT_ITERATIONS):
             if damping > MAX_DAMPING:
                 break
-            _, step, moved = _left(aim - slopes.centre, slopes, rival, gone, damping)
+            _, step, moved = _compute_remaining_difference(
+                aim - slopes.centre, slopes, rival, gone, damping
+            )
             tried, begin = at.copy(), states.copy()
             tried[fit.free] += step * rival.spread
             begin[self.free] += moved
-            after = self._slopes(run, rival, tried, begin)
+            after = self._linearise_run(run, rival, tried, begin)
             own = np.inf if after is None else float(np.square(aim - after.centre).sum())
             cost = own + float((gone + step) @ rival.inverse @ (gone + step))
             if after is None or not cost < least:
@@ -267,7 +273,7 @@ class RunRanker:
         return least
 
 
-def _known(models: ModelSet, model: FittedModel) -> _Known:
+def _compute_prior_covariance(models: ModelSet, model: FittedModel) -> _Known:
     """Compute the covariance C of a model's parameters from the present runs, for eqs. (1) and (2).
 
     The unit of each parameter, `spread`, is its standard error, but at most a tenth of the width of
@@ -283,13 +289,13 @@ def _known(models: ModelSet, model: FittedModel) -> _Known:
     return _Known(model, np.asarray(spread), inverse)
 
 
-def _worth(values: Array) -> float:
+def _sum_discrimination(values: Array) -> float:
     """Sum the discrimination over all pairs; each pair counts up to `MAX_USEFUL_DISCRIMINATION`."""
     least = np.minimum(values, values.T)
     return float(np.minimum(least[np.triu_indices(len(least), 1)], MAX_USEFUL_DISCRIMINATION).sum())
 
 
-def _left(
+def _compute_remaining_difference(
     gap: Array,
     slopes: _LinearisedRun,
     known: _Known,

@@ -63,11 +63,14 @@ def stated_limits(world: RunEvaluator) -> StatedLimits:
     for name, joint in joints.items():
         drives = [actuator for actuator in robot.actuators if actuator.joint == name]
         if joint.effort is not None:
-            forces[f"tau.{name}"] = _effort(robot, joint)
+            forces[f"tau.{name}"] = _get_effort_limit(robot, joint)
         elif drives and all(actuator.force is not None for actuator in drives):
             forces[f"tau.{name}"] = UNLIMITED
-    commands = {f"u.{actuator.name}": _command(robot, actuator) for actuator in robot.actuators}
-    commands |= {f"force.{name}": _effort(robot, joint) for name, joint in joints.items()}
+    commands = {
+        f"u.{actuator.name}": _compute_command_range(robot, actuator)
+        for actuator in robot.actuators
+    }
+    commands |= {f"force.{name}": _get_effort_limit(robot, joint) for name, joint in joints.items()}
     return StatedLimits(
         {name: interval for name, interval in commands.items() if interval != UNLIMITED},
         {f"q.{name}": joint.range for name, joint in joints.items() if joint.range},
@@ -76,7 +79,7 @@ def stated_limits(world: RunEvaluator) -> StatedLimits:
     )
 
 
-def _command(robot: Any, actuator: Any) -> Interval:
+def _compute_command_range(robot: Any, actuator: Any) -> Interval:
     """Compute the range of an actuator's control that respects all limits of actuator and joint.
 
     It is in the unit of the control: a force for a motor, a position or velocity for a servo.
@@ -90,20 +93,22 @@ def _command(robot: Any, actuator: Any) -> Interval:
         # The actuator force is gain times control, and the joint force is gear times actuator
         # force.
         gain = float(robot.compiled.actuator_gainprm[actuator.id, 0])
-        own = _both(own, _divided(actuator.force, gain))
+        own = _intersect(own, _divide_interval(actuator.force, gain))
         # Several motors of a joint may act at the same time.
         motors = [a for a in robot.actuators if a.joint == joint.name and a.kind == "motor"]
-        return _both(own, _divided(_effort(robot, joint), gear * gain * len(motors)))
+        return _intersect(
+            own, _divide_interval(_get_effort_limit(robot, joint), gear * gain * len(motors))
+        )
     # The set point of a servo is the gear times the desired value at the joint.
     if actuator.kind in ("position", "pid"):
-        own = _both(own, _multiplied(joint.range, gear))
+        own = _intersect(own, _multiply_interval(joint.range, gear))
     elif actuator.kind == "velocity" and joint.name in robot.speeds:
         speed = robot.speeds[joint.name]
-        own = _both(own, _multiplied((-speed, speed), gear))
+        own = _intersect(own, _multiply_interval((-speed, speed), gear))
     return own
 
 
-def _effort(robot: Any, joint: Any) -> Interval:
+def _get_effort_limit(robot: Any, joint: Any) -> Interval:
     """Return the interval of the total actuator force on a joint."""
     if joint.effort is None:
         return UNLIMITED
@@ -111,13 +116,13 @@ def _effort(robot: Any, joint: Any) -> Interval:
     return low, high
 
 
-def _both(one: Interval, other: Interval) -> Interval:
+def _intersect(one: Interval, other: Interval) -> Interval:
     """Intersect two intervals; return the first if they are disjoint."""
     low, high = max(one[0], other[0]), min(one[1], other[1])
     return (low, high) if low <= high else one
 
 
-def _multiplied(interval: Interval | None, factor: float) -> Interval:
+def _multiply_interval(interval: Interval | None, factor: float) -> Interval:
     """Multiply an interval by a factor; unlimited without an interval or with a zero factor."""
     if interval is None or not factor:
         return UNLIMITED
@@ -125,5 +130,5 @@ def _multiplied(interval: Interval | None, factor: float) -> Interval:
     return low, high
 
 
-def _divided(interval: Interval | None, divisor: float) -> Interval:
-    return _multiplied(interval, 1.0 / divisor) if divisor else UNLIMITED
+def _divide_interval(interval: Interval | None, divisor: float) -> Interval:
+    return _multiply_interval(interval, 1.0 / divisor) if divisor else UNLIMITED

@@ -132,7 +132,7 @@ def design_next_run(
             [longer.make_run(entry.run.plan) for entry in found[:PLANS_TESTED_FOR_LENGTH]]
         )
         found = sorted([found[0], *_evaluate_fully(judge, long)[:1]], key=get_sort_key)
-    return _made(models, [model, *rivals], rig, found[0]) if found else None
+    return _describe_best_run(models, [model, *rivals], rig, found[0]) if found else None
 
 
 def _would_longer_run_help(best: RunValue, times: float) -> bool:
@@ -165,7 +165,7 @@ def _evaluate_fully(judge: RunRanker, found: Sequence[RunValue]) -> list[RunValu
     return sorted(ranked, key=lambda entry: (not entry.is_exact, *get_sort_key(entry)))
 
 
-def _made(
+def _describe_best_run(
     models: ModelSet, among: Sequence[FittedModel], rig: RigModel, entry: RunValue
 ) -> NextRunDesign:
     """Describe the best run, and what it is expected to tell, for the report.
@@ -183,8 +183,8 @@ def _made(
     if rivals:
         least = np.minimum(entry.values, entry.values.T)
         stands = among[0]
-        names = [_other(one, stands) for one in rivals]
-        effect = _other(stands, rivals[0])
+        names = [_list_other_effects(one, stands) for one in rivals]
+        effect = _list_other_effects(stands, rivals[0])
         discrimination = {
             name: float(value) for name, value in zip(names, least[0, 1:], strict=True)
         }
@@ -205,7 +205,7 @@ def _made(
     )
 
 
-def _other(model: FittedModel, than: FittedModel) -> str:
+def _list_other_effects(model: FittedModel, than: FittedModel) -> str:
     """Return the effects that one model has and the other does not have."""
     return " and ".join(name for name in model.effects if name not in than.effects)
 

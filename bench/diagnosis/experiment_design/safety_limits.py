@@ -52,12 +52,12 @@ class RigLimits:
     def __init__(self, world: RunEvaluator, model: FittedModel) -> None:
         """Simulate the present runs with the fitted model, and derive the channel limits."""
         self.world = world
-        self.past = self._seen(
+        self.past = self._simulate_monitored_channels(
             model,
             [track.scenario for track in world.tracks],
             np.where(np.isfinite(model.fit.states), model.fit.states, world.guess),
         )
-        self.bounds = self._bounds()
+        self.bounds = self._determine_bounds()
 
     def __call__(self, model: FittedModel, runs: Sequence[CandidateRun]) -> list[bool]:
         """Return for each run whether it stays within the limits if a model is true.
@@ -69,8 +69,8 @@ class RigLimits:
         if not runs:
             return []
         states = np.array([run.states for run in runs])
-        seen = self._seen(model, [run.scenario for run in runs], states)
-        return [self._within(channels) for channels in seen]
+        seen = self._simulate_monitored_channels(model, [run.scenario for run in runs], states)
+        return [self._is_within_limits(channels) for channels in seen]
 
     # -- monitored channels
 
@@ -81,16 +81,20 @@ class RigLimits:
         if not kind.has_model:
             moving = {*kind.system.coordinates, *kind.system.rates, *self.world.channels}
             return [c.name for c in kind.channels if c.name in moving]
-        names = {f"{what}.{joint.name}" for joint in self._joints for what in ("q", "qd", "tau")}
+        names = {
+            f"{what}.{joint.name}"
+            for joint in self._single_coordinate_joints
+            for what in ("q", "qd", "tau")
+        }
         return [c.name for c in kind.channels if c.name in names]
 
     @property
-    def _joints(self) -> list[Any]:
+    def _single_coordinate_joints(self) -> list[Any]:
         """The joints of the robot with one coordinate."""
         robot: Any = self.world.kind
         return [joint for joint in robot.robot.joints if joint.has_one_coordinate]
 
-    def _seen(
+    def _simulate_monitored_channels(
         self, model: FittedModel, scenarios: Sequence[Scenario], states: Array
     ) -> list[Mapping[str, Array]]:
         """Simulate runs with a model, and return the monitored channels of each, (T,) by name."""
@@ -114,7 +118,7 @@ class RigLimits:
 
     # -- limits
 
-    def _bounds(self) -> dict[str, tuple[float, float]]:
+    def _determine_bounds(self) -> dict[str, tuple[float, float]]:
         """Determine the allowed range of each monitored channel.
 
         It is the limit in the model file if there is one, else the range of the present runs,
@@ -127,14 +131,14 @@ class RigLimits:
             ends[name] = (float(values.min()), float(values.max())) if values.size else (0.0, 0.0)
         scales = {channel.name: channel.scale for channel in self.world.kind.channels}
         if not self.world.kind.has_model:
-            return {name: _wider(*ends[name], scales[name]) for name in ends}
+            return {name: _widen_range(*ends[name], scales[name]) for name in ends}
         stated = stated_limits(self.world).channels
         bounds = {}
         for name, (low, high) in ends.items():
             if name in stated:
                 bounds[name] = _with_stop(stated[name], (low, high), name.startswith("q."))
             elif name.startswith("q."):
-                bounds[name] = _wider(low, high, scales[name])
+                bounds[name] = _widen_range(low, high, scales[name])
             else:
                 kind = name.partition(".")[0]
                 most = max(max(map(abs, own)) for key, own in ends.items() if key.startswith(kind))
@@ -142,7 +146,7 @@ class RigLimits:
                 bounds[name] = -own, own
         return bounds
 
-    def _within(self, channels: Mapping[str, Array]) -> bool:
+    def _is_within_limits(self, channels: Mapping[str, Array]) -> bool:
         """Return whether a simulated run stays within the limits of all monitored channels.
 
         A run of a robot must not touch bodies that did not touch each other in the present runs.
@@ -159,11 +163,11 @@ class RigLimits:
                 return False
         return (
             not self.world.kind.has_model
-            or find_contacts(self.world.kind, channels) <= self._touched
+            or find_contacts(self.world.kind, channels) <= self._touching_pairs
         )
 
     @cached_property
-    def _touched(self) -> frozenset[tuple[int, int]]:
+    def _touching_pairs(self) -> frozenset[tuple[int, int]]:
         """Pairs of bodies that touched in the present runs."""
         return frozenset().union(*(find_contacts(self.world.kind, run) for run in self.past))
 
@@ -177,6 +181,6 @@ def _with_stop(stated: Interval, past: Interval, is_position: bool) -> Interval:
     return max(min(low, past[0]), low - slack), min(max(high, past[1]), high + slack)
 
 
-def _wider(low: float, high: float, scale: float) -> tuple[float, float]:
+def _widen_range(low: float, high: float, scale: float) -> tuple[float, float]:
     slack = TRAVEL_FACTOR * max(high - low, scale)
     return low - slack, high + slack

@@ -46,7 +46,7 @@ def range_files(
         "left_out": list(ranges.left_out),
         "ranges": rows,
     }
-    table = [[_cell(row.get(column)) for column in COLUMNS] for row in rows]
+    table = [[_format_cell(row.get(column)) for column in COLUMNS] for row in rows]
     tables = {"ranges.toml": tomli_w.dumps(document), "ranges.csv": csv_text(COLUMNS, table)}
     if not any(each.fields for each in ranges.ranges):
         return tables
@@ -58,7 +58,7 @@ def range_files(
     }
 
 
-def _cell(value: Any) -> object:
+def _format_cell(value: Any) -> object:
     """Format a value as a cell: an address as numbers with spaces, a missing value as empty."""
     if isinstance(value, list):
         return " ".join(str(number) for number in value)

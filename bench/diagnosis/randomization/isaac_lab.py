@@ -55,7 +55,7 @@ def isaac_lab_code(ranges: RandomizationRanges, extended: ExtendedSimulator, rob
         robot: Robot with its compiled model.
     """
     sentences = dict(texts(ranges))
-    terms, missing = _terms(ranges, sentences, robot)
+    terms, missing = _build_terms(ranges, sentences, robot)
     return render_code(
         "ranges_isaac_lab.py",
         heading=list_heading(extended, "Isaac Lab", ranges.left_out),
@@ -64,7 +64,7 @@ def isaac_lab_code(ranges: RandomizationRanges, extended: ExtendedSimulator, rob
     )
 
 
-def _terms(
+def _build_terms(
     ranges: RandomizationRanges, sentences: Mapping[RandomizationRange, str], robot: Any
 ) -> tuple[list[Term], list[RandomizationRange]]:
     """Build the Isaac Lab event terms, and list the ranges for which Isaac Lab has no term.
@@ -82,11 +82,13 @@ def _terms(
         for name, (each,) in by_effect.pop(effect, {}).items():
             notes = [FRICTION_NOTE] if effect == "friction.coulomb" else []
             terms.append(
-                _joint_term(each.field, name, function, key, _ends(each), [sentences[each], *notes])
+                _joint_term(
+                    each.field, name, function, key, _get_ends(each), [sentences[each], *notes]
+                )
             )
-    terms += _gains(by_effect, sentences, robot)
+    terms += _make_gain_terms(by_effect, sentences, robot)
     for name, (each,) in by_effect.pop("mass.scale", {}).items():
-        params = {"mass_distribution_params": _pair(*_ends(each)), "operation": '"abs"'}
+        params = {"mass_distribution_params": _format_pair(*_get_ends(each)), "operation": '"abs"'}
         if name in by_effect.get("inertia.scale", {}):
             # The range of the inertia already includes the scaling by the mass.
             params["recompute_inertia"] = "False"
@@ -94,20 +96,22 @@ def _terms(
             _body_term("body_mass", name, "randomize_rigid_body_mass", params, [sentences[each]])
         )
     for name, offsets in by_effect.pop("mass.offset", {}).items():
-        pairs = [f'"{each.coefficient}": {_pair(each.minimum, each.maximum)}' for each in offsets]
+        pairs = [
+            f'"{each.coefficient}": {_format_pair(each.minimum, each.maximum)}' for each in offsets
+        ]
         params = {"com_range": "{" + ", ".join(pairs) + "}"}
         notes = [sentences[each] for each in offsets]
         terms.append(_body_term("body_ipos", name, "randomize_rigid_body_com", params, notes))
     for name, (each,) in by_effect.pop("inertia.scale", {}).items():
         params = {
-            "inertia_distribution_params": _pair(each.minimum, each.maximum),
+            "inertia_distribution_params": _format_pair(each.minimum, each.maximum),
             "operation": '"scale"',
             "diagonal_only": "False",
         }
         notes = [sentences[each], "This term exists since Isaac Lab 3."]
         function = "randomize_rigid_body_inertia"
         terms.append(_body_term("body_inertia", name, function, params, notes))
-    terms += _gravity(by_effect, sentences, robot)
+    terms += _make_gravity_term(by_effect, sentences, robot)
     return terms, [
         each
         for ranges_by_place in by_effect.values()
@@ -116,7 +120,7 @@ def _terms(
     ]
 
 
-def _gains(
+def _make_gain_terms(
     by_effect: dict[str, dict[str, list[RandomizationRange]]],
     sentences: Mapping[RandomizationRange, str],
     robot: Any,
@@ -130,7 +134,7 @@ def _gains(
     passive = by_effect.pop("drag.linear", {})
     function = "randomize_actuator_gains"
     for joint, actuators in _by_joint(robot, stiffness).items():
-        ends = _sum([_at_joint(robot, stiffness, name, 1) for name in actuators])
+        ends = _sum_ranges([_at_joint(robot, stiffness, name, 1) for name in actuators])
         notes = [sentences[each] for name in actuators for each in stiffness.get(name, ())]
         key = "stiffness_distribution_params"
         yield _joint_term("stiffness", joint, function, key, ends, notes)
@@ -139,14 +143,14 @@ def _gains(
         parts = [_at_joint(robot, damping, name, 2) for name in names]
         stated = float(robot.compiled.dof_damping[robot.joint(joint).velocity])
         damping_ranges = passive.get(joint)
-        parts.append(_ends(damping_ranges[0]) if damping_ranges else (stated, stated))
+        parts.append(_get_ends(damping_ranges[0]) if damping_ranges else (stated, stated))
         joint_ranges = [
             *(damping_ranges or ()),
             *(each for name in names for each in damping.get(name, ())),
         ]
         notes = [*(sentences[each] for each in joint_ranges), DAMPING_NOTE]
         key = "damping_distribution_params"
-        yield _joint_term("damping", joint, function, key, _sum(parts), notes)
+        yield _joint_term("damping", joint, function, key, _sum_ranges(parts), notes)
 
 
 def _by_joint(robot: Any, ranges: Mapping[str, Any]) -> dict[str, list[str]]:
@@ -166,13 +170,13 @@ def _at_joint(
     actuator_id = robot.actuator(name).id
     share = float(robot.compiled.actuator_gear[actuator_id, 0]) ** 2
     if name in ranges:
-        low, high = _ends(ranges[name][0])
+        low, high = _get_ends(ranges[name][0])
         return share * low, share * high
     stated = -share * float(robot.compiled.actuator_biasprm[actuator_id, term])
     return stated, stated
 
 
-def _gravity(
+def _make_gravity_term(
     by_effect: dict[str, dict[str, list[RandomizationRange]]],
     sentences: Mapping[RandomizationRange, str],
     robot: Any,
@@ -218,8 +222,8 @@ def _joint_term(
         notes: Comments above the term.
     """
     params = {
-        "asset_cfg": _asset("joint_names", joint),
-        key: _pair(*ends),
+        "asset_cfg": _format_asset("joint_names", joint),
+        key: _format_pair(*ends),
         "operation": '"abs"',
         "distribution": '"uniform"',
     }
@@ -234,22 +238,25 @@ def _body_term(
     `params` has the code of each further argument; `notes` become comments above the term.
     """
     return Term(
-        f"{prefix}_{body}", function, {"asset_cfg": _asset("body_names", body), **params}, notes
+        f"{prefix}_{body}",
+        function,
+        {"asset_cfg": _format_asset("body_names", body), **params},
+        notes,
     )
 
 
-def _asset(key: str, name: str) -> str:
+def _format_asset(key: str, name: str) -> str:
     """Format the asset with one joint or body; Isaac Lab reads names as regular expressions."""
     return f'SceneEntityCfg("robot", {key}=[{literal(re.escape(name))}])'
 
 
-def _ends(each: RandomizationRange) -> tuple[float, float]:
+def _get_ends(each: RandomizationRange) -> tuple[float, float]:
     return each.low, each.high
 
 
-def _sum(parts: Sequence[tuple[float, float]]) -> tuple[float, float]:
+def _sum_ranges(parts: Sequence[tuple[float, float]]) -> tuple[float, float]:
     return sum(low for low, _ in parts), sum(high for _, high in parts)
 
 
-def _pair(low: float, high: float) -> str:
+def _format_pair(low: float, high: float) -> str:
     return f"({number(low)}, {number(high)})"

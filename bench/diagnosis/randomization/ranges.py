@@ -151,10 +151,10 @@ def randomization_ranges(answer: Verdict, extended: ExtendedSimulator) -> Random
     for number, (cause, is_free, is_wanted) in enumerate(causes):
         for coefficient, fitted in cause.numbers.items() if is_wanted else ():
             entry = _Entry(cause, is_free, coefficient)
-            if why := _reason(fitted, entry):
+            if why := _find_missing_range_reason(fitted, entry):
                 left_out += [why] if is_free or fitted.value or fitted.at_bound else []
             else:
-                ranges.append(_range(kind.robot, totals, number, entry))
+                ranges.append(_convert_to_range(kind.robot, totals, number, entry))
     if ranges and not any(one.fields for one in ranges):
         left_out.append(NO_FIELD)
     if not ranges:
@@ -162,7 +162,7 @@ def randomization_ranges(answer: Verdict, extended: ExtendedSimulator) -> Random
     return RandomizationRanges(tuple(ranges), tuple(left_out))
 
 
-def _reason(number: FittedValue, entry: _Entry) -> str:
+def _find_missing_range_reason(number: FittedValue, entry: _Entry) -> str:
     """Return why a number has no range; empty if it has one."""
     from sims.robot.fitted_causes import is_gravity_compensated
 
@@ -189,7 +189,7 @@ class _Totals:
         self.robot: RobotModel = kind.robot
         self.effects = [kind.system.effect(cause.name) for cause in causes]
         self.values = [
-            {c.name: _value(cause.numbers, c.name) for c in effect.coefficients}
+            {c.name: _get_value(cause.numbers, c.name) for c in effect.coefficients}
             for effect, cause in zip(self.effects, causes, strict=True)
         ]
 
@@ -219,11 +219,13 @@ class _Totals:
         return None, value, effect.coefficients[index].units[0] or "1"
 
 
-def _value(numbers: Mapping[str, FittedValue], coefficient: str) -> float:
+def _get_value(numbers: Mapping[str, FittedValue], coefficient: str) -> float:
     return numbers[coefficient].value if coefficient in numbers else 0.0
 
 
-def _range(robot: RobotModel, totals: _Totals, number: int, entry: _Entry) -> RandomizationRange:
+def _convert_to_range(
+    robot: RobotModel, totals: _Totals, number: int, entry: _Entry
+) -> RandomizationRange:
     """Convert the interval of a fitted coefficient to a range of the number in the model file.
 
     Its operation says whether a simulator sets, adds or multiplies with the random value.

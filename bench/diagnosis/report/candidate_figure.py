@@ -84,7 +84,7 @@ def candidates_figure(report: DiagnosisReportData) -> Figure:
     the fitted runs.
     """
     candidates = select_shown_candidates(report)
-    names = [_name(report, candidate) for candidate in candidates]
+    names = [_format_candidate_name(report, candidate) for candidate in candidates]
     has_shares = any(candidate.heldout_gain is not None for candidate in candidates)
 
     # Names of causes are bold, which is a little wider.
@@ -93,7 +93,7 @@ def candidates_figure(report: DiagnosisReportData) -> Figure:
     width = max(left + shares_width + _SCORES_WIDTH + _SCORE_TEXTS_WIDTH + _EDGE, 7.0)
     # All rows have the height of the longest name, so that bars are evenly spaced.
     row = _ROW + _LINE * most_lines(names)
-    handles, labels = _legend(report)
+    handles, labels = _make_legend(report)
     top = _TOP if handles else _TOP_WITHOUT_LEGEND
     height = top + _BOTTOM + row * len(candidates)
 
@@ -126,12 +126,12 @@ def candidates_figure(report: DiagnosisReportData) -> Figure:
         handletextpad=0.5,
         columnspacing=1.4,
     )
-    note = "\n".join(_notes(report, candidates))
+    note = "\n".join(_format_notes(report, candidates))
     figure.text(_EDGE / width, 0.1 / height, note, fontsize=8, color=CAPTION_GREY, va="bottom")
     return figure
 
 
-def _name(report: DiagnosisReportData, candidate: Candidate) -> str:
+def _format_candidate_name(report: DiagnosisReportData, candidate: Candidate) -> str:
     """Format a candidate's name in as many lines as needed; its place is never cut off."""
     text = sanitise(shorten_effect_name(candidate.effect), 160)
     if get_candidate_status(report, candidate.effect) != NOT_NEEDED:
@@ -229,7 +229,7 @@ def _scores_panel(
         longest = max(longest, size, *other_scores)
         text = format_number(candidate.score)
         if CERTAIN < candidate.p_value <= CHANCE:
-            text += f"  ({_printed(candidate.p_value)})"
+            text += f"  ({_format_p_value(candidate.p_value)})"
         axis.annotate(
             text,
             (max([size, *other_scores]), row),
@@ -252,28 +252,28 @@ def _is_chance(report: DiagnosisReportData, candidate: Candidate) -> bool:
     )
 
 
-def _printed(p_value: float) -> str:
+def _format_p_value(p_value: float) -> str:
     """Format a p-value, such as ``p < 10⁻¹²``."""
     return format_p_value(p_value).replace(" 1×10", " 10")
 
 
-def _notes(report: DiagnosisReportData, candidates: Sequence[Candidate]) -> list[str]:
+def _format_notes(report: DiagnosisReportData, candidates: Sequence[Candidate]) -> list[str]:
     """Format the notes below the figure: numbers of runs and samples, meaning of p-values."""
-    counts = f"Fitted: {_counted(report.fitting)}"
+    counts = f"Fitted: {_format_split_size(report.fitting)}"
     if report.held_out is not None and report.cross_validated:
         counts += "; each run left out in turn"
     elif report.held_out is not None:
-        counts += f"; held out: {_counted(report.held_out)}"
+        counts += f"; held out: {_format_split_size(report.held_out)}"
     notes = [f"{counts}."]
     p_value_note = "p: probability of such a score by chance"
     certain = [c.p_value for c in candidates if c.p_value <= CERTAIN]
     by_chance = [c.p_value for c in candidates if _is_chance(report, c)]
     if certain:
         bars = "for all shown" if len(certain) == len(candidates) else "for grey or coloured bars"
-        p_value_note += f"; {_printed(max(certain)).replace('=', '≤')} {bars}"
+        p_value_note += f"; {_format_p_value(max(certain)).replace('=', '≤')} {bars}"
     if by_chance:
         bars = "for all shown" if len(by_chance) == len(candidates) else "for white bars"
-        p_value_note += f"; {_printed(min(by_chance)).replace('=', '≥')} {bars}"
+        p_value_note += f"; {_format_p_value(min(by_chance)).replace('=', '≥')} {bars}"
     notes.append(f"{p_value_note}.")
     missing = sum(candidate.heldout_gain is None for candidate in candidates)
     if 0 < missing < len(candidates):
@@ -281,7 +281,7 @@ def _notes(report: DiagnosisReportData, candidates: Sequence[Candidate]) -> list
     return notes
 
 
-def _counted(split: DataSplit) -> str:
+def _format_split_size(split: DataSplit) -> str:
     """Format the size of a data split, such as ``3 runs, 1200 samples of 2 channels``."""
     runs, channels = len(split.times), split.observed.shape[2]
     samples = int(np.isfinite(split.observed).any(axis=2).sum())
@@ -290,7 +290,7 @@ def _counted(split: DataSplit) -> str:
     return f"{run_count}, {samples} samples{channel_text}"
 
 
-def _legend(report: DiagnosisReportData) -> tuple[list[Any], list[str]]:
+def _make_legend(report: DiagnosisReportData) -> tuple[list[Any], list[str]]:
     """Return handles and labels of the legend, for the styles that are drawn."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch

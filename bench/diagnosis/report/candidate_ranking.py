@@ -59,13 +59,13 @@ def rank_candidates(report: DiagnosisReportData) -> list[RankedCandidate]:
     entries = []
     for group in groups.values():
         # A diagnosed cause represents its effect even if another place has a higher score.
-        heads = [c for c in group if c.effect in causes] or [_head(group)]
+        heads = [c for c in group if c.effect in causes] or [_choose_representative(group)]
         rest = tuple(c for c in group if c not in heads)
         entries += [RankedCandidate(heads[0], rest), *(RankedCandidate(head) for head in heads[1:])]
     return sorted(entries, key=lambda entry: entry.best.score, reverse=True)
 
 
-def _head(group: list[Candidate]) -> Candidate:
+def _choose_representative(group: list[Candidate]) -> Candidate:
     """Return the best place, unless the family explains much more; it explains at least as much."""
     best_place = next((c for c in group if split_effect_name(c.effect)[1] != ALL_PLACES), group[0])
     return (

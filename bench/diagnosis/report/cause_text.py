@@ -49,7 +49,7 @@ def format_effect_set(names: Sequence[str], last: str = "or") -> str:
     """
     if not any("@" in name for name in names):
         return joined([format_effect(name) for name in names], last)
-    parts = _grouped(names, last)
+    parts = _group_effects(names, last)
     if len(parts) > MAX_NAMED_MEMBERS:
         parts = [
             *parts[: MAX_NAMED_MEMBERS - 1],
@@ -60,7 +60,7 @@ def format_effect_set(names: Sequence[str], last: str = "or") -> str:
     return f", {last} ".join(parts) if nested else joined(parts, last)
 
 
-def _grouped(names: Sequence[str], last: str) -> list[str]:
+def _group_effects(names: Sequence[str], last: str) -> list[str]:
     """Group effects that share a name or a place, and format one text for each group.
 
     `last` is the conjunction, such as "or".
@@ -77,10 +77,10 @@ def _grouped(names: Sequence[str], last: str) -> list[str]:
         group.sort(key=lambda name: split_effect_name(name)[1] == ALL_PLACES)
         key = f"{get_place_kind(group[0])} {place}" if alone else group[0]
         by_place.setdefault(key, []).extend(group)
-    return [_together(group, last) for group in by_place.values()]
+    return [_format_effect_group(group, last) for group in by_place.values()]
 
 
-def _together(group: Sequence[str], last: str) -> str:
+def _format_effect_group(group: Sequence[str], last: str) -> str:
     """Format effects of one name at several places, or several effects at one place."""
     if len(group) == 1:
         return format_effect(group[0])
@@ -164,7 +164,7 @@ def is_overstated(cause: Cause) -> bool:
     return bool(place) and base in DIFFERENCE_EFFECTS and bool(values) and max(values) < 0
 
 
-def _share(quantity: str) -> Callable[[str, Sequence[FittedValue]], str]:
+def _make_percentage_formatter(quantity: str) -> Callable[[str, Sequence[FittedValue]], str]:
     """Return a function that says by which percentage a quantity differs from the model file.
 
     The function takes the place in words and the fitted values; the first value is the relative
@@ -179,7 +179,7 @@ def _share(quantity: str) -> Callable[[str, Sequence[FittedValue]], str]:
     return say
 
 
-def _difference(quantity: str) -> Callable[[str, Sequence[FittedValue]], str]:
+def _make_difference_formatter(quantity: str) -> Callable[[str, Sequence[FittedValue]], str]:
     """Return a function that says by how much, in its unit, a quantity differs from the model file.
 
     The function takes the place in words and the fitted values; the first value is the difference.
@@ -193,7 +193,7 @@ def _difference(quantity: str) -> Callable[[str, Sequence[FittedValue]], str]:
     return say
 
 
-def _moved(where: str, values: Sequence[FittedValue]) -> str:
+def _format_displaced_mass_centre(where: str, values: Sequence[FittedValue]) -> str:
     """Say how far the centre of mass at `where` is from that of the model file.
 
     `values` has the fitted displacement along each axis.
@@ -204,19 +204,19 @@ def _moved(where: str, values: Sequence[FittedValue]) -> str:
     return f"the centre of mass {where} is {distance} from where the model file has it"
 
 
-def _zero(where: str, values: Sequence[FittedValue]) -> str:
+def _format_joint_zero(where: str, values: Sequence[FittedValue]) -> str:
     """Say how far the zero of a joint, for command and reading, is from that of the model file."""
     size = append_unit(format_number(abs(values[0].value), 2), values[0].unit)
     return f"the zero {where}, of command and reading alike, is {size} from that of the model file"
 
 
-def _tilted(where: str, values: Sequence[FittedValue]) -> str:
+def _format_tilted_axis(where: str, values: Sequence[FittedValue]) -> str:
     """Say by how many degrees the axis of a joint is tilted; `values` has the angles in rad."""
     angle = np.rad2deg(np.linalg.norm([n.value for n in values]))
     return f"the axis {where} is tilted by {format_number(float(angle), 2)}° from the model file"
 
 
-def _length(where: str, values: Sequence[FittedValue]) -> str:
+def _format_link_length(where: str, values: Sequence[FittedValue]) -> str:
     """Say by which percentage the length of the link at `where` differs from the model file.
 
     `values[0]` is the relative change of the length.
@@ -229,15 +229,15 @@ def _length(where: str, values: Sequence[FittedValue]) -> str:
 
 
 _SIZED: Mapping[str, Callable[[str, Sequence[FittedValue]], str]] = {
-    "mass.scale": _share("mass"),
-    "inertia.scale": _share("inertia"),
-    "actuator.stiffness": _share("stiffness"),
-    "actuator.damping": _share("damping"),
-    "inertia.armature": _difference("armature"),
-    "mass.offset": _moved,
-    "joint.zero": _zero,
-    "joint.axis": _tilted,
-    "link.length": _length,
+    "mass.scale": _make_percentage_formatter("mass"),
+    "inertia.scale": _make_percentage_formatter("inertia"),
+    "actuator.stiffness": _make_percentage_formatter("stiffness"),
+    "actuator.damping": _make_percentage_formatter("damping"),
+    "inertia.armature": _make_difference_formatter("armature"),
+    "mass.offset": _format_displaced_mass_centre,
+    "joint.zero": _format_joint_zero,
+    "joint.axis": _format_tilted_axis,
+    "link.length": _format_link_length,
 }
 """Functions that format how wrong a value of the model file is, by effect."""
 _STEPPED = {
@@ -291,8 +291,8 @@ def list_place_marks(report: DiagnosisReportData) -> list[PlaceMark]:
         is_certain = not cause.alternatives
         for name in (cause.effect, *cause.alternatives):
             noun, kind = format_effect_name(split_effect_name(name)[0]), get_place_kind(name)
-            for place in _places(report, name, cause):
-                size = _size(cause, name, place) if name == cause.effect else ""
+            for place in _list_places(report, name, cause):
+                size = _format_coefficient(cause, name, place) if name == cause.effect else ""
                 # A family and one of its places give the same mark, which is kept once.
                 marks.setdefault(
                     (kind, place, noun), PlaceMark(kind, place, f"{noun}{size}", is_certain)
@@ -300,7 +300,7 @@ def list_place_marks(report: DiagnosisReportData) -> list[PlaceMark]:
     return list(marks.values())
 
 
-def _places(report: DiagnosisReportData, effect: str, cause: Cause) -> list[str]:
+def _list_places(report: DiagnosisReportData, effect: str, cause: Cause) -> list[str]:
     """List the places at which an effect acts, for marks on the drawing of the robot.
 
     An effect at all places has those of its coefficients, or all places of its kind.
@@ -322,7 +322,7 @@ def _places(report: DiagnosisReportData, effect: str, cause: Cause) -> list[str]
     return tables.get(get_place_kind(effect), [])
 
 
-def _size(cause: Cause, effect: str, place: str) -> str:
+def _format_coefficient(cause: Cause, effect: str, place: str) -> str:
     """Format the coefficient of a cause at a place for a label; empty for several coefficients."""
     at_place = [
         n for name, n in cause.coefficients.items() if split_effect_name(name)[1] in ("", place)

@@ -53,19 +53,20 @@ def format_consistency(report: DiagnosisReportData) -> list[str]:
         and not earlier.is_consistent
     ]
     if reconciled and causes:
-        names = list(dict.fromkeys(_name(spread) for spread in reconciled))
+        names = list(dict.fromkeys(_get_number_name(spread) for spread in reconciled))
         sentences.append(
             f"without {causes}, {joined(names[:MAX_NAMED_PARAMETERS])} differed between "
-            f"{_plural(reconciled[0].by)} by more than the intervals"
+            f"{_pluralise_group(reconciled[0].by)} by more than the intervals"
         )
     rivals = [s for s in report.consistency.alternative_effect if not s.is_consistent]
     for rival in _select_clearest(rivals)[:1]:
         trend = ""
         if _has_trend(rival):
-            trend = f", and it {_direction(rival)} with {sanitise(rival.by, 40)}"
+            trend = f", and it {_get_trend_direction(rival)} with {sanitise(rival.by, 40)}"
         sentences.append(
-            f"with {_name(rival)} instead of {causes}, its value would differ between "
-            f"{_plural(rival.by)}, {_format_span(rival)} ({format_p_value(rival.p_value)}){trend}; "
+            f"with {_get_number_name(rival)} instead of {causes}, its value would differ between "
+            f"{_pluralise_group(rival.by)}, {_format_span(rival)} "
+            f"({format_p_value(rival.p_value)}){trend}; "
             f"this difference speaks for {causes}"
         )
     inconsistent = _select_clearest([spread for spread in after if not spread.is_consistent])
@@ -75,7 +76,7 @@ def format_consistency(report: DiagnosisReportData) -> list[str]:
         count = len(inconsistent) - len(named)
         sentences.append(f"{count} more numbers differ between their groups")
     if after and not inconsistent:
-        groups = _plural(after[0].by)
+        groups = _pluralise_group(after[0].by)
         sentences.append(f"all {groups} agree on every number within its interval")
     return [format_sentence(text) for text in (*sentences, *_format_drifts(after))]
 
@@ -85,10 +86,10 @@ def _select_clearest(spreads: Sequence[ParameterConsistency]) -> list[ParameterC
     by_number: dict[str, list[ParameterConsistency]] = {}
     for spread in spreads:
         by_number.setdefault(spread.number, []).append(spread)
-    return [min(same_number, key=_rank) for same_number in by_number.values()]
+    return [min(same_number, key=_make_sort_key) for same_number in by_number.values()]
 
 
-def _rank(spread: ParameterConsistency) -> tuple[bool, int, float]:
+def _make_sort_key(spread: ParameterConsistency) -> tuple[bool, int, float]:
     """Return a sort key: by trend first, then constants, logs and runs, then by p-value."""
     grouping = {"log": 1, "run": 2}.get(spread.by, 0)
     has_trend = _has_trend(spread) or spread.trend_covariate is not None
@@ -107,7 +108,8 @@ def _format_inconsistency(spread: ParameterConsistency, effects: Sequence[str]) 
     effect that could explain it. `effects` are the effects of the model.
     """
     text = (
-        f"{_name(spread)} differs between {_plural(spread.by)}, {_format_span(spread)} "
+        f"{_get_number_name(spread)} differs between {_pluralise_group(spread.by)}, "
+        f"{_format_span(spread)} "
         f"({format_p_value(spread.p_value)}): for a new run it is known to "
         f"±{format_number(Z95 * spread.prediction_sigma)}, not to "
         f"±{format_number(Z95 * spread.error)}"
@@ -144,21 +146,22 @@ def _format_drifts(after: Sequence[ParameterConsistency]) -> Iterator[str]:
     for spread, trend in drifting[:MAX_NAMED_PARAMETERS]:
         size = f"{format_number(abs(trend.slope))} ± {format_number(Z95 * trend.error)}"
         change = append_unit(size, spread.unit)
-        yield f"{_name(spread)} {_direction(spread)} from log to log by {change}"
+        direction = _get_trend_direction(spread)
+        yield f"{_get_number_name(spread)} {direction} from log to log by {change}"
     if not drifting:
         count = len(logs[0].group_estimates)
         yield f"no number drifts over the {count} logs, in the order given"
 
 
-def _direction(spread: ParameterConsistency) -> str:
+def _get_trend_direction(spread: ParameterConsistency) -> str:
     return "increases" if spread.trend is not None and spread.trend.slope > 0 else "decreases"
 
 
-def _name(spread: ParameterConsistency) -> str:
+def _get_number_name(spread: ParameterConsistency) -> str:
     return sanitise(spread.number, 60)
 
 
-def _plural(by: str) -> str:
+def _pluralise_group(by: str) -> str:
     return f"{by}s" if by in ("run", "log") else f"values of {sanitise(by, 40)}"
 
 
@@ -195,7 +198,7 @@ def build_agreement_rows(report: DiagnosisReportData) -> list[AgreementRow]:
                 spread.is_consistent,
                 _format_interval(spread, spread.error),
                 _format_interval(spread, spread.prediction_sigma),
-                f"{len(halves)} {_plural(spread.by)}",
+                f"{len(halves)} {_pluralise_group(spread.by)}",
                 spread.p_value,
                 draw_intervals(
                     [("after", value, value - half, value + half) for value, half in halves],

@@ -38,7 +38,7 @@ BEST, ELSEWHERE = "the best of each effect", "the same at other places"
 
 def build_candidate_table(report: DiagnosisReportData) -> Table:
     """Build a table with one row per candidate, the highest score first."""
-    sets = _sets(report)
+    sets = _map_indistinguishable_sets(report)
     heads = {entry.best.effect for entry in rank_candidates(report)}
     has_causes = bool(report.verdict.causes)
     rows = []
@@ -61,19 +61,19 @@ def build_candidate_table(report: DiagnosisReportData) -> Table:
                 "place": "all" if place == ALL_PLACES else sanitise(place, 80),
                 "joint": find_joint(report, get_place_kind(c.effect), place),
                 "shown": BEST if c.effect in heads else ELSEWHERE,
-                "says": _says(report, c.effect),
+                "says": _get_effect_description(report, c.effect),
             }
         )
-    return Table.from_rows(rows).without(_needless(report))
+    return Table.from_rows(rows).without(_list_empty_columns(report))
 
 
-def _needless(report: DiagnosisReportData) -> list[str]:
+def _list_empty_columns(report: DiagnosisReportData) -> list[str]:
     """List the columns that would be empty."""
-    columns = [] if _sets(report) else ["set"]
+    columns = [] if _map_indistinguishable_sets(report) else ["set"]
     return columns + ([] if has_placed_causes(report) else ["kind", "place", "joint", "shown"])
 
 
-def _sets(report: DiagnosisReportData) -> dict[str, str]:
+def _map_indistinguishable_sets(report: DiagnosisReportData) -> dict[str, str]:
     """Return, by effect, the set of effects that it is indistinguishable from."""
     sets: dict[str, str] = {}
     for cause in report.verdict.causes:
@@ -83,7 +83,7 @@ def _sets(report: DiagnosisReportData) -> dict[str, str]:
     return sets
 
 
-def _says(report: DiagnosisReportData, name: str) -> str:
+def _get_effect_description(report: DiagnosisReportData, name: str) -> str:
     """Return the description of an effect; for a cause, the one in the verdict."""
     for cause in report.verdict.causes:
         if cause.effect == name:
@@ -130,7 +130,9 @@ def build_residual_profile_table(report: DiagnosisReportData) -> Table:
 def list_less_informative_profiles(report: DiagnosisReportData) -> tuple[str, ...]:
     """List the names of the profiles that are not shown at first."""
     shown = {id(profile) for profile in select_informative_profiles(report.profiles)}
-    return tuple(_name(profile) for profile in report.profiles if id(profile) not in shown)
+    return tuple(
+        _format_profile_name(profile) for profile in report.profiles if id(profile) not in shown
+    )
 
 
 def make_residual_profile_panels(report: DiagnosisReportData) -> list[Panel]:
@@ -154,7 +156,7 @@ def make_residual_profile_panels(report: DiagnosisReportData) -> list[Panel]:
         up = format_label(label, units.get(profile.channel, "1"), 60)
         panels.append(
             Panel(
-                _name(profile),
+                _format_profile_name(profile),
                 FOLLOWS,
                 "at",
                 tuple(series),
@@ -163,12 +165,12 @@ def make_residual_profile_panels(report: DiagnosisReportData) -> list[Panel]:
                     scales=("linear",),
                 ),
                 Axis(up, scales=("linear",), holds=(0.0,)),
-                {"residual of": _name(profile)},
+                {"residual of": _format_profile_name(profile)},
                 height=230,
             )
         )
     return panels
 
 
-def _name(profile: ResidualProfile) -> str:
+def _format_profile_name(profile: ResidualProfile) -> str:
     return f"{sanitise(profile.channel, 80)} against {sanitise(profile.variable, 80)}"

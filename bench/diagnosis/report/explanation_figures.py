@@ -97,7 +97,7 @@ def draw_figure(report: DiagnosisReportData, name: str) -> Figure:
     known = list_figure_names(report)
     if name not in known:
         raise make_unknown_name_error("figure", name, known)
-    with _styled():
+    with _apply_style():
         figure = _MAKERS[name](report)
         # Ticks take their style from the settings that are active when they are first drawn.
         figure.draw_without_rendering()
@@ -123,7 +123,7 @@ class RenderedFigure(NamedTuple):
 
 def render_figures(report: DiagnosisReportData) -> dict[str, RenderedFigure]:
     """Draw all figures and render their files, by name."""
-    with _styled():
+    with _apply_style():
         # The settings must stay active, because text is laid out again when a figure is written.
         figures = {name: _MAKERS[name](report) for name in list_figure_names(report)}
         rendered = {}
@@ -145,7 +145,7 @@ def render_figures(report: DiagnosisReportData) -> dict[str, RenderedFigure]:
 
 
 @contextmanager
-def _styled() -> Iterator[None]:
+def _apply_style() -> Iterator[None]:
     """Apply the style settings while figures are drawn or written."""
     from matplotlib import rc_context
 
@@ -176,7 +176,7 @@ def get_extreme_pose(report: DiagnosisReportData, view: RunView) -> dict[str, fl
     return dict(zip(joints, motion[:, int(np.argmax(distances))].tolist(), strict=True))
 
 
-def _robot(report: DiagnosisReportData) -> Figure:
+def _draw_robot(report: DiagnosisReportData) -> Figure:
     """Draw the robot in the extreme pose of the run that is shown."""
     if report.robot is None:
         raise InputError(f"{report.path}: no robot was recorded")
@@ -185,7 +185,7 @@ def _robot(report: DiagnosisReportData) -> Figure:
     )
 
 
-def _overview(report: DiagnosisReportData) -> Figure:
+def _draw_overview(report: DiagnosisReportData) -> Figure:
     """Draw the run with the largest residual: each channel over time, and its residual below.
 
     For a robot, the figure of `joint_figure` is drawn instead.
@@ -197,7 +197,7 @@ def _overview(report: DiagnosisReportData) -> Figure:
     size = (_WIDTHS[count], 5.2)
     figure, axes = make_panel_grid(2, count, size, layout=None, sharex=True, height_ratios=(3, 2))
     for column, c in enumerate(view.channels):
-        _signal(axes[0][column], axes[1][column], report, view, c)
+        _draw_signal(axes[0][column], axes[1][column], report, view, c)
     # A sample time counts once, however many channels were recorded.
     samples = int(np.isfinite(view.side.observed[view.row]).any(axis=1).sum())
     kind = f"{report.validation_run} run" if view.held_out else "run"
@@ -217,7 +217,7 @@ def _overview(report: DiagnosisReportData) -> Figure:
     return figure
 
 
-def _signal(
+def _draw_signal(
     signal_axis: Axes, residual_axis: Axes, report: DiagnosisReportData, view: RunView, c: int
 ) -> None:
     """Draw the measured and simulated signal of a channel, and the residual below it."""
@@ -306,7 +306,7 @@ _PROFILES_AFTER = 4.1
 """Distance from the end of the names of places to the profiles, in inches."""
 
 
-def _where(report: DiagnosisReportData) -> Figure:
+def _draw_residual_locations(report: DiagnosisReportData) -> Figure:
     """Draw the gap locations on the left, and the most informative profiles on the right."""
     places, profiles = (
         select_gap_locations(report.places),
@@ -362,8 +362,8 @@ def _where(report: DiagnosisReportData) -> Figure:
 
 
 _MAKERS: Mapping[str, Callable[[DiagnosisReportData], Figure]] = {
-    "robot": _robot,
-    "overview": _overview,
-    "where": _where,
+    "robot": _draw_robot,
+    "overview": _draw_overview,
+    "where": _draw_residual_locations,
     "candidates": candidates_figure,
 }

@@ -264,10 +264,10 @@ def _make_still(
     figure = drawn.get(name)
     if figure is None:
         return None
-    return PrintedFigure(figure.svg or figure.png, figure.pdf, _describe(report, name), name)
+    return PrintedFigure(figure.svg or figure.png, figure.pdf, _describe_figure(report, name), name)
 
 
-def _describe(report: DiagnosisReportData, name: str) -> str:
+def _describe_figure(report: DiagnosisReportData, name: str) -> str:
     """Return the alternative text of a figure."""
     if name == "robot":
         named = [

@@ -109,7 +109,7 @@ def draw_gap_location_panel(
         places: Gap locations to draw.
         report: Report data.
     """
-    rows = _rows_of(axis, places)
+    rows = _place_rows(axis, places)
     # The RMS of n noise samples has a standard deviation of 1 / sqrt(2 n); two of them are drawn.
     noise = [min(2 / (2 * p.samples) ** 0.5, _WIDEST) for p in places]
     floor = np.ones(len(rows))
@@ -132,7 +132,7 @@ def draw_gap_location_panel(
     axis.plot(before_values, rows, linestyle="", label=name, **BASE_MODEL_MARKER)
     shown_values = [*before_values, *after_values] if has_extended_model(report) else before_values
     # The noise floor must be visible, whatever the sizes.
-    _decades(axis, [*shown_values, 1.0])
+    _use_log_axis_if_needed(axis, [*shown_values, 1.0])
     axis.set_yticks(rows, place_names(places), linespacing=1.05)
     axis.set_ylim(rows[-1] + 0.7, -0.1)
     axis.set_xlabel("RMS of the residual, in units of the noise")
@@ -144,7 +144,7 @@ def place_names(places: Sequence[GapLocation]) -> list[str]:
     return [break_name(name, _NAME_LINE) for name in names]
 
 
-def _rows_of(axis: Axes, places: Sequence[GapLocation]) -> list[float]:
+def _place_rows(axis: Axes, places: Sequence[GapLocation]) -> list[float]:
     """Return the vertical position of each row, and write a heading above each kind of place."""
     rows: list[float] = []
     for i, place in enumerate(places):
@@ -176,7 +176,7 @@ def get_legend_entries(axis: Axes) -> tuple[list[Any], list[str]]:
     return [by_label[name] for name in present], present
 
 
-def _decades(axis: Axes, values: Sequence[float]) -> None:
+def _use_log_axis_if_needed(axis: Axes, values: Sequence[float]) -> None:
     """Use a logarithmic axis with plain numbers if the values differ by a large factor."""
     positive = np.array([v for v in values if np.isfinite(v) and v > 0])
     if not positive.size or positive.max() / positive.min() < _SPAN_FOR_LOG:
@@ -185,14 +185,14 @@ def _decades(axis: Axes, values: Sequence[float]) -> None:
     axis.set_xscale("log")
     low = positive.min() / 1.4
     high = positive.max() * 1.4
-    ticks = _ticks(low, high)
+    ticks = _compute_log_ticks(low, high)
     axis.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
     # Minor ticks of a short axis would be labelled too, in powers of ten.
     axis.set_xticks([], minor=True)
     axis.set_xlim(low, high)
 
 
-def _ticks(low: float, high: float) -> list[float]:
+def _compute_log_ticks(low: float, high: float) -> list[float]:
     """Return round ticks of a logarithmic axis; per decade 1, 2, 5 or fewer."""
     # With more decades, each has fewer numbers, so that labels do not overlap.
     steps: tuple[int, ...] = (1,)
@@ -214,8 +214,8 @@ def select_informative_profiles(profiles: Sequence[ResidualProfile]) -> list[Res
 
     Each variable comes once before any comes a second time.
     """
-    measured = [p for p in profiles if np.isfinite(_standing(p))]
-    strongest_first = sorted(measured, key=lambda p: -_standing(p))
+    measured = [p for p in profiles if np.isfinite(_compute_profile_significance(p))]
+    strongest_first = sorted(measured, key=lambda p: -_compute_profile_significance(p))
     variables = [p.variable for p in strongest_first]
     is_repeated = [name in variables[:i] for i, name in enumerate(variables)]
     # The sort is stable: first profiles of each variable come first, each group by significance.
@@ -223,7 +223,7 @@ def select_informative_profiles(profiles: Sequence[ResidualProfile]) -> list[Res
     return [strongest_first[i] for i in order[:MAX_PROFILES]]
 
 
-def _standing(profile: ResidualProfile) -> float:
+def _compute_profile_significance(profile: ResidualProfile) -> float:
     """Compute the mean squared residual in standard errors; 1 for noise, NaN for too few bins."""
     is_measured = np.isfinite(profile.before) & (profile.error > 0)
     if is_measured.sum() < 2:

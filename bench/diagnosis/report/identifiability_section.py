@@ -130,24 +130,24 @@ def build_identifiability_section(report: DiagnosisReportData) -> Identifiabilit
     """Build the section on free parameters and causes; None if identifiability is unknown."""
     if not report.identifiability:
         return None
-    rows = _rows(report)
+    rows = _list_rows(report)
     present = [status for status in _STANDINGS if any(row.standing == status for row in rows)]
-    unclear, clear = _told_apart([row for row in rows if _place(row)])
+    unclear, clear = _told_apart([row for row in rows if _get_place(row)])
     count = len({split_effect_name(row.effect)[0] for row in clear})
     ordered = sorted(rows, key=lambda row: _STANDINGS.index(row.standing))
-    without_place = [row for row in rows if not _place(row)]
+    without_place = [row for row in rows if not _get_place(row)]
     columns = [s for s in _STANDINGS if any(row.standing == s for row in without_place)]
     return IdentifiabilitySection(
         counts=format_counts(report),
         free=[_table_row(one, one.word) for one in report.identifiability if one.free],
         legend="; ".join(f"{_SIGNS[status]} {_LEGEND[status]}" for status in present),
-        matrices=_matrices(unclear),
+        matrices=_build_matrices(unclear),
         family_headings=[f"{_SIGNS[status]} {_LEGEND[status]}" for status in columns],
-        families=_families(without_place, columns),
+        families=_build_family_table(without_place, columns),
         identifiable_heading=(
             f"{count} {'more ' * bool(unclear)}effects that can be identified at every place"
         ),
-        identifiable_matrices=_matrices(clear),
+        identifiable_matrices=_build_matrices(clear),
         all=[_table_row(row.number, _LEGEND[row.standing]) for row in ordered],
     )
 
@@ -163,17 +163,18 @@ def _told_apart(rows: Sequence[_Row]) -> tuple[list[_Row], list[_Row]]:
     return first, [row for row in rows if split_effect_name(row.effect)[0] not in telling]
 
 
-def _matrices(rows: Sequence[_Row]) -> list[Matrix]:
+def _build_matrices(rows: Sequence[_Row]) -> list[Matrix]:
     """Build a matrix for each kind of place."""
     kinds = dict.fromkeys(get_place_kind(row.effect) for row in rows)
     return [
-        _matrix([row for row in rows if get_place_kind(row.effect) == kind], kind) for kind in kinds
+        _build_matrix([row for row in rows if get_place_kind(row.effect) == kind], kind)
+        for kind in kinds
     ]
 
 
 def format_counts(report: DiagnosisReportData) -> str:
     """Format how many causes are identifiable, and which were found."""
-    rows = _rows(report)
+    rows = _list_rows(report)
     words = [str("identifiable" if r.standing == "found" else r.number.word) for r in rows]
     counts = {s: words.count(s) for s in _STANDINGS[2:]}
     sentence = (
@@ -182,21 +183,22 @@ def format_counts(report: DiagnosisReportData) -> str:
         f"{counts['not identifiable']} not at all."
     )
     named_causes = [
-        f"{format_effect(c.effect)} ({sanitise(c.effect, 60)})" for c in _causes(report)
+        f"{format_effect(c.effect)} ({sanitise(c.effect, 60)})"
+        for c in _list_supported_causes(report)
     ]
     return f"{sentence} Found: {joined(named_causes)}." if named_causes else sentence
 
 
-def _causes(report: DiagnosisReportData) -> list[Cause]:
+def _list_supported_causes(report: DiagnosisReportData) -> list[Cause]:
     """Return the causes that the verdict supports."""
     vouched = report.verdict.verdict in ("named", "ambiguous", "partial")
     return list(report.verdict.causes) if vouched else []
 
 
-def _rows(report: DiagnosisReportData) -> list[_Row]:
+def _list_rows(report: DiagnosisReportData) -> list[_Row]:
     """List the causes in the order of the numbers, with those of the verdict marked."""
     status_by_effect: dict[str, str] = {}
-    for cause in _causes(report):
+    for cause in _list_supported_causes(report):
         for name in (cause.effect, *cause.alternatives):
             standing = "set" if cause.alternatives else "found"
             status_by_effect.setdefault(name, standing)
@@ -212,22 +214,22 @@ def _rows(report: DiagnosisReportData) -> list[_Row]:
     return rows
 
 
-def _place(row: _Row) -> str:
+def _get_place(row: _Row) -> str:
     """Return the place of an effect; empty if it acts at all places."""
     place = split_effect_name(row.effect)[1]
     return "" if place == ALL_PLACES else place
 
 
-def _matrix(rows: Sequence[_Row], kind: str) -> Matrix:
+def _build_matrix(rows: Sequence[_Row], kind: str) -> Matrix:
     """Build the matrix of effects by places of one kind."""
-    places = list(dict.fromkeys(_place(row) for row in rows))
+    places = list(dict.fromkeys(_get_place(row) for row in rows))
     by_effect: dict[str, dict[str, _Row]] = {}
     for row in rows:
         by_place = by_effect.setdefault(split_effect_name(row.effect)[0], {})
         # Of several coefficients at a place, the best one is shown.
-        best = by_place.setdefault(_place(row), row)
+        best = by_place.setdefault(_get_place(row), row)
         if _STANDINGS.index(row.standing) < _STANDINGS.index(best.standing):
-            by_place[_place(row)] = row
+            by_place[_get_place(row)] = row
 
     def order(effect: str) -> list[int]:
         return sorted(_STANDINGS.index(row.standing) for row in by_effect[effect].values())
@@ -236,13 +238,13 @@ def _matrix(rows: Sequence[_Row], kind: str) -> Matrix:
         _KINDS.get(kind, "places"),
         places,
         [
-            MatrixRow(effect, [_cell(by_effect[effect].get(place)) for place in places])
+            MatrixRow(effect, [_make_cell(by_effect[effect].get(place)) for place in places])
             for effect in sorted(by_effect, key=order)
         ],
     )
 
 
-def _cell(row: _Row | None) -> MatrixCell | None:
+def _make_cell(row: _Row | None) -> MatrixCell | None:
     """Return the matrix cell of an effect at a place; None if the effect is not available there.
 
     The cell is emphasised if the verdict names the effect here, or if the effect explains the data
@@ -250,12 +252,12 @@ def _cell(row: _Row | None) -> MatrixCell | None:
     """
     if row is None:
         return None
-    interval = _interval(row.number)
+    interval = _format_half_interval(row.number)
     label = f"{row.effect}: {_LEGEND[row.standing]}{', ' * bool(interval)}{interval}"
     return MatrixCell(_SIGNS[row.standing], label, row.standing in ("found", "set"))
 
 
-def _families(
+def _build_family_table(
     rows: Sequence[_Row], columns: Sequence[str]
 ) -> list[tuple[str, list[tuple[str, bool]]]]:
     """Build the table of causes without a place: families of effects by identifiability."""
@@ -266,13 +268,16 @@ def _families(
     return [
         (
             family,
-            [(_names(by_status.get(column, ())), column in ("found", "set")) for column in columns],
+            [
+                (_join_effect_names(by_status.get(column, ())), column in ("found", "set"))
+                for column in columns
+            ],
         )
         for family, by_status in families.items()
     ]
 
 
-def _names(effects: Sequence[str]) -> str:
+def _join_effect_names(effects: Sequence[str]) -> str:
     """Join the names of at most `MAX_NAMED_CAUSES` different effects, and count the others."""
     unique = list(dict.fromkeys(effects))
     shown = ", ".join(format_effect_name(effect) for effect in unique[:MAX_NAMED_CAUSES])
@@ -280,7 +285,7 @@ def _names(effects: Sequence[str]) -> str:
     return f"{shown} and {more} more" if more > 0 else shown
 
 
-def _interval(number: ParameterIdentifiability) -> str:
+def _format_half_interval(number: ParameterIdentifiability) -> str:
     """Format half the 95 % interval with its unit; empty if the data are insensitive."""
     if not np.isfinite(number.half):
         return ""
@@ -291,4 +296,6 @@ def _table_row(number: ParameterIdentifiability, status: str) -> Identifiability
     """Format the identifiability of a parameter or cause as a table row."""
     mixed = joined([f"{name} ({correlation:.2f})" for name, correlation in number.mixed])
     span = f"{format_number(number.low)} to {format_number(number.high)}"
-    return IdentifiabilityRow(number.name, status, _interval(number), span, mixed or "–")
+    return IdentifiabilityRow(
+        number.name, status, _format_half_interval(number), span, mixed or "–"
+    )

@@ -94,7 +94,7 @@ def list_joint_rows(report: DiagnosisReportData) -> list[JointRow]:
         if quantity in QUANTITY_LABELS and name:
             joints.setdefault(name, {})[quantity] = c
         else:
-            sensors.append(JointRow(channel.name, c, {_first(report): c}))
+            sensors.append(JointRow(channel.name, c, {_get_first_quantity(report): c}))
     rows = []
     for name, channels in joints.items():
         # The position is shown if it was recorded, otherwise the velocity or the torque.
@@ -103,12 +103,12 @@ def list_joint_rows(report: DiagnosisReportData) -> list[JointRow]:
     return rows + sensors
 
 
-def _first(report: DiagnosisReportData) -> str:
+def _get_first_quantity(report: DiagnosisReportData) -> str:
     """Return the quantity of the first residual column, which also holds those of sensors."""
-    return next(iter(_quantities(report)), "q")
+    return next(iter(_list_quantities(report)), "q")
 
 
-def _quantities(report: DiagnosisReportData) -> list[str]:
+def _list_quantities(report: DiagnosisReportData) -> list[str]:
     """Return the recorded quantities of joints, such as position and velocity, in a fixed order."""
     recorded = {channel.name.partition(".")[0] for channel in report.channels}
     return [quantity for quantity in QUANTITY_LABELS if quantity in recorded]
@@ -121,8 +121,8 @@ def draw_joint_figure(report: DiagnosisReportData, view: RunView) -> Figure:
         report: Report data.
         view: Run to draw.
     """
-    rows = _worst(report, view)
-    quantities = _quantities(report) or ["q"]
+    rows = _select_worst_rows(report, view)
+    quantities = _list_quantities(report) or ["q"]
     height = _HEIGHTS.get(len(rows), _LEAST_HEIGHT)
     named_joints = {mark.name for mark in list_place_marks(report)} | _joints_of_marks(report)
     names = [_row_name(row, row.name in named_joints) for row in rows]
@@ -134,10 +134,10 @@ def draw_joint_figure(report: DiagnosisReportData, view: RunView) -> Figure:
         len(rows), len(ratios), size, layout=None, sharex=True, width_ratios=ratios
     )
     for row, panels in zip(rows, axes, strict=True):
-        _motion(panels[0], report, view, row, row.name in named_joints)
+        _draw_motion(panels[0], report, view, row, row.name in named_joints)
         for panel, quantity in zip(panels[1:], quantities, strict=True):
             if quantity in row.channels:
-                _residual(panel, report, view, row.channels[quantity])
+                _draw_residual(panel, report, view, row.channels[quantity])
             else:
                 panel.set_axis_off()
     for column, quantity in enumerate(quantities, start=1):
@@ -149,29 +149,31 @@ def draw_joint_figure(report: DiagnosisReportData, view: RunView) -> Figure:
         panel.set_xlabel("time [s]")
         # The narrow columns have little space for tick labels, which may be long.
         panel.locator_params(axis="x", nbins=4)
-    _finish(figure, axes, report, view, rows, names_width)
+    _add_title_and_legend(figure, axes, report, view, rows, names_width)
     return figure
 
 
-def _worst(report: DiagnosisReportData, view: RunView) -> list[JointRow]:
+def _select_worst_rows(report: DiagnosisReportData, view: RunView) -> list[JointRow]:
     """Select the rows with the largest residuals, in their original order."""
     rows = list_joint_rows(report)
 
     def gap(row: JointRow) -> float:
-        return max(_size(report, view, c, "before") for c in row.channels.values())
+        return max(_compute_residual_rms(report, view, c, "before") for c in row.channels.values())
 
     worst = sorted(rows, key=gap, reverse=True)[:MAX_JOINTS]
     return [row for row in rows if row in worst]
 
 
-def _size(report: DiagnosisReportData, view: RunView, c: int, model: str) -> float:
+def _compute_residual_rms(report: DiagnosisReportData, view: RunView, c: int, model: str) -> float:
     """Return the RMS residual of a channel in this run in noise units; 0 without samples."""
-    residual = _left(report, view, c, model)
+    residual = _compute_scaled_residual(report, view, c, model)
     finite = residual[np.isfinite(residual)]
     return float(np.sqrt(np.mean(finite**2))) if finite.size else 0.0
 
 
-def _left(report: DiagnosisReportData, view: RunView, c: int, model: str) -> Array:
+def _compute_scaled_residual(
+    report: DiagnosisReportData, view: RunView, c: int, model: str
+) -> Array:
     """Return the residual (T,) of a channel in units of its noise."""
     count = len(view.side.times[view.row])
     simulated = getattr(view.side, model)
@@ -181,7 +183,7 @@ def _left(report: DiagnosisReportData, view: RunView, c: int, model: str) -> Arr
     return residual
 
 
-def _motion(
+def _draw_motion(
     panel: Axes, report: DiagnosisReportData, view: RunView, row: JointRow, is_named: bool
 ) -> None:
     """Draw the measured and simulated motion of a joint, with its name at the left.
@@ -240,7 +242,7 @@ def _row_name(row: JointRow, is_named: bool) -> str:
     return f"{NAMED_JOINT_MARKER} {name}" if is_named else name
 
 
-def _residual(panel: Axes, report: DiagnosisReportData, view: RunView, c: int) -> None:
+def _draw_residual(panel: Axes, report: DiagnosisReportData, view: RunView, c: int) -> None:
     """Draw the residuals of channel number c in units of its noise, with the RMS above."""
     times = view.side.times[view.row]
     panel.axhspan(
@@ -249,14 +251,16 @@ def _residual(panel: Axes, report: DiagnosisReportData, view: RunView, c: int) -
     panel.axhline(0, color=ZERO_LINE_GREY, linewidth=0.6, zorder=1)
     models = ("before", "after") if has_extended_model(report) else ("before",)
     for model in models:
-        residual = _left(report, view, c, model)
+        residual = _compute_scaled_residual(report, view, c, model)
         rows = decimate(residual)
         line_style = {**BASE_MODEL_LINE, "linewidth": 1.0, "zorder": 3}
         if model == "after":
             line_style = {**EXTENDED_MODEL_LINE, "linewidth": 0.8, "zorder": 2}
         line_style["rasterized"] = rows.size > MAX_OUTLINED_DOTS
         panel.plot(times[rows], residual[rows], **line_style)
-    rms_texts = [format_number(_size(report, view, c, model), 2) for model in models]
+    rms_texts = [
+        format_number(_compute_residual_rms(report, view, c, model), 2) for model in models
+    ]
     panel.text(
         1.0,
         1.02,
@@ -284,7 +288,9 @@ def _one_scale(
     limit = MIN_RESIDUAL_AXIS_SIGMAS
     for row in rows:
         if quantity in row.channels:
-            residual = np.abs(_left(report, view, row.channels[quantity], "before"))
+            residual = np.abs(
+                _compute_scaled_residual(report, view, row.channels[quantity], "before")
+            )
             finite = residual[np.isfinite(residual)]
             if finite.size:
                 limit = max(limit, 1.08 * float(np.quantile(finite, RESIDUAL_AXIS_QUANTILE)))
@@ -323,7 +329,7 @@ def _joints_of_marks(report: DiagnosisReportData) -> set[str]:
     return {find_joint(report, mark.kind, mark.name) for mark in list_place_marks(report)}
 
 
-def _finish(
+def _add_title_and_legend(
     figure: Figure,
     axes: Any,
     report: DiagnosisReportData,

@@ -29,41 +29,43 @@ def find_model_file_changes(before: str, after: str) -> tuple[ModelFileChange, .
         before: Text of the file; empty if there is none of the same format.
         after: Text of the extended file, where comments precede the elements that they describe.
     """
-    old, new = _elements(before), _elements(after)
+    old, new = _split_into_elements(before), _split_into_elements(after)
     matcher = SequenceMatcher(None, old, new, autojunk=False)
     if matcher.ratio() < MIN_UNCHANGED_SHARE:
-        return tuple(_commented(new))
+        return tuple(_list_commented_elements(new))
     changes: list[ModelFileChange] = []
     for kind, i1, i2, j1, j2 in matcher.get_opcodes():
         if kind != "equal":
-            changes += _block(old[i1:i2], new[j1:j2])
+            changes += _compare_blocks(old[i1:i2], new[j1:j2])
     return tuple(changes)
 
 
-def _elements(text: str) -> list[str]:
+def _split_into_elements(text: str) -> list[str]:
     """Split the text into tags and comments, whatever the line breaks."""
     return [" ".join(part.split()) for part in _PART.findall(text)]
 
 
-def _block(old: Sequence[str], new: Sequence[str]) -> Iterator[ModelFileChange]:
+def _compare_blocks(old: Sequence[str], new: Sequence[str]) -> Iterator[ModelFileChange]:
     """Yield the changes of a block of elements, each with the comments before it."""
     elements = list(_with_comments(new))
     # With equal counts, each new element replaces the old one at its position.
     if len(old) != len(elements):
         for i, (line, comment) in enumerate(elements):
-            yield ModelFileChange(_element(line), "\n".join(old) if i == 0 else "", line, comment)
+            yield ModelFileChange(
+                _format_element(line), "\n".join(old) if i == 0 else "", line, comment
+            )
         if not elements and old:
-            yield ModelFileChange(_element(old[0]), "\n".join(old), "")
+            yield ModelFileChange(_format_element(old[0]), "\n".join(old), "")
         return
     for line_before, (line, comment) in zip(old, elements, strict=True):
-        yield ModelFileChange(_element(line), line_before, line, comment)
+        yield ModelFileChange(_format_element(line), line_before, line, comment)
 
 
-def _commented(lines: Sequence[str]) -> Iterator[ModelFileChange]:
+def _list_commented_elements(lines: Sequence[str]) -> Iterator[ModelFileChange]:
     """Yield the elements with a comment, of a rewritten file."""
     for line, comment in _with_comments(lines):
         if comment:
-            yield ModelFileChange(_element(line), "", line, comment)
+            yield ModelFileChange(_format_element(line), "", line, comment)
 
 
 def _with_comments(lines: Sequence[str]) -> Iterator[tuple[str, str]]:
@@ -78,7 +80,7 @@ def _with_comments(lines: Sequence[str]) -> Iterator[tuple[str, str]]:
         above = []
 
 
-def _element(line: str) -> str:
+def _format_element(line: str) -> str:
     """Format the element of a line of XML, such as ``joint elbow``."""
     head, name = _HEAD.search(line), _NAME.search(line)
     return " ".join(match[1] for match in (head, name) if match)

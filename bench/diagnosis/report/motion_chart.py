@@ -86,21 +86,21 @@ def build_motion_table(report: DiagnosisReportData, most: int = MAX_ROWS) -> Mot
         report: Report data.
         most: Approximate maximum number of samples.
     """
-    runs = _runs(report)
+    runs = _sort_runs(report)
     count = len(report.channels)
     shown = runs[: max(1, most // (MIN_ROWS_PER_CHANNEL * count))]
     samples_per_run = max(MIN_ROWS_PER_CHANNEL, most // (len(shown) * count))
-    parts = [_rows(report, run, c, samples_per_run) for run in shown for c in range(count)]
+    parts = [_format_rows(report, run, c, samples_per_run) for run in shown for c in range(count)]
     names = ["run", "channel", "t", "measured", "before"] + ["after"] * has_extended_model(report)
     names += ["residual_before"] + ["residual_after"] * has_extended_model(report)
     columns = [[cell for part in parts for cell in part[i]] for i in range(len(names))]
     frame = Table(dict(zip(names, columns, strict=True)))
     longest = max(len(run.side.times[run.row]) for run in shown)
-    part_count = _stretches(report, samples_per_run) if longest > samples_per_run else 0
+    part_count = _count_parts(report, samples_per_run) if longest > samples_per_run else 0
     return MotionTable(frame, tuple(shown), part_count, longest, len(runs) - len(shown))
 
 
-def _runs(report: DiagnosisReportData) -> list[ShownRun]:
+def _sort_runs(report: DiagnosisReportData) -> list[ShownRun]:
     """List all runs by descending RMS residual, but the run of the printed figure first."""
     sigma = np.array([c.sigma for c in report.channels])
     first = select_worst_run(report)
@@ -119,7 +119,7 @@ def _runs(report: DiagnosisReportData) -> list[ShownRun]:
     return sorted(runs, key=lambda run: ((id(run.side), run.row) != first_run, -run.gap))
 
 
-def _stretches(report: DiagnosisReportData, most: int) -> int:
+def _count_parts(report: DiagnosisReportData, most: int) -> int:
     """Return the number of parts of a long run: the extremes of two or three signals are kept."""
     return max(1, most // (6 if has_extended_model(report) else 4))
 
@@ -153,7 +153,7 @@ def select_extreme_samples(signals: Sequence[Array], stretches: int) -> NDArray[
     return np.unique(np.concatenate(chosen))
 
 
-def _rows(report: DiagnosisReportData, run: ShownRun, c: int, most: int) -> list[list[str]]:
+def _format_rows(report: DiagnosisReportData, run: ShownRun, c: int, most: int) -> list[list[str]]:
     """Format the samples of a channel of a run as columns of text for the chart's table.
 
     If there are more than `most` samples, only the extremes of short parts are kept.
@@ -166,7 +166,7 @@ def _rows(report: DiagnosisReportData, run: ShownRun, c: int, most: int) -> list
     residuals = [(observed - signal) / channel.sigma for signal in simulated]
     rows = np.arange(len(times))
     if len(times) > most:
-        rows = select_extreme_samples([observed, *residuals], _stretches(report, most))
+        rows = select_extreme_samples([observed, *residuals], _count_parts(report, most))
     digits = (
         int(np.clip(ceil(log10(NOISE_RESOLUTION / channel.sigma)), 0, 15))
         if channel.sigma > 0
@@ -177,12 +177,12 @@ def _rows(report: DiagnosisReportData, run: ShownRun, c: int, most: int) -> list
     fine = int(np.clip(3 - floor(log10(step)), 0, 9)) if step > 0 else 6
     count = len(rows)
     texts = [[sanitise(split.names[run.row], 80)] * count, [sanitise(channel.name, 80)] * count]
-    texts.append(_written(times[rows], fine))
-    texts += [_written(values[rows], digits) for values in (observed, *simulated)]
-    return texts + [_written(values[rows], 2) for values in residuals]
+    texts.append(_format_numbers(times[rows], fine))
+    texts += [_format_numbers(values[rows], digits) for values in (observed, *simulated)]
+    return texts + [_format_numbers(values[rows], 2) for values in residuals]
 
 
-def _written(values: Array, digits: int) -> list[str]:
+def _format_numbers(values: Array, digits: int) -> list[str]:
     """Format numbers with at most this many decimals; empty for missing values."""
     texts = [f"{value:.{digits}f}" if np.isfinite(value) else "" for value in values.tolist()]
     return [text.rstrip("0").rstrip(".") if "." in text else text for text in texts]
@@ -210,12 +210,12 @@ class MotionChart(NamedTuple):
 
 def make_motion_chart(report: DiagnosisReportData) -> MotionChart:
     """Make the chart with its table."""
-    table, places = build_motion_table(report), _places(report)
+    table, places = build_motion_table(report), _list_switches(report)
     is_wide = len(places) > 2 or is_robot(report)
     panels: list[Panel] = []
     for run in table.runs:
         for facets, c in places:
-            panels += _pair(report, run, c, {"run": run.says, **facets}, is_wide)
+            panels += _make_panels(report, run, c, {"run": run.says, **facets}, is_wide)
     toggles = ("joint", "quantity") if is_robot(report) else ("channel",)
     return MotionChart(
         table,
@@ -223,11 +223,11 @@ def make_motion_chart(report: DiagnosisReportData) -> MotionChart:
         2 if is_wide else 1,
         ("Left", "Right") if is_wide else ("Above", "Below"),
         toggles,
-        {toggles[0]: _off(report, places, toggles[0])},
+        {toggles[0]: _list_hidden(report, places, toggles[0])},
     )
 
 
-def _places(report: DiagnosisReportData) -> list[tuple[dict[str, str], int]]:
+def _list_switches(report: DiagnosisReportData) -> list[tuple[dict[str, str], int]]:
     """Return the switches of each channel; for a robot, joint and quantity."""
     if not is_robot(report):
         return [({"channel": sanitise(c.name, 40)}, i) for i, c in enumerate(report.channels)]
@@ -240,7 +240,7 @@ def _places(report: DiagnosisReportData) -> list[tuple[dict[str, str], int]]:
     return places
 
 
-def _off(
+def _list_hidden(
     report: DiagnosisReportData, places: Sequence[tuple[dict[str, str], int]], toggle: str
 ) -> tuple[str, ...]:
     """Return the channels or joints that are hidden at first, if there are many.
@@ -265,7 +265,7 @@ def _off(
     return tuple(name for name in gaps if name not in visible)
 
 
-def _pair(
+def _make_panels(
     report: DiagnosisReportData, run: ShownRun, c: int, facets: dict[str, str], wide: bool
 ) -> tuple[Panel, Panel]:
     """Make two panels of channel number c of a run: its motion, and its residual in noise units.
@@ -295,7 +295,7 @@ def _pair(
         format_label(brief(sanitise(channel.name), 24), channel.unit), scales=("linear",)
     )
     band = (AxisSpan(-2.0, 2.0, "±2σ: 95 % of the noise", along="y"),)
-    tells = _tells(format_unit(channel.unit), channel.sigma, extended)
+    tells = _make_tooltip_lines(format_unit(channel.unit), channel.sigma, extended)
     heights = (_ROW, _ROW) if wide else (_TALL, _LOW)
     above = Panel(
         name,
@@ -325,7 +325,7 @@ def _pair(
     return above, below
 
 
-def _tells(unit: str, sigma: float, extended: bool) -> tuple[TooltipLine, ...]:
+def _make_tooltip_lines(unit: str, sigma: float, extended: bool) -> tuple[TooltipLine, ...]:
     """Return the values that the chart shows at the cursor.
 
     They are the signals in `unit`, and the residuals both in that unit and in units of the noise.

@@ -96,7 +96,7 @@ def format_details(report: DiagnosisReportData) -> Iterator[str]:
     explained = verdict in ("named", "partial")
     for cause in report.verdict.causes:
         name = f"{format_sentence(format_effect(cause.effect))[:-1]} ({sanitise(cause.effect, 60)})"
-        says = "" if explained else f"{_says(cause)}; "
+        says = "" if explained else f"{_describe_within_sentence(cause)}; "
         yield f"{name}: {says}{format_coefficients(cause)}"
     # The most important reasons come first; the page contains all of them.
     if report.why:
@@ -124,7 +124,7 @@ def format_details(report: DiagnosisReportData) -> Iterator[str]:
     yield format_simulation_count(report)
 
 
-def _says(cause: Cause) -> str:
+def _describe_within_sentence(cause: Cause) -> str:
     """Return the description of an effect, to be used within a sentence."""
     return strip_place(sanitise(cause.says).rstrip("."))
 
@@ -151,7 +151,9 @@ def format_headline(report: DiagnosisReportData) -> str:
     if verdict == "ambiguous":
         return f"The simulation {format_lacking(causes)}: these data do not show which."
     if verdict == "partial" and (open_ones := [c for c in causes if c.open_numbers]):
-        return f"The simulation {format_lacking(causes)}, but {_undetermined(open_ones)}."
+        return (
+            f"The simulation {format_lacking(causes)}, but {_format_unconfirmed_reason(open_ones)}."
+        )
     if bordering := report.verdict.bordering:
         (name, first), *_ = bordering.items()
         end = f"the {END[first.at_bound or 'high']} bound of its range"
@@ -165,7 +167,9 @@ def format_headline(report: DiagnosisReportData) -> str:
         remainder = "something else that no known cause explains"
         if len(causes) == 1 and (number_error := format_number_error(causes[0])):
             return format_sentence(f"{number_error}, and the simulation lacks {remainder}")
-        return f"The simulation {format_lacking(causes)}, and {_also(causes)}{remainder}."
+        return (
+            f"The simulation {format_lacking(causes)}, and {_get_linking_verb(causes)}{remainder}."
+        )
     if len(causes) > 1:
         # With several causes the sentence would be too long; their descriptions follow it.
         return f"The simulation {format_lacking([replace(c, alternatives=()) for c in causes])}."
@@ -174,10 +178,11 @@ def format_headline(report: DiagnosisReportData) -> str:
         return format_sentence(number_error)
     if is_overstated(cause):
         return f"The simulation has too much {format_effect(cause.effect)}."
-    return f"The simulation {format_lacking([replace(cause, alternatives=())])}: {_says(cause)}."
+    lacking = format_lacking([replace(cause, alternatives=())])
+    return f"The simulation {lacking}: {_describe_within_sentence(cause)}."
 
 
-def _undetermined(causes: Sequence[Cause]) -> str:
+def _format_unconfirmed_reason(causes: Sequence[Cause]) -> str:
     """Say why causes are not confirmed: their coefficient is at a bound or has no interval."""
     numbers = [n for cause in causes for n in cause.open_numbers.values()]
     at_bounds = [n for n in numbers if n.at_bound is not None]
@@ -218,7 +223,7 @@ def undetermined(report: DiagnosisReportData) -> Iterator[str]:
         )
 
 
-def _also(causes: Sequence[Cause]) -> str:
+def _get_linking_verb(causes: Sequence[Cause]) -> str:
     """Return the verb before a missing effect that follows wrong values."""
     names = [name for cause in causes for name in (cause.effect, *cause.alternatives)]
     return "lacks " if any(is_parameter_error(name) for name in names) else ""
@@ -286,7 +291,8 @@ def format_gain_and_caveats(report: DiagnosisReportData) -> Iterator[str]:
     if verdict == "partial" or (verdict == "named" and len(report.verdict.causes) > 1):
         # The headline describes a single diagnosed cause; several causes are described here.
         sayings = [
-            format_number_error(cause) or f"{format_effect(cause.effect)}: {_says(cause)}"
+            format_number_error(cause)
+            or f"{format_effect(cause.effect)}: {_describe_within_sentence(cause)}"
             for cause in report.verdict.causes
         ]
         yield format_sentence("; ".join(sayings))
@@ -318,9 +324,9 @@ def format_gain(report: DiagnosisReportData) -> str:
     held_out = report.verdict.heldout
     if held_out is None:
         return _format_fitted_gain(report)
-    base = _error(report, held_out.rmse_base)
-    extended = _error(report, held_out.rmse_extended)
-    perfect = f"{PERFECT_MODEL_NOTE} {_error(report, held_out.noise_floor)}"
+    base = _format_error(report, held_out.rmse_base)
+    extended = _format_error(report, held_out.rmse_extended)
+    perfect = f"{PERFECT_MODEL_NOTE} {_format_error(report, held_out.noise_floor)}"
     runs = report.validation_runs
     # Without a cause the extended model is the base model, so there is no error after.
     if not report.verdict.causes:
@@ -329,7 +335,7 @@ def format_gain(report: DiagnosisReportData) -> str:
     if not has_gap_closed(held_out):
         return errors[0].upper() + errors[1:]
     share = f"{format_percent(held_out.gap_closed)} of the gap{format_interval(held_out)}"
-    return f"{_closer(report)} {share}: {errors}"
+    return f"{_format_closed_gap_subject(report)} {share}: {errors}"
 
 
 def has_gap_closed(held_out: HeldOutResult) -> bool:
@@ -345,7 +351,7 @@ def format_interval(held_out: HeldOutResult) -> str:
     return f" ({format_percent(low).removesuffix(' %')} to {format_percent(high)})"
 
 
-def _closer(report: DiagnosisReportData) -> str:
+def _format_closed_gap_subject(report: DiagnosisReportData) -> str:
     """Return the subject and verb of the sentence on how much of the gap is closed."""
     causes = report.verdict.causes
     if report.verdict.verdict == "unknown" and report.verdict.cut is None:
@@ -400,7 +406,7 @@ def get_held_out_unit(report: DiagnosisReportData) -> str:
     return units[0] if len(units) == 1 else "1"
 
 
-def _error(report: DiagnosisReportData, value: float | None) -> str:
+def _format_error(report: DiagnosisReportData, value: float | None) -> str:
     return append_unit(format_number(value), get_held_out_unit(report))
 
 

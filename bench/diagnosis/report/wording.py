@@ -45,10 +45,10 @@ def format_effect(effect: str) -> str:
 
     Effects joined by + become ``a and b``. Unknown effects keep their name.
     """
-    return joined([_noun(part.strip()) for part in effect.split("+")])
+    return joined([_format_effect_as_noun(part.strip()) for part in effect.split("+")])
 
 
-def _noun(name: str) -> str:
+def _format_effect_as_noun(name: str) -> str:
     """Format one effect as a noun with its place, or by its name and description without a noun."""
     base, place = split_effect_name(name)
     if base in NUMERICS_NAMES:

@@ -137,12 +137,12 @@ def apply_causes(
     for cause in sorted(found, key=lambda c: (get_application_order(c), _is_in_series(c))):
         before = {name: values.copy() for name, values in wanted.items()}
         done = {one.place for one in held if _is_in_series(one)}
-        answer = _write(wanted, robot, cause, series if cause.place not in done else {})
+        answer = _write_cause(wanted, robot, cause, series if cause.place not in done else {})
         if answer and not answer.startswith("+"):
             notes.append(f"{cause.format(recording)}: not in the file: {answer}")
             continue
         held.append(cause)
-        note = f"{cause.effect}: {answer[1:]}" if answer else _note(robot, cause)
+        note = f"{cause.effect}: {answer[1:]}" if answer else _find_note(robot, cause)
         if note and note not in notes:
             notes.append(note)
         changed = [
@@ -157,12 +157,12 @@ def apply_causes(
             for actuator in (a for a in robot.actuators if a.joint == cause.place):
                 element = ModelElement("actuator", actuator.id)
                 comments.setdefault(element, []).append(cause.format(recording))
-    spec, model = _compiled(robot, wanted)
+    spec, model = _compile_changed_spec(robot, wanted)
     if any(is_compliant_flank(made)[0] for made in series.values()):
         # The solver parameters of compliant flanks depend on all causes, so they are computed
         # again.
         robot = prepare_flanks_for_file(robot, series, model)
-        spec, model = _compiled(robot, wanted)
+        spec, model = _compile_changed_spec(robot, wanted)
     # Only the text is stored, since a compiled spec holds all meshes a second time.
     text = format_spec(spec, robot.path.resolve().parent)
     del spec
@@ -170,7 +170,7 @@ def apply_causes(
     return ModifiedModel(robot, text, model, wanted, comments, tuple(held), tuple(notes))
 
 
-def _note(robot: RobotModel, cause: FittedCause) -> str | None:
+def _find_note(robot: RobotModel, cause: FittedCause) -> str | None:
     """Return the note about an effect that the file contains; None if there is none."""
     if cause.effect == COULOMB and (robot.friction_form == "soft" or cause.coefficients[0] < 0):
         return _SOFT
@@ -189,17 +189,17 @@ def _in_series(causes: Sequence[FittedCause]) -> dict[str, Transmission]:
     elements: dict[str, list[Transmission]] = {}
     for cause in causes:
         if _is_in_series(cause):
-            elements.setdefault(cause.place, []).append(_element(cause))
+            elements.setdefault(cause.place, []).append(_make_series_element(cause))
     return {place: combine_elements(own) for place, own in elements.items()}
 
 
-def _element(cause: FittedCause) -> Transmission:
+def _make_series_element(cause: FittedCause) -> Transmission:
     """Make the element in series with a joint from the coefficients of a cause."""
     numbers = {name: np.array([number.value]) for name, number in cause.numbers.items()}
     return make_series_element(library.get_effect(cause.effect), numbers)
 
 
-def _write(
+def _write_cause(
     wanted: Fields, robot: RobotModel, cause: FittedCause, series: Mapping[str, Transmission]
 ) -> str | None:
     """Write a cause into the model fields; return None or a reason.
@@ -239,7 +239,7 @@ def _is_in_frame(robot: RobotModel, cause: FittedCause) -> bool:
     return any(one.name == cause.place and one.frame is not None for one in elements)
 
 
-def _compiled(robot: RobotModel, wanted: Fields) -> tuple[Any, Any]:
+def _compile_changed_spec(robot: RobotModel, wanted: Fields) -> tuple[Any, Any]:
     """Change a copy of the robot's spec until it compiles to the wanted fields.
 
     Several rounds are needed, because a change may also modify values that should stay.
@@ -321,10 +321,10 @@ def set_attributes(element: Any, statement: AttributeStatement) -> None:
         elif kind == "frame" and name == "pos":
             value = _in_frames(element, values)
         else:
-            value = _numbers(element, name, known[name], values)
+            value = _convert_to_attribute(element, name, known[name], values)
         setattr(element, known[name], value)
     if kind == "body":
-        _explicit(element)
+        _make_inertia_explicit(element)
     if kind == "joint" and {"damping", "stiffness"} & set(statement.values):
         element.springdamper = (0.0, 0.0)
 
@@ -345,7 +345,7 @@ def _in_frames(body: Any, position: Sequence[float]) -> Array:
     return result
 
 
-def _numbers(element: Any, name: str, attribute: str, values: Sequence[float]) -> Any:
+def _convert_to_attribute(element: Any, name: str, attribute: str, values: Sequence[float]) -> Any:
     """Convert values to the form of a spec attribute: a number, or an array padded with zeros.
 
     Angles of a hinge are converted to degrees if the spec's compiler uses degrees.
@@ -362,7 +362,7 @@ def _numbers(element: Any, name: str, attribute: str, values: Sequence[float]) -
     return padded
 
 
-def _explicit(body: Any) -> None:
+def _make_inertia_explicit(body: Any) -> None:
     """Make MuJoCo's compiler use the mass and principal moments that were set for a body.
 
     Otherwise a full inertia tensor or an orientation from the file would take precedence.

@@ -49,15 +49,17 @@ class _Actuator:
         self.control = int(robot.compiled.actuator_ctrladr[self.id])
         self.single = int(robot.compiled.actuator_ctrlnum[self.id]) == 1
         self.fields = fields
-        self.direct = self._of("actuator_dyntype") == int(mujoco.mjtDyn.mjDYN_NONE)
+        self.direct = self._get_integer_field("actuator_dyntype") == int(mujoco.mjtDyn.mjDYN_NONE)
         self.clamped = bool(robot.compiled.actuator_actlimited[self.id])
-        self.fixed = self._of("actuator_gaintype") == int(mujoco.mjtGain.mjGAIN_FIXED)
+        self.fixed = self._get_integer_field("actuator_gaintype") == int(
+            mujoco.mjtGain.mjGAIN_FIXED
+        )
         self.gain = fields["actuator_gainprm"][0, self.id]
         self.bias = fields["actuator_biasprm"][0, self.id]
         # The factor 1 + a and the offset b of (1) from causes that are in the fields already.
-        self.command = fields.setdefault("command", _commands(robot))[0, self.id]
+        self.command = fields.setdefault("command", _get_command_scaling(robot))[0, self.id]
 
-    def _of(self, name: str) -> int:
+    def _get_integer_field(self, name: str) -> int:
         return int(self.fields[name][0, self.id])
 
     @property
@@ -71,7 +73,7 @@ class _Actuator:
         import mujoco
 
         kinds = (int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE))
-        return self._of("actuator_biastype") in kinds
+        return self._get_integer_field("actuator_biastype") in kinds
 
     @property
     def filtered(self) -> bool:
@@ -79,13 +81,13 @@ class _Actuator:
         import mujoco
 
         kinds = (int(mujoco.mjtDyn.mjDYN_FILTER), int(mujoco.mjtDyn.mjDYN_FILTEREXACT))
-        return self._of("actuator_dyntype") in kinds and not self.clamped
+        return self._get_integer_field("actuator_dyntype") in kinds and not self.clamped
 
     def shift(self, force: float) -> None:
         """Add a constant force in N or N m to the force that the actuator computes."""
         import mujoco
 
-        if self._of("actuator_biastype") == int(mujoco.mjtBias.mjBIAS_NONE):
+        if self._get_integer_field("actuator_biastype") == int(mujoco.mjtBias.mjBIAS_NONE):
             # Bias parameters of an actuator without a bias type have no effect.
             self.bias[:] = 0.0
             self.fields["actuator_biastype"][0, self.id] = int(mujoco.mjtBias.mjBIAS_AFFINE)
@@ -105,7 +107,7 @@ class _Actuator:
             self.fields["actuator_ctrlrange"][0, self.control] = (low, high)
 
 
-def _commands(robot: RobotModel) -> Any:
+def _get_command_scaling(robot: RobotModel) -> Any:
     """Return the unchanged factor and offset (1, N, 2) of each actuator's command."""
     return np.array([[(1.0, 0.0)] * len(robot.compiled.actuator_ctrlnum)])
 
@@ -113,7 +115,7 @@ def _commands(robot: RobotModel) -> Any:
 _NOT_LINEAR = "its actuator is not a gain and a bias of one control"
 
 
-def _gain(fields: Fields, robot: RobotModel, cause: FittedCause) -> UnstatableReason:
+def _write_input_gain(fields: Fields, robot: RobotModel, cause: FittedCause) -> UnstatableReason:
     """Write an input gain into the actuator: scale its gain (1), and its control range (2)."""
     actuator, (a,) = _Actuator(fields, robot, cause.place), cause.coefficients
     scaled = actuator.single and actuator.fixed and (actuator.direct or actuator.filtered)
@@ -128,7 +130,7 @@ def _gain(fields: Fields, robot: RobotModel, cause: FittedCause) -> UnstatableRe
     return None
 
 
-def _bias(fields: Fields, robot: RobotModel, cause: FittedCause) -> UnstatableReason:
+def _write_input_bias(fields: Fields, robot: RobotModel, cause: FittedCause) -> UnstatableReason:
     """Write an input bias into the actuator: shift its force (1), and its control range (2).
 
     `share` is the factor 1 + a of an input gain that is in the fields already.
@@ -144,7 +146,7 @@ def _bias(fields: Fields, robot: RobotModel, cause: FittedCause) -> UnstatableRe
     return None
 
 
-def _saturation(fields: Fields, robot: RobotModel, cause: FittedCause) -> UnstatableReason:
+def _write_saturation(fields: Fields, robot: RobotModel, cause: FittedCause) -> UnstatableReason:
     """Write a saturation of the input at ±s as a narrower control range of the actuator (2).
 
     A saturation s of zero or less has no effect, as in the simulation.
@@ -163,7 +165,7 @@ def _saturation(fields: Fields, robot: RobotModel, cause: FittedCause) -> Unstat
     return None
 
 
-def _delay(fields: Fields, robot: RobotModel, cause: FittedCause) -> UnstatableReason:
+def _write_delay(fields: Fields, robot: RobotModel, cause: FittedCause) -> UnstatableReason:
     """Write an input delay in seconds into the actuator's delay and history buffer.
 
     The returned text begins with +, which marks a note about a cause that was written.
@@ -187,7 +189,7 @@ def _delay(fields: Fields, robot: RobotModel, cause: FittedCause) -> UnstatableR
     )
 
 
-def _lag(fields: Fields, robot: RobotModel, cause: FittedCause) -> UnstatableReason:
+def _write_lag(fields: Fields, robot: RobotModel, cause: FittedCause) -> UnstatableReason:
     """Write a first-order lag of the input as an exact activation filter (FILTEREXACT) of MuJoCo.
 
     `lag` is the time constant in seconds. The returned text begins with +, which marks a note
@@ -210,7 +212,9 @@ def _lag(fields: Fields, robot: RobotModel, cause: FittedCause) -> UnstatableRea
     )
 
 
-def _force(fields: Fields, robot: RobotModel, cause: FittedCause) -> UnstatableReason:
+def _write_constant_force(
+    fields: Fields, robot: RobotModel, cause: FittedCause
+) -> UnstatableReason:
     """Write a constant force at a joint into the model, in N or N m.
 
     A joint with a linear spring gets another rest position: force = stiffness times
@@ -243,14 +247,14 @@ def _force(fields: Fields, robot: RobotModel, cause: FittedCause) -> UnstatableR
     return "MuJoCo has no constant force at a joint without a spring or an actuator free of limits"
 
 
-def _step(fields: Fields, robot: RobotModel, cause: FittedCause) -> UnstatableReason:  # noqa: ARG001
+def _write_time_step(fields: Fields, robot: RobotModel, cause: FittedCause) -> UnstatableReason:  # noqa: ARG001
     """Write a time step in seconds as the option of the model file."""
     (step,) = cause.coefficients
     fields["opt.timestep"][0] = step
     return None
 
 
-def _integrator(fields: Fields, robot: RobotModel, cause: FittedCause) -> UnstatableReason:  # noqa: ARG001
+def _write_integrator(fields: Fields, robot: RobotModel, cause: FittedCause) -> UnstatableReason:  # noqa: ARG001
     """Write MuJoCo's number of an integrator as the option of the model file."""
     (number,) = cause.coefficients
     fields["opt.integrator"][0] = int(number)
@@ -260,14 +264,14 @@ def _integrator(fields: Fields, robot: RobotModel, cause: FittedCause) -> Unstat
 CommandWriter = Callable[[Fields, RobotModel, FittedCause], UnstatableReason]
 
 COMMAND_WRITERS: Mapping[str, CommandWriter] = {
-    "numerics.step": _step,
-    "numerics.integrator": _integrator,
-    "input.gain": _gain,
-    "input.bias": _bias,
-    "input.saturation": _saturation,
-    "input.delay": _delay,
-    "input.lag": _lag,
-    "force.bias": _force,
+    "numerics.step": _write_time_step,
+    "numerics.integrator": _write_integrator,
+    "input.gain": _write_input_gain,
+    "input.bias": _write_input_bias,
+    "input.saturation": _write_saturation,
+    "input.delay": _write_delay,
+    "input.lag": _write_lag,
+    "force.bias": _write_constant_force,
 }
 """Writers by effect: model changes, then effects in the order in which a command passes them."""
 

@@ -41,13 +41,13 @@ def render_default_class(
         name: name of the class.
         notes: further comments.
     """
-    lines = [f'<default class="{name}">', *(f"  {_comment(note)}" for note in notes)]
+    lines = [f'<default class="{name}">', *(f"  {_format_comment(note)}" for note in notes)]
     elements = [ModelElement("joint", joint)]
     elements += [] if actuator is None else [ModelElement("actuator", actuator)]
     for element in elements:
         told = applied.comments.get(element, [])
-        lines += [f"  {_comment(text)}" for text in dict.fromkeys(told)]
-        tag, stated = _stated(
+        lines += [f"  {_format_comment(text)}" for text in dict.fromkeys(told)]
+        tag, stated = _format_default_element(
             element, list_all_attributes(applied.model, element, applied.target_values)
         )
         said = "".join(f' {key}="{value}"' for key, value in stated.items())
@@ -55,7 +55,9 @@ def render_default_class(
     return "\n".join([*lines, "</default>"])
 
 
-def _stated(element: ModelElement, values: Mapping[str, Values]) -> tuple[str, dict[str, str]]:
+def _format_default_element(
+    element: ModelElement, values: Mapping[str, Values]
+) -> tuple[str, dict[str, str]]:
     """Return the tag of an element in a default class, and its attributes as text."""
     own = {
         name: value
@@ -120,7 +122,7 @@ def render_model_using_class(
         tag = tags[element]
         tag.new["class"] = name
         tag.removed |= {a.name for a in ATTRIBUTES_BY_KIND["actuator"]} | set(SHORTCUT_ATTRIBUTES)
-        tag.renamed, _ = _stated(
+        tag.renamed, _ = _format_default_element(
             element, list_all_attributes(applied.model, element, applied.target_values)
         )
     if not any(one.name in FILE_ELEMENTS for one in document.walk()):
@@ -136,7 +138,7 @@ def render_model_using_class(
     return written
 
 
-def _comment(text: str) -> str:
+def _format_comment(text: str) -> str:
     """Render text as an XML comment."""
     # Two hyphens would end an XML comment early.
     safe = text.replace("--", "- -")

@@ -66,7 +66,7 @@ class MjcfAttribute(NamedTuple):
     read: Callable[[Fields, Any], Any]
 
 
-def _of(name: str, address: str = "id") -> Callable[[Fields, Any], Any]:
+def _make_reader(name: str, address: str = "id") -> Callable[[Fields, Any], Any]:
     return lambda fields, where: fields[name][0, getattr(where, address)]
 
 
@@ -86,7 +86,7 @@ class FieldAddress(NamedTuple):
     control: int = 0
 
 
-def _polynomial(
+def _make_polynomial_reader(
     first: str, others: str, address: str = "id"
 ) -> Callable[[Fields, Any], list[float]]:
     """Return a reader of a polynomial attribute: its linear coefficient, then the others.
@@ -106,39 +106,45 @@ def _polynomial(
 ATTRIBUTES_BY_KIND: Mapping[Kind, tuple[MjcfAttribute, ...]] = {
     "joint": (
         MjcfAttribute(
-            "damping", "damping", _polynomial("dof_damping", "dof_dampingpoly", "velocity")
+            "damping",
+            "damping",
+            _make_polynomial_reader("dof_damping", "dof_dampingpoly", "velocity"),
         ),
-        MjcfAttribute("frictionloss", "frictionloss", _of("dof_frictionloss", "velocity")),
-        MjcfAttribute("solreffriction", "solref_friction", _of("dof_solref", "velocity")),
-        MjcfAttribute("solimpfriction", "solimp_friction", _of("dof_solimp", "velocity")),
-        MjcfAttribute("stiffness", "stiffness", _polynomial("jnt_stiffness", "jnt_stiffnesspoly")),
-        MjcfAttribute("springref", "springref", _of("qpos_spring", "position")),
-        MjcfAttribute("armature", "armature", _of("dof_armature", "velocity")),
-        MjcfAttribute("axis", "axis", _of("jnt_axis")),
-        MjcfAttribute("ref", "ref", _of("qpos0", "position")),
+        MjcfAttribute("frictionloss", "frictionloss", _make_reader("dof_frictionloss", "velocity")),
+        MjcfAttribute("solreffriction", "solref_friction", _make_reader("dof_solref", "velocity")),
+        MjcfAttribute("solimpfriction", "solimp_friction", _make_reader("dof_solimp", "velocity")),
+        MjcfAttribute(
+            "stiffness", "stiffness", _make_polynomial_reader("jnt_stiffness", "jnt_stiffnesspoly")
+        ),
+        MjcfAttribute("springref", "springref", _make_reader("qpos_spring", "position")),
+        MjcfAttribute("armature", "armature", _make_reader("dof_armature", "velocity")),
+        MjcfAttribute("axis", "axis", _make_reader("jnt_axis")),
+        MjcfAttribute("ref", "ref", _make_reader("qpos0", "position")),
     ),
     "body": (
-        MjcfAttribute("pos", "ipos", _of("body_ipos")),
-        MjcfAttribute("quat", "iquat", _of("body_iquat")),
-        MjcfAttribute("mass", "mass", _of("body_mass")),
-        MjcfAttribute("diaginertia", "inertia", _of("body_inertia")),
+        MjcfAttribute("pos", "ipos", _make_reader("body_ipos")),
+        MjcfAttribute("quat", "iquat", _make_reader("body_iquat")),
+        MjcfAttribute("mass", "mass", _make_reader("body_mass")),
+        MjcfAttribute("diaginertia", "inertia", _make_reader("body_inertia")),
     ),
     "frame": (
-        MjcfAttribute("pos", "pos", _of("body_pos")),
-        MjcfAttribute("gravcomp", "gravcomp", _of("body_gravcomp")),
+        MjcfAttribute("pos", "pos", _make_reader("body_pos")),
+        MjcfAttribute("gravcomp", "gravcomp", _make_reader("body_gravcomp")),
     ),
     "actuator": (
-        MjcfAttribute("dyntype", "dyntype", _of("actuator_dyntype")),
-        MjcfAttribute("dynprm", "dynprm", _of("actuator_dynprm")),
-        MjcfAttribute("gaintype", "gaintype", _of("actuator_gaintype")),
-        MjcfAttribute("gainprm", "gainprm", _of("actuator_gainprm")),
-        MjcfAttribute("biastype", "biastype", _of("actuator_biastype")),
-        MjcfAttribute("biasprm", "biasprm", _of("actuator_biasprm")),
-        MjcfAttribute("ctrllimited", "ctrllimited", _of("actuator_ctrllimited", "control")),
-        MjcfAttribute("ctrlrange", "ctrlrange", _of("actuator_ctrlrange", "control")),
-        MjcfAttribute("forcelimited", "forcelimited", _of("actuator_forcelimited")),
-        MjcfAttribute("forcerange", "forcerange", _of("actuator_forcerange")),
-        MjcfAttribute("delay", "delay", _of("actuator_delay")),
+        MjcfAttribute("dyntype", "dyntype", _make_reader("actuator_dyntype")),
+        MjcfAttribute("dynprm", "dynprm", _make_reader("actuator_dynprm")),
+        MjcfAttribute("gaintype", "gaintype", _make_reader("actuator_gaintype")),
+        MjcfAttribute("gainprm", "gainprm", _make_reader("actuator_gainprm")),
+        MjcfAttribute("biastype", "biastype", _make_reader("actuator_biastype")),
+        MjcfAttribute("biasprm", "biasprm", _make_reader("actuator_biasprm")),
+        MjcfAttribute(
+            "ctrllimited", "ctrllimited", _make_reader("actuator_ctrllimited", "control")
+        ),
+        MjcfAttribute("ctrlrange", "ctrlrange", _make_reader("actuator_ctrlrange", "control")),
+        MjcfAttribute("forcelimited", "forcelimited", _make_reader("actuator_forcelimited")),
+        MjcfAttribute("forcerange", "forcerange", _make_reader("actuator_forcerange")),
+        MjcfAttribute("delay", "delay", _make_reader("actuator_delay")),
         MjcfAttribute("nsample", "nsample", lambda f, where: f["actuator_history"][0, where.id, 0]),
         MjcfAttribute("interp", "interp", lambda f, where: f["actuator_history"][0, where.id, 1]),
     ),
@@ -247,7 +253,7 @@ def find_differing_statements(
         values = {}
         for attribute in ATTRIBUTES_BY_KIND[element.kind]:
             is_now, should = attribute.read(found, at), attribute.read(wanted, at)
-            if not _same(is_now, should, tolerance):
+            if not _is_equal(is_now, should, tolerance):
                 values[attribute.name] = tuple(float(v) for v in np.atleast_1d(should))
         if element.kind == "body" and values:
             # An inertial must be written with all its attributes.
@@ -272,7 +278,7 @@ def list_all_attributes(model: Any, element: ModelElement, wanted: Fields) -> di
     }
 
 
-def _same(one: Any, other: Any, tolerance: float) -> bool:
+def _is_equal(one: Any, other: Any, tolerance: float) -> bool:
     """Return whether two arrays are equal to within `tolerance` times the largest entry."""
     one, other = np.asarray(one, dtype=float), np.asarray(other, dtype=float)
     if one.shape != other.shape:

@@ -38,9 +38,9 @@ class MjcfDocument:
         self.main = XmlText(text, path)
         self.root = self.main.root
         self._included: dict[XmlElement, XmlText] = {}
-        self._include(self.root)
+        self._read_included_files(self.root)
 
-    def _include(self, root: XmlElement) -> None:
+    def _read_included_files(self, root: XmlElement) -> None:
         """Read the included files below an element, and those that they include in turn.
 
         All names are relative to the folder of the outer file, as in MuJoCo.
@@ -55,7 +55,7 @@ class MjcfDocument:
             except OSError:
                 raise NotEditableError(f"{name} cannot be read") from None
             self._included[tag] = inner
-            self._include(inner.root)
+            self._read_included_files(inner.root)
 
     def children(self, tag: XmlElement) -> Iterator[XmlElement]:
         """Yield the children of an element, including those from included files."""
@@ -90,25 +90,29 @@ class MjcfDocument:
         bodies: list[XmlElement] = []
         joints: list[XmlElement] = []
         for world in self.find_elements("worldbody"):
-            self._body(world, bodies, joints)
+            self._collect_bodies(world, bodies, joints)
         actuators = [
             child for tag in self.find_elements("actuator") for child in self.children(tag)
         ]
         found = {ModelElement("body", i + 1): tag for i, tag in enumerate(bodies)}
         found |= {ModelElement("joint", i): tag for i, tag in enumerate(joints)}
         found |= {ModelElement("actuator", i): tag for i, tag in enumerate(actuators)}
-        _compare(found, model, (len(bodies) + 1, len(joints), len(actuators)))
+        _compare_with_model(found, model, (len(bodies) + 1, len(joints), len(actuators)))
         return found
 
-    def _body(self, tag: XmlElement, bodies: list[XmlElement], joints: list[XmlElement]) -> None:
+    def _collect_bodies(
+        self, tag: XmlElement, bodies: list[XmlElement], joints: list[XmlElement]
+    ) -> None:
         """Collect bodies depth first, and the joints of each body before those of its children."""
         below: list[XmlElement] = []
-        self._within(tag, below, joints)
+        self._append_children(tag, below, joints)
         for body in below:
             bodies.append(body)
-            self._body(body, bodies, joints)
+            self._collect_bodies(body, bodies, joints)
 
-    def _within(self, tag: XmlElement, bodies: list[XmlElement], joints: list[XmlElement]) -> None:
+    def _append_children(
+        self, tag: XmlElement, bodies: list[XmlElement], joints: list[XmlElement]
+    ) -> None:
         """Append the bodies and joints directly within a body to the two lists, in document order.
 
         A frame only groups its contents, so they count as contents of the body.
@@ -119,7 +123,7 @@ class MjcfDocument:
             elif child.name in ("joint", "freejoint"):
                 joints.append(child)
             elif child.name == "frame":
-                self._within(child, bodies, joints)
+                self._append_children(child, bodies, joints)
 
     def make_paths_absolute(self, folder: Path) -> bool:
         """Make asset folders absolute, so that the text can be loaded from anywhere.
@@ -135,10 +139,10 @@ class MjcfDocument:
             for tag in self.walk()
         )
         if named:
-            self._directories(folder)
+            self._write_absolute_folders(folder)
         return named
 
-    def _directories(self, folder: Path) -> None:
+    def _write_absolute_folders(self, folder: Path) -> None:
         """Write absolute mesh and texture folders, so that the document can be stored elsewhere.
 
         `folder` is the folder of the model file; the stated directories are relative to it.
@@ -160,10 +164,10 @@ class MjcfDocument:
 
     def to_text(self) -> str:
         """Return the text with all changes; changed files replace their include elements."""
-        self._settle(self.root)
+        self._prepare_includes(self.root)
         return self.main.to_text().decode()
 
-    def _settle(self, root: XmlElement) -> None:
+    def _prepare_includes(self, root: XmlElement) -> None:
         """Prepare each include element for writing, included files first.
 
         A changed file is inserted in place of its include element, between two comments. An
@@ -173,7 +177,7 @@ class MjcfDocument:
             inner = self._included.get(tag)
             if inner is None:
                 continue
-            self._settle(inner.root)
+            self._prepare_includes(inner.root)
             name = tag.attributes["file"]
             if inner.root.has_changes:
                 tag.before = [f"from here: {name}, with changes"]
@@ -182,7 +186,7 @@ class MjcfDocument:
                 tag.new["file"] = str((self.path.parent / name).resolve())
 
 
-def _compare(
+def _compare_with_model(
     found: dict[ModelElement, XmlElement], model: Any, counts: tuple[int, int, int]
 ) -> None:
     """Raise an error if elements differ from those of the compiled model."""

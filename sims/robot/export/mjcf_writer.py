@@ -70,7 +70,7 @@ class MjcfWriter:
         """
         element = statement.element
         if element.kind == "option":
-            self._option(statement, comments)
+            self._write_option(statement, comments)
         elif element.kind == "frame":
             body = self.tags[ModelElement("body", element.id)]
             _add_comments(body, comments)
@@ -78,16 +78,16 @@ class MjcfWriter:
         elif element.kind == "body":
             if statement.values:
                 self._keep_masses()
-            self._inertial(self.tags[element], statement, comments)
+            self._write_inertial(self.tags[element], statement, comments)
         else:
             tag = self.tags[element]
             _add_comments(tag, comments)
-            values = self._joint(tag, statement)
+            values = self._format_joint(tag, statement)
             if element.kind == "actuator":
-                values = self._actuator(tag, statement)
+                values = self._format_actuator(tag, statement)
             tag.new |= values
 
-    def _option(self, statement: AttributeStatement, comments: Sequence[str]) -> None:
+    def _write_option(self, statement: AttributeStatement, comments: Sequence[str]) -> None:
         """Write global options, such as gravity, into the last option element or a new one."""
         options, values = self.document.find_elements("option"), format_attributes(statement.values)
         if options:
@@ -107,7 +107,7 @@ class MjcfWriter:
             if float(compiler.get_attribute("settotalmass") or -1) > 0:
                 compiler.new["settotalmass"] = format_number(float(self.wanted["body_mass"].sum()))
 
-    def _inertial(
+    def _write_inertial(
         self, body: XmlElement, statement: AttributeStatement, comments: Sequence[str]
     ) -> None:
         """Write mass, centre of mass and inertia into the (perhaps new) inertial of a body.
@@ -122,7 +122,7 @@ class MjcfWriter:
                 _add_comments(child, comments)
                 if not values:
                     return
-                before = self._before(statement.element)
+                before = self._list_attributes_before(statement.element)
                 changed = {
                     name for name, stated in statement.values.items() if stated != before[name]
                 }
@@ -139,10 +139,10 @@ class MjcfWriter:
         attributes = " ".join(f'{name}="{value}"' for name, value in values.items())
         body.within.append((list(comments), f"<inertial {attributes}/>"))
 
-    def _before(self, element: ModelElement) -> Mapping[str, Values]:
+    def _list_attributes_before(self, element: ModelElement) -> Mapping[str, Values]:
         return list_all_attributes(self.model, element, copy_model_fields(self.model))
 
-    def _joint(self, tag: XmlElement, statement: AttributeStatement) -> dict[str, str]:
+    def _format_joint(self, tag: XmlElement, statement: AttributeStatement) -> dict[str, str]:
         """Return the attributes of a joint as text, with hinge angles in the document's unit.
 
         The attribute springdamper would override stiffness and damping, so it is set to
@@ -156,7 +156,7 @@ class MjcfWriter:
             values["springdamper"] = "0 0"
         return values
 
-    def _actuator(self, tag: XmlElement, statement: AttributeStatement) -> dict[str, str]:
+    def _format_actuator(self, tag: XmlElement, statement: AttributeStatement) -> dict[str, str]:
         """Return the attributes of an actuator as text, and keep its element name if possible.
 
         Names such as position or motor are shortcuts for a general actuator. If the
@@ -164,8 +164,8 @@ class MjcfWriter:
         the attributes that it needs.
         """
         changed = statement.values
-        before = {} if statement.insisted else self._before(statement.element)
-        own = _shortcut(
+        before = {} if statement.insisted else self._list_attributes_before(statement.element)
+        own = _format_shortcut(
             tag.name,
             list_all_attributes(self.model, statement.element, self.wanted),
             changed,
@@ -179,20 +179,20 @@ class MjcfWriter:
             tag.renamed = "general"
             tag.removed |= set(SHORTCUT_ATTRIBUTES)
             stated = list_all_attributes(self.model, statement.element, self.wanted)
-            changed = {k: v for k, v in stated.items() if k in changed or _needed(k, v)}
+            changed = {k: v for k, v in stated.items() if k in changed or _is_needed(k, v)}
             if tag.name in _INPUTS and hasattr(self.model, "actuator_ctrlspec"):
                 tag.new["input"] = _INPUTS[tag.name]
         return format_attributes(changed)
 
 
-def _needed(name: str, values: tuple[float, ...]) -> bool:
+def _is_needed(name: str, values: tuple[float, ...]) -> bool:
     """Return whether ``general`` must specify an attribute that a shortcut implies."""
     if name in ("dyntype", "gaintype", "biastype", "gainprm", "biasprm"):
         return True
     return name in ("dynprm", "ctrllimited", "ctrlrange") and any(values)
 
 
-def _shortcut(
+def _format_shortcut(
     name: str,
     stated: Mapping[str, Values],
     changed: Mapping[str, Values],
@@ -234,10 +234,10 @@ def _add_comments(tag: XmlElement, comments: Sequence[str]) -> None:
 
 def format_attributes(values: Mapping[str, Values]) -> dict[str, str]:
     """Format values as text of attributes."""
-    return {name: _text(name, stated) for name, stated in values.items()}
+    return {name: _format_values(name, stated) for name, stated in values.items()}
 
 
-def _text(name: str, values: tuple[float, ...]) -> str:
+def _format_values(name: str, values: tuple[float, ...]) -> str:
     """Format the numbers of an attribute for MJCF: word, true or false, integer or list."""
     if name in ENUM_ATTRIBUTES or name == "interp":
         return get_enum_word(name, values[0])

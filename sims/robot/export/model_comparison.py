@@ -35,7 +35,7 @@ def format_spec(spec: Any, folder: Path) -> str:
     spec.texturedir = str(folder / spec.texturedir)
     spec.compiler.savecompiled = False
     spec.compiler.savecanonical = False
-    library = _library()
+    library = _load_library()
     try:
         digits = library._mjPRIVATE__get_xml_precision()
         library._mjPRIVATE__set_xml_precision(EXACT_DIGITS)
@@ -48,7 +48,7 @@ def format_spec(spec: Any, folder: Path) -> str:
 
 
 @cache
-def _library() -> Any:
+def _load_library() -> Any:
     """Load MuJoCo's shared library; its Python module does not expose the number of digits."""
     import mujoco
 
@@ -76,12 +76,14 @@ def find_first_difference(one: Any, other: Any, tolerance: float) -> str | None:
             if name.startswith("_") or any(part in name for part in _TEXTS):
                 continue
             mine, others = getattr(this, name), getattr(that, name)
-            if isinstance(mine, np.ndarray | int | float) and _differ(mine, others, tolerance):
-                return f"{prefix}{name}: {_shown(mine, others)}"
+            if isinstance(mine, np.ndarray | int | float) and _fields_differ(
+                mine, others, tolerance
+            ):
+                return f"{prefix}{name}: {_format_difference(mine, others)}"
     return None
 
 
-def _differ(one: Any, other: Any, tolerance: float) -> bool:
+def _fields_differ(one: Any, other: Any, tolerance: float) -> bool:
     """Return whether two fields of compiled models differ in shape or in value.
 
     Floating-point numbers may differ by `tolerance` times the largest entry of both arrays;
@@ -97,7 +99,7 @@ def _differ(one: Any, other: Any, tolerance: float) -> bool:
     return not bool((near | (one == other)).all())
 
 
-def _shown(one: Any, other: Any) -> str:
+def _format_difference(one: Any, other: Any) -> str:
     """Format the largest difference of two fields as "value and value", or both shapes."""
     one, other = np.asarray(one), np.asarray(other)
     if one.shape != other.shape:

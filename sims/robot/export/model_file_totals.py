@@ -34,25 +34,25 @@ It takes the model fields, the robot and the place.
 """
 
 
-def _joint(field: str, *index: int) -> Read:
+def _make_dof_reader(field: str, *index: int) -> Read:
     return lambda f, r, place: [f[field][(0, r.joint(place).velocity, *index)]]
 
 
-def _spring(field: str, *index: int) -> Read:
+def _make_joint_reader(field: str, *index: int) -> Read:
     return lambda f, r, place: [f[field][(0, r.joint(place).id, *index)]]
 
 
-def _servo(term: int) -> Read:
+def _make_servo_reader(term: int) -> Read:
     return lambda f, r, place: [-f["actuator_biasprm"][0, r.actuator(place).id, term]]
 
 
-def _strength(f: Fields, robot: RobotModel, place: str) -> Sequence[float]:  # noqa: ARG001
+def _get_gravity_strength(f: Fields, robot: RobotModel, place: str) -> Sequence[float]:  # noqa: ARG001
     """Return the component of gravity along the direction that the file specifies."""
     stated = robot.compiled.opt.gravity
     return [float(f["opt.gravity"][0] @ stated / max(np.linalg.norm(stated), 1e-300))]
 
 
-def _limit(f: Fields, robot: RobotModel, place: str) -> Sequence[float]:
+def _get_force_limit(f: Fields, robot: RobotModel, place: str) -> Sequence[float]:
     """Return the upper force limit of an actuator in a list of one; infinite if none."""
     number = robot.actuator(place).id
     limited = f["actuator_forcelimited"][0, number]
@@ -74,15 +74,15 @@ class Reading(NamedTuple):
 
 
 _TOTALS: Mapping[str, Reading] = {
-    "drag.linear": Reading(_joint("dof_damping")),
-    "drag.quadratic": Reading(_joint("dof_dampingpoly", 0)),
-    "friction.coulomb": Reading(_joint("dof_frictionloss")),
-    "inertia.armature": Reading(_joint("dof_armature")),
-    "spring.linear": Reading(_spring("jnt_stiffness")),
-    "spring.cubic": Reading(_spring("jnt_stiffnesspoly", 1)),
-    "actuator.limit": Reading(_limit),
-    "actuator.stiffness": Reading(_servo(1), "N*m/rad", "N/m"),
-    "actuator.damping": Reading(_servo(2), "N*m*s/rad", "N*s/m"),
+    "drag.linear": Reading(_make_dof_reader("dof_damping")),
+    "drag.quadratic": Reading(_make_dof_reader("dof_dampingpoly", 0)),
+    "friction.coulomb": Reading(_make_dof_reader("dof_frictionloss")),
+    "inertia.armature": Reading(_make_dof_reader("dof_armature")),
+    "spring.linear": Reading(_make_joint_reader("jnt_stiffness")),
+    "spring.cubic": Reading(_make_joint_reader("jnt_stiffnesspoly", 1)),
+    "actuator.limit": Reading(_get_force_limit),
+    "actuator.stiffness": Reading(_make_servo_reader(1), "N*m/rad", "N/m"),
+    "actuator.damping": Reading(_make_servo_reader(2), "N*m*s/rad", "N*s/m"),
     "mass.scale": Reading(lambda f, r, place: [f["body_mass"][0, r.body(place).id]], "kg"),
     "mass.offset": Reading(lambda f, r, place: f["body_ipos"][0, r.body(place).id]),
     # The largest of the three principal moments represents the tensor.
@@ -96,7 +96,7 @@ _TOTALS: Mapping[str, Reading] = {
         lambda f, r, place: [float(np.linalg.norm(f["body_pos"][0, r.body(place).id]))], "m"
     ),
     "gravity.compensation": Reading(lambda f, r, place: [f["body_gravcomp"][0, r.body(place).id]]),
-    "gravity.scale": Reading(_strength, "m/s^2"),
+    "gravity.scale": Reading(_get_gravity_strength, "m/s^2"),
     "gravity.tilt": Reading(lambda f, *_: f["opt.gravity"][0, :2], "m/s^2"),
 }
 
@@ -119,18 +119,18 @@ def totals(robot: RobotModel, fitted: Fitted) -> list[list[Total | None]]:
         For each effect, one entry per coefficient; None if the file has no such number.
     """
     stated, after = copy_model_fields(robot.compiled), copy_model_fields(robot.compiled)
-    for effect, values in sorted(fitted, key=lambda one: get_write_order(_name(one[0]))):
-        if _name(effect) in _TOTALS:
+    for effect, values in sorted(fitted, key=lambda one: get_write_order(_get_effect_name(one[0]))):
+        if _get_effect_name(effect) in _TOTALS:
             c = np.array(values, dtype=float)[:, None]
-            MODEL_FIELD_EFFECTS[_name(effect)].write(after, robot, effect.place, c)
-    return [_totals(robot, effect, len(values), stated, after) for effect, values in fitted]
+            MODEL_FIELD_EFFECTS[_get_effect_name(effect)].write(after, robot, effect.place, c)
+    return [_list_totals(robot, effect, len(values), stated, after) for effect, values in fitted]
 
 
-def _name(effect: type[Effect]) -> str:
+def _get_effect_name(effect: type[Effect]) -> str:
     return effect.of or effect.name
 
 
-def _totals(
+def _list_totals(
     robot: RobotModel, effect: type[Effect], count: int, stated: Fields, after: Fields
 ) -> list[Total | None]:
     """Return what the numbers of the file become with one effect, for each of its coefficients.
@@ -145,19 +145,21 @@ def _totals(
         stated: fields of the model file.
         after: fields with the effect.
     """
-    if _name(effect) not in _TOTALS:
+    if _get_effect_name(effect) not in _TOTALS:
         return [None] * count
-    reading = _TOTALS[_name(effect)]
+    reading = _TOTALS[_get_effect_name(effect)]
     found: list[Total | None] = []
     pairs = (np.array(reading.read(f, robot, effect.place), dtype=float) for f in (stated, after))
     for c, before, total in zip(effect.coefficients, *pairs, strict=True):
-        unit = (reading.slide if _slides(robot, effect) else "") or reading.hinge or c.units[0]
+        unit = (
+            (reading.slide if _acts_on_slide(robot, effect) else "") or reading.hinge or c.units[0]
+        )
         known = np.isfinite([before, total]).all()
         found.append(Total(float(before), float(total), unit or "1") if known else None)
     return found
 
 
-def _slides(robot: RobotModel, effect: type[Effect]) -> bool:
+def _acts_on_slide(robot: RobotModel, effect: type[Effect]) -> bool:
     """Return whether an effect acts at an actuator of a slide joint."""
     if effect.at != "actuator":
         return False

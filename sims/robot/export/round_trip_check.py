@@ -76,7 +76,7 @@ def _check_mjcf(done: WrittenModelFiles, path: Path) -> None:
 
     with capture_mujoco_warnings():
         model = mujoco.MjModel.from_xml_path(str(path))
-    _compare(model, done.applied.model, path.name)
+    _compare_models(model, done.applied.model, path.name)
 
 
 def _check_urdf(robot: RobotModel, causes: CauseCoefficients, path: Path) -> None:
@@ -124,7 +124,7 @@ def _without_contacts(model: Any) -> None:
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
 
 
-def _compare(found: Any, wanted: Any, name: str) -> None:
+def _compare_models(found: Any, wanted: Any, name: str) -> None:
     """Check that a reloaded model equals the wanted one in its fields and in its motion.
 
     Raises:

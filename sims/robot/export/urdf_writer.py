@@ -62,15 +62,15 @@ class UrdfWriter:
     def write(self, cause: FittedCause) -> str | None:
         """Write a cause; return the reason if a URDF cannot express it, else None."""
         known: Mapping[str, Callable[[FittedCause], str | None]] = {
-            "drag.linear": lambda cause: self._dynamics(cause, "damping"),
-            "friction.coulomb": lambda cause: self._dynamics(cause, "friction"),
-            "mass.scale": self._mass,
-            "inertia.scale": self._tensor,
-            "mass.offset": self._offset,
-            "joint.zero": self._zero,
-            "joint.axis": self._axis,
-            "link.length": self._length,
-            "payload": self._payload,
+            "drag.linear": lambda cause: self._write_dynamics(cause, "damping"),
+            "friction.coulomb": lambda cause: self._write_dynamics(cause, "friction"),
+            "mass.scale": self._write_mass,
+            "inertia.scale": self._write_inertia_tensor,
+            "mass.offset": self._write_centre_of_mass,
+            "joint.zero": self._write_joint_zero,
+            "joint.axis": self._write_joint_axis,
+            "link.length": self._write_link_length,
+            "payload": self._write_payload,
         }
         if cause.effect not in known:
             return "a URDF cannot state it"
@@ -87,7 +87,7 @@ class UrdfWriter:
         self.markup.root.within.insert(0, ([comment], ""))
         return self.markup.to_text().decode()
 
-    def _dynamics(self, cause: FittedCause, attribute: str) -> str | None:
+    def _write_dynamics(self, cause: FittedCause, attribute: str) -> str | None:
         """Add a cause to the damping or the friction in the dynamics element of its joint.
 
         A missing element is added. The result is None, or the reason why the URDF cannot
@@ -105,7 +105,7 @@ class UrdfWriter:
     def _add_comment(self, tag: XmlElement, cause: FittedCause) -> None:
         tag.before.append(cause.format(self.recording))
 
-    def _inertials(self, cause: FittedCause) -> list[tuple[str, XmlElement]] | None:
+    def _find_inertials(self, cause: FittedCause) -> list[tuple[str, XmlElement]] | None:
         """Return the links of a body that have a mass, with their inertials.
 
         A link without mass, such as a frame that carries others on fixed joints, adds nothing. The
@@ -115,59 +115,61 @@ class UrdfWriter:
         found = []
         for name in (body.name, *body.aliases):
             link = self.links.get(name)
-            inertial = _child(link, "inertial") if link else None
+            inertial = _find_child(link, "inertial") if link else None
             if inertial is not None:
                 found += [(name, inertial)] if _has_mass(inertial) else []
-            elif link is None or _child(link, "collision"):
+            elif link is None or _find_child(link, "collision"):
                 return None
         return found or None
 
-    def _mass(self, cause: FittedCause) -> str | None:
+    def _write_mass(self, cause: FittedCause) -> str | None:
         """Scale mass and inertia tensor of each link in the body, by (1).
 
         The result is None, or the reason why the URDF cannot state the cause.
         """
-        inertials = self._inertials(cause)
+        inertials = self._find_inertials(cause)
         if inertials is None:
             return "a link of the body states no inertial"
         factor = float(compute_factor(cause.coefficients[0]))
         for _, inertial in inertials:
             self._add_comment(inertial, cause)
-            _scale(inertial, "mass", ("value",), factor)  # (1)
-            _scale(inertial, "inertia", _TENSOR, factor)
+            _scale_attributes(inertial, "mass", ("value",), factor)  # (1)
+            _scale_attributes(inertial, "inertia", _TENSOR, factor)
         return None
 
-    def _tensor(self, cause: FittedCause) -> str | None:
+    def _write_inertia_tensor(self, cause: FittedCause) -> str | None:
         """Scale the inertia tensor of the body's only link by 1 + c; its mass stays.
 
         A body of several links is refused: its tensor includes the distances between the
         links, which no change of the links' own tensors would scale. The result is None, or
         the reason for a refusal.
         """
-        inertials = self._inertials(cause)
+        inertials = self._find_inertials(cause)
         if inertials is None or len(inertials) > 1:
             return "the body is not one link with an inertial"
         ((_, inertial),) = inertials
         self._add_comment(inertial, cause)
-        _scale(inertial, "inertia", _TENSOR, float(compute_factor(cause.coefficients[0])))
+        _scale_attributes(
+            inertial, "inertia", _TENSOR, float(compute_factor(cause.coefficients[0]))
+        )
         return None
 
-    def _offset(self, cause: FittedCause) -> str | None:
+    def _write_centre_of_mass(self, cause: FittedCause) -> str | None:
         """Move the centre of mass of each link in the body by the same vector in metres, by (2).
 
         The result is None, or the reason why the URDF cannot state the cause.
         """
-        inertials = self._inertials(cause)
+        inertials = self._find_inertials(cause)
         if inertials is None:
             return "a link of the body states no inertial"
         body = self.robot.body(cause.place).name
         for name, inertial in inertials:
             self._add_comment(inertial, cause)
-            moved = self._axes(name, body).T @ cause.coefficients  # (2)
-            _set(inertial, "origin", "xyz", _origin(inertial, "xyz") + moved)
+            moved = self._get_link_axes(name, body).T @ cause.coefficients  # (2)
+            _set_vector(inertial, "origin", "xyz", _read_origin(inertial, "xyz") + moved)
         return None
 
-    def _zero(self, cause: FittedCause) -> str | None:
+    def _write_joint_zero(self, cause: FittedCause) -> str | None:
         """Move the zero of a joint by c (rad or m): turn or move its origin, by (3).
 
         The result is None, or the reason why the URDF cannot state the cause.
@@ -178,15 +180,15 @@ class UrdfWriter:
         (c,) = cause.coefficients
         self._add_comment(joint, cause)
         axis = _axis_of(joint)
-        axes = _turn(_origin(joint, "rpy"))
+        axes = _compute_rotation(_read_origin(joint, "rpy"))
         if joint.get_attribute("type") == "prismatic":
-            _set(joint, "origin", "xyz", _origin(joint, "xyz") - axes @ axis * c)
+            _set_vector(joint, "origin", "xyz", _read_origin(joint, "xyz") - axes @ axis * c)
         else:
             turned = Rotation.from_matrix(axes) * Rotation.from_rotvec(-c * axis)
-            _set(joint, "origin", "rpy", turned.as_euler("xyz"))  # (3)
+            _set_vector(joint, "origin", "rpy", turned.as_euler("xyz"))  # (3)
         return None
 
-    def _axis(self, cause: FittedCause) -> str | None:
+    def _write_joint_axis(self, cause: FittedCause) -> str | None:
         """Rotate the axis of a joint by a rotation vector in radians, given in the joint's frame.
 
         The result is None, or the reason why the URDF cannot state the cause.
@@ -196,10 +198,10 @@ class UrdfWriter:
             return _NO_JOINT
         self._add_comment(joint, cause)
         turn = Rotation.from_rotvec(cause.coefficients)
-        _set(joint, "axis", "xyz", turn.apply(_axis_of(joint)))
+        _set_vector(joint, "axis", "xyz", turn.apply(_axis_of(joint)))
         return None
 
-    def _length(self, cause: FittedCause) -> str | None:
+    def _write_link_length(self, cause: FittedCause) -> str | None:
         """Lengthen a link: move its joint away from the joint of the parent body, by (4).
 
         `carrier` is the parent body in the compiled model, and `axes` are the axes of the
@@ -207,17 +209,17 @@ class UrdfWriter:
         cause.
         """
         body, model = self.robot.body(cause.place), self.robot.compiled
-        joints = [tag for tag in self.joints.values() if _names(tag, "child") == body.name]
+        joints = [tag for tag in self.joints.values() if _get_link_name(tag, "child") == body.name]
         if not joints:
             return "the file has no joint that carries the link"
         carrier = model.body(int(model.body_parentid[body.id])).name
-        axes = self._axes(_names(joints[0], "parent"), carrier)
+        axes = self._get_link_axes(_get_link_name(joints[0], "parent"), carrier)
         moved = axes.T @ model.body_pos[body.id] * cause.coefficients[0]  # (4)
         self._add_comment(joints[0], cause)
-        _set(joints[0], "origin", "xyz", _origin(joints[0], "xyz") + moved)
+        _set_vector(joints[0], "origin", "xyz", _read_origin(joints[0], "xyz") + moved)
         return None
 
-    def _payload(self, cause: FittedCause) -> str | None:
+    def _write_payload(self, cause: FittedCause) -> str | None:
         """Add a point mass to a link: new mass, centre of mass, and inertia tensor by (5).
 
         The coefficients are the mass `more` in kg and its offset from the body's centre of
@@ -227,15 +229,18 @@ class UrdfWriter:
         """
         body = self.robot.body(cause.place)
         link = self.links.get(body.name)
-        inertial = _child(link, "inertial") if link else None
+        inertial = _find_child(link, "inertial") if link else None
         if inertial is None:
             return "the link states no inertial"
-        mass_tag, tensor_tag = _child(inertial, "mass"), _child(inertial, "inertia")
+        mass_tag, tensor_tag = _find_child(inertial, "mass"), _find_child(inertial, "inertia")
         if mass_tag is None or tensor_tag is None:
             return "the link's inertial lacks a mass or an inertia"
         mass, (more, *offset) = float(mass_tag.get_attribute("value") or 0.0), cause.coefficients
         point = self.robot.compiled.body_ipos[body.id] + offset
-        centre, axes = _origin(inertial, "xyz"), _turn(_origin(inertial, "rpy"))
+        centre, axes = (
+            _read_origin(inertial, "xyz"),
+            _compute_rotation(_read_origin(inertial, "rpy")),
+        )
         values = [float(tensor_tag.get_attribute(key) or 0.0) for key in _TENSOR]
         tensor = np.zeros((3, 3))
         tensor[np.triu_indices(3)] = values
@@ -249,81 +254,86 @@ class UrdfWriter:
         mass_tag.new["value"] = format_number(mass + more)
         for key, value in zip(_TENSOR, tensor[np.triu_indices(3)].tolist(), strict=True):
             tensor_tag.new[key] = format_number(value)
-        _set(inertial, "origin", "xyz", middle)
+        _set_vector(inertial, "origin", "xyz", middle)
         return None
 
-    def _axes(self, link: str, body: str) -> Array:
+    def _get_link_axes(self, link: str, body: str) -> Array:
         """Return the axes (3, 3) of a link in the frame of the body into which it is fused."""
         axes = np.eye(3)
         while link != body:
-            (joint,) = [tag for tag in self.joints.values() if _names(tag, "child") == link]
-            axes = _turn(_origin(joint, "rpy")) @ axes
-            link = _names(joint, "parent")
+            (joint,) = [tag for tag in self.joints.values() if _get_link_name(tag, "child") == link]
+            axes = _compute_rotation(_read_origin(joint, "rpy")) @ axes
+            link = _get_link_name(joint, "parent")
         return axes
 
 
 _NO_JOINT = "the file has no joint of this name"
 
 
-def _origin(tag: XmlElement, attribute: str) -> Array:
+def _read_origin(tag: XmlElement, attribute: str) -> Array:
     """Return the position ``xyz`` or the angles ``rpy`` of an element's origin."""
-    origin = _child(tag, "origin")
-    return _vector(origin.get_attribute(attribute) if origin else None)
+    origin = _find_child(tag, "origin")
+    return _parse_vector(origin.get_attribute(attribute) if origin else None)
 
 
 def _axis_of(joint: XmlElement) -> Array:
     """Return the unit vector of a joint's axis; URDF's default is x."""
-    axis = _child(joint, "axis")
-    vector = _vector((axis.get_attribute("xyz") if axis else None) or "1 0 0")
+    axis = _find_child(joint, "axis")
+    vector = _parse_vector((axis.get_attribute("xyz") if axis else None) or "1 0 0")
     result: Array = vector / np.linalg.norm(vector)
     return result
 
 
-def _set(tag: XmlElement, name: str, attribute: str, vector: Array) -> None:
+def _set_vector(tag: XmlElement, name: str, attribute: str, vector: Array) -> None:
     """Set a vector of a child element, which is added if there is none."""
     _child_or_new(tag, name).new[attribute] = format_numbers(tuple(vector.tolist()))
 
 
 def _child_or_new(tag: XmlElement, name: str) -> XmlElement:
     """Return the child element with a name, which is added if there is none."""
-    child = _child(tag, name)
+    child = _find_child(tag, name)
     if child is None:
         child = XmlElement(name, {}, tag.inside)
         tag.inserted.append(child)
     return child
 
 
-def _child(tag: XmlElement, name: str) -> XmlElement | None:
+def _find_child(tag: XmlElement, name: str) -> XmlElement | None:
     return next((c for c in (*tag.children, *tag.inserted) if c.name == name), None)
 
 
-def _names(joint: XmlElement, end: str) -> str:
+def _get_link_name(joint: XmlElement, end: str) -> str:
     """Return the link at one end of a joint."""
-    found = _child(joint, end)
+    found = _find_child(joint, end)
     return (found.get_attribute("link") or "") if found else ""
 
 
 def _has_mass(inertial: XmlElement) -> bool:
     """Return whether an inertial specifies a nonzero mass or moment of inertia."""
-    stated = ((_child(inertial, "mass"), ("value",)), (_child(inertial, "inertia"), _TENSOR))
+    stated = (
+        (_find_child(inertial, "mass"), ("value",)),
+        (_find_child(inertial, "inertia"), _TENSOR),
+    )
     return any(float(tag.get_attribute(key) or 0.0) for tag, keys in stated if tag for key in keys)
 
 
-def _scale(inertial: XmlElement, name: str, attributes: tuple[str, ...], factor: float) -> None:
+def _scale_attributes(
+    inertial: XmlElement, name: str, attributes: tuple[str, ...], factor: float
+) -> None:
     """Multiply stated attributes of an inertial's child element (mass, inertia) by a factor."""
-    child = _child(inertial, name)
+    child = _find_child(inertial, name)
     for attribute in attributes:
         value = child.get_attribute(attribute) if child else None
         if child and value is not None:
             child.new[attribute] = format_number(float(value) * factor)
 
 
-def _vector(text: str | None) -> Array:
+def _parse_vector(text: str | None) -> Array:
     """Parse a vector (3,); zeros for a missing text."""
     return np.array([float(word) for word in text.split()]) if text else np.zeros(3)
 
 
-def _turn(rpy: Array) -> Array:
+def _compute_rotation(rpy: Array) -> Array:
     """Return the axes (3, 3) rotated about fixed x, y and z in turn, as URDF defines ``rpy``."""
     axes: Array = Rotation.from_euler("xyz", rpy).as_matrix()
     return axes

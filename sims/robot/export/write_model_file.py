@@ -97,7 +97,7 @@ def write_model_files(
         if robot.format == "mjcf":
             notes.append(f"the MJCF is as MuJoCo writes it, not as {robot.path.name}: {unfit}")
         text = MjcfEditor(applied.robot, applied, recording, applied.text.encode()).to_text()
-    urdf = _urdf(robot, causes, recording, notes) if robot.format == "urdf" else None
+    urdf = _render_urdf(robot, causes, recording, notes) if robot.format == "urdf" else None
     return WrittenModelFiles(text, urdf, tuple(notes), applied)
 
 
@@ -119,13 +119,13 @@ def render_with_series_joints(applied: ModifiedModel) -> bytes:
     if fixed:
         _fix_base(document)
     if robot.coupled:
-        _couple(document, applied)
+        _write_couplings(document, applied)
     tags = {tag.attributes.get("name"): tag for tag in document.walk() if tag.name == "joint"}
     for second in (joint for joint in robot.spec.joints if joint.name in robot.series):
         first = tags.get(second.name.rpartition("_")[0])
         if first is None:
             raise NotEditableError(f"no joint of its text is in series with {second.name}")
-        first.after.append(_joint(second))
+        first.after.append(_render_series_joint(second))
     return document.to_text().encode()
 
 
@@ -137,7 +137,7 @@ def _fix_base(document: MjcfDocument) -> None:
             tag.text = b""
 
 
-def _couple(document: MjcfDocument, applied: ModifiedModel) -> None:
+def _write_couplings(document: MjcfDocument, applied: ModifiedModel) -> None:
     """Write the couplings of joints: a fixed tendon for each, which the joint's actuators drive.
 
     The length of the tendon is q + c q_first, with the coefficient c and the preceding joint
@@ -165,7 +165,7 @@ def _couple(document: MjcfDocument, applied: ModifiedModel) -> None:
             tags[actuator.id].new["tendon"] = f"{name}{COUPLING_TENDON_SUFFIX}"
 
 
-def _joint(second: Any) -> str:
+def _render_series_joint(second: Any) -> str:
     """Render a joint in series as an MJCF element, with all attributes stated.
 
     The file's default classes then have no influence on it. `plays` is whether its range is
@@ -190,7 +190,7 @@ def _joint(second: Any) -> str:
     return f"<joint {text}/>"
 
 
-def _urdf(
+def _render_urdf(
     robot: RobotModel, causes: CauseCoefficients, recording: str, notes: list[str]
 ) -> str | None:
     """Render the URDF with the causes that it can express, and add notes about all others."""
@@ -228,9 +228,9 @@ class MjcfEditor:
         """Compile the unchanged document, which is the reference for later comparisons."""
         self.robot, self.applied, self.recording, self.text = robot, applied, recording, text
         self.folder = robot.path.resolve().parent
-        self.original = compile_mjcf(self._document().to_text())
+        self.original = compile_mjcf(self._parse_document().to_text())
 
-    def _document(self) -> MjcfDocument:
+    def _parse_document(self) -> MjcfDocument:
         """Parse the text, with asset folders that are valid from anywhere."""
         document = MjcfDocument(self.text, self.robot.path)
         document.make_paths_absolute(self.folder)
@@ -258,7 +258,7 @@ class MjcfEditor:
                 # Attributes that were written without effect need their related attributes.
                 held.insisted = bool(held.values) or model is not self.original
                 held.values |= statement.values
-            text = self._written(list(statements.values()))
+            text = self._render_document(list(statements.values()))
             model = compile_mjcf(text)
             if not find_missing_statements(model, self.applied.target_values, ROUNDING_TOLERANCE):
                 break
@@ -267,19 +267,19 @@ class MjcfEditor:
             raise NotEditableError(f"its attributes do not say all ({differs})")
         return text
 
-    def _written(self, statements: Sequence[AttributeStatement]) -> str:
+    def _render_document(self, statements: Sequence[AttributeStatement]) -> str:
         """Return the text of the document with the statements, their comments and a heading.
 
         A statement without a cause of its own keeps a value that would change otherwise.
         """
-        document = self._document()
+        document = self._parse_document()
         writer = MjcfWriter(document, self.original, self.applied.target_values)
         for statement in statements:
             writer.write(statement, self.applied.comments.get(statement.element, [KEPT_VALUE_NOTE]))
-        document.root.within.insert(0, ([self._heading()], ""))
+        document.root.within.insert(0, ([self._format_heading()], ""))
         return document.to_text()
 
-    def _heading(self) -> str:
+    def _format_heading(self) -> str:
         """Format the comment at the top: the origin of the file, and notes."""
         fitted = f", with what was found in {self.recording}" if self.recording else ""
         return format_heading([f"{self.robot.path.name}{fitted}", *self.applied.notes])

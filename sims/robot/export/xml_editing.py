@@ -85,9 +85,9 @@ class XmlText:
         self._open: list[XmlElement] = []
         self._top: XmlElement | None = None
         self._parser = expat.ParserCreate("utf-8")
-        self._parser.StartElementHandler = self._begin
-        self._parser.EndElementHandler = self._end
-        self._parser.StartDoctypeDeclHandler = self._refuse
+        self._parser.StartElementHandler = self._handle_start_tag
+        self._parser.EndElementHandler = self._handle_end_tag
+        self._parser.StartDoctypeDeclHandler = self._refuse_document_type
         try:
             self._parser.Parse(text, True)
         except expat.ExpatError as error:
@@ -101,10 +101,10 @@ class XmlText:
         assert self._top is not None, "well-formed XML has one"
         return self._top
 
-    def _refuse(self, *what: object) -> None:  # noqa: ARG002
+    def _refuse_document_type(self, *what: object) -> None:  # noqa: ARG002
         raise NotEditableError(f"{self.path.name} has a document type")
 
-    def _begin(self, name: str, attributes: dict[str, str]) -> None:
+    def _handle_start_tag(self, name: str, attributes: dict[str, str]) -> None:
         """Add an element to the tree at its start tag (called by the parser).
 
         Until its end tag is parsed, `inside` and `end` are the end of the start tag.
@@ -117,13 +117,13 @@ class XmlText:
             self._top = tag
         self._open.append(tag)
 
-    def _end(self, name: str) -> None:  # noqa: ARG002
+    def _handle_end_tag(self, name: str) -> None:  # noqa: ARG002
         """Store where the content of an element ends, at its end tag (called by the parser)."""
         tag = self._open.pop()
-        if not self._closed(tag):
+        if not self._is_self_closing(tag):
             tag.end = self._parser.CurrentByteIndex
 
-    def _closed(self, tag: XmlElement) -> bool:
+    def _is_self_closing(self, tag: XmlElement) -> bool:
         """Return whether an element has a self-closing tag."""
         return self.text[tag.inside - 2 : tag.inside] == b"/>"
 
@@ -142,13 +142,13 @@ class XmlText:
 
     def inner_text(self) -> bytes:
         """Return the content of the root element, with all changes."""
-        return self._written(self.root.inside, self.root.end, self.root.children)
+        return self._render_range(self.root.inside, self.root.end, self.root.children)
 
     def to_text(self) -> bytes:
         """Return the text with all changes."""
-        return self._written(0, len(self.text), [self.root])
+        return self._render_range(0, len(self.text), [self.root])
 
-    def _written(self, begin: int, end: int, tags: list[XmlElement]) -> bytes:
+    def _render_range(self, begin: int, end: int, tags: list[XmlElement]) -> bytes:
         """Return the text between two byte positions, with changed elements replaced.
 
         `tags` are the elements directly within this range, in document order.
@@ -156,44 +156,51 @@ class XmlText:
         parts, at = [], begin
         for tag in tags:
             if tag.has_changes or tag.text is not None:
-                parts += [self.text[at : tag.begin], self._tag(tag)]
-                at = self._after(tag)
+                parts += [self.text[at : tag.begin], self._render_element(tag)]
+                at = self._find_end_of_element(tag)
         return b"".join([*parts, self.text[at:end]])
 
-    def _after(self, tag: XmlElement) -> int:
-        return tag.inside if self._closed(tag) else self._end_of(tag.end)
+    def _find_end_of_element(self, tag: XmlElement) -> int:
+        return tag.inside if self._is_self_closing(tag) else self._end_of(tag.end)
 
-    def _tag(self, tag: XmlElement) -> bytes:
+    def _render_element(self, tag: XmlElement) -> bytes:
         """Return the text of an element with its comments, changed attributes and new elements.
 
         Raises:
             NotEditableError: new elements belong into an element with a self-closing tag.
         """
-        indent = self._indent(tag.begin)
-        comments = [self._comment(text) + self._newline + indent for text in tag.before]
+        indent = self._get_indentation(tag.begin)
+        comments = [self._render_comment(text) + self._newline + indent for text in tag.before]
         if tag.text is not None:
             return b"".join([*comments, tag.text])
-        if self._closed(tag) and (tag.within or tag.inserted):
+        if self._is_self_closing(tag) and (tag.within or tag.inserted):
             raise NotEditableError(f"{tag.name} has nothing in it")
-        closing = self.text[tag.end : self._after(tag)] if not self._closed(tag) else b""
+        closing = (
+            self.text[tag.end : self._find_end_of_element(tag)]
+            if not self._is_self_closing(tag)
+            else b""
+        )
         if tag.renamed:
             closing = closing.replace(tag.name.encode(), tag.renamed.encode(), 1)
-        inside = self._written(tag.inside, tag.end, tag.children)
+        inside = self._render_range(tag.inside, tag.end, tag.children)
         behind = [self._newline + indent + element.encode() for element in tag.after]
-        whole = [self._start(tag), self._first(tag, indent), inside, closing]
+        whole = [self._render_start_tag(tag), self._render_inserted(tag, indent), inside, closing]
         return b"".join([*comments, *whole, *behind])
 
-    def _first(self, tag: XmlElement, indent: bytes) -> bytes:
+    def _render_inserted(self, tag: XmlElement, indent: bytes) -> bytes:
         """Return the text of the elements inserted before all children."""
-        below = self._indent(tag.children[0].begin) if tag.children else indent + b"  "
+        below = self._get_indentation(tag.children[0].begin) if tag.children else indent + b"  "
         parts = []
         inserted = [(child.before, _render_new_element(child)) for child in tag.inserted]
         for comments, element in [*tag.within, *inserted]:
-            for line in [*map(self._comment, comments), *([element.encode()] if element else [])]:
+            for line in [
+                *map(self._render_comment, comments),
+                *([element.encode()] if element else []),
+            ]:
                 parts += [self._newline + below, line]
         return b"".join(parts)
 
-    def _start(self, tag: XmlElement) -> bytes:
+    def _render_start_tag(self, tag: XmlElement) -> bytes:
         """Return the changed start tag; unchanged attributes keep their spaces and quotes."""
         text = self.text[tag.begin : tag.inside]
         at = 1 + len(tag.name.encode())
@@ -202,34 +209,36 @@ class XmlText:
         while found := _ATTRIBUTE.match(text, at):
             name = found[2].decode()
             if name in tag.new:
-                parts.append(found[1] + _attribute(name, tag.new[name]))
+                parts.append(found[1] + _render_attribute(name, tag.new[name]))
                 written.add(name)
             elif name not in tag.removed:
                 parts.append(found[0])
             at = found.end()
         parts += [
-            b" " + _attribute(name, value) for name, value in tag.new.items() if name not in written
+            b" " + _render_attribute(name, value)
+            for name, value in tag.new.items()
+            if name not in written
         ]
         return b"".join([*parts, text[at:]])
 
-    def _comment(self, text: str) -> bytes:
+    def _render_comment(self, text: str) -> bytes:
         """Render text as an XML comment, with the line ends of the file."""
         # Two hyphens would end a comment early, and so would a hyphen at its end.
         safe = re.sub(r"-(?=-)", "- ", text)
         return f"<!-- {safe} -->".encode().replace(b"\n", self._newline)
 
-    def _indent(self, begin: int) -> bytes:
+    def _get_indentation(self, begin: int) -> bytes:
         """Return the indentation of an element; empty if other text precedes it on its line."""
         line = self.text[self.text.rfind(b"\n", 0, begin) + 1 : begin]
         return line if not line.strip() else b""
 
 
 def _render_new_element(tag: XmlElement) -> str:
-    attributes = [_attribute(name, value).decode() for name, value in tag.new.items()]
+    attributes = [_render_attribute(name, value).decode() for name, value in tag.new.items()]
     return f"<{' '.join([tag.name, *attributes])}/>"
 
 
-def _attribute(name: str, value: str) -> bytes:
+def _render_attribute(name: str, value: str) -> bytes:
     return f'{name}="{escape(value, {chr(34): "&quot;"})}"'.encode()
 
 

@@ -83,13 +83,15 @@ def add_actuators(spec: Any, tables: Mapping[str, Any], source: str) -> tuple[st
         table = toml_validation.check_entries(
             source, where, given, toml_validation.get_type_hints_of(ActuatorTable)
         )
-        _check(spec, source, where, name, table)
-        _add(spec, name, table)
+        _check_actuator_table(spec, source, where, name, table)
+        _add_actuator(spec, name, table)
         rated += [name] if "kd" in table else []
     return tuple(rated)
 
 
-def _check(spec: Any, source: str, where: str, name: str, table: Mapping[str, Any]) -> None:
+def _check_actuator_table(
+    spec: Any, source: str, where: str, name: str, table: Mapping[str, Any]
+) -> None:
     """Check the table of an added actuator: its joint, kind, name and gains.
 
     Args:
@@ -110,7 +112,7 @@ def _check(spec: Any, source: str, where: str, name: str, table: Mapping[str, An
         raise InputError(
             f"{source}: {where}: {make_unknown_name_error('kind', kind, list(GAIN_KEYS_BY_KIND))}"
         )
-    joints = [joint.name for joint in spec.joints if _single(joint)]
+    joints = [joint.name for joint in spec.joints if _has_one_degree_of_freedom(joint)]
     if table["joint"] not in joints:
         error = make_unknown_name_error("joint", table["joint"], joints or ["none"])
         raise InputError(f"{source}: {where}: {error}")
@@ -136,14 +138,14 @@ def _check(spec: Any, source: str, where: str, name: str, table: Mapping[str, An
                 raise toml_validation.make_error(source, f"{where}.{key}", "0 or more", value)
 
 
-def _single(joint: Any) -> bool:
+def _has_one_degree_of_freedom(joint: Any) -> bool:
     """Return whether a joint of a spec has one degree of freedom."""
     import mujoco
 
     return joint.type in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 
 
-def _add(spec: Any, name: str, table: Mapping[str, Any]) -> None:
+def _add_actuator(spec: Any, name: str, table: Mapping[str, Any]) -> None:
     """Add an actuator to the spec from its checked table: motor, position, velocity or PID."""
     import mujoco
 

@@ -111,7 +111,7 @@ def read_hull(model: Any, mesh: int, whole: bool = False) -> Hull | None:
     first = int(model.mesh_polyadr[mesh])
     rows = slice(first, first + int(model.mesh_polynum[mesh]))
     at = int(model.mesh_vertadr[mesh]) + ids
-    polygons = _gather(
+    polygons = _gather_lists(
         model.mesh_polyvert, model.mesh_polyvertadr[rows], model.mesh_polyvertnum[rows]
     )
     return Hull(
@@ -119,7 +119,9 @@ def read_hull(model: Any, mesh: int, whole: bool = False) -> Hull | None:
         graph=graph,
         normals=model.mesh_polynormal[rows].copy(),
         polygons=polygons._replace(values=new[polygons.values]),
-        around=_gather(model.mesh_polymap, model.mesh_polymapadr[at], model.mesh_polymapnum[at]),
+        around=_gather_lists(
+            model.mesh_polymap, model.mesh_polymapadr[at], model.mesh_polymapnum[at]
+        ),
         extrema=model.mesh_extrema[mesh].copy(),
     )
 
@@ -152,7 +154,9 @@ class CollisionShapes:
             for name, i in geoms.items()
         }
         bodies = {int(model.geom_bodyid[i]) for i in geoms.values()}
-        return cls(hulls, fields, {body: _bounds(model, body).copy() for body in bodies})
+        return cls(
+            hulls, fields, {body: _get_bounding_volumes(model, body).copy() for body in bodies}
+        )
 
     def write(self, model: Any) -> None:
         """Write the data into a model compiled with meshes of `add_hull` and `add_reserve`."""
@@ -161,14 +165,14 @@ class CollisionShapes:
             for field, values in fields.items():
                 getattr(model, field)[model.geom(name).id] = values
         for body, bounds in self.bounds.items():
-            there = _bounds(model, body)
+            there = _get_bounding_volumes(model, body)
             # The numbers of bounds differ if geoms that cannot collide were removed; then the
             # compiler's own bounds are equally valid.
             if there.shape == bounds.shape:
                 there[:] = bounds
 
 
-def _bounds(model: Any, body: int) -> Array:
+def _get_bounding_volumes(model: Any, body: int) -> Array:
     """Return the bounding volumes (N, 6) of a body, as a view into the model."""
     first = int(model.body_bvhadr[body])
     view: Array = model.bvh_aabb[first : first + int(model.body_bvhnum[body])]
@@ -208,25 +212,29 @@ def add_reserve(spec: Any, model: Any, whole: Any, hulls: Mapping[str, Hull]) ->
         hulls: hulls by name of the mesh.
     """
     found = [read_hull(model, model.mesh(name).id) for name in hulls]
-    lacking = _sizes(hulls.values()) - _sizes(hull for hull in found if hull)
+    lacking = _count_hull_elements(hulls.values()) - _count_hull_elements(
+        hull for hull in found if hull
+    )
     if lacking.max() > 0:
         # A hull of n vertices in general position has 2 n - 4 triangles, and so 15 n - 22 integers
         # in its graph, 2 n - 4 polygons and 6 n - 12 corners. MuJoCo merges some of them.
         count = int(1.5 * np.max(lacking / (15, 2, 6))) + 8
         height = 1.0 - 2.0 * (np.arange(count) + 0.5) / count
-        x, y = np.sqrt(1.0 - height**2) * _turns(np.arange(count) * np.pi * (3.0 - np.sqrt(5.0)))
+        x, y = np.sqrt(1.0 - height**2) * _compute_rotations(
+            np.arange(count) * np.pi * (3.0 - np.sqrt(5.0))
+        )
         sphere = np.stack([x, y, height], axis=1)
         spec.add_mesh(name=f"{RESERVE}.sphere", uservert=sphere.ravel())
     if any(getattr(model, size) < getattr(whole, size) for size in LARGEST):
         # The base of a pyramid is a polygon with as many corners as the apex has sides.
         count = 8 + max(getattr(whole, size) for size in LARGEST)
-        x, y = _turns(2.0 * np.pi * np.arange(count) / count)
+        x, y = _compute_rotations(2.0 * np.pi * np.arange(count) / count)
         base = np.stack([x, y, np.zeros(count)], axis=1)
         pyramid = np.concatenate([base, [[0.0, 0.0, 1.0]]])
         spec.add_mesh(name=f"{RESERVE}.pyramid", uservert=pyramid.ravel())
 
 
-def _turns(angles: Array) -> Array:
+def _compute_rotations(angles: Array) -> Array:
     """Return cosines and sines, (2, n)."""
     return np.stack([np.cos(angles), np.sin(angles)])
 
@@ -271,30 +279,32 @@ def write_hulls(model: Any, hulls: Mapping[str, Hull]) -> None:
         model.mesh_polynum[i] = hull.polygons.sizes.size
         model.mesh_polynormal[rows] = hull.normals
         begins, counts = model.mesh_polyvertadr[rows], model.mesh_polyvertnum[rows]
-        corner = _put(model.mesh_polyvert, begins, counts, hull.polygons, corner)
+        corner = _write_lists(model.mesh_polyvert, begins, counts, hull.polygons, corner)
         polygon = rows.stop
         at = int(model.mesh_vertadr[i])
         model.mesh_polymapnum[at : at + int(model.mesh_vertnum[i])] = 0
         rows = slice(at, at + hull.around.sizes.size)
         begins, counts = model.mesh_polymapadr[rows], model.mesh_polymapnum[rows]
-        mapped = _put(model.mesh_polymap, begins, counts, hull.around, mapped)
+        mapped = _write_lists(model.mesh_polymap, begins, counts, hull.around, mapped)
 
 
-def _sizes(hulls: Iterable[Hull]) -> Array:
+def _count_hull_elements(hulls: Iterable[Hull]) -> Array:
     """Return the total numbers (3,) of graph integers, polygons and polygon corners of hulls."""
     sizes = [(h.graph.size, h.polygons.sizes.size, h.polygons.values.size) for h in hulls]
     total: Array = np.sum(np.array(sizes, dtype=float).reshape(-1, 3), axis=0)
     return total
 
 
-def _gather(values: Integers, begins: Integers, sizes: Integers) -> Lists:
+def _gather_lists(values: Integers, begins: Integers, sizes: Integers) -> Lists:
     """Copy lists of the given begins and sizes out of a flat array."""
     ends = np.cumsum(sizes)
     places = np.repeat(begins - ends + sizes, sizes) + np.arange(ends[-1] if ends.size else 0)
     return Lists(values[places], sizes.copy())
 
 
-def _put(values: Integers, begins: Integers, sizes: Integers, lists: Lists, first: int) -> int:
+def _write_lists(
+    values: Integers, begins: Integers, sizes: Integers, lists: Lists, first: int
+) -> int:
     """Write lists into an array from index `first` on; return the end index."""
     ends = first + np.cumsum(lists.sizes)
     begins[:], sizes[:] = ends - lists.sizes, lists.sizes

@@ -63,11 +63,11 @@ class CompileRepairs:
                 raise
             except Exception as error:
                 said = format_mujoco_error(error)
-                if not self._mended(spec, said):
+                if not self._repair_named_element(spec, said):
                     break
         raise self.files.make_mujoco_error(said)
 
-    def _mended(self, spec: Any, said: str) -> bool:
+    def _repair_named_element(self, spec: Any, said: str) -> bool:
         """Repair the element that MuJoCo's message names, and return whether anything was changed.
 
         `said` is the message. It is the only information about the reason, so its text is
@@ -77,15 +77,15 @@ class CompileRepairs:
         found = re.search(r"Element name '(.*?)', id", said)
         name = found[1] if found else ""
         if "balanceinertia" in said:
-            return self._balance(spec)
+            return self._repair_triangle_inequality(spec)
         if "mass and inertia of moving bodies" in said:
-            return self._weigh(spec, name)
+            return self._set_default_mass(spec, name)
         why = f"is refused by MuJoCo ({re.sub(r'; Element.*|Error: ', '', said)})"
         if TEXTURE_ERROR_PATTERN.search(why) and remove_texture(spec, name, why, self.left):
             return True
         return bool(MESH_ERROR_PATTERN.search(why)) and remove_mesh(spec, name, why, self.left)
 
-    def _balance(self, spec: Any) -> bool:
+    def _repair_triangle_inequality(self, spec: Any) -> bool:
         """Replace principal moments that violate the triangle inequality A + B >= C, in all bodies.
 
         Returns whether any body was changed; no rigid body can have moments that violate
@@ -93,27 +93,27 @@ class CompileRepairs:
         """
         before = len(self.balanced)
         for body in spec.bodies:
-            moments, axes = _moments(body)
+            moments, axes = _get_principal_moments(body)
             if inertia_repair.compute_triangle_violation(moments) > 0:
                 after = inertia_repair.find_nearest_valid_moments(moments)
-                _state(body, after, axes)
+                _set_principal_moments(body, after, axes)
                 self.balanced.append(f"{body.name} {inertia_repair.format_moments(moments, after)}")
         return len(self.balanced) > before
 
-    def _weigh(self, spec: Any, name: str) -> bool:
+    def _set_default_mass(self, spec: Any, name: str) -> bool:
         """Give a moving body the default mass and the least moments, where it has less.
 
         Returns whether the body was changed. `carries` is whether other bodies are attached
         to it.
         """
         for body in [body for body in spec.bodies if body.name == name]:
-            mass, (moments, axes) = float(np.nan_to_num(body.mass)), _moments(body)
+            mass, (moments, axes) = float(np.nan_to_num(body.mass)), _get_principal_moments(body)
             light, thin = (
                 mass < DEFAULT_BODY_MASS,
                 min(moments) < inertia_repair.MIN_MOMENT * (1 - inertia_repair.ROUNDING_SHARE),
             )
             body.mass = max(mass, DEFAULT_BODY_MASS)
-            _state(body, np.maximum(moments, inertia_repair.MIN_MOMENT), axes)
+            _set_principal_moments(body, np.maximum(moments, inertia_repair.MIN_MOMENT), axes)
             body.explicitinertial = True
             if light:
                 carries = any(b.parent is not None and b.parent.name == name for b in spec.bodies)
@@ -146,7 +146,7 @@ class CompileRepairs:
         return notes
 
 
-def _moments(body: Any) -> tuple[Array, Array | None]:
+def _get_principal_moments(body: Any) -> tuple[Array, Array | None]:
     """Return the specified principal moments in kg m^2, and their axes or None.
 
     None stands for the axes of the body's inertial frame.
@@ -157,7 +157,7 @@ def _moments(body: Any) -> tuple[Array, Array | None]:
     return np.nan_to_num(np.asarray(body.inertia, dtype=float)), None
 
 
-def _state(body: Any, moments: Array, axes: Array | None) -> None:
+def _set_principal_moments(body: Any, moments: Array, axes: Array | None) -> None:
     """Write principal moments in kg m^2 into a body of the spec, about the given axes.
 
     Without axes, they are about the axes of the body's inertial frame.

@@ -45,7 +45,7 @@ class MeshLookup:
         if ending.lower() not in MESH_SUFFIXES:
             return None, f"is of a format that MuJoCo does not read ({ending or 'none'})"
         if name not in self.found:
-            path = next((path for path in self._candidates(name) if is_file(path)), None)
+            path = next((path for path in self._list_candidate_paths(name) if is_file(path)), None)
             if path is None:
                 return None, "is absent"
             self.files.read_content(path, MAX_ASSET_BYTES)
@@ -53,7 +53,7 @@ class MeshLookup:
             self.found[name] = Path(os.path.relpath(path.resolve(), here)).as_posix()
         return self.found[name], ""
 
-    def _candidates(self, name: str) -> list[Path]:
+    def _list_candidate_paths(self, name: str) -> list[Path]:
         """Return the possible paths of a mesh, in the order in which they are tried."""
         here = self.files.path.parent
         scheme, separator, rest = name.partition("://")

@@ -93,7 +93,7 @@ def load_referenced_files(files: ModelFileReader, root: Element) -> MissingFiles
     Raises:
         InputError: a count, a size or a file is too large, or an attached model is missing.
     """
-    _measured(files, root, 1.0)
+    _check_sizes(files, root, 1.0)
     absent = MissingFiles()
     settings = {key: value for e in find_children(root, "compiler") for key, value in e.items()}
     everywhere = settings.get("assetdir", "")
@@ -102,43 +102,49 @@ def load_referenced_files(files: ModelFileReader, root: Element) -> MissingFiles
     strip = settings.get("strippath") == "true"
     for element in root.iter("flexcomp"):
         file = element.get("file")
-        if file and _read(files, meshes, file, strip):
+        if file and _read_asset(files, meshes, file, strip):
             element.set("file", str((files.path.parent / meshes / file).resolve()))
     for asset in find_children(root, "asset"):
         for element in list(asset):
             if element.tag == "model":
-                _model(files, element)
+                _read_attached_model(files, element)
                 continue
             folder = pictures if element.tag == "texture" else meshes
-            missing = [name for name in _named(element) if not _read(files, folder, name, strip)]
+            missing = [
+                name
+                for name in _iterate_asset_files(element)
+                if not _read_asset(files, folder, name, strip)
+            ]
             if missing:
                 _insert_placeholder(absent, asset, element, missing[0])
     return absent
 
 
-def _measured(files: ModelFileReader, element: Element, times: float) -> None:
+def _check_sizes(files: ModelFileReader, element: Element, times: float) -> None:
     """Reject counts and sizes that would exhaust the memory.
 
     `times` is the product of all counts above the element, since nested replicates multiply.
     """
     for key, value in element.items():
         numbers = (
-            [_size(word) for word in value.split()]
+            [_parse_size(word) for word in value.split()]
             if key in (*COUNT_ATTRIBUTES, *MAX_SIZE_ATTRIBUTES)
             else []
         )
         most = MAX_SIZE_ATTRIBUTES.get(key, MAX_COUNT)
         if key in COUNT_ATTRIBUTES:
             times *= math.prod(max(number, 1.0) for number in numbers)
-        if max([times, *numbers]) > most or (key.startswith("nuser_") and _size(value) > MAX_COUNT):
+        if max([times, *numbers]) > most or (
+            key.startswith("nuser_") and _parse_size(value) > MAX_COUNT
+        ):
             raise files.make_error(
                 element, f'{key}="{truncate_text(value)}" is too much: at most {most:g} in all'
             )
     for child in element:
-        _measured(files, child, times)
+        _check_sizes(files, child, times)
 
 
-def _size(word: str) -> float:
+def _parse_size(word: str) -> float:
     """Return the magnitude of a number in an attribute; zero if the text is not a number."""
     try:
         return abs(float(word))
@@ -146,7 +152,7 @@ def _size(word: str) -> float:
         return 0.0
 
 
-def _model(files: ModelFileReader, element: Element) -> None:
+def _read_attached_model(files: ModelFileReader, element: Element) -> None:
     """Read an attached model, which MuJoCo opens itself."""
     name = element.get("file") or ""
     path = files.path.parent / name.replace("\\", "/")
@@ -154,19 +160,19 @@ def _model(files: ModelFileReader, element: Element) -> None:
         raise files.make_error(element, f"the attached model {truncate_text(name)} is absent")
     if path.resolve() in files.included:
         raise files.make_error(element, f"{truncate_text(name)} holds itself")
-    _measured(files, parse_tree(files, path), 1.0)
+    _check_sizes(files, parse_tree(files, path), 1.0)
     # MuJoCo opens the attached model before the spec knows its folder, so the path must be
     # absolute.
     element.set("file", str(path.resolve()))
 
 
-def _named(element: Element) -> Iterator[str]:
+def _iterate_asset_files(element: Element) -> Iterator[str]:
     """Return the names of the files that an asset refers to; a texture may have six."""
     keys = TEXTURE_FILE_ATTRIBUTES if element.tag == "texture" else ("file",)
     return (element.attrib[key] for key in keys if element.get(key))
 
 
-def _read(files: ModelFileReader, folder: str, name: str, strip: bool) -> bool:
+def _read_asset(files: ModelFileReader, folder: str, name: str, strip: bool) -> bool:
     """Return whether an asset file exists, and read it into the digest of the model.
 
     Args:

@@ -70,12 +70,12 @@ def read_robot(
             )
         resolve_includes(files, root)
         with capture_mujoco_warnings() as warnings:
-            return _robot(files, root, kind, actuators or {}, engine or {}, warnings)
+            return _make_robot(files, root, kind, actuators or {}, engine or {}, warnings)
     except RecursionError:
         raise InputError(f"{path}: elements too deep within each other") from None
 
 
-def _robot(
+def _make_robot(
     files: ModelFileReader,
     root: Element,
     kind: Format,
@@ -97,22 +97,22 @@ def _robot(
     mends = CompileRepairs(files, OmittedShapes(source))
     if kind == "urdf":
         notes += urdf_loading.repair_urdf(files, root)
-        spec = _parsed(files, root)
+        spec = _parse_repaired_file(files, root)
         urdf_loading.stiffen_mimics(spec)
     else:
         absent = mjcf_loading.load_referenced_files(files, root)
-        spec = _parsed(files, root)
+        spec = _parse_repaired_file(files, root)
         absent.remove_from_spec(spec, mends.left)
     rated = added_actuators.add_actuators(spec, actuators, source)
     notes += added_actuators.apply_engine_settings(spec, engine, source)
     notes += element_names.name_unnamed_elements(spec)
     above = {body.name: body.parent.name for body in spec.bodies if body.parent is not None}
     spec, model = mends.compile(spec)
-    _check(files, model)
+    _check_model(files, model)
     further = contact_exclusion.exclude_spurious_contacts(spec, model) if kind == "urdf" else []
     if further:
         spec, model = mends.compile(spec)
-    aliases = _fused(above, {model.body(i).name for i in range(model.nbody)})
+    aliases = _map_fused_bodies(above, {model.body(i).name for i in range(model.nbody)})
     said = [f"MuJoCo says: {warning}" for warning in dict.fromkeys(warnings)]
     if model.nu == 0:
         said.insert(0, NO_ACTUATORS_NOTE)
@@ -137,7 +137,7 @@ def _robot(
     return robot
 
 
-def _check(files: ModelFileReader, model: Any) -> None:
+def _check_model(files: ModelFileReader, model: Any) -> None:
     """Check that a compiled model can be simulated: it moves, its time step and numbers are sane.
 
     Raises:
@@ -162,7 +162,7 @@ def _check(files: ModelFileReader, model: Any) -> None:
             )
 
 
-def _parsed(files: ModelFileReader, root: Element) -> Any:
+def _parse_repaired_file(files: ModelFileReader, root: Element) -> Any:
     """Parse the repaired file into a mujoco.MjSpec."""
     import mujoco
 
@@ -175,7 +175,7 @@ def _parsed(files: ModelFileReader, root: Element) -> Any:
     return spec
 
 
-def _fused(parents: Mapping[str, str], compiled: set[str]) -> dict[str, str]:
+def _map_fused_bodies(parents: Mapping[str, str], compiled: set[str]) -> dict[str, str]:
     """Map the bodies that MuJoCo fused into others to the bodies that contain them."""
     aliases = {}
     for name in parents:

@@ -75,7 +75,7 @@ def repair_inertials(
             continue
         points += [name] if max(map(abs, entries)) < inertia_repair.NEGLIGIBLE_MOMENT else []
         raised += [f"{name} {change}"] if name not in points else []
-    return _said(points, raised, inferred)
+    return _format_repair_notes(points, raised, inferred)
 
 
 def _raise_moments(tensor: Element, entries: Sequence[float]) -> str:
@@ -91,7 +91,7 @@ def _raise_moments(tensor: Element, entries: Sequence[float]) -> str:
     return inertia_repair.format_moments(moments, after)
 
 
-def _said(points: list[str], raised: list[str], inferred: list[str]) -> list[str]:
+def _format_repair_notes(points: list[str], raised: list[str], inferred: list[str]) -> list[str]:
     """Return the notes about repaired inertials of links, one for each kind of repair.
 
     Args:
@@ -144,12 +144,12 @@ def remove_unusable_shapes(
         for shape in find_children(link, "visual"):
             link.remove(shape)
         for shape in find_children(link, "collision"):
-            if not _kept(files, name, shape, meshes, stated):
+            if not _resolve_collision_shape(files, name, shape, meshes, stated):
                 link.remove(shape)
     return meshes.notes
 
 
-def _kept(
+def _resolve_collision_shape(
     files: ModelFileReader, name: str, shape: Element, meshes: MeshLookup, stated: bool
 ) -> bool:
     """Return whether a collision shape can be read, and set the path of its mesh."""

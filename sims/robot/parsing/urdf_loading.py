@@ -51,23 +51,27 @@ def repair_urdf(files: ModelFileReader, root: Element) -> list[str]:
         InputError: the links do not form a tree, or nothing in it moves.
     """
     _no_macros(files, root)
-    links, joints = _links(files, root), find_children(root, "joint")
-    notes = [*_with_world(files, root, links, joints), *_unread(root), *_named(files, joints)]
-    above = _joined(files, links, joints)
+    links, joints = _collect_links(files, root), find_children(root, "joint")
+    notes = [
+        *_with_world(files, root, links, joints),
+        *_remove_unread_elements(root),
+        *_make_joint_names_unique(files, joints),
+    ]
+    above = _find_parent_links(files, links, joints)
     if not any(joint.get("type") in MOVING_JOINT_TYPES for joint in joints):
         raise InputError(f"{files.path}: none of its {len(joints)} joints moves")
-    held = {name for name in links if _held(above, name)}
+    held = {name for name in links if _is_fixed_to_root(above, name)}
     heavy = [name for name in links if name not in above and get_link_mass(links[name]) > 0]
     if heavy:
         notes.append(
             f"held to the world, as MuJoCo does with a URDF's root: {format_name_list(heavy)}"
         )
-    notes += _once([*links.values(), *joints])
+    notes += _remove_repeated_elements([*links.values(), *joints])
     notes += repair_inertials(files, links, held)
-    _checked(files, root)
-    notes += remove_unusable_shapes(files, links, _compiler(root), held)
-    notes += _limits(joints)
-    notes += _mimics(joints)
+    _check_mujoco_settings(files, root)
+    notes += remove_unusable_shapes(files, links, _get_compiler_element(root), held)
+    notes += _remove_meaningless_limits(joints)
+    notes += _remove_unsupported_mimics(joints)
     return notes
 
 
@@ -83,7 +87,7 @@ def _no_macros(files: ModelFileReader, root: Element) -> None:
             )
 
 
-def _unread(root: Element) -> list[str]:
+def _remove_unread_elements(root: Element) -> list[str]:
     """Remove elements that MuJoCo does not read, and return a note about them."""
     tags = sorted(
         {child.tag for child in root if child.tag not in (*READ_ELEMENTS, *VISUAL_ELEMENTS)}
@@ -93,7 +97,7 @@ def _unread(root: Element) -> list[str]:
     return [f"not read, since MuJoCo knows no such thing: {unread}"] if tags else []
 
 
-def _links(files: ModelFileReader, root: Element) -> dict[str, Element]:
+def _collect_links(files: ModelFileReader, root: Element) -> dict[str, Element]:
     """Return the links by name.
 
     Raises:
@@ -117,19 +121,21 @@ def _with_world(
 
     Simulators with a link of this name read such a file in this way.
     """
-    if WORLD in links or not any(_end(files, joint, "parent") == WORLD for joint in joints):
+    if WORLD in links or not any(
+        _get_link_name(files, joint, "parent") == WORLD for joint in joints
+    ):
         return []
     links[WORLD] = SubElement(root, "link", {"name": WORLD})
     return [f"the link {WORLD}, which the file does not state, is the fixed world"]
 
 
-def _named(files: ModelFileReader, joints: Sequence[Element]) -> list[str]:
+def _make_joint_names_unique(files: ModelFileReader, joints: Sequence[Element]) -> list[str]:
     """Give each joint a unique name, which MuJoCo requires, and return notes about the changes."""
     seen: set[str] = set()
     notes = []
     for joint in joints:
         name = joint.get("name") or ""
-        own = name or f"joint_{_end(files, joint, 'child')}"
+        own = name or f"joint_{_get_link_name(files, joint, 'child')}"
         while own in seen:
             own += "_"
         seen.add(own)
@@ -141,7 +147,7 @@ def _named(files: ModelFileReader, joints: Sequence[Element]) -> list[str]:
     return notes
 
 
-def _end(files: ModelFileReader, joint: Element, tag: str) -> str:
+def _get_link_name(files: ModelFileReader, joint: Element, tag: str) -> str:
     """Return the name of the link at one end of a joint; `tag` is parent or child.
 
     Raises:
@@ -155,7 +161,7 @@ def _end(files: ModelFileReader, joint: Element, tag: str) -> str:
     return name
 
 
-def _joined(
+def _find_parent_links(
     files: ModelFileReader, links: Mapping[str, Element], joints: Sequence[Element]
 ) -> dict[str, tuple[str, Element]]:
     """Return the parent link and the joint of each link; raise an error if links form no tree."""
@@ -166,7 +172,10 @@ def _joined(
             raise files.make_error(
                 joint, f"joint {label}: {make_unknown_name_error('type', kind, JOINT_TYPES)}"
             )
-        parent, child = _end(files, joint, "parent"), _end(files, joint, "child")
+        parent, child = (
+            _get_link_name(files, joint, "parent"),
+            _get_link_name(files, joint, "child"),
+        )
         for name in (parent, child):
             if name not in links:
                 raise files.make_error(
@@ -186,7 +195,7 @@ def _joined(
     return above
 
 
-def _held(above: Mapping[str, tuple[str, Element]], name: str) -> bool:
+def _is_fixed_to_root(above: Mapping[str, tuple[str, Element]], name: str) -> bool:
     """Return whether only fixed joints are between a link and the root, so that it never moves.
 
     `above` maps a link to its parent link and the joint between them.
@@ -198,7 +207,7 @@ def _held(above: Mapping[str, tuple[str, Element]], name: str) -> bool:
     return True
 
 
-def _compiler(root: Element) -> Element:
+def _get_compiler_element(root: Element) -> Element:
     """Return the settings element of MuJoCo's compiler, which is created if missing."""
     blocks = find_children(root, "mujoco")
     block = blocks[0] if blocks else SubElement(root, "mujoco")
@@ -206,7 +215,7 @@ def _compiler(root: Element) -> Element:
     return found[0] if found else SubElement(block, "compiler")
 
 
-def _checked(files: ModelFileReader, root: Element) -> None:
+def _check_mujoco_settings(files: ModelFileReader, root: Element) -> None:
     """Raise an error for unknown MuJoCo settings, which MuJoCo ignores in a URDF."""
     import mujoco
 
@@ -221,7 +230,7 @@ def _checked(files: ModelFileReader, root: Element) -> None:
                 raise files.make_error(setting, said) from None
 
 
-def _once(parts: Sequence[Element]) -> list[str]:
+def _remove_repeated_elements(parts: Sequence[Element]) -> list[str]:
     """Remove repeated elements in a link or a joint, except for the first of each kind."""
     twice = []
     for part in parts:
@@ -245,7 +254,7 @@ def read_velocity_limits(root: Element) -> dict[str, float]:
     return found
 
 
-def _limits(joints: Sequence[Element]) -> list[str]:
+def _remove_meaningless_limits(joints: Sequence[Element]) -> list[str]:
     """Remove limits that are meaningless, and return notes about the limits of joints.
 
     Removed are limits of joints without one degree of freedom, effort limits that are not
@@ -299,7 +308,7 @@ def stiffen_mimics(spec: Any) -> None:
         equality.solimp = FRICTION_SOLIMP
 
 
-def _mimics(joints: Sequence[Element]) -> list[str]:
+def _remove_unsupported_mimics(joints: Sequence[Element]) -> list[str]:
     """Remove mimic elements that MuJoCo cannot represent, and return notes about all of them.
 
     A mimic joint follows another joint: q = multiplier q_other + offset. Both must have one

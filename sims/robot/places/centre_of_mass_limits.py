@@ -40,16 +40,16 @@ def reach(robot: RobotModel, body: str) -> Array:
     """
     model, data = _at_start(robot)
     number = robot.body(body).id
-    points = np.array(list(_points(model, data, number)))
+    points = np.array(list(_iterate_link_points(model, data, number)))
     low, high = points.min(axis=0), points.max(axis=0)
-    longest = float((high - low).max()) or _length(model, number)
+    longest = float((high - low).max()) or _estimate_link_length(model, number)
     half = np.maximum(0.5 * (high - low), THINNEST * longest) + MARGIN * longest
     middle, stated = 0.5 * (low + high), model.body_ipos[number]
     box: Array = np.stack([middle - half - stated, middle + half - stated], axis=1)
     return box
 
 
-def _points(model: Any, data: Any, number: int) -> Iterator[Array]:
+def _iterate_link_points(model: Any, data: Any, number: int) -> Iterator[Array]:
     """Yield the points of a link, in its own frame, that its box must contain.
 
     They are its origin, its specified centre of mass, the corners of its geoms, and the origins of
@@ -86,7 +86,7 @@ def _fixed_to(model: Any, number: int) -> list[int]:
     return found
 
 
-def _length(model: Any, number: int) -> float:
+def _estimate_link_length(model: Any, number: int) -> float:
     """Return the assumed length, in metres, of a link without a specified shape.
 
     It is the distance of the link from its parent, or else the longest such distance in the robot.
@@ -111,10 +111,10 @@ def observable_axes(robot: RobotModel, body: str) -> tuple[int, ...]:
     Returns:
         Observable axes, 0, 1, 2 for x, y, z.
     """
-    return _observable(robot.compiled, robot.body(body).id)
+    return _compute_observable_axes(robot.compiled, robot.body(body).id)
 
 
-def _observable(model: Any, number: int) -> tuple[int, ...]:
+def _compute_observable_axes(model: Any, number: int) -> tuple[int, ...]:
     """Return the observable axes of body `number` of a compiled model, see `observable_axes`.
 
     `axes` collects, in world coordinates, the hinge axes between the body and the world.
@@ -122,7 +122,7 @@ def _observable(model: Any, number: int) -> tuple[int, ...]:
     import mujoco
 
     hinge, slide = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
-    data = _started(model)
+    data = _make_reference_data(model)
     axes = []
     body = number
     while body:
@@ -145,11 +145,11 @@ def _observable(model: Any, number: int) -> tuple[int, ...]:
 
 
 def _at_start(robot: RobotModel) -> tuple[Any, Any]:
-    return robot.compiled, _started(robot.compiled)
+    return robot.compiled, _make_reference_data(robot.compiled)
 
 
 @lru_cache(maxsize=8)
-def _started(model: Any) -> Any:
+def _make_reference_data(model: Any) -> Any:
     """Return MuJoCo's data with the poses of all bodies in the reference pose of the model."""
     import mujoco
 

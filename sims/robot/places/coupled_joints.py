@@ -33,7 +33,7 @@ def coupled_joints(model: Any, dofs: Sequence[int]) -> list[set[int]]:
         elif kind in (int(kinds.mjEQ_CONNECT), int(kinds.mjEQ_WELD)):
             if int(model.eq_objtype[k]) == int(objects.mjOBJ_SITE):
                 first, second = (int(model.site_bodyid[site]) for site in (first, second))
-            one, other = _ancestors(model, first), _ancestors(model, second)
+            one, other = _list_ancestors(model, first), _list_ancestors(model, second)
             ends = [dof for body in set(one) ^ set(other) for dof in _dofs_of(model, body)]
         else:
             continue
@@ -44,7 +44,7 @@ def coupled_joints(model: Any, dofs: Sequence[int]) -> list[set[int]]:
     return [group for group in groups if len(group) > 1]
 
 
-def _ancestors(model: Any, body: int) -> list[int]:
+def _list_ancestors(model: Any, body: int) -> list[int]:
     """Return a body and all its ancestors, including the world."""
     found = [body]
     while body > 0:

@@ -78,18 +78,18 @@ def make_default_recording(robot: RobotModel) -> DefaultRecording:
     joint. A robot without actuators is moved by forces at its joints.
     """
     joints = [joint for joint in robot.joints if joint.has_one_coordinate]
-    commands = _commands(robot, joints)
+    commands = _make_commands(robot, joints)
     shares = [0.5**k for k in range(MAX_AMPLITUDE_HALVINGS)]
     with capture_mujoco_warnings():
         # If joints leave their ranges at any amplitude, their commands are not the cause.
-        share = next((s for s in shares if _stays(robot, joints, commands, s)), 1.0)
+        share = next((s for s in shares if _stays_within_ranges(robot, joints, commands, s)), 1.0)
     observe = tuple(f"q.{joint.name}" for joint in joints)
     return DefaultRecording(
         observe=observe, inputs={c.name: c.to_signal_text(share) for c in commands}
     )
 
 
-def _commands(robot: RobotModel, joints: Sequence[Joint]) -> list[ExcitationCommand]:
+def _make_commands(robot: RobotModel, joints: Sequence[Joint]) -> list[ExcitationCommand]:
     """Make the commands of all actuators on the joints, or forces at the joints if there are none.
 
     Each command oscillates about a holding value that balances gravity in the reference pose.
@@ -101,7 +101,7 @@ def _commands(robot: RobotModel, joints: Sequence[Joint]) -> list[ExcitationComm
         if actuator.joint in driven:
             joint = driven[actuator.joint]
             held, force = holding[joint.name], forces[joint.name]
-            commands.append(_command(robot, actuator, joint, held, force))
+            commands.append(_make_command(robot, actuator, joint, held, force))
     if commands:
         return commands
     return [
@@ -124,14 +124,14 @@ def _at_pose(
     holding, forces = {}, {}
     for number, joint in enumerate(joints):
         holding[joint.name] = float(bias[joint.velocity])
-        swing = _swing(joint, float(model.qpos0[joint.position]))
+        swing = _choose_amplitude(joint, float(model.qpos0[joint.position]))
         # The inertia force of a free joint at the centre frequency; gravity restrains other joints.
         free = sizes.inertia[number] * CENTRE_FREQUENCY**2 * swing
         forces[joint.name] = float(max(free, MIN_GRAVITY_FORCE_SHARE * sizes.force[number]))
     return holding, forces
 
 
-def _swing(joint: Joint, start: float) -> float:
+def _choose_amplitude(joint: Joint, start: float) -> float:
     """Return the amplitude of a joint's motion, in rad or m.
 
     Args:
@@ -146,7 +146,7 @@ def _swing(joint: Joint, start: float) -> float:
     return min(swing, MAX_RANGE_SHARE * (high - low), room if room > 0 else swing)
 
 
-def _command(
+def _make_command(
     robot: RobotModel, actuator: Actuator, joint: Joint, holding: float, force: float
 ) -> ExcitationCommand:
     """Make a sinusoidal command of an actuator that moves its joint within all limits.
@@ -156,7 +156,7 @@ def _command(
     """
     model = robot.compiled
     start = float(model.qpos0[joint.position])
-    swing = _swing(joint, start)
+    swing = _choose_amplitude(joint, start)
     if actuator.kind in ("position", "pid"):
         centre, size = start, swing
     elif actuator.kind == "velocity":
@@ -177,7 +177,7 @@ def _command(
     return ExcitationCommand(f"u.{actuator.name}", centre, size, actuator.control)
 
 
-def _stays(
+def _stays_within_ranges(
     robot: RobotModel, joints: Sequence[Joint], commands: Sequence[ExcitationCommand], share: float
 ) -> bool:
     """Return whether no joint leaves its range under commands of reduced amplitude in phase."""

@@ -80,8 +80,8 @@ _KINDS: Mapping[str, SystemKind] = {"hinge": "rotary", "slide": "linear"}
 
 def make_world_effect(effect: type[Effect]) -> type[Effect]:
     """Make an effect of the world, with the units that it has on any kind of system."""
-    coefficients = [_everywhere(c) for c in effect.coefficients]
-    return _made(effect, effect.name, "", coefficients, {})
+    coefficients = [_unify_units(c) for c in effect.coefficients]
+    return _create_placed_effect(effect, effect.name, "", coefficients, {})
 
 
 def make_placed_effect(effect: type[Effect], spot: EffectPlace) -> type[Effect]:
@@ -102,16 +102,22 @@ def make_placed_effect(effect: type[Effect], spot: EffectPlace) -> type[Effect]:
     elif issubclass(effect, HiddenStateEffect):
         changed["act"] = _act_of(effect)
         declared = effect.between or effect.coefficients
-        coefficients = [_tried(_of_spot(effect, c, spot)) for c in declared if not _has(spot, c)]
+        coefficients = [
+            _add_search_starts(_of_spot(effect, c, spot))
+            for c in declared
+            if not _has_quantity(spot, c)
+        ]
         own = [f"{other}@{spot.name}" for other in effect.contains]
         # A rigid transmission with the drive's inertia is the armature effect.
         drive = f"inertia.armature@{spot.name}"
         for number, c in enumerate(coefficients):
             if c.of == "rotor":
                 own.append(drive)
-                changed["taking"] = _taking(drive, spot.inertia, number, c.plausible[0])
+                changed["taking"] = _make_taking_method(drive, spot.inertia, number, c.plausible[0])
         changed["contains"] = tuple(own)
-    return _made(effect, f"{effect.name}@{spot.name}", spot.name, coefficients, changed)
+    return _create_placed_effect(
+        effect, f"{effect.name}@{spot.name}", spot.name, coefficients, changed
+    )
 
 
 def _force_of(effect: type[Force]) -> Callable[[Force, Array, StateSnapshot], Array]:
@@ -153,7 +159,7 @@ def make_shared_effects(
         "says": f"{effect.says} (of one supply that all drives share)",
         "force": _force_of_all(effect, [cast(int, joint) for joint in joints]),
     }
-    yield _made(effect, effect.name, "", coefficients, changed)
+    yield _create_placed_effect(effect, effect.name, "", coefficients, changed)
 
 
 def _force_of_all(effect: type[Force], joints: Sequence[int]) -> Callable[..., Array]:
@@ -191,13 +197,13 @@ def _limit_of(effect: type[Friction]) -> Callable[[Friction, Array, StateSnapsho
     return limit
 
 
-def _has(spot: EffectPlace, c: Coefficient) -> bool:
+def _has_quantity(spot: EffectPlace, c: Coefficient) -> bool:
     """Return whether the model file specifies the quantity of a coefficient."""
     stated = spot.stated.get("inertia.armature", 0.0)
     return c.of == "rotor" and stated > c.plausible[0][0] * spot.inertia
 
 
-def _taking(
+def _make_taking_method(
     drive: str, inertia: float, number: int, bounds: tuple[float, float]
 ) -> Callable[[Effect, Array, str, Array], Array]:
     """Make the `taking` method, which starts a flexible joint at the values of a fitted armature.
@@ -218,7 +224,7 @@ def _taking(
     return taking
 
 
-def _tried(c: Coefficient) -> Coefficient:
+def _add_search_starts(c: Coefficient) -> Coefficient:
     """Add start values of a search to a shape parameter of a hidden-state effect."""
     low, high = c.plausible[0]
     if c.tried or low <= 0:
@@ -281,10 +287,12 @@ def make_effect_family(effect: type[Effect], members: Sequence[type[Effect]]) ->
         "contains": tuple(sorted(contains)),
         "says": f"{effect.says} (at every place of its kind)",
     }
-    return _made(effect, f"{effect.name}@{ALL_PLACES}", ALL_PLACES, coefficients, changed)
+    return _create_placed_effect(
+        effect, f"{effect.name}@{ALL_PLACES}", ALL_PLACES, coefficients, changed
+    )
 
 
-def _made(
+def _create_placed_effect(
     effect: type[Effect],
     name: str,
     place: str,
@@ -315,7 +323,7 @@ def _made(
     return type(f"{effect.__name__}At", (effect,), body)
 
 
-def _everywhere(c: Coefficient) -> Coefficient:
+def _unify_units(c: Coefficient) -> Coefficient:
     """Give a coefficient one unit and range for all kinds of systems: the first that it has."""
     i = next(k for k, unit in enumerate(c.units) if unit is not None)
     return replace(c, units=(c.units[i],) * 3, plausible=(c.plausible[i],) * 3)

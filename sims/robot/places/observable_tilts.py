@@ -42,21 +42,21 @@ def observable_tilts(robot: RobotModel, name: str) -> tuple[int, ...]:
         turned = np.cross(np.eye(3)[axis], stated)
         sides = []
         for sign in (1.0, -1.0):
-            model.jnt_axis[joint.id] = _unit(stated + sign * TILT * turned)
-            sides.append(_forces(model, robot.joints))
+            model.jnt_axis[joint.id] = _normalise(stated + sign * TILT * turned)
+            sides.append(_compute_random_state_forces(model, robot.joints))
         change = (sides[0] - sides[1]) / (2.0 * TILT)
         if (np.abs(change) > MAX_UNOBSERVABLE_SHARE * np.abs(sides[0]).max()).any():
             observable.append(axis)
     return tuple(observable)
 
 
-def _unit(vector: Array) -> Array:
+def _normalise(vector: Array) -> Array:
     """Return the vector scaled to length 1."""
     result: Array = vector / np.linalg.norm(vector)
     return result
 
 
-def _forces(model: Any, joints: tuple[Joint, ...]) -> Array:
+def _compute_random_state_forces(model: Any, joints: tuple[Joint, ...]) -> Array:
     """Return bias forces and inertia matrices in fixed random states, as one vector.
 
     If a change of the model changes none of these numbers, it changes no motion.

@@ -112,7 +112,7 @@ def list_places(
                 joint.unit,
                 sizes.force[number],
                 sizes.inertia[number],
-                _stated(robot, joint.velocity, joint.id),
+                _get_file_values(robot, joint.velocity, joint.id),
                 f"joint {joint.name}",
                 last=lasts[int(bodies[joint.id])] == joint.id,
                 coupled=joint.name in may_be_coupled,
@@ -130,7 +130,7 @@ def list_places(
                 name=actuator.name,
                 signal=f"u.{actuator.name}",
                 unit=actuator.control_unit,
-                stated=_gains(robot, actuator.id),
+                stated=_get_servo_gains(robot, actuator.id),
                 words=f"actuator {actuator.name}",
                 servo=actuator.kind == "position" and on.coordinate is not None,
             )
@@ -192,7 +192,7 @@ def _beyond_joints(
     return EffectPlace(actuator.name, actuator.motion, None, "", "", size, inertia, {}, "")
 
 
-def _gains(robot: RobotModel, actuator: int) -> dict[str, float]:
+def _get_servo_gains(robot: RobotModel, actuator: int) -> dict[str, float]:
     """Return the servo gains of an actuator in the model file; zero if it is not a servo."""
     bias = robot.compiled.actuator_biasprm[actuator]
     return {"actuator.stiffness": float(bias[1]), "actuator.damping": float(bias[2])}
@@ -211,7 +211,7 @@ def _stated_of_body(robot: RobotModel, body: int) -> dict[str, float]:
     }
 
 
-def _stated(robot: RobotModel, dof: int, joint: int) -> dict[str, float]:
+def _get_file_values(robot: RobotModel, dof: int, joint: int) -> dict[str, float]:
     """Return the numbers that the model file specifies at a joint, by effect.
 
     `dof` is the address of its velocity and `joint` its number in the compiled model.

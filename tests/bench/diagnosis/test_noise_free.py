@@ -97,7 +97,7 @@ def judged(fitted, held_out, left=NOTHING, base_error=1.0):
     floor = SimpleNamespace(sigma=np.ones(1))
     finding = DiagnosisResult("unknown", base, base, (), left, held_out_fits=measured)
     assessor = VerdictBuilder(None, None, runs, floor, None)
-    return assessor._refutes(search, finding)
+    return assessor._is_refuted(search, finding)
 
 
 @pytest.mark.parametrize(

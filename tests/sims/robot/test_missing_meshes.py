@@ -61,7 +61,7 @@ def test_lanes_of_a_model_that_does_not_compile_are_nan_and_the_others_are_simul
     kind, capsys, monkeypatch
 ):
     # The single check is disabled, since combinations of elements in series may fail to compile.
-    monkeypatch.setattr(kind.system, "_compiles", lambda _: True)
+    monkeypatch.setattr(kind.system, "_compiles_with", lambda _: True)
     names = ["joint.flexibility@elbow", "drag.linear@shoulder"]
     simulator = kind(observe=["q.elbow"], effects=names)
     theta = np.zeros((2, len(simulator.parameters)))

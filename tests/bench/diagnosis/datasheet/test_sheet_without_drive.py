@@ -54,7 +54,7 @@ def test_there_is_no_drive_and_no_diagram_in_any_file(swing: Path) -> None:
 
 def test_the_printed_page_says_it_too_and_can_be_read(swing: Path) -> None:
     made = datasheet(swing / "swing.csv", explained=swing / "sheet" / "explained")
-    with drive_figure._styled():
+    with drive_figure._apply_sheet_style():
         page = drive_figure.draw_sheet(made)
         assert unreadable(page) == []
     assert not page.axes, "no diagram is drawn"
@@ -65,7 +65,7 @@ def test_the_printed_page_says_it_too_and_can_be_read(swing: Path) -> None:
 def test_a_driven_joint_has_its_diagram_and_a_page_that_can_be_read(sheet: DataSheet) -> None:
     assert sheet.is_driven
     assert "diagram" in sheet.document()
-    with drive_figure._styled():
+    with drive_figure._apply_sheet_style():
         page = drive_figure.draw_sheet(sheet)
         assert unreadable(page) == []
     assert len(page.axes) == 1

@@ -10,7 +10,10 @@ from bench.cli.main import main
 from bench.core.plugin_registries import make_robot_simulator
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.experiment_design.candidate_runs import RigModel, RunPlan
-from bench.diagnosis.experiment_design.discriminating_run import _largest_share, _runs
+from bench.diagnosis.experiment_design.discriminating_run import (
+    _iterate_changed_runs,
+    _largest_share,
+)
 from bench.diagnosis.experiment_design.model_file_limits import UNLIMITED, stated_limits
 from bench.diagnosis.experiment_design.safety_limits import RigLimits
 from sims.core.simulator import Scenario
@@ -173,7 +176,7 @@ def test_every_simple_run_of_a_robot_is_within_the_limits(tmp_path):
     # The recorded command exceeds the limits, which hold for runs with this command too.
     world, _ = world_of(kind, 1.3 * np.sin(2.0 * TIMES))
     limits = stated_limits(world)
-    runs = list(_runs(world))
+    runs = list(_iterate_changed_runs(world))
     assert len(runs) > 4
     for run in runs:
         assert np.abs(run.scenario.inputs["u.m"]).max() <= 1.0
@@ -210,7 +213,7 @@ def test_plans_say_that_a_command_is_limited_and_begin_in_range(tmp_path):
     run = rig.make_run(RunPlan(("u.m",), "slow sine", 2.0))
     assert np.abs(run.scenario.inputs["u.m"]).max() == 1.0
     assert "u.m limited to -1 to 1" in run.says
-    begins = [value for name, value in rig._beginnings() if name == "q.hip"]
+    begins = [value for name, value in rig._iterate_initial_states() if name == "q.hip"]
     assert max(begins) == 0.9
     assert min(begins) == pytest.approx(-0.6, abs=0.01)
     assert len(begins) == len(set(begins))

@@ -65,7 +65,11 @@ def test_a_speed_that_the_file_states_is_kept_though_nobody_recorded_it(arm):
     assert limits.bounds["qd.hip"] == (-9.0, 9.0)
     gentle, strong = pushes(rig, 1.0), pushes(rig, 1.5)
     assert limits(model, [gentle, strong]) == [True, True]
-    fastest = np.abs(limits._seen(model, [strong.scenario], strong.states[None])[0]["qd.hip"]).max()
+    fastest = np.abs(
+        limits._simulate_monitored_channels(model, [strong.scenario], strong.states[None])[0][
+            "qd.hip"
+        ]
+    ).max()
     slower, same = arm(0.9 * fastest)
     assert RigLimits(slower, same)(same, [strong]) == [False]
 
@@ -86,7 +90,7 @@ def test_commands_keep_to_what_joints_take(arm):
     world, _ = arm(9.0)
     rig = RigModel(world, 2.0)
     assert rig.limits.commands["force.hip"] == (-30.0, 30.0)
-    assert np.abs(rig._limited("force.hip", np.array([-50.0, 7.0]))).max() == 30.0
+    assert np.abs(rig._limit_command("force.hip", np.array([-50.0, 7.0]))).max() == 30.0
 
 
 @pytest.fixture(scope="module")

@@ -392,7 +392,7 @@ def test_of_a_tracked_film_the_picture_of_its_track_stands_beside_the_curves(fig
 
     def track(extra):
         recording = SimpleNamespace(path=tmp_path / "drop.csv", extra=dict.fromkeys(extra, "px"))
-        return DiagnosisReportDataBuilder._track(
+        return DiagnosisReportDataBuilder._read_track_figure(
             SimpleNamespace(assessor=SimpleNamespace(recording=recording))
         )
 
