@@ -328,7 +328,7 @@ def make_simulator_class(
     fresh = kind(extended.constants, observed, effects=effects, **_engine(extended))
     added = [_at(p, n) for p, n in zip(fresh.parameters[len(own) :], values, strict=True)]
     fresh.close()
-    return _class_of(extended, kind, (*own, *added))
+    return _make_subclass(extended, kind, (*own, *added))
 
 
 def _engine(extended: ExtendedSimulator) -> dict[str, Any]:
@@ -336,7 +336,7 @@ def _engine(extended: ExtendedSimulator) -> dict[str, Any]:
     return {"engine": extended.engine} if extended.engine else {}
 
 
-def _class_of(
+def _make_subclass(
     extended: ExtendedSimulator, kind: type[SystemSimulator], parameters: tuple[Parameter, ...]
 ) -> type[SystemSimulator]:
     """Make a subclass of `kind` with all fitted values as defaults."""

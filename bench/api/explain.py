@@ -125,12 +125,12 @@ def score(
     """
     about = FrameDescription(units=units, constants=constants, description=description)
     if isinstance(recording, Frame):
-        about = _of_model(Path(model), about)
+        about = _complete_from_model(Path(model), about)
     (source,) = list_sources(recording, about)
     return score_model(Path(model), source, held_out, force)
 
 
-def _of_model(model: Path, about: FrameDescription) -> FrameDescription:
+def _complete_from_model(model: Path, about: FrameDescription) -> FrameDescription:
     """Complete the description of a data frame by the system or robot of a model.
 
     `model` is a robot's model file, or an extended simulator (TOML) that names a robot or a system.

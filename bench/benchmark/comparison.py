@@ -164,7 +164,9 @@ class Comparison:
             )
             runs = file.read_runs(experiment, records)
             check_runs(runs, file, experiment)
-            check_rows_match_statuses(runs, file, statuses, partial(_at_file, file), "its statuses")
+            check_rows_match_statuses(
+                runs, file, statuses, partial(_make_status_error, file), "its statuses"
+            )
 
     def _finished_statuses(self, ids: list[str]) -> dict[int, RunStatus]:
         """Return the statuses of a finished comparison by their index in the plan.
@@ -335,7 +337,7 @@ class Comparison:
         return failed
 
 
-def _at_file(file: RunsTable, _row: int, problem: str) -> InputError:
+def _make_status_error(file: RunsTable, _row: int, problem: str) -> InputError:
     """Make the error for a status of a journal file, which belongs to none of its rows."""
     return file.make_error(None, problem)
 

@@ -254,7 +254,7 @@ class ComparisonCollection:
 
     def build_figures(self) -> dict[str, Figure]:
         """Draw runtime-distribution, and critical-difference if `has_enough_problems`."""
-        drawn = {"runtime-distribution": self._joint_figure()}
+        drawn = {"runtime-distribution": self._draw_joint_figure()}
         if self.has_enough_problems:
             friedman, p_values = self.rank_tests
             drawn["critical-difference"] = draw_critical_difference_figure(
@@ -264,7 +264,7 @@ class ComparisonCollection:
             name: add_trust_note(figure, self.has_trusted_runs) for name, figure in drawn.items()
         }
 
-    def _joint_figure(self) -> Figure:
+    def _draw_joint_figure(self) -> Figure:
         """Draw the runtime distribution over all problems.
 
         It is the share of solved targets against the number of simulations. The tuners are ordered

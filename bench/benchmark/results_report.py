@@ -158,7 +158,7 @@ def build_tables(
         "ranking": statistics.ranking,
         "pairs": compare_all_pairs(statistics.curves, statistics.floor),
         "break_even": _break_even(experiment.name, statistics),
-        "who_wins": _who_wins(experiment.name, statistics),
+        "who_wins": _build_fastest_tuner_table(experiment.name, statistics),
     }
     return {name: add_trust_column(frame, experiment) for name, frame in frames.items()}
 
@@ -178,7 +178,7 @@ def _break_even(experiment: str, statistics: ComparisonStatistics) -> pd.DataFra
     return pd.concat(parts) if parts else pd.DataFrame(columns=BREAK_EVEN_COLUMNS)
 
 
-def _who_wins(experiment: str, statistics: ComparisonStatistics) -> pd.DataFrame:
+def _build_fastest_tuner_table(experiment: str, statistics: ComparisonStatistics) -> pd.DataFrame:
     """Build the table of the fastest tuner by duration of one simulation, per threshold and range.
 
     A training is shared by `TARGETS_PER_TRAINING` targets. Each row has the bounds of the duration
@@ -293,10 +293,10 @@ def _format_error_table(
     medians = build_summary(lines, metric, kind, statistics.order_in(kind))
     fits = lines.drop_duplicates("tuner").set_index("tuner")["fit_simulations"]
     medians["trained on"] = [f"{fits[t]:.0f}" if fits[t] else "-" for t in medians.index]
-    return f"{title}\n{_laid_out(medians.rename(index=statistics.labelled))}"
+    return f"{title}\n{_format_frame(medians.rename(index=statistics.labelled))}"
 
 
-def _laid_out(frame: pd.DataFrame) -> str:
+def _format_frame(frame: pd.DataFrame) -> str:
     """Format numbers with two digits, without names of rows and columns."""
     bare = frame.rename_axis(index=None, columns=None)
     return bare.to_string(float_format=lambda value: f"{value:.2g}")
@@ -324,7 +324,9 @@ def _format_direction_errors(
     title = "median error along stiff and sloppy directions [training widths]"
     if "heldout_error" in set(part["metric"]):
         title += f" and RMSE of {channel} in unseen scenarios"
-    return f"{title}, after N simulations\n{_laid_out(medians.rename(index=statistics.labelled))}"
+    return (
+        f"{title}, after N simulations\n{_format_frame(medians.rename(index=statistics.labelled))}"
+    )
 
 
 def _format_run_seconds(lines: pd.DataFrame, statistics: ComparisonStatistics) -> str:
@@ -340,7 +342,7 @@ def _format_run_seconds(lines: pd.DataFrame, statistics: ComparisonStatistics) -
     }
     seconds = pd.DataFrame({name: last[column] for name, column in columns.items()})
     seconds = seconds.reindex([t for t in statistics.order if t in seconds.index])
-    return f"mean seconds of a run\n{_laid_out(seconds)}"
+    return f"mean seconds of a run\n{_format_frame(seconds)}"
 
 
 def format_failures(failed: pd.DataFrame) -> list[str]:

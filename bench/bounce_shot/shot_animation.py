@@ -119,8 +119,8 @@ def write_animation(
     )
     shot = execute_example(settings, setup, methods, stored)
     panels = zip(axes[0, film_columns:], methods, strict=True)
-    moving = [_shot_panel(axis, setup, method, shot) for axis, method in panels]
-    filmed = _film_panel(axes[0, 0], film) if film_columns else None
+    moving = [_draw_shot_panel(axis, setup, method, shot) for axis, method in panels]
+    filmed = _draw_film_panel(axes[0, 0], film) if film_columns else None
     step = SAMPLING_RATE_HZ / _FRAMES_PER_SECOND / _SLOW_MOTION_FACTOR
     shots = int(np.ceil(max(panel.end for panel in moving) / step)) + 1
 
@@ -151,7 +151,7 @@ def write_animation(
     return path
 
 
-def _shot_panel(axis: Any, setup: ShotSetup, method: str, shot: ExampleShot) -> _Moving:
+def _draw_shot_panel(axis: Any, setup: ShotSetup, method: str, shot: ExampleShot) -> _Moving:
     """Draw the panel of one method in its initial state: the planned path, no flown path yet.
 
     Args:
@@ -168,7 +168,7 @@ def _shot_panel(axis: Any, setup: ShotSetup, method: str, shot: ExampleShot) -> 
     return _Moving(path, find_path_end(path, setup.scene), line, ball)
 
 
-def _film_panel(axis: Any, film: FilmFrames) -> _Filmed:
+def _draw_film_panel(axis: Any, film: FilmFrames) -> _Filmed:
     """Draw the panel of the film in its initial state: first frame, no track.
 
     Args:

@@ -123,7 +123,7 @@ def draw_success_figure(experiment: Experiment, lines: pd.DataFrame) -> Figure:
     return figure
 
 
-def _methods_down(axis: Axes, methods: Sequence[str]) -> None:
+def _label_methods(axis: Axes, methods: Sequence[str]) -> None:
     """Label the vertical axis with the methods, the first one at the top."""
     axis.set_yticks(range(len(methods)), [get_method_label(m) for m in methods])
     axis.invert_yaxis()
@@ -171,7 +171,7 @@ def draw_miss_figure(settings: ShotConfig, rows: pd.DataFrame) -> Figure:
     right.set_xscale("log")
     right.set_xticks([1, 2, 5, 10, 20, 50], ["1", "2", "5", "10", "20", "50"])
     right.minorticks_off()
-    _methods_down(left, methods)
+    _label_methods(left, methods)
     for axis in (left, right):
         axis.grid(visible=True, axis="x", which="both", linewidth=0.3, alpha=0.5)
         axis.spines[["top", "right"]].set_visible(False)

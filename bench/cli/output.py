@@ -105,7 +105,7 @@ class JsonWriter:
 
     def capture_output(self) -> AbstractContextManager[None]:
         """Return a context that redirects all output to stderr."""
-        return _stdout_to_stderr()
+        return _redirect_stdout_to_stderr()
 
     def print_result(self, answer: CommandResult) -> None:
         """Print the document."""
@@ -145,7 +145,7 @@ def to_json_value(value: Any) -> Any:
 
 
 @contextmanager
-def _stdout_to_stderr() -> Iterator[None]:
+def _redirect_stdout_to_stderr() -> Iterator[None]:
     """Redirect to stderr what Python, C libraries and worker processes print.
 
     With ``--json`` stdout must contain the JSON document only. C libraries write to the descriptor

@@ -120,9 +120,11 @@ class SearchProgress:
             percent = ""
         elif empty:
             bar = f"|{full * done}{empty * (BAR_WIDTH - done)}| "
-        long = self._join_parts(self._format_times(), self._format_stage(), self._best_so_far())
+        long = self._join_parts(
+            self._format_times(), self._format_stage(), self._format_best_so_far()
+        )
         short = self._join_parts(
-            self._format_times(), self._format_stage(), self._best_so_far("best {1} % {0}")
+            self._format_times(), self._format_stage(), self._format_best_so_far("best {1} % {0}")
         )
         yield f"simgap {percent}{bar}{long}"
         yield f"{percent}{bar}{short}"
@@ -131,13 +133,13 @@ class SearchProgress:
     def report(self) -> str:
         """Return the state as a line of a log."""
         times = self._format_times() if self.elapsed() >= 1.0 else ""
-        return self._join_parts(self._format_stage(), self._best_so_far(), times)
+        return self._join_parts(self._format_stage(), self._format_best_so_far(), times)
 
     @staticmethod
     def _join_parts(*parts: str) -> str:
         return "; ".join(part for part in parts if part)
 
-    def _best_so_far(self, form: str = "best so far {0} closes {1} % of the gap") -> str:
+    def _format_best_so_far(self, form: str = "best so far {0} closes {1} % of the gap") -> str:
         return form.format(*self._best) if self._best is not None else ""
 
     def _format_stage(self) -> str:
@@ -329,7 +331,7 @@ class ProgressDisplay(SearchProgress):
         from tqdm.utils import disp_len, disp_trim
 
         columns = _get_terminal_width(self._stream) - 1
-        lines = list(self.lines(*_bar_characters(self._stream)))
+        lines = list(self.lines(*_choose_bar_characters(self._stream)))
         line = next((one for one in lines if disp_len(one) <= columns), lines[-1])
         line = disp_trim(line, columns)
         # A terminal echoes ^C at the end of the line, so two more characters are overwritten.
@@ -373,7 +375,7 @@ def _get_terminal_width(stream: Any) -> int:
     return columns or shutil.get_terminal_size().columns
 
 
-def _bar_characters(stream: Any) -> tuple[str, str]:
+def _choose_bar_characters(stream: Any) -> tuple[str, str]:
     """Return the bar's characters for the open part and the done part, in the stream's encoding."""
     try:
         "█░".encode(getattr(stream, "encoding", None) or "ascii")

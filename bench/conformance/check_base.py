@@ -71,10 +71,10 @@ def check_global_random_state(look: str) -> Iterator[None]:
     # Large primes as seeds: a method that seeds with 0 or 42 certainly changes the state.
     random.seed(82_589_933)
     np.random.seed(30_402_457)  # noqa: NPY002
-    before = _random_states()
+    before = _get_random_states()
     try:
         yield
-        after = _random_states()
+        after = _get_random_states()
     finally:
         random.setstate(python)
         np.random.set_state(legacy)  # noqa: NPY002
@@ -82,7 +82,7 @@ def check_global_random_state(look: str) -> Iterator[None]:
     check(not touched, "global random state left alone", f"changed: {', '.join(touched)}", look)
 
 
-def _random_states() -> dict[str, object]:
+def _get_random_states() -> dict[str, object]:
     """Return the states of the global random generators of Python, numpy and torch (if loaded).
 
     They are compared before and after a call, to see whether the call has used one of them.

@@ -96,7 +96,7 @@ def _open_case(
         assert issubclass(simulator, SystemSimulator)
         recording = read_recording(path, simulator)
         if missing:
-            recording = _with_gaps(recording)
+            recording = _add_gaps(recording)
         SIMULATION_COUNTER.reset(budget)
         try:
             yield DiagnosisCase(
@@ -113,7 +113,7 @@ def _open_case(
             SIMULATION_COUNTER.reset()
 
 
-def _with_gaps(recording: Recording) -> Recording:
+def _add_gaps(recording: Recording) -> Recording:
     """Return the recording with every seventh sample missing."""
     runs = []
     for run in recording.runs:

@@ -109,13 +109,14 @@ def run_check(kind: str, name: str, place: int) -> str:
     except InputError as error:
         return str(error)
     except Exception as error:
-        return f"expected no exception; found {type(error).__name__}: {error}; {_raised_at(error)}"
+        location = _describe_raise_location(error)
+        return f"expected no exception; found {type(error).__name__}: {error}; {location}"
     if known:
         return f"expected to fail ({known}); found that it passes; see {name}.known_failures"
     return f"{_NOT_APPLICABLE_PREFIX}{outcome.reason}" if outcome else ""
 
 
-def _raised_at(error: Exception) -> str:
+def _describe_raise_location(error: Exception) -> str:
     """Describe where the subject's own code raised an exception, or else where it was raised."""
     frames = traceback.extract_tb(error.__traceback__)
     packages = Path(__file__).parents[2]

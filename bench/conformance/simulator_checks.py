@@ -122,7 +122,7 @@ def check_same_proposal_gives_the_same_bits(kind: type[Simulator]) -> None:
         """
         if not is_bitwise_equal(together, observations):
             what = f"{kind.__name__}.reset" if hasattr(kind, "reset") else kind.__name__
-            difference = _first_difference(kind, together, observations)
+            difference = _describe_first_difference(kind, together, observations)
             raise CheckError(
                 f"expected the same numbers {after}; found {difference}; see {what}: it must set "
                 "everything that a run has changed"
@@ -139,7 +139,7 @@ def check_same_proposal_gives_the_same_bits(kind: type[Simulator]) -> None:
     other.close()
 
 
-def _first_difference(kind: type[Simulator], expected: Array, observations: Array) -> str:
+def _describe_first_difference(kind: type[Simulator], expected: Array, observations: Array) -> str:
     """Describe where two observations (n, T, C) first differ in time."""
     if expected.shape != observations.shape:
         return f"shape {observations.shape} in place of {expected.shape}"

@@ -279,7 +279,9 @@ def check_beats_random_search(kind: type[Tuner]) -> None:
     tuner, chance = make_trained_tuner(kind, 2), _RandomSearchBaseline()
     logs: list[Array] = []
     for look in _SEQUENTIAL_TEST_TARGETS:
-        logs += [_final_logs((tuner, chance), target) for target in range(len(logs), look)]
+        logs += [
+            _compute_final_log_errors((tuner, chance), target) for target in range(len(logs), look)
+        ]
         tuner_logs, random = np.array(logs).T
         differ = (tuner_logs != random).any()  # the test is undefined without a difference
         p = float(wilcoxon(tuner_logs, random, alternative="less").pvalue) if differ else 1.0
@@ -292,7 +294,7 @@ def check_beats_random_search(kind: type[Tuner]) -> None:
     raise CheckError(f"expected {expected}; found {found}; see {kind.__name__}.tune")
 
 
-def _final_logs(subjects: tuple[Tuner, ...], target: int) -> Array:
+def _compute_final_log_errors(subjects: tuple[Tuner, ...], target: int) -> Array:
     """Compute the logarithms of the final errors of several tuners on one target.
 
     Each runs on the toy problem with 2 parameters and 30 simulations. The error is the mean

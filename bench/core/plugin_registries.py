@@ -141,7 +141,7 @@ def _find_plugin_classes(module: ModuleType) -> list[tuple[Registry[Any], type]]
     ]
 
 
-def _module_name(path: Path) -> str:
+def _make_module_name(path: Path) -> str:
     """Return a module name for a plugin file that no other file has in this process."""
     name = f"simgap_plugin_{path.stem}"
     number = 1
@@ -161,7 +161,7 @@ def _execute_module(path: Path) -> ModuleType:
     """
     if not path.is_file():
         raise InputError(f"plugin {path}: no such file")
-    spec = importlib.util.spec_from_file_location(_module_name(path), path)
+    spec = importlib.util.spec_from_file_location(_make_module_name(path), path)
     if spec is None or spec.loader is None:
         raise InputError(f"plugin {path}: expected a Python file ending in .py")
     module = importlib.util.module_from_spec(spec)

@@ -176,10 +176,10 @@ def providing(kind: str, path: str) -> DataSet | None:
 def _read_catalogue() -> dict[str, DataSet]:
     """Read datasets.toml, and return its data sets by name."""
     text = resources.files(__package__).joinpath("datasets.toml").read_text(encoding="utf-8")
-    return {name: _data_set(name, table) for name, table in tomllib.loads(text).items()}
+    return {name: _make_data_set(name, table) for name, table in tomllib.loads(text).items()}
 
 
-def _data_set(name: str, table: dict[str, object]) -> DataSet:
+def _make_data_set(name: str, table: dict[str, object]) -> DataSet:
     """Make a data set from its table in datasets.toml.
 
     Args:

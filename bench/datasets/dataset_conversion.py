@@ -51,7 +51,7 @@ def free_swing(files: Mapping[str, bytes]) -> dict[str, Content]:
         InputError: the file does not have this form.
     """
     (name,) = [name for name in files if name.endswith(".mat")]
-    swing = _joined_pieces(name, files[name])[:, ::_EVERY]
+    swing = _join_pieces(name, files[name])[:, ::_EVERY]
     q = np.round(swing[0], _DECIMALS) - np.pi
     qd = np.round(swing[1], _DECIMALS)
     runs = swing.shape[1] // _SAMPLES
@@ -68,7 +68,7 @@ def free_swing(files: Mapping[str, bytes]) -> dict[str, Content]:
     return {"recording.csv": "\n".join(lines) + "\n", "recording.toml": description}
 
 
-def _joined_pieces(name: str, content: bytes) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
+def _join_pieces(name: str, content: bytes) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
     """Join the angles and rates (2, T) of all pieces of a MATLAB file, in their order.
 
     Args:

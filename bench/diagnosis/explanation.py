@@ -166,15 +166,15 @@ class Explanation:
         """Summarise the verdict, the causes and the share of the gap that is closed."""
         lines = [
             f"{self.verdict}: {self.story.title}",
-            self._causes_in_words(),
+            self._format_causes(),
             self._format_gain(),
         ]
         lines.append(format_early_stop(self.story))
         # Titles and names come from files; a long one must not fill the cell.
         return "\n".join(sanitise(line, MAX_TEXT_WIDTH) for line in lines if line)
 
-    def _causes_in_words(self) -> str:
-        return "; ".join(_in_words(cause) for cause in self.causes)
+    def _format_causes(self) -> str:
+        return "; ".join(_format_cause(cause) for cause in self.causes)
 
     def _format_gain(self) -> str:
         """Return the share of the gap that is closed; empty if nothing was found or measured."""
@@ -194,7 +194,7 @@ class Explanation:
         )
 
 
-def _in_words(cause: Cause) -> str:
+def _format_cause(cause: Cause) -> str:
     """Format a cause, its alternatives and its numbers.
 
     For example ``drag.linear or friction.coulomb: coefficient 2.2×10⁻⁴ (2.0×10⁻⁴ to 2.4×10⁻⁴)

@@ -118,7 +118,7 @@ class _Identified:
         flat = jacobian.reshape(runs, -1, jacobian.shape[3])
         # A known initial state is not fitted, so nothing is projected out for it.
         self.states = flat[..., q:] * ~world.known[:, None, :]
-        self.parameters = self._without_states(flat[..., :q])
+        self.parameters = self._project_out_states(flat[..., :q])
 
     def numbers(self) -> tuple[ParameterIdentifiability, ...]:
         """Return the identifiability of the free parameters, then of the causes, the best first."""
@@ -126,7 +126,7 @@ class _Identified:
         causes = sorted(self._assess_causes(), key=_share_of_range)
         return (*free, *causes)
 
-    def _without_states(self, columns: Array) -> Array:
+    def _project_out_states(self, columns: Array) -> Array:
         """Project the initial states of each run out of columns (R, n, k); return (N, k)."""
         b = self.states
         precision = np.diag(compute_state_prior(self.world) ** -2.0)
@@ -194,7 +194,7 @@ class _Identified:
         shown = np.where(self.seen[..., None], values, 0.0)
         shown /= self.noise.sigma[:, None]
         runs, _, _, count = shown.shape
-        columns = self._without_states(shown.reshape(runs, -1, count))
+        columns = self._project_out_states(shown.reshape(runs, -1, count))
         if self.parameters.shape[1]:
             basis, _ = np.linalg.qr(self.parameters)
             columns -= basis @ (basis.T @ columns)

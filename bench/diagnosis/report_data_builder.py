@@ -66,7 +66,7 @@ class DiagnosisReportDataBuilder:
         after = self.finding.model.fit.simulated
         # The noise is that of the finding, because a good model estimates it better.
         sigma = self.assessor.estimate_noise_sigma(self.finding)
-        held_out, held_out_places = self._held_out(sigma)
+        held_out, held_out_places = self._summarise_held_out(sigma)
         return DiagnosisReportData(
             # A recording without a title is identified by its file name.
             recording.title or recording.path.stem,
@@ -177,7 +177,7 @@ class DiagnosisReportDataBuilder:
     def _how_validated(self) -> str:
         return "left out" if self._is_cross_validated else "held out"
 
-    def _held_out(self, sigma: Array) -> tuple[DataSplit | None, list[GapLocation]]:
+    def _summarise_held_out(self, sigma: Array) -> tuple[DataSplit | None, list[GapLocation]]:
         """Return the held-out runs and their gap locations; None and empty if not measured."""
         world = self.assessor.held_out_evaluator
         measured = self.finding.held_out_fits

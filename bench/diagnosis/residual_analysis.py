@@ -214,7 +214,7 @@ def compute_residual_profiles(
     followed_by = _iterate_variables(world, after)
     if get_robot(world) is not None:
         name = _find_largest_residual_channel(world, before, sigma)
-        followed_by = _variables_of_joint(world, after, name)
+        followed_by = _iterate_joint_variables(world, after, name)
     c = world.channels.index(name)
     shown = []
     for variable, unit, values in followed_by:
@@ -310,7 +310,7 @@ def _iterate_inputs(
             yield channel.name, channel.unit, values
 
 
-def _variables_of_joint(
+def _iterate_joint_variables(
     world: RunEvaluator, simulated: Array, channel: str
 ) -> Iterator[tuple[str, str, Array]]:
     """Yield the variables for residual profiles of a joint's channel: name, unit and values (R, T).

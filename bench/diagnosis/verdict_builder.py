@@ -163,7 +163,7 @@ class VerdictBuilder:
             result[place] = FittedValue(
                 value, unit, low_end, high_end, at_bound, usual_range=unusual
             )
-        return self._with_totals(model, result)
+        return self._add_totals(model, result)
 
     def _get_plausible_range(self, place: int) -> tuple[float, float]:
         """Return the plausible range, narrower than the bounds for a robot's free numbers."""
@@ -171,7 +171,7 @@ class VerdictBuilder:
         free = self.fitting_evaluator.kind.has_model and place in self.fitting_evaluator.base
         return parameter.training or parameter.bounds if free else parameter.bounds
 
-    def _with_totals(
+    def _add_totals(
         self, model: FittedModel, numbers: dict[int, FittedValue]
     ) -> dict[int, FittedValue]:
         """Add to each fitted number of a robot the model file's value and the resulting value.
@@ -252,7 +252,7 @@ class VerdictBuilder:
             for cause in certain
             for i in self.fitting_evaluator.get_coefficient_indices(cause.effect)
         ]
-        results = all(numbers[i].is_result for i in places) and not self._ends_at_bound(numbers)
+        results = all(numbers[i].is_result for i in places) and not self._is_at_bound(numbers)
         return replace(finding, verdict=verdict_rules.verdict_of_numbers(finding.verdict, results))
 
     def _is_refuted(self, search: EffectSearch, finding: DiagnosisResult) -> bool:
@@ -271,7 +271,7 @@ class VerdictBuilder:
             if model.penalised_log_likelihood > search.base_model.penalised_log_likelihood
         ]
         held_out = finding.held_out_fits or {}
-        excess = self._held_out_excess(finding)
+        excess = self._compute_held_out_excess(finding)
         if not tried or (excess is not None and verdict_rules.misses_held_out_gap(excess, excess)):
             return False
         return not any(
@@ -280,7 +280,7 @@ class VerdictBuilder:
             for names in better
         )
 
-    def _held_out_excess(self, finding: DiagnosisResult) -> float | None:
+    def _compute_held_out_excess(self, finding: DiagnosisResult) -> float | None:
         """Return the excess RMS residual of the base model on held-out runs; None without them."""
         runs, measured = self.held_out_evaluator, finding.held_out_fits
         if runs is None or measured is None or () not in measured:
@@ -288,7 +288,7 @@ class VerdictBuilder:
         left = (runs.observed - measured[()].simulated) / self.noise_floor.sigma
         return float(np.sqrt(np.square(left[np.isfinite(runs.observed)]).mean())) - 1.0
 
-    def _ends_at_bound(self, numbers: Mapping[int, FittedValue]) -> bool:
+    def _is_at_bound(self, numbers: Mapping[int, FittedValue]) -> bool:
         """Return whether a base parameter of the extended model is at a bound of its range.
 
         A cause may then compensate for a value beyond the bound.
@@ -342,7 +342,7 @@ class VerdictBuilder:
         unit = units[world.channels.index(reading)]
         return [c for c, other in enumerate(units) if other == unit]
 
-    def _floor_of(self, finding: DiagnosisResult) -> float:
+    def _compute_noise_floor(self, finding: DiagnosisResult) -> float:
         """Compute the RMS of the noise floor over the channels that count."""
         return float(
             np.sqrt(
@@ -371,7 +371,7 @@ class VerdictBuilder:
         if not np.isfinite(before[np.isfinite(runs.observed)]).all():
             return None
         counted = self._list_counted_channels()
-        given = counted, self._floor_of(finding), rng, self._by_stretches
+        given = counted, self._compute_noise_floor(finding), rng, self._by_stretches
         result = compute_held_out_gain(runs, before, after, *given)
         return _build_held_out_result(
             result, self.fitting_evaluator.simulator.channels[counted[0]].unit
@@ -412,7 +412,7 @@ class VerdictBuilder:
         if runs is None or measured is None or names not in measured:
             return None
         counted = self._list_counted_channels()
-        floor = self._floor_of(finding)
+        floor = self._compute_noise_floor(finding)
         # As for the gain of the whole model, an error below the noise floor is not a gain.
         before = _compute_rmse(runs, measured[()].simulated, counted)
         after = _compute_rmse(runs, measured[names].simulated, counted)
@@ -443,7 +443,12 @@ class VerdictBuilder:
             # Each effect has its own random stream, so that its interval does not depend on the
             # others.
             rng = make_rng("held-out share", *names)
-            given = self._list_counted_channels(), self._floor_of(finding), rng, self._by_stretches
+            given = (
+                self._list_counted_channels(),
+                self._compute_noise_floor(finding),
+                rng,
+                self._by_stretches,
+            )
             result = compute_held_out_gain(runs, before, simulated.simulated, *given)
             if np.isfinite(result.low) and np.isfinite(result.high):
                 found[names[0]] = result.low, result.high

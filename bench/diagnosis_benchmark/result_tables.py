@@ -136,7 +136,7 @@ PAIR_METRICS = (
 """Metrics by which each diagnoser is compared with simgap."""
 
 
-def _by_diagnoser(
+def _build_diagnoser_table(
     rows: pd.DataFrame,
     order: Sequence[str],
     list_lines: Callable[[pd.DataFrame], Iterator[TableRow]],
@@ -248,13 +248,13 @@ def build_confusion_table(rows: pd.DataFrame, order: Sequence[str]) -> pd.DataFr
     asked = rows[(rows["kind"] != "double") & rows["diagnoser"].isin(order)].copy()
     asked["hidden"] = asked["hidden"].where(asked["kind"] == "single", "(" + asked["kind"] + ")")
     answers = zip(asked["verdict"].astype(str), asked["named"].astype(str), strict=True)
-    asked["said"] = [_leading_name(verdict, named) for verdict, named in answers]
+    asked["said"] = [_get_confusion_column(verdict, named) for verdict, named in answers]
     counted = asked.groupby(["diagnoser", "hidden", "said"]).size()
     counts: pd.DataFrame = counted.rename("count").reset_index()
     return counts
 
 
-def _leading_name(verdict: str, named: str) -> str:
+def _get_confusion_column(verdict: str, named: str) -> str:
     """Return the column of confusion.csv for an answer.
 
     Args:
@@ -348,23 +348,23 @@ def build_all_tables(
         order: names of the diagnosers.
         training: rows of training.csv.
     """
-    costs = _by_diagnoser(rows, order, _list_costs)
+    costs = _build_diagnoser_table(rows, order, _list_costs)
     for column, kind in (("simulations", int), ("seconds", float)):
         costs[f"training_{column}"] = [
             sum(kind(lesson[column]) for lesson in training if lesson["diagnoser"] == name)
             for name in order
         ]
-    calibration = _by_diagnoser(rows, order, _list_calibration)
+    calibration = _build_diagnoser_table(rows, order, _list_calibration)
     if calibration.empty:
         names = ["diagnoser", "level", "count", "of", "share", "low", "high"]
         calibration = pd.DataFrame(columns=names)
     return {
-        "table": _by_diagnoser(rows, order, _list_metrics),
-        "groups": _by_diagnoser(rows, order, _list_groups),
-        "power": _by_diagnoser(rows, order, _list_power),
+        "table": _build_diagnoser_table(rows, order, _list_metrics),
+        "groups": _build_diagnoser_table(rows, order, _list_groups),
+        "power": _build_diagnoser_table(rows, order, _list_power),
         "confusion": build_confusion_table(rows, order),
         "calibration": calibration,
-        "sets": _by_diagnoser(rows, order, _list_set_sizes),
+        "sets": _build_diagnoser_table(rows, order, _list_set_sizes),
         "costs": costs,
         "pairs": build_pair_table(rows, order),
     }

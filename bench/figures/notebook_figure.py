@@ -12,25 +12,25 @@ from bench.figures.figure_files import is_command
 
 
 @contextmanager
-def _without_tables_of_properties() -> Iterator[None]:
+def _skip_property_tables() -> Iterator[None]:
     """Context that skips the property tables in Matplotlib's docstrings if a command runs.
 
     They take a sixth of the import time.
     """
     tables = matplotlib.artist.kwdoc
     if is_command():
-        matplotlib.artist.kwdoc = _no_table
+        matplotlib.artist.kwdoc = _return_no_table
     try:
         yield
     finally:
         matplotlib.artist.kwdoc = tables
 
 
-def _no_table(artist: object) -> str:  # noqa: ARG001
+def _return_no_table(artist: object) -> str:  # noqa: ARG001
     return ""
 
 
-with _without_tables_of_properties():
+with _skip_property_tables():
     from matplotlib.figure import Figure
 
 

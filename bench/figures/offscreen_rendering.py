@@ -128,7 +128,7 @@ def _render_image(mujoco: Any, model: Any, data: Any, view: Projection) -> Image
     # Shadows and reflections give no information about places.
     model.light_castshadow[:] = 0
     model.mat_reflectance[:] = 0
-    _without_ground(mujoco, model)
+    _hide_floors(mujoco, model)
 
     camera = mujoco.MjvCamera()
     mujoco.mjv_defaultFreeCamera(model, camera)
@@ -163,7 +163,7 @@ def convert_to_grey(colours: Array, shape: NDArray[np.bool_]) -> Image:
     return np.repeat(grey.round().astype(np.uint8)[:, :, None], 3, axis=2)
 
 
-def _without_ground(mujoco: Any, model: Any) -> None:
+def _hide_floors(mujoco: Any, model: Any) -> None:
     """Hide floors, which would fill the image."""
     endless = (int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_HFIELD))
     for g in range(model.ngeom):

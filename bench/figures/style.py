@@ -346,8 +346,8 @@ def finish_figure(
         if label in handles
     ]
     for reference in style.behind:
-        listed += _behind_entries(axes, style, reference)
-        caption += _behind_caption(reference, style.experiment)
+        listed += _make_reference_entries(axes, style, reference)
+        caption += _format_reference_caption(reference, style.experiment)
     size = 9.0 if len(listed) <= _ROWS else 7.0
     figure.legend(
         [handle for handle, _ in listed],
@@ -370,7 +370,7 @@ _ROWS = 18
 """Maximum number of legend entries in letters of the normal size."""
 
 
-def _behind_entries(
+def _make_reference_entries(
     axes: list[Axes], style: TunerStyles, reference: ReferenceResult
 ) -> list[tuple[Line2D, str]]:
     """Make the legend entries of reference results: a heading, and each tuner that is drawn."""
@@ -388,7 +388,7 @@ def _behind_entries(
     ]
 
 
-def _behind_caption(reference: ReferenceResult, experiment: Experiment) -> str:
+def _format_reference_caption(reference: ReferenceResult, experiment: Experiment) -> str:
     mismatches = reference.find_mismatches(experiment)
     difference_text = f"; differs in {'; '.join(mismatches)}" if mismatches else ""
     return f" Grey: medians of the reference {reference.provenance_text}{difference_text}."
@@ -471,14 +471,16 @@ def render_png_and_pdf(figure: Figure, dpi: int = DPI) -> tuple[bytes, bytes | N
     Returns:
         The bytes of the PNG file, and those of the PDF file or None.
     """
-    with _laid_out_once(figure, dpi):
-        return render_png(figure, dpi), _asked_pdf(figure)
+    with _lay_out_once(figure, dpi):
+        return render_png(figure, dpi), _render_pdf_if_wanted(figure)
 
 
 def render_all_formats(figure: Figure, dpi: int = DPI) -> FigureFiles:
     """Render a figure as PNG, as SVG for a page, and as PDF if requested."""
-    with _laid_out_once(figure, dpi):
-        return FigureFiles(render_png(figure, dpi), render_svg(figure), _asked_pdf(figure))
+    with _lay_out_once(figure, dpi):
+        return FigureFiles(
+            render_png(figure, dpi), render_svg(figure), _render_pdf_if_wanted(figure)
+        )
 
 
 class FigureFiles(NamedTuple):
@@ -489,12 +491,12 @@ class FigureFiles(NamedTuple):
     pdf: bytes | None = None
 
 
-def _asked_pdf(figure: Figure) -> bytes | None:
+def _render_pdf_if_wanted(figure: Figure) -> bytes | None:
     return render_pdf(figure) if is_pdf_wanted() else None
 
 
 @contextmanager
-def _laid_out_once(figure: Figure, dpi: int) -> Iterator[None]:
+def _lay_out_once(figure: Figure, dpi: int) -> Iterator[None]:
     """Compute the layout of a figure once for all files that are written in the `with` block."""
     engine, screen = figure.get_layout_engine(), figure.dpi
     try:

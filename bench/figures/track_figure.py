@@ -50,8 +50,8 @@ def draw_track_figure(track: BallTrack, heights: BallHeights, part: slice, title
     figure, axes = make_panel_grid(1, 3, (13, 4.3), gridspec_kw={"width_ratios": (1, 1.2, 1.2)})
     scene, above, below = axes[0]
     _draw_scene(scene, track)
-    _over_time(above, track, part, heights.z, "height of the centre z [m]")
-    _over_time(below, track, part, track.radius, "radius [px]")
+    _draw_over_time(above, track, part, heights.z, "height of the centre z [m]")
+    _draw_over_time(below, track, part, track.radius, "radius [px]")
     above.axhline(heights.radius, color="black", linewidth=0.6, linestyle=":")
     above.set_title("dotted: ball on the ground", fontsize=9)
     below.set_title("grey: recorded; marks at the foot: no ball seen", fontsize=9)
@@ -76,7 +76,7 @@ def _draw_scene(axis: Axes, track: BallTrack) -> None:
     axis.set(xlabel="u [px]", ylabel="v [px]", title="the track; circles: outlines found")
 
 
-def _over_time(axis: Axes, track: BallTrack, part: slice, values: Array, label: str) -> None:
+def _draw_over_time(axis: Axes, track: BallTrack, part: slice, values: Array, label: str) -> None:
     """Draw a quantity of the ball (T,) over time, with marks where the ball was not detected.
 
     `part` selects the recorded frames, which have a grey background. The marks are at 2 % of the

@@ -163,7 +163,9 @@ def format_summary(recording: Recording, kind: type[Simulator]) -> Iterator[str]
     if len(runs) > _MOST_RUNS:
         yield f"... and {len(runs) - _MOST_RUNS} more runs"
     yield ""
-    yield from _align_columns([_SIGNAL_HEAD, *_signal_rows(recording, kind)], left_columns=3)
+    yield from _align_columns(
+        [_SIGNAL_HEAD, *_iterate_signal_rows(recording, kind)], left_columns=3
+    )
     yield _CAVEAT
     yield ""
     yield from _format_constants(recording, kind)
@@ -190,7 +192,7 @@ def _run_row(run: Run) -> tuple[str, ...]:
     )
 
 
-def _signal_rows(recording: Recording, kind: type[Simulator]) -> Iterator[tuple[str, ...]]:
+def _iterate_signal_rows(recording: Recording, kind: type[Simulator]) -> Iterator[tuple[str, ...]]:
     """Yield a row of the table of signals for each channel and input: unit, range, gaps and noise.
 
     `role` is the kind of the signal. The stated noise is "-" for a channel whose noise is not

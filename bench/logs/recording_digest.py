@@ -56,14 +56,14 @@ def read_content(path: Path) -> bytes:
     root = path if bag is None else bag[0]
     files = sorted(root.rglob("*")) if bag is not None and root.is_dir() else [root]
     content = hashlib.sha256()
-    for file in files if root.suffix.lower() != ".xml" else _with_included(root):
+    for file in files if root.suffix.lower() != ".xml" else _list_included_files(root):
         if file.is_file():
             file_stat = file.stat()
             content.update(_hash_file(file, file_stat.st_mtime_ns, file_stat.st_size))
     return content.digest()
 
 
-def _with_included(model: Path) -> list[Path]:
+def _list_included_files(model: Path) -> list[Path]:
     """Return a model file and the files that it includes, searched in the folder of the model."""
     files, visited_count = [model], 0
     while visited_count < len(files):

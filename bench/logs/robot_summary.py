@@ -54,11 +54,11 @@ def format_log_warnings(recording: Recording, kind: type[Simulator]) -> Iterator
     if not kind.has_model:
         return
     robot = cast(type[RobotSimulator], kind).robot
-    yield from _left_out(recording, robot)
+    yield from _list_missing_signals(recording, robot)
     yield from _list_exceeded_ranges(recording, robot)
 
 
-def _left_out(recording: Recording, robot: RobotModel) -> Iterator[str]:
+def _list_missing_signals(recording: Recording, robot: RobotModel) -> Iterator[str]:
     """Yield a line for the commands and one for the joint positions missing in the log."""
     run = recording.runs[0]
     silent = [f"u.{a.name}" for a in robot.actuators if f"u.{a.name}" not in run.inputs]

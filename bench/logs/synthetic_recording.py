@@ -139,7 +139,7 @@ class SimulatedRecording:
         import tomli_w
 
         table_path = Path(path)
-        truth = _truth_of(table_path)
+        truth = _make_truth_path(table_path)
         truth_file = {truth: tomli_w.dumps(dict(self.truth))}
         write_recording(
             table_path, self.recording, type(self.simulator), digits=_DIGITS, beside=truth_file
@@ -153,10 +153,10 @@ def check_output_path(out: Path) -> None:
     Raises:
         InputError: It does not end in ``.csv``, or a file exists already.
     """
-    check_absent([out, out.with_suffix(".toml"), _truth_of(out)])
+    check_absent([out, out.with_suffix(".toml"), _make_truth_path(out)])
 
 
-def _truth_of(table_path: Path) -> Path:
+def _make_truth_path(table_path: Path) -> Path:
     if table_path.suffix != ".csv":
         raise InputError(f"{table_path}: expected a name that ends in .csv")
     return table_path.with_suffix(".truth.toml")
@@ -192,7 +192,7 @@ class _RecordingSimulation:
         self.kind = kind = _get_simulator_class(options)
         self.name = options.system or kind.name
         self.usual = _get_default_recording(kind)
-        self.held_out = _held_out(options)
+        self.held_out = _count_held_out_runs(options)
         self.theta = _make_parameters(
             {} if options.parameters is None else options.parameters, kind
         )
@@ -210,7 +210,7 @@ class _RecordingSimulation:
         self.ranges = {**self.usual.initial, **stated_ranges}
         check_known_names("input", inputs, [c.name for c in kind.inputs])
         inputs = {**self.usual.inputs, **inputs}
-        self.inputs = {name: _signal_text(name, value) for name, value in inputs.items()}
+        self.inputs = {name: _format_signal(name, value) for name, value in inputs.items()}
         samples = _count_samples(options)
         check_simulation_size(options.runs, samples, options.seconds, self.simulator, options.force)
         self.times = _make_sample_times(samples, options.rate)
@@ -337,7 +337,7 @@ def _get_default_recording(kind: type[Simulator]) -> DefaultRecording:
     return usual if kind.name == kind.system.name else replace(usual, observe=())
 
 
-def _held_out(options: SimulationSpec) -> int:
+def _count_held_out_runs(options: SimulationSpec) -> int:
     """Return how many runs, the last ones, are held out for validation; by default a third."""
     if options.runs < 1:
         raise InputError(f"runs = {options.runs}: expected at least 1")
@@ -413,10 +413,12 @@ def _make_coefficients(
         check_known_names(f"coefficient of effect {name}", stated_values, names)
         return [_check_number(f"effect {name}:", c, stated_values.get(c, 0.0)) for c in names]
     values = [stated_values] if isinstance(stated_values, int | float) else list(stated_values)
-    return [_check_number("effect", name, value) for value in _of_family(name, values, kind)]
+    return [
+        _check_number("effect", name, value) for value in _repeat_for_places(name, values, kind)
+    ]
 
 
-def _of_family(name: str, values: list[float], kind: type[Simulator]) -> list[float]:
+def _repeat_for_places(name: str, values: list[float], kind: type[Simulator]) -> list[float]:
     """Repeat the coefficients of one place for all places of an effect family."""
     if not name.endswith("@*") or not issubclass(kind, SystemSimulator):
         return values
@@ -464,7 +466,7 @@ def _check_interval(name: str, stated_range: float | tuple[float, float]) -> tup
     return low, high
 
 
-def _signal_text(name: str, value: float | str) -> str:
+def _format_signal(name: str, value: float | str) -> str:
     return value if isinstance(value, str) else f"{_check_number('input', name, value):.17g}"
 
 

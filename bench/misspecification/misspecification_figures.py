@@ -75,7 +75,7 @@ def draw_bias_figure(systems: Sequence[StudyResult], table: pd.DataFrame) -> Fig
     figure, panels = _panels(len(systems))
     for panel, study in zip(panels, systems, strict=False):
         lines = table[(table["experiment"] == study.experiment.name) & (table["metric"] == "bias")]
-        parameter = _most_biased(lines)
+        parameter = _find_most_biased(lines)
         _compared(panel, study, lines[lines["parameter"] == parameter])
         panel.axvline(0.0, color=ZERO_LINE_GREY, linewidth=0.8)
         panel.set_title(f"{study.name}: {parameter}\n{_lacks(study)}", fontsize=9)
@@ -197,7 +197,7 @@ def _compared(panel: Axes, study: StudyResult, lines: pd.DataFrame) -> None:
     panel.invert_yaxis()
 
 
-def _most_biased(lines: pd.DataFrame) -> str:
+def _find_most_biased(lines: pd.DataFrame) -> str:
     """Return the parameter with the largest bias in the simulator as it is.
 
     The bias is that of the reference tuner, least squares, or of all tuners if it did not take

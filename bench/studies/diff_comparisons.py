@@ -88,7 +88,7 @@ def load_side(folder: Path, metric: str | None = None) -> ComparisonSide:
     Raises:
         InputError: the folder has no comparison, no runs, or no runs with the metric.
     """
-    stored = read_comparison(folder, [*REQUIRED_RUN_COLUMNS, *_target_columns(folder)])
+    stored = read_comparison(folder, [*REQUIRED_RUN_COLUMNS, *_list_target_columns(folder)])
     if stored.runs.empty:
         raise InputError(f"{folder}: holds no runs")
     name = metric or select_primary_metric(stored.runs).metric
@@ -101,7 +101,7 @@ def load_side(folder: Path, metric: str | None = None) -> ComparisonSide:
     return ComparisonSide(folder, stored, curves, targets)
 
 
-def _target_columns(folder: Path) -> list[str]:
+def _list_target_columns(folder: Path) -> list[str]:
     """List the columns of a comparison's runs that identify a target.
 
     These are its true parameters and its start. Empty if the table cannot be
@@ -298,7 +298,7 @@ class ComparisonDiff:
         elif not found["paired"].all():
             notes.append("some lines are not paired: their targets are not in both")
         least = min(
-            _min_attainable_p_value(n, p)
+            _compute_min_attainable_p_value(n, p)
             for n, p in zip(found["targets"], found["paired"], strict=True)
         )
         if least * len(found) > FAMILYWISE_ERROR_RATE:
@@ -381,7 +381,7 @@ def _compare_unpaired(a: Array, b: Array) -> tuple[float, float]:
     return ratio, float(mannwhitneyu(a, b).pvalue)
 
 
-def _min_attainable_p_value(targets: int, paired: bool) -> float:
+def _compute_min_attainable_p_value(targets: int, paired: bool) -> float:
     """Compute the smallest p-value that is possible with a number of targets."""
     from math import comb
 

@@ -142,7 +142,7 @@ class ExplanationDiff:
         )
         parameters = _pair_coefficients(self.a.verdict.parameters, self.b.verdict.parameters)
         rows = [*coefficients, *parameters]
-        p = np.array([_p_value(row) for row in rows])
+        p = np.array([_compute_p_value(row) for row in rows])
         there = np.isfinite(p)
         corrected = np.full(len(p), np.nan)
         corrected[there] = correct_holm(p[there])
@@ -170,7 +170,7 @@ class ExplanationDiff:
         """
         raise InputError("--fail-on worse: is for comparisons; of explanations take change")
 
-    def _held_out(self) -> list[dict[str, Any]]:
+    def _list_held_out_errors(self) -> list[dict[str, Any]]:
         """List errors on held-out runs and the closed gap of both explanations; None if missing."""
         sides = [each.verdict.heldout for each in (self.a, self.b)]
         return [
@@ -225,7 +225,7 @@ class ExplanationDiff:
             "causes": self.causes,
             "coefficients": coefficients,
             "parameters": parameters,
-            "heldout": self._held_out(),
+            "heldout": self._list_held_out_errors(),
             "candidates": self._compare_candidates(),
             "settings": find_changes(self.a.settings, self.b.settings),
             "notes": self.notes,
@@ -269,7 +269,9 @@ class ExplanationDiff:
     def to_table(self) -> pd.DataFrame:
         """Return the table for a CSV file."""
         coefficients, parameters = self.numbers
-        held_out = [{**row, "name": f"heldout {row['name']}"} for row in self._held_out()]
+        held_out = [
+            {**row, "name": f"heldout {row['name']}"} for row in self._list_held_out_errors()
+        ]
         return pd.DataFrame([*coefficients, *parameters, *held_out])
 
 
@@ -306,7 +308,7 @@ def _pair_coefficients(
     return rows
 
 
-def _p_value(row: Mapping[str, Any]) -> float:
+def _compute_p_value(row: Mapping[str, Any]) -> float:
     """Compute the p-value of no difference; NaN if an interval is open or a number is missing."""
     ends = [row[key] for key in ("low_a", "high_a", "low_b", "high_b", "a", "b")]
     if any(end is None for end in ends):

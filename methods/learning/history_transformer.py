@@ -124,7 +124,7 @@ def predict_proposals(
         [_apply_linear_layer(w, "first", here), _apply_linear_layer(w, "token", tokens)], axis=-2
     )
     for block in range(design.blocks):
-        h = h + _causal_attention(xp, w, block, h)  # (4)
+        h = h + _compute_causal_attention(xp, w, block, h)  # (4)
         h = h + _apply_linear_layer(
             w, f"outer{block}", _compute_swish(xp, _apply_linear_layer(w, f"inner{block}", h))
         )
@@ -154,7 +154,7 @@ def _compute_step_features(xp: Any, far: Any, tried: Any) -> tuple[Any, Any]:
     return begun(tried, step / length), begun(far, xp.arcsinh(slope))
 
 
-def _causal_attention(xp: Any, w: dict[str, Any], block: int, h: Any) -> Any:
+def _compute_causal_attention(xp: Any, w: dict[str, Any], block: int, h: Any) -> Any:
     """Compute the attention of each token (..., k, width) to itself and to earlier tokens.
 
     This is Eq. 1 of Vaswani et al. with a learned bias for each lag (number of tokens between two).

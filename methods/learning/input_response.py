@@ -91,14 +91,14 @@ def _compute_run_response(series: Array, inputs: Array) -> Array:
     constant = np.ones_like(driven[..., :1])
     # All terms of (1) except the last one, which needs the derivative w'.
     plain = np.concatenate(
-        [constant, series, series**3, _smoothed_velocity_signs(series), driven], axis=2
+        [constant, series, series**3, _compute_smoothed_velocity_signs(series), driven], axis=2
     )
     regressors = np.concatenate([integral(plain, bump), -integral(series, slope)], axis=2)  # (2)
     accelerations = integral(series, bend)  # (2)
     return _fit_ridge_regression(regressors, accelerations).reshape(len(series), -1)
 
 
-def _smoothed_velocity_signs(series: Array) -> Array:
+def _compute_smoothed_velocity_signs(series: Array) -> Array:
     """Compute smoothed signs of the rates of change (n, T, C), a regressor for dry friction."""
     # Slopes of lines through seven samples; noise would change the sign of single differences.
     reach = np.arange(-3, 4)

@@ -141,13 +141,13 @@ def estimate_noise_sigma(observations: Array, lengths: tuple[int, ...]) -> Array
         count = min(_PARTS, max(1, thirds.shape[1] // _LEAST_PART))
         parts = np.array_split(thirds, count, axis=1)
         for i, c in np.ndindex(out.shape):
-            calmest = _min_part_median([part[i, :, c] for part in parts])
+            calmest = _compute_min_part_median([part[i, :, c] for part in parts])
             noise = calmest / (_NORMAL * _THIRD)
             out[i, c] = max(float(out[i, c]), noise)
     return out
 
 
-def _min_part_median(parts: list[Array]) -> float:
+def _compute_min_part_median(parts: list[Array]) -> float:
     """Return the smallest median of the parts, without NaN; 0 if there are no values."""
     medians = []
     for part in parts:

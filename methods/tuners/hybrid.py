@@ -135,7 +135,7 @@ class TuneNetLeastSquares(TuneNet):
         chosen, basis = self._choose_secants(steps, finite, finish.smallest_difference)
         directions = steps[chosen]
         changes = [run.residuals[i] - residual for i in chosen]
-        missing = _orthogonal_complement(basis, len(point))
+        missing = _compute_orthogonal_complement(basis, len(point))
         if len(missing):
             # Differences have the length of the secants, so that all columns have similar accuracy.
             size = float(np.abs(directions).max()) if chosen else finish.difference
@@ -185,7 +185,7 @@ class TuneNetLeastSquares(TuneNet):
         return chosen, basis
 
 
-def _orthogonal_complement(basis: list[Array], dim: int) -> Array:
+def _compute_orthogonal_complement(basis: list[Array], dim: int) -> Array:
     """Return orthonormal directions (m, dim) orthogonal to `basis`; the axes if it is empty.
 
     `basis` are orthonormal vectors (dim,): directions in which the slope is already known.

@@ -93,7 +93,7 @@ def atomic_replacement(path: Path, *, keep_ending: bool = False) -> Iterator[Pat
     partial = _make_temporary_path(path, keep_ending)
     try:
         yield partial
-        _to_disk(partial)
+        _flush_to_disk(partial)
         partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)
@@ -111,7 +111,7 @@ def write_new_files(contents: Mapping[Path, Content]) -> None:
             cleaning.callback(partial.unlink, missing_ok=True)
             with _set_file_name_in_errors(path):
                 partial.write_bytes(_encode_content(contents[path]))
-                _to_disk(partial)
+                _flush_to_disk(partial)
         for path, partial in partials.items():
             with _set_file_name_in_errors(path):
                 _rename_if_free(partial, path)
@@ -207,7 +207,7 @@ def _encode_content(content: Content) -> bytes:
     return content.encode() if isinstance(content, str) else content
 
 
-def _to_disk(path: Path) -> None:
+def _flush_to_disk(path: Path) -> None:
     """Flush a file's content to disk, so that it is there before the rename."""
     with path.open("rb") as file:
         os.fsync(file.fileno())

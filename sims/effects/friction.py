@@ -115,7 +115,7 @@ class StribeckFriction(Friction):
             c: (K, L, 1) coefficients.
             moment: state snapshot of L batch elements.
         """
-        return np.maximum(c[0] + c[1] * _stribeck_factor(moment.speed, c[2]), 0.0)  # (2)
+        return np.maximum(c[0] + c[1] * _compute_stribeck_factor(moment.speed, c[2]), 0.0)  # (2)
 
 
 class LoadFriction(Friction):
@@ -249,7 +249,7 @@ def _limit_to_opposing(drive: Array, against: Array) -> Array:
     return np.maximum(low, 0.0) - np.minimum(high, 0.0)
 
 
-def _stribeck_factor(speed: Array, scale: Array) -> Array:
+def _compute_stribeck_factor(speed: Array, scale: Array) -> Array:
     """Return exp(-(v / scale)^2) (L, 1), the share of Stribeck's extra friction (2) at a speed."""
     ratio = speed / np.maximum(scale, _SMALLEST)
     left: Array = np.exp(-np.square(ratio))

@@ -183,9 +183,9 @@ def _find_change_times(
         rows = []
         for s, u in zip(runs.unique_scenarios, commands, strict=True):
             changed = np.diff(u[name]) != 0
-            later = np.maximum(_command_times(s)[1:], 0.0)
+            later = np.maximum(_get_command_times(s)[1:], 0.0)
             # Commands from before the run may be applied within it.
-            rows.append(np.concatenate([_history_times(s, name), later[changed]]))
+            rows.append(np.concatenate([_get_history_times(s, name), later[changed]]))
         size = max(row.size for row in rows)
         padded = [np.concatenate([row, np.zeros(size - row.size)]) for row in rows]
         applied = np.stack(padded)[runs.scenario_index]
@@ -254,13 +254,13 @@ def _sample_times(scenario: Scenario) -> Array:
     return seconds
 
 
-def _command_times(scenario: Scenario) -> Array:
+def _get_command_times(scenario: Scenario) -> Array:
     """Return the times (T,) since the first sample at which inputs change, s."""
     seconds: Array = _sample_times(scenario) + scenario.offset
     return seconds
 
 
-def _history_times(scenario: Scenario, name: str) -> Array:
+def _get_history_times(scenario: Scenario, name: str) -> Array:
     """Return the times (K,) of an input's known history before the run, s."""
     if name not in scenario.before:
         return np.empty(0)
@@ -268,7 +268,7 @@ def _history_times(scenario: Scenario, name: str) -> Array:
     return earlier
 
 
-def _command_values(scenario: Scenario, name: str, values: Array) -> Array:
+def _get_command_values(scenario: Scenario, name: str, values: Array) -> Array:
     """Return the values (K + T,) of an input, including its known history before the run.
 
     Args:
@@ -337,7 +337,7 @@ def compute_applied_inputs(
             )
             means = np.where(on, means + c[0] * (other - means), means)
     pairs = zip(runs.unique_scenarios, commands, strict=True)
-    beginnings = np.array([_command_values(s, first, u[first])[0] for s, u in pairs])
+    beginnings = np.array([_get_command_values(s, first, u[first])[0] for s, u in pairs])
     result = _apply_input_effects(
         effects, steps, ends, means, beginnings[runs.scenario_index, None]
     )
@@ -358,7 +358,7 @@ def _build_lead_in_steps(
         Beginnings, ends and lengths (N, K) of the steps, s; the length is zero where the history is
         unknown.
     """
-    event_times = [_history_times(s, name) for s in runs.unique_scenarios]
+    event_times = [_get_history_times(s, name) for s in runs.unique_scenarios]
     event_times = [np.append(row[row < 0], 0.0) for row in event_times]
     size = max(row.size for row in event_times)
     if size == 1:
@@ -392,7 +392,7 @@ def _apply_input_effects(
     Returns:
         Applied values (L, S).
     """
-    last_steps = _last_nonzero_step(steps)
+    last_steps = _find_last_nonzero_step(steps)
     values = np.take_along_axis(means, last_steps, axis=1)
     start = start.copy()
     for effect, c, on in effects:
@@ -416,7 +416,7 @@ def _step_begins(ends: Array) -> Array:
     return np.broadcast_to(begin, ends.shape)
 
 
-def _last_nonzero_step(steps: Array) -> Indices:
+def _find_last_nonzero_step(steps: Array) -> Indices:
     """Return the number (L, S) of each step, or of the last step before it with nonzero length.
 
     The input does not change while a batch element waits.
@@ -465,8 +465,10 @@ def _average_command(
         target_rows, source_rows = (
             (slice(run, run + 1), elements[:1]) if has_uniform_steps else (elements, elements)
         )
-        instants = np.concatenate([_history_times(scenario, name), _command_times(scenario)])
-        signal = _command_values(scenario, name, commands[run][name])
+        instants = np.concatenate(
+            [_get_history_times(scenario, name), _get_command_times(scenario)]
+        )
+        signal = _get_command_values(scenario, name, commands[run][name])
         result[target_rows] = average_signal(instants, signal, begin[source_rows], end[source_rows])
     return runs.expand_rows(result) if has_uniform_steps else result
 
@@ -492,7 +494,9 @@ def _average_held_signal(times: Array, values: Array, begin: Array, end: Array) 
         area = np.concatenate([[0.0], np.cumsum(held)])
         a = begin[crossing]
         b = end[crossing]
-        integral = _held_integral(times, values, area, b) - _held_integral(times, values, area, a)
+        integral = _compute_held_integral(times, values, area, b) - _compute_held_integral(
+            times, values, area, a
+        )
         value[crossing] = integral / (b - a)  # (1)
     return value
 
@@ -516,7 +520,7 @@ def _average_linear_signal(times: Array, values: Array, begin: Array, end: Array
     crossing = np.searchsorted(times, end, side="left") > first
     if crossing.any():
         a, b = begin[crossing], end[crossing]
-        integral = _linear_integral(times, values, area, b) - _linear_integral(
+        integral = _compute_linear_integral(times, values, area, b) - _compute_linear_integral(
             times, values, area, a
         )
         value[crossing] = integral / (b - a)  # (1)
@@ -524,7 +528,7 @@ def _average_linear_signal(times: Array, values: Array, begin: Array, end: Array
     return result
 
 
-def _linear_integral(times: Array, values: Array, area: Array, t: Array) -> Array:
+def _compute_linear_integral(times: Array, values: Array, area: Array, t: Array) -> Array:
     """Return the integral A(t) (1) of a signal that is interpolated linearly between samples.
 
     The difference of A over a step, divided by its length, is the mean that the engine applies.
@@ -541,7 +545,7 @@ def _linear_integral(times: Array, values: Array, area: Array, t: Array) -> Arra
     return result
 
 
-def _held_integral(times: Array, values: Array, area: Array, t: Array) -> Array:
+def _compute_held_integral(times: Array, values: Array, area: Array, t: Array) -> Array:
     """Return the integral A(t) (1) of a signal that is held between samples.
 
     The difference of A over a step, divided by its length, is the mean that the engine applies.

@@ -64,7 +64,7 @@ def read_table(
     try:
         return Table(path, channels, inputs, extra).read()
     except UnicodeDecodeError:
-        raise _not_text(path) from None
+        raise _make_encoding_error(path) from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
 
@@ -78,7 +78,7 @@ def has_run_column(path: Path) -> bool:
         return False
 
 
-def _not_text(path: Path) -> InputError:
+def _make_encoding_error(path: Path) -> InputError:
     """Make the error for a table that is not UTF-8."""
     data = path.read_bytes()
     if data[:2] in (b"\xff\xfe", b"\xfe\xff"):

@@ -390,18 +390,18 @@ def _read_system_name(path: Path, meta: Mapping[str, Any]) -> str:
 
 def get_floating_state_units(declared: DeclaredSignals) -> Mapping[str, str]:
     """Return the units of the states of floating bodies, by name; empty if there are none."""
-    units: Mapping[str, str] = getattr(_system_of(declared), "afloat", {})
+    units: Mapping[str, str] = getattr(_get_system(declared), "afloat", {})
     return units
 
 
-def _system_of(declared: DeclaredSignals) -> object:
+def _get_system(declared: DeclaredSignals) -> object:
     """Return the system of a simulator, or the system itself."""
     return getattr(declared, "system", declared)
 
 
 def _refuse_inputs(path: Path, meta: Mapping[str, Any], declared: DeclaredSignals) -> None:
     """Refuse inputs whose effect depends on quantities that a recording does not contain."""
-    reasons: Mapping[str, str] = getattr(_system_of(declared), "refused_inputs", {})
+    reasons: Mapping[str, str] = getattr(_get_system(declared), "refused_inputs", {})
     input_tables = dotted(check_table(path, "inputs", meta.get("inputs", {})), reasons)
     for name in (name for name in reasons if name in input_tables):
         raise InputError(f"{path}: input {name}: {reasons[name]}")
@@ -593,7 +593,7 @@ def _read_run(path: Path, name: str, value: Any, declared: DeclaredSignals) -> R
         raise InputError(f"{path}: {location}: constant {repeated_name} stands twice")
     constants |= _read_constants(path, location, direct, declared)
     _check_constants_possible(path, location, constants, declared)
-    states = [*declared.states, *getattr(_system_of(declared), "activations", ())]
+    states = [*declared.states, *getattr(_get_system(declared), "activations", ())]
     initial = _read_numbers(path, f"{location}.initial", table.get("initial", {}), states)
     return RunMetadata(constants, initial, held_out)
 

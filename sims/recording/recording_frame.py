@@ -125,7 +125,7 @@ def described(
         elif name in switches:
             extra[name] = {"unit": "1"}
         else:
-            raise _belongs_to_nothing(path, name, declared)
+            raise _make_unassigned_column_error(path, name, declared)
 
     noted = frame.attrs.get("units", {})
     noted = noted if isinstance(noted, Mapping) else {}
@@ -175,7 +175,7 @@ def _list_names(signals: Iterable[Any]) -> list[str]:
     return [signal.name for signal in signals]
 
 
-def _belongs_to_nothing(path: Path, name: str, declared: DeclaredSignals) -> InputError:
+def _make_unassigned_column_error(path: Path, name: str, declared: DeclaredSignals) -> InputError:
     """Make the error for a column that is neither channel nor input."""
     channels, inputs = _list_names(declared.channels), _list_names(declared.inputs)
     declared_names = f"channels {', '.join(channels)}"

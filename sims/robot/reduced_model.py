@@ -110,7 +110,7 @@ def _strip_model(robot: RobotModel) -> RobotModel:
         add_reserve(spec, stripped.compile(spec), model, hulls)
         geoms = {geom.name: numbers[geom.name] for geom in spec.geoms if geom.meshname in hulls}
         stripped = replace(stripped, shapes=CollisionShapes.read(model, hulls, geoms))
-    alike = _moves_alike(model, stripped.compiled, numbers)
+    alike = _has_equal_motion(model, stripped.compiled, numbers)
     if alike and hulls:
         alike = has_room(stripped.compiled, model)
         alike = alike and _touches_alike(robot, stripped.compiled, numbers)
@@ -216,7 +216,7 @@ def _reduce_geoms(spec: Any, model: Any) -> tuple[dict[str, Hull], dict[str, int
     return hulls, numbers
 
 
-def _moves_alike(model: Any, other: Any, numbers: Mapping[str, int]) -> bool:
+def _has_equal_motion(model: Any, other: Any, numbers: Mapping[str, int]) -> bool:
     """Return whether two models of one robot have equal fields, except for non-colliding shapes.
 
     Args:

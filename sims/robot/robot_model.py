@@ -256,7 +256,7 @@ class RobotModel:
         if hasattr(model, "actuator_ctrladr"):
             control, controls = int(model.actuator_ctrladr[i]), int(model.actuator_ctrlnum[i])
         limited = controls > 0 and bool(model.actuator_ctrllimited[control])
-        moves = self._joints_of_tendon(i)
+        moves = self._get_tendon_joints(i)
         motion = None
         if joint is not None:
             motion = self.joint(joint).motion
@@ -279,7 +279,7 @@ class RobotModel:
             moves=moves if joint is None else (),
         )
 
-    def _joints_of_tendon(self, i: int) -> tuple[str, ...]:
+    def _get_tendon_joints(self, i: int) -> tuple[str, ...]:
         """Return the joints of the fixed tendon that an actuator drives, if it drives one."""
         import mujoco
 

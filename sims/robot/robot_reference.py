@@ -144,11 +144,11 @@ def read_robot_reference(source: Path, document: Mapping[str, Any]) -> RobotRefe
         check_table(source, "actuators", document.get("actuators", {})),
         check_table(source, "engine", document.get("engine", {})),
         _check_numerics(source, document.get("numerics", {})),
-        _friction_form(source, document.get("friction_form", "stiff")),
+        _check_friction_form(source, document.get("friction_form", "stiff")),
     )
 
 
-def _friction_form(source: Source, value: Any) -> FrictionForm:
+def _check_friction_form(source: Source, value: Any) -> FrictionForm:
     """Check the value of ``friction_form``."""
     for form in FRICTION_FORMS:
         if value == form:

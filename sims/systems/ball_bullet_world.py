@@ -46,7 +46,7 @@ def build(client: int, constants: Mapping[str, float]) -> int:
         constants: constants of the system by name.
     """
     p = bullet_world.import_pybullet()
-    ground, ball = _ground_and_ball(client, constants)
+    ground, ball = _create_ground_and_ball(client, constants)
     # There is no push-out, s of (3) is zero, and slow impacts rebound as well.
     p.setPhysicsEngineParameter(
         contactERP=0.0, contactSlop=0.0, restitutionVelocityThreshold=0.0, physicsClientId=client
@@ -75,7 +75,7 @@ def build_native(client: int, constants: Mapping[str, float], settings: Mapping[
         settings: settings of the engine by name.
     """
     p = bullet_world.import_pybullet()
-    ground, ball = _ground_and_ball(client, constants)
+    ground, ball = _create_ground_and_ball(client, constants)
     friction = settings["lateral_friction"]
     p.changeDynamics(
         ground,
@@ -95,7 +95,7 @@ def build_native(client: int, constants: Mapping[str, float], settings: Mapping[
     return ball
 
 
-def _ground_and_ball(client: int, constants: Mapping[str, float]) -> tuple[int, int]:
+def _create_ground_and_ball(client: int, constants: Mapping[str, float]) -> tuple[int, int]:
     """Create level ground and a ball in an empty Bullet world; return both body ids."""
     p = bullet_world.import_pybullet()
     p.setGravity(0.0, 0.0, -constants["gravity"], physicsClientId=client)

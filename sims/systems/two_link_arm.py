@@ -47,7 +47,7 @@ _REST_SPEED = 1e-6
 """rad/s: a joint that is slower is at rest."""
 
 
-def _of_link(
+def _make_link_parameters(
     name: str,
     unit: str,
     nominal: float,
@@ -72,8 +72,8 @@ class TwoLinkArm(OwnSimulator):
     kind = "rotary"
     time_step = 1 / 250
     parameters = (
-        *_of_link("mass", "kg", 1.0, (0.2, 3.0), (0.5, 1.5), says="mass of link"),
-        *_of_link(
+        *_make_link_parameters("mass", "kg", 1.0, (0.2, 3.0), (0.5, 1.5), says="mass of link"),
+        *_make_link_parameters(
             "centre",
             "m",
             0.2,
@@ -81,10 +81,12 @@ class TwoLinkArm(OwnSimulator):
             (0.12, 0.28),
             says="from the joint to the centre of mass of link",
         ),
-        *_of_link(
+        *_make_link_parameters(
             "damping", "N*m*s/rad", 0.1, (0.0, 0.5), (0.0, 0.2), says="viscous damping of joint"
         ),
-        *_of_link("friction", "N*m", 0.1, (0.0, 0.5), (0.0, 0.2), says="dry friction of joint"),
+        *_make_link_parameters(
+            "friction", "N*m", 0.1, (0.0, 0.5), (0.0, 0.2), says="dry friction of joint"
+        ),
     )
     constants = (
         Constant("length", "m", 0.4, "of link 1, from joint to joint", True, LENGTH_RANGE),

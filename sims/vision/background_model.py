@@ -153,13 +153,13 @@ def compute_masked_background(
     values = np.where(hidden[:, ever, None], np.nan, colours)
     result = before.copy()
     if ever.any():
-        middle = _median_of_seen(values)
+        middle = _compute_nan_median(values)
         # Add half a grey level, because the conversion to integers truncates.
         result[ever] = (middle + 0.5).astype(np.uint8)
     return result
 
 
-def _median_of_seen(values: NDArray[np.float32]) -> NDArray[np.float32]:
+def _compute_nan_median(values: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return the median over the first axis, ignoring NaN; numpy's takes four times as long."""
     # NaN are sorted last, so the number of other values determines the middle.
     ranked = np.sort(values, axis=0)

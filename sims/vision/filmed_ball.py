@@ -91,7 +91,9 @@ class FilmedBall(Simulator):
             # Fail here with one message, not in the middle of a training.
             video_packages.check_installed()
         self._tracked = film == "tracked"
-        self._ball = Ball(self._of_ball(self.constant_values), ["x", "y", "z"], **settings)
+        self._ball = Ball(
+            self._select_ball_constants(self.constant_values), ["x", "y", "z"], **settings
+        )
         # with the coefficients of effects that are not fixed
         self.parameters = self._ball.parameters
 
@@ -99,7 +101,9 @@ class FilmedBall(Simulator):
         """Simulate each row of `theta` (n, 1); returns (n, T, C). See `Simulator.simulate`."""
         constants = self.run_constants(scenario)
         self.run_inputs(scenario)  # which refuses any: the ball does not know of these names
-        fall = Scenario(scenario.times, scenario.initial, {}, self._of_ball(constants))
+        fall = Scenario(
+            scenario.times, scenario.initial, {}, self._select_ball_constants(constants)
+        )
         places = self._ball.simulate(theta, fall)
         camera = _make_camera(constants)
         radius = constants["radius"]
@@ -120,7 +124,7 @@ class FilmedBall(Simulator):
         self._ball.close()
 
     @staticmethod
-    def _of_ball(constants: Mapping[str, float]) -> dict[str, float]:
+    def _select_ball_constants(constants: Mapping[str, float]) -> dict[str, float]:
         return {c.name: constants[c.name] for c in BallSystem.constants}
 
 

@@ -227,7 +227,7 @@ def merge_continuations(paths: Sequence[TrackedPath]) -> tuple[TrackedPath, list
         apart = not set(path.frames) & set(frames)
         alike = low < path.radius / main.radius < high
         alike &= main.compute_colour_distance(path.mean_colour.tolist(), path.contrast) <= 1
-        aside = _median_distance_from_line(main.places, path.places)
+        aside = _compute_median_distance(main.places, path.places)
         if apart and alike and aside < _MAX_CONTINUATION_DISTANCE * main.radius:
             frames += path.frames
             spots += path.spots
@@ -242,7 +242,7 @@ def merge_continuations(paths: Sequence[TrackedPath]) -> tuple[TrackedPath, list
     return whole, others
 
 
-def _median_distance_from_line(line: Array, points: Array) -> float:
+def _compute_median_distance(line: Array, points: Array) -> float:
     """Return the median distance of points from the line fitted to other points.
 
     Args:

@@ -41,7 +41,7 @@ def patch():
         return target
 
     TuningProblem.draw_target = noting
-    result_rows._parameter_columns = lambda *_: {}
+    result_rows._build_parameter_columns = lambda *_: {}
 
 
 with contextlib.suppress(Exception):

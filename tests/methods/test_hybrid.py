@@ -3,7 +3,7 @@ import pytest
 
 from bench.benchmark.runner.tuner_loop import drive_tuner
 from methods.tuner import Evaluation, Task
-from methods.tuners.hybrid import TuneNetLeastSquares, _orthogonal_complement
+from methods.tuners.hybrid import TuneNetLeastSquares, _compute_orthogonal_complement
 from methods.tuners.least_squares import EvaluationHistory, LeastSquares
 from methods.tuners.tunenet import TuneNet
 from tests.methods.test_tunenet import TRAINING, Toy, run
@@ -110,7 +110,7 @@ def test_model_simulates_only_the_directions_that_are_missing():
 
 def test_complement_is_orthonormal():
     basis = [np.array([0.6, 0.8, 0.0])]
-    directions = _orthogonal_complement(basis, 3)
+    directions = _compute_orthogonal_complement(basis, 3)
     assert directions.shape == (2, 3)
     assert np.allclose(directions @ directions.T, np.eye(2))
     assert np.allclose(directions @ basis[0], 0.0)

@@ -134,7 +134,7 @@ def _make_median_chart(
         panels.append(replace(panel, facets=facets, rules=rules, title=title))
     medians = pd.concat(frames, ignore_index=True)
     return ComparisonChart(
-        _with_data(panels),
+        _select_panels_with_data(panels),
         {table: medians},
         side_by_side,
         _make_notes(view, statistics.coinciding(keys)),
@@ -204,7 +204,7 @@ def make_ert_chart(view: ComparisonView) -> ComparisonChart:
     for kind in view.ranges:
         lines = _make_lines(view, table, "ert", "line", "low", "high", range=kind)
         panels.append(_make_panel(view, kind, "ert", "threshold", lines, across, up))
-    return ComparisonChart(_with_data(panels), {}, notes=_make_notes(view))
+    return ComparisonChart(_select_panels_with_data(panels), {}, notes=_make_notes(view))
 
 
 def make_cost_chart(view: ComparisonView) -> ComparisonChart:
@@ -228,9 +228,9 @@ def make_cost_chart(view: ComparisonView) -> ComparisonChart:
             where = {"range": kind, "threshold": str(level)}
             lines = _make_lines(view, table[table["range"] == kind], "seconds", "line", **where)
             panel = _make_panel(view, kind, "seconds", "simulation_seconds", lines, across, up)
-            panels.append(_at_level(replace(panel, spans=spans), view, level))
+            panels.append(_add_error_threshold(replace(panel, spans=spans), view, level))
     return ComparisonChart(
-        _with_data(panels), {"seconds": pd.concat(parts)}, notes=_make_notes(view)
+        _select_panels_with_data(panels), {"seconds": pd.concat(parts)}, notes=_make_notes(view)
     )
 
 
@@ -266,8 +266,10 @@ def make_amortisation_chart(view: ComparisonView) -> ComparisonChart:
                 for place, name in enumerate(trained)
             )
             panel = _make_panel(view, kind, "even", "row", series, across, up)
-            panels.append(_at_level(replace(panel, rules=rules), view, level))
-    return ComparisonChart(_with_data(panels), {"even": pd.concat(parts)}, notes=_make_notes(view))
+            panels.append(_add_error_threshold(replace(panel, rules=rules), view, level))
+    return ComparisonChart(
+        _select_panels_with_data(panels), {"even": pd.concat(parts)}, notes=_make_notes(view)
+    )
 
 
 def split_by_training(view: ComparisonView, level: float) -> tuple[list[str], list[str]]:
@@ -337,7 +339,7 @@ def _make_panel(
     return Panel(title, table, x, series, across, up, {SIDE_BY_SIDE: PANEL_TITLES[kind]})
 
 
-def _at_level(panel: Panel, view: ComparisonView, level: float) -> Panel:
+def _add_error_threshold(panel: Panel, view: ComparisonView, level: float) -> Panel:
     """Add the error threshold to a panel's facets."""
     reached = f"{format_number(level)}{view.unit_of_levels}"
     return replace(panel, facets={**panel.facets, "error reached": reached})
@@ -363,6 +365,6 @@ def _make_lines(
     )
 
 
-def _with_data(panels: Sequence[Panel]) -> list[Panel]:
+def _select_panels_with_data(panels: Sequence[Panel]) -> list[Panel]:
     """Select the panels with data; at least one, since its axes show what is missing."""
     return [panel for panel in panels if panel.series] or list(panels[:1])

@@ -26,7 +26,7 @@ def limited_memory(mebibytes: int) -> Iterator[None]:
     resource = import_resource_module()
     previous_limits = resource.getrlimit(resource.RLIMIT_DATA)
     # The limit is relative to the present size, which depends on the packages loaded.
-    limit = _data_bytes() + mebibytes * 2**20
+    limit = _read_data_bytes() + mebibytes * 2**20
     soft = limit if previous_limits[1] == resource.RLIM_INFINITY else min(limit, previous_limits[1])
     resource.setrlimit(resource.RLIMIT_DATA, (soft, previous_limits[1]))
     try:
@@ -43,7 +43,7 @@ def limit_memory(mebibytes: int) -> None:
     """
     if mebibytes:
         resource = import_resource_module()
-        limit = _data_bytes() + mebibytes * 2**20
+        limit = _read_data_bytes() + mebibytes * 2**20
         resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
 
 
@@ -60,7 +60,7 @@ def import_resource_module() -> Any:
     return resource
 
 
-def _data_bytes() -> int:
+def _read_data_bytes() -> int:
     """Return the private writable memory of this process in bytes, as RLIMIT_DATA counts it."""
     with open("/proc/self/status", encoding="ascii") as lines:
         for line in lines:

@@ -35,14 +35,18 @@ def availability(experiment: Experiment) -> Availability:
     """Find what is missing for an experiment, or for all experiments that it names."""
     if experiment.experiments:
         return _combine_availability(experiment)
-    data_set = _missing_data_set(experiment)
+    data_set = _find_missing_data_set(experiment)
     missing_file = (
-        "" if data_set else find_missing_model_file(experiment) or _missing_recording(experiment)
+        ""
+        if data_set
+        else find_missing_model_file(experiment) or _explain_missing_recording(experiment)
     )
     return Availability(
         data_set,
-        missing_file or _missing_simulator(experiment) or _missing_engine(experiment),
-        _missing_tuners(experiment),
+        missing_file
+        or _explain_missing_simulator(experiment)
+        or _explain_missing_engine(experiment),
+        _explain_missing_tuners(experiment),
     )
 
 
@@ -93,7 +97,7 @@ def _combine_availability(experiment: Experiment) -> Availability:
     return Availability(next(iter(data_sets), None), "; ".join(skipped), absent)
 
 
-def _missing_simulator(experiment: Experiment) -> str:
+def _explain_missing_simulator(experiment: Experiment) -> str:
     """Return why the experiment's registered simulator cannot be used here.
 
     The text is empty if it can be used, or if the simulator is not a registered one.
@@ -107,7 +111,7 @@ def _missing_simulator(experiment: Experiment) -> str:
     return ""
 
 
-def _missing_data_set(experiment: Experiment) -> DataSet | None:
+def _find_missing_data_set(experiment: Experiment) -> DataSet | None:
     """Return the data set that an experiment needs and that is missing here."""
     wanted = [("robot", experiment.model)] if experiment.model else []
     if experiment.recording:
@@ -119,7 +123,7 @@ def _missing_data_set(experiment: Experiment) -> DataSet | None:
     return None
 
 
-def _missing_recording(experiment: Experiment) -> str:
+def _explain_missing_recording(experiment: Experiment) -> str:
     """Return why the recording of an experiment cannot be read here; empty if it can."""
     if not experiment.recording:
         return ""
@@ -130,13 +134,13 @@ def _missing_recording(experiment: Experiment) -> str:
     return ""
 
 
-def _missing_engine(experiment: Experiment) -> str:
+def _explain_missing_engine(experiment: Experiment) -> str:
     """Return why an engine of an experiment cannot be used here; empty if all can.
 
     The engines are those of the tuned simulator and of the simulator that makes the targets.
     """
     settings = [experiment.settings, *([experiment.world] if experiment.world else [])]
-    engines = [str(each.get("engine") or _default_engine(experiment)) for each in settings]
+    engines = [str(each.get("engine") or _get_default_engine(experiment)) for each in settings]
     packages = sorted(
         {
             package
@@ -150,7 +154,7 @@ def _missing_engine(experiment: Experiment) -> str:
     return f"needs {', '.join(packages)}, not installed (pip install {' '.join(packages)})"
 
 
-def _default_engine(experiment: Experiment) -> str:
+def _get_default_engine(experiment: Experiment) -> str:
     """Return the default engine of an experiment; empty if its simulator is not known."""
     if experiment.model:
         return "mujoco"
@@ -159,7 +163,7 @@ def _default_engine(experiment: Experiment) -> str:
     return str(getattr(simulators.get(experiment.simulator), "default_engine", ""))
 
 
-def _missing_tuners(experiment: Experiment) -> Mapping[str, str]:
+def _explain_missing_tuners(experiment: Experiment) -> Mapping[str, str]:
     """Return the reason by label for each tuner of an experiment that cannot run here."""
     reasons = {}
     for entry in experiment.tuners:

@@ -81,7 +81,7 @@ class RandomisedSimulator:
         except (InputError, TypeError) as error:
             raise InputError(f"{who}: {error}") from None
         tuned = len(problem.simulator.parameters)
-        self._ranges = _in_order(who, self._simulator, tuned, ranges)
+        self._ranges = _order_bounds(who, self._simulator, tuned, ranges)
 
     def simulate(
         self, rng: np.random.Generator, points: Array, scenarios: tuple[Scenario, ...]
@@ -130,7 +130,7 @@ def _get_effect_name(name: str) -> str:
     )
 
 
-def _in_order(
+def _order_bounds(
     who: str, simulator: Simulator, tuned: int, ranges: Mapping[str, tuple[float, float]]
 ) -> tuple[Array, Array]:
     """Return lower and upper bounds in the simulator's order; zero for coefficients not named."""

@@ -187,7 +187,7 @@ def _draw_target(problem: TargetProblem, kind: str, index: int, number: int) -> 
     clean = problem.world.simulate(theta, scenarios[0])[0]
     observed = clean + problem.noise * streams.get_stream("noise").standard_normal(clean.shape)
     fitting = ObservedRuns(scenarios, _round_to_resolution(observed, problem))
-    held_out = _held_out(problem, theta, streams)
+    held_out = _simulate_held_out(problem, theta, streams)
     if any(_is_divergent(each, problem.channels) for each in (clean, held_out.observed)):
         return None
     sealed = BlindedTarget(name, kind, start, fitting, held_out)
@@ -244,7 +244,7 @@ def _draw_value(rng: np.random.Generator, value: FixedOrRange) -> float:
     return rng.uniform(*value) if isinstance(value, tuple) else value
 
 
-def _held_out(problem: TargetProblem, theta: Array, target: TargetStreams) -> ObservedRuns:
+def _simulate_held_out(problem: TargetProblem, theta: Array, target: TargetStreams) -> ObservedRuns:
     """Simulate the held-out scenarios of a target, without sensor noise.
 
     Args:

@@ -56,14 +56,14 @@ def standings(statistics: ComparisonStatistics, kind: str) -> list[Standing]:
         statistics: Statistics of the comparison.
         kind: Range of the targets.
     """
-    ranking = _in_range(statistics, kind)
+    ranking = _select_range(statistics, kind)
     return [
         _sort_by_verdict(statistics, k, ranking[ranking["simulations"] == k])
         for k in sorted(set(ranking["simulations"].astype(int)))
     ]
 
 
-def _in_range(statistics: ComparisonStatistics, kind: str) -> pd.DataFrame:
+def _select_range(statistics: ComparisonStatistics, kind: str) -> pd.DataFrame:
     return statistics.ranking[statistics.ranking["range"] == kind]
 
 
@@ -117,7 +117,10 @@ def targets_text(statistics: ComparisonStatistics, kind: str) -> str:
         statistics: Statistics of the comparison.
         kind: Range of the targets.
     """
-    count, deciding_counts = statistics.target_counts[kind], _in_range(statistics, kind)["targets"]
+    count, deciding_counts = (
+        statistics.target_counts[kind],
+        _select_range(statistics, kind)["targets"],
+    )
     deciding = int(deciding_counts.max()) if len(deciding_counts) else 0
     unit = ("starting point" if kind == "real" else "target") + "s" * (count != 1)
     # Targets whose data identify no direction have no deciding error.
@@ -148,7 +151,7 @@ def how_decided(statistics: ComparisonStatistics, kind: str) -> str:
 
 def _count_tested_tuners(statistics: ComparisonStatistics, kind: str) -> int:
     """Return the number of tuners that the best one is tested against."""
-    part = _in_range(statistics, kind)
+    part = _select_range(statistics, kind)
     return max(part.loc[part["verdict"] != FAILED, "tuner"].nunique() - 1, 0)
 
 
@@ -160,7 +163,7 @@ def too_few(statistics: ComparisonStatistics, kind: str) -> str:
         kind: Range of the targets.
     """
     ranked, comparison_count = (
-        _in_range(statistics, kind)["targets"],
+        _select_range(statistics, kind)["targets"],
         _count_tested_tuners(statistics, kind),
     )
     if not comparison_count or int(ranked.max()) >= (needed := targets_needed(comparison_count)):
@@ -179,7 +182,7 @@ def failed_runs(statistics: ComparisonStatistics, kind: str) -> str:
         statistics: Statistics of the comparison.
         kind: Range of the targets.
     """
-    part = _in_range(statistics, kind).drop_duplicates("tuner")
+    part = _select_range(statistics, kind).drop_duplicates("tuner")
     texts = [
         f"{row['tuner']} {row['failures']} of {row['runs']}"
         for row in part.to_dict("records")

@@ -195,14 +195,14 @@ def _list_source_classes(kind: type) -> list[type]:
             # Classes of the standard library are determined by the version of Python. A base that
             # only describes an interface is found there. A class that a metaclass made only names
             # such a module.
-            if part in parts or (_of_python(part) and _under_its_name(part)):
+            if part in parts or (_is_standard_library(part) and _is_defined_in_module(part)):
                 continue
             parts.append(part)
             waiting += vars(part).get("made_of", ())
     return parts
 
 
-def _of_python(kind: type) -> bool:
+def _is_standard_library(kind: type) -> bool:
     top = _get_top_level_package(kind)
     return top in sys.stdlib_module_names and top != "__main__"
 
@@ -211,7 +211,7 @@ def _get_top_level_package(kind: type) -> str:
     return kind.__module__.partition(".")[0]
 
 
-def _under_its_name(kind: type) -> bool:
+def _is_defined_in_module(kind: type) -> bool:
     """Return whether the module that a class names contains this class under its name.
 
     Only then is the module's source the source of the class. A function may make many classes from
@@ -235,7 +235,7 @@ def _represent_class(kind: type) -> Any:
     # The digest is not inherited, because a subclass behaves differently.
     if (own := vars(kind).get("source_digest")) is not None:
         return own
-    if not _under_its_name(kind):
+    if not _is_defined_in_module(kind):
         raise _make_source_error(kind)
     if kind.__module__ == "__main__":
         return _read_class_source(kind)

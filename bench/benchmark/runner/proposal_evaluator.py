@@ -59,7 +59,7 @@ class ProposalEvaluator:
         observations = self._problem.simulate(points, self._scenarios)
         single = observations.shape[0] == observations.shape[2] == 1
         if single and self._missing is None:
-            return observations, self._one_loss(observations)
+            return observations, self._compute_single_loss(observations)
         squares = self._sum_squared_errors(observations)
         self._seen.append(squares)
         losses: Array = np.sqrt(squares @ self._per_loss)  # (1)
@@ -69,7 +69,7 @@ class ProposalEvaluator:
             losses[~np.isfinite(losses)] = np.inf
         return observations, losses
 
-    def _one_loss(self, observations: Array) -> Array:
+    def _compute_single_loss(self, observations: Array) -> Array:
         """Compute the loss (1,) of one observation of one channel without missing samples.
 
         Most evaluations are of this kind, and this takes a third of the time of the general case.

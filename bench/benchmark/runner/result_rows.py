@@ -87,9 +87,9 @@ def build_rows(
         "range": [target.blinded.range] * (k + 1),
         "trusted": [problem.experiment.trusted] * (k + 1),
         "k": np.arange(k + 1),
-        "loss": _after_start(trace.losses),
+        "loss": _prepend_nan(trace.losses),
     }
-    columns |= _parameter_columns(problem, target, outcome)
+    columns |= _build_parameter_columns(problem, target, outcome)
     if spectrum is not None and target.truth is not None:
         # Directions combine parameters, which therefore need a common unit: training widths.
         away = problem.cube.to_physical(trace.recommendations) - target.truth
@@ -108,12 +108,12 @@ def build_rows(
         noise = problem.noise[i] if problem.noise[i] > 0 else np.nan
         columns[f"obs_error_{channel.name}_in_noise"] = outcome.obs_rmse[:, i] / noise
         columns[f"heldout_error_{channel.name}"] = heldout[:, i]
-    columns["tuner_seconds"] = _after_start(trace.tuner_seconds)
-    columns["simulator_seconds"] = _after_start(trace.simulator_seconds)
+    columns["tuner_seconds"] = _prepend_nan(trace.tuner_seconds)
+    columns["simulator_seconds"] = _prepend_nan(trace.simulator_seconds)
     return columns
 
 
-def _parameter_columns(
+def _build_parameter_columns(
     problem: TuningProblem, target: Target, outcome: RunOutcome
 ) -> dict[str, Any]:
     """Build columns of parameter errors, proposals, recommendations and true parameters."""
@@ -133,12 +133,12 @@ def _parameter_columns(
         np.nan if target.truth is None else problem.compute_distance_from_training(target.truth),
     )
     for i, parameter in enumerate(cube.parameters):
-        columns[f"proposal_{parameter.name}"] = _after_start(proposed[:, i])
+        columns[f"proposal_{parameter.name}"] = _prepend_nan(proposed[:, i])
         columns[f"recommendation_{parameter.name}"] = recommended[:, i]
         columns[f"true_{parameter.name}"] = np.full(len(errors), truth[i])
     return columns
 
 
-def _after_start(values: Any) -> Any:
+def _prepend_nan(values: Any) -> Any:
     """Prepend NaN, for k = 0 before any simulation, to the values of simulations 1..k."""
     return np.concatenate([[np.nan], values])

@@ -118,12 +118,14 @@ def make_tuner_spec(entry: TunerEntry) -> TunerSpec:
     file = tuners.place(entry.tuner)
     module = getattr(kind, "module", "") or kind.__module__
     preloaded = (
-        find_preloadable_packages(str(file) if file else _file_of(module)) if file or module else ()
+        find_preloadable_packages(str(file) if file else _find_source_file(module))
+        if file or module
+        else ()
     )
     return TunerSpec(kind.name, module, str(file or ""), dict(entry.options), preloaded)
 
 
-def _file_of(module: str) -> str:
+def _find_source_file(module: str) -> str:
     """Return the source file of a module of a package that the fork server may import in advance.
 
     Empty for modules of other packages, such as plugins: locating them could execute their code.
@@ -148,7 +150,7 @@ def find_preloadable_packages(file: str) -> tuple[str, ...]:
             if name.partition(".")[0] in _PRELOADABLE_PACKAGES and name not in packages:
                 packages[name] = None
                 if name.startswith("methods."):
-                    files.append(_file_of(name))
+                    files.append(_find_source_file(name))
     return tuple(packages)
 
 

@@ -28,7 +28,7 @@ class WorkerProcess(SpawnProcess):
         # The resource tracker unblocks interrupts after it has started its own process, so it must
         # be running before they are blocked.
         resource_tracker.ensure_running()
-        with _interrupts_held_back(), _main_module_left_out():
+        with _block_interrupts(), _leave_out_main_module():
             super().start()
 
 
@@ -45,7 +45,7 @@ _preparing = threading.RLock()
 
 
 @contextmanager
-def _main_module_left_out() -> Iterator[None]:
+def _leave_out_main_module() -> Iterator[None]:
     """Prevent processes that this thread spawns from importing the main module.
 
     multiprocessing has no option for this. The preparation data is made inside ``Popen._launch``,
@@ -73,7 +73,7 @@ def _main_module_left_out() -> Iterator[None]:
 
 
 @contextmanager
-def _interrupts_held_back() -> Iterator[None]:
+def _block_interrupts() -> Iterator[None]:
     """Block SIGINT in this thread; processes started in the block inherit the mask.
 
     Ctrl-C is sent to all processes of the terminal's group; workers must finish their runs.

@@ -236,7 +236,7 @@ class LocalPool:
         following = deque(_AssignedCall(place) for place in range(len(calls)))
         pace = _PrefetchPolicy()
         while True:
-            self._hand_out(following, pace.depth, calls, limit)
+            self._assign_calls(following, pace.depth, calls, limit)
             futures = [future for slot in self._slots for future in slot.given]
             if not futures:
                 return
@@ -248,7 +248,7 @@ class LocalPool:
                     yield call.place, result
             pace.adapt()
 
-    def _hand_out(
+    def _assign_calls(
         self,
         following: deque[_AssignedCall],
         depth: int,
@@ -345,7 +345,7 @@ class _WorkerSlot:
                 waiting.appendleft(call)
             else:
                 ended.append((call, future.result() if error is None else _convert_error(error)))
-        if not lost and self._died_quietly():
+        if not lost and self._was_replaced_without_result():
             lost = True
             running = next(future for future in self.given if future.running())
             ended.append((self.given.pop(running), WorkerDiedError(_describe_worker_exit(0))))
@@ -355,7 +355,7 @@ class _WorkerSlot:
             self._replace_process()
         return ended
 
-    def _died_quietly(self) -> bool:
+    def _was_replaced_without_result(self) -> bool:
         """Return whether the process was replaced although its running call has no result."""
         while self._births.poll():
             self._births.recv()
@@ -380,14 +380,16 @@ class _WorkerSlot:
         self._start_process()
 
 
-def _exit_code(error: BaseException | None) -> int | None:
+def _get_exit_code(error: BaseException | None) -> int | None:
     """Return the exit code of the worker process if pebble reports that this ended the call."""
     return getattr(error, "exitcode", None)
 
 
 def _loses_the_worker(error: BaseException | None) -> bool:
     """Return whether the worker of an ended call is gone: it died, or was killed at its limit."""
-    return _exit_code(error) is not None or isinstance(error, BrokenExecutor | FutureTimeoutError)
+    return _get_exit_code(error) is not None or isinstance(
+        error, BrokenExecutor | FutureTimeoutError
+    )
 
 
 def _should_retry(call: _AssignedCall, error: BaseException | None) -> bool:
@@ -395,7 +397,7 @@ def _should_retry(call: _AssignedCall, error: BaseException | None) -> bool:
 
     It also counts the deaths of workers during the call.
     """
-    code = _exit_code(error)
+    code = _get_exit_code(error)
     # A broken pool has not begun the call, or has not reported its result.
     is_repeated = isinstance(error, BrokenExecutor) or (
         code in _EXTERNAL_KILL_EXIT_CODES and call.deaths < MAX_RETRIES
@@ -409,7 +411,7 @@ def _convert_error(error: BaseException) -> BaseException:
     """Return the exception that replaces the result of a failed call."""
     if isinstance(error, FutureTimeoutError):
         return TimeoutError(str(error))  # two different classes before Python 3.11
-    code = _exit_code(error)
+    code = _get_exit_code(error)
     return error if code is None else WorkerDiedError(_describe_worker_exit(code))
 
 

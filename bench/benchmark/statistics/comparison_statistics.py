@@ -59,14 +59,14 @@ class ComparisonStatistics:
         """
         self.metric, self.runs, in_widths = select_primary_metric(runs)
         self._statuses, self._budget, self._costs = statuses, experiment.budget, costs
-        self._rows = self._laid_out(self.runs)
+        self._rows = self._make_run_rows(self.runs)
         self.curves = self._rows.build_curves(self.metric)
         self.spread, self.levels = select_thresholds(self.curves, in_widths)
         self.floor = experiment.negligible_error
         if not in_widths:
             # For a recording no error is known to be zero; the smallest median error is used
             # instead.
-            self.floor = (1.0 + self.floor) * _least_median(self.curves)
+            self.floor = (1.0 + self.floor) * _find_least_median(self.curves)
         self.all_runs = runs
         self._curves: dict[str, RunCurves] = {}
         self._medians: dict[tuple[str, str], pd.DataFrame] = {}
@@ -173,15 +173,15 @@ class ComparisonStatistics:
         """
         key = metric, kind
         if key not in self._medians:
-            curves = self._of_all(metric).select(range=kind)
+            curves = self._get_curves_of_all_runs(metric).select(range=kind)
             self._medians[key] = compute_median_curves(curves, metric, self._budget)
         return self._medians[key]
 
-    def _of_all(self, metric: str) -> RunCurves:
+    def _get_curves_of_all_runs(self, metric: str) -> RunCurves:
         """Return the curves of a metric for all runs that have it, from a cache if possible."""
         if metric not in self._curves:
             there = self.all_runs[metric].notna()
-            rows = self._all_runs if there.all() else self._laid_out(self.all_runs[there])
+            rows = self._all_runs if there.all() else self._make_run_rows(self.all_runs[there])
             self._curves[metric] = rows.build_curves(metric)
         return self._curves[metric]
 
@@ -189,9 +189,9 @@ class ComparisonStatistics:
     def _all_runs(self) -> RunRowTable:
         """Table of all runs; equal to the table of the deciding runs if these are all runs."""
         whole = len(self.runs) == len(self.all_runs)
-        return self._rows if whole else self._laid_out(self.all_runs)
+        return self._rows if whole else self._make_run_rows(self.all_runs)
 
-    def _laid_out(self, runs: pd.DataFrame) -> RunRowTable:
+    def _make_run_rows(self, runs: pd.DataFrame) -> RunRowTable:
         return RunRowTable(runs, self._statuses, self._budget)
 
     @property
@@ -206,7 +206,7 @@ class ComparisonStatistics:
         See `median_curves.compute_medians_by_distance`.
         """
         first = self.select_range("wide").drop_duplicates("target").set_index("target")["outside"]
-        curves = self._of_all(self.parameter_error_metric).select(range="wide")
+        curves = self._get_curves_of_all_runs(self.parameter_error_metric).select(range="wide")
         return compute_medians_by_distance(curves, first.sort_index(), self._budget)
 
     @cached_property
@@ -254,7 +254,7 @@ class ComparisonStatistics:
         return max(self.tuning_costs)
 
 
-def _least_median(curves: RunCurves) -> float:
+def _find_least_median(curves: RunCurves) -> float:
     """Return the smallest median final error of any tuner; 0 if every run failed."""
     medians = [
         float(np.median(curves.select(tuner=t).compute_final_values()))

@@ -82,7 +82,9 @@ def build_error_table(
         ]
         counts = len(mine), int(rows.failed[mine].sum())
         for metric, curve in curves.items():
-            values = _over_targets(curve, mine, points, (str(tuner), str(kind), metric), resamples)
+            values = _summarise_over_targets(
+                curve, mine, points, (str(tuner), str(kind), metric), resamples
+            )
             for i, k in enumerate(points):
                 errors, times = values[:, i], (seconds[0][i], seconds[1][i])
                 key = (experiment, tuner, kind, k, metric)
@@ -95,7 +97,7 @@ def build_error_table(
     return pd.DataFrame(lines, columns=ERROR_TABLE_COLUMNS)
 
 
-def _over_targets(
+def _summarise_over_targets(
     curves: RunCurves,
     mine: NDArray[np.int64],
     points: list[int],

@@ -95,14 +95,14 @@ class ThresholdEffort:
         Returns:
             (...) expected running time; infinite without a success.
         """
-        return _per_success(self.simulations, self.successes, picked)
+        return _divide_by_successes(self.simulations, self.successes, picked)
 
     def compute_tuner_seconds(self) -> float:
         """Return the seconds in the tuner per success."""
-        return float(_per_success(self.seconds, self.successes, None))
+        return float(_divide_by_successes(self.seconds, self.successes, None))
 
 
-def _per_success(
+def _divide_by_successes(
     spent: Array, successes: NDArray[np.int64], picked: NDArray[np.int64] | None
 ) -> Array:
     """Divide the total effort by the number of successes; infinite without a success.

@@ -118,7 +118,7 @@ def coinciding(drawn: Mapping[str, Sequence[pd.Series[float]]]) -> dict[str, str
             if len(drawn[above]) != len(drawn[name]):
                 continue
             pairs = list(zip(drawn[name], drawn[above], strict=True))
-            upto = min(_equal_up_to(mine, other) for mine, other in pairs)
+            upto = min(_count_equal_simulations(mine, other) for mine, other in pairs)
             moved = any((mine.loc[:upto] < 0.5 * mine.iloc[0]).any() for mine, _ in pairs)
             if upto > longest and moved:
                 longest = upto
@@ -127,7 +127,7 @@ def coinciding(drawn: Mapping[str, Sequence[pd.Series[float]]]) -> dict[str, str
     return notes
 
 
-def _equal_up_to(mine: pd.Series[float], other: pd.Series[float]) -> int:
+def _count_equal_simulations(mine: pd.Series[float], other: pd.Series[float]) -> int:
     """Return the largest number of simulations up to which two curves look the same; 0 for none."""
     points = mine.index.intersection(other.index)
     a, b = mine[points].to_numpy(), other[points].to_numpy()
@@ -166,7 +166,14 @@ def compute_medians_by_distance(
                 if len(part):
                     ends = float(distances[names].min()), float(distances[names].max())
                     lines.append(
-                        (k, tuner, b, *ends, len(names), *_median_with_interval(part, tuner, b))
+                        (
+                            k,
+                            tuner,
+                            b,
+                            *ends,
+                            len(names),
+                            *_compute_median_with_interval(part, tuner, b),
+                        )
                     )
     return pd.DataFrame(lines, columns=DISTANCE_COLUMNS)
 
@@ -184,7 +191,9 @@ def _group_by_distance(distances: pd.Series[float]) -> dict[int, list[str]]:
     return {b: names for b, names in enumerate([inside, *parts]) if names}
 
 
-def _median_with_interval(values: Array, tuner: str, place: int) -> tuple[float, float, float]:
+def _compute_median_with_interval(
+    values: Array, tuner: str, place: int
+) -> tuple[float, float, float]:
     """Return the median of values (n,) with its interval; the interval of one value is NaN."""
     # The stream's name numbers the group inside the training range -1.
     names = ("distance", tuner, str(place - 1))

@@ -100,11 +100,13 @@ def compute_rank_agreement(first: Array, second: Array, *names: str) -> RankAgre
     low, high = np.nanquantile(boot, [0.025, 0.975]) if count > 1 else (np.nan, np.nan)
     # Targets that are drawn twice make ranks noisier, and noise moves tau towards 0.
     low, high = min(low, observed), max(high, observed)
-    p = _permutation_p_value(ranks[1] - ranks[0], rng)
-    return RankAgreement(observed, float(low), float(high), _mean_split_half_tau(ranks[0], rng), p)
+    p = _compute_permutation_p_value(ranks[1] - ranks[0], rng)
+    return RankAgreement(
+        observed, float(low), float(high), _compute_mean_split_half_tau(ranks[0], rng), p
+    )
 
 
-def _permutation_p_value(changes: Array, rng: np.random.Generator) -> float:
+def _compute_permutation_p_value(changes: Array, rng: np.random.Generator) -> float:
     """Compute the permutation p-value for changes of rank (targets, tuners).
 
     The null hypothesis is that no tuner's mean rank changes. The statistic is the sum over tuners
@@ -119,7 +121,7 @@ def _permutation_p_value(changes: Array, rng: np.random.Generator) -> float:
     return float((1 + (sums >= observed * (1 - 1e-12)).sum()) / (1 + PERMUTATION_COUNT))
 
 
-def _mean_split_half_tau(ranks: Array, rng: np.random.Generator) -> float:
+def _compute_mean_split_half_tau(ranks: Array, rng: np.random.Generator) -> float:
     """Compute the mean Kendall tau between the rankings on two random halves of the targets.
 
     It says how well a ranking of tuners repeats on other targets: 1 is the same order, 0 a random

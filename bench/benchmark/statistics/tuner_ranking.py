@@ -180,7 +180,7 @@ def _build_verdict_rows(
         else:
             verdict = EQUAL if ranks[tuner] == ranks[best] else UNDECIDED
         worse = int((logs[tuner] > logs[best]).sum())
-        median, least = _median_error(logs[tuner]), _median_error(logs[best])
+        median, least = _compute_median_error(logs[tuner]), _compute_median_error(logs[best])
         p_value = test.p_value if tuner in others else np.nan
         against = (
             median,
@@ -195,7 +195,7 @@ def _build_verdict_rows(
     return pd.DataFrame(lines, columns=RANKING_COLUMNS)
 
 
-def _median_error(logs: pd.Series[float]) -> float:
+def _compute_median_error(logs: pd.Series[float]) -> float:
     """Return the median error; infinite if half of the targets failed."""
     middle = float(logs.median())
     return float(np.exp(middle)) if middle < _NO_ERROR else np.inf

@@ -78,7 +78,7 @@ def read_records(path: Path) -> Iterator[tuple[int, RunStatus, pa.Table, int]]:
         end += _HEAD.size + length
         try:
             rows = pa.ipc.open_stream(payload).read_all()
-            held = _statuses_of([json.loads(rows.schema.metadata[b"status"])])
+            held = _convert_statuses([json.loads(rows.schema.metadata[b"status"])])
         except _DAMAGE as error:
             raise _make_damage_error(path, f"a record of a run: {get_first_line(error)}") from None
         ((place, status),) = held.items()
@@ -94,7 +94,7 @@ def read_part_statuses(path: Path) -> dict[int, RunStatus]:
     from pyarrow import parquet
 
     try:
-        return _statuses_of(json.loads(parquet.read_schema(path).metadata[b"statuses"]))
+        return _convert_statuses(json.loads(parquet.read_schema(path).metadata[b"statuses"]))
     except _DAMAGE as error:
         raise _make_damage_error(
             path, f"a part of a comparison, found damage: {get_first_line(error)}"
@@ -105,7 +105,7 @@ _DAMAGE = (OSError, ValueError, KeyError, TypeError, CellError, RecursionError, 
 """Errors that reading a damaged segment may raise; they include Arrow's own errors."""
 
 
-def _statuses_of(held: Any) -> dict[int, RunStatus]:
+def _convert_statuses(held: Any) -> dict[int, RunStatus]:
     """Convert ``[[place, {column: value}], ...]`` to statuses by index, checking every cell.
 
     Raises:

@@ -293,8 +293,8 @@ def read_comparison(folder: Path, columns: Sequence[str] | None = None) -> Store
     runs = parquet.read_table(path, columns=wanted).to_pandas()
     return StoredComparison(
         experiment,
-        _with_defaults(runs, RUN_COLUMNS, columns) if there else runs,
-        _with_defaults(files.statuses, STATUS_COLUMNS),
+        _add_missing_columns(runs, RUN_COLUMNS, columns) if there else runs,
+        _add_missing_columns(files.statuses, STATUS_COLUMNS),
         _compute_training_costs(files.training),
         files.spectra,
     )
@@ -311,7 +311,7 @@ def read_checked_comparison(folder: Path) -> StoredComparison:
     return stored
 
 
-def _with_defaults(
+def _add_missing_columns(
     frame: pd.DataFrame, declared: Columns, wanted: Sequence[str] | None = None
 ) -> pd.DataFrame:
     """Add columns that a folder of an older version lacks, filled with their declared default.

@@ -343,15 +343,15 @@ def expand_columns(
 
 def list_parameters(names: Iterable[str]) -> list[str]:
     """List the parameters in the names of a file's columns."""
-    return _spoken_of(names, "proposal_", "recommendation_", "true_")
+    return _list_name_parts(names, "proposal_", "recommendation_", "true_")
 
 
 def list_channels(names: Iterable[str]) -> list[str]:
     """List the channels in the names of a file's columns."""
-    found = _spoken_of(names, "obs_error_", "heldout_error_")
+    found = _list_name_parts(names, "obs_error_", "heldout_error_")
     return list(dict.fromkeys(name.removesuffix("_in_noise") for name in found))
 
 
-def _spoken_of(names: Iterable[str], *prefixes: str) -> list[str]:
+def _list_name_parts(names: Iterable[str], *prefixes: str) -> list[str]:
     rests = [name[len(p) :] for name in names for p in prefixes if name.startswith(p)]
     return list(dict.fromkeys(rests))

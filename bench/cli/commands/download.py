@@ -78,7 +78,7 @@ def _run_download(options: argparse.Namespace, say: PrintLine) -> CommandResult:
         say(f"{data_set.name}: {_download_data_set(data_set, options.source, options.out)}")
         downloaded.append(data_set.name)
         if options.out:
-            say(_how_found(data_set, options.out))
+            say(_explain_folder_lookup(data_set, options.out))
         for name in _list_dependent_experiments(data_set):
             say(f"needed by: simgap compare {name}")
     documents = [_make_data_set_document(each, options.out) for each in data_sets]
@@ -118,7 +118,7 @@ def _find_present_folder(data_set: DataSet, out: Path | None) -> Path | None:
     return folder if all((folder / file).is_file() for file in data_set.provides) else None
 
 
-def _how_found(data_set: DataSet, out: Path) -> str:
+def _explain_folder_lookup(data_set: DataSet, out: Path) -> str:
     """Explain how experiments find a data set in a folder other than the default one."""
     from bench.datasets.dataset_catalogue import FOLDER_VARIABLES, search_folders
 

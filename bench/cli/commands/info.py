@@ -42,7 +42,7 @@ def collect_info() -> JsonDocument:
         "paths": {
             "simgap": str(_HOME),
             "cache": str(_get_cache_folder()),
-            "data sets": str(_data_sets()),
+            "data sets": str(_get_data_set_folder()),
             "SIMGAP_DATA": os.environ.get("SIMGAP_DATA"),
             "SIMGAP_ROBOTS": os.environ.get("SIMGAP_ROBOTS"),
         },
@@ -61,7 +61,7 @@ def _get_cache_folder() -> Path:
     return get_weights_folder()
 
 
-def _data_sets() -> Path:
+def _get_data_set_folder() -> Path:
     from bench.datasets.dataset_catalogue import user_folder
 
     return user_folder()

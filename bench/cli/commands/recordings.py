@@ -241,9 +241,9 @@ def _run_inspect(options: argparse.Namespace, say: PrintLine) -> CommandResult:
     ]
     odd = [*(o.text for o in found), *robot_summary.format_log_warnings(recording, kind)]
     findings = list(check_log_quality(recording, kind))
-    active_recording, inactive = _without_inactive_drives(recording, kind)
+    active_recording, inactive = _remove_inactive_drives(recording, kind)
     findings += inactive
-    differences, fixes = _differing_conventions(options, active_recording, kind)
+    differences, fixes = _find_differing_conventions(options, active_recording, kind)
     for line in (
         *about,
         *format_summary(recording, kind),
@@ -283,7 +283,7 @@ def _run_inspect(options: argparse.Namespace, say: PrintLine) -> CommandResult:
     return CommandResult(document, EXIT_PROBLEMS_FOUND if lost else EXIT_OK)
 
 
-def _without_inactive_drives(
+def _remove_inactive_drives(
     recording: Recording, kind: type[Simulator]
 ) -> tuple[Recording, list[QualityFinding]]:
     """Return a robot's recording without samples in which drives do nothing, and where that is."""
@@ -301,7 +301,7 @@ def _without_inactive_drives(
     return used, findings
 
 
-def _differing_conventions(
+def _find_differing_conventions(
     options: argparse.Namespace, recording: Recording, kind: type[Simulator]
 ) -> tuple[list[ConventionDifference], list[str]]:
     """Return a robot log's conventions that differ from its model file, and their corrections.

@@ -34,7 +34,7 @@ def build_log_table(rows: Sequence[LogResult], folders: Mapping[str, Path]) -> p
     lines = []
     for log_number, row in enumerate(rows, start=1):
         folder = folders[row.log]
-        error = _held_out_of(folder) if not row.error else {}
+        error = _read_held_out_errors(folder) if not row.error else {}
         report = "" if row.error else quote(f"{folder.name}/{REPORT_FILE}")
         lines.append({
             "number": log_number, "log": row.log, "verdict": row.verdict or "not explained",
@@ -58,7 +58,7 @@ def read_log_table(rows: Sequence[LogResult]) -> pd.DataFrame:
     return frame
 
 
-def _held_out_of(folder: Path) -> dict[str, float]:
+def _read_held_out_errors(folder: Path) -> dict[str, float]:
     """Read the held-out errors from a log's verdict.json; empty if it cannot be read."""
     try:
         held_out = json.loads((folder / "verdict.json").read_text(encoding="utf-8"))["heldout"]

@@ -136,7 +136,7 @@ def compute_detection_limits(
     likelihood = model.likelihood
     # The residual of the model is taken as the noise, whatever the recording specifies.
     noise = NoiseModel(np.maximum(likelihood.sigma, 1e-300), likelihood.phi)
-    directions = _with_small_gaps(evaluator, fit, compute_directions(evaluator, fit, names))
+    directions = _add_small_gaps(evaluator, fit, compute_directions(evaluator, fit, names))
     information = _Shown(
         evaluator,
         noise,
@@ -163,7 +163,7 @@ def _compute_prediction_half_widths(
     }
 
 
-def _with_small_gaps(
+def _add_small_gaps(
     evaluator: RunEvaluator, fit: TrajectoryFit, directions: DirectionSet
 ) -> DirectionSet:
     """Add directions of backlash that is smaller than the search tries.
@@ -269,7 +269,9 @@ class _Shown:
         reaches = {}
         for (name, place), probe_indices in shapes.items():
             # At that shape a richer law may be equivalent to a simpler one that it contains.
-            new_shapes = [k for k in probe_indices if not self._told_already(name, k, best)]
+            new_shapes = [
+                k for k in probe_indices if not self._is_covered_by_simpler_effect(name, k, best)
+            ]
             if name not in limits and new_shapes:
                 reaches[name, self._get_coefficient_name(name, place)] = (
                     self._compute_proportional_limit(new_shapes[0])
@@ -314,7 +316,9 @@ class _Shown:
         order = np.argsort(-parts).tolist()
         return tuple(self.free[j] for j in order if parts[j] > MIN_CONFOUNDING_SHARE)
 
-    def _told_already(self, name: str, k: int, best: Mapping[tuple[str, int], int]) -> bool:
+    def _is_covered_by_simpler_effect(
+        self, name: str, k: int, best: Mapping[tuple[str, int], int]
+    ) -> bool:
         """Return whether a simpler effect that this effect contains has an equivalent coefficient.
 
         The simpler effect may be in the model or not.

@@ -138,9 +138,9 @@ def draw_sheet(content: SheetContent) -> Figure:
         text = "\n".join(textwrap.wrap(content.without_drive(), _LETTERS))
         figure.text(_MARGIN, top - 0.01, text, va="top", linespacing=1.4)
         # Without a diagram there is space for a table with a larger font.
-        _not_shown(figure, content, size=_SMALL_SIZE + 1.4, begins=top - 0.09)
+        _draw_effects_not_shown(figure, content, size=_SMALL_SIZE + 1.4, begins=top - 0.09)
         return figure
-    below = _not_shown(figure, content, size=_SMALL_SIZE)
+    below = _draw_effects_not_shown(figure, content, size=_SMALL_SIZE)
     height = min(_MAX_DIAGRAM_HEIGHT, top - below - 0.09)
     if height > 0.1:
         width = height * A4_INCHES[1] / A4_INCHES[0]
@@ -203,7 +203,9 @@ def _choose_table_layout(rows: Sequence[Sequence[str]]) -> tuple[float, list[flo
     return size, (_MARGIN + begins / A4_INCHES[0]).tolist()
 
 
-def _not_shown(figure: Figure, content: SheetContent, size: float, begins: float = 0.0) -> float:
+def _draw_effects_not_shown(
+    figure: Figure, content: SheetContent, size: float, begins: float = 0.0
+) -> float:
     """Draw the effects that are not shown in two columns.
 
     Args:

@@ -60,11 +60,11 @@ def build_mjcf(facts: SheetContent, folder: Path) -> MjcfFiles:
 
     with capture_mujoco_warnings():
         if facts.subject.kind.has_model:
-            return _of_robot(facts)
-        return _of_system(facts, folder)
+            return _build_robot_files(facts)
+        return _build_system_files(facts, folder)
 
 
-def _of_robot(facts: SheetContent) -> MjcfFiles:
+def _build_robot_files(facts: SheetContent) -> MjcfFiles:
     """Build the MJCF default class of a joint of a robot, and the robot's model with this class.
 
     The class is for the joint and its first actuator. The model is omitted if the class cannot be
@@ -82,7 +82,7 @@ def _of_robot(facts: SheetContent) -> MjcfFiles:
     return MjcfFiles(files, tuple(rendered.said))
 
 
-def _of_system(facts: SheetContent, folder: Path) -> MjcfFiles:
+def _build_system_files(facts: SheetContent, folder: Path) -> MjcfFiles:
     """Build a class, a model and a log description for each group of runs with equal constants."""
     from sims.robot.parsing.read_model_file import read_robot
 

@@ -62,10 +62,10 @@ class SheetContent:
             "verdict": self.verdict.verdict,
             "elsewhere": list(self.elsewhere()),
             "quantities": named,
-            **self._at_rest(),
+            **self._describe_rest(),
         }
 
-    def _at_rest(self) -> dict[str, Any]:
+    def _describe_rest(self) -> dict[str, Any]:
         """Return the diagram of a drive; without a drive, the dry friction that holds the joint."""
         if self.diagram is not None:
             return {"diagram": self.diagram.to_document()}

@@ -179,7 +179,7 @@ class _Rows:
                 "",
             )
             if local_place:
-                row = self._of_effect(f"{effect}@{local_place}", name, number, "fitted")
+                row = self._make_effect_row(f"{effect}@{local_place}", name, number, "fitted")
                 yield self._add_prediction_interval(row, f"{effect}@{local_place}", name)
 
     def causes(self) -> Iterator[SheetRow]:
@@ -193,7 +193,7 @@ class _Rows:
                     continue
                 has_several = sum(other == effect for other, _, _ in local_coefficients) > 1
                 label = f"{effect} {coefficient}" if has_several else effect
-                row = self._of_effect(effect, label, number, "found", self._find_cause(name))
+                row = self._make_effect_row(effect, label, number, "found", self._find_cause(name))
                 if _is_nothing(number):
                     yield self._make_hidden_row(row, effect, number)
                     continue
@@ -219,7 +219,7 @@ class _Rows:
 
     def _make_hidden_row(self, row: SheetRow, effect: str, number: FittedValue) -> SheetRow:
         """Build the row of a cause at other places that is not shown here."""
-        reach = _of_number(number, self.subject.get_model_file_value(effect))
+        reach = _make_number_limit(number, self.subject.get_model_file_value(effect))
         return SheetRow(
             row.name,
             row.says,
@@ -271,7 +271,7 @@ class _Rows:
             alternatives=instead,
         )
 
-    def _of_effect(
+    def _make_effect_row(
         self,
         effect: str,
         label: str,
@@ -325,7 +325,7 @@ def _is_nothing(number: FittedValue) -> bool:
     return number.low <= 0 <= number.high
 
 
-def _of_number(number: FittedValue, stated: ModelFileValue | None) -> DetectionLimit:
+def _make_number_limit(number: FittedValue, stated: ModelFileValue | None) -> DetectionLimit:
     low, high = number.low or 0.0, number.high or 0.0
     size = max(abs(low), abs(high))
     return DetectionLimit(size if stated is None else stated.compute_half_width(size))

@@ -104,7 +104,7 @@ def propose_discriminating_run(
     apart = [(size, run) for size, run in apart if np.isfinite(size) and size > 0.0]
     apart.sort(key=lambda entry: -entry[0])
     is_limited = False
-    if found := _first_within_limits(world, (model, rival), apart):
+    if found := _find_first_within_limits(world, (model, rival), apart):
         largest, (says, change, _, _) = found
         is_limited = largest < MIN_DISCRIMINATION_SIGMAS <= apart[0][0]
     # Effects that both models have are not in question.
@@ -118,7 +118,7 @@ def propose_discriminating_run(
     return DiscriminatingRun(says, change, largest)
 
 
-def _first_within_limits(
+def _find_first_within_limits(
     world: RunEvaluator, models: Sequence[FittedModel], runs: Sequence[tuple[float, _Run]]
 ) -> tuple[float, _Run] | None:
     """Return the first run that stays within the limits of a robot, whichever model is true.
@@ -261,7 +261,7 @@ def _scale_inputs(world: RunEvaluator, first: _Run, limits: StatedLimits) -> Ite
         if not signal.any():
             continue
         low, high = limits.commands.get(name, UNLIMITED)
-        most = _largest_share(signal, (low, high))
+        most = _compute_largest_share(signal, (low, high))
         for share in dict.fromkeys(min(share, most) for share in shares):
             driven = share * signal
             if 1.0 / LARGER < share < LARGER or driven.min() < low or driven.max() > high:
@@ -273,7 +273,7 @@ def _scale_inputs(world: RunEvaluator, first: _Run, limits: StatedLimits) -> Ite
             yield _Run(says, {name: share}, scenario, first.states)
 
 
-def _largest_share(signal: Array, limits: Interval) -> float:
+def _compute_largest_share(signal: Array, limits: Interval) -> float:
     """Return the largest factor that keeps a signal within its limits, rounded down.
 
     It is infinite if nothing limits the signal.

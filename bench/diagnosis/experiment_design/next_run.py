@@ -188,7 +188,7 @@ def _describe_best_run(
         discrimination = {
             name: float(value) for name, value in zip(names, least[0, 1:], strict=True)
         }
-        groups = tuple(_connected_groups([effect, *names], least))
+        groups = tuple(_iterate_connected_groups([effect, *names], least))
         gain = min(discrimination.values())
     constants = dict(run.plan.constants)
     return NextRunDesign(
@@ -210,7 +210,7 @@ def _list_other_effects(model: FittedModel, than: FittedModel) -> str:
     return " and ".join(name for name in model.effects if name not in than.effects)
 
 
-def _connected_groups(names: Sequence[str], least: Array) -> Iterator[tuple[str, ...]]:
+def _iterate_connected_groups(names: Sequence[str], least: Array) -> Iterator[tuple[str, ...]]:
     """Yield connected groups of names that are linked by pairs that are not distinguished."""
     left = list(range(len(names)))
     while left:

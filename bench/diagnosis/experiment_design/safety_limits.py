@@ -136,7 +136,7 @@ class RigLimits:
         bounds = {}
         for name, (low, high) in ends.items():
             if name in stated:
-                bounds[name] = _with_stop(stated[name], (low, high), name.startswith("q."))
+                bounds[name] = _widen_by_stop(stated[name], (low, high), name.startswith("q."))
             elif name.startswith("q."):
                 bounds[name] = _widen_range(low, high, scales[name])
             else:
@@ -172,7 +172,7 @@ class RigLimits:
         return frozenset().union(*(find_contacts(self.world.kind, run) for run in self.past))
 
 
-def _with_stop(stated: Interval, past: Interval, is_position: bool) -> Interval:
+def _widen_by_stop(stated: Interval, past: Interval, is_position: bool) -> Interval:
     """Return the specified limits; a position range is widened a little if stops were pressed."""
     low, high = stated
     if not is_position:

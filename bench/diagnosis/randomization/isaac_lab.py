@@ -82,7 +82,7 @@ def _build_terms(
         for name, (each,) in by_effect.pop(effect, {}).items():
             notes = [FRICTION_NOTE] if effect == "friction.coulomb" else []
             terms.append(
-                _joint_term(
+                _build_joint_term(
                     each.field, name, function, key, _get_ends(each), [sentences[each], *notes]
                 )
             )
@@ -93,7 +93,9 @@ def _build_terms(
             # The range of the inertia already includes the scaling by the mass.
             params["recompute_inertia"] = "False"
         terms.append(
-            _body_term("body_mass", name, "randomize_rigid_body_mass", params, [sentences[each]])
+            _build_body_term(
+                "body_mass", name, "randomize_rigid_body_mass", params, [sentences[each]]
+            )
         )
     for name, offsets in by_effect.pop("mass.offset", {}).items():
         pairs = [
@@ -101,7 +103,7 @@ def _build_terms(
         ]
         params = {"com_range": "{" + ", ".join(pairs) + "}"}
         notes = [sentences[each] for each in offsets]
-        terms.append(_body_term("body_ipos", name, "randomize_rigid_body_com", params, notes))
+        terms.append(_build_body_term("body_ipos", name, "randomize_rigid_body_com", params, notes))
     for name, (each,) in by_effect.pop("inertia.scale", {}).items():
         params = {
             "inertia_distribution_params": _format_pair(each.minimum, each.maximum),
@@ -110,7 +112,7 @@ def _build_terms(
         }
         notes = [sentences[each], "This term exists since Isaac Lab 3."]
         function = "randomize_rigid_body_inertia"
-        terms.append(_body_term("body_inertia", name, function, params, notes))
+        terms.append(_build_body_term("body_inertia", name, function, params, notes))
     terms += _make_gravity_term(by_effect, sentences, robot)
     return terms, [
         each
@@ -133,14 +135,16 @@ def _make_gain_terms(
     damping = by_effect.pop("actuator.damping", {})
     passive = by_effect.pop("drag.linear", {})
     function = "randomize_actuator_gains"
-    for joint, actuators in _by_joint(robot, stiffness).items():
-        ends = _sum_ranges([_at_joint(robot, stiffness, name, 1) for name in actuators])
+    for joint, actuators in _group_by_joint(robot, stiffness).items():
+        ends = _sum_ranges(
+            [_convert_gain_to_joint(robot, stiffness, name, 1) for name in actuators]
+        )
         notes = [sentences[each] for name in actuators for each in stiffness.get(name, ())]
         key = "stiffness_distribution_params"
-        yield _joint_term("stiffness", joint, function, key, ends, notes)
-    for joint in dict.fromkeys([*passive, *_by_joint(robot, damping)]):
+        yield _build_joint_term("stiffness", joint, function, key, ends, notes)
+    for joint in dict.fromkeys([*passive, *_group_by_joint(robot, damping)]):
         names = [each.name for each in robot.actuators if each.joint == joint]
-        parts = [_at_joint(robot, damping, name, 2) for name in names]
+        parts = [_convert_gain_to_joint(robot, damping, name, 2) for name in names]
         stated = float(robot.compiled.dof_damping[robot.joint(joint).velocity])
         damping_ranges = passive.get(joint)
         parts.append(_get_ends(damping_ranges[0]) if damping_ranges else (stated, stated))
@@ -150,10 +154,10 @@ def _make_gain_terms(
         ]
         notes = [*(sentences[each] for each in joint_ranges), DAMPING_NOTE]
         key = "damping_distribution_params"
-        yield _joint_term("damping", joint, function, key, _sum_ranges(parts), notes)
+        yield _build_joint_term("damping", joint, function, key, _sum_ranges(parts), notes)
 
 
-def _by_joint(robot: Any, ranges: Mapping[str, Any]) -> dict[str, list[str]]:
+def _group_by_joint(robot: Any, ranges: Mapping[str, Any]) -> dict[str, list[str]]:
     """Return all actuators of each joint at which one of the given actuators acts."""
     joints = dict.fromkeys(robot.actuator(name).joint for name in ranges)
     return {
@@ -163,7 +167,7 @@ def _by_joint(robot: Any, ranges: Mapping[str, Any]) -> dict[str, list[str]]:
     }
 
 
-def _at_joint(
+def _convert_gain_to_joint(
     robot: Any, ranges: Mapping[str, Sequence[RandomizationRange]], name: str, term: int
 ) -> tuple[float, float]:
     """Return the interval of an actuator's gain, converted to its joint."""
@@ -203,7 +207,7 @@ def _make_gravity_term(
     yield Term("gravity", "randomize_physics_scene_gravity", params, notes)
 
 
-def _joint_term(
+def _build_joint_term(
     prefix: str,
     joint: str,
     function: str,
@@ -230,7 +234,7 @@ def _joint_term(
     return Term(f"{prefix}_{joint}", function, params, notes)
 
 
-def _body_term(
+def _build_body_term(
     prefix: str, body: str, function: str, params: Mapping[str, str], notes: Sequence[str]
 ) -> Term:
     """Build an Isaac Lab event term that calls `function` with `params` for one body of the robot.

@@ -103,11 +103,11 @@ def candidates_figure(report: DiagnosisReportData) -> Figure:
     bottom, size = _BOTTOM / height, row * len(candidates) / height
     scores = axes[0, -1]
     scores.set_position(((left + shares_width) / width, bottom, _SCORES_WIDTH / width, size))
-    _scores_panel(scores, report, candidates, thickness=_BAR / row)
+    _draw_scores(scores, report, candidates, thickness=_BAR / row)
     if has_shares:
         shares = axes[0, 0]
         shares.set_position((left / width, bottom, _SHARES_WIDTH / width, size))
-        _shares_panel(shares, report, candidates)
+        _draw_shares(shares, report, candidates)
         scores.tick_params(axis="y", left=False, labelleft=False)
     _label_rows(axes[0, 0], report, candidates, names)
 
@@ -159,7 +159,7 @@ def _label_rows(
             label.set_fontweight("bold")
 
 
-def _shares_panel(axis: Axes, report: DiagnosisReportData, candidates: Sequence[Candidate]) -> None:
+def _draw_shares(axis: Axes, report: DiagnosisReportData, candidates: Sequence[Candidate]) -> None:
     """Draw which share of the held-out gap each candidate closes, with its 95 % interval.
 
     Each candidate is a row, in the given order. One that was not simulated has no mark.
@@ -201,7 +201,7 @@ def _shares_panel(axis: Axes, report: DiagnosisReportData, candidates: Sequence[
     axis.set_title("How much it closes (95 %)", fontsize=9.5, loc="left")
 
 
-def _scores_panel(
+def _draw_scores(
     axis: Axes, report: DiagnosisReportData, candidates: Sequence[Candidate], thickness: float
 ) -> None:
     """Draw the score of each candidate as a bar, which is twice the gain in log-likelihood.

@@ -256,10 +256,10 @@ def _draw_signal(
     for axis in (signal_axis, residual_axis):
         axis.locator_params(nbins=6)
     # Noise must not fill the panel: its band should look narrow.
-    _at_least(residual_axis, 3 * channel.sigma)
+    _extend_axis(residual_axis, 3 * channel.sigma)
 
 
-def _at_least(axis: Axes, size: float) -> None:
+def _extend_axis(axis: Axes, size: float) -> None:
     """Extend a vertical axis to at least this size on both sides of zero."""
     low, high = axis.get_ylim()
     axis.set_ylim(min(low, -size), max(high, size))

@@ -132,14 +132,14 @@ def build_identifiability_section(report: DiagnosisReportData) -> Identifiabilit
         return None
     rows = _list_rows(report)
     present = [status for status in _STANDINGS if any(row.standing == status for row in rows)]
-    unclear, clear = _told_apart([row for row in rows if _get_place(row)])
+    unclear, clear = _separate_identifiable([row for row in rows if _get_place(row)])
     count = len({split_effect_name(row.effect)[0] for row in clear})
     ordered = sorted(rows, key=lambda row: _STANDINGS.index(row.standing))
     without_place = [row for row in rows if not _get_place(row)]
     columns = [s for s in _STANDINGS if any(row.standing == s for row in without_place)]
     return IdentifiabilitySection(
         counts=format_counts(report),
-        free=[_table_row(one, one.word) for one in report.identifiability if one.free],
+        free=[_format_table_row(one, one.word) for one in report.identifiability if one.free],
         legend="; ".join(f"{_SIGNS[status]} {_LEGEND[status]}" for status in present),
         matrices=_build_matrices(unclear),
         family_headings=[f"{_SIGNS[status]} {_LEGEND[status]}" for status in columns],
@@ -148,11 +148,11 @@ def build_identifiability_section(report: DiagnosisReportData) -> Identifiabilit
             f"{count} {'more ' * bool(unclear)}effects that can be identified at every place"
         ),
         identifiable_matrices=_build_matrices(clear),
-        all=[_table_row(row.number, _LEGEND[row.standing]) for row in ordered],
+        all=[_format_table_row(row.number, _LEGEND[row.standing]) for row in ordered],
     )
 
 
-def _told_apart(rows: Sequence[_Row]) -> tuple[list[_Row], list[_Row]]:
+def _separate_identifiable(rows: Sequence[_Row]) -> tuple[list[_Row], list[_Row]]:
     """Separate effects that are identifiable at every place from all others.
 
     Returns:
@@ -292,7 +292,7 @@ def _format_half_interval(number: ParameterIdentifiability) -> str:
     return append_unit(f"±{format_number(number.half)}", number.unit)
 
 
-def _table_row(number: ParameterIdentifiability, status: str) -> IdentifiabilityRow:
+def _format_table_row(number: ParameterIdentifiability, status: str) -> IdentifiabilityRow:
     """Format the identifiability of a parameter or cause as a table row."""
     mixed = joined([f"{name} ({correlation:.2f})" for name, correlation in number.mixed])
     span = f"{format_number(number.low)} to {format_number(number.high)}"

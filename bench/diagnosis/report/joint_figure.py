@@ -124,8 +124,8 @@ def draw_joint_figure(report: DiagnosisReportData, view: RunView) -> Figure:
     rows = _select_worst_rows(report, view)
     quantities = _list_quantities(report) or ["q"]
     height = _HEIGHTS.get(len(rows), _LEAST_HEIGHT)
-    named_joints = {mark.name for mark in list_place_marks(report)} | _joints_of_marks(report)
-    names = [_row_name(row, row.name in named_joints) for row in rows]
+    named_joints = {mark.name for mark in list_place_marks(report)} | _list_marked_joints(report)
+    names = [_format_row_name(row, row.name in named_joints) for row in rows]
     names_width = max(1.95, 0.12 + text_width(names, _NAME_SIZE, "bold") + _BESIDE_NAME)
     width = names_width + 5.15 + 2.6 * len(quantities)
     size = (width, _HEAD + _FOOT + height * len(rows))
@@ -141,7 +141,7 @@ def draw_joint_figure(report: DiagnosisReportData, view: RunView) -> Figure:
             else:
                 panel.set_axis_off()
     for column, quantity in enumerate(quantities, start=1):
-        _one_scale(axes[:, column], report, view, rows, quantity)
+        _unify_scale(axes[:, column], report, view, rows, quantity)
         label = QUANTITY_LABELS[quantity]
         axes[0, column].set_title(f"residual of {label} [σ]", fontsize=9.5, loc="left")
     axes[0, 0].set_title("measured and simulated", fontsize=9.5, loc="left")
@@ -219,7 +219,7 @@ def _draw_motion(
     symbol = quantity if quantity in QUANTITY_LABELS else ""
     panel.set_ylabel(shorten_label(symbol, channel.unit, 14), fontsize=8)
     panel.annotate(
-        _row_name(row, is_named),
+        _format_row_name(row, is_named),
         (0, 0.5),
         (-0.72 * 72, 0),
         xycoords="axes fraction",
@@ -236,7 +236,7 @@ def _draw_motion(
     panel.tick_params(labelsize=8)
 
 
-def _row_name(row: JointRow, is_named: bool) -> str:
+def _format_row_name(row: JointRow, is_named: bool) -> str:
     """Format the name of a joint or sensor in short lines."""
     name = break_name(sanitise(row.name, LONGEST_NAME), _NAME_LINE)
     return f"{NAMED_JOINT_MARKER} {name}" if is_named else name
@@ -277,7 +277,7 @@ def _draw_residual(panel: Axes, report: DiagnosisReportData, view: RunView, c: i
     panel.tick_params(labelsize=8)
 
 
-def _one_scale(
+def _unify_scale(
     panels: Sequence[Axes],
     report: DiagnosisReportData,
     view: RunView,
@@ -324,7 +324,7 @@ def find_joint(report: DiagnosisReportData, kind: str, place: str) -> str:
     return ""
 
 
-def _joints_of_marks(report: DiagnosisReportData) -> set[str]:
+def _list_marked_joints(report: DiagnosisReportData) -> set[str]:
     """Return the joints of the channels, actuators and bodies in the diagnosis."""
     return {find_joint(report, mark.kind, mark.name) for mark in list_place_marks(report)}
 

@@ -47,7 +47,7 @@ def _split_into_elements(text: str) -> list[str]:
 
 def _compare_blocks(old: Sequence[str], new: Sequence[str]) -> Iterator[ModelFileChange]:
     """Yield the changes of a block of elements, each with the comments before it."""
-    elements = list(_with_comments(new))
+    elements = list(_pair_with_comments(new))
     # With equal counts, each new element replaces the old one at its position.
     if len(old) != len(elements):
         for i, (line, comment) in enumerate(elements):
@@ -63,12 +63,12 @@ def _compare_blocks(old: Sequence[str], new: Sequence[str]) -> Iterator[ModelFil
 
 def _list_commented_elements(lines: Sequence[str]) -> Iterator[ModelFileChange]:
     """Yield the elements with a comment, of a rewritten file."""
-    for line, comment in _with_comments(lines):
+    for line, comment in _pair_with_comments(lines):
         if comment:
             yield ModelFileChange(_format_element(line), "", line, comment)
 
 
-def _with_comments(lines: Sequence[str]) -> Iterator[tuple[str, str]]:
+def _pair_with_comments(lines: Sequence[str]) -> Iterator[tuple[str, str]]:
     """Yield each XML element (a line) with the comments before it that explain a fitted value."""
     above: list[str] = []
     for line in lines:

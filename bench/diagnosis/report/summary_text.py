@@ -135,7 +135,7 @@ def format_headline(report: DiagnosisReportData) -> str:
     if report.verdict.recording_faults:
         return format_sentence(report.verdict.recording_faults[0].says)
     if report.verdict.cut is not None:
-        return _headline_of_cut(report.verdict)
+        return _format_early_stop_headline(report.verdict)
     # A cause is reported as lacking only if the verdict supports it.
     if verdict == "adequate":
         return "Nothing is missing from the simulation that these data can show."
@@ -229,7 +229,7 @@ def _get_linking_verb(causes: Sequence[Cause]) -> str:
     return "lacks " if any(is_parameter_error(name) for name in names) else ""
 
 
-def _headline_of_cut(verdict: Verdict) -> str:
+def _format_early_stop_headline(verdict: Verdict) -> str:
     """Format the headline of a search that was stopped early, with its preliminary result."""
     if verdict.verdict == "partial":
         lacking = format_lacking(verdict.causes)
@@ -278,7 +278,7 @@ def format_gain_and_caveats(report: DiagnosisReportData) -> Iterator[str]:
     verdict = report.verdict.verdict
     yield from (format_sentence(note) for note in report.verdict.recording_notes)
     if report.verdict.recording_faults:
-        yield from _of_faults(report.verdict.recording_faults)
+        yield from _format_unit_errors(report.verdict.recording_faults)
         return
     if report.verdict.cut is not None:
         yield format_early_stop(report)
@@ -300,7 +300,7 @@ def format_gain_and_caveats(report: DiagnosisReportData) -> Iterator[str]:
         yield "To distinguish them: " + (format_next_run(report) or "no experiment is proposed.")
 
 
-def _of_faults(faults: Sequence[RecordingFault]) -> Iterator[str]:
+def _format_unit_errors(faults: Sequence[RecordingFault]) -> Iterator[str]:
     """Yield sentences on a wrong unit or sign: evidence, alternatives, and what to do."""
     first, *further_faults = faults
     if first.error_after is not None:
@@ -432,14 +432,16 @@ def format_detectable_gap(report: DiagnosisReportData) -> str:
     # The detectable gap of a channel with too few samples is unknown.
     finite_sizes = [(channel, size) for channel, size in sizes if isfinite(size)]
     parts = []
-    for channel, size in _worst_of_each(finite_sizes):
+    for channel, size in _select_worst_of_each_kind(finite_sizes):
         amount = append_unit(format_number(size, 2), channel.unit)
         share = f"{format_number(size / channel.sigma, 2)} of its noise"
         parts.append(f"{amount} in {sanitise(channel.name, 30)} ({share})")
     return f"A gap of up to {joined(parts)} RMS could still hide in the noise." if parts else ""
 
 
-def _worst_of_each(sizes: Sequence[tuple[ChannelInfo, float]]) -> list[tuple[ChannelInfo, float]]:
+def _select_worst_of_each_kind(
+    sizes: Sequence[tuple[ChannelInfo, float]],
+) -> list[tuple[ChannelInfo, float]]:
     """Select, from many channels, the one of each kind that hides most, in units of its noise."""
     if len(sizes) <= MAX_NAMED_CHANNELS:
         return list(sizes)

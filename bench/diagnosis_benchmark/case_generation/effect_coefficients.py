@@ -211,7 +211,7 @@ def _draw_saturation(
     return lambda s: (float(peak * (1 - s)),)
 
 
-def _one_way(
+def _draw_one_way_friction(
     far: float, setting: RecordingConditions, rng: np.random.Generator
 ) -> CoefficientFunction:
     """Draw friction that is several times larger in one direction.
@@ -435,8 +435,8 @@ SHAPE_SAMPLERS: dict[str, Callable[..., CoefficientFunction]] = {
     "friction.hysteresis": _draw_hysteresis,
     "joint.backlash": _draw_backlash,
     "joint.flexibility": _draw_flexible_load,
-    "friction.direction": _one_way,
-    "friction.load_direction": _one_way,
+    "friction.direction": _draw_one_way_friction,
+    "friction.load_direction": _draw_one_way_friction,
     "friction.load_quadratic": _draw_quadratic_friction,
     "friction.position": _draw_position_friction,
     "friction.warming": _draw_warm_up_friction,
@@ -572,7 +572,7 @@ def _draw_updraft(setting: RecordingConditions, rng: np.random.Generator) -> Coe
     return lambda s: (10.0 * s, centre, half)
 
 
-def _ball_gust(setting: RecordingConditions, rng: np.random.Generator) -> CoefficientFunction:
+def _draw_ball_gust(setting: RecordingConditions, rng: np.random.Generator) -> CoefficientFunction:
     """Draw a gust of 0.1 to 0.4 s in each run; at strength 1 it accelerates the ball by 20 m/s^2.
 
     Its direction is drawn in the vertical plane along x.
@@ -611,7 +611,7 @@ UNMODELLED_SAMPLERS: dict[tuple[bool, str], Callable[..., CoefficientFunction]] 
     (False, "ageing"): _draw_growing_damping,
     (False, "latch"): _draw_soft_stop,
     (True, "updraft"): _draw_updraft,
-    (True, "gust"): _ball_gust,
+    (True, "gust"): _draw_ball_gust,
     (True, "wear"): _draw_changing_restitution,
     (True, "layer"): _draw_drag_layer,
 }

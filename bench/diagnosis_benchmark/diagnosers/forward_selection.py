@@ -302,7 +302,7 @@ def _refit_with_one_more_effect(
     """
     world = evidence.world
     names = [name for name in world.library if name not in at.effects]
-    evidence = _with_model(evidence, at)
+    evidence = _replace_base_model(evidence, at)
     found = compute_directions(world, at, names)
     # The cached property; its value for the base model would include the effects of the model.
     evidence.__dict__["sensitivity_directions"] = found
@@ -327,7 +327,7 @@ def _refit_with_one_more_effect(
     return list(by_name.values())
 
 
-def _with_model(evidence: RegressionEvidence, at: TrajectoryFit) -> RegressionEvidence:
+def _replace_base_model(evidence: RegressionEvidence, at: TrajectoryFit) -> RegressionEvidence:
     """Copy the evidence, with another fitted model in place of the base model.
 
     Directions of further effects must be computed at the current model. Cached properties are not

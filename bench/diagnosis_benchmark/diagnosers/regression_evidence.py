@@ -177,7 +177,7 @@ class RegressionEvidence:
         runs, length, channels, _ = fit.jacobian.shape
         return self._flatten_to_rows(
             self.residual,
-            self._base_columns(),
+            self._compute_base_columns(),
             self.sensitivity_directions.responses,
             np.broadcast_to(self.noise.sigma, (runs, length, channels)),
             self.observed_mask,
@@ -195,13 +195,13 @@ class RegressionEvidence:
             seconds: window of the local polynomials.
         """
         left, sigma, seen = self._apply_residual_operator(self.residual[..., None], seconds)
-        base, _, _ = self._apply_residual_operator(self._base_columns(), seconds)
+        base, _, _ = self._apply_residual_operator(self._compute_base_columns(), seconds)
         effects, _, _ = self._apply_residual_operator(
             self.sensitivity_directions.responses, seconds
         )
         return self._flatten_to_rows(left[..., 0], base, effects, sigma, seen)
 
-    def _base_columns(self) -> Array:
+    def _compute_base_columns(self) -> Array:
         """Return the columns of parameters and initial states in equation (1), (R, T, C, B)."""
         return compute_base_jacobian(self.world, self.base.fit)
 

@@ -158,7 +158,9 @@ def draw_effect_shape(
     }[effect]
 
 
-def _per_force(bottom: Callable[[dict[str, float]], float]) -> Callable[..., CoefficientFunction]:
+def _make_force_drawer(
+    bottom: Callable[[dict[str, float]], float],
+) -> Callable[..., CoefficientFunction]:
     """Make the function that draws an effect whose force is proportional to its coefficient.
 
     At strength 1, the coefficient times `bottom` is twice the typical force of the joint.
@@ -211,14 +213,14 @@ def _draw_stribeck(typical: dict[str, float], rng: np.random.Generator) -> Coeff
 
 
 MOTION_SCALED_EFFECTS: dict[str, Callable[..., CoefficientFunction]] = {
-    "drag.linear": _per_force(lambda typical: typical["speed"]),
-    "drag.quadratic": _per_force(lambda typical: typical["speed"] ** 2),
-    "force.bias": _per_force(lambda typical: 1.0),
+    "drag.linear": _make_force_drawer(lambda typical: typical["speed"]),
+    "drag.quadratic": _make_force_drawer(lambda typical: typical["speed"] ** 2),
+    "force.bias": _make_force_drawer(lambda typical: 1.0),
     "force.ripple": _draw_ripple,
-    "friction.coulomb": _per_force(lambda typical: 2.0),
+    "friction.coulomb": _make_force_drawer(lambda typical: 2.0),
     "friction.stribeck": _draw_stribeck,
     "inertia.armature": lambda typical, rng: lambda s: (2.0 * typical["inertia"] * s,),
-    "spring.linear": _per_force(lambda typical: typical["position"] + 0.05),
+    "spring.linear": _make_force_drawer(lambda typical: typical["position"] + 0.05),
 }
 """Functions that draw the shape of an effect from the typical scales of its joint and a generator.
 

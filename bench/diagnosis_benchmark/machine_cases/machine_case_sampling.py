@@ -480,11 +480,11 @@ def build_description(item: BenchmarkCase, made: MachineRecordingConditions) -> 
     first = item.runs - made.held_out
     runs = {str(number): {"held_out": True} for number in range(first, item.runs)}
     of = {"model": MODEL_FILE_NAME} if robot else {"system": item.system}
-    constants = {} if robot else {"constants": _stated_constants(made)}
+    constants = {} if robot else {"constants": _get_stated_constants(made)}
     return {**of, "channels": channels, "inputs": inputs, **constants, "runs": runs}
 
 
-def _stated_constants(made: MachineRecordingConditions) -> dict[str, float]:
+def _get_stated_constants(made: MachineRecordingConditions) -> dict[str, float]:
     """Return the parameters of a servo that its recording states and that are not fitted."""
     return {name: v for name, v in made.numbers.items() if name not in made.free_parameters}
 

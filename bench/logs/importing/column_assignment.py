@@ -60,7 +60,7 @@ class ColumnAssigner:
         self._options = options
         self.normalised: NormalisedPositions | None = None
 
-    def _with_role(self, *roles: Role | None) -> list[LogColumn]:
+    def _select_by_role(self, *roles: Role | None) -> list[LogColumn]:
         """Return the columns that have one of some roles."""
         return [c for c in self._logs.columns if column_guessing.guess_role(c) in roles]
 
@@ -72,14 +72,14 @@ class ColumnAssigner:
         Raises:
             InputError: No column is a joint's position.
         """
-        columns = self._with_role("position", None)
+        columns = self._select_by_role("position", None)
         self._find_normalised([column for column in columns if not column.unit])
         for column, joint, placement in self._signals.place_columns(columns):
             self._add_signal(
                 self._signals.channels,
                 f"q.{joint.name}",
                 column,
-                self._position_signal(column, joint, placement),
+                self._make_position_signal(column, joint, placement),
             )
         if not self._signals.channels:
             names = ", ".join(f"{c.file}: {c.name}" for c in self._logs.columns[:MAX_NAMES])
@@ -121,7 +121,7 @@ class ColumnAssigner:
                 f"normalised positions; {UNIT_REMEDY}"
             )
 
-    def _position_signal(
+    def _make_position_signal(
         self, column: LogColumn, joint: Joint, placement: Placement
     ) -> Signal | None:
         """Determine the unit of a position or a position command.
@@ -176,7 +176,9 @@ class ColumnAssigner:
 
     def assign_commands(self) -> None:
         """Assign commands to actuators, and to servos that are missing in the model file."""
-        for column, joint, placement in self._signals.place_columns(self._with_role("command")):
+        for column, joint, placement in self._signals.place_columns(
+            self._select_by_role("command")
+        ):
             actuator = self._signals.actuator_of(joint.name)
             if actuator is not None:
                 self._assign_command(column, joint, placement, actuator)
@@ -192,7 +194,7 @@ class ColumnAssigner:
             self._assign_force(column, joint, f"force.{joint.name}", placement)
         elif quantity in (None, "position"):
             name = f"m_{joint.name}"
-            signal = self._position_signal(column, joint, placement)
+            signal = self._make_position_signal(column, joint, placement)
             if self._add_signal(self._signals.inputs, f"u.{name}", column, signal):
                 self._signals.added_servos[name] = joint
         else:
@@ -227,7 +229,7 @@ class ColumnAssigner:
         elif actuator.kind == "motor":
             self._assign_force(column, joint, name, placement)
         elif actuator.kind == "position":
-            signal = self._position_signal(column, joint, placement)
+            signal = self._make_position_signal(column, joint, placement)
             self._add_signal(self._signals.inputs, name, column, signal)
         else:
             si = f"{joint.unit}/s"
@@ -267,7 +269,7 @@ class ColumnAssigner:
     def assign_efforts(self) -> None:
         """Assign measured torques to motors without a command and to undriven joints."""
         signals = self._signals
-        columns = [column for column in self._with_role("force") if _is_torque(column)]
+        columns = [column for column in self._select_by_role("force") if _is_torque(column)]
         torques: dict[str, list[tuple[LogColumn, Joint, Placement]]] = {}
         for column, joint, placement in signals.place_columns(columns):
             actuator = signals.actuator_of(joint.name)
@@ -292,7 +294,7 @@ class ColumnAssigner:
 
     def find_switches(self) -> None:
         """Keep the columns of zeros and ones that change: one may say when a drive is on."""
-        for column in self._with_role("other", "command"):
+        for column in self._select_by_role("other", "command"):
             if self._is_used(column) or self._result.is_left_out(column):
                 continue
             values = np.concatenate([column.values, *self._logs.read_runs(column)[1:]])
@@ -315,7 +317,9 @@ class ColumnAssigner:
             names = ", ".join(actuator.name for actuator in idle[:MAX_NAMES])
             text = f"actuators without an input: {names}; their commands are taken for 0"
             table = f"u.{idle[0].name}"
-        candidates = [c.name for c in self._with_role("command", "force") if not self._is_used(c)]
+        candidates = [
+            c.name for c in self._select_by_role("command", "force") if not self._is_used(c)
+        ]
         likely = f"columns that may be it: {', '.join(candidates[:6])}; " if candidates else ""
         self._result.checks.append(
             f'{text}; {likely}add [inputs."{table}"] with file, column and unit'

@@ -119,7 +119,7 @@ def guess_role(column: LogColumn) -> Role | None:
         return "command"
     if column.quantity in _ROLE_OF_QUANTITY:
         return _ROLE_OF_QUANTITY[column.quantity]
-    return _measured_role(column_words) or _measured_role(file_words)
+    return _guess_measured_role(column_words) or _guess_measured_role(file_words)
 
 
 def commanded_role(column: LogColumn) -> Role | None:
@@ -133,7 +133,7 @@ def commanded_role(column: LogColumn) -> Role | None:
         return "position"
     column_words, file_words = _split_into_words(column)
     # `joint_command` gives no more information than `command`; `joint_position_command` does.
-    return _measured_role(column_words - _VAGUE) or _measured_role(file_words - _VAGUE)
+    return _guess_measured_role(column_words - _VAGUE) or _guess_measured_role(file_words - _VAGUE)
 
 
 def is_measured(column: LogColumn) -> bool:
@@ -148,7 +148,7 @@ def _split_into_words(column: LogColumn) -> tuple[set[str], set[str]]:
     return set(split_name(column.bare)), set(split_name(stem))
 
 
-def _measured_role(words: set[str]) -> Role | None:
+def _guess_measured_role(words: set[str]) -> Role | None:
     """Return the role of a measured signal that some words indicate; None if there is none."""
     roles: tuple[Role, ...] = ("other", "velocity", "force", "position")
     # `current` in "current position" is not an electric current, and a joint state may be a

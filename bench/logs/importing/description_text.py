@@ -71,7 +71,7 @@ class DescriptionWriter:
 
     def write(self) -> str:
         """Return the description."""
-        servos = [self._added_servo(*item) for item in self._signals.added_servos.items()]
+        servos = [self._estimate_added_servo(*item) for item in self._signals.added_servos.items()]
         body = [*self._time_lines(), *self._run_lines()]
         for servo in servos:
             body += [
@@ -87,10 +87,10 @@ class DescriptionWriter:
             ("inputs", self._signals.inputs),
         ):
             for name, signal in table.items():
-                body += self._signal_lines(kind, name, signal)
+                body += self._format_signal_lines(kind, name, signal)
         for column in self._signals.switches:
             body += [f"[extra.{toml_key(column.name)}]  # guess: zeros and ones"]
-            body += [*self._file_lines(column.file), f"column = {toml_text(column.name)}"]
+            body += [*self._format_file_lines(column.file), f"column = {toml_text(column.name)}"]
             body += ['unit = "1"', ""]
         head = [*(f"# check: {line}" for line in self._result.checks)]
         head += [f"model = {toml_text(self._make_relative(self._model))}"]
@@ -127,7 +127,7 @@ class DescriptionWriter:
                     yield "held_out = true"
                 yield ""
 
-    def _file_lines(self, file: str) -> list[str]:
+    def _format_file_lines(self, file: str) -> list[str]:
         """Return the line with the file of a signal; none if each run is one file."""
         runs = self._logs.runs
         if next(iter(runs.values())).alone:
@@ -136,11 +136,11 @@ class DescriptionWriter:
             file = self._make_relative(runs[""].folder / file)
         return [f"file = {toml_text(file)}"]
 
-    def _signal_lines(self, kind: str, name: str, signal: Signal) -> list[str]:
+    def _format_signal_lines(self, kind: str, name: str, signal: Signal) -> list[str]:
         """Return the lines of a channel or an input."""
         column = signal.column
         lines = [f"[{kind}.{toml_text(name)}]  # guess: {signal.description}"]
-        lines += self._file_lines(column.file)
+        lines += self._format_file_lines(column.file)
         lines += [f"column = {toml_text(column.name)}", f"unit = {toml_text(signal.unit)}"]
         # A stated scale shows that the user knows that positions are not normalised.
         is_stated = self._options.position_unit == "deg" and name.startswith("q.")
@@ -153,7 +153,7 @@ class DescriptionWriter:
         )
         return [*lines, ""]
 
-    def _added_servo(self, name: str, joint: Joint) -> _AddedServo:
+    def _estimate_added_servo(self, name: str, joint: Joint) -> _AddedServo:
         """Estimate the gains kp and kv of a servo that is missing in the model file.
 
         They follow from frequency and damping of its response and from the inertia of the joint.
@@ -161,7 +161,7 @@ class DescriptionWriter:
         """
         signals = self._signals
         inertia = float(compute_joint_scales(signals.robot).inertia[signals.joints.index(joint)])
-        samples = self._servo_samples(name, joint)
+        samples = self._collect_servo_samples(name, joint)
         response = estimate_servo_response(samples)
         frequency, damping = response or DEFAULT_RESPONSE
         kp, kv = inertia * frequency**2, 2.0 * damping * frequency * inertia
@@ -185,7 +185,7 @@ class DescriptionWriter:
             )
         return _AddedServo(name, joint, kp, kv, is_moved)
 
-    def _servo_samples(self, name: str, joint: Joint) -> list[tuple[Array, Array, Array]]:
+    def _collect_servo_samples(self, name: str, joint: Joint) -> list[tuple[Array, Array, Array]]:
         """Return times (s), commands and positions (T,) of a servo in each run, in rad or m.
 
         A command holds until the next one.

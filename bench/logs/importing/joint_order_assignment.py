@@ -44,7 +44,7 @@ def assign_order(
     Returns:
         For each joint, the joint at whose index its column is, if positions were exchanged.
     """
-    servos = _servo_signals(logs, signals)
+    servos = _collect_servo_signals(logs, signals)
     by_order = [
         all(table[name].placement.is_order for name in names)
         for table, names in (
@@ -65,7 +65,7 @@ def assign_order(
     return exchanged if by_order[1] and not by_order[0] else {}
 
 
-def _servo_signals(logs: RunLogs, signals: SignalAssignment) -> _ServoSignals:
+def _collect_servo_signals(logs: RunLogs, signals: SignalAssignment) -> _ServoSignals:
     """Collect the joints that have a servo, a recorded command and a recorded position.
 
     Their values (T,) are included only if the order of the columns is a guess, to test other

@@ -80,11 +80,11 @@ def runs_of(logs: Sequence[Path]) -> dict[str, RunFiles]:
         raise InputError(f"{log_names}: expected logs ({kinds}), found none")
     if len(runs) == 1:
         ((name, run),) = runs.items()
-        return _one_run_a_group(run) or _one_run_a_file(run) or {name: run}
+        return _make_run_per_group(run) or _make_run_per_file(run) or {name: run}
     return runs
 
 
-def _one_run_a_group(run: RunFiles) -> dict[str, RunFiles]:
+def _make_run_per_group(run: RunFiles) -> dict[str, RunFiles]:
     """Return a run for each group of an HDF5 file with several runs; otherwise an empty dict."""
     if len(run.paths) != 1 or not is_hdf5(run.paths[0]):
         return {}
@@ -94,7 +94,7 @@ def _one_run_a_group(run: RunFiles) -> dict[str, RunFiles]:
     return {group.name: RunFiles(run.folder, [group], True, run.chosen) for group in groups}
 
 
-def _one_run_a_file(run: RunFiles) -> dict[str, RunFiles]:
+def _make_run_per_file(run: RunFiles) -> dict[str, RunFiles]:
     """Return a run for each file if all files have the same columns; otherwise an empty dict."""
     tables = [path for path in run.paths if path.suffix.lower() in TABLES and path.is_file()]
     stems = [path.stem for path in tables]

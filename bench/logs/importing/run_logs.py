@@ -129,7 +129,7 @@ class RunLogs:
             try:
                 log = self._read_log(path)
                 if not log.named:
-                    raise self._no_header(log)
+                    raise self._make_missing_header_error(log)
             except InputError as error:
                 errors.append(error)
                 self._leave_out_file(files.name(path), error, path)
@@ -139,7 +139,7 @@ class RunLogs:
             raise errors[0]
         return logs
 
-    def _no_header(self, log: LogFile) -> InputError:
+    def _make_missing_header_error(self, log: LogFile) -> InputError:
         """Make the error for a table whose first row contains numbers."""
         names = ["t", *(f"{name}_pos" for name in self._joint_names)]
         example_header = ",".join(names[:MAX_NAMES])
@@ -179,7 +179,7 @@ class RunLogs:
         }
         counts: dict[tuple[str, str], int] = {}
         for file, (column, unit) in chosen.items():
-            roles = map(column_guessing.guess_role, _all_columns(file, logs[file]))
+            roles = map(column_guessing.guess_role, _list_all_columns(file, logs[file]))
             key = column.name, unit
             counts[key] = counts.get(key, 0) + sum(role is not None for role in roles)
         self.time_column, self.time_unit = max(counts, key=lambda key: counts[key])
@@ -219,8 +219,8 @@ class RunLogs:
         clocks: dict[str, list[tuple[LogColumn, str]]] = {}
         errors: list[InputError] = []
         for file, log in logs.items():
-            columns = column_guessing.clocks(_all_columns(file, log))
-            units = [(column, _unit_of_time(column)) for column in columns]
+            columns = column_guessing.clocks(_list_all_columns(file, log))
+            units = [(column, _detect_time_unit(column)) for column in columns]
             candidates = [(column, unit) for column, unit in units if unit is not None]
             if candidates:
                 clocks[file] = candidates
@@ -250,7 +250,7 @@ class RunLogs:
         """
         columns = []
         for file, seconds in self.seconds.items():
-            for column in _all_columns(file, logs[file]):
+            for column in _list_all_columns(file, logs[file]):
                 if column.name == self.time_column:
                     continue
                 if column.values.size != seconds.size:
@@ -276,7 +276,7 @@ def hold(stamps: Array, values: Array, times: Array) -> Array:
     return held_values
 
 
-def _all_columns(file: str, log: LogFile) -> list[LogColumn]:
+def _list_all_columns(file: str, log: LogFile) -> list[LogColumn]:
     """Return all numeric columns of a log."""
     columns = []
     for name in log.list_columns():
@@ -286,7 +286,7 @@ def _all_columns(file: str, log: LogFile) -> list[LogColumn]:
     return columns
 
 
-def _unit_of_time(column: LogColumn) -> str | None:
+def _detect_time_unit(column: LogColumn) -> str | None:
     """Return the unit of time stamps: as in the file, else the one with a plausible rate."""
     if column.quantity == "time" and column.unit in column_guessing.TIME_UNITS:
         return column.unit

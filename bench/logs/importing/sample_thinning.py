@@ -76,13 +76,13 @@ def _keeps_motion(recording: Recording, stride: int) -> bool:
             if np.isfinite(values).mean() < COMPLETE:
                 return False
             min_error = PRECISION * float(np.ptp(values[np.isfinite(values)]))
-            allowed = max(LARGER * _interpolation_error(run.times, values, 2), min_error)
-            if _interpolation_error(run.times, values, stride) > allowed:
+            allowed = max(LARGER * _compute_interpolation_error(run.times, values, 2), min_error)
+            if _compute_interpolation_error(run.times, values, stride) > allowed:
                 return False
     return True
 
 
-def _interpolation_error(times: Array, values: Array, stride: int) -> float:
+def _compute_interpolation_error(times: Array, values: Array, stride: int) -> float:
     """Return the RMS error of a cubic spline through every k-th sample at the other samples."""
     # Import SciPy here, since only fast recordings need it.
     from scipy.interpolate import CubicSpline

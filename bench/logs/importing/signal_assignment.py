@@ -143,11 +143,11 @@ class SignalAssignment:
         """Return whether the number in a joint's name is that of its column's name."""
         numbers = [
             [int(digits) for digits in re.findall(r"\d+", text)]
-            for text in (joint, self._column_name(joint))
+            for text in (joint, self._get_column_name(joint))
         ]
         return all(numbers) and numbers[0][-1] == numbers[1][-1]
 
-    def _column_name(self, joint: str) -> str:
+    def _get_column_name(self, joint: str) -> str:
         """Return the column name of a joint's position, or else of its command."""
         position = self.position_of(joint)
         if position is not None and position.placement.is_order:

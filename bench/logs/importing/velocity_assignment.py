@@ -88,7 +88,7 @@ def assign_velocities(
             result.leave_out(column, f"no position of {joint.name} in the same file shows its unit")
             continue
         comparison = _compare_with_derivative(logs, column, position, joint)
-        unit = _confirmed_unit(comparison, column, joint)
+        unit = _confirm_unit(comparison, column, joint)
         candidate = _Candidate(column, joint, placement, position, comparison, unit)
         kinds.setdefault(candidate.kind, []).append(candidate)
     for candidates in kinds.values():
@@ -115,7 +115,7 @@ def _compare_with_derivative(
     return VelocityComparison.measure(runs, "q", "v")
 
 
-def _confirmed_unit(comparison: VelocityComparison | None, column: LogColumn, joint: Joint) -> str:
+def _confirm_unit(comparison: VelocityComparison | None, column: LogColumn, joint: Joint) -> str:
     """Return the unit in which a velocity is its position's derivative; empty if there is none."""
     if comparison is None or comparison.correlation < MIN_CORRELATION:
         return ""

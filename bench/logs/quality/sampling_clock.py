@@ -133,7 +133,7 @@ def _count_stale_samples(run: Run) -> tuple[int, float]:
     signals = [values for values in run.channels.values() if np.isfinite(values).sum() > 3]
     if not signals or run.times.size < 4:
         return 0, 0.0
-    changes = np.array([_in_steps(values) for values in signals])
+    changes = np.array([_count_quantisation_steps(values) for values in signals])
     is_unchanged = np.nan_to_num(changes, nan=0.0) == 0
     neighbour_changes = np.maximum(np.abs(changes[:, :-2]), np.abs(changes[:, 2:]))
     moving = (
@@ -147,7 +147,7 @@ def _count_stale_samples(run: Run) -> tuple[int, float]:
     return int(stale.sum()), one_step_count / max(3.0 ** len(signals) - 1.0, 1.0)
 
 
-def _in_steps(values: Array) -> Array:
+def _count_quantisation_steps(values: Array) -> Array:
     """Return the (T - 1,) changes of a signal in units of its smallest change."""
     changes = np.diff(values)
     sizes = np.abs(changes[np.isfinite(changes)])

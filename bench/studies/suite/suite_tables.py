@@ -170,7 +170,7 @@ class SuiteTables:
         for training in (FREE, COUNTED):
             for k in self.checkpoints:
                 rows = {
-                    cell: _median_over_targets(self.compute_log_errors(cell, k, training))
+                    cell: _compute_median_over_targets(self.compute_log_errors(cell, k, training))
                     for cell in self.curves
                 }
                 frame = pd.DataFrame(rows).T
@@ -389,7 +389,7 @@ class SuiteTables:
         }
 
 
-def _median_over_targets(logs: pd.DataFrame) -> pd.Series[float]:
+def _compute_median_over_targets(logs: pd.DataFrame) -> pd.Series[float]:
     """Return the median of each tuner; NaN where a target has no value."""
     values: Array = logs.to_numpy(dtype=np.float64)
     return pd.Series(np.median(values, axis=0), index=logs.columns)

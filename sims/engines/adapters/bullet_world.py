@@ -20,13 +20,13 @@ NO_LIMIT = 1e100
 @functools.cache
 def import_pybullet() -> Any:
     """Import the module ``pybullet`` on first use, because most commands never simulate."""
-    with _output_discarded():
+    with _discard_output():
         import pybullet
     return pybullet
 
 
 @contextlib.contextmanager
-def _output_discarded() -> Iterator[None]:
+def _discard_output() -> Iterator[None]:
     """Discard the output of C code, such as PyBullet's build date."""
     # PyBullet prints from C and bypasses `sys.stdout`, so redirect the file descriptors.
     flush = ctypes.CDLL(None).fflush if os.name == "posix" else lambda _: None

@@ -102,7 +102,7 @@ def emit_llvm() -> tuple[str, str]:
     # numba is only partly typed, and its untyped functions would fail the type check.
     numba: Any = typed
     space = _compile_functions(numba, KERNEL_MODULES)
-    space.update(_names_of(kernel_entry, keep=space))
+    space.update(_list_module_names(kernel_entry, keep=space))
     return _emit_llvm_code(numba, kernel_entry.kernel_entry, space, 1)
 
 
@@ -116,7 +116,7 @@ def emit_callback(offsets: Mapping[str, int]) -> tuple[str, str]:
 
     numba: Any = typed
     space = _compile_functions(numba, (interpreter,))
-    space.update(_names_of(mujoco_callback, keep=space))
+    space.update(_list_module_names(mujoco_callback, keep=space))
     space |= {name.upper(): offset for name, offset in offsets.items()}
     limits = mujoco_callback.set_friction_limits
     space["set_friction_limits"] = numba.njit(error_model="numpy")(
@@ -125,7 +125,7 @@ def emit_callback(offsets: Mapping[str, int]) -> tuple[str, str]:
     return _emit_llvm_code(numba, mujoco_callback.add_effect_forces, space, 2)
 
 
-def _names_of(module: ModuleType, keep: Collection[str] = ()) -> dict[str, Any]:
+def _list_module_names(module: ModuleType, keep: Collection[str] = ()) -> dict[str, Any]:
     """Return the names of a module, without those to keep."""
     return {k: v for k, v in vars(module).items() if not k.startswith("__") and k not in keep}
 
@@ -141,7 +141,7 @@ def _compile_functions(numba: Any, modules: Sequence[ModuleType]) -> dict[str, A
     """
     space: dict[str, Any] = {}
     for module in modules:
-        space.update(_names_of(module))
+        space.update(_list_module_names(module))
     space.update(_make_intrinsics(numba))
     functions = {
         name: value

@@ -280,7 +280,7 @@ def _wrap_result(graph: ExpressionGraph, result: Any) -> Any:
     return TracedArray(graph, to_node_array(result))
 
 
-def _graph_of(*args: Any) -> ExpressionGraph:
+def _find_graph(*args: Any) -> ExpressionGraph:
     return next(arg.graph for arg in args if isinstance(arg, TracedArray))
 
 
@@ -288,13 +288,13 @@ def _trace_where(condition: Any, *values: Any) -> TracedArray:
     """Trace numpy.where(condition, x, y), a choice between two numbers for each element."""
     if len(values) != 2:
         raise NotTraceableError("numpy.where with a condition alone is not traced")
-    graph = _graph_of(condition, *values)
+    graph = _find_graph(condition, *values)
     return _apply_elementwise(graph, "where", (condition, *values))
 
 
 def _trace_clip(x: Any, low: Any, high: Any) -> TracedArray:
     """Trace numpy.clip as a maximum and a minimum; a limit may be None."""
-    graph = _graph_of(x, low, high)
+    graph = _find_graph(x, low, high)
     result = x
     if low is not None:
         result = _apply_elementwise(graph, "maximum", (result, low))

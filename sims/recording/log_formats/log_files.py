@@ -205,7 +205,7 @@ def _read_group(stamp: FileVersion) -> LogFile:
     """Read a group of an HDF5 file; cached by file version."""
     group = hdf5_files.group_of(stamp.path)
     assert group is not None  # the caller checked the path
-    return _of_arrays(stamp.path, *hdf5_files.read_group(*group))
+    return _make_array_log(stamp.path, *hdf5_files.read_group(*group))
 
 
 @lru_cache(maxsize=8)
@@ -271,7 +271,7 @@ def _read_npz(path: Path) -> LogFile:
     return LogFile(path, {**columns, **named}, tuple(texts), "entry", unlisted=unlisted)
 
 
-def _of_arrays(path: Path, columns: dict[str, Array], texts: dict[str, list[str]]) -> LogFile:
+def _make_array_log(path: Path, columns: dict[str, Array], texts: dict[str, list[str]]) -> LogFile:
     """Make a log of arrays, whose entries are named by lists of names in the file."""
     if not columns:
         raise InputError(f"{path}: expected columns of numbers, found none")
@@ -286,7 +286,7 @@ def _read_torch_file(path: Path) -> LogFile:
     # Imported here, because few logs are PyTorch files.
     from sims.recording.log_formats.torch_tensors import read_tensors
 
-    return _of_arrays(path, *read_tensors(path))
+    return _make_array_log(path, *read_tensors(path))
 
 
 def _read_parquet(path: Path) -> LogFile:

@@ -148,7 +148,7 @@ def _iterate_numbers(path: str, value: Any, depth: int) -> Iterator[tuple[str, f
     message = _get_fields(value)
     if message is not None:
         if depth < MAX_MESSAGE_DEPTH:
-            yield from _message_numbers(path, message, depth)
+            yield from _iterate_message_numbers(path, message, depth)
         return
     if isinstance(value, str | bytes) or not hasattr(value, "__len__"):
         return
@@ -159,7 +159,7 @@ def _iterate_numbers(path: str, value: Any, depth: int) -> Iterator[tuple[str, f
             yield from _iterate_numbers(inner, entry, depth + 1)
 
 
-def _message_numbers(
+def _iterate_message_numbers(
     path: str, message: Mapping[str, Any], depth: int
 ) -> Iterator[tuple[str, float]]:
     """Yield the numbers of a message with their names, except its time stamp.

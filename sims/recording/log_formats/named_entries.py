@@ -54,7 +54,7 @@ def entries_by_name(
             values = np.column_stack(
                 [columns[columns_by_number[place]] for place in sorted(columns_by_number)]
             )
-            entries = _by_name(values, names, f"{siblings}.")
+            entries = _sort_by_name(values, names, f"{siblings}.")
             if entries and not entries.keys() & columns.keys():
                 named |= entries
                 unlisted |= set(columns_by_number.values())
@@ -77,13 +77,13 @@ def lists_by_name(
     unlisted: set[str] = set()
     for names_column, cells in texts.items():
         stem = _NAMES_COLUMN.fullmatch(names_column)
-        lists = [_texts_of(cell) for cell in cells] if stem else []
+        lists = [_parse_text_list(cell) for cell in cells] if stem else []
         if not lists or not lists[0] or len({len(name_list) for name_list in lists}) > 1:
             continue
         names = [list(entry_names) for entry_names in zip(*lists, strict=True)]
         for name, values in columns.items():
             if values.ndim == 2 and values.shape[1] == len(names):
-                entries = _by_name(values, names, f"{name}.")
+                entries = _sort_by_name(values, names, f"{name}.")
                 if entries and not entries.keys() & columns.keys():
                     named |= entries
                     unlisted.add(name)
@@ -141,7 +141,7 @@ def _group_numbered_columns(
     return columns_by_stem
 
 
-def _by_name(values: Array, names: Sequence[Sequence[str]], prefix: str) -> dict[str, Array]:
+def _sort_by_name(values: Array, names: Sequence[Sequence[str]], prefix: str) -> dict[str, Array]:
     """Sort numbers into columns by name, looking up the names in each row.
 
     Args:
@@ -170,7 +170,7 @@ def _by_name(values: Array, names: Sequence[Sequence[str]], prefix: str) -> dict
     return columns
 
 
-def _texts_of(cell: str) -> list[str]:
+def _parse_text_list(cell: str) -> list[str]:
     """Return the texts of a list that is written in a cell as ``['base', 'elbow']``."""
     match = _LIST_OF_TEXTS.fullmatch(cell.strip())
     if not match:

@@ -72,7 +72,7 @@ def read_topic(bag: Path, topic: str, wanted: Collection[str] = ()) -> dict[str,
     if topics:
         # Topics of other loggers need not begin with a slash.
         if topic.lstrip("/") not in topics:
-            raise _unknown_topic(bag, topic, topics)
+            raise _make_unknown_topic_error(bag, topic, topics)
         for message, stamp in mcap_messages.read_messages(bag, topic.lstrip("/")):
             table.add(message, stamp)
         return table.columns()
@@ -80,13 +80,13 @@ def read_topic(bag: Path, topic: str, wanted: Collection[str] = ()) -> dict[str,
         connections = [c for c in reader.connections if c.topic == topic]
         if not connections:
             topics = sorted({c.topic.lstrip("/") for c in reader.connections})
-            raise _unknown_topic(bag, topic, topics)
+            raise _make_unknown_topic_error(bag, topic, topics)
         for connection, stamp, raw in reader.messages(connections=connections):
             table.add(reader.deserialize(raw, connection.msgtype), stamp)
     return table.columns()
 
 
-def _unknown_topic(bag: Path, topic: str, topics: list[str]) -> InputError:
+def _make_unknown_topic_error(bag: Path, topic: str, topics: list[str]) -> InputError:
     """Make the error for a topic that a bag lacks; it lists the existing topics."""
     names = ", ".join(topics) or "none"
     return InputError(f"{bag}: unknown topic '{topic.lstrip('/')}'; there are: {names}")

@@ -86,7 +86,7 @@ def find_layout(path: Path) -> Layout:
         n: _split_line(line, separator) for n, line in enumerate(lines, start=1) if line.strip()
     }
     width = _find_row_width([row for n, row in rows.items() if not COMMENT.match(lines[n - 1])])
-    columns = _numeric_columns(rows.values(), width)
+    columns = _find_numeric_columns(rows.values(), width)
     first = next((n for n, row in rows.items() if _is_data(row, width, columns)), 0)
     above = [n for n in rows if n < first] if first else list(rows)
     units_row: dict[int, str] = {}
@@ -170,7 +170,7 @@ def _normalise_row(row: Sequence[str], width: int) -> list[str]:
     return [cell.strip() for cell in [*row, *[""] * width][:width]]
 
 
-def _numeric_columns(rows: Iterable[Sequence[str]], width: int) -> list[int]:
+def _find_numeric_columns(rows: Iterable[Sequence[str]], width: int) -> list[int]:
     """Return the positions of the columns in which at least half of the cells are numbers."""
     full_rows = [row for row in rows if len(row) == width]
     # The second half of the inspected rows is data, whatever precedes it.

@@ -129,7 +129,7 @@ def _read_cells(path: Path, layout: Layout) -> list[Any]:
         except pandas.errors.EmptyDataError:
             return [np.array([], dtype=object)] * layout.width
         except (pandas.errors.ParserError, ValueError) as error:
-            raise _find_uneven_row(path, layout) or _not_a_table(path, layout, error) from None
+            raise _find_uneven_row(path, layout) or _make_split_error(path, layout, error) from None
     else:
         raise InputError(f"{path}: expected UTF-8 text; save it as UTF-8")
     comment = table[0].str.match(COMMENT.pattern)
@@ -151,7 +151,7 @@ def _read_cells(path: Path, layout: Layout) -> list[Any]:
     return [table[name].fillna("").to_numpy(dtype=object) for name in table.columns]
 
 
-def _not_a_table(path: Path, layout: Layout, error: Exception) -> InputError:
+def _make_split_error(path: Path, layout: Layout, error: Exception) -> InputError:
     """Make the error for a file whose rows pandas cannot split."""
     quote_match = re.search(r"EOF inside string starting at row (\d+)", str(error))
     if quote_match:
@@ -183,7 +183,7 @@ def _find_uneven_row(path: Path, layout: Layout) -> InputError | None:
                 )
             reference = f"as in the header, row {layout.header}" if layout.header else "as above"
             remedy = "correct or delete this row"
-            if filled < layout.width and line >= _last_line(path, layout):
+            if filled < layout.width and line >= _find_last_line(path, layout):
                 remedy = "the log was cut off there: delete this row"
             return InputError(
                 f"{path}, row {line}: expected {layout.width} cells {reference}, found {filled}; "
@@ -216,7 +216,7 @@ def _iterate_rows(path: Path, layout: Layout) -> Iterator[tuple[int, int, list[s
             before = last
 
 
-def _last_line(path: Path, layout: Layout) -> int:
+def _find_last_line(path: Path, layout: Layout) -> int:
     """Return the line of the last data row."""
     last = 0
     for line, *_ in _iterate_rows(path, layout):
@@ -224,7 +224,7 @@ def _last_line(path: Path, layout: Layout) -> int:
     return last
 
 
-def _line_of(path: Path, layout: Layout, record: int) -> int:
+def _find_line(path: Path, layout: Layout, record: int) -> int:
     """Return the line of a data row, counted from 1 as in an editor."""
     for number, (line, *_) in enumerate(_iterate_rows(path, layout)):
         if number == record:
@@ -301,7 +301,7 @@ class _CellKind:
         texts = self.series
         if self.has_commas:
             if self.has_decimal_commas or (commas and not self.is_thousands):
-                texts = self._decimal_points(path, layout, name)
+                texts = self._convert_decimal_commas(path, layout, name)
             elif self.is_thousands:
                 texts = texts.str.replace(",", "", regex=False)
             else:
@@ -320,7 +320,7 @@ class _CellKind:
             return None
         raise self._make_cell_error(path, layout, name, int(bad_rows[0]), "a number")
 
-    def _decimal_points(self, path: Path, layout: Layout, name: str) -> Any:
+    def _convert_decimal_commas(self, path: Path, layout: Layout, name: str) -> Any:
         """Return the cells with decimal points instead of decimal commas.
 
         Points before groups of three digits are removed if some cell has both marks.
@@ -384,7 +384,7 @@ class _CellKind:
         self, path: Path, layout: Layout, name: str, record: int, expected: str, note: str = ""
     ) -> InputError:
         """Make the error for a cell that does not fit its column."""
-        line = _line_of(path, layout, record)
+        line = _find_line(path, layout, record)
         cell_text = format_value(self.cells[record])
         return InputError(
             f"{path}, row {line}, column {name}: expected {expected}, found {cell_text}{note}"

@@ -125,7 +125,7 @@ def apply_causes(
     notes = []
     couplings = {c.place: float(c.coefficients[0]) for c in found if c.effect == COUPLED}
     robot = make_coupled_robot(robot, couplings) if couplings else robot
-    series = _in_series(found)
+    series = _combine_series_elements(found)
     if series:
         notes += [KEYFRAMES_OMITTED_NOTE] if robot.compiled.nkey else []
         added = tuple((c.place, c.effect) for c in found if _is_in_series(c))
@@ -184,7 +184,7 @@ def _is_in_series(cause: FittedCause) -> bool:
     )
 
 
-def _in_series(causes: Sequence[FittedCause]) -> dict[str, Transmission]:
+def _combine_series_elements(causes: Sequence[FittedCause]) -> dict[str, Transmission]:
     """Combine the elements that causes put in series with joints, by joint."""
     elements: dict[str, list[Transmission]] = {}
     for cause in causes:
@@ -319,7 +319,7 @@ def set_attributes(element: Any, statement: AttributeStatement) -> None:
         elif name in INTEGER_ATTRIBUTES:
             value = int(values[0])
         elif kind == "frame" and name == "pos":
-            value = _in_frames(element, values)
+            value = _convert_to_inner_frame(element, values)
         else:
             value = _convert_to_attribute(element, name, known[name], values)
         setattr(element, known[name], value)
@@ -329,7 +329,7 @@ def set_attributes(element: Any, statement: AttributeStatement) -> None:
         element.springdamper = (0.0, 0.0)
 
 
-def _in_frames(body: Any, position: Sequence[float]) -> Array:
+def _convert_to_inner_frame(body: Any, position: Sequence[float]) -> Array:
     """Convert a position in the parent body to the innermost of the frames around a body.
 
     MuJoCo replaces the bodies that it fuses by such frames.

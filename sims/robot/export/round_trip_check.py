@@ -111,13 +111,13 @@ def _check_urdf(robot: RobotModel, causes: CauseCoefficients, path: Path) -> Non
     for model in (wanted, found):
         # A URDF does not specify the stiffness of friction, and colliding shapes may be meshes
         # elsewhere.
-        _without_contacts(model)
+        _disable_contacts(model)
         for name in _NOT_OF_URDF:
             getattr(model, name)[:] = getattr(found, name)
     _compare_motion(found, wanted, "extended.urdf")
 
 
-def _without_contacts(model: Any) -> None:
+def _disable_contacts(model: Any) -> None:
     """Switch off contacts in a compiled model, so that only joints and actuators are compared."""
     import mujoco
 

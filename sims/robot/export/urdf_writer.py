@@ -96,7 +96,7 @@ class UrdfWriter:
         joint = self.joints.get(cause.place)
         if joint is None:
             return _NO_JOINT
-        dynamics = _child_or_new(joint, "dynamics")
+        dynamics = _get_or_add_child(joint, "dynamics")
         before = float(dynamics.get_attribute(attribute) or 0.0)
         self._add_comment(dynamics, cause)
         dynamics.new[attribute] = format_number(float(add_to_stated(before, cause.coefficients[0])))
@@ -179,7 +179,7 @@ class UrdfWriter:
             return _NO_JOINT
         (c,) = cause.coefficients
         self._add_comment(joint, cause)
-        axis = _axis_of(joint)
+        axis = _get_joint_axis(joint)
         axes = _compute_rotation(_read_origin(joint, "rpy"))
         if joint.get_attribute("type") == "prismatic":
             _set_vector(joint, "origin", "xyz", _read_origin(joint, "xyz") - axes @ axis * c)
@@ -198,7 +198,7 @@ class UrdfWriter:
             return _NO_JOINT
         self._add_comment(joint, cause)
         turn = Rotation.from_rotvec(cause.coefficients)
-        _set_vector(joint, "axis", "xyz", turn.apply(_axis_of(joint)))
+        _set_vector(joint, "axis", "xyz", turn.apply(_get_joint_axis(joint)))
         return None
 
     def _write_link_length(self, cause: FittedCause) -> str | None:
@@ -276,7 +276,7 @@ def _read_origin(tag: XmlElement, attribute: str) -> Array:
     return _parse_vector(origin.get_attribute(attribute) if origin else None)
 
 
-def _axis_of(joint: XmlElement) -> Array:
+def _get_joint_axis(joint: XmlElement) -> Array:
     """Return the unit vector of a joint's axis; URDF's default is x."""
     axis = _find_child(joint, "axis")
     vector = _parse_vector((axis.get_attribute("xyz") if axis else None) or "1 0 0")
@@ -286,10 +286,10 @@ def _axis_of(joint: XmlElement) -> Array:
 
 def _set_vector(tag: XmlElement, name: str, attribute: str, vector: Array) -> None:
     """Set a vector of a child element, which is added if there is none."""
-    _child_or_new(tag, name).new[attribute] = format_numbers(tuple(vector.tolist()))
+    _get_or_add_child(tag, name).new[attribute] = format_numbers(tuple(vector.tolist()))
 
 
-def _child_or_new(tag: XmlElement, name: str) -> XmlElement:
+def _get_or_add_child(tag: XmlElement, name: str) -> XmlElement:
     """Return the child element with a name, which is added if there is none."""
     child = _find_child(tag, name)
     if child is None:

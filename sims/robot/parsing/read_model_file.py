@@ -122,7 +122,7 @@ def _make_robot(
         path=files.path,
         format=kind,
         spec=spec,
-        notes=(*notes, *mends.notes, *further, *_said_of(aliases), *said),
+        notes=(*notes, *mends.notes, *further, *_make_alias_note(aliases), *said),
         aliases=aliases,
         digest=files.digest.hexdigest(),
         rate_controlled_actuators=rated,
@@ -187,7 +187,7 @@ def _map_fused_bodies(parents: Mapping[str, str], compiled: set[str]) -> dict[st
     return aliases
 
 
-def _said_of(aliases: Mapping[str, str]) -> list[str]:
+def _make_alias_note(aliases: Mapping[str, str]) -> list[str]:
     """Return a note about links that MuJoCo fused into the body that carries them, or no note.
 
     `aliases` maps the fused link to that body. The user needs the note, because effects act on

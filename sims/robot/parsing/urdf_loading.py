@@ -50,10 +50,10 @@ def repair_urdf(files: ModelFileReader, root: Element) -> list[str]:
     Raises:
         InputError: the links do not form a tree, or nothing in it moves.
     """
-    _no_macros(files, root)
+    _reject_macros(files, root)
     links, joints = _collect_links(files, root), find_children(root, "joint")
     notes = [
-        *_with_world(files, root, links, joints),
+        *_add_world_link(files, root, links, joints),
         *_remove_unread_elements(root),
         *_make_joint_names_unique(files, joints),
     ]
@@ -75,7 +75,7 @@ def repair_urdf(files: ModelFileReader, root: Element) -> list[str]:
     return notes
 
 
-def _no_macros(files: ModelFileReader, root: Element) -> None:
+def _reject_macros(files: ModelFileReader, root: Element) -> None:
     """Reject a file with unexpanded xacro macros, and tell the user how to expand them."""
     for element in root.iter():
         macros = [value for value in element.attrib.values() if "${" in value or "$(" in value]
@@ -114,7 +114,7 @@ def _collect_links(files: ModelFileReader, root: Element) -> dict[str, Element]:
     return links
 
 
-def _with_world(
+def _add_world_link(
     files: ModelFileReader, root: Element, links: dict[str, Element], joints: Sequence[Element]
 ) -> list[str]:
     """Add the link `world` if joints refer to it and the file does not define it.

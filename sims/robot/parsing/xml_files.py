@@ -181,10 +181,10 @@ def resolve_includes(files: ModelFileReader, root: Element) -> None:
     """
     for parent in list(root.iter()):
         if any(child.tag == "include" for child in parent):
-            parent[:] = _with_included(files, parent)
+            parent[:] = _expand_includes(files, parent)
 
 
-def _with_included(files: ModelFileReader, parent: Element) -> list[Element]:
+def _expand_includes(files: ModelFileReader, parent: Element) -> list[Element]:
     """Return the children of an element, with include elements replaced by the included children.
 
     Raises:

@@ -38,7 +38,7 @@ def reach(robot: RobotModel, body: str) -> Array:
         (3, 2) lowest and highest offset from the specified centre of mass, in metres, along the
         axes of the body's frame.
     """
-    model, data = _at_start(robot)
+    model, data = _get_reference_state(robot)
     number = robot.body(body).id
     points = np.array(list(_iterate_link_points(model, data, number)))
     low, high = points.min(axis=0), points.max(axis=0)
@@ -61,7 +61,7 @@ def _iterate_link_points(model: Any, data: Any, number: int) -> Iterator[Array]:
     yield np.zeros(3)
     yield model.body_ipos[number]
     flat = (int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_HFIELD))
-    for one in _fixed_to(model, number):
+    for one in _list_fixed_bodies(model, number):
         yield axes.T @ (data.xpos[one] - origin)
         first, count = model.body_geomadr[one], model.body_geomnum[one]
         for geom in range(first, first + count):
@@ -77,7 +77,7 @@ def _iterate_link_points(model: Any, data: Any, number: int) -> Iterator[Array]:
                 yield axes.T @ (data.xpos[child] - origin)
 
 
-def _fixed_to(model: Any, number: int) -> list[int]:
+def _list_fixed_bodies(model: Any, number: int) -> list[int]:
     """Return the numbers of a body and of all bodies that are rigidly attached below it."""
     found = [number]
     for child in range(number + 1, model.nbody):
@@ -144,7 +144,7 @@ def _compute_observable_axes(model: Any, number: int) -> tuple[int, ...]:
     return tuple(axis for axis in range(3) if axis != nearest)
 
 
-def _at_start(robot: RobotModel) -> tuple[Any, Any]:
+def _get_reference_state(robot: RobotModel) -> tuple[Any, Any]:
     return robot.compiled, _make_reference_data(robot.compiled)
 
 

@@ -34,7 +34,7 @@ def coupled_joints(model: Any, dofs: Sequence[int]) -> list[set[int]]:
             if int(model.eq_objtype[k]) == int(objects.mjOBJ_SITE):
                 first, second = (int(model.site_bodyid[site]) for site in (first, second))
             one, other = _list_ancestors(model, first), _list_ancestors(model, second)
-            ends = [dof for body in set(one) ^ set(other) for dof in _dofs_of(model, body)]
+            ends = [dof for body in set(one) ^ set(other) for dof in _get_dofs(model, body)]
         else:
             continue
         group = {number[dof] for dof in ends if dof in number}
@@ -53,7 +53,7 @@ def _list_ancestors(model: Any, body: int) -> list[int]:
     return found
 
 
-def _dofs_of(model: Any, body: int) -> range:
+def _get_dofs(model: Any, body: int) -> range:
     """Return the velocity addresses of a body's own joints; empty if it has none."""
     first = int(model.body_dofadr[body])
     return range(first, first + int(model.body_dofnum[body])) if first >= 0 else range(0)

@@ -94,7 +94,7 @@ def _make_commands(robot: RobotModel, joints: Sequence[Joint]) -> list[Excitatio
 
     Each command oscillates about a holding value that balances gravity in the reference pose.
     """
-    holding, forces = _at_pose(robot, joints)
+    holding, forces = _compute_reference_forces(robot, joints)
     driven = {joint.name: joint for joint in joints}
     commands = []
     for actuator in robot.actuators:
@@ -110,7 +110,7 @@ def _make_commands(robot: RobotModel, joints: Sequence[Joint]) -> list[Excitatio
     ]
 
 
-def _at_pose(
+def _compute_reference_forces(
     robot: RobotModel, joints: Sequence[Joint]
 ) -> tuple[dict[str, float], dict[str, float]]:
     """Return the holding force of each joint in the reference pose, and a force amplitude."""

@@ -92,7 +92,7 @@ def make_placed_effect(effect: type[Effect], spot: EffectPlace) -> type[Effect]:
     """
     tilts = spot.tilts if effect.name == "joint.axis" else None
     shown = [c for c in effect.coefficients if tilts is None or c.name in tilts]
-    coefficients = [_of_spot(effect, c, spot) for c in shown]
+    coefficients = [_adapt_to_place(effect, c, spot) for c in shown]
     changed: dict[str, Any] = {"coordinate": spot.coordinate, "signal": spot.signal}
     changed["says"] = f"{effect.says} (at {spot.words})"
     if issubclass(effect, Force):
@@ -100,10 +100,10 @@ def make_placed_effect(effect: type[Effect], spot: EffectPlace) -> type[Effect]:
     elif issubclass(effect, Friction):
         changed["limit"] = _limit_of(effect)
     elif issubclass(effect, HiddenStateEffect):
-        changed["act"] = _act_of(effect)
+        changed["act"] = _make_act_method(effect)
         declared = effect.between or effect.coefficients
         coefficients = [
-            _add_search_starts(_of_spot(effect, c, spot))
+            _add_search_starts(_adapt_to_place(effect, c, spot))
             for c in declared
             if not _has_quantity(spot, c)
         ]
@@ -153,7 +153,7 @@ def make_shared_effects(
     if len(joints) < 2 or len(kinds) > 1 or not issubclass(effect, Force):
         return
     whole = drives[0]._replace(size=sum(one.size for one in joints.values()))
-    coefficients = [_of_spot(effect, c, whole) for c in effect.coefficients]
+    coefficients = [_adapt_to_place(effect, c, whole) for c in effect.coefficients]
     changed: dict[str, Any] = {
         "at": "world",
         "says": f"{effect.says} (of one supply that all drives share)",
@@ -232,7 +232,7 @@ def _add_search_starts(c: Coefficient) -> Coefficient:
     return replace(c, tried=tuple(np.geomspace(low, high, HIDDEN_STATE_SHAPE_COUNT).tolist()))
 
 
-def _act_of(effect: type[HiddenStateEffect]) -> Callable[..., tuple[Array, Array]]:
+def _make_act_method(effect: type[HiddenStateEffect]) -> Callable[..., tuple[Array, Array]]:
     """Make the `act` method of an effect with a hidden state at one joint.
 
     The registered effect is written for a system with one coordinate. The new method passes it
@@ -329,7 +329,7 @@ def _unify_units(c: Coefficient) -> Coefficient:
     return replace(c, units=(c.units[i],) * 3, plausible=(c.plausible[i],) * 3)
 
 
-def _of_spot(effect: type[Effect], c: Coefficient, spot: EffectPlace) -> Coefficient:
+def _adapt_to_place(effect: type[Effect], c: Coefficient, spot: EffectPlace) -> Coefficient:
     """Give a coefficient the unit, plausible range and limits that apply at a place.
 
     Ranges of forces are scaled with the typical force of the joint. If the file specifies a
@@ -392,7 +392,7 @@ def make_effect_classes(
         if effect.name in native or (issubclass(effect, Sensor) and not effect.filters):
             yield make_world_effect(effect)
         return
-    if effect.name not in native and not _for_one(effect):
+    if effect.name not in native and not _needs_no_engine_support(effect):
         return
     members = [
         make_placed_effect(effect, s) for s in found[effect.at] if _acts_at(effect, s, found)
@@ -407,7 +407,7 @@ def make_effect_classes(
         yield from make_shared_effects(effect, found["actuator"])
 
 
-def _for_one(effect: type[Effect]) -> bool:
+def _needs_no_engine_support(effect: type[Effect]) -> bool:
     """Return whether an effect can act at one of several places without the engine's support."""
     if issubclass(effect, Input | Sensor):
         return True

@@ -122,7 +122,7 @@ def list_places(
     for actuator in robot.actuators:
         on = next((s for s in found["joint"] if s.name == actuator.joint), None)
         if on is None:
-            on = _beyond_joints(actuator, found["joint"], mass)
+            on = _make_actuator_place(actuator, found["joint"], mass)
         if on is None:
             continue
         found["actuator"].append(
@@ -156,7 +156,7 @@ def list_places(
             "kg",
             1.0,
             1.0,
-            _stated_of_body(robot, body.id),
+            _get_body_file_values(robot, body.id),
             words,
             limits={"mass.offset": offsets, "payload": loads},
             mass=mass,
@@ -174,7 +174,7 @@ def list_places(
     return found
 
 
-def _beyond_joints(
+def _make_actuator_place(
     actuator: Actuator, joints: Sequence[EffectPlace], mass: float
 ) -> EffectPlace | None:
     """Return a place like a joint for an actuator on a tendon or a site; None if there is none.
@@ -198,7 +198,7 @@ def _get_servo_gains(robot: RobotModel, actuator: int) -> dict[str, float]:
     return {"actuator.stiffness": float(bias[1]), "actuator.damping": float(bias[2])}
 
 
-def _stated_of_body(robot: RobotModel, body: int) -> dict[str, float]:
+def _get_body_file_values(robot: RobotModel, body: int) -> dict[str, float]:
     """Return the gravity compensation of a body, and its distance from a parent that moves.
 
     The distance is zero if no moving body carries it: then it moves the whole robot.

@@ -141,7 +141,7 @@ def test_the_background_is_the_median_of_what_is_seen():
     values[rng.uniform(size=(9, 50)) < 0.6] = np.nan
     values[0] = 7.0  # each pixel is observed at least once
     np.testing.assert_array_equal(
-        background_model._median_of_seen(values), np.nanmedian(values, axis=0)
+        background_model._compute_nan_median(values), np.nanmedian(values, axis=0)
     )
 
 

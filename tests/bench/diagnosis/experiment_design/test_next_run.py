@@ -8,7 +8,10 @@ import simgap
 from bench.cli.main import main
 from bench.core.plugin_registries import make_robot_simulator
 from bench.diagnosis.experiment_design.information_gain import RunValue
-from bench.diagnosis.experiment_design.next_run import _connected_groups, _would_longer_run_help
+from bench.diagnosis.experiment_design.next_run import (
+    _iterate_connected_groups,
+    _would_longer_run_help,
+)
 from bench.logs.quality.pose_check import find_contacts
 from sims.core.simulator import InputError
 
@@ -141,7 +144,7 @@ def test_what_is_asked_wrongly_is_one_line(tmp_path, capsys):
 
 def test_what_hangs_together_and_what_a_longer_run_would_tell():
     least = np.array([[0, 90, 7, 80.0], [90, 0, 95, 3.0], [7, 95, 0, 60.0], [80, 3, 60, 0]])
-    assert list(_connected_groups(["a", "b", "c", "d"], least)) == [("a", "c"), ("b", "d")]
+    assert list(_iterate_connected_groups(["a", "b", "c", "d"], least)) == [("a", "c"), ("b", "d")]
     run = RunValue(None, least + np.triu(least), 0.0, is_exact=True)
     # With 7 and 3 noise variances, twice the run length may exceed the threshold of 25.
     assert _would_longer_run_help(run, 2.0)
