@@ -37,17 +37,17 @@ def find_preceding_joint(robot: RobotModel, name: str) -> Joint | None:
     Returns:
         The preceding joint; None if there is none or if it is of another kind.
     """
-    model, own = robot.compiled, robot.joint(name)
-    body = int(model.jnt_bodyid[own.id])
-    first, behind = int(model.body_jntadr[body]), own.id
+    model, second_joint = robot.compiled, robot.joint(name)
+    body = int(model.jnt_bodyid[second_joint.id])
+    first, end = int(model.body_jntadr[body]), second_joint.id
     while body > 0:
-        there = [robot.joints[i] for i in range(first, behind)]
-        there = [joint for joint in there if joint.name not in robot.series]
-        if there:
-            return there[-1] if there[-1].kind == own.kind else None
+        preceding_joints = [robot.joints[i] for i in range(first, end)]
+        preceding_joints = [joint for joint in preceding_joints if joint.name not in robot.series]
+        if preceding_joints:
+            return preceding_joints[-1] if preceding_joints[-1].kind == second_joint.kind else None
         body = int(model.body_parentid[body])
         first = int(model.body_jntadr[body])
-        behind = first + int(model.body_jntnum[body])
+        end = first + int(model.body_jntnum[body])
     return None
 
 

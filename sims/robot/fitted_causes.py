@@ -117,14 +117,14 @@ def expand_families(
         causes: coefficients by ``effect@place``. Those of a family have keys ``coefficient@PLACE``,
             or keys without a place if they hold for all places.
     """
-    found = []
+    fitted_causes = []
     for name, numbers in causes.items():
         effect, _, place = name.partition("@")
         if place == ALL_PLACES:
-            found += _list_family_causes(robot, effect, numbers)
+            fitted_causes += _list_family_causes(robot, effect, numbers)
         else:
-            found.append(FittedCause(effect, place, dict(numbers)))
-    return found
+            fitted_causes.append(FittedCause(effect, place, dict(numbers)))
+    return fitted_causes
 
 
 def _list_family_causes(
@@ -139,9 +139,9 @@ def _list_family_causes(
     for key, number in numbers.items():
         coefficient, _, place = key.partition("@")
         places = [place] if place else _list_places(robot, effect)
-        for one in places:
-            by_place.setdefault(one, {})[coefficient] = number
-    return [FittedCause(effect, place, own) for place, own in by_place.items()]
+        for member_place in places:
+            by_place.setdefault(member_place, {})[coefficient] = number
+    return [FittedCause(effect, place, place_numbers) for place, place_numbers in by_place.items()]
 
 
 def _list_places(robot: RobotModel, effect: str) -> list[str]:

@@ -84,8 +84,10 @@ class FloatingJoints:
     def names(self) -> tuple[list[str], list[str]]:
         """Return the names of positions and velocities, such as ``q.base.qw``, ``qd.base.wx``."""
         axes = [(joint.name, _list_translation_axes(joint)) for joint in self.joints]
-        positions = [f"q.{name}.{axis}" for name, own in axes for axis in own + TURN]
-        velocities = [f"qd.{name}.{axis}" for name, own in axes for axis in own + SPIN]
+        positions = [f"q.{name}.{axis}" for name, joint_axes in axes for axis in joint_axes + TURN]
+        velocities = [
+            f"qd.{name}.{axis}" for name, joint_axes in axes for axis in joint_axes + SPIN
+        ]
         return positions, velocities
 
     def units(self) -> dict[str, str]:
@@ -117,35 +119,44 @@ class FloatingJoints:
         positions, velocities = self.names()
         pose = np.array([states[name] for name in positions], dtype=float)
         rate = np.array([states[name] for name in velocities], dtype=float)
-        for joint, (_, turn, _) in zip(self.joints, self._joint_addresses, strict=True):
-            length = float(np.linalg.norm(pose[turn]))
+        for joint, (_, quaternion_columns, _) in zip(
+            self.joints, self._joint_addresses, strict=True
+        ):
+            length = float(np.linalg.norm(pose[quaternion_columns]))
             if length < MIN_QUATERNION_NORM:
-                given = ", ".join(f"q.{joint.name}.{axis}" for axis in TURN)
-                raise InputError(f"initial states {given}: expected a quaternion, found zeros")
-            pose[turn] /= length
+                state_names = ", ".join(f"q.{joint.name}.{axis}" for axis in TURN)
+                raise InputError(
+                    f"initial states {state_names}: expected a quaternion, found zeros"
+                )
+            pose[quaternion_columns] /= length
         return FloatingState(pose, rate)
 
-    def displace(self, pose: Array, number: int, by: float) -> Array:
+    def displace(self, pose: Array, number: int, displacement: float) -> Array:
         """Displace poses along one degree of freedom, by (1): add to a position, or rotate.
 
         Args:
             pose: (n, P) poses.
             number: index of the degree of freedom, below F.
-            by: displacement in m or rad.
+            displacement: displacement in m or rad.
 
         Returns:
             The displaced poses (n, P).
         """
         result = pose.copy()
-        for axes, turn, first in self._joint_addresses:
+        for axes, quaternion_columns, first in self._joint_addresses:
             # A free joint has its position before its quaternion.
-            own = number - first - len(axes)
-            if -len(axes) <= own < 0:
-                result[:, turn.start + own] += by
-            elif 0 <= own < len(SPIN):
-                small = np.zeros(len(TURN))
-                small[0], small[1 + own] = np.cos(0.5 * by), np.sin(0.5 * by)
-                result[:, turn] = _multiply_quaternions(pose[:, turn], small[None])
+            rotation_index = number - first - len(axes)
+            if -len(axes) <= rotation_index < 0:
+                result[:, quaternion_columns.start + rotation_index] += displacement
+            elif 0 <= rotation_index < len(SPIN):
+                quaternion = np.zeros(len(TURN))
+                quaternion[0], quaternion[1 + rotation_index] = (
+                    np.cos(0.5 * displacement),
+                    np.sin(0.5 * displacement),
+                )
+                result[:, quaternion_columns] = _multiply_quaternions(
+                    pose[:, quaternion_columns], quaternion[None]
+                )
         return result
 
     def displaced(self, pose: Array, moves: Array) -> Array:
@@ -154,36 +165,42 @@ class FloatingJoints:
         Positions move along the axes of the world; rotations are about the axes of the body.
         """
         result = pose.copy()
-        for axes, turn, first in self._joint_addresses:
-            place = slice(turn.start - len(axes), turn.start)
+        for axes, quaternion_columns, first in self._joint_addresses:
+            place = slice(quaternion_columns.start - len(axes), quaternion_columns.start)
             result[:, place] += moves[:, first : first + len(axes)]
             rotation = moves[:, first + len(axes) : first + len(axes) + len(SPIN)]
             angle = np.linalg.norm(rotation, axis=1, keepdims=True)
             # sin(a / 2) / a, whose limit is 1 / 2 at a = 0.
-            half = 0.5 * np.sinc(angle / (2.0 * np.pi))
-            small = np.concatenate([np.cos(0.5 * angle), half * rotation], axis=1)
-            result[:, turn] = _multiply_quaternions(pose[:, turn], small)
+            half_sinc = 0.5 * np.sinc(angle / (2.0 * np.pi))
+            quaternion = np.concatenate([np.cos(0.5 * angle), half_sinc * rotation], axis=1)
+            result[:, quaternion_columns] = _multiply_quaternions(
+                pose[:, quaternion_columns], quaternion
+            )
         return result
 
     def compute_displacement(self, pose: Array, reference: Array) -> Array:
         """Compute the displacements (n, F) from reference poses (n, P) to poses (n, P)."""
         parts = []
-        for axes, turn, _ in self._joint_addresses:
-            place = slice(turn.start - len(axes), turn.start)
+        for axes, quaternion_columns, _ in self._joint_addresses:
+            place = slice(quaternion_columns.start - len(axes), quaternion_columns.start)
             parts.append(pose[:, place] - reference[:, place])
-            back = reference[:, turn] * np.array([1.0, -1.0, -1.0, -1.0])
-            parts.append(_compute_rotation_vectors(_multiply_quaternions(back, pose[:, turn])))
+            inverse_reference = reference[:, quaternion_columns] * np.array([1.0, -1.0, -1.0, -1.0])
+            parts.append(
+                _compute_rotation_vectors(
+                    _multiply_quaternions(inverse_reference, pose[:, quaternion_columns])
+                )
+            )
         return np.concatenate(parts, axis=1) if parts else np.zeros((len(pose), 0))
 
     @cached_property
     def _joint_addresses(self) -> tuple[FloatingJoint, ...]:
         """Where the pose numbers and the velocities of each joint are, in order."""
-        own, end, first = [], 0, 0
+        floating_joints, end, first = [], 0, 0
         for axes in map(_list_translation_axes, self.joints):
             end += len(axes + TURN)
-            own.append(FloatingJoint(axes, slice(end - len(TURN), end), first))
+            floating_joints.append(FloatingJoint(axes, slice(end - len(TURN), end), first))
             first += len(axes + SPIN)
-        return tuple(own)
+        return tuple(floating_joints)
 
 
 def _list_translation_axes(joint: Joint) -> tuple[str, ...]:
@@ -191,20 +208,20 @@ def _list_translation_axes(joint: Joint) -> tuple[str, ...]:
     return AXES if joint.kind == "free" else ()
 
 
-def _multiply_quaternions(one: Array, other: Array) -> Array:
-    """Compute the Hamilton products (n, 4) of `one` and `other`, quaternions (w, x, y, z)."""
-    a, u = one[:, :1], one[:, 1:]
-    b, v = other[:, :1], other[:, 1:]
+def _multiply_quaternions(first: Array, second: Array) -> Array:
+    """Compute the Hamilton products (n, 4) of `first` and `second`, quaternions (w, x, y, z)."""
+    a, u = first[:, :1], first[:, 1:]
+    b, v = second[:, :1], second[:, 1:]
     real = a * b - np.sum(u * v, axis=1, keepdims=True)
     return np.concatenate([real, a * v + b * u + np.cross(u, v)], axis=1)
 
 
-def _compute_rotation_vectors(turn: Array) -> Array:
+def _compute_rotation_vectors(quaternions: Array) -> Array:
     """Compute rotation vectors (n, 3) of unit quaternions, with angles of at most pi."""
-    sign = np.where(turn[:, :1] < 0, -1.0, 1.0)
-    real, vector = sign * turn[:, :1], sign * turn[:, 1:]
+    sign = np.where(quaternions[:, :1] < 0, -1.0, 1.0)
+    real, vector = sign * quaternions[:, :1], sign * quaternions[:, 1:]
     length = np.linalg.norm(vector, axis=1, keepdims=True)
     angle = 2.0 * np.arctan2(length, real)
-    small = length < MIN_QUATERNION_NORM
-    scale = np.where(small, 2.0, angle / np.where(small, 1.0, length))
+    is_small = length < MIN_QUATERNION_NORM
+    scale = np.where(is_small, 2.0, angle / np.where(is_small, 1.0, length))
     return vector * scale

@@ -144,9 +144,9 @@ def write_friction_form(fields: Fields, robot: RobotModel, lanes: Any, dofs: Any
     fields["dof_solimp"][lanes, dofs] = FRICTION_SOLIMP
 
 
-def add_to_stated(stated: Any, c: Any) -> Any:
+def add_to_stated(file_value: Any, c: Any) -> Any:
     """Add a coefficient to a value, at least zero (1); a negative value of the file may remain."""
-    return np.maximum(stated + c, np.minimum(stated, 0.0))
+    return np.maximum(file_value + c, np.minimum(file_value, 0.0))
 
 
 def compute_factor(c: Any) -> Any:
@@ -174,15 +174,15 @@ def _add_quadratic(fields: Fields, robot: RobotModel, place: str, c: Array) -> N
 def _add_friction(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
     """Add c to the dry friction of a joint by (1), in N m or N.
 
-    Where the friction increases (`rubs`), it also becomes stiff, so that the joint hardly creeps
-    at rest; with `friction_form` soft, the file's solver parameters remain.
+    Where the friction increases, it also becomes stiff, so that the joint hardly creeps at rest;
+    with `friction_form` soft, the file's solver parameters remain.
     """
     column = robot.joint(place).velocity
     loss = fields["dof_frictionloss"]
     # A reduced friction keeps the solver parameters of the file.
-    rubs = c[0] > 0
+    has_added_friction = c[0] > 0
     loss[:, column] = add_to_stated(loss[:, column], c[0])
-    write_friction_form(fields, robot, rubs, column)
+    write_friction_form(fields, robot, has_added_friction, column)
 
 
 def _add_spring(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
@@ -300,20 +300,24 @@ def _turn_axis(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
     Rodrigues' formula; the result is normalised because MuJoCo expects a unit vector.
     """
     number = robot.joint(place).id
-    turned = np.flatnonzero(c.any(axis=0))
-    axis = fields["jnt_axis"][turned, number]
+    tilted_elements = np.flatnonzero(c.any(axis=0))
+    axis = fields["jnt_axis"][tilted_elements, number]
     vector = np.zeros(axis.shape)
     # At a place, the effect has only the coefficients that the motion shows.
-    vector[:, list(range(3) if len(c) == 3 else observable_tilts(robot, place))] = c[:, turned].T
+    vector[:, list(range(3) if len(c) == 3 else observable_tilts(robot, place))] = c[
+        :, tilted_elements
+    ].T
     angle = np.linalg.norm(vector, axis=1, keepdims=True)
-    about = vector / angle
-    along = np.sum(about * axis, axis=1, keepdims=True)
+    unit_vector = vector / angle
+    along = np.sum(unit_vector * axis, axis=1, keepdims=True)
     rotated = (
         np.cos(angle) * axis
-        + np.sin(angle) * np.cross(about, axis)
-        + (1.0 - np.cos(angle)) * along * about
+        + np.sin(angle) * np.cross(unit_vector, axis)
+        + (1.0 - np.cos(angle)) * along * unit_vector
     )  # (6)
-    fields["jnt_axis"][turned, number] = rotated / np.linalg.norm(rotated, axis=1, keepdims=True)
+    fields["jnt_axis"][tilted_elements, number] = rotated / np.linalg.norm(
+        rotated, axis=1, keepdims=True
+    )
 
 
 def _scale_length(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:

@@ -66,10 +66,10 @@ def _make_servo_gain_finder(term: int) -> Find:
     def find(robot: RobotModel, place: str) -> list[list[ModelField]]:
         """Return the bias field with the servo's gain, and the gain field if it is the same."""
         number = robot.actuator(place).id
-        found = [ModelField("actuator_biasprm", (number, term), -1)]
+        servo_fields = [ModelField("actuator_biasprm", (number, term), -1)]
         if gain_pulls(robot, number, term):
-            found.insert(0, ModelField("actuator_gainprm", (number, 0)))
-        return [found]
+            servo_fields.insert(0, ModelField("actuator_gainprm", (number, 0)))
+        return [servo_fields]
 
     return find
 

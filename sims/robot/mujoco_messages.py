@@ -20,15 +20,15 @@ def capture_mujoco_warnings() -> Iterator[list[str]]:
     """
     import mujoco
 
-    said: list[str] = []
+    messages: list[str] = []
     before = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(lambda text: said.append(format_mujoco_error(text)))
+    mujoco.set_mju_user_warning(lambda text: messages.append(format_mujoco_error(text)))
     try:
         with warnings.catch_warnings():
             # MuJoCo's compiler issues its warnings through Python's `warnings` module.
             warnings.simplefilter("always")
-            warnings.showwarning = lambda message, *_: said.append(format_mujoco_error(message))
-            yield said
+            warnings.showwarning = lambda message, *_: messages.append(format_mujoco_error(message))
+            yield messages
     finally:
         mujoco.set_mju_user_warning(before)
 
@@ -36,5 +36,5 @@ def capture_mujoco_warnings() -> Iterator[list[str]]:
 def format_mujoco_error(message: object) -> str:
     """Format a message of MuJoCo as one line: ``message; Element 'joint', line 6``."""
     lines = [line.strip().rstrip(".") for line in str(message).splitlines()]
-    said = "; ".join(line for line in lines if line)
-    return re.sub(r"^((XML )?(Error|Warning): )+", "", said)
+    line_text = "; ".join(line for line in lines if line)
+    return re.sub(r"^((XML )?(Error|Warning): )+", "", line_text)

@@ -13,23 +13,23 @@ MAX_LISTED_WITH_NUMBERS = 4
 
 
 def format_name_list(
-    names: Iterable[str], most: int = MAX_LISTED_NAMES, between: str = ", "
+    names: Iterable[str], most: int = MAX_LISTED_NAMES, separator: str = ", "
 ) -> str:
     """Format names as a list without duplicates.
 
     Args:
         names: names to list; each is shortened to 200 characters.
         most: maximum number of names to list.
-        between: separator.
+        separator: text between two names.
 
     Returns:
         The first `most` names, followed by the number of the remaining ones ("and 3 more").
     """
-    each = list(dict.fromkeys(names))
-    more = f" and {len(each) - most} more" if len(each) > most else ""
-    return between.join(truncate_text(name, 200) for name in each[:most]) + more
+    unique_names = list(dict.fromkeys(names))
+    others_text = f" and {len(unique_names) - most} more" if len(unique_names) > most else ""
+    return separator.join(truncate_text(name, 200) for name in unique_names[:most]) + others_text
 
 
-def format_item_list(things: Sequence[str]) -> str:
+def format_item_list(items: Sequence[str]) -> str:
     """Format at most `MAX_LISTED_WITH_NUMBERS` items with numbers, and count the further ones."""
-    return format_name_list(things, MAX_LISTED_WITH_NUMBERS, "; ")
+    return format_name_list(items, MAX_LISTED_WITH_NUMBERS, "; ")

@@ -101,20 +101,20 @@ def _strip_model(robot: RobotModel) -> RobotModel:
     name_unnamed_elements(spec, robot)
     spec.discard_visual()
     spec.compiler.discardvisual = False
-    used = {geom.hfieldname for geom in spec.geoms}
-    unused = [field for field in spec.hfields if field.name not in used]
-    for asset in [*spec.skins, *unused]:
+    used_fields = {geom.hfieldname for geom in spec.geoms}
+    unused_fields = [field for field in spec.hfields if field.name not in used_fields]
+    for asset in [*spec.skins, *unused_fields]:
         spec.delete(asset)
     stripped = replace(robot, spec=spec)
     if hulls:
         add_reserve(spec, stripped.compile(spec), model, hulls)
         geoms = {geom.name: numbers[geom.name] for geom in spec.geoms if geom.meshname in hulls}
         stripped = replace(stripped, shapes=CollisionShapes.read(model, hulls, geoms))
-    alike = _has_equal_motion(model, stripped.compiled, numbers)
-    if alike and hulls:
-        alike = has_room(stripped.compiled, model)
-        alike = alike and _touches_alike(robot, stripped.compiled, numbers)
-    return stripped if alike else robot
+    is_equal = _has_equal_motion(model, stripped.compiled, numbers)
+    if is_equal and hulls:
+        is_equal = has_room(stripped.compiled, model)
+        is_equal = is_equal and _touches_alike(robot, stripped.compiled, numbers)
+    return stripped if is_equal else robot
 
 
 @cache_per_robot
@@ -146,9 +146,9 @@ def _needs_shapes(model: Any) -> bool:
 
     kinds = {mujoco.mjtSensor(int(kind)).name for kind in model.sensor_type}
     sdf = int(mujoco.mjtGeom.mjGEOM_SDF) in model.geom_type
-    sleeps = model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP
+    has_sleep = model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP
     fluid = model.geom_fluid.any()
-    return bool(kinds & RAYS or model.nflex or model.nplugin or sdf or fluid or sleeps)
+    return bool(kinds & RAYS or model.nflex or model.nplugin or sdf or fluid or has_sleep)
 
 
 def _state_inertials(spec: Any, model: Any) -> None:
@@ -182,15 +182,15 @@ def _reduce_geoms(spec: Any, model: Any) -> tuple[dict[str, Hull], dict[str, int
     """
     import mujoco
 
-    touching = contact_exclusion.touching(model)
-    known = mujoco.__version__.startswith(TESTED)
+    collision_mask = contact_exclusion.touching(model)
+    is_tested_version = mujoco.__version__.startswith(TESTED)
     hulls: dict[str, Hull] = {}
     numbers: dict[str, int] = {}
     # The numbers are collected first, since a spec loses them when it is edited.
     for geom, i in [(geom, geom.id) for geom in spec.geoms]:
         geom.name = geom.name or f"simgap.geom{i}"
         numbers[geom.name] = i
-        if not touching[i]:
+        if not collision_mask[i]:
             geom.contype = geom.conaffinity = 0
         mesh = int(model.geom_dataid[i]) if geom.meshname else -1
         if mesh < 0 and not geom.meshname:
@@ -199,7 +199,7 @@ def _reduce_geoms(spec: Any, model: Any) -> tuple[dict[str, Hull], dict[str, int
         kind = mujoco.mjtGeom(int(model.geom_type[i]))
         if kind != mujoco.mjtGeom.mjGEOM_MESH:
             geom.type, geom.size, geom.meshname = kind, model.geom_size[i], ""
-        elif known and touching[i] and model.mesh_facenum[mesh] > MIN_FACES:
+        elif is_tested_version and collision_mask[i] and model.mesh_facenum[mesh] > MIN_FACES:
             hull = hulls.get(geom.meshname) or read_hull(model, mesh)
             if hull is None:
                 continue
@@ -216,59 +216,62 @@ def _reduce_geoms(spec: Any, model: Any) -> tuple[dict[str, Hull], dict[str, int
     return hulls, numbers
 
 
-def _has_equal_motion(model: Any, other: Any, numbers: Mapping[str, int]) -> bool:
+def _has_equal_motion(model: Any, reduced_model: Any, numbers: Mapping[str, int]) -> bool:
     """Return whether two models of one robot have equal fields, except for non-colliding shapes.
 
     Args:
         model: whole model.
-        other: model with some of its geoms.
+        reduced_model: model with some of its geoms.
         numbers: numbers of the whole model's geoms, by geom name.
     """
-    of = [numbers[other.geom(i).name] for i in range(other.ngeom)]
+    geom_numbers = [numbers[reduced_model.geom(i).name] for i in range(reduced_model.ngeom)]
     fields = {
         name: getattr(model, name) for name in dir(model) if not name.startswith(("_", *SHAPES))
     }
     for name, values in fields.items():
         is_number = isinstance(values, np.ndarray) and values.dtype.kind == "f"
-        if is_number and not np.array_equal(values, getattr(other, name), equal_nan=True):
+        if is_number and not np.array_equal(values, getattr(reduced_model, name), equal_nan=True):
             return False
-    if model.stat.meaninertia != other.stat.meaninertia:
+    if model.stat.meaninertia != reduced_model.stat.meaninertia:
         return False
     return all(
-        np.array_equal(getattr(model, field)[of], getattr(other, field)) for field in GEOM_FIELDS
+        np.array_equal(getattr(model, field)[geom_numbers], getattr(reduced_model, field))
+        for field in GEOM_FIELDS
     )
 
 
-def _touches_alike(robot: RobotModel, other: Any, numbers: Mapping[str, int]) -> bool:
+def _touches_alike(robot: RobotModel, reduced_model: Any, numbers: Mapping[str, int]) -> bool:
     """Return whether contacts are equal in random poses within the ranges of the joints.
 
     The test is needed since other versions of MuJoCo may read more of a mesh than hulls contain.
 
     Args:
         robot: robot with the whole model.
-        other: model with hulls.
+        reduced_model: model with hulls.
         numbers: numbers of the whole model's geoms, by geom name.
     """
     import mujoco
 
     model = robot.compiled
     rng = np.random.default_rng(0)
-    data, smaller = mujoco.MjData(model), mujoco.MjData(other)
-    of = np.array([numbers[other.geom(i).name] for i in range(other.ngeom)])
+    data, reduced_data = mujoco.MjData(model), mujoco.MjData(reduced_model)
+    geom_numbers = np.array(
+        [numbers[reduced_model.geom(i).name] for i in range(reduced_model.ngeom)]
+    )
     for _ in range(POSES):
         data.qpos[:] = model.qpos0
         for joint in robot.joints:
             if joint.has_one_coordinate:
                 data.qpos[joint.position] = rng.uniform(*(joint.range or FREE_RANGE))
-        smaller.qpos[:] = data.qpos
-        for one, its in ((model, data), (other, smaller)):
-            mujoco.mj_fwdPosition(one, its)
-        whole, reduced = data.contact, smaller.contact
-        if data.ncon != smaller.ncon or not (
-            np.array_equal(whole.geom, of[reduced.geom])
-            and np.array_equal(whole.dist, reduced.dist)
-            and np.array_equal(whole.pos, reduced.pos)
-            and np.array_equal(whole.frame, reduced.frame)
+        reduced_data.qpos[:] = data.qpos
+        for posed_model, posed_data in ((model, data), (reduced_model, reduced_data)):
+            mujoco.mj_fwdPosition(posed_model, posed_data)
+        full_contacts, reduced_contacts = data.contact, reduced_data.contact
+        if data.ncon != reduced_data.ncon or not (
+            np.array_equal(full_contacts.geom, geom_numbers[reduced_contacts.geom])
+            and np.array_equal(full_contacts.dist, reduced_contacts.dist)
+            and np.array_equal(full_contacts.pos, reduced_contacts.pos)
+            and np.array_equal(full_contacts.frame, reduced_contacts.frame)
         ):
             return False
     return True

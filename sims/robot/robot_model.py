@@ -192,10 +192,10 @@ class RobotModel:
 
     def with_friction_form(self, form: FrictionForm) -> RobotModel:
         """Return the robot with another form of the dry friction that effects add."""
-        other = replace(self, friction_form=form)
+        robot = replace(self, friction_form=form)
         # The compiled model does not depend on the form, so it is reused.
-        other.__dict__["compiled"] = self.compiled
-        return other
+        robot.__dict__["compiled"] = self.compiled
+        return robot
 
     @property
     def name(self) -> str:
@@ -250,8 +250,8 @@ class RobotModel:
             joint = self.joints[int(model.actuator_trnid[i, 0])].name
         if self.coupled and int(model.actuator_trntype[i]) == int(mujoco.mjtTrn.mjTRN_TENDON):
             tendon = model.tendon(int(model.actuator_trnid[i, 0])).name
-            own = tendon.removesuffix(COUPLING_TENDON_SUFFIX)
-            joint = own if own in self.coupled else None
+            coupled_joint = tendon.removesuffix(COUPLING_TENDON_SUFFIX)
+            joint = coupled_joint if coupled_joint in self.coupled else None
         control, controls = i, 1
         if hasattr(model, "actuator_ctrladr"):
             control, controls = int(model.actuator_ctrladr[i]), int(model.actuator_ctrlnum[i])
@@ -288,9 +288,11 @@ class RobotModel:
             return ()
         tendon = int(model.actuator_trnid[i, 0])
         first, count = int(model.tendon_adr[tendon]), int(model.tendon_num[tendon])
-        own = range(first, first + count)
+        wrap_indices = range(first, first + count)
         is_joint = int(mujoco.mjtWrap.mjWRAP_JOINT)
-        joints = [int(model.wrap_objid[k]) for k in own if int(model.wrap_type[k]) == is_joint]
+        joints = [
+            int(model.wrap_objid[k]) for k in wrap_indices if int(model.wrap_type[k]) == is_joint
+        ]
         return tuple(self.joints[joint].name for joint in joints)
 
     @cached_property
@@ -300,15 +302,15 @@ class RobotModel:
         fused: dict[str, list[str]] = {}
         for alias, name in (self.aliases or {}).items():
             fused.setdefault(name, []).append(alias)
-        moving = []
+        moving_bodies = []
         for i in range(1, model.nbody):
             # Bodies welded to the world do not move; those welded to other bodies move with them.
             if int(model.body_weldid[i]) == 0:
                 continue
             name = model.body(i).name or f"body{i}"
             aliases = tuple(fused.get(name, ()))
-            moving.append(Body(name, i, float(model.body_mass[i]), aliases))
-        return tuple(moving)
+            moving_bodies.append(Body(name, i, float(model.body_mass[i]), aliases))
+        return tuple(moving_bodies)
 
     @cached_property
     def sensors(self) -> tuple[SensorRow, ...]:
@@ -327,14 +329,14 @@ class RobotModel:
         """Return the SI unit of a sensor by its number; 1 if MuJoCo does not determine it."""
         import mujoco
 
-        model, of = self.compiled, mujoco.mjtSensor
-        kind, on = int(model.sensor_type[sensor]), int(model.sensor_objid[sensor])
-        if kind == int(of.mjSENS_JOINTPOS):
-            return self.joints[on].unit
-        if kind == int(of.mjSENS_JOINTVEL):
-            return f"{self.joints[on].unit}/s"
-        if kind in (int(of.mjSENS_JOINTACTFRC), int(of.mjSENS_JOINTLIMITFRC)):
-            return self.joints[on].force_unit
+        model, sensor_types = self.compiled, mujoco.mjtSensor
+        kind, object_id = int(model.sensor_type[sensor]), int(model.sensor_objid[sensor])
+        if kind == int(sensor_types.mjSENS_JOINTPOS):
+            return self.joints[object_id].unit
+        if kind == int(sensor_types.mjSENS_JOINTVEL):
+            return f"{self.joints[object_id].unit}/s"
+        if kind in (int(sensor_types.mjSENS_JOINTACTFRC), int(sensor_types.mjSENS_JOINTLIMITFRC)):
+            return self.joints[object_id].force_unit
         return _UNITS.get(kind, "1")
 
     def integrates(self, actuator: Actuator) -> bool:
@@ -371,23 +373,23 @@ class RobotModel:
         found: Body = self._find_by_name("body", fused if fused in bodies else name, bodies)
         return found
 
-    def _find_by_name(self, kind: str, name: str, known: Mapping[str, Any]) -> Any:
+    def _find_by_name(self, kind: str, name: str, elements: Mapping[str, Any]) -> Any:
         """Return an element of the robot by name.
 
         Args:
             kind: word for the element in the message, such as joint.
             name: name from the user.
-            known: all elements of this kind by name.
+            elements: all elements of this kind by name.
 
         Raises:
             InputError: the robot has no such element; the message lists the known names.
         """
-        if name not in known:
+        if name not in elements:
             error = make_unknown_name_error(
-                f"{kind} of {self.path.name}", name, list(known) or ["none"]
+                f"{kind} of {self.path.name}", name, list(elements) or ["none"]
             )
             raise InputError(str(error))
-        return known[name]
+        return elements[name]
 
 
 _P = ParamSpec("_P")
@@ -408,8 +410,8 @@ def cache_per_robot(
         key = (function, *args, *kwargs.items())
         if key not in robot.function_cache:
             robot.function_cache[key] = function(robot, *args, **kwargs)
-        found: _T = robot.function_cache[key]
-        return found
+        result: _T = robot.function_cache[key]
+        return result
 
     return asked
 

@@ -58,7 +58,7 @@ class RobotReference:
         Args:
             folder: folder of the TOML file; None stores the model file's name without a folder.
         """
-        where = self.path.name if folder is None else _make_relative_path(folder, self.path)
+        model_path = self.path.name if folder is None else _make_relative_path(folder, self.path)
         document = {
             key: value for key, value in asdict(self).items() if value and key in ROBOT_KEYS
         }
@@ -66,7 +66,7 @@ class RobotReference:
         if self.friction_form == "stiff":
             del document["friction_form"]
         free = {"free": list(self.free)} if self.free else {}
-        return {"model": where, **document, **free}
+        return {"model": model_path, **document, **free}
 
     def make_simulator(self) -> type[RobotSimulator]:
         """Make the simulator of the robot.
@@ -160,14 +160,14 @@ def _check_numerics(source: Source, value: Any) -> dict[str, Any]:
     """Check the table ``[numerics]``: a time step in seconds, and one of MuJoCo's integrators."""
     from sims.robot.integrator_settings import INTEGRATOR_IDS
 
-    given = check_table(source, "numerics", value)
-    for key, entry in given.items():
-        where = f"numerics.{key}"
+    settings = check_table(source, "numerics", value)
+    for key, entry in settings.items():
+        entry_name = f"numerics.{key}"
         if key == "timestep":
-            given[key] = check_finite(source, where, entry)
-            if given[key] <= 0:
-                raise make_error(source, where, "more than 0 s", entry)
+            settings[key] = check_finite(source, entry_name, entry)
+            if settings[key] <= 0:
+                raise make_error(source, entry_name, "more than 0 s", entry)
         elif key != "integrator" or entry not in INTEGRATOR_IDS:
-            wanted = f"timestep, or integrator = {' | '.join(INTEGRATOR_IDS)}"
-            raise make_error(source, where, wanted, entry)
-    return given
+            expectation = f"timestep, or integrator = {' | '.join(INTEGRATOR_IDS)}"
+            raise make_error(source, entry_name, expectation, entry)
+    return settings

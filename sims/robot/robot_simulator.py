@@ -102,11 +102,13 @@ class RobotSimulator(SystemSimulator):
         but not both.
         """
         super().__init__(*args, **kwargs)
-        twice = [effect.name for effect in self.effects if self.system.is_free(type(effect))]
-        if twice:
-            raise InputError(f"effect {twice[0]}: its coefficient is free already")
-        freed = self.system.freed_effects
-        self._freed: list[Effect] = [effect() for effect in freed]
+        repeated_names = [
+            effect.name for effect in self.effects if self.system.is_free(type(effect))
+        ]
+        if repeated_names:
+            raise InputError(f"effect {repeated_names[0]}: its coefficient is free already")
+        freed_effects = self.system.freed_effects
+        self._freed: list[Effect] = [effect() for effect in freed_effects]
         self.robotic = self.system()
         self.addresses = JointAddresses(self.robot)
         self._floating = FloatingJoints.from_robot(self.robot)
@@ -129,8 +131,8 @@ class RobotSimulator(SystemSimulator):
                 "integrator", str(numerics.integrator), list(INTEGRATOR_IDS)
             )
         if not (isinstance(numerics.timestep, float) and numerics.timestep > 0):
-            found = format_value(numerics.timestep)
-            raise InputError(f"timestep must be a positive number of seconds, found {found}")
+            value_text = format_value(numerics.timestep)
+            raise InputError(f"timestep must be a positive number of seconds, found {value_text}")
         return RobotEngine(numerics)
 
     @classmethod
@@ -194,10 +196,10 @@ class RobotSimulator(SystemSimulator):
         _, x, v = self._known(scenarios, initial)
         return self._lanes(acting, runs, commands, x, v)
 
-    def simulate_observations(self, work: RobotRunBatch) -> Array:
+    def simulate_observations(self, batch: RobotRunBatch) -> Array:
         """Simulate observations (n, T, C) of the batch elements of one run."""
-        runs = ScenarioGroups((work.scenario,), np.zeros(len(work.x), dtype=np.intp))
-        return self._lanes(work.acting, runs, [work.commands], work.x, work.v)
+        runs = ScenarioGroups((batch.scenario,), np.zeros(len(batch.x), dtype=np.intp))
+        return self._lanes(batch.acting, runs, [batch.commands], batch.x, batch.v)
 
     def _lanes(
         self,
@@ -208,92 +210,100 @@ class RobotSimulator(SystemSimulator):
         v: Array,
     ) -> Array:
         """Simulate observations (L, T, C) of batch elements that begin at x and v (L, D)."""
-        longest = max(s.times.size for s in runs.unique_scenarios)
-        result = np.full((len(x), longest, len(self.channels)), np.nan)
+        max_samples = max(s.times.size for s in runs.unique_scenarios)
+        result = np.full((len(x), max_samples, len(self.channels)), np.nan)
         derived = find_active_elements(acting, len(x), changes_derived_constants)
-        asked = find_active_elements(acting, len(x), is_evaluated_per_step)
+        is_stepwise = find_active_elements(acting, len(x), is_evaluated_per_step)
         # A diverging batch element becomes NaN, so floating-point warnings are suppressed.
         with np.errstate(all="ignore"), capture_mujoco_warnings():
-            for series, kind, lanes in _alike(acting, derived, asked):
+            for series, kind, lanes in _alike(acting, derived, is_stepwise):
                 # Batch elements are sorted by run, so that data common to a run are computed once.
                 lanes = lanes[np.argsort(runs.scenario_index[lanes], kind="stable")]
                 for part in np.array_split(lanes, max(-(-lanes.size // BATCH_SIZE), 1)):
-                    works = [
+                    run_batches = [
                         RobotRunBatch(
                             runs.unique_scenarios[run],
                             commands[run],
-                            slice_active_effects(acting, own),
-                            x[own],
-                            v[own],
+                            slice_active_effects(acting, run_lanes),
+                            x[run_lanes],
+                            v[run_lanes],
                         )
-                        for run, own in group_by_run(runs, part)
+                        for run, run_lanes in group_by_run(runs, part)
                     ]
                     bits = bool(kind & 1), bool(kind & 2)
                     try:
-                        done = self._simulate(
-                            works, slice_active_effects(acting, part), *bits, series
+                        run_observations = self._simulate(
+                            run_batches, slice_active_effects(acting, part), *bits, series
                         )
                     except RefusedModelError:
                         # These elements stay NaN, like those of a diverging motion; the others are
                         # simulated.
                         continue
-                    for (_, own), seen in zip(group_by_run(runs, part), done, strict=True):
-                        result[own, : seen.shape[1]] = seen
+                    for (_, run_lanes), observations in zip(
+                        group_by_run(runs, part), run_observations, strict=True
+                    ):
+                        result[run_lanes, : observations.shape[1]] = observations
         # Negative zeros become positive, so that results do not depend on their origin.
         result += 0.0
         return result
 
     def _simulate(
         self,
-        works: Sequence[RobotRunBatch],
+        run_batches: Sequence[RobotRunBatch],
         acting: ActiveEffects,
         derived: bool,
-        asked: bool,
+        is_stepwise: bool,
         series: SeriesJoints = (),
     ) -> list[Array]:
         """Simulate observations (n, T, C) of the batch elements of each run, in one batch.
 
         Args:
-            works: batch elements of each run.
+            run_batches: batch elements of each run.
             acting: effects active on all of them.
             derived: whether effects change constants that MuJoCo derives.
-            asked: whether forces are evaluated in every step.
+            is_stepwise: whether forces are evaluated in every step.
             series: effects in series with joints.
         """
-        if not works:
+        if not run_batches:
             return []
         # A sensor at the end needs a further step, since MuJoCo computes its reading within the
         # step that begins then.
         extra_steps = int(self._reads_sensors())
-        sizes = [self.count_steps(list_last_read_times(work)) for work in works]
-        given = [
-            self.compute_controls(work, size + extra_steps)
-            for work, size in zip(works, sizes, strict=True)
+        sizes = [self.count_steps(list_last_read_times(batch)) for batch in run_batches]
+        run_inputs = [
+            self.compute_controls(batch, size + extra_steps)
+            for batch, size in zip(run_batches, sizes, strict=True)
         ]
-        whole = BatchInputs.concatenate(given)
-        x = np.concatenate([work.x for work in works])
-        v = np.concatenate([work.v for work in works])
-        made = self._stepped(
-            BatchStart(x, v, acting, self._afloat(works)), whole, derived, asked, series=series
+        inputs = BatchInputs.concatenate(run_inputs)
+        x = np.concatenate([batch.x for batch in run_batches])
+        v = np.concatenate([batch.v for batch in run_batches])
+        result = self._stepped(
+            BatchStart(x, v, acting, self._afloat(run_batches)),
+            inputs,
+            derived,
+            is_stepwise,
+            series=series,
         )
-        seen = []
+        observations = []
         first = 0
-        for work, size in zip(works, sizes, strict=True):
-            own = slice(first, first + len(work.x))
-            seen.append(self._shown(made.select(own), work, work.times, size))
-            first += len(work.x)
-        return seen
+        for batch, size in zip(run_batches, sizes, strict=True):
+            run_lanes = slice(first, first + len(batch.x))
+            observations.append(self._shown(result.select(run_lanes), batch, batch.times, size))
+            first += len(batch.x)
+        return observations
 
-    def _afloat(self, works: Sequence[RobotRunBatch]) -> FloatingState:
+    def _afloat(self, run_batches: Sequence[RobotRunBatch]) -> FloatingState:
         """Return the initial states of floating bodies for all batch elements."""
-        begun = [self.get_floating_start(work) for work in works]
-        sizes = [len(work.x) for work in works]
-        return FloatingState(*(np.repeat(rows, sizes, axis=0) for rows in zip(*begun, strict=True)))
+        initial_states = [self.get_floating_start(batch) for batch in run_batches]
+        sizes = [len(batch.x) for batch in run_batches]
+        return FloatingState(
+            *(np.repeat(rows, sizes, axis=0) for rows in zip(*initial_states, strict=True))
+        )
 
-    def get_floating_start(self, work: RobotRunBatch) -> FloatingState:
+    def get_floating_start(self, batch: RobotRunBatch) -> FloatingState:
         """Return the initial state of floating bodies, from the recording or the model file."""
         return self._floating.get_initial_state(
-            self.run_initial(work.scenario) if self._floating else {}
+            self.run_initial(batch.scenario) if self._floating else {}
         )
 
     def count_steps(self, times: Array) -> int:
@@ -316,18 +326,18 @@ class RobotSimulator(SystemSimulator):
         """Return whether a recorded channel is computed by MuJoCo within a step."""
         return any(c.name.startswith(("tau.", "s.")) for c in self.channels)
 
-    def compute_controls(self, work: RobotRunBatch, steps: int) -> BatchInputs:
+    def compute_controls(self, batch: RobotRunBatch, steps: int) -> BatchInputs:
         """Compute the inputs of the batch elements of one run over all steps.
 
         They are the controls of the actuators, the generalised forces on the joints that do
         not depend on the state, and the activations of the filters before actuators.
 
         Args:
-            work: batch elements of the run.
+            batch: batch elements of the run.
             steps: number of steps.
         """
-        n = len(work.x)
-        of_run = self.time_step, work.scenario, work.commands, work.acting, n, steps
+        n = len(batch.x)
+        of_run = self.time_step, batch.scenario, batch.commands, batch.acting, n, steps
         applied_inputs = compute_inputs_over_steps(*of_run)
         instant = (
             compute_inputs_over_steps(*of_run, SAME_INSTANT_SHARE)
@@ -338,12 +348,12 @@ class RobotSimulator(SystemSimulator):
         model = self.robot.compiled
         controls = np.zeros((n, steps, model.nu))
         forces = np.zeros((n, steps, model.nv))
-        given = np.zeros_like(controls) if self._drives else controls
+        instant_controls = np.zeros_like(controls) if self._drives else controls
         for actuator in self.robot.actuators:
             name = f"u.{actuator.name}"
             controls[:, :, actuator.control] = applied_inputs[name]
             if self._drives:
-                given[:, :, actuator.control] = instant[name]
+                instant_controls[:, :, actuator.control] = instant[name]
             # A derivative gain on the error's rate needs the rate of the command.
             if actuator.id in self._rated:
                 rate = (
@@ -351,28 +361,42 @@ class RobotSimulator(SystemSimulator):
                     / self.time_step
                 )
                 controls[:, :, actuator.control + 1] = rate
-                given[:, :, actuator.control + 1] = rate
+                instant_controls[:, :, actuator.control + 1] = rate
         for joint in self.robot.joints:
             if joint.has_one_coordinate:
                 forces[:, :, joint.velocity] = applied_inputs[f"force.{joint.name}"]
         dofs = self.addresses.velocities
         forces[:, :, dofs] += compute_time_dependent_forces(
-            self.robotic, work.acting, begins, len(dofs), n
+            self.robotic, batch.acting, begins, len(dofs), n
         )
-        begun = np.zeros((n, model.na))
-        for one in activation_filters(self.robot):
-            taken = controls[:, :, one.actuator.control]
-            begun[:, one.address] = self._first_activation(one, work, taken)
+        initial_activations = np.zeros((n, model.na))
+        for activation_filter in activation_filters(self.robot):
+            filter_controls = controls[:, :, activation_filter.actuator.control]
+            initial_activations[:, activation_filter.address] = self._first_activation(
+                activation_filter, batch, filter_controls
+            )
             # The servo's effective set point is the activation instead of the command.
-            activations = self._activations(one, taken, begun[:, one.address])
-            applied_inputs = {**applied_inputs, f"u.{one.actuator.name}": activations[:, :-1]}
-        off = off_steps(self.robot, work.scenario, self.time_step, steps)
+            activations = self._activations(
+                activation_filter,
+                filter_controls,
+                initial_activations[:, activation_filter.address],
+            )
+            applied_inputs = {
+                **applied_inputs,
+                f"u.{activation_filter.actuator.name}": activations[:, :-1],
+            }
+        off_mask = off_steps(self.robot, batch.scenario, self.time_step, steps)
         return BatchInputs(
-            controls, forces, applied_inputs, given, begun, np.broadcast_to(off, (n, *off.shape))
+            controls,
+            forces,
+            applied_inputs,
+            instant_controls,
+            initial_activations,
+            np.broadcast_to(off_mask, (n, *off_mask.shape)),
         )
 
     def _first_activation(
-        self, one: ActivationFilter, work: RobotRunBatch, controls: Array
+        self, activation_filter: ActivationFilter, batch: RobotRunBatch, controls: Array
     ) -> Array:
         """Return the activation (n,) of a filter at the start of a run.
 
@@ -381,34 +405,40 @@ class RobotSimulator(SystemSimulator):
         the first command.
 
         Args:
-            one: the filter.
-            work: batch elements of the run.
+            activation_filter: the filter.
+            batch: batch elements of the run.
             controls: (n, S) controls of the filter.
         """
-        stated = stated_activations(self.robot, work.scenario.initial)
-        if one.state in stated:
-            return np.full(len(work.x), stated[one.state])
-        settled: Array = np.clip(one.clipped(controls[:, 0]), *one.limits)
-        history = with_history(work.scenario, self.time_step)
+        file_activations = stated_activations(self.robot, batch.scenario.initial)
+        if activation_filter.state in file_activations:
+            return np.full(len(batch.x), file_activations[activation_filter.state])
+        settled_activation: Array = np.clip(
+            activation_filter.clipped(controls[:, 0]), *activation_filter.limits
+        )
+        history = with_history(batch.scenario, self.time_step)
         if history is None:
-            return settled
+            return settled_activation
         scenario, steps = history
         commands = self.run_inputs(scenario)
-        n = len(work.x)
+        n = len(batch.x)
         applied_inputs = compute_inputs_over_steps(
-            self.time_step, scenario, commands, work.acting, n, steps
+            self.time_step, scenario, commands, batch.acting, n, steps
         )
-        earlier = applied_inputs[f"u.{one.actuator.name}"]
-        last: Array = self._activations(one, earlier, one.clipped(earlier[:, 0]))[:, -1]
-        return last
+        earlier_controls = applied_inputs[f"u.{activation_filter.actuator.name}"]
+        last_activation: Array = self._activations(
+            activation_filter, earlier_controls, activation_filter.clipped(earlier_controls[:, 0])
+        )[:, -1]
+        return last_activation
 
-    def _activations(self, one: ActivationFilter, controls: Array, begun: Array) -> Array:
+    def _activations(
+        self, activation_filter: ActivationFilter, controls: Array, initial_activations: Array
+    ) -> Array:
         """Integrate an activation filter over the steps, as MuJoCo's integrator does.
 
         Args:
-            one: the filter.
+            activation_filter: the filter.
             controls: (n, S) controls over the steps.
-            begun: (n,) activations at the beginning.
+            initial_activations: (n,) activations at the beginning.
 
         Returns:
             (n, S + 1) activations at the beginnings of steps, and at the end.
@@ -416,13 +446,15 @@ class RobotSimulator(SystemSimulator):
         engine = self.engine
         assert isinstance(engine, RobotEngine)
         fourth = is_fourth_order(int(engine.numerics.to_model_options()["integrator"]))
-        return one.activations(controls, begun, self.time_step, fourth)
+        return activation_filter.activations(controls, initial_activations, self.time_step, fourth)
 
     def run_initial(self, scenario: Scenario) -> dict[str, float]:
         """Return initial states, see `Simulator`; filter activations are not estimated states."""
-        stated = stated_activations(self.robot, scenario.initial)
-        own = {name: v for name, v in scenario.initial.items() if name not in stated}
-        return super().run_initial(replace(scenario, initial=own))
+        file_activations = stated_activations(self.robot, scenario.initial)
+        state_values = {
+            name: v for name, v in scenario.initial.items() if name not in file_activations
+        }
+        return super().run_initial(replace(scenario, initial=state_values))
 
     def make_linearisation_batch(self, acting: ActiveEffects = ()) -> MujocoBatch:
         """Return the batch for linearisation, with the joints in series that effects need.
@@ -443,7 +475,7 @@ class RobotSimulator(SystemSimulator):
         return bench_cache(self.robot).bench(series, True, LINEARISATION_BATCH_SIZE, settings)
 
     def step_batch(
-        self, work: RobotRunBatch, given: BatchInputs, more: Sequence[str] = ()
+        self, batch: RobotRunBatch, inputs: BatchInputs, extra_fields: Sequence[str] = ()
     ) -> BatchResult:
         """Step the batch elements of one run.
 
@@ -452,24 +484,24 @@ class RobotSimulator(SystemSimulator):
         joints in series.
 
         Args:
-            work: batch elements of the run.
-            given: inputs over the steps.
-            more: additional fields of MuJoCo's data to record.
+            batch: batch elements of the run.
+            inputs: inputs over the steps.
+            extra_fields: additional fields of MuJoCo's data to record.
         """
-        n = len(work.x)
-        derived = bool(find_active_elements(work.acting, n, changes_derived_constants).any())
-        asked = bool(find_active_elements(work.acting, n, is_evaluated_per_step).any())
-        (series,) = group_by_series_joints(work.acting, n)
-        start = BatchStart(work.x, work.v, work.acting, self._afloat([work]))
-        return self._stepped(start, given, derived, asked, more, series)
+        n = len(batch.x)
+        derived = bool(find_active_elements(batch.acting, n, changes_derived_constants).any())
+        is_stepwise = bool(find_active_elements(batch.acting, n, is_evaluated_per_step).any())
+        (series,) = group_by_series_joints(batch.acting, n)
+        start = BatchStart(batch.x, batch.v, batch.acting, self._afloat([batch]))
+        return self._stepped(start, inputs, derived, is_stepwise, extra_fields, series)
 
     def _stepped(
         self,
         start: BatchStart,
-        given: BatchInputs,
+        inputs: BatchInputs,
         derived: bool,
-        asked: bool,
-        more: Sequence[str] = (),
+        is_stepwise: bool,
+        extra_fields: Sequence[str] = (),
         series: SeriesJoints = (),
     ) -> BatchResult:
         """Simulate a batch of n elements over all steps, and return its states and readings.
@@ -478,10 +510,11 @@ class RobotSimulator(SystemSimulator):
 
         Args:
             start: initial states, and the active effects.
-            given: controls, forces and activations over the steps.
+            inputs: controls, forces and activations over the steps.
             derived: whether masses or armatures change, from which MuJoCo derives constants.
-            asked: whether an effect depends on the state, so that it is evaluated in each step.
-            more: additional fields of MuJoCo's data to record.
+            is_stepwise: whether an effect depends on the state, so that it is evaluated in each
+                step.
+            extra_fields: additional fields of MuJoCo's data to record.
             series: joints in series that effects add to the robot.
         """
         n = len(start.x)
@@ -492,46 +525,55 @@ class RobotSimulator(SystemSimulator):
         bench.write_effects(
             pad_coefficients(select_model_field_effects(start.acting), n, bench.count)
         )
-        behind = bench.set_initial_state(start.x, start.v, start.floating_state)
-        bench.activate(given.activations)
-        record = ["qpos", "qvel", *more]
+        initial_second = bench.set_initial_state(start.x, start.v, start.floating_state)
+        bench.activate(inputs.activations)
+        record = ["qpos", "qvel", *extra_fields]
         if self._reads_sensors():
             record.append("sensordata")
         record = list(dict.fromkeys(record))
-        if asked:
+        if is_stepwise:
             stiffness = bench.get_servo_stiffness(places)[:n]
             effect_forces = EffectForces(
-                self.robotic, start.acting, given.applied_inputs, places, stiffness, self.time_step
+                self.robotic, start.acting, inputs.applied_inputs, places, stiffness, self.time_step
             )
-            forces = bench.map_forces(given.forces)
-            compiled = done = None
-            if given.off.any():
+            forces = bench.map_forces(inputs.forces)
+            compiled = recorded_fields = None
+            if inputs.off.any():
                 # Compiled effects assume a constant servo stiffness over all steps.
-                effect_forces.working = working_servos(bench.robot, places.velocities, given.off)
+                effect_forces.working = working_servos(bench.robot, places.velocities, inputs.off)
             else:
                 compiled = compile_forces(effect_forces)
             if compiled is not None:
-                done = step_in_callback(bench, given.controls, forces, compiled, record)
-            if done is None:
-                done = bench.step_with_forces(
-                    given.controls, forces, compiled or effect_forces, record, given.off
+                recorded_fields = step_in_callback(bench, inputs.controls, forces, compiled, record)
+            if recorded_fields is None:
+                recorded_fields = bench.step_with_forces(
+                    inputs.controls, forces, compiled or effect_forces, record, inputs.off
                 )
         else:
-            forces = bench.map_forces(given.forces)
-            done = bench.step(given.controls, forces, record, given.off)
-        x = np.concatenate([start.x[:, None], done["qpos"][:, :, places.positions]], axis=1)
-        v = np.concatenate([start.v[:, None], done["qvel"][:, :, places.velocities]], axis=1)
+            forces = bench.map_forces(inputs.forces)
+            recorded_fields = bench.step(inputs.controls, forces, record, inputs.off)
+        x = np.concatenate(
+            [start.x[:, None], recorded_fields["qpos"][:, :, places.positions]], axis=1
+        )
+        v = np.concatenate(
+            [start.v[:, None], recorded_fields["qvel"][:, :, places.velocities]], axis=1
+        )
         x[bench.failed] = np.nan
         if self._drives:
-            shown = DriveSensorModel(self.robot, self.robotic, bench, given, self.time_step)
-            shown.shift_to_step_begin(done["sensordata"])
-            shown.add_drive_effects(done["sensordata"], x, v, start.acting)
-        after = done["qpos"][:, :, second.positions], done["qvel"][:, :, second.velocities]
+            sensor_model = DriveSensorModel(self.robot, self.robotic, bench, inputs, self.time_step)
+            sensor_model.shift_to_step_begin(recorded_fields["sensordata"])
+            sensor_model.add_drive_effects(recorded_fields["sensordata"], x, v, start.acting)
+        later_second = (
+            recorded_fields["qpos"][:, :, second.positions],
+            recorded_fields["qvel"][:, :, second.velocities],
+        )
         hidden = [
-            np.concatenate([first[:, None], rest], axis=1)
-            for first, rest in zip(behind, after, strict=True)
+            np.concatenate([first[:, None], later_values], axis=1)
+            for first, later_values in zip(initial_second, later_second, strict=True)
         ]
-        return BatchResult(x, v, done, given.activations, bench.failed, (hidden[0], hidden[1]))
+        return BatchResult(
+            x, v, recorded_fields, inputs.activations, bench.failed, (hidden[0], hidden[1])
+        )
 
     def _bench(self, derived: bool, count: int, series: SeriesJoints = ()) -> MujocoBatch:
         """Return the batch for this time step and integrator, from the robot's cache."""
@@ -540,50 +582,52 @@ class RobotSimulator(SystemSimulator):
         settings = engine.numerics.to_model_options()
         return bench_cache(self.robot).bench(series, derived, count, settings)
 
-    def _shown(self, made: BatchResult, work: RobotRunBatch, times: Array, steps: int) -> Array:
+    def _shown(
+        self, result_of_batch: BatchResult, batch: RobotRunBatch, times: Array, steps: int
+    ) -> Array:
         """Compute the recorded observations (n, T, C) of one run, including sensor effects.
 
         Args:
-            made: states and readings of the batch; failed elements become NaN.
-            work: the n batch elements of the run.
+            result_of_batch: states and readings of the batch; failed elements become NaN.
+            batch: the n batch elements of the run.
             times: (T,) sample times in seconds since the start.
             steps: number of steps of the run; the batch may have more.
         """
         columns = []
         for channel in self.channels:
-            values, slopes = self._signal(made, channel.name, steps)
+            values, slopes = self._signal(result_of_batch, channel.name, steps)
             sensors = tuple(
                 (e, c)
-                for e, c in work.acting
+                for e, c in batch.acting
                 if isinstance(e, Sensor) and e.signal in ("", channel.name)
             )
-            clock = float(work.scenario.times[0])
+            clock = float(batch.scenario.times[0])
             columns.append(sample_readings(values, slopes, self.time_step, times, sensors, clock))
         result = np.stack(columns, axis=2)
-        result[made.failed] = np.nan
+        result[result_of_batch.failed] = np.nan
         return result
 
-    def _signal(self, made: BatchResult, name: str, steps: int) -> tuple[Array, Array | None]:
+    def _signal(self, result: BatchResult, name: str, steps: int) -> tuple[Array, Array | None]:
         """Return the values (n, S + 1) of a channel at all steps, and their slopes if known."""
-        kind, _, of = name.partition(".")
-        upto = slice(steps + 1)
+        kind, _, element_name = name.partition(".")
+        steps_of_run = slice(steps + 1)
         if kind in ("q", "qd"):
-            number = self.system.coordinates.index(f"q.{of}")
+            number = self.system.coordinates.index(f"q.{element_name}")
             if kind == "q":
-                return made.x[:, upto, number], made.v[:, upto, number]
-            return made.v[:, upto, number], None
-        return made.fields["sensordata"][:, upto, self.get_sensor_address(name)], None
+                return result.x[:, steps_of_run, number], result.v[:, steps_of_run, number]
+            return result.v[:, steps_of_run, number], None
+        return result.fields["sensordata"][:, steps_of_run, self.get_sensor_address(name)], None
 
     def get_sensor_address(self, channel: str) -> int:
         """Return the column in MuJoCo's sensor data of a channel that is not a state."""
-        kind, _, of = channel.partition(".")
+        kind, _, element_name = channel.partition(".")
         if kind == "tau":
-            return self._bench(False, 1).drives[of]
-        return next(s for s in self.robot.sensors if s.name == of).address
+            return self._bench(False, 1).drives[element_name]
+        return next(s for s in self.robot.sensors if s.name == element_name).address
 
 
 def _alike(
-    acting: ActiveEffects, derived: Mask, asked: Mask
+    acting: ActiveEffects, derived: Mask, is_stepwise: Mask
 ) -> Iterator[tuple[SeriesJoints, int, Places]]:
     """Group batch elements that can be simulated together.
 
@@ -591,11 +635,11 @@ def _alike(
         Effects in series with joints, a bit field (1: derived constants change, 2: forces are
         evaluated in every step), and the indices of the batch elements.
     """
-    for series, own in group_by_series_joints(acting, len(derived)).items():
-        there = np.zeros(len(derived), dtype=bool)
-        there[own] = True
+    for series, group_lanes in group_by_series_joints(acting, len(derived)).items():
+        is_in_group = np.zeros(len(derived), dtype=bool)
+        is_in_group[group_lanes] = True
         for kind in range(4):
-            of_kind = there & (derived == bool(kind & 1)) & (asked == bool(kind & 2))
+            of_kind = is_in_group & (derived == bool(kind & 1)) & (is_stepwise == bool(kind & 2))
             yield series, kind, np.flatnonzero(of_kind)
 
 
@@ -615,8 +659,8 @@ def make_robot_simulator(
     numerics = numerics or read_integrator_settings(robot)
     # The class is created at run time, so its source text does not identify the robot; the digest
     # does.
-    told = repr((robot.digest, tuple(free), tuple(numerics)))
-    told += "" if robot.friction_form == "stiff" else robot.friction_form
+    identity_text = repr((robot.digest, tuple(free), tuple(numerics)))
+    identity_text += "" if robot.friction_form == "stiff" else robot.friction_form
     system = make_robot_system(robot, free)
     declared = {
         "system": system,
@@ -624,7 +668,7 @@ def make_robot_simulator(
         "numerics": numerics,
         "free": tuple(free),
         "made_of": tuple(library.get_effect(n) for n in {e.of: 0 for e in system.freed_effects}),
-        "source_digest": hashlib.sha256(told.encode()).hexdigest(),
+        "source_digest": hashlib.sha256(identity_text.encode()).hexdigest(),
         "__module__": __name__,
         "__doc__": f"The robot of {robot.path.name}.",
     }

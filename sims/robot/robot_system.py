@@ -95,10 +95,18 @@ class RobotSystem(System):
                     effect, cls.places, MODEL_FIELD_EFFECTS, cls._compiles_with
                 )
             )
-        found = [one for one in cls._placed[effect.name] if not cls.is_free(one)]
+        placed_effects = [
+            placed_effect
+            for placed_effect in cls._placed[effect.name]
+            if not cls.is_free(placed_effect)
+        ]
         if effect.name == "payload":
-            return [one for one in found if f"mass.scale@{one.place}" not in cls.freed_parameters]
-        return found
+            return [
+                placed_effect
+                for placed_effect in placed_effects
+                if f"mass.scale@{placed_effect.place}" not in cls.freed_parameters
+            ]
+        return placed_effects
 
     @classmethod
     def _compiles_with(cls, effect: type[Effect]) -> bool:
@@ -139,24 +147,26 @@ class RobotSystem(System):
         cls.placed(registered)
         if name in cls.left_out:
             raise InputError(f"effect {name} of robot {cls.name}: {cls.left_out[name]}")
-        known = {one.name: one for one in cls._placed[base]}
-        if name in known:
-            return known[name]
-        if not known:
+        effects_by_name = {placed_effect.name: placed_effect for placed_effect in cls._placed[base]}
+        if name in effects_by_name:
+            return effects_by_name[name]
+        if not effects_by_name:
             raise InputError(f"robot {cls.name} cannot have effect {base}")
         if not place:
             raise InputError(
                 f"effect {base} of robot {cls.name} needs a place; there are: "
-                + ", ".join(sorted(known))
+                + ", ".join(sorted(effects_by_name))
             )
         if registered.at == "body" and place in (cls.robot.aliases or {}):
             return cls.effect(f"{base}@{cls.robot.body(place).name}")
-        there = [one.place for one in known.values() if one.place]
-        if place == ALL_PLACES and len(there) == 1:
+        place_names = [
+            placed_effect.place for placed_effect in effects_by_name.values() if placed_effect.place
+        ]
+        if place == ALL_PLACES and len(place_names) == 1:
             # If there is one place only, the family is this place.
-            return known[f"{base}@{there[0]}"]
+            return effects_by_name[f"{base}@{place_names[0]}"]
         raise make_unknown_name_error(
-            f"place of effect {base} in robot {cls.name}", place, there or ["none"]
+            f"place of effect {base} in robot {cls.name}", place, place_names or ["none"]
         )
 
     @classmethod
@@ -170,20 +180,24 @@ class RobotSystem(System):
         base, _, place = word.partition("@")
         name = MUJOCO_EFFECT_WORDS.get(base, base)
         if name not in library.list_names():
-            there = [
+            known_words = [
                 *cls.list_mujoco_words(),
-                *(other for other in library.list_names() if cls._can_have_effect(other)),
+                *(
+                    effect_name
+                    for effect_name in library.list_names()
+                    if cls._can_have_effect(effect_name)
+                ),
             ]
-            raise make_unknown_name_error(f"number of robot {cls.name}", base, there)
-        found = cls.effect(f"{name}@{place}" if place else name)
-        assert found is not None
+            raise make_unknown_name_error(f"number of robot {cls.name}", base, known_words)
+        placed_effect = cls.effect(f"{name}@{place}" if place else name)
+        assert placed_effect is not None
         # Shared effects, such as delays, have one number for all places.
         members = (
             ()
             if name in effect_places.SHARED_COEFFICIENT_EFFECTS
-            else getattr(found, "members", ())
+            else getattr(placed_effect, "members", ())
         )
-        return [type(member) for member in members] or [found]
+        return [type(member) for member in members] or [placed_effect]
 
     @classmethod
     def list_mujoco_words(cls) -> list[str]:
@@ -241,13 +255,13 @@ def make_robot_system(robot: RobotModel, free: Sequence[str] = ()) -> type[Robot
     servos: dict[int, str] = {}
     gears: dict[int, float] = {}
     for number, joint in enumerate(joints):
-        own = [a for a in robot.actuators if a.joint == joint.name]
-        drives[number] = tuple(f"u.{a.name}" for a in own)
-        follows = [a for a in own if a.kind == "position"]
+        joint_actuators = [a for a in robot.actuators if a.joint == joint.name]
+        drives[number] = tuple(f"u.{a.name}" for a in joint_actuators)
+        position_servos = [a for a in joint_actuators if a.kind == "position"]
         # With several servos at one joint, its motion would not show which one has an error.
-        if len(follows) == 1:
-            servos[number] = f"u.{follows[0].name}"
-            gears[number] = float(model.actuator_gear[follows[0].id, 0])
+        if len(position_servos) == 1:
+            servos[number] = f"u.{position_servos[0].name}"
+            gears[number] = float(model.actuator_gear[position_servos[0].id, 0])
     declared: dict[str, Any] = {
         "name": robot.name,
         "says": f"the robot of {robot.path.name}",
@@ -268,7 +282,9 @@ def make_robot_system(robot: RobotModel, free: Sequence[str] = ()) -> type[Robot
         "drives": drives,
         "servos": servos,
         "gears": gears,
-        "activations": tuple(one.state for one in activation_filters(robot)),
+        "activations": tuple(
+            activation_filter.state for activation_filter in activation_filters(robot)
+        ),
         "refused_inputs": MappingProxyType(
             {f"u.{a.name}": INTEGRATES for a in robot.actuators if robot.integrates(a)}
         ),
@@ -293,7 +309,9 @@ def list_freed_effects(system: type[RobotSystem], free: Sequence[str]) -> list[t
     Returns:
         Effects at one place each, or shared by all places.
     """
-    by_name = {one.name: one for word in free for one in system.find_freeable_effects(word)}
+    by_name = {
+        effect.name: effect for word in free for effect in system.find_freeable_effects(word)
+    }
     return list(by_name.values())
 
 
@@ -309,10 +327,10 @@ def _make_parameters(effect: type[Effect]) -> list[Parameter]:
     for c in effect.coefficients:
         low, high = c.plausible[0]
         # A free gain is a guess, so the true value may be several times as large.
-        guess = effect.at == "actuator" and c.least is not None
+        is_free_gain = effect.at == "actuator" and c.least is not None
         bounds = (
             FREED_RANGE_FACTOR * low,
-            FREED_GAIN_RANGE_FACTOR if guess else FREED_RANGE_FACTOR * high,
+            FREED_GAIN_RANGE_FACTOR if is_free_gain else FREED_RANGE_FACTOR * high,
         )
         # A coefficient that cannot be observed has an empty range; it gets wider bounds, and the
         # data will not identify it.

@@ -112,16 +112,16 @@ class RobotSnapshot(StateSnapshot):
 
     def select_element(self, lane: int) -> RobotSnapshot:
         """Select one batch element."""
-        own = slice(lane, lane + 1)
+        element_slice = slice(lane, lane + 1)
         return replace(
             self,
-            theta=self.theta[own],
-            t=self.t[own],
-            x=self.x[own],
-            v=self.v[own],
-            inputs={name: u[own] for name, u in self.inputs.items()},
-            carried=self.carried[:, own],
-            stiffness=self.stiffness[own],
+            theta=self.theta[element_slice],
+            t=self.t[element_slice],
+            x=self.x[element_slice],
+            v=self.v[element_slice],
+            inputs={name: u[element_slice] for name, u in self.inputs.items()},
+            carried=self.carried[:, element_slice],
+            stiffness=self.stiffness[element_slice],
         )
 
     def get_joint_snapshot(self, joint: int) -> JointSnapshot:
@@ -130,22 +130,22 @@ class RobotSnapshot(StateSnapshot):
         Effects are written for such systems. The set point is NaN without a position servo
         whose input is known.
         """
-        one = slice(joint, joint + 1)
+        joint_slice = slice(joint, joint + 1)
         inputs = {
             name: self.inputs[name] for name in self.drives.get(joint, ()) if name in self.inputs
         }
         servo = self.servos.get(joint)
-        followed = servo is not None and servo in self.inputs and self.stiffness.size
+        has_servo = servo is not None and servo in self.inputs and self.stiffness.size
         return JointSnapshot(
             self.alone[joint],
             self.theta,
             self.constants,
             self.t,
-            self.x[:, one],
-            self.v[:, one],
+            self.x[:, joint_slice],
+            self.v[:, joint_slice],
             inputs,
-            self.carried[:, :, one],
-            self.inputs[servo] if followed and servo else np.full_like(self.t, np.nan),
-            self.stiffness[:, one] if followed else np.zeros_like(self.t),
+            self.carried[:, :, joint_slice],
+            self.inputs[servo] if has_servo and servo else np.full_like(self.t, np.nan),
+            self.stiffness[:, joint_slice] if has_servo else np.zeros_like(self.t),
             self.system.gear(joint),
         )

@@ -121,53 +121,58 @@ def apply_causes(
         InputError: the robot has no place of that name.
         RuntimeError: the model does not accept a change; this is a program error.
     """
-    found = expand_families(robot, causes)
+    fitted_causes = expand_families(robot, causes)
     notes = []
-    couplings = {c.place: float(c.coefficients[0]) for c in found if c.effect == COUPLED}
+    couplings = {c.place: float(c.coefficients[0]) for c in fitted_causes if c.effect == COUPLED}
     robot = make_coupled_robot(robot, couplings) if couplings else robot
-    series = _combine_series_elements(found)
+    series = _combine_series_elements(fitted_causes)
     if series:
         notes += [KEYFRAMES_OMITTED_NOTE] if robot.compiled.nkey else []
-        added = tuple((c.place, c.effect) for c in found if _is_in_series(c))
+        added = tuple((c.place, c.effect) for c in fitted_causes if _is_in_series(c))
         robot = prepare_flanks_for_file(add_series_joints(robot, added), series)
-    wanted = copy_model_fields(robot.compiled)
+    target_values = copy_model_fields(robot.compiled)
     comments: dict[ModelElement, list[str]] = {}
-    held: list[FittedCause] = []
+    applied_causes: list[FittedCause] = []
     # Elements in series take their share of armatures, so they are written last.
-    for cause in sorted(found, key=lambda c: (get_application_order(c), _is_in_series(c))):
-        before = {name: values.copy() for name, values in wanted.items()}
-        done = {one.place for one in held if _is_in_series(one)}
-        answer = _write_cause(wanted, robot, cause, series if cause.place not in done else {})
-        if answer and not answer.startswith("+"):
-            notes.append(f"{cause.format(recording)}: not in the file: {answer}")
+    for cause in sorted(fitted_causes, key=lambda c: (get_application_order(c), _is_in_series(c))):
+        before = {name: values.copy() for name, values in target_values.items()}
+        places_in_series = {applied.place for applied in applied_causes if _is_in_series(applied)}
+        remark = _write_cause(
+            target_values, robot, cause, series if cause.place not in places_in_series else {}
+        )
+        if remark and not remark.startswith("+"):
+            notes.append(f"{cause.format(recording)}: not in the file: {remark}")
             continue
-        held.append(cause)
-        note = f"{cause.effect}: {answer[1:]}" if answer else _find_note(robot, cause)
+        applied_causes.append(cause)
+        note = f"{cause.effect}: {remark[1:]}" if remark else _find_note(robot, cause)
         if note and note not in notes:
             notes.append(note)
-        changed = [
-            one.element for one in find_differing_statements(robot.compiled, before, wanted, 0.0)
+        changed_elements = [
+            statement.element
+            for statement in find_differing_statements(robot.compiled, before, target_values, 0.0)
         ]
         if _is_in_series(cause):
             second = ModelElement("joint", robot.joint(find_series_joint(robot, cause.place)).id)
-            changed += [] if second in changed else [second]
-        for one in changed:
-            comments.setdefault(one, []).append(cause.format(recording))
+            changed_elements += [] if second in changed_elements else [second]
+        for changed_element in changed_elements:
+            comments.setdefault(changed_element, []).append(cause.format(recording))
         if cause.effect == COUPLED:
             for actuator in (a for a in robot.actuators if a.joint == cause.place):
                 element = ModelElement("actuator", actuator.id)
                 comments.setdefault(element, []).append(cause.format(recording))
-    spec, model = _compile_changed_spec(robot, wanted)
-    if any(is_compliant_flank(made)[0] for made in series.values()):
+    spec, model = _compile_changed_spec(robot, target_values)
+    if any(is_compliant_flank(transmission)[0] for transmission in series.values()):
         # The solver parameters of compliant flanks depend on all causes, so they are computed
         # again.
         robot = prepare_flanks_for_file(robot, series, model)
-        spec, model = _compile_changed_spec(robot, wanted)
+        spec, model = _compile_changed_spec(robot, target_values)
     # Only the text is stored, since a compiled spec holds all meshes a second time.
     text = format_spec(spec, robot.path.resolve().parent)
     del spec
     release_free_memory()
-    return ModifiedModel(robot, text, model, wanted, comments, tuple(held), tuple(notes))
+    return ModifiedModel(
+        robot, text, model, target_values, comments, tuple(applied_causes), tuple(notes)
+    )
 
 
 def _find_note(robot: RobotModel, cause: FittedCause) -> str | None:
@@ -190,7 +195,7 @@ def _combine_series_elements(causes: Sequence[FittedCause]) -> dict[str, Transmi
     for cause in causes:
         if _is_in_series(cause):
             elements.setdefault(cause.place, []).append(_make_series_element(cause))
-    return {place: combine_elements(own) for place, own in elements.items()}
+    return {place: combine_elements(place_elements) for place, place_elements in elements.items()}
 
 
 def _make_series_element(cause: FittedCause) -> Transmission:
@@ -200,7 +205,7 @@ def _make_series_element(cause: FittedCause) -> Transmission:
 
 
 def _write_cause(
-    wanted: Fields, robot: RobotModel, cause: FittedCause, series: Mapping[str, Transmission]
+    target_values: Fields, robot: RobotModel, cause: FittedCause, series: Mapping[str, Transmission]
 ) -> str | None:
     """Write a cause into the model fields; return None or a reason.
 
@@ -213,21 +218,21 @@ def _write_cause(
         return None
     if is_gravity_compensated(cause.effect, cause.numbers):
         for body in robot.bodies:
-            wanted["body_gravcomp"][0, body.id] = 1.0
+            target_values["body_gravcomp"][0, body.id] = 1.0
         return "+gravity is compensated: the bodies have gravcomp = 1, and gravity is as it was"
     if cause.effect in GEOMETRY_EFFECTS and _is_in_frame(robot, cause):
         return "its element is within a <frame>, or made by another element"
     if cause.effect in MODEL_FIELD_EFFECTS:
         MODEL_FIELD_EFFECTS[cause.effect].write(
-            wanted, robot, cause.place, cause.coefficients[:, None]
+            target_values, robot, cause.place, cause.coefficients[:, None]
         )
         return None
     if _is_in_series(cause):
         if cause.place in series:
-            state_element(wanted, robot, cause.place, series[cause.place])
+            state_element(target_values, robot, cause.place, series[cause.place])
         return None
     if cause.effect in COMMAND_WRITERS:
-        return COMMAND_WRITERS[cause.effect](wanted, robot, cause)
+        return COMMAND_WRITERS[cause.effect](target_values, robot, cause)
     if cause.effect.startswith(("sensor.", "clock.")):
         return "a model file does not state sensor errors"
     return "MuJoCo has no such element"
@@ -236,10 +241,10 @@ def _write_cause(
 def _is_in_frame(robot: RobotModel, cause: FittedCause) -> bool:
     """Return whether a frame element changes the attributes that a geometry effect changes."""
     elements = robot.spec.joints if cause.effect.startswith("joint.") else robot.spec.bodies
-    return any(one.name == cause.place and one.frame is not None for one in elements)
+    return any(element.name == cause.place and element.frame is not None for element in elements)
 
 
-def _compile_changed_spec(robot: RobotModel, wanted: Fields) -> tuple[Any, Any]:
+def _compile_changed_spec(robot: RobotModel, target_values: Fields) -> tuple[Any, Any]:
     """Change a copy of the robot's spec until it compiles to the wanted fields.
 
     Several rounds are needed, because a change may also modify values that should stay.
@@ -251,28 +256,28 @@ def _compile_changed_spec(robot: RobotModel, wanted: Fields) -> tuple[Any, Any]:
     by_id = SpecElements(spec, robot)
     tolerance = 0.0
     for _ in range(MAX_CORRECTION_ROUNDS):
-        statements = find_missing_statements(model, wanted, tolerance)
+        statements = find_missing_statements(model, target_values, tolerance)
         if not statements:
             return spec, model
         for statement in statements:
             set_attributes(by_id.get_element(statement.element), statement)
         if any(statement.element.kind == "body" for statement in statements):
-            _keep_masses(spec, wanted)
+            _keep_masses(spec, target_values)
         model, tolerance = spec.compile(), ROUNDING_TOLERANCE
-    left = find_missing_statements(model, wanted, tolerance)
-    if left:
-        raise RuntimeError(f"{robot.path}: the model does not take {left[0]}")
+    missing_statements = find_missing_statements(model, target_values, tolerance)
+    if missing_statements:
+        raise RuntimeError(f"{robot.path}: the model does not take {missing_statements[0]}")
     return spec, model
 
 
-def _keep_masses(spec: Any, wanted: Fields) -> None:
+def _keep_masses(spec: Any, target_values: Fields) -> None:
     """Change compiler settings so that MuJoCo uses inertials as specified."""
     import mujoco
 
     if spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE:
         spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
     if spec.compiler.settotalmass > 0:
-        spec.compiler.settotalmass = float(wanted["body_mass"].sum())
+        spec.compiler.settotalmass = float(target_values["body_mass"].sum())
 
 
 class SpecElements:
@@ -309,7 +314,7 @@ def set_attributes(element: Any, statement: AttributeStatement) -> None:
     import mujoco
 
     kind = statement.element.kind
-    known = {attribute.name: attribute.spec for attribute in ATTRIBUTES_BY_KIND[kind]}
+    spec_names = {attribute.name: attribute.spec for attribute in ATTRIBUTES_BY_KIND[kind]}
     for name, values in statement.values.items():
         if name in ENUM_ATTRIBUTES:
             value: Any = getattr(mujoco, ENUM_ATTRIBUTES[name])(int(values[0]))
@@ -321,8 +326,8 @@ def set_attributes(element: Any, statement: AttributeStatement) -> None:
         elif kind == "frame" and name == "pos":
             value = _convert_to_inner_frame(element, values)
         else:
-            value = _convert_to_attribute(element, name, known[name], values)
-        setattr(element, known[name], value)
+            value = _convert_to_attribute(element, name, spec_names[name], values)
+        setattr(element, spec_names[name], value)
     if kind == "body":
         _make_inertia_explicit(element)
     if kind == "joint" and {"damping", "stiffness"} & set(statement.values):
@@ -354,10 +359,10 @@ def _convert_to_attribute(element: Any, name: str, attribute: str, values: Seque
 
     if name in ANGLE_ATTRIBUTES and element.type == mujoco.mjtJoint.mjJNT_HINGE:
         return float(np.rad2deg(values[0])) if element.compiler.degree else values[0]
-    now = np.asarray(getattr(element, attribute))
-    if now.ndim == 0:
+    present_values = np.asarray(getattr(element, attribute))
+    if present_values.ndim == 0:
         return values[0]
-    padded = np.zeros(now.shape)
+    padded = np.zeros(present_values.shape)
     padded[: len(values)] = values[: len(padded)]
     return padded
 

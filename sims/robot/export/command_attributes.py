@@ -182,9 +182,9 @@ def _write_delay(fields: Fields, robot: RobotModel, cause: FittedCause) -> Unsta
     # MuJoCo interpolates linearly between past controls. This equals the mean, over a step, of
     # delayed controls that are constant over their steps.
     fields["actuator_history"][0, actuator.id] = (ceil(delay / step) + 1, 1)
-    late = "" if delay >= step else f", delays it by a whole step, {step:g} s"
+    delay_note = "" if delay >= step else f", delays it by a whole step, {step:g} s"
     return (
-        f"+MuJoCo takes a control that is delayed for 0 before the first one{late} "
+        f"+MuJoCo takes a control that is delayed for 0 before the first one{delay_note} "
         "(mj_initCtrlHistory sets another)"
     )
 
@@ -223,21 +223,21 @@ def _write_constant_force(
     """
     joint, (force,) = robot.joint(cause.place), cause.coefficients
     stiffness = fields["jnt_stiffness"][0, joint.id]
-    stated = robot.compiled.ntendon - len(robot.coupled)
-    plain = not fields["jnt_stiffnesspoly"][0, joint.id].any() and not stated
+    tendon_count = robot.compiled.ntendon - len(robot.coupled)
+    has_linear_spring = not fields["jnt_stiffnesspoly"][0, joint.id].any() and not tendon_count
     if (
         joint.has_one_coordinate
         and stiffness > 0
-        and plain
+        and has_linear_spring
         and not robot.compiled.jnt_springyield[joint.id]
     ):
         fields["qpos_spring"][0, joint.position] += force / stiffness
         return None
     for driving in robot.actuators:
         actuator = _Actuator(fields, robot, driving.name)
-        alone = joint.name not in robot.coupled
-        unlimited = driving.force is None and joint.effort is None and alone
-        if driving.joint == joint.name and actuator.single and actuator.steady and unlimited:
+        is_uncoupled = joint.name not in robot.coupled
+        is_unlimited = driving.force is None and joint.effort is None and is_uncoupled
+        if driving.joint == joint.name and actuator.single and actuator.steady and is_unlimited:
             gear = robot.compiled.actuator_gear[actuator.id]
             if not fields["actuator_forcelimited"][0, actuator.id] and gear[0]:
                 actuator.shift(float(force / gear[0]))

@@ -45,13 +45,13 @@ def render_default_class(
     elements = [ModelElement("joint", joint)]
     elements += [] if actuator is None else [ModelElement("actuator", actuator)]
     for element in elements:
-        told = applied.comments.get(element, [])
-        lines += [f"  {_format_comment(text)}" for text in dict.fromkeys(told)]
-        tag, stated = _format_default_element(
+        cause_comments = applied.comments.get(element, [])
+        lines += [f"  {_format_comment(text)}" for text in dict.fromkeys(cause_comments)]
+        tag, attributes = _format_default_element(
             element, list_all_attributes(applied.model, element, applied.target_values)
         )
-        said = "".join(f' {key}="{value}"' for key, value in stated.items())
-        lines.append(f"  <{tag}{said}/>")
+        attribute_text = "".join(f' {key}="{value}"' for key, value in attributes.items())
+        lines.append(f"  <{tag}{attribute_text}/>")
     return "\n".join([*lines, "</default>"])
 
 
@@ -59,24 +59,28 @@ def _format_default_element(
     element: ModelElement, values: Mapping[str, Values]
 ) -> tuple[str, dict[str, str]]:
     """Return the tag of an element in a default class, and its attributes as text."""
-    own = {
+    class_values = {
         name: value
         for name, value in values.items()
         if name not in _OF_THE_POSE and not _is_usual(name, value)
     }
     if element.kind == "joint":
         if not values["frictionloss"][0]:
-            own = {name: value for name, value in own.items() if not name.startswith("sol")}
-        return "joint", format_attributes(own)
+            class_values = {
+                name: value for name, value in class_values.items() if not name.startswith("sol")
+            }
+        return "joint", format_attributes(class_values)
     ranges = {"ctrlrange": "ctrllimited", "forcerange": "forcelimited"}
-    own = {k: v for k, v in own.items() if k not in ranges or values[ranges[k]][0]}
+    class_values = {
+        k: v for k, v in class_values.items() if k not in ranges or values[ranges[k]][0]
+    }
     if not _is_servo(values):
         return "general", format_attributes(
-            {**own, **{k: values[k] for k in ("gaintype", "biastype")}}
+            {**class_values, **{k: values[k] for k in ("gaintype", "biastype")}}
         )
     gains = {"kp": format_number(values["gainprm"][0]), "kv": format_number(-values["biasprm"][2])}
     return "position", gains | format_attributes(
-        {k: v for k, v in own.items() if not k.startswith(("gain", "bias", "dyn"))}
+        {k: v for k, v in class_values.items() if not k.startswith(("gain", "bias", "dyn"))}
     )
 
 
@@ -125,21 +129,23 @@ def render_model_using_class(
         tag.renamed, _ = _format_default_element(
             element, list_all_attributes(applied.model, element, applied.target_values)
         )
-    if not any(one.name in FILE_ELEMENTS for one in document.walk()):
+    if not any(element_tag.name in FILE_ELEMENTS for element_tag in document.walk()):
         for compiler in document.find_elements("compiler"):
             compiler.removed |= {"meshdir", "texturedir"}
     document.root.within.insert(
         0, ([], "<default>\n    " + text.replace("\n", "\n    ") + "\n  </default>")
     )
-    written = document.to_text()
-    differs = find_first_difference(compile_mjcf(written), applied.model, EQUAL_NUMBERS_TOLERANCE)
-    if differs:
-        raise NotEditableError(differs)
-    return written
+    written_text = document.to_text()
+    difference = find_first_difference(
+        compile_mjcf(written_text), applied.model, EQUAL_NUMBERS_TOLERANCE
+    )
+    if difference:
+        raise NotEditableError(difference)
+    return written_text
 
 
 def _format_comment(text: str) -> str:
     """Render text as an XML comment."""
     # Two hyphens would end an XML comment early.
-    safe = text.replace("--", "- -")
-    return f"<!-- {safe} -->"
+    escaped_text = text.replace("--", "- -")
+    return f"<!-- {escaped_text} -->"

@@ -67,7 +67,7 @@ class MjcfAttribute(NamedTuple):
 
 
 def _make_reader(name: str, address: str = "id") -> Callable[[Fields, Any], Any]:
-    return lambda fields, where: fields[name][0, getattr(where, address)]
+    return lambda fields, field_address: fields[name][0, getattr(field_address, address)]
 
 
 class FieldAddress(NamedTuple):
@@ -87,18 +87,18 @@ class FieldAddress(NamedTuple):
 
 
 def _make_polynomial_reader(
-    first: str, others: str, address: str = "id"
+    first: str, higher_orders: str, address: str = "id"
 ) -> Callable[[Fields, Any], list[float]]:
     """Return a reader of a polynomial attribute: its linear coefficient, then the others.
 
     MuJoCo stores the linear coefficient in the field `first` and the others in the field
-    `others`. `address` names the attribute of `where` with the row in these fields.
+    `higher_orders`. `address` names the attribute of `field_address` with the row in these fields.
     """
 
-    def read(fields: Fields, where: Any) -> list[float]:
-        """Return the coefficients of the element at the address in `where`, lowest order first."""
-        at = getattr(where, address)
-        return [fields[first][0, at], *fields[others][0, at]]
+    def read(fields: Fields, field_address: Any) -> list[float]:
+        """Return the coefficients of the element at `field_address`, lowest order first."""
+        row = getattr(field_address, address)
+        return [fields[first][0, row], *fields[higher_orders][0, row]]
 
     return read
 
@@ -182,10 +182,10 @@ ENUM_ATTRIBUTES: Mapping[str, str] = {
 
 def copy_model_fields(model: Any) -> Fields:
     """Copy the fields of a compiled model that store attributes."""
-    found = {name: np.array(getattr(model, name))[None] for name in _NAMES}
+    fields = {name: np.array(getattr(model, name))[None] for name in _NAMES}
     for name in ("timestep", "integrator", "gravity"):
-        found[f"opt.{name}"] = np.array(getattr(model.opt, name))[None]
-    return found
+        fields[f"opt.{name}"] = np.array(getattr(model.opt, name))[None]
+    return fields
 
 
 def get_field_address(model: Any, element: ModelElement) -> FieldAddress:
@@ -205,33 +205,39 @@ def list_elements(model: Any) -> list[ModelElement]:
     """
     import mujoco
 
-    one = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
-    found = [ModelElement("joint", i) for i in range(model.njnt) if int(model.jnt_type[i]) in one]
-    found += [ModelElement("body", i) for i in range(1, model.nbody)]
-    found += [ModelElement("frame", i) for i in range(1, model.nbody)]
-    single = [i for i in range(len(model.actuator_ctrlnum)) if int(model.actuator_ctrlnum[i]) == 1]
-    found += [ModelElement("actuator", i) for i in single]
-    return [*found, ModelElement("option", 0)]
+    scalar_types = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+    elements = [
+        ModelElement("joint", i)
+        for i in range(model.njnt)
+        if int(model.jnt_type[i]) in scalar_types
+    ]
+    elements += [ModelElement("body", i) for i in range(1, model.nbody)]
+    elements += [ModelElement("frame", i) for i in range(1, model.nbody)]
+    scalar_actuators = [
+        i for i in range(len(model.actuator_ctrlnum)) if int(model.actuator_ctrlnum[i]) == 1
+    ]
+    elements += [ModelElement("actuator", i) for i in scalar_actuators]
+    return [*elements, ModelElement("option", 0)]
 
 
 def find_missing_statements(
-    model: Any, wanted: Fields, tolerance: float
+    model: Any, target_values: Fields, tolerance: float
 ) -> list[AttributeStatement]:
     """Find the attributes to write so that a compiled model gets the wanted fields.
 
     Args:
         model: compiled model of the present file.
-        wanted: wanted fields.
+        target_values: wanted fields.
         tolerance: relative difference that is ignored.
 
     Returns:
         One statement for each element with differences.
     """
-    return find_differing_statements(model, copy_model_fields(model), wanted, tolerance)
+    return find_differing_statements(model, copy_model_fields(model), target_values, tolerance)
 
 
 def find_differing_statements(
-    model: Any, found: Fields, wanted: Fields, tolerance: float
+    model: Any, present_values: Fields, target_values: Fields, tolerance: float
 ) -> list[AttributeStatement]:
     """Find the attributes in which two sets of model fields differ.
 
@@ -240,8 +246,8 @@ def find_differing_statements(
 
     Args:
         model: compiled model with the elements.
-        found: present fields.
-        wanted: wanted fields.
+        present_values: present fields.
+        target_values: wanted fields.
         tolerance: relative difference that is ignored.
 
     Returns:
@@ -249,42 +255,49 @@ def find_differing_statements(
     """
     statements = []
     for element in list_elements(model):
-        at = get_field_address(model, element)
+        field_address = get_field_address(model, element)
         values = {}
         for attribute in ATTRIBUTES_BY_KIND[element.kind]:
-            is_now, should = attribute.read(found, at), attribute.read(wanted, at)
-            if not _is_equal(is_now, should, tolerance):
-                values[attribute.name] = tuple(float(v) for v in np.atleast_1d(should))
+            present_value, target_value = (
+                attribute.read(present_values, field_address),
+                attribute.read(target_values, field_address),
+            )
+            if not _is_equal(present_value, target_value, tolerance):
+                values[attribute.name] = tuple(float(v) for v in np.atleast_1d(target_value))
         if element.kind == "body" and values:
             # An inertial must be written with all its attributes.
-            values = list_all_attributes(model, element, wanted)
+            values = list_all_attributes(model, element, target_values)
         if values:
             statements.append(AttributeStatement(element, values))
     return statements
 
 
-def list_all_attributes(model: Any, element: ModelElement, wanted: Fields) -> dict[str, Values]:
+def list_all_attributes(
+    model: Any, element: ModelElement, target_values: Fields
+) -> dict[str, Values]:
     """Read the wanted values of all attributes of an element.
 
     Args:
         model: compiled model with the element.
         element: the element.
-        wanted: wanted fields.
+        target_values: wanted fields.
     """
-    at = get_field_address(model, element)
+    field_address = get_field_address(model, element)
     return {
-        attribute.name: tuple(float(v) for v in np.atleast_1d(attribute.read(wanted, at)))
+        attribute.name: tuple(
+            float(v) for v in np.atleast_1d(attribute.read(target_values, field_address))
+        )
         for attribute in ATTRIBUTES_BY_KIND[element.kind]
     }
 
 
-def _is_equal(one: Any, other: Any, tolerance: float) -> bool:
+def _is_equal(first: Any, second: Any, tolerance: float) -> bool:
     """Return whether two arrays are equal to within `tolerance` times the largest entry."""
-    one, other = np.asarray(one, dtype=float), np.asarray(other, dtype=float)
-    if one.shape != other.shape:
+    first, second = np.asarray(first, dtype=float), np.asarray(second, dtype=float)
+    if first.shape != second.shape:
         return False
-    scale = np.maximum(np.abs(one), np.abs(other)).max(initial=0.0)
-    return bool((np.abs(one - other) <= tolerance * scale).all())
+    scale = np.maximum(np.abs(first), np.abs(second)).max(initial=0.0)
+    return bool((np.abs(first - second) <= tolerance * scale).all())
 
 
 def get_enum_word(name: str, value: float) -> str:

@@ -73,10 +73,12 @@ class MjcfDocument:
 
     def find_elements(self, *names: str) -> list[XmlElement]:
         """Return all elements at a path of names from the root."""
-        found = [self.root]
+        elements = [self.root]
         for name in names:
-            found = [child for tag in found for child in self.children(tag) if child.name == name]
-        return found
+            elements = [
+                child for tag in elements for child in self.children(tag) if child.name == name
+            ]
+        return elements
 
     def map_to_compiled_ids(self, model: Any) -> dict[ModelElement, XmlElement]:
         """Map element numbers of the compiled model to the elements of the text.
@@ -94,11 +96,11 @@ class MjcfDocument:
         actuators = [
             child for tag in self.find_elements("actuator") for child in self.children(tag)
         ]
-        found = {ModelElement("body", i + 1): tag for i, tag in enumerate(bodies)}
-        found |= {ModelElement("joint", i): tag for i, tag in enumerate(joints)}
-        found |= {ModelElement("actuator", i): tag for i, tag in enumerate(actuators)}
-        _compare_with_model(found, model, (len(bodies) + 1, len(joints), len(actuators)))
-        return found
+        tags_by_element = {ModelElement("body", i + 1): tag for i, tag in enumerate(bodies)}
+        tags_by_element |= {ModelElement("joint", i): tag for i, tag in enumerate(joints)}
+        tags_by_element |= {ModelElement("actuator", i): tag for i, tag in enumerate(actuators)}
+        _compare_with_model(tags_by_element, model, (len(bodies) + 1, len(joints), len(actuators)))
+        return tags_by_element
 
     def _collect_bodies(
         self, tag: XmlElement, bodies: list[XmlElement], joints: list[XmlElement]
@@ -134,33 +136,36 @@ class MjcfDocument:
         Returns:
             Whether the text refers to any asset files.
         """
-        named = any(
+        has_files = any(
             tag.name in FILE_ELEMENTS and any(key.startswith("file") for key in tag.attributes)
             for tag in self.walk()
         )
-        if named:
+        if has_files:
             self._write_absolute_folders(folder)
-        return named
+        return has_files
 
     def _write_absolute_folders(self, folder: Path) -> None:
         """Write absolute mesh and texture folders, so that the document can be stored elsewhere.
 
         `folder` is the folder of the model file; the stated directories are relative to it.
         """
-        stated: dict[str, str] = {}
+        stated_folders: dict[str, str] = {}
         compilers = self.find_elements("compiler")
         for compiler in compilers:
-            stated |= {
+            stated_folders |= {
                 key: compiler.attributes[key] for key in _DIRECTORIES if key in compiler.attributes
             }
-        both = stated.get("assetdir", "")
-        found = {key: str(folder / stated.get(key, both)) for key in ("meshdir", "texturedir")}
+        asset_folder = stated_folders.get("assetdir", "")
+        absolute_folders = {
+            key: str(folder / stated_folders.get(key, asset_folder))
+            for key in ("meshdir", "texturedir")
+        }
         # The last compiler element takes precedence.
         if compilers:
-            compilers[-1].new |= found
+            compilers[-1].new |= absolute_folders
         else:
-            said = " ".join(f'{key}="{value}"' for key, value in found.items())
-            self.root.within.append(([], f"<compiler {said}/>"))
+            attribute_text = " ".join(f'{key}="{value}"' for key, value in absolute_folders.items())
+            self.root.within.append(([], f"<compiler {attribute_text}/>"))
 
     def to_text(self) -> str:
         """Return the text with all changes; changed files replace their include elements."""
@@ -187,13 +192,13 @@ class MjcfDocument:
 
 
 def _compare_with_model(
-    found: dict[ModelElement, XmlElement], model: Any, counts: tuple[int, int, int]
+    tags_by_element: dict[ModelElement, XmlElement], model: Any, counts: tuple[int, int, int]
 ) -> None:
     """Raise an error if elements differ from those of the compiled model."""
-    wanted = (model.nbody, model.njnt, len(model.actuator_ctrlnum))
-    if counts != wanted:
+    compiled_counts = (model.nbody, model.njnt, len(model.actuator_ctrlnum))
+    if counts != compiled_counts:
         raise NotEditableError("the compiled model has other elements")
-    for (kind, i), tag in found.items():
+    for (kind, i), tag in tags_by_element.items():
         name = str(getattr(model, kind)(i).name)
         if tag.attributes.get("name", "") != name:
             raise NotEditableError(f"the compiled model has its elements in another order ({name})")

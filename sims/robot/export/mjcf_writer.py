@@ -49,13 +49,13 @@ class MjcfWriter:
         degrees: whether the document specifies angles in degrees.
     """
 
-    def __init__(self, document: MjcfDocument, model: Any, wanted: Fields) -> None:
+    def __init__(self, document: MjcfDocument, model: Any, target_values: Fields) -> None:
         """Map the elements of the document to the model, and read the unit of its angles.
 
         MJCF uses degrees unless a compiler element states radians; the last one takes
         precedence.
         """
-        self.document, self.model, self.wanted = document, model, wanted
+        self.document, self.model, self.wanted = document, model, target_values
         self.tags = document.map_to_compiled_ids(model)
         self.degrees = True
         for compiler in document.find_elements("compiler"):
@@ -124,7 +124,7 @@ class MjcfWriter:
                     return
                 before = self._list_attributes_before(statement.element)
                 changed = {
-                    name for name, stated in statement.values.items() if stated != before[name]
+                    name for name, target in statement.values.items() if target != before[name]
                 }
                 if statement.insisted:
                     changed = set(values)
@@ -165,21 +165,23 @@ class MjcfWriter:
         """
         changed = statement.values
         before = {} if statement.insisted else self._list_attributes_before(statement.element)
-        own = _format_shortcut(
+        gains = _format_shortcut(
             tag.name,
             list_all_attributes(self.model, statement.element, self.wanted),
             changed,
             before,
         )
-        if own is not None:
-            if "kv" in own:
+        if gains is not None:
+            if "kv" in gains:
                 tag.removed.add("dampratio")
-            return format_attributes({k: v for k, v in changed.items() if k not in _SERVO}) | own
+            return format_attributes({k: v for k, v in changed.items() if k not in _SERVO}) | gains
         if tag.name != "general":
             tag.renamed = "general"
             tag.removed |= set(SHORTCUT_ATTRIBUTES)
-            stated = list_all_attributes(self.model, statement.element, self.wanted)
-            changed = {k: v for k, v in stated.items() if k in changed or _is_needed(k, v)}
+            target_attributes = list_all_attributes(self.model, statement.element, self.wanted)
+            changed = {
+                k: v for k, v in target_attributes.items() if k in changed or _is_needed(k, v)
+            }
             if tag.name in _INPUTS and hasattr(self.model, "actuator_ctrlspec"):
                 tag.new["input"] = _INPUTS[tag.name]
         return format_attributes(changed)
@@ -194,7 +196,7 @@ def _is_needed(name: str, values: tuple[float, ...]) -> bool:
 
 def _format_shortcut(
     name: str,
-    stated: Mapping[str, Values],
+    target_attributes: Mapping[str, Values],
     changed: Mapping[str, Values],
     before: Mapping[str, Values],
 ) -> dict[str, str] | None:
@@ -205,7 +207,7 @@ def _format_shortcut(
 
     Args:
         name: name of the shortcut, such as ``position``.
-        stated: all attribute values that the actuator should have.
+        target_attributes: all attribute values that the actuator should have.
         changed: attribute values to write.
         before: attribute values of the document; empty if all must be written.
 
@@ -216,8 +218,8 @@ def _format_shortcut(
         return None
     if not set(changed) & _SERVO:
         return {}
-    gain = stated["gainprm"][0]
-    offset, stiffness, damping = stated["biasprm"][:3]
+    gain = target_attributes["gainprm"][0]
+    offset, stiffness, damping = target_attributes["biasprm"][:3]
     if name == "position" and offset == 0 and stiffness == -gain:
         gains = {} if before and gain == before["gainprm"][0] else {"kp": format_number(gain)}
         if not before or damping != before["biasprm"][2]:
@@ -234,7 +236,7 @@ def _add_comments(tag: XmlElement, comments: Sequence[str]) -> None:
 
 def format_attributes(values: Mapping[str, Values]) -> dict[str, str]:
     """Format values as text of attributes."""
-    return {name: _format_values(name, stated) for name, stated in values.items()}
+    return {name: _format_values(name, value) for name, value in values.items()}
 
 
 def _format_values(name: str, values: tuple[float, ...]) -> str:
@@ -247,6 +249,6 @@ def _format_values(name: str, values: tuple[float, ...]) -> str:
         return str(int(values[0]))
     if name in _LISTS:
         # Trailing zeros are omitted, since numbers missing in a list are zero.
-        last = max((i for i, value in enumerate(values) if value), default=0)
-        return format_numbers(values[: last + 1])
+        last_nonzero = max((i for i, value in enumerate(values) if value), default=0)
+        return format_numbers(values[: last_nonzero + 1])
     return format_numbers(values)

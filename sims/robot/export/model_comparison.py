@@ -54,55 +54,58 @@ def _load_library() -> Any:
 
     folder = Path(mujoco.__file__).parent
     names = ("libmujoco*.so*", "libmujoco*.dylib", "mujoco.dll")
-    (path, *_) = [found for name in names for found in sorted(folder.glob(name))]
+    (path, *_) = [library_path for name in names for library_path in sorted(folder.glob(name))]
     return ctypes.CDLL(str(path))
 
 
-def find_first_difference(one: Any, other: Any, tolerance: float) -> str | None:
+def find_first_difference(first_model: Any, second_model: Any, tolerance: float) -> str | None:
     """Find the first field in which two compiled models differ.
 
     It compares all numeric fields and options. Names and other texts are ignored.
 
     Args:
-        one: a mujoco.MjModel.
-        other: another mujoco.MjModel.
+        first_model: a mujoco.MjModel.
+        second_model: another mujoco.MjModel.
         tolerance: difference that counts as rounding, relative to the largest value of a field.
 
     Returns:
         The name of the field with both values, or None if the models are equal.
     """
-    for prefix, this, that in (("", one, other), ("opt.", one.opt, other.opt)):
-        for name in sorted(dir(this)):
+    for prefix, first_struct, second_struct in (
+        ("", first_model, second_model),
+        ("opt.", first_model.opt, second_model.opt),
+    ):
+        for name in sorted(dir(first_struct)):
             if name.startswith("_") or any(part in name for part in _TEXTS):
                 continue
-            mine, others = getattr(this, name), getattr(that, name)
-            if isinstance(mine, np.ndarray | int | float) and _fields_differ(
-                mine, others, tolerance
+            first_value, second_value = getattr(first_struct, name), getattr(second_struct, name)
+            if isinstance(first_value, np.ndarray | int | float) and _fields_differ(
+                first_value, second_value, tolerance
             ):
-                return f"{prefix}{name}: {_format_difference(mine, others)}"
+                return f"{prefix}{name}: {_format_difference(first_value, second_value)}"
     return None
 
 
-def _fields_differ(one: Any, other: Any, tolerance: float) -> bool:
+def _fields_differ(first: Any, second: Any, tolerance: float) -> bool:
     """Return whether two fields of compiled models differ in shape or in value.
 
     Floating-point numbers may differ by `tolerance` times the largest entry of both arrays;
     infinities of equal sign are equal. All other types must be identical.
     """
-    one, other = np.asarray(one), np.asarray(other)
-    if one.shape != other.shape:
+    first, second = np.asarray(first), np.asarray(second)
+    if first.shape != second.shape:
         return True
-    if one.dtype.kind != "f":
-        return bool((one != other).any())
-    scale = max(float(np.abs(one).max(initial=0.0)), float(np.abs(other).max(initial=0.0)))
-    near = np.abs(one - other) <= tolerance * scale
-    return not bool((near | (one == other)).all())
+    if first.dtype.kind != "f":
+        return bool((first != second).any())
+    scale = max(float(np.abs(first).max(initial=0.0)), float(np.abs(second).max(initial=0.0)))
+    is_close = np.abs(first - second) <= tolerance * scale
+    return not bool((is_close | (first == second)).all())
 
 
-def _format_difference(one: Any, other: Any) -> str:
+def _format_difference(first: Any, second: Any) -> str:
     """Format the largest difference of two fields as "value and value", or both shapes."""
-    one, other = np.asarray(one), np.asarray(other)
-    if one.shape != other.shape:
-        return f"{one.shape} and {other.shape}"
-    at = np.argmax(np.abs(one.astype(float) - other.astype(float)))
-    return f"{one.flat[at]!r} and {other.flat[at]!r}"
+    first, second = np.asarray(first), np.asarray(second)
+    if first.shape != second.shape:
+        return f"{first.shape} and {second.shape}"
+    index = np.argmax(np.abs(first.astype(float) - second.astype(float)))
+    return f"{first.flat[index]!r} and {second.flat[index]!r}"

@@ -48,8 +48,10 @@ def _make_servo_reader(term: int) -> Read:
 
 def _get_gravity_strength(f: Fields, robot: RobotModel, place: str) -> Sequence[float]:  # noqa: ARG001
     """Return the component of gravity along the direction that the file specifies."""
-    stated = robot.compiled.opt.gravity
-    return [float(f["opt.gravity"][0] @ stated / max(np.linalg.norm(stated), 1e-300))]
+    gravity_in_file = robot.compiled.opt.gravity
+    return [
+        float(f["opt.gravity"][0] @ gravity_in_file / max(np.linalg.norm(gravity_in_file), 1e-300))
+    ]
 
 
 def _get_force_limit(f: Fields, robot: RobotModel, place: str) -> Sequence[float]:
@@ -118,12 +120,22 @@ def totals(robot: RobotModel, fitted: Fitted) -> list[list[Total | None]]:
     Returns:
         For each effect, one entry per coefficient; None if the file has no such number.
     """
-    stated, after = copy_model_fields(robot.compiled), copy_model_fields(robot.compiled)
-    for effect, values in sorted(fitted, key=lambda one: get_write_order(_get_effect_name(one[0]))):
+    file_fields, changed_fields = (
+        copy_model_fields(robot.compiled),
+        copy_model_fields(robot.compiled),
+    )
+    for effect, values in sorted(
+        fitted, key=lambda entry: get_write_order(_get_effect_name(entry[0]))
+    ):
         if _get_effect_name(effect) in _TOTALS:
             c = np.array(values, dtype=float)[:, None]
-            MODEL_FIELD_EFFECTS[_get_effect_name(effect)].write(after, robot, effect.place, c)
-    return [_list_totals(robot, effect, len(values), stated, after) for effect, values in fitted]
+            MODEL_FIELD_EFFECTS[_get_effect_name(effect)].write(
+                changed_fields, robot, effect.place, c
+            )
+    return [
+        _list_totals(robot, effect, len(values), file_fields, changed_fields)
+        for effect, values in fitted
+    ]
 
 
 def _get_effect_name(effect: type[Effect]) -> str:
@@ -131,7 +143,7 @@ def _get_effect_name(effect: type[Effect]) -> str:
 
 
 def _list_totals(
-    robot: RobotModel, effect: type[Effect], count: int, stated: Fields, after: Fields
+    robot: RobotModel, effect: type[Effect], count: int, file_fields: Fields, changed_fields: Fields
 ) -> list[Total | None]:
     """Return what the numbers of the file become with one effect, for each of its coefficients.
 
@@ -142,21 +154,24 @@ def _list_totals(
         robot: robot with the model file.
         effect: effect at one place.
         count: number of coefficients.
-        stated: fields of the model file.
-        after: fields with the effect.
+        file_fields: fields of the model file.
+        changed_fields: fields with the effect.
     """
     if _get_effect_name(effect) not in _TOTALS:
         return [None] * count
     reading = _TOTALS[_get_effect_name(effect)]
-    found: list[Total | None] = []
-    pairs = (np.array(reading.read(f, robot, effect.place), dtype=float) for f in (stated, after))
+    number_totals: list[Total | None] = []
+    pairs = (
+        np.array(reading.read(f, robot, effect.place), dtype=float)
+        for f in (file_fields, changed_fields)
+    )
     for c, before, total in zip(effect.coefficients, *pairs, strict=True):
         unit = (
             (reading.slide if _acts_on_slide(robot, effect) else "") or reading.hinge or c.units[0]
         )
-        known = np.isfinite([before, total]).all()
-        found.append(Total(float(before), float(total), unit or "1") if known else None)
-    return found
+        is_stated = np.isfinite([before, total]).all()
+        number_totals.append(Total(float(before), float(total), unit or "1") if is_stated else None)
+    return number_totals
 
 
 def _acts_on_slide(robot: RobotModel, effect: type[Effect]) -> bool:

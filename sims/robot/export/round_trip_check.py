@@ -46,37 +46,37 @@ Inverse weights belong to the reference pose, which is another one if a joint's 
 
 
 def check_written_files(
-    robot: RobotModel, causes: CauseCoefficients, done: WrittenModelFiles
+    robot: RobotModel, causes: CauseCoefficients, written_files: WrittenModelFiles
 ) -> None:
     """Reload each written file from a temporary folder, and compare it with the intended model.
 
     Args:
         robot: robot as read from its model file.
         causes: causes that were written.
-        done: the written files.
+        written_files: the written files.
 
     Raises:
         RuntimeError: a number or the motion differs; names the field. This is a program error.
     """
     with tempfile.TemporaryDirectory() as folder:
-        if done.xml is not None:
+        if written_files.xml is not None:
             path = Path(folder) / "extended.xml"
-            path.write_bytes(done.xml.encode())
-            _check_mjcf(done, path)
+            path.write_bytes(written_files.xml.encode())
+            _check_mjcf(written_files, path)
             release_free_memory()
-        if done.urdf is not None:
+        if written_files.urdf is not None:
             path = Path(folder) / "extended.urdf"
-            path.write_bytes(done.urdf.encode())
+            path.write_bytes(written_files.urdf.encode())
             _check_urdf(robot, causes, path)
 
 
-def _check_mjcf(done: WrittenModelFiles, path: Path) -> None:
+def _check_mjcf(written_files: WrittenModelFiles, path: Path) -> None:
     """Compile a written MJCF, and check that it equals the intended model."""
     import mujoco
 
     with capture_mujoco_warnings():
         model = mujoco.MjModel.from_xml_path(str(path))
-    _compare_models(model, done.applied.model, path.name)
+    _compare_models(model, written_files.applied.model, path.name)
 
 
 def _check_urdf(robot: RobotModel, causes: CauseCoefficients, path: Path) -> None:
@@ -89,32 +89,40 @@ def _check_urdf(robot: RobotModel, causes: CauseCoefficients, path: Path) -> Non
     from sims.robot.parsing.read_model_file import read_robot
 
     writer = UrdfWriter(robot, "")
-    held = {c.name: c.numbers for c in expand_families(robot, causes) if writer.write(c) is None}
-    wanted = apply_causes(read_robot(robot.path), held).model
+    urdf_causes = {
+        c.name: c.numbers for c in expand_families(robot, causes) if writer.write(c) is None
+    }
+    target_model = apply_causes(read_robot(robot.path), urdf_causes).model
     release_free_memory()
-    found = read_robot(path).compiled
+    reloaded_model = read_robot(path).compiled
     for name in _OF_URDF:
-        one, other = getattr(found, name), getattr(wanted, name)
-        if one.shape != other.shape or not np.allclose(
-            one, other, rtol=EQUAL_NUMBERS_TOLERANCE, atol=EQUAL_NUMBERS_TOLERANCE
+        reloaded_values, target_values = getattr(reloaded_model, name), getattr(target_model, name)
+        if reloaded_values.shape != target_values.shape or not np.allclose(
+            reloaded_values,
+            target_values,
+            rtol=EQUAL_NUMBERS_TOLERANCE,
+            atol=EQUAL_NUMBERS_TOLERANCE,
         ):
             raise RuntimeError(f"extended.urdf differs from the intended model: {name}")
     # The axes of two equal moments are arbitrary, so whole tensors are compared.
-    one, other = (compute_inertia_tensors(m.body_iquat, m.body_inertia) for m in (found, wanted))
+    reloaded_values, target_values = (
+        compute_inertia_tensors(m.body_iquat, m.body_inertia)
+        for m in (reloaded_model, target_model)
+    )
     if not np.allclose(
-        one,
-        other,
+        reloaded_values,
+        target_values,
         rtol=EQUAL_NUMBERS_TOLERANCE,
-        atol=max(MOTION_TOLERANCE * np.abs(other).max(), MIN_MOMENT),
+        atol=max(MOTION_TOLERANCE * np.abs(target_values).max(), MIN_MOMENT),
     ):
         raise RuntimeError("extended.urdf differs from the intended model: body_inertia")
-    for model in (wanted, found):
+    for model in (target_model, reloaded_model):
         # A URDF does not specify the stiffness of friction, and colliding shapes may be meshes
         # elsewhere.
         _disable_contacts(model)
         for name in _NOT_OF_URDF:
-            getattr(model, name)[:] = getattr(found, name)
-    _compare_motion(found, wanted, "extended.urdf")
+            getattr(model, name)[:] = getattr(reloaded_model, name)
+    _compare_motion(reloaded_model, target_model, "extended.urdf")
 
 
 def _disable_contacts(model: Any) -> None:
@@ -124,29 +132,34 @@ def _disable_contacts(model: Any) -> None:
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
 
 
-def _compare_models(found: Any, wanted: Any, name: str) -> None:
+def _compare_models(reloaded_model: Any, target_model: Any, name: str) -> None:
     """Check that a reloaded model equals the wanted one in its fields and in its motion.
 
     Raises:
         RuntimeError: a field or the motion differs, so the written file would mislead the user.
     """
-    differs = find_first_difference(found, wanted, EQUAL_NUMBERS_TOLERANCE)
-    if differs:
-        raise RuntimeError(f"{name} differs from the intended model: {differs}")
-    _compare_motion(found, wanted, name)
+    difference = find_first_difference(reloaded_model, target_model, EQUAL_NUMBERS_TOLERANCE)
+    if difference:
+        raise RuntimeError(f"{name} differs from the intended model: {difference}")
+    _compare_motion(reloaded_model, target_model, name)
 
 
-def _compare_motion(found: Any, wanted: Any, name: str) -> None:
+def _compare_motion(reloaded_model: Any, target_model: Any, name: str) -> None:
     """Check that two models move alike in a short test simulation from the same pose.
 
     Raises:
         RuntimeError: the positions differ by more than `MOTION_TOLERANCE`.
     """
     # A URDF states a joint's zero as a turned frame, so that its reference pose is another one.
-    pose = displace_reference_pose(wanted)
-    one, other = simulate_test_motion(found, pose), simulate_test_motion(wanted, pose)
-    if not np.allclose(one, other, rtol=MOTION_TOLERANCE, atol=MOTION_TOLERANCE, equal_nan=True):
-        error = float(np.nanmax(np.abs(one - other)))
+    pose = displace_reference_pose(target_model)
+    reloaded_motion, target_motion = (
+        simulate_test_motion(reloaded_model, pose),
+        simulate_test_motion(target_model, pose),
+    )
+    if not np.allclose(
+        reloaded_motion, target_motion, rtol=MOTION_TOLERANCE, atol=MOTION_TOLERANCE, equal_nan=True
+    ):
+        error = float(np.nanmax(np.abs(reloaded_motion - target_motion)))
         raise RuntimeError(f"{name} does not move as intended: qpos differs by {error:.2g}")
 
 
@@ -176,14 +189,14 @@ def simulate_test_motion(model: Any, pose: Array | None = None) -> Array:
     data = mujoco.MjData(model)
     data.qpos[:] = displace_reference_pose(model) if pose is None else pose
     low, high = model.actuator_ctrlrange.T
-    middle, half = (low + high) / 2.0, (high - low) / 2.0
+    middle, half_range = (low + high) / 2.0, (high - low) / 2.0
     limited = model.actuator_ctrllimited.astype(bool)
     signs = 0.5 * np.cos(np.arange(model.nu))
-    control = np.where(limited, middle + half * signs, signs)
+    control = np.where(limited, middle + half_range * signs, signs)
     steps = min(int(COMPARED_SECONDS / model.opt.timestep), MAX_COMPARED_STEPS)
     state = np.zeros(mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS))
     mujoco.mj_getState(model, data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
     controls = np.tile(control, (1, steps, 1))
-    made, _ = rollout.rollout(model, data, state, controls)
-    result: Array = made[0, :, 1 : 1 + model.nq]
+    states, _ = rollout.rollout(model, data, state, controls)
+    result: Array = states[0, :, 1 : 1 + model.nq]
     return result

@@ -61,7 +61,7 @@ class UrdfWriter:
 
     def write(self, cause: FittedCause) -> str | None:
         """Write a cause; return the reason if a URDF cannot express it, else None."""
-        known: Mapping[str, Callable[[FittedCause], str | None]] = {
+        writers_by_effect: Mapping[str, Callable[[FittedCause], str | None]] = {
             "drag.linear": lambda cause: self._write_dynamics(cause, "damping"),
             "friction.coulomb": lambda cause: self._write_dynamics(cause, "friction"),
             "mass.scale": self._write_mass,
@@ -72,9 +72,9 @@ class UrdfWriter:
             "link.length": self._write_link_length,
             "payload": self._write_payload,
         }
-        if cause.effect not in known:
+        if cause.effect not in writers_by_effect:
             return "a URDF cannot state it"
-        return known[cause.effect](cause)
+        return writers_by_effect[cause.effect](cause)
 
     def to_text(self, lines: list[str]) -> str:
         """Return the file with all changes.
@@ -112,15 +112,15 @@ class UrdfWriter:
         result is None if the mass of a link follows from its shapes, or if no link has a mass.
         """
         body = self.robot.body(cause.place)
-        found = []
+        inertials = []
         for name in (body.name, *body.aliases):
             link = self.links.get(name)
             inertial = _find_child(link, "inertial") if link else None
             if inertial is not None:
-                found += [(name, inertial)] if _has_mass(inertial) else []
+                inertials += [(name, inertial)] if _has_mass(inertial) else []
             elif link is None or _find_child(link, "collision"):
                 return None
-        return found or None
+        return inertials or None
 
     def _write_mass(self, cause: FittedCause) -> str | None:
         """Scale mass and inertia tensor of each link in the body, by (1).
@@ -165,8 +165,8 @@ class UrdfWriter:
         body = self.robot.body(cause.place).name
         for name, inertial in inertials:
             self._add_comment(inertial, cause)
-            moved = self._get_link_axes(name, body).T @ cause.coefficients  # (2)
-            _set_vector(inertial, "origin", "xyz", _read_origin(inertial, "xyz") + moved)
+            displacement = self._get_link_axes(name, body).T @ cause.coefficients  # (2)
+            _set_vector(inertial, "origin", "xyz", _read_origin(inertial, "xyz") + displacement)
         return None
 
     def _write_joint_zero(self, cause: FittedCause) -> str | None:
@@ -184,8 +184,8 @@ class UrdfWriter:
         if joint.get_attribute("type") == "prismatic":
             _set_vector(joint, "origin", "xyz", _read_origin(joint, "xyz") - axes @ axis * c)
         else:
-            turned = Rotation.from_matrix(axes) * Rotation.from_rotvec(-c * axis)
-            _set_vector(joint, "origin", "rpy", turned.as_euler("xyz"))  # (3)
+            rotated_frame = Rotation.from_matrix(axes) * Rotation.from_rotvec(-c * axis)
+            _set_vector(joint, "origin", "rpy", rotated_frame.as_euler("xyz"))  # (3)
         return None
 
     def _write_joint_axis(self, cause: FittedCause) -> str | None:
@@ -197,8 +197,8 @@ class UrdfWriter:
         if joint is None:
             return _NO_JOINT
         self._add_comment(joint, cause)
-        turn = Rotation.from_rotvec(cause.coefficients)
-        _set_vector(joint, "axis", "xyz", turn.apply(_get_joint_axis(joint)))
+        rotation = Rotation.from_rotvec(cause.coefficients)
+        _set_vector(joint, "axis", "xyz", rotation.apply(_get_joint_axis(joint)))
         return None
 
     def _write_link_length(self, cause: FittedCause) -> str | None:
@@ -214,15 +214,15 @@ class UrdfWriter:
             return "the file has no joint that carries the link"
         carrier = model.body(int(model.body_parentid[body.id])).name
         axes = self._get_link_axes(_get_link_name(joints[0], "parent"), carrier)
-        moved = axes.T @ model.body_pos[body.id] * cause.coefficients[0]  # (4)
+        displacement = axes.T @ model.body_pos[body.id] * cause.coefficients[0]  # (4)
         self._add_comment(joints[0], cause)
-        _set_vector(joints[0], "origin", "xyz", _read_origin(joints[0], "xyz") + moved)
+        _set_vector(joints[0], "origin", "xyz", _read_origin(joints[0], "xyz") + displacement)
         return None
 
     def _write_payload(self, cause: FittedCause) -> str | None:
         """Add a point mass to a link: new mass, centre of mass, and inertia tensor by (5).
 
-        The coefficients are the mass `more` in kg and its offset from the body's centre of
+        The coefficients are the mass `added_mass` in kg and its offset from the body's centre of
         mass in m. The tensor is computed in the axes of the link about the common centre of
         mass `middle`, and written in the axes of the inertial. The result is None, or the
         reason why the URDF cannot state the cause.
@@ -235,7 +235,10 @@ class UrdfWriter:
         mass_tag, tensor_tag = _find_child(inertial, "mass"), _find_child(inertial, "inertia")
         if mass_tag is None or tensor_tag is None:
             return "the link's inertial lacks a mass or an inertia"
-        mass, (more, *offset) = float(mass_tag.get_attribute("value") or 0.0), cause.coefficients
+        mass, (added_mass, *offset) = (
+            float(mass_tag.get_attribute("value") or 0.0),
+            cause.coefficients,
+        )
         point = self.robot.compiled.body_ipos[body.id] + offset
         centre, axes = (
             _read_origin(inertial, "xyz"),
@@ -245,13 +248,13 @@ class UrdfWriter:
         tensor = np.zeros((3, 3))
         tensor[np.triu_indices(3)] = values
         tensor += np.triu(tensor, 1).T
-        middle = (mass * centre + more * point) / (mass + more)
+        middle = (mass * centre + added_mass * point) / (mass + added_mass)
         tensor = axes @ tensor @ axes.T
         arms = np.stack([centre - middle, point - middle])
-        tensor += np.einsum("n,nij->ij", [mass, more], compute_point_inertias(arms))  # (5)
+        tensor += np.einsum("n,nij->ij", [mass, added_mass], compute_point_inertias(arms))  # (5)
         tensor = axes.T @ tensor @ axes
         self._add_comment(inertial, cause)
-        mass_tag.new["value"] = format_number(mass + more)
+        mass_tag.new["value"] = format_number(mass + added_mass)
         for key, value in zip(_TENSOR, tensor[np.triu_indices(3)].tolist(), strict=True):
             tensor_tag.new[key] = format_number(value)
         _set_vector(inertial, "origin", "xyz", middle)
@@ -304,17 +307,19 @@ def _find_child(tag: XmlElement, name: str) -> XmlElement | None:
 
 def _get_link_name(joint: XmlElement, end: str) -> str:
     """Return the link at one end of a joint."""
-    found = _find_child(joint, end)
-    return (found.get_attribute("link") or "") if found else ""
+    link_tag = _find_child(joint, end)
+    return (link_tag.get_attribute("link") or "") if link_tag else ""
 
 
 def _has_mass(inertial: XmlElement) -> bool:
     """Return whether an inertial specifies a nonzero mass or moment of inertia."""
-    stated = (
+    stated_values = (
         (_find_child(inertial, "mass"), ("value",)),
         (_find_child(inertial, "inertia"), _TENSOR),
     )
-    return any(float(tag.get_attribute(key) or 0.0) for tag, keys in stated if tag for key in keys)
+    return any(
+        float(tag.get_attribute(key) or 0.0) for tag, keys in stated_values if tag for key in keys
+    )
 
 
 def _scale_attributes(
@@ -330,7 +335,7 @@ def _scale_attributes(
 
 def _parse_vector(text: str | None) -> Array:
     """Parse a vector (3,); zeros for a missing text."""
-    return np.array([float(word) for word in text.split()]) if text else np.zeros(3)
+    return np.array([float(number) for number in text.split()]) if text else np.zeros(3)
 
 
 def _compute_rotation(rpy: Array) -> Array:

@@ -153,8 +153,8 @@ def _write_couplings(document: MjcfDocument, applied: ModifiedModel) -> None:
     for name in robot.coupled:
         first = find_preceding_joint(robot, name)
         assert first is not None
-        known = {tag.attributes.get("name") for tag in document.walk() if tag.name == "joint"}
-        if not {name, first.name} <= known:
+        joint_names = {tag.attributes.get("name") for tag in document.walk() if tag.name == "joint"}
+        if not {name, first.name} <= joint_names:
             raise NotEditableError(f"no joint of its text is called {name} or {first.name}")
         c = format_number(float(model.wrap_prm[get_coupling_address(robot, name)]))
         joints = f'<joint joint="{name}" coef="1"/><joint joint="{first.name}" coef="{c}"/>'
@@ -168,20 +168,20 @@ def _write_couplings(document: MjcfDocument, applied: ModifiedModel) -> None:
 def _render_series_joint(second: Any) -> str:
     """Render a joint in series as an MJCF element, with all attributes stated.
 
-    The file's default classes then have no influence on it. `plays` is whether its range is
+    The file's default classes then have no influence on it. `is_limited` is whether its range is
     limited, which represents backlash.
     """
     kind = "slide" if str(second.type).endswith("SLIDE") else "hinge"
-    plays = str(second.limited).endswith("TRUE")
+    is_limited = str(second.limited).endswith("TRUE")
     attributes = {
         "name": second.name,
         "type": kind,
         "axis": format_numbers(tuple(second.axis)),
         "pos": format_numbers(tuple(second.pos)),
-        "limited": "true" if plays else "false",
+        "limited": "true" if is_limited else "false",
         "actuatorfrclimited": "false",
     }
-    if plays:
+    if is_limited:
         attributes["range"] = format_numbers(tuple(second.range))
         attributes["solreflimit"] = format_numbers(tuple(second.solref_limit))
         attributes["solimplimit"] = format_numbers(tuple(second.solimp_limit))
@@ -200,11 +200,11 @@ def _render_urdf(
         notes.append(f"no URDF is written: {unfit}")
         return None
     lines = []
-    found = expand_families(robot, causes)
-    for cause in sorted(found, key=lambda one: get_write_order(one.effect)):
-        answer = writer.write(cause)
-        if answer:
-            lines.append(f"{cause.format(recording)}: not in the URDF: {answer}")
+    fitted_causes = expand_families(robot, causes)
+    for cause in sorted(fitted_causes, key=lambda entry: get_write_order(entry.effect)):
+        reason = writer.write(cause)
+        if reason:
+            lines.append(f"{cause.format(recording)}: not in the URDF: {reason}")
         elif cause.effect == COULOMB and robot.friction_form == "stiff":
             lines.append(_SOFT_IN_URDF)
     lines = list(dict.fromkeys(lines))
@@ -252,19 +252,21 @@ class MjcfEditor:
             for statement in find_missing_statements(
                 model, self.applied.target_values, ROUNDING_TOLERANCE
             ):
-                held = statements.setdefault(
+                element_statement = statements.setdefault(
                     statement.element, AttributeStatement(statement.element)
                 )
                 # Attributes that were written without effect need their related attributes.
-                held.insisted = bool(held.values) or model is not self.original
-                held.values |= statement.values
+                element_statement.insisted = (
+                    bool(element_statement.values) or model is not self.original
+                )
+                element_statement.values |= statement.values
             text = self._render_document(list(statements.values()))
             model = compile_mjcf(text)
             if not find_missing_statements(model, self.applied.target_values, ROUNDING_TOLERANCE):
                 break
-        differs = find_first_difference(model, self.applied.model, EQUAL_NUMBERS_TOLERANCE)
-        if differs:
-            raise NotEditableError(f"its attributes do not say all ({differs})")
+        difference = find_first_difference(model, self.applied.model, EQUAL_NUMBERS_TOLERANCE)
+        if difference:
+            raise NotEditableError(f"its attributes do not say all ({difference})")
         return text
 
     def _render_document(self, statements: Sequence[AttributeStatement]) -> str:

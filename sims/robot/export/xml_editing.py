@@ -55,9 +55,11 @@ class XmlElement:
     @property
     def has_changes(self) -> bool:
         """Whether the element or any of its descendants has changes."""
-        own = self.new or self.removed or self.renamed or self.before or self.after
-        replaced = self.within or self.inserted or self.text is not None
-        return bool(own or replaced) or any(child.has_changes for child in self.children)
+        has_tag_changes = self.new or self.removed or self.renamed or self.before or self.after
+        has_content_changes = self.within or self.inserted or self.text is not None
+        return bool(has_tag_changes or has_content_changes) or any(
+            child.has_changes for child in self.children
+        )
 
     def get_attribute(self, name: str) -> str | None:
         """Return the value of an attribute, including changes; None if it is missing."""
@@ -131,12 +133,12 @@ class XmlText:
         """Return the offset after a start tag, at the first ``>`` outside of quotes."""
         quote = b""
         for i in range(begin, len(self.text)):
-            one = self.text[i : i + 1]
+            character = self.text[i : i + 1]
             if quote:
-                quote = b"" if one == quote else quote
-            elif one in (b'"', b"'"):
-                quote = one
-            elif one == b">":
+                quote = b"" if character == quote else quote
+            elif character in (b'"', b"'"):
+                quote = character
+            elif character == b">":
                 return i + 1
         raise NotEditableError(f"{self.path.name} ends within a tag")
 
@@ -153,12 +155,12 @@ class XmlText:
 
         `tags` are the elements directly within this range, in document order.
         """
-        parts, at = [], begin
+        parts, offset = [], begin
         for tag in tags:
             if tag.has_changes or tag.text is not None:
-                parts += [self.text[at : tag.begin], self._render_element(tag)]
-                at = self._find_end_of_element(tag)
-        return b"".join([*parts, self.text[at:end]])
+                parts += [self.text[offset : tag.begin], self._render_element(tag)]
+                offset = self._find_end_of_element(tag)
+        return b"".join([*parts, self.text[offset:end]])
 
     def _find_end_of_element(self, tag: XmlElement) -> int:
         return tag.inside if self._is_self_closing(tag) else self._end_of(tag.end)
@@ -182,10 +184,15 @@ class XmlText:
         )
         if tag.renamed:
             closing = closing.replace(tag.name.encode(), tag.renamed.encode(), 1)
-        inside = self._render_range(tag.inside, tag.end, tag.children)
-        behind = [self._newline + indent + element.encode() for element in tag.after]
-        whole = [self._render_start_tag(tag), self._render_inserted(tag, indent), inside, closing]
-        return b"".join([*comments, *whole, *behind])
+        content = self._render_range(tag.inside, tag.end, tag.children)
+        following_elements = [self._newline + indent + element.encode() for element in tag.after]
+        element_parts = [
+            self._render_start_tag(tag),
+            self._render_inserted(tag, indent),
+            content,
+            closing,
+        ]
+        return b"".join([*comments, *element_parts, *following_elements])
 
     def _render_inserted(self, tag: XmlElement, indent: bytes) -> bytes:
         """Return the text of the elements inserted before all children."""
@@ -203,29 +210,29 @@ class XmlText:
     def _render_start_tag(self, tag: XmlElement) -> bytes:
         """Return the changed start tag; unchanged attributes keep their spaces and quotes."""
         text = self.text[tag.begin : tag.inside]
-        at = 1 + len(tag.name.encode())
+        offset = 1 + len(tag.name.encode())
         parts = [b"<", (tag.renamed or tag.name).encode()]
-        written = set()
-        while found := _ATTRIBUTE.match(text, at):
-            name = found[2].decode()
+        written_names = set()
+        while attribute_match := _ATTRIBUTE.match(text, offset):
+            name = attribute_match[2].decode()
             if name in tag.new:
-                parts.append(found[1] + _render_attribute(name, tag.new[name]))
-                written.add(name)
+                parts.append(attribute_match[1] + _render_attribute(name, tag.new[name]))
+                written_names.add(name)
             elif name not in tag.removed:
-                parts.append(found[0])
-            at = found.end()
+                parts.append(attribute_match[0])
+            offset = attribute_match.end()
         parts += [
             b" " + _render_attribute(name, value)
             for name, value in tag.new.items()
-            if name not in written
+            if name not in written_names
         ]
-        return b"".join([*parts, text[at:]])
+        return b"".join([*parts, text[offset:]])
 
     def _render_comment(self, text: str) -> bytes:
         """Render text as an XML comment, with the line ends of the file."""
         # Two hyphens would end a comment early, and so would a hyphen at its end.
-        safe = re.sub(r"-(?=-)", "- ", text)
-        return f"<!-- {safe} -->".encode().replace(b"\n", self._newline)
+        escaped_text = re.sub(r"-(?=-)", "- ", text)
+        return f"<!-- {escaped_text} -->".encode().replace(b"\n", self._newline)
 
     def _get_indentation(self, begin: int) -> bytes:
         """Return the indentation of an element; empty if other text precedes it on its line."""

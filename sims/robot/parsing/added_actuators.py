@@ -78,26 +78,26 @@ def add_actuators(spec: Any, tables: Mapping[str, Any], source: str) -> tuple[st
         InputError: a table is invalid; existing names are listed.
     """
     rated = []
-    for name, given in tables.items():
-        where = f"actuators.{name}"
+    for name, entries in tables.items():
+        table_name = f"actuators.{name}"
         table = toml_validation.check_entries(
-            source, where, given, toml_validation.get_type_hints_of(ActuatorTable)
+            source, table_name, entries, toml_validation.get_type_hints_of(ActuatorTable)
         )
-        _check_actuator_table(spec, source, where, name, table)
+        _check_actuator_table(spec, source, table_name, name, table)
         _add_actuator(spec, name, table)
         rated += [name] if "kd" in table else []
     return tuple(rated)
 
 
 def _check_actuator_table(
-    spec: Any, source: str, where: str, name: str, table: Mapping[str, Any]
+    spec: Any, source: str, table_name: str, name: str, table: Mapping[str, Any]
 ) -> None:
     """Check the table of an added actuator: its joint, kind, name and gains.
 
     Args:
         spec: a mujoco.MjSpec with the joints and actuators of the file.
         source: beginning of error messages.
-        where: place of the table in the recording's description.
+        table_name: place of the table in the recording's description.
         name: name of the new actuator.
         table: entries of the table.
 
@@ -106,36 +106,35 @@ def _check_actuator_table(
     """
     for key in ("joint", "kind"):
         if key not in table:
-            raise InputError(f"{source}: {where} states no {key}")
+            raise InputError(f"{source}: {table_name} states no {key}")
     kind = table["kind"]
     if kind not in GAIN_KEYS_BY_KIND:
-        raise InputError(
-            f"{source}: {where}: {make_unknown_name_error('kind', kind, list(GAIN_KEYS_BY_KIND))}"
-        )
+        error = make_unknown_name_error("kind", kind, list(GAIN_KEYS_BY_KIND))
+        raise InputError(f"{source}: {table_name}: {error}")
     joints = [joint.name for joint in spec.joints if _has_one_degree_of_freedom(joint)]
     if table["joint"] not in joints:
         error = make_unknown_name_error("joint", table["joint"], joints or ["none"])
-        raise InputError(f"{source}: {where}: {error}")
+        raise InputError(f"{source}: {table_name}: {error}")
     if name in [actuator.name for actuator in spec.actuators]:
         raise InputError(
-            f"{source}: {where}: the model has an actuator {truncate_text(name)} already"
+            f"{source}: {table_name}: the model has an actuator {truncate_text(name)} already"
         )
     allowed = (*COMMON_ACTUATOR_KEYS, *GAIN_KEYS_BY_KIND[kind])
-    toml_validation.check_known_names(f"entry of [{where}], of kind {kind}", table, allowed)
+    toml_validation.check_known_names(f"entry of [{table_name}], of kind {kind}", table, allowed)
     for key in GAIN_KEYS_BY_KIND[kind][:1]:
         if key not in table:
             raise InputError(
-                f"{source}: {where}: kind {kind} needs {key}; free it if it is a guess"
+                f"{source}: {table_name}: kind {kind} needs {key}; free it if it is a guess"
             )
     if "kd" in table and "kv" in table:
         raise InputError(
-            f"{source}: {where}: kd acts on the error's rate, kv on the joint's: give one"
+            f"{source}: {table_name}: kd acts on the error's rate, kv on the joint's: give one"
         )
     for key in ("kp", "ki", "kd", "kv", "gear"):
         if key in table:
-            value = toml_validation.check_finite(source, f"{where}.{key}", table[key])
+            value = toml_validation.check_finite(source, f"{table_name}.{key}", table[key])
             if value < 0 and key != "gear":
-                raise toml_validation.make_error(source, f"{where}.{key}", "0 or more", value)
+                raise toml_validation.make_error(source, f"{table_name}.{key}", "0 or more", value)
 
 
 def _has_one_degree_of_freedom(joint: Any) -> bool:
@@ -203,24 +202,24 @@ def apply_engine_settings(spec: Any, table: Mapping[str, Any], source: str) -> l
     """
     import mujoco
 
-    given = toml_validation.check_entries(
+    settings = toml_validation.check_entries(
         source, "engine", table, toml_validation.get_type_hints_of(EngineTable)
     )
-    if "timestep" in given:
-        step = toml_validation.check_finite(source, "engine.timestep", given["timestep"])
+    if "timestep" in settings:
+        step = toml_validation.check_finite(source, "engine.timestep", settings["timestep"])
         if not SHORTEST <= step <= LONGEST:
             raise toml_validation.make_error(
                 source, "engine.timestep", f"{SHORTEST:g} to {LONGEST:g} s", step
             )
         spec.option.timestep = step
-    if "integrator" in given:
-        name = given["integrator"]
+    if "integrator" in settings:
+        name = settings["integrator"]
         if name not in INTEGRATORS:
             raise InputError(
                 f"{source}: engine: {make_unknown_name_error('integrator', name, INTEGRATORS)}"
             )
         spec.option.integrator = int(mujoco.mjtIntegrator(INTEGRATORS.index(name)))
-    return fix_bases(spec) if given.get("fix_base") else []
+    return fix_bases(spec) if settings.get("fix_base") else []
 
 
 def fix_bases(spec: Any) -> list[str]:

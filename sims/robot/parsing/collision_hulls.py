@@ -82,7 +82,7 @@ class Hull:
     extrema: Integers
 
 
-def read_hull(model: Any, mesh: int, whole: bool = False) -> Hull | None:
+def read_hull(model: Any, mesh: int, keeps_all_vertices: bool = False) -> Hull | None:
     """Read the hull of a compiled mesh.
 
     The hull is all that contacts read of a mesh. A reduced model that contains it needs less
@@ -91,7 +91,7 @@ def read_hull(model: Any, mesh: int, whole: bool = False) -> Hull | None:
     Args:
         model: the mujoco.MjModel.
         mesh: number of the mesh.
-        whole: keep vertices that are not on the hull, and the numbers of all vertices.
+        keeps_all_vertices: keep vertices that are not on the hull, and the numbers of all vertices.
 
     Returns:
         The hull; None if the mesh has none, since no geom with it collides.
@@ -101,26 +101,28 @@ def read_hull(model: Any, mesh: int, whole: bool = False) -> Hull | None:
         return None
     count, faces = model.mesh_graph[begin : begin + 2].tolist()
     graph: Integers = model.mesh_graph[begin : begin + 2 + 3 * count + 6 * faces].copy()
-    every = np.arange(model.mesh_vertnum[mesh], dtype=np.int32)
+    all_vertices = np.arange(model.mesh_vertnum[mesh], dtype=np.int32)
     # The vertices keep their order, as MuJoCo may compare the numbers of two vertices.
-    ids = every if whole else np.sort(graph[2 + count : 2 + 2 * count])
-    new = np.full(every.size, -1, dtype=np.int32)
-    new[ids] = np.arange(ids.size)
+    ids = all_vertices if keeps_all_vertices else np.sort(graph[2 + count : 2 + 2 * count])
+    new_numbers = np.full(all_vertices.size, -1, dtype=np.int32)
+    new_numbers[ids] = np.arange(ids.size)
     for part in (slice(2 + count, 2 + 2 * count), slice(graph.size - 3 * faces, graph.size)):
-        graph[part] = new[graph[part]]
+        graph[part] = new_numbers[graph[part]]
     first = int(model.mesh_polyadr[mesh])
     rows = slice(first, first + int(model.mesh_polynum[mesh]))
-    at = int(model.mesh_vertadr[mesh]) + ids
+    vertex_rows = int(model.mesh_vertadr[mesh]) + ids
     polygons = _gather_lists(
         model.mesh_polyvert, model.mesh_polyvertadr[rows], model.mesh_polyvertnum[rows]
     )
     return Hull(
-        vertices=model.mesh_vert[at],
+        vertices=model.mesh_vert[vertex_rows],
         graph=graph,
         normals=model.mesh_polynormal[rows].copy(),
-        polygons=polygons._replace(values=new[polygons.values]),
+        polygons=polygons._replace(values=new_numbers[polygons.values]),
         around=_gather_lists(
-            model.mesh_polymap, model.mesh_polymapadr[at], model.mesh_polymapnum[at]
+            model.mesh_polymap,
+            model.mesh_polymapadr[vertex_rows],
+            model.mesh_polymapnum[vertex_rows],
         ),
         extrema=model.mesh_extrema[mesh].copy(),
     )
@@ -165,11 +167,11 @@ class CollisionShapes:
             for field, values in fields.items():
                 getattr(model, field)[model.geom(name).id] = values
         for body, bounds in self.bounds.items():
-            there = _get_bounding_volumes(model, body)
+            compiled_bounds = _get_bounding_volumes(model, body)
             # The numbers of bounds differ if geoms that cannot collide were removed; then the
             # compiler's own bounds are equally valid.
-            if there.shape == bounds.shape:
-                there[:] = bounds
+            if compiled_bounds.shape == bounds.shape:
+                compiled_bounds[:] = bounds
 
 
 def _get_bounding_volumes(model: Any, body: int) -> Array:
@@ -192,9 +194,9 @@ def add_hull(spec: Any, name: str, hull: Hull) -> None:
     """
     import mujoco
 
-    half = float(np.abs(hull.vertices).max()) * CORE
+    core_size = float(np.abs(hull.vertices).max()) * CORE
     # The principal moments must decrease from x to z, else MuJoCo would exchange the axes.
-    sides = 2.0 ** np.floor(np.log2(half)) * np.array([0.25, 0.5, 1.0])
+    sides = 2.0 ** np.floor(np.log2(core_size)) * np.array([0.25, 0.5, 1.0])
     signs = [(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
     vertices = np.concatenate([hull.vertices.astype(float), sides * np.array(signs)])
     faces = np.array(CORE_FACES) + len(hull.vertices)
@@ -202,32 +204,32 @@ def add_hull(spec: Any, name: str, hull: Hull) -> None:
     mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_EXACT
 
 
-def add_reserve(spec: Any, model: Any, whole: Any, hulls: Mapping[str, Hull]) -> None:
+def add_reserve(spec: Any, model: Any, full_model: Any, hulls: Mapping[str, Hull]) -> None:
     """Add meshes that reserve memory for `write_hulls` in compiled models, if there is too little.
 
     Args:
         spec: the mujoco.MjSpec with the meshes of `add_hull`; it is changed in place.
         model: model compiled from `spec`.
-        whole: model with the whole meshes.
+        full_model: model with the whole meshes.
         hulls: hulls by name of the mesh.
     """
-    found = [read_hull(model, model.mesh(name).id) for name in hulls]
-    lacking = _count_hull_elements(hulls.values()) - _count_hull_elements(
-        hull for hull in found if hull
+    compiled_hulls = [read_hull(model, model.mesh(name).id) for name in hulls]
+    missing_sizes = _count_hull_elements(hulls.values()) - _count_hull_elements(
+        hull for hull in compiled_hulls if hull
     )
-    if lacking.max() > 0:
+    if missing_sizes.max() > 0:
         # A hull of n vertices in general position has 2 n - 4 triangles, and so 15 n - 22 integers
         # in its graph, 2 n - 4 polygons and 6 n - 12 corners. MuJoCo merges some of them.
-        count = int(1.5 * np.max(lacking / (15, 2, 6))) + 8
+        count = int(1.5 * np.max(missing_sizes / (15, 2, 6))) + 8
         height = 1.0 - 2.0 * (np.arange(count) + 0.5) / count
         x, y = np.sqrt(1.0 - height**2) * _compute_rotations(
             np.arange(count) * np.pi * (3.0 - np.sqrt(5.0))
         )
         sphere = np.stack([x, y, height], axis=1)
         spec.add_mesh(name=f"{RESERVE}.sphere", uservert=sphere.ravel())
-    if any(getattr(model, size) < getattr(whole, size) for size in LARGEST):
+    if any(getattr(model, size) < getattr(full_model, size) for size in LARGEST):
         # The base of a pyramid is a polygon with as many corners as the apex has sides.
-        count = 8 + max(getattr(whole, size) for size in LARGEST)
+        count = 8 + max(getattr(full_model, size) for size in LARGEST)
         x, y = _compute_rotations(2.0 * np.pi * np.arange(count) / count)
         base = np.stack([x, y, np.zeros(count)], axis=1)
         pyramid = np.concatenate([base, [[0.0, 0.0, 1.0]]])
@@ -239,17 +241,17 @@ def _compute_rotations(angles: Array) -> Array:
     return np.stack([np.cos(angles), np.sin(angles)])
 
 
-def has_room(model: Any, whole: Any) -> bool:
+def has_room(model: Any, full_model: Any) -> bool:
     """Return whether MuJoCo's contact buffers for a model are at least those for the whole meshes.
 
     With smaller buffers MuJoCo would write beyond their ends.
 
     Args:
         model: model with hulls.
-        whole: model with the whole meshes.
+        full_model: model with the whole meshes.
     """
-    sizes = [name for name in dir(whole) if name.startswith("n") and name.endswith("max")]
-    return all(getattr(model, name) >= getattr(whole, name) for name in sizes)
+    sizes = [name for name in dir(full_model) if name.startswith("n") and name.endswith("max")]
+    return all(getattr(model, name) >= getattr(full_model, name) for name in sizes)
 
 
 def write_hulls(model: Any, hulls: Mapping[str, Hull]) -> None:
@@ -264,9 +266,12 @@ def write_hulls(model: Any, hulls: Mapping[str, Hull]) -> None:
     """
     names = [model.mesh(i).name for i in range(model.nmesh)]
     # All hulls are read before the first is written, since they move within MuJoCo's arrays.
-    wanted = [hulls.get(name) or read_hull(model, i, whole=True) for i, name in enumerate(names)]
+    target_hulls = [
+        hulls.get(name) or read_hull(model, i, keeps_all_vertices=True)
+        for i, name in enumerate(names)
+    ]
     graph = polygon = corner = mapped = 0
-    for i, (name, hull) in enumerate(zip(names, wanted, strict=True)):
+    for i, (name, hull) in enumerate(zip(names, target_hulls, strict=True)):
         model.mesh_graphadr[i] = -1
         model.mesh_polyadr[i], model.mesh_polynum[i] = polygon, 0
         if hull is None or name.startswith(RESERVE):
@@ -281,9 +286,9 @@ def write_hulls(model: Any, hulls: Mapping[str, Hull]) -> None:
         begins, counts = model.mesh_polyvertadr[rows], model.mesh_polyvertnum[rows]
         corner = _write_lists(model.mesh_polyvert, begins, counts, hull.polygons, corner)
         polygon = rows.stop
-        at = int(model.mesh_vertadr[i])
-        model.mesh_polymapnum[at : at + int(model.mesh_vertnum[i])] = 0
-        rows = slice(at, at + hull.around.sizes.size)
+        first_vertex = int(model.mesh_vertadr[i])
+        model.mesh_polymapnum[first_vertex : first_vertex + int(model.mesh_vertnum[i])] = 0
+        rows = slice(first_vertex, first_vertex + hull.around.sizes.size)
         begins, counts = model.mesh_polymapadr[rows], model.mesh_polymapnum[rows]
         mapped = _write_lists(model.mesh_polymap, begins, counts, hull.around, mapped)
 

@@ -62,28 +62,29 @@ class CompileRepairs:
             except InputError:
                 raise
             except Exception as error:
-                said = format_mujoco_error(error)
-                if not self._repair_named_element(spec, said):
+                message = format_mujoco_error(error)
+                if not self._repair_named_element(spec, message):
                     break
-        raise self.files.make_mujoco_error(said)
+        raise self.files.make_mujoco_error(message)
 
-    def _repair_named_element(self, spec: Any, said: str) -> bool:
+    def _repair_named_element(self, spec: Any, message: str) -> bool:
         """Repair the element that MuJoCo's message names, and return whether anything was changed.
 
-        `said` is the message. It is the only information about the reason, so its text is
-        searched. False means that the message fits no known repair, and that the user must
-        change the file.
+        The message is the only information about the reason, so its text is searched. False
+        means that it fits no known repair, and that the user must change the file.
         """
-        found = re.search(r"Element name '(.*?)', id", said)
-        name = found[1] if found else ""
-        if "balanceinertia" in said:
+        name_match = re.search(r"Element name '(.*?)', id", message)
+        name = name_match[1] if name_match else ""
+        if "balanceinertia" in message:
             return self._repair_triangle_inequality(spec)
-        if "mass and inertia of moving bodies" in said:
+        if "mass and inertia of moving bodies" in message:
             return self._set_default_mass(spec, name)
-        why = f"is refused by MuJoCo ({re.sub(r'; Element.*|Error: ', '', said)})"
-        if TEXTURE_ERROR_PATTERN.search(why) and remove_texture(spec, name, why, self.left):
+        reason = f"is refused by MuJoCo ({re.sub(r'; Element.*|Error: ', '', message)})"
+        if TEXTURE_ERROR_PATTERN.search(reason) and remove_texture(spec, name, reason, self.left):
             return True
-        return bool(MESH_ERROR_PATTERN.search(why)) and remove_mesh(spec, name, why, self.left)
+        return bool(MESH_ERROR_PATTERN.search(reason)) and remove_mesh(
+            spec, name, reason, self.left
+        )
 
     def _repair_triangle_inequality(self, spec: Any) -> bool:
         """Replace principal moments that violate the triangle inequality A + B >= C, in all bodies.
@@ -103,24 +104,26 @@ class CompileRepairs:
     def _set_default_mass(self, spec: Any, name: str) -> bool:
         """Give a moving body the default mass and the least moments, where it has less.
 
-        Returns whether the body was changed. `carries` is whether other bodies are attached
+        Returns whether the body was changed. `has_children` is whether other bodies are attached
         to it.
         """
         for body in [body for body in spec.bodies if body.name == name]:
             mass, (moments, axes) = float(np.nan_to_num(body.mass)), _get_principal_moments(body)
-            light, thin = (
+            is_too_light, has_small_moments = (
                 mass < DEFAULT_BODY_MASS,
                 min(moments) < inertia_repair.MIN_MOMENT * (1 - inertia_repair.ROUNDING_SHARE),
             )
             body.mass = max(mass, DEFAULT_BODY_MASS)
             _set_principal_moments(body, np.maximum(moments, inertia_repair.MIN_MOMENT), axes)
             body.explicitinertial = True
-            if light:
-                carries = any(b.parent is not None and b.parent.name == name for b in spec.bodies)
-                self.massless.setdefault(carries, []).append(name)
-            elif thin:
+            if is_too_light:
+                has_children = any(
+                    b.parent is not None and b.parent.name == name for b in spec.bodies
+                )
+                self.massless.setdefault(has_children, []).append(name)
+            elif has_small_moments:
                 self.slight.append(name)
-            return light or thin
+            return is_too_light or has_small_moments
         return False
 
     @property
@@ -132,16 +135,21 @@ class CompileRepairs:
                 "no body has principal moments A + B < C; the nearest are taken (kg m^2): "
                 f"{format_item_list(self.balanced)}"
             )
-        given = (
+        repair_text = (
             f"given {DEFAULT_BODY_MASS:g} kg and moments of {inertia_repair.MIN_MOMENT:g} kg m^2"
         )
-        for carries, names in self.massless.items():
-            hangs = "" if carries else ", and nothing hangs on them, so their joints mean little"
-            notes.append(f"move without a mass{hangs}; {given}: {format_name_list(names)}")
-        if self.slight:
-            least = f"{inertia_repair.MIN_MOMENT:g} kg m^2"
+        for has_children, names in self.massless.items():
+            childless_note = (
+                "" if has_children else ", and nothing hangs on them, so their joints mean little"
+            )
             notes.append(
-                f"move without moments of inertia; given {least}: {format_name_list(self.slight)}"
+                f"move without a mass{childless_note}; {repair_text}: {format_name_list(names)}"
+            )
+        if self.slight:
+            min_moment = f"{inertia_repair.MIN_MOMENT:g} kg m^2"
+            notes.append(
+                f"move without moments of inertia; given {min_moment}: "
+                f"{format_name_list(self.slight)}"
             )
         return notes
 
@@ -151,9 +159,9 @@ def _get_principal_moments(body: Any) -> tuple[Array, Array | None]:
 
     None stands for the axes of the body's inertial frame.
     """
-    full = np.asarray(body.fullinertia, dtype=float)
-    if np.isfinite(full).all() and full.any():
-        return inertia_repair.compute_principal_moments(list(full))
+    tensor = np.asarray(body.fullinertia, dtype=float)
+    if np.isfinite(tensor).all() and tensor.any():
+        return inertia_repair.compute_principal_moments(list(tensor))
     return np.nan_to_num(np.asarray(body.inertia, dtype=float)), None
 
 

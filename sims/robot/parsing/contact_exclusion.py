@@ -33,27 +33,33 @@ def exclude_spurious_contacts(spec: Any, model: Any) -> list[str]:
     import mujoco
 
     bodies = model.geom_bodyid
-    touching = {int(body) for body, kind in zip(bodies, model.geom_contype, strict=True) if kind}
-    beside = []
-    if 0 in touching:
-        beside = [i for i in sorted(touching) if i and int(model.body_parentid[i]) == 0]
+    colliding_bodies = {
+        int(body) for body, kind in zip(bodies, model.geom_contype, strict=True) if kind
+    }
+    base_children = []
+    if 0 in colliding_bodies:
+        base_children = [
+            i for i in sorted(colliding_bodies) if i and int(model.body_parentid[i]) == 0
+        ]
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    inside = set()
+    overlapping_pairs = set()
     for contact in data.contact:
         pair = tuple(sorted(int(model.geom_bodyid[geom]) for geom in contact.geom))
-        if contact.dist < -OVERLAP_DEPTH and not (pair[0] == 0 and pair[1] in beside):
-            inside.add(pair)
+        if contact.dist < -OVERLAP_DEPTH and not (pair[0] == 0 and pair[1] in base_children):
+            overlapping_pairs.add(pair)
     names = [model.body(i).name for i in range(model.nbody)]
-    for one, other in [*((0, i) for i in beside), *sorted(inside)]:
-        spec.add_exclude(bodyname1=names[one], bodyname2=names[other])
+    for first, second in [*((0, i) for i in base_children), *sorted(overlapping_pairs)]:
+        spec.add_exclude(bodyname1=names[first], bodyname2=names[second])
     notes = []
-    if beside:
-        listing = format_name_list([names[i] for i in beside])
+    if base_children:
+        listing = format_name_list([names[i] for i in base_children])
         notes.append(f"no contacts between the fixed base and what hangs on it: {listing}")
-    if inside:
+    if overlapping_pairs:
         names[0] = "the base"
-        pairs = [f"{names[one]} and {names[other]}" for one, other in sorted(inside)]
+        pairs = [
+            f"{names[first]} and {names[second]}" for first, second in sorted(overlapping_pairs)
+        ]
         notes.append(
             "no contacts between parts that overlap at the zero position: "
             f"{format_name_list(pairs)}"
@@ -84,18 +90,18 @@ def touching(model: Any) -> NDArray[np.bool_]:
     bodies = np.asarray(model.geom_bodyid)
     rows = (bodies, model.geom_contype, model.geom_conaffinity)
     # Many geoms of a body have equal masks; equal rows are merged to keep the matrices small.
-    (body, kind, affinity), of = np.unique(np.stack(rows), axis=1, return_inverse=True)
+    (body, kind, affinity), row_indices = np.unique(np.stack(rows), axis=1, return_inverse=True)
     masks = kind[:, None] & affinity
-    meet = (masks | masks.T) != 0
-    own = weld[body]
-    meet &= own[:, None] != own
+    can_collide = (masks | masks.T) != 0
+    weld_ids = weld[body]
+    can_collide &= weld_ids[:, None] != weld_ids
     if not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FILTERPARENT:
         # MuJoCo excludes contacts between a body and its parent, except if the parent is the world.
-        carrier = weld[np.asarray(model.body_parentid)[own]]
-        carried = (carrier[:, None] == own) & (own != 0) & (own[:, None] != 0)
-        meet &= ~(carried | carried.T)
+        carrier = weld[np.asarray(model.body_parentid)[weld_ids]]
+        carried = (carrier[:, None] == weld_ids) & (weld_ids != 0) & (weld_ids[:, None] != 0)
+        can_collide &= ~(carried | carried.T)
     first, second = np.minimum(body[:, None], body), np.maximum(body[:, None], body)
-    meet &= ~np.isin((first << 16) + second, model.exclude_signature)
-    result: NDArray[np.bool_] = meet.any(axis=1)[of.reshape(-1)]
+    can_collide &= ~np.isin((first << 16) + second, model.exclude_signature)
+    result: NDArray[np.bool_] = can_collide.any(axis=1)[row_indices.reshape(-1)]
     result[[*model.pair_geom1, *model.pair_geom2]] = True
     return result

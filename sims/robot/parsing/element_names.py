@@ -29,22 +29,22 @@ def rename_invalid_names(root: Element) -> list[str]:
     Returns:
         Notes, at most one.
     """
-    named = {element.get("name") or "" for element in root.iter()}
+    names = {element.get("name") or "" for element in root.iter()}
     changed: dict[str, str] = {}
-    for name in sorted(named):
-        other = name.strip()
+    for name in sorted(names):
+        valid_name = name.strip()
         for character in RESERVED_CHARACTERS:
-            other = other.replace(character, "_")
-        if other == name:
+            valid_name = valid_name.replace(character, "_")
+        if valid_name == name:
             continue
-        while other in named or other in changed.values() or not other:
-            other += "_"
-        changed[name] = other
+        while valid_name in names or valid_name in changed.values() or not valid_name:
+            valid_name += "_"
+        changed[name] = valid_name
     for element in root.iter():
         for key, value in element.items():
             if value in changed and key not in FREE_TEXT_ATTRIBUTES:
                 element.set(key, changed[value])
-    pairs = [f"{name} -> {other}" for name, other in changed.items()]
+    pairs = [f"{name} -> {valid_name}" for name, valid_name in changed.items()]
     return (
         [f"renamed, since places are written with {RESERVED_CHARACTERS}: {format_name_list(pairs)}"]
         if pairs
@@ -69,17 +69,17 @@ def name_unnamed_elements(spec: Any) -> list[str]:
         "sensor": spec.sensors,
     }
     for kind, parts in kinds.items():
-        taken = {part.name for part in parts}
-        new = []
+        used_names = {part.name for part in parts}
+        new_names = []
         for number, part in enumerate(parts):
             if part.name:
                 continue
             name = f"{kind}{number}"
-            while name in taken:
+            while name in used_names:
                 name += "_"
             part.name = name
-            taken.add(name)
-            new.append(name)
-        if new:
-            notes.append(f"without a name in the file, called here: {format_name_list(new)}")
+            used_names.add(name)
+            new_names.append(name)
+        if new_names:
+            notes.append(f"without a name in the file, called here: {format_name_list(new_names)}")
     return notes

@@ -37,16 +37,16 @@ def find_nearest_valid_moments(moments: Array) -> Array:
     return np.where(raised == np.max(raised), raised - third, raised + third)
 
 
-def compute_principal_moments(full: Sequence[float]) -> tuple[Array, Array]:
+def compute_principal_moments(entries: Sequence[float]) -> tuple[Array, Array]:
     """Compute the principal moments and axes of an inertia tensor.
 
     Args:
-        full: entries xx, yy, zz, xy, xz, yz of the tensor, in kg m^2.
+        entries: xx, yy, zz, xy, xz, yz of the tensor, in kg m^2.
 
     Returns:
         Principal moments (3,) in kg m^2, and axes (3, 3) as columns.
     """
-    xx, yy, zz, xy, xz, yz = full
+    xx, yy, zz, xy, xz, yz = entries
     moments, axes = np.linalg.eigh(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
     return moments, axes
 
@@ -61,8 +61,8 @@ def compose_inertia_tensor(moments: Array, axes: Array) -> list[float]:
     Returns:
         Entries xx, yy, zz, xy, xz, yz of the tensor, in kg m^2.
     """
-    full = axes @ np.diag(moments) @ axes.T
-    return [float(full[at]) for at in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))]
+    tensor = axes @ np.diag(moments) @ axes.T
+    return [float(tensor[index]) for index in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))]
 
 
 def format_moments(before: Array, after: Array) -> str:

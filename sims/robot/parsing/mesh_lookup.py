@@ -49,48 +49,52 @@ class MeshLookup:
             if path is None:
                 return None, "is absent"
             self.files.read_content(path, MAX_ASSET_BYTES)
-            here = self.files.path.parent.resolve()
-            self.found[name] = Path(os.path.relpath(path.resolve(), here)).as_posix()
+            model_folder = self.files.path.parent.resolve()
+            self.found[name] = Path(os.path.relpath(path.resolve(), model_folder)).as_posix()
         return self.found[name], ""
 
     def _list_candidate_paths(self, name: str) -> list[Path]:
         """Return the possible paths of a mesh, in the order in which they are tried."""
-        here = self.files.path.parent
-        scheme, separator, rest = name.partition("://")
+        model_folder = self.files.path.parent
+        scheme, separator, uri_path = name.partition("://")
         if not separator:
-            plain = name.replace("\\", "/")
-            folder = here / self.folder
-            return [folder / plain, here / plain, folder / PurePosixPath(plain).name]
+            file_name = name.replace("\\", "/")
+            folder = model_folder / self.folder
+            return [
+                folder / file_name,
+                model_folder / file_name,
+                folder / PurePosixPath(file_name).name,
+            ]
         if scheme == "file":
-            return [Path(rest)]
+            return [Path(uri_path)]
         if scheme not in ("package", "model"):
             return []
-        package, *within = PurePosixPath(rest).parts or [""]
+        package, *relative_parts = PurePosixPath(uri_path).parts or [""]
         candidates = []
-        above = here.resolve()
-        for folder in [above, *above.parents][: MAX_PARENT_FOLDERS + 1]:
+        resolved_folder = model_folder.resolve()
+        for folder in [resolved_folder, *resolved_folder.parents][: MAX_PARENT_FOLDERS + 1]:
             # The folder is the package, contains it, or is the package under another name.
-            inside = folder.joinpath(*within)
-            candidates += [inside] if folder.name == package else []
-            candidates += [folder / rest, inside]
+            package_path = folder.joinpath(*relative_parts)
+            candidates += [package_path] if folder.name == package else []
+            candidates += [folder / uri_path, package_path]
         return candidates
 
-    def leave_out(self, name: str, why: str) -> None:
+    def leave_out(self, name: str, reason: str) -> None:
         """Record that a link omits a mesh.
 
         Args:
             name: file name or URI in the URDF.
-            why: reason.
+            reason: why the mesh cannot be read.
         """
-        self.left.setdefault(why, []).append(PurePosixPath(name).name)
+        self.left.setdefault(reason, []).append(PurePosixPath(name).name)
 
     @property
     def notes(self) -> list[str]:
         """One note for each reason why shapes were omitted."""
         return [
-            f"shapes left out, and their contacts, since their mesh {why}: "
+            f"shapes left out, and their contacts, since their mesh {reason}: "
             f"{format_name_list(names)}"
-            for why, names in self.left.items()
+            for reason, names in self.left.items()
         ]
 
 

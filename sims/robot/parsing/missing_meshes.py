@@ -26,14 +26,14 @@ class OmittedShapes:
     touching: dict[str, list[str]] = field(default_factory=dict)
     seen: dict[str, list[str]] = field(default_factory=dict)
 
-    def leave_out(self, spec: Any, geom: Any, label: str, why: str) -> None:
+    def leave_out(self, spec: Any, geom: Any, label: str, reason: str) -> None:
         """Remove a geom from a spec and record it.
 
         Args:
             spec: the mujoco.MjSpec.
             geom: geom to remove.
             label: file or name of the shape, for messages.
-            why: reason.
+            reason: why the shape or texture cannot be read.
 
         Raises:
             InputError: the mass of a moving body depends on the geom.
@@ -41,24 +41,26 @@ class OmittedShapes:
         body = geom.parent
         if determines_mass(spec, geom, body):
             raise InputError(
-                f"{self.source}: mesh {truncate_text(label)} {why}, and the mass of body "
+                f"{self.source}: mesh {truncate_text(label)} {reason}, and the mass of body "
                 f"{truncate_text(body.name)} would follow from it; "
                 "mend the mesh, or state the body's <inertial>"
             )
         group = self.touching if geom.contype or geom.conaffinity else self.seen
-        group.setdefault(why, []).append(label)
+        group.setdefault(reason, []).append(label)
         spec.delete(geom)
 
     @property
     def notes(self) -> list[str]:
         """Notes, one for each reason."""
         notes = [
-            f"shapes left out, and their contacts, since their file {why}: "
+            f"shapes left out, and their contacts, since their file {reason}: "
             f"{format_name_list(labels)}"
-            for why, labels in self.touching.items()
+            for reason, labels in self.touching.items()
         ]
-        for why, labels in self.seen.items():
-            notes.append(f"left out, only seen, since the file {why}: {format_name_list(labels)}")
+        for reason, labels in self.seen.items():
+            notes.append(
+                f"left out, only seen, since the file {reason}: {format_name_list(labels)}"
+            )
         return notes
 
 
@@ -75,9 +77,12 @@ def determines_mass(spec: Any, geom: Any, body: Any) -> bool:
     import mujoco
 
     low, high = spec.compiler.inertiagrouprange
-    rule, always = spec.compiler.inertiafromgeom, mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
-    never = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
-    if rule == never or (rule != always and body.explicitinertial):
+    rule, always_rule = (
+        spec.compiler.inertiafromgeom,
+        mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE,
+    )
+    never_rule = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
+    if rule == never_rule or (rule != always_rule and body.explicitinertial):
         return False
     if geom.mass == 0 or (not np.isfinite(geom.mass) and geom.density == 0):
         return False
@@ -93,7 +98,7 @@ def is_moving_body(body: Any) -> bool:
     return False
 
 
-def remove_mesh(spec: Any, name: str, why: str, left: OmittedShapes) -> bool:
+def remove_mesh(spec: Any, name: str, reason: str, omitted: OmittedShapes) -> bool:
     """Remove a mesh that MuJoCo rejects, and the geoms that use it.
 
     The robot then moves as before, without this shape in contacts or pictures.
@@ -101,21 +106,21 @@ def remove_mesh(spec: Any, name: str, why: str, left: OmittedShapes) -> bool:
     Args:
         spec: the mujoco.MjSpec.
         name: name of the mesh.
-        why: reason.
-        left: record of omitted shapes.
+        reason: why the shape or texture cannot be read.
+        omitted: record of omitted shapes.
 
     Returns:
         Whether the spec contains this mesh.
     """
     meshes = [mesh for mesh in spec.meshes if mesh.name == name]
     for geom in [geom for geom in spec.geoms if geom.meshname == name]:
-        left.leave_out(spec, geom, name, why)
+        omitted.leave_out(spec, geom, name, reason)
     for mesh in meshes:
         spec.delete(mesh)
     return bool(meshes)
 
 
-def remove_texture(spec: Any, name: str, why: str, left: OmittedShapes) -> bool:
+def remove_texture(spec: Any, name: str, reason: str, omitted: OmittedShapes) -> bool:
     """Replace a texture that MuJoCo rejects by a single colour.
 
     A texture has no influence on the motion.
@@ -123,8 +128,8 @@ def remove_texture(spec: Any, name: str, why: str, left: OmittedShapes) -> bool:
     Args:
         spec: the mujoco.MjSpec.
         name: name of the texture.
-        why: reason.
-        left: record of omitted shapes.
+        reason: why the shape or texture cannot be read.
+        omitted: record of omitted shapes.
 
     Returns:
         Whether the spec contains this texture.
@@ -132,7 +137,7 @@ def remove_texture(spec: Any, name: str, why: str, left: OmittedShapes) -> bool:
     import mujoco
 
     for texture in [texture for texture in spec.textures if texture.name == name]:
-        left.seen.setdefault(why, []).append(texture.file or name)
+        omitted.seen.setdefault(reason, []).append(texture.file or name)
         texture.file, texture.cubefiles = "", []
         texture.builtin = mujoco.mjtBuiltin.mjBUILTIN_FLAT
         texture.width = texture.height = 1

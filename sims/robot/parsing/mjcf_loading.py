@@ -55,7 +55,7 @@ class MissingFiles:
     fields: dict[str, str] = field(default_factory=dict)
     pictures: list[str] = field(default_factory=list)
 
-    def remove_from_spec(self, spec: Any, left: OmittedShapes) -> None:
+    def remove_from_spec(self, spec: Any, omitted: OmittedShapes) -> None:
         """Remove elements with missing files from a spec.
 
         The file was loaded with placeholders for the missing files; these are removed
@@ -63,21 +63,21 @@ class MissingFiles:
 
         Args:
             spec: the mujoco.MjSpec; it is changed in place.
-            left: record of omitted shapes.
+            omitted: record of omitted shapes.
 
         Raises:
             InputError: the mass of a moving body depends on a missing mesh.
         """
-        why = "is absent"
+        reason = "is absent"
         for geom in list(spec.geoms):
             file = self.meshes.get(geom.meshname) or self.fields.get(geom.hfieldname)
             if file:
-                left.leave_out(spec, geom, file, why)
+                omitted.leave_out(spec, geom, file, reason)
         for assets, names in ((spec.meshes, self.meshes), (spec.hfields, self.fields)):
             for asset in [asset for asset in assets if asset.name in names]:
                 spec.delete(asset)
         if self.pictures:
-            left.seen.setdefault(why, []).extend(self.pictures)
+            omitted.seen.setdefault(reason, []).extend(self.pictures)
 
 
 def load_referenced_files(files: ModelFileReader, root: Element) -> MissingFiles:
@@ -96,20 +96,20 @@ def load_referenced_files(files: ModelFileReader, root: Element) -> MissingFiles
     _check_sizes(files, root, 1.0)
     absent = MissingFiles()
     settings = {key: value for e in find_children(root, "compiler") for key, value in e.items()}
-    everywhere = settings.get("assetdir", "")
-    meshes = settings.get("meshdir", everywhere)
-    pictures = settings.get("texturedir", everywhere)
+    asset_folder = settings.get("assetdir", "")
+    mesh_folder = settings.get("meshdir", asset_folder)
+    texture_folder = settings.get("texturedir", asset_folder)
     strip = settings.get("strippath") == "true"
     for element in root.iter("flexcomp"):
         file = element.get("file")
-        if file and _read_asset(files, meshes, file, strip):
-            element.set("file", str((files.path.parent / meshes / file).resolve()))
+        if file and _read_asset(files, mesh_folder, file, strip):
+            element.set("file", str((files.path.parent / mesh_folder / file).resolve()))
     for asset in find_children(root, "asset"):
         for element in list(asset):
             if element.tag == "model":
                 _read_attached_model(files, element)
                 continue
-            folder = pictures if element.tag == "texture" else meshes
+            folder = texture_folder if element.tag == "texture" else mesh_folder
             missing = [
                 name
                 for name in _iterate_asset_files(element)
@@ -120,34 +120,34 @@ def load_referenced_files(files: ModelFileReader, root: Element) -> MissingFiles
     return absent
 
 
-def _check_sizes(files: ModelFileReader, element: Element, times: float) -> None:
+def _check_sizes(files: ModelFileReader, element: Element, factor: float) -> None:
     """Reject counts and sizes that would exhaust the memory.
 
-    `times` is the product of all counts above the element, since nested replicates multiply.
+    `factor` is the product of all counts above the element, since nested replicates multiply.
     """
     for key, value in element.items():
         numbers = (
-            [_parse_size(word) for word in value.split()]
+            [_parse_size(number_text) for number_text in value.split()]
             if key in (*COUNT_ATTRIBUTES, *MAX_SIZE_ATTRIBUTES)
             else []
         )
         most = MAX_SIZE_ATTRIBUTES.get(key, MAX_COUNT)
         if key in COUNT_ATTRIBUTES:
-            times *= math.prod(max(number, 1.0) for number in numbers)
-        if max([times, *numbers]) > most or (
+            factor *= math.prod(max(number, 1.0) for number in numbers)
+        if max([factor, *numbers]) > most or (
             key.startswith("nuser_") and _parse_size(value) > MAX_COUNT
         ):
             raise files.make_error(
                 element, f'{key}="{truncate_text(value)}" is too much: at most {most:g} in all'
             )
     for child in element:
-        _check_sizes(files, child, times)
+        _check_sizes(files, child, factor)
 
 
-def _parse_size(word: str) -> float:
+def _parse_size(text: str) -> float:
     """Return the magnitude of a number in an attribute; zero if the text is not a number."""
     try:
-        return abs(float(word))
+        return abs(float(text))
     except ValueError:  # MuJoCo itself reports what it expects.
         return 0.0
 
@@ -181,8 +181,8 @@ def _read_asset(files: ModelFileReader, folder: str, name: str, strip: bool) -> 
         name: name as in the model file; it may have the backslashes of Windows.
         strip: whether folders in the name are ignored (attribute strippath).
     """
-    plain = name.replace("\\", "/")
-    path = files.path.parent / folder / (PurePosixPath(plain).name if strip else plain)
+    file_name = name.replace("\\", "/")
+    path = files.path.parent / folder / (PurePosixPath(file_name).name if strip else file_name)
     if not is_file(path):
         return False
     files.read_content(path, MAX_ASSET_BYTES)
@@ -194,14 +194,14 @@ def _insert_placeholder(absent: MissingFiles, asset: Element, element: Element, 
     name = element.get("name") or PurePosixPath(file.replace("\\", "/")).stem
     if element.tag == "mesh":
         absent.meshes[name] = file
-        kept = {"name": name, "vertex": PLACEHOLDER_MESH_VERTICES}
+        attributes = {"name": name, "vertex": PLACEHOLDER_MESH_VERTICES}
     elif element.tag == "hfield":
         absent.fields[name] = file
-        kept = {"name": name, "nrow": "2", "ncol": "2", "size": "1 1 1 1"}
+        attributes = {"name": name, "nrow": "2", "ncol": "2", "size": "1 1 1 1"}
     elif element.tag == "texture":
         absent.pictures.append(file)
-        kept = {"name": name, "type": element.get("type", "cube"), "builtin": "flat"}
-        kept |= {"width": "1", "height": "1"}
+        attributes = {"name": name, "type": element.get("type", "cube"), "builtin": "flat"}
+        attributes |= {"width": "1", "height": "1"}
     elif element.tag == "skin":
         absent.pictures.append(file)
         asset.remove(element)
@@ -209,4 +209,4 @@ def _insert_placeholder(absent: MissingFiles, asset: Element, element: Element, 
     else:
         return  # MuJoCo itself reports what is missing.
     element.attrib.clear()
-    element.attrib.update(kept)
+    element.attrib.update(attributes)

@@ -94,7 +94,7 @@ def _make_robot(
         warnings: list to which MuJoCo's warnings are appended while it compiles.
     """
     source, notes = str(files.path), element_names.rename_invalid_names(root)
-    mends = CompileRepairs(files, OmittedShapes(source))
+    repairs = CompileRepairs(files, OmittedShapes(source))
     if kind == "urdf":
         notes += urdf_loading.repair_urdf(files, root)
         spec = _parse_repaired_file(files, root)
@@ -102,27 +102,35 @@ def _make_robot(
     else:
         absent = mjcf_loading.load_referenced_files(files, root)
         spec = _parse_repaired_file(files, root)
-        absent.remove_from_spec(spec, mends.left)
+        absent.remove_from_spec(spec, repairs.left)
     rated = added_actuators.add_actuators(spec, actuators, source)
     notes += added_actuators.apply_engine_settings(spec, engine, source)
     notes += element_names.name_unnamed_elements(spec)
-    above = {body.name: body.parent.name for body in spec.bodies if body.parent is not None}
-    spec, model = mends.compile(spec)
+    parents = {body.name: body.parent.name for body in spec.bodies if body.parent is not None}
+    spec, model = repairs.compile(spec)
     _check_model(files, model)
-    further = contact_exclusion.exclude_spurious_contacts(spec, model) if kind == "urdf" else []
-    if further:
-        spec, model = mends.compile(spec)
-    aliases = _map_fused_bodies(above, {model.body(i).name for i in range(model.nbody)})
-    said = [f"MuJoCo says: {warning}" for warning in dict.fromkeys(warnings)]
+    exclusion_notes = (
+        contact_exclusion.exclude_spurious_contacts(spec, model) if kind == "urdf" else []
+    )
+    if exclusion_notes:
+        spec, model = repairs.compile(spec)
+    aliases = _map_fused_bodies(parents, {model.body(i).name for i in range(model.nbody)})
+    warning_notes = [f"MuJoCo says: {warning}" for warning in dict.fromkeys(warnings)]
     if model.nu == 0:
-        said.insert(0, NO_ACTUATORS_NOTE)
+        warning_notes.insert(0, NO_ACTUATORS_NOTE)
     settings = json.dumps([actuators, engine], sort_keys=True, default=str)
     files.add_to_digest(settings.encode())
     robot = RobotModel(
         path=files.path,
         format=kind,
         spec=spec,
-        notes=(*notes, *mends.notes, *further, *_make_alias_note(aliases), *said),
+        notes=(
+            *notes,
+            *repairs.notes,
+            *exclusion_notes,
+            *_make_alias_note(aliases),
+            *warning_notes,
+        ),
         aliases=aliases,
         digest=files.digest.hexdigest(),
         rate_controlled_actuators=rated,
@@ -153,11 +161,11 @@ def _check_model(files: ModelFileReader, model: Any) -> None:
         values = np.asarray(getattr(model, field), dtype=float)
         faults = np.argwhere(~(np.abs(values) <= MAX_NUMBER))
         if len(faults):
-            (row, *_), (kind, what) = faults[0], field.split("_", 1)
+            (row, *_), (kind, quantity) = faults[0], field.split("_", 1)
             joint = model.dof_jntid[row] if kind == "dof" else row
             name = (model.body(row) if kind == "body" else model.joint(joint)).name
             raise InputError(
-                f"{files.path}: {what} of {truncate_text(name)}: "
+                f"{files.path}: {quantity} of {truncate_text(name)}: "
                 f"expected numbers within ±{MAX_NUMBER:g}, found {values[tuple(faults[0])]:g}"
             )
 
@@ -179,11 +187,11 @@ def _map_fused_bodies(parents: Mapping[str, str], compiled: set[str]) -> dict[st
     """Map the bodies that MuJoCo fused into others to the bodies that contain them."""
     aliases = {}
     for name in parents:
-        into = name
-        while into not in compiled:
-            into = parents[into]
-        if into != name:
-            aliases[name] = into
+        containing_body = name
+        while containing_body not in compiled:
+            containing_body = parents[containing_body]
+        if containing_body != name:
+            aliases[name] = containing_body
     return aliases
 
 
@@ -196,6 +204,6 @@ def _make_alias_note(aliases: Mapping[str, str]) -> list[str]:
     groups: dict[str, list[str]] = {}
     for alias, name in aliases.items():
         groups.setdefault(name, []).append(alias)
-    said = [f"{format_name_list(names)} of {into}" for into, names in groups.items()]
-    whole = format_name_list(said, between="; ")
-    return [f"links on fixed joints are part of what carries them: {whole}"] if said else []
+    body_notes = [f"{format_name_list(names)} of {body}" for body, names in groups.items()]
+    listing = format_name_list(body_notes, separator="; ")
+    return [f"links on fixed joints are part of what carries them: {listing}"] if body_notes else []

@@ -31,19 +31,19 @@ def parse_number(text: str | None) -> float:
 
 def get_link_mass(link: Element) -> float:
     """Return the mass that a link specifies, in kg; 0 if it specifies none."""
-    stated = find_children(link, "inertial", "mass")
-    return parse_number(stated[0].get("value")) if stated else 0.0
+    mass_elements = find_children(link, "inertial", "mass")
+    return parse_number(mass_elements[0].get("value")) if mass_elements else 0.0
 
 
 def repair_inertials(
-    files: ModelFileReader, links: Mapping[str, Element], held: set[str]
+    files: ModelFileReader, links: Mapping[str, Element], fixed_links: set[str]
 ) -> list[str]:
     """Repair masses and moments of inertia of links that MuJoCo would reject.
 
     Args:
         files: reader of the model file.
         links: link elements by name; changed in place.
-        held: links that are fused to the world, which need no notes.
+        fixed_links: links that are fused to the world, which need no notes.
 
     Returns:
         Notes about the repairs.
@@ -53,25 +53,29 @@ def repair_inertials(
     """
     points, raised, inferred = [], [], []
     for name, link in links.items():
-        stated = find_children(link, "inertial")
-        if not stated:
-            inferred += [name] if find_children(link, "collision") and name not in held else []
+        inertials = find_children(link, "inertial")
+        if not inertials:
+            inferred += (
+                [name] if find_children(link, "collision") and name not in fixed_links else []
+            )
             continue
         weight = get_link_mass(link)
         if not 0 <= weight < math.inf:
             raise files.make_error(
-                stated[0], f"link {truncate_text(name)}: its mass is {weight:g} kg"
+                inertials[0], f"link {truncate_text(name)}: its mass is {weight:g} kg"
             )
-        if not find_children(stated[0], "mass"):
-            SubElement(stated[0], "mass", value="0")
-        tensor = (find_children(stated[0], "inertia") or [SubElement(stated[0], "inertia")])[0]
+        if not find_children(inertials[0], "mass"):
+            SubElement(inertials[0], "mass", value="0")
+        tensor = (find_children(inertials[0], "inertia") or [SubElement(inertials[0], "inertia")])[
+            0
+        ]
         entries = [parse_number(tensor.get(key)) for key in TENSOR_ENTRIES]
         if not np.isfinite(entries).all():
             raise files.make_error(
                 tensor, f"link {truncate_text(name)}: its inertia is not made of numbers"
             )
         change = _raise_moments(tensor, entries)
-        if name in held or weight < FRAME_MASS_THRESHOLD or not change:
+        if name in fixed_links or weight < FRAME_MASS_THRESHOLD or not change:
             continue
         points += [name] if max(map(abs, entries)) < inertia_repair.NEGLIGIBLE_MOMENT else []
         raised += [f"{name} {change}"] if name not in points else []
@@ -101,9 +105,10 @@ def _format_repair_notes(points: list[str], raised: list[str], inferred: list[st
     """
     notes = []
     if points:
-        least = f"{inertia_repair.MIN_MOMENT:g} kg m^2"
+        min_moment = f"{inertia_repair.MIN_MOMENT:g} kg m^2"
         notes.append(
-            f"a mass and no moments of inertia, so a point ({least}): {format_name_list(points)}"
+            f"a mass and no moments of inertia, so a point ({min_moment}): "
+            f"{format_name_list(points)}"
         )
     if raised:
         notes.append(
@@ -119,7 +124,7 @@ def _format_repair_notes(points: list[str], raised: list[str], inferred: list[st
 
 
 def remove_unusable_shapes(
-    files: ModelFileReader, links: Mapping[str, Element], compiler: Element, held: set[str]
+    files: ModelFileReader, links: Mapping[str, Element], compiler: Element, fixed_links: set[str]
 ) -> list[str]:
     """Remove visual shapes, and collision shapes whose mesh is missing or of an unsupported format.
 
@@ -127,7 +132,7 @@ def remove_unusable_shapes(
         files: reader of the model file.
         links: link elements by name; changed in place.
         compiler: settings of MuJoCo's compiler; changed in place.
-        held: links that are fused to the world, whose mass does not matter.
+        fixed_links: links that are fused to the world, whose mass does not matter.
 
     Returns:
         Notes about the omitted shapes.
@@ -140,31 +145,31 @@ def remove_unusable_shapes(
     for key in MESH_FOLDER_SETTINGS:
         compiler.attrib.pop(key, None)
     for name, link in links.items():
-        stated = (bool(find_children(link, "inertial")) and not inferring) or name in held
+        has_mass = (bool(find_children(link, "inertial")) and not inferring) or name in fixed_links
         for shape in find_children(link, "visual"):
             link.remove(shape)
         for shape in find_children(link, "collision"):
-            if not _resolve_collision_shape(files, name, shape, meshes, stated):
+            if not _resolve_collision_shape(files, name, shape, meshes, has_mass):
                 link.remove(shape)
     return meshes.notes
 
 
 def _resolve_collision_shape(
-    files: ModelFileReader, name: str, shape: Element, meshes: MeshLookup, stated: bool
+    files: ModelFileReader, name: str, shape: Element, meshes: MeshLookup, has_mass: bool
 ) -> bool:
     """Return whether a collision shape can be read, and set the path of its mesh."""
     for mesh in find_children(shape, "geometry", "mesh"):
         file = mesh.get("filename") or ""
-        found, why = meshes.find(file)
-        if found is not None:
-            mesh.set("filename", found)
+        path, reason = meshes.find(file)
+        if path is not None:
+            mesh.set("filename", path)
             return True
-        if not stated:
+        if not has_mass:
             raise files.make_error(
                 mesh,
-                f"mesh {truncate_text(file)} {why}, and the mass of link {truncate_text(name)} "
+                f"mesh {truncate_text(file)} {reason}, and the mass of link {truncate_text(name)} "
                 "would follow from it; put it there, or state the link's <inertial>",
             )
-        meshes.leave_out(file, why)
+        meshes.leave_out(file, reason)
         return False
     return True

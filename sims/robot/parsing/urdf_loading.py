@@ -57,19 +57,19 @@ def repair_urdf(files: ModelFileReader, root: Element) -> list[str]:
         *_remove_unread_elements(root),
         *_make_joint_names_unique(files, joints),
     ]
-    above = _find_parent_links(files, links, joints)
+    parents = _find_parent_links(files, links, joints)
     if not any(joint.get("type") in MOVING_JOINT_TYPES for joint in joints):
         raise InputError(f"{files.path}: none of its {len(joints)} joints moves")
-    held = {name for name in links if _is_fixed_to_root(above, name)}
-    heavy = [name for name in links if name not in above and get_link_mass(links[name]) > 0]
-    if heavy:
+    fixed_links = {name for name in links if _is_fixed_to_root(parents, name)}
+    heavy_roots = [name for name in links if name not in parents and get_link_mass(links[name]) > 0]
+    if heavy_roots:
         notes.append(
-            f"held to the world, as MuJoCo does with a URDF's root: {format_name_list(heavy)}"
+            f"held to the world, as MuJoCo does with a URDF's root: {format_name_list(heavy_roots)}"
         )
     notes += _remove_repeated_elements([*links.values(), *joints])
-    notes += repair_inertials(files, links, held)
+    notes += repair_inertials(files, links, fixed_links)
     _check_mujoco_settings(files, root)
-    notes += remove_unusable_shapes(files, links, _get_compiler_element(root), held)
+    notes += remove_unusable_shapes(files, links, _get_compiler_element(root), fixed_links)
     notes += _remove_meaningless_limits(joints)
     notes += _remove_unsupported_mimics(joints)
     return notes
@@ -80,10 +80,10 @@ def _reject_macros(files: ModelFileReader, root: Element) -> None:
     for element in root.iter():
         macros = [value for value in element.attrib.values() if "${" in value or "$(" in value]
         if element.tag.startswith("xacro:") or macros:
-            what = truncate_text(macros[0]) if macros else f"<{truncate_text(element.tag)}>"
+            macro_text = truncate_text(macros[0]) if macros else f"<{truncate_text(element.tag)}>"
             command = f"pip install xacro; xacro {files.path.name} > robot.urdf"
             raise files.make_error(
-                element, f"{what} is a macro; run xacro, and give the result ({command})"
+                element, f"{macro_text} is a macro; run xacro, and give the result ({command})"
             )
 
 
@@ -93,8 +93,8 @@ def _remove_unread_elements(root: Element) -> list[str]:
         {child.tag for child in root if child.tag not in (*READ_ELEMENTS, *VISUAL_ELEMENTS)}
     )
     root[:] = [child for child in root if child.tag in READ_ELEMENTS]
-    unread = format_name_list([f"<{tag}>" for tag in tags])
-    return [f"not read, since MuJoCo knows no such thing: {unread}"] if tags else []
+    unread_tags = format_name_list([f"<{tag}>" for tag in tags])
+    return [f"not read, since MuJoCo knows no such thing: {unread_tags}"] if tags else []
 
 
 def _collect_links(files: ModelFileReader, root: Element) -> dict[str, Element]:
@@ -131,19 +131,19 @@ def _add_world_link(
 
 def _make_joint_names_unique(files: ModelFileReader, joints: Sequence[Element]) -> list[str]:
     """Give each joint a unique name, which MuJoCo requires, and return notes about the changes."""
-    seen: set[str] = set()
+    used_names: set[str] = set()
     notes = []
     for joint in joints:
         name = joint.get("name") or ""
-        own = name or f"joint_{_get_link_name(files, joint, 'child')}"
-        while own in seen:
-            own += "_"
-        seen.add(own)
-        if own == name:
+        unique_name = name or f"joint_{_get_link_name(files, joint, 'child')}"
+        while unique_name in used_names:
+            unique_name += "_"
+        used_names.add(unique_name)
+        if unique_name == name:
             continue
-        joint.set("name", own)
-        was = f"another joint {truncate_text(name)}" if name else "a joint without a name"
-        notes.append(f"called {truncate_text(own)} here: {was}")
+        joint.set("name", unique_name)
+        old_label = f"another joint {truncate_text(name)}" if name else "a joint without a name"
+        notes.append(f"called {truncate_text(unique_name)} here: {old_label}")
     return notes
 
 
@@ -165,7 +165,7 @@ def _find_parent_links(
     files: ModelFileReader, links: Mapping[str, Element], joints: Sequence[Element]
 ) -> dict[str, tuple[str, Element]]:
     """Return the parent link and the joint of each link; raise an error if links form no tree."""
-    above: dict[str, tuple[str, Element]] = {}
+    parents: dict[str, tuple[str, Element]] = {}
     for joint in joints:
         label, kind = truncate_text(joint.get("name") or ""), joint.get("type") or ""
         if kind not in JOINT_TYPES:
@@ -181,18 +181,18 @@ def _find_parent_links(
                 raise files.make_error(
                     joint, f"joint {label}: there is no link '{truncate_text(name)}'"
                 )
-        if child in above:
+        if child in parents:
             raise files.make_error(
                 joint, f"link {truncate_text(child)} hangs on two joints; a loop needs an MJCF"
             )
-        above[child] = (parent, joint)
+        parents[child] = (parent, joint)
     for name in links:
-        upwards, steps = name, 0
-        while upwards in above:
-            upwards, steps = above[upwards][0], steps + 1
+        ancestor, steps = name, 0
+        while ancestor in parents:
+            ancestor, steps = parents[ancestor][0], steps + 1
             if steps > len(links):
                 raise files.make_error(links[name], f"link {truncate_text(name)} hangs on itself")
-    return above
+    return parents
 
 
 def _is_fixed_to_root(above: Mapping[str, tuple[str, Element]], name: str) -> bool:
@@ -211,8 +211,8 @@ def _get_compiler_element(root: Element) -> Element:
     """Return the settings element of MuJoCo's compiler, which is created if missing."""
     blocks = find_children(root, "mujoco")
     block = blocks[0] if blocks else SubElement(root, "mujoco")
-    found = find_children(block, "compiler")
-    return found[0] if found else SubElement(block, "compiler")
+    compilers = find_children(block, "compiler")
+    return compilers[0] if compilers else SubElement(block, "compiler")
 
 
 def _check_mujoco_settings(files: ModelFileReader, root: Element) -> None:
@@ -221,37 +221,37 @@ def _check_mujoco_settings(files: ModelFileReader, root: Element) -> None:
 
     for child in find_children(root, "mujoco"):
         for setting in child:
-            alone = Element("mujoco")
-            alone.append(Element(setting.tag, setting.attrib))
+            settings = Element("mujoco")
+            settings.append(Element(setting.tag, setting.attrib))
             try:
-                mujoco.MjSpec.from_string(format_tree(alone)[0])
+                mujoco.MjSpec.from_string(format_tree(settings)[0])
             except ValueError as error:
-                said = re.sub(r", line \d+", "", format_mujoco_error(error))
-                raise files.make_error(setting, said) from None
+                message = re.sub(r", line \d+", "", format_mujoco_error(error))
+                raise files.make_error(setting, message) from None
 
 
 def _remove_repeated_elements(parts: Sequence[Element]) -> list[str]:
     """Remove repeated elements in a link or a joint, except for the first of each kind."""
-    twice = []
+    repeated = []
     for part in parts:
-        seen: set[str] = set()
+        seen_tags: set[str] = set()
         for child in list(part):
-            if child.tag in seen and child.tag not in ("visual", "collision"):
+            if child.tag in seen_tags and child.tag not in ("visual", "collision"):
                 part.remove(child)
-                twice.append(f"<{child.tag}> of {part.tag} {part.get('name')}")
-            seen.add(child.tag)
-    return [f"stated twice, the first is read: {format_name_list(twice)}"] if twice else []
+                repeated.append(f"<{child.tag}> of {part.tag} {part.get('name')}")
+            seen_tags.add(child.tag)
+    return [f"stated twice, the first is read: {format_name_list(repeated)}"] if repeated else []
 
 
 def read_velocity_limits(root: Element) -> dict[str, float]:
     """Return the velocity limits of joints, rad/s or m/s, where the file specifies them."""
-    found = {}
+    limits = {}
     for joint in find_children(root, "joint"):
         for limit in find_children(joint, "limit"):
-            fastest = parse_number(limit.get("velocity"))
-            if joint.get("type") in ONE_DOF_JOINT_TYPES and 0 < fastest < math.inf:
-                found[joint.get("name") or ""] = fastest
-    return found
+            max_velocity = parse_number(limit.get("velocity"))
+            if joint.get("type") in ONE_DOF_JOINT_TYPES and 0 < max_velocity < math.inf:
+                limits[joint.get("name") or ""] = max_velocity
+    return limits
 
 
 def _remove_meaningless_limits(joints: Sequence[Element]) -> list[str]:
@@ -260,7 +260,7 @@ def _remove_meaningless_limits(joints: Sequence[Element]) -> list[str]:
     Removed are limits of joints without one degree of freedom, effort limits that are not
     positive, position limits of continuous joints, and position ranges that are empty.
     """
-    unstated, empty, clamped = [], [], []
+    invalid_efforts, empty_ranges, effort_limits = [], [], []
     for joint in joints:
         name, kind = joint.get("name") or "", joint.get("type")
         for limit in find_children(joint, "limit"):
@@ -269,28 +269,30 @@ def _remove_meaningless_limits(joints: Sequence[Element]) -> list[str]:
                 continue
             effort = parse_number(limit.get("effort"))
             if "effort" in limit.attrib and not (0 < effort < math.inf):
-                unstated.append(name)
+                invalid_efforts.append(name)
                 del limit.attrib["effort"]
             elif effort > 0:
-                clamped.append(f"{name} {effort:g}")
+                effort_limits.append(f"{name} {effort:g}")
             if kind == "continuous" or parse_number(limit.get("lower")) >= parse_number(
                 limit.get("upper")
             ):
-                empty += [name] if kind != "continuous" else []
+                empty_ranges += [name] if kind != "continuous" else []
                 limit.attrib.pop("lower", None)
                 limit.attrib.pop("upper", None)
     notes = []
-    if clamped:
+    if effort_limits:
         notes.append(
-            f"effort limits clamp what actuators exert (N m or N): {format_name_list(clamped)}"
+            "effort limits clamp what actuators exert (N m or N): "
+            f"{format_name_list(effort_limits)}"
         )
-    if unstated:
+    if invalid_efforts:
         notes.append(
-            f"an effort limit that is not positive is read as none: {format_name_list(unstated)}"
+            "an effort limit that is not positive is read as none: "
+            f"{format_name_list(invalid_efforts)}"
         )
-    if empty:
+    if empty_ranges:
         notes.append(
-            f"a lower limit not below the upper is read as none: {format_name_list(empty)}"
+            f"a lower limit not below the upper is read as none: {format_name_list(empty_ranges)}"
         )
     return notes
 
@@ -312,28 +314,31 @@ def _remove_unsupported_mimics(joints: Sequence[Element]) -> list[str]:
     """Remove mimic elements that MuJoCo cannot represent, and return notes about all of them.
 
     A mimic joint follows another joint: q = multiplier q_other + offset. Both must have one
-    degree of freedom. `tied` lists the mimics that stay, `loose` those that are removed.
+    degree of freedom.
     """
     kinds = {joint.get("name"): joint.get("type") for joint in joints}
-    tied, loose = [], []
+    kept_mimics, removed_mimics = [], []
     for joint in joints:
         for mimic in find_children(joint, "mimic"):
-            name, other = joint.get("name") or "", mimic.get("joint") or ""
+            name, leading_joint = joint.get("name") or "", mimic.get("joint") or ""
             if (
                 joint.get("type") in ONE_DOF_JOINT_TYPES
-                and kinds.get(other) in ONE_DOF_JOINT_TYPES
-                and name != other
+                and kinds.get(leading_joint) in ONE_DOF_JOINT_TYPES
+                and name != leading_joint
             ):
-                factor, shift = mimic.get("multiplier") or "1", mimic.get("offset") or "0"
-                tied.append(f"{name} = {factor} {other} + {shift}")
+                factor, offset = mimic.get("multiplier") or "1", mimic.get("offset") or "0"
+                kept_mimics.append(f"{name} = {factor} {leading_joint} + {offset}")
             else:
                 joint.remove(mimic)
-                loose.append(f"{name} ({other})")
+                removed_mimics.append(f"{name} ({leading_joint})")
     notes = []
-    if tied:
-        notes.append(f"mimic joints follow as stiffly as MuJoCo allows: {format_name_list(tied)}")
-    if loose:
+    if kept_mimics:
         notes.append(
-            f"mimics of joints that do not move, or are not there: {format_name_list(loose)}"
+            f"mimic joints follow as stiffly as MuJoCo allows: {format_name_list(kept_mimics)}"
+        )
+    if removed_mimics:
+        notes.append(
+            "mimics of joints that do not move, or are not there: "
+            f"{format_name_list(removed_mimics)}"
         )
     return notes

@@ -50,15 +50,15 @@ class ModelFileReader:
         place = self.places.get(element) if element is not None else None
         return InputError(f"{place or self.path}: {message}")
 
-    def make_mujoco_error(self, said: str) -> InputError:
+    def make_mujoco_error(self, message: str) -> InputError:
         """Make the error for a message of MuJoCo about the text that it was given.
 
         The line in that text is replaced by the line in the user's file.
         """
-        line = re.search(r", line (\d+)", said)
+        line = re.search(r", line (\d+)", message)
         number = int(line[1]) if line else 0
         element = self.given[number - 1] if 0 < number <= len(self.given) else None
-        return self.make_error(element, re.sub(r", line \d+", "", said))
+        return self.make_error(element, re.sub(r", line \d+", "", message))
 
     def read_content(self, path: Path, most: int) -> bytes:
         """Read a file, and add its bytes to the digest.
@@ -109,19 +109,19 @@ def parse_tree(files: ModelFileReader, path: Path) -> Element:
     text = data.rstrip(b"\0").lstrip(b" \t\r\n")
     above = data[: data.find(text[:1])].count(b"\n") if text else 0
     parser = expat.ParserCreate()
-    grown = _LineTrackingTreeBuilder(files, path, parser, above)
+    builder = _LineTrackingTreeBuilder(files, path, parser, above)
     try:
         parser.Parse(text, True)
     except InputError:
         raise
     except expat.ExpatError as error:
-        what = expat.ErrorString(error.code)
+        reason = expat.ErrorString(error.code)
         line = error.lineno + above
-        wanted = "a robot's model file is MJCF or URDF"
-        raise InputError(f"{path}:{line}: not well-formed XML: {what}; {wanted}") from None
+        expectation = "a robot's model file is MJCF or URDF"
+        raise InputError(f"{path}:{line}: not well-formed XML: {reason}; {expectation}") from None
     except (ValueError, LookupError) as error:  # The declared encoding does not exist.
         raise InputError(f"{path}: not XML: {error}") from None
-    return grown.root
+    return builder.root
 
 
 class _LineTrackingTreeBuilder:
@@ -229,7 +229,7 @@ def format_tree(root: Element) -> tuple[str, list[Element]]:
 
 def find_children(element: Element, *path: str) -> list[Element]:
     """Find all elements at a path of tags below an element; each tag may occur repeatedly."""
-    found = [element]
+    elements = [element]
     for tag in path:
-        found = [child for parent in found for child in parent if child.tag == tag]
-    return found
+        elements = [child for parent in elements for child in parent if child.tag == tag]
+    return elements

@@ -42,10 +42,12 @@ def reach(robot: RobotModel, body: str) -> Array:
     number = robot.body(body).id
     points = np.array(list(_iterate_link_points(model, data, number)))
     low, high = points.min(axis=0), points.max(axis=0)
-    longest = float((high - low).max()) or _estimate_link_length(model, number)
-    half = np.maximum(0.5 * (high - low), THINNEST * longest) + MARGIN * longest
-    middle, stated = 0.5 * (low + high), model.body_ipos[number]
-    box: Array = np.stack([middle - half - stated, middle + half - stated], axis=1)
+    longest_side = float((high - low).max()) or _estimate_link_length(model, number)
+    half_size = np.maximum(0.5 * (high - low), THINNEST * longest_side) + MARGIN * longest_side
+    middle, stated_centre = 0.5 * (low + high), model.body_ipos[number]
+    box: Array = np.stack(
+        [middle - half_size - stated_centre, middle + half_size - stated_centre], axis=1
+    )
     return box
 
 
@@ -61,29 +63,29 @@ def _iterate_link_points(model: Any, data: Any, number: int) -> Iterator[Array]:
     yield np.zeros(3)
     yield model.body_ipos[number]
     flat = (int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_HFIELD))
-    for one in _list_fixed_bodies(model, number):
-        yield axes.T @ (data.xpos[one] - origin)
-        first, count = model.body_geomadr[one], model.body_geomnum[one]
+    for body in _list_fixed_bodies(model, number):
+        yield axes.T @ (data.xpos[body] - origin)
+        first, count = model.body_geomadr[body], model.body_geomnum[body]
         for geom in range(first, first + count):
             if int(model.geom_type[geom]) in flat:
                 continue
             centre, size = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
-            turned = data.geom_xmat[geom].reshape(3, 3)
+            geom_axes = data.geom_xmat[geom].reshape(3, 3)
             for corner in np.ndindex(2, 2, 2):
-                local = centre + size * (2.0 * np.array(corner) - 1.0)
-                yield axes.T @ (data.geom_xpos[geom] + turned @ local - origin)
-        for child in np.flatnonzero(model.body_parentid == one):
+                corner_point = centre + size * (2.0 * np.array(corner) - 1.0)
+                yield axes.T @ (data.geom_xpos[geom] + geom_axes @ corner_point - origin)
+        for child in np.flatnonzero(model.body_parentid == body):
             if child and model.body_jntnum[child]:
                 yield axes.T @ (data.xpos[child] - origin)
 
 
 def _list_fixed_bodies(model: Any, number: int) -> list[int]:
     """Return the numbers of a body and of all bodies that are rigidly attached below it."""
-    found = [number]
+    bodies = [number]
     for child in range(number + 1, model.nbody):
-        if model.body_parentid[child] in found and not model.body_jntnum[child]:
-            found.append(child)
-    return found
+        if model.body_parentid[child] in bodies and not model.body_jntnum[child]:
+            bodies.append(child)
+    return bodies
 
 
 def _estimate_link_length(model: Any, number: int) -> float:
@@ -140,8 +142,8 @@ def _compute_observable_axes(model: Any, number: int) -> tuple[int, ...]:
         return (0, 1, 2)
     along = data.xmat[number].reshape(3, 3).T @ axes[0]
     # For a diagonal direction the nearest frame axis is omitted, since the two others suffice.
-    nearest = int(np.argmax(np.abs(along).round(9)))
-    return tuple(axis for axis in range(3) if axis != nearest)
+    nearest_axis = int(np.argmax(np.abs(along).round(9)))
+    return tuple(axis for axis in range(3) if axis != nearest_axis)
 
 
 def _get_reference_state(robot: RobotModel) -> tuple[Any, Any]:

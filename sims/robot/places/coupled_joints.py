@@ -33,24 +33,31 @@ def coupled_joints(model: Any, dofs: Sequence[int]) -> list[set[int]]:
         elif kind in (int(kinds.mjEQ_CONNECT), int(kinds.mjEQ_WELD)):
             if int(model.eq_objtype[k]) == int(objects.mjOBJ_SITE):
                 first, second = (int(model.site_bodyid[site]) for site in (first, second))
-            one, other = _list_ancestors(model, first), _list_ancestors(model, second)
-            ends = [dof for body in set(one) ^ set(other) for dof in _get_dofs(model, body)]
+            first_ancestors, second_ancestors = (
+                _list_ancestors(model, first),
+                _list_ancestors(model, second),
+            )
+            ends = [
+                dof
+                for body in set(first_ancestors) ^ set(second_ancestors)
+                for dof in _get_dofs(model, body)
+            ]
         else:
             continue
         group = {number[dof] for dof in ends if dof in number}
-        joined = [known for known in groups if known & group]
-        groups = [known for known in groups if not known & group]
-        groups.append(group.union(*joined))
+        overlapping_groups = [other_group for other_group in groups if other_group & group]
+        groups = [other_group for other_group in groups if not other_group & group]
+        groups.append(group.union(*overlapping_groups))
     return [group for group in groups if len(group) > 1]
 
 
 def _list_ancestors(model: Any, body: int) -> list[int]:
     """Return a body and all its ancestors, including the world."""
-    found = [body]
+    bodies = [body]
     while body > 0:
         body = int(model.body_parentid[body])
-        found.append(body)
-    return found
+        bodies.append(body)
+    return bodies
 
 
 def _get_dofs(model: Any, body: int) -> range:

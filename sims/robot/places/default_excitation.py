@@ -66,8 +66,8 @@ class LazyDefaultRecording:
         # robot.
         if self._name not in vars(owner):
             setattr(owner, self._name, make_default_recording(owner.robot))
-        made: DefaultRecording = vars(owner)[self._name]
-        return made
+        recording: DefaultRecording = vars(owner)[self._name]
+        return recording
 
 
 def make_default_recording(robot: RobotModel) -> DefaultRecording:
@@ -100,8 +100,8 @@ def _make_commands(robot: RobotModel, joints: Sequence[Joint]) -> list[Excitatio
     for actuator in robot.actuators:
         if actuator.joint in driven:
             joint = driven[actuator.joint]
-            held, force = holding[joint.name], forces[joint.name]
-            commands.append(_make_command(robot, actuator, joint, held, force))
+            holding_force, force = holding[joint.name], forces[joint.name]
+            commands.append(_make_command(robot, actuator, joint, holding_force, force))
     if commands:
         return commands
     return [
@@ -142,8 +142,8 @@ def _choose_amplitude(joint: Joint, start: float) -> float:
     if joint.range is None:
         return swing
     low, high = joint.range
-    room = MAX_MARGIN_SHARE * min(start - low, high - start)
-    return min(swing, MAX_RANGE_SHARE * (high - low), room if room > 0 else swing)
+    margin = MAX_MARGIN_SHARE * min(start - low, high - start)
+    return min(swing, MAX_RANGE_SHARE * (high - low), margin if margin > 0 else swing)
 
 
 def _make_command(
@@ -168,12 +168,12 @@ def _make_command(
     if actuator.range is not None:
         low, high = actuator.range
         centre = min(max(centre, low), high)
-        room = min(centre - low, high - centre)
+        margin = min(centre - low, high - centre)
         # A set point at the end of the control range is moved to its middle.
-        if room < MAX_RANGE_SHARE * size:
+        if margin < MAX_RANGE_SHARE * size:
             centre = 0.5 * (low + high)
-            room = 0.5 * (high - low)
-        size = min(size, room)
+            margin = 0.5 * (high - low)
+        size = min(size, margin)
     return ExcitationCommand(f"u.{actuator.name}", centre, size, actuator.control)
 
 
@@ -190,14 +190,18 @@ def _stays_within_ranges(
     low, high = np.array([joint.range for joint in limited]).reshape(-1, 2).T
     # The reference pose of a file may violate the file's limits, so limits include it.
     low, high = np.minimum(low, model.qpos0[places]), np.maximum(high, model.qpos0[places])
-    told: Any = data.ctrl if any(c.name.startswith("u.") for c in commands) else data.qfrc_applied
+    control_array: Any = (
+        data.ctrl if any(c.name.startswith("u.") for c in commands) else data.qfrc_applied
+    )
     addresses = [c.address for c in commands]
     centres = np.array([c.centre for c in commands])
     sizes = share * np.array([c.size for c in commands])
     for k in range(int(TRIAL_SECONDS / model.opt.timestep)):
-        told[addresses] = centres + sizes * np.sin(CENTRE_FREQUENCY * k * model.opt.timestep)
+        control_array[addresses] = centres + sizes * np.sin(
+            CENTRE_FREQUENCY * k * model.opt.timestep
+        )
         mujoco.mj_step(model, data)
-        at = data.qpos[places]
-        if not np.isfinite(data.qpos).all() or (at < low).any() or (at > high).any():
+        positions = data.qpos[places]
+        if not np.isfinite(data.qpos).all() or (positions < low).any() or (positions > high).any():
             return False
     return True

@@ -91,8 +91,8 @@ def make_placed_effect(effect: type[Effect], spot: EffectPlace) -> type[Effect]:
     the coordinate or the signal of that place.
     """
     tilts = spot.tilts if effect.name == "joint.axis" else None
-    shown = [c for c in effect.coefficients if tilts is None or c.name in tilts]
-    coefficients = [_adapt_to_place(effect, c, spot) for c in shown]
+    observable_coefficients = [c for c in effect.coefficients if tilts is None or c.name in tilts]
+    coefficients = [_adapt_to_place(effect, c, spot) for c in observable_coefficients]
     changed: dict[str, Any] = {"coordinate": spot.coordinate, "signal": spot.signal}
     changed["says"] = f"{effect.says} (at {spot.words})"
     if issubclass(effect, Force):
@@ -107,14 +107,16 @@ def make_placed_effect(effect: type[Effect], spot: EffectPlace) -> type[Effect]:
             for c in declared
             if not _has_quantity(spot, c)
         ]
-        own = [f"{other}@{spot.name}" for other in effect.contains]
+        contained_names = [
+            f"{contained_effect}@{spot.name}" for contained_effect in effect.contains
+        ]
         # A rigid transmission with the drive's inertia is the armature effect.
         drive = f"inertia.armature@{spot.name}"
         for number, c in enumerate(coefficients):
             if c.of == "rotor":
-                own.append(drive)
+                contained_names.append(drive)
                 changed["taking"] = _make_taking_method(drive, spot.inertia, number, c.plausible[0])
-        changed["contains"] = tuple(own)
+        changed["contains"] = tuple(contained_names)
     return _create_placed_effect(
         effect, f"{effect.name}@{spot.name}", spot.name, coefficients, changed
     )
@@ -147,13 +149,13 @@ def make_shared_effects(
         effect: registered effect.
         drives: places of the actuators.
     """
-    drives = [one for one in drives if one.coordinate is not None]
-    joints = {one.coordinate: one for one in drives}
-    kinds = {one.kind for one in drives}
+    drives = [drive for drive in drives if drive.coordinate is not None]
+    joints = {drive.coordinate: drive for drive in drives}
+    kinds = {drive.kind for drive in drives}
     if len(joints) < 2 or len(kinds) > 1 or not issubclass(effect, Force):
         return
-    whole = drives[0]._replace(size=sum(one.size for one in joints.values()))
-    coefficients = [_adapt_to_place(effect, c, whole) for c in effect.coefficients]
+    combined_place = drives[0]._replace(size=sum(drive.size for drive in joints.values()))
+    coefficients = [_adapt_to_place(effect, c, combined_place) for c in effect.coefficients]
     changed: dict[str, Any] = {
         "at": "world",
         "says": f"{effect.says} (of one supply that all drives share)",
@@ -172,11 +174,11 @@ def _force_of_all(effect: type[Force], joints: Sequence[int]) -> Callable[..., A
     def force(self: Force, c: Array, moment: StateSnapshot) -> Array:
         """Compute the forces (L, D) along the joints, each from the total load of the supply."""
         robot = cast(RobotSnapshot, moment)
-        drawn = sum(np.abs(robot.carried[0][:, joint : joint + 1]) for joint in joints)
+        total_load = sum(np.abs(robot.carried[0][:, joint : joint + 1]) for joint in joints)
         result = np.zeros_like(moment.x)
         for joint in joints:
-            alone = replace(robot.get_joint_snapshot(joint), shared=drawn)
-            result[:, joint] = effect.force(self, c, alone)[:, 0]
+            joint_snapshot = replace(robot.get_joint_snapshot(joint), shared=total_load)
+            result[:, joint] = effect.force(self, c, joint_snapshot)[:, 0]
         return result
 
     return force
@@ -199,8 +201,8 @@ def _limit_of(effect: type[Friction]) -> Callable[[Friction, Array, StateSnapsho
 
 def _has_quantity(spot: EffectPlace, c: Coefficient) -> bool:
     """Return whether the model file specifies the quantity of a coefficient."""
-    stated = spot.stated.get("inertia.armature", 0.0)
-    return c.of == "rotor" and stated > c.plausible[0][0] * spot.inertia
+    file_armature = spot.stated.get("inertia.armature", 0.0)
+    return c.of == "rotor" and file_armature > c.plausible[0][0] * spot.inertia
 
 
 def _make_taking_method(
@@ -213,13 +215,13 @@ def _make_taking_method(
     inertia, within `bounds`.
     """
 
-    def taking(_: Effect, c: Array, simpler: str, given: Array) -> Array:
+    def taking(_: Effect, c: Array, simpler: str, armature: Array) -> Array:
         """Convert the inertia of an armature effect to the rotor's share of the joint inertia."""
         if simpler != drive:
             return c
-        made: Array = c.copy()
-        made[number] = np.clip(given[0] / inertia, *bounds)
-        return made
+        coefficients: Array = c.copy()
+        coefficients[number] = np.clip(armature[0] / inertia, *bounds)
+        return coefficients
 
     return taking
 
@@ -273,8 +275,11 @@ def make_effect_family(effect: type[Effect], members: Sequence[type[Effect]]) ->
     def parts(_: Effect, c: Array) -> ActiveEffects:
         """Return the effect at each place, with its share of the coefficients."""
         if shared:
-            return tuple((one, c) for one in instances)
-        return tuple((one, c[i * count : (i + 1) * count]) for i, one in enumerate(instances))
+            return tuple((member_effect, c) for member_effect in instances)
+        return tuple(
+            (member_effect, c[i * count : (i + 1) * count])
+            for i, member_effect in enumerate(instances)
+        )
 
     contains = {member.name for member in members}
     for member in members:
@@ -308,7 +313,11 @@ def _create_placed_effect(
         coefficients: coefficients with units and ranges for this place.
         changed: attributes and methods that differ from those of `effect`.
     """
-    contains = tuple(f"{other}@{place}" for other in effect.contains) if place else ()
+    contains = (
+        tuple(f"{contained_effect}@{place}" for contained_effect in effect.contains)
+        if place
+        else ()
+    )
     body = {
         "name": name,
         "of": effect.name,
@@ -337,7 +346,7 @@ def _adapt_to_place(effect: type[Effect], c: Coefficient, spot: EffectPlace) -> 
     """
     i = 2 if spot.kind == "hinge" else 1
     unit, (low, high) = c.units[i], c.plausible[i]
-    least = c.least
+    lower_limit = c.least
     if c.of.startswith(("input", "error")):
         unit = c.of.replace("error", "input").replace("input", spot.unit)
     elif c.of.startswith("reading"):
@@ -354,29 +363,31 @@ def _adapt_to_place(effect: type[Effect], c: Coefficient, spot: EffectPlace) -> 
         high = 3.0 * spot.inertia
     if c.of == "give":
         high = 1.0 / (spot.inertia * MIN_LOAD_FREQUENCY**2)
-    most = c.most
+    upper_limit = c.most
     with_total = effect.at == "joint" or effect.name == "gravity.compensation"
-    stated = spot.stated.get(effect.name) if with_total else None
-    if stated is not None:
+    file_value = spot.stated.get(effect.name) if with_total else None
+    if file_value is not None:
         # The total must not be negative, so the difference can at most remove the value of the
         # file.
-        high = max(high, 2.0 * abs(stated))
-        low = least = min(0.0 - stated, 0.0)
+        high = max(high, 2.0 * abs(file_value))
+        low = lower_limit = min(0.0 - file_value, 0.0)
     if effect.name == "payload" and c.name == "mass":
         high = MAX_PAYLOAD_SHARE * spot.mass
     if c.name in spot.limits.get(effect.name, {}):
-        least, most = spot.limits[effect.name][c.name]
+        lower_limit, upper_limit = spot.limits[effect.name][c.name]
         if effect.name == "payload":
             begin, end = spot.limits["mass.offset"][c.name]
             low, high = (begin, end) if begin < end else (low, high)
-        elif least < most:
-            low, high = max(low, least), min(high, most)
-    return replace(c, units=(unit,) * 3, plausible=((low, high),) * 3, least=least, most=most)
+        elif lower_limit < upper_limit:
+            low, high = max(low, lower_limit), min(high, upper_limit)
+    return replace(
+        c, units=(unit,) * 3, plausible=((low, high),) * 3, least=lower_limit, most=upper_limit
+    )
 
 
 def make_effect_classes(
     effect: type[Effect],
-    found: Mapping[str, Sequence[EffectPlace]],
+    places: Mapping[str, Sequence[EffectPlace]],
     native: Collection[str],
     compiles: Callable[[type[Effect]], bool] = lambda _: True,
 ) -> Iterator[type[Effect]]:
@@ -384,7 +395,7 @@ def make_effect_classes(
 
     Args:
         effect: registered effect.
-        found: places of the robot by kind.
+        places: places of the robot by kind.
         native: effects that the engine writes into the model.
         compiles: returns whether the model with an effect at one place compiles.
     """
@@ -395,16 +406,16 @@ def make_effect_classes(
     if effect.name not in native and not _needs_no_engine_support(effect):
         return
     members = [
-        make_placed_effect(effect, s) for s in found[effect.at] if _acts_at(effect, s, found)
+        make_placed_effect(effect, s) for s in places[effect.at] if _acts_at(effect, s, places)
     ]
     members = [member for member in members if compiles(member)]
     yield from members
     # Position channels of encoders are alike, while other channels have units of their own.
-    alike = [m for m in members if effect.at != "channel" or m.place.startswith("q.")]
-    if len(alike) > 1 and effect.name not in EFFECTS_WITHOUT_FAMILY:
-        yield make_effect_family(effect, alike)
-    if len(alike) > 1 and effect.name in SHARED_ACTUATOR_EFFECTS:
-        yield from make_shared_effects(effect, found["actuator"])
+    family_members = [m for m in members if effect.at != "channel" or m.place.startswith("q.")]
+    if len(family_members) > 1 and effect.name not in EFFECTS_WITHOUT_FAMILY:
+        yield make_effect_family(effect, family_members)
+    if len(family_members) > 1 and effect.name in SHARED_ACTUATOR_EFFECTS:
+        yield from make_shared_effects(effect, places["actuator"])
 
 
 def _needs_no_engine_support(effect: type[Effect]) -> bool:
@@ -420,20 +431,22 @@ def _needs_no_engine_support(effect: type[Effect]) -> bool:
 
 
 def _acts_at(
-    effect: type[Effect], spot: EffectPlace, found: Mapping[str, Sequence[EffectPlace]]
+    effect: type[Effect], spot: EffectPlace, places: Mapping[str, Sequence[EffectPlace]]
 ) -> bool:
     """Return whether a place has the quantity that an effect changes.
 
-    `found` lists all places by kind. An actuator effect needs a joint with an actuator, for
+    `places` lists all places by kind. An actuator effect needs a joint with an actuator, for
     example, and a servo effect a position servo.
     """
     if effect.at == "joint" and effect.coefficients[0].unit(_KINDS[spot.kind]) is None:
         return False
     if effect.at == "joint" and effect.needs == "input":
-        return any(actuator.coordinate == spot.coordinate for actuator in found["actuator"])
+        return any(actuator.coordinate == spot.coordinate for actuator in places["actuator"])
     if issubclass(effect, HiddenStateEffect) and effect.between:
         # The effect connects the drive of a joint to its load, so both must exist.
-        return spot.last and any(one.coordinate == spot.coordinate for one in found["actuator"])
+        return spot.last and any(
+            actuator_place.coordinate == spot.coordinate for actuator_place in places["actuator"]
+        )
     if effect.needs == "servo" and not spot.servo:
         return False
     if effect.name == "joint.coupling" and not spot.coupled:

@@ -35,14 +35,14 @@ def observable_tilts(robot: RobotModel, name: str) -> tuple[int, ...]:
     """
     model = copy.copy(robot.compiled)
     joint = robot.joint(name)
-    stated = model.jnt_axis[joint.id].copy()
-    nearest = int(np.argmax(np.abs(stated).round(9)))
+    file_axis = model.jnt_axis[joint.id].copy()
+    nearest_axis = int(np.argmax(np.abs(file_axis).round(9)))
     observable = []
-    for axis in (axis for axis in range(3) if axis != nearest):
-        turned = np.cross(np.eye(3)[axis], stated)
+    for axis in (axis for axis in range(3) if axis != nearest_axis):
+        tilt_direction = np.cross(np.eye(3)[axis], file_axis)
         sides = []
         for sign in (1.0, -1.0):
-            model.jnt_axis[joint.id] = _normalise(stated + sign * TILT * turned)
+            model.jnt_axis[joint.id] = _normalise(file_axis + sign * TILT * tilt_direction)
             sides.append(_compute_random_state_forces(model, robot.joints))
         change = (sides[0] - sides[1]) / (2.0 * TILT)
         if (np.abs(change) > MAX_UNOBSERVABLE_SHARE * np.abs(sides[0]).max()).any():

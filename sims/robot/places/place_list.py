@@ -95,7 +95,7 @@ def list_places(
     from sims.robot.places.typical_forces import coefficient_scales
 
     sizes = coefficient_scales(robot)
-    found: dict[str, list[EffectPlace]] = {"joint": [], "actuator": [], "body": [], "channel": []}
+    places: dict[str, list[EffectPlace]] = {"joint": [], "actuator": [], "body": [], "channel": []}
     numbers: dict[str, int] = {}
     mass = sum(body.mass for body in robot.bodies)
     may_be_coupled = coupled_places(robot)
@@ -103,7 +103,7 @@ def list_places(
     lasts = {int(body): i for i, body in enumerate(bodies)}
     for number, joint in enumerate(j for j in robot.joints if j.has_one_coordinate):
         numbers[joint.name] = number
-        found["joint"].append(
+        places["joint"].append(
             EffectPlace(
                 joint.name,
                 joint.kind,
@@ -120,30 +120,30 @@ def list_places(
             )
         )
     for actuator in robot.actuators:
-        on = next((s for s in found["joint"] if s.name == actuator.joint), None)
-        if on is None:
-            on = _make_actuator_place(actuator, found["joint"], mass)
-        if on is None:
+        joint_place = next((s for s in places["joint"] if s.name == actuator.joint), None)
+        if joint_place is None:
+            joint_place = _make_actuator_place(actuator, places["joint"], mass)
+        if joint_place is None:
             continue
-        found["actuator"].append(
-            on._replace(
+        places["actuator"].append(
+            joint_place._replace(
                 name=actuator.name,
                 signal=f"u.{actuator.name}",
                 unit=actuator.control_unit,
                 stated=_get_servo_gains(robot, actuator.id),
                 words=f"actuator {actuator.name}",
-                servo=actuator.kind == "position" and on.coordinate is not None,
+                servo=actuator.kind == "position" and joint_place.coordinate is not None,
             )
         )
-    longest = float(np.linalg.norm(robot.compiled.body_pos[1:], axis=1).max(initial=0.0))
+    longest_link = float(np.linalg.norm(robot.compiled.body_pos[1:], axis=1).max(initial=0.0))
     for body in robot.bodies:
-        words = f"body {body.name}"
+        description = f"body {body.name}"
         box = reach(robot, body.name)
         axes = observable_axes(robot, body.name)
         ends = np.where(np.isin(range(3), axes)[:, None], box, 0.0).tolist()
         offsets = {axis: (low, high) for axis, (low, high) in zip("xyz", ends, strict=True)}
         middle = box.mean(axis=1).tolist()
-        distance = max(float(np.ptp(box, axis=1).max()), 0.5 * longest)
+        distance = max(float(np.ptp(box, axis=1).max()), 0.5 * longest_link)
         loads = {
             axis: (middle[k] - distance, middle[k] + distance) if k in axes else (0.0, 0.0)
             for k, axis in enumerate("xyz")
@@ -157,21 +157,21 @@ def list_places(
             1.0,
             1.0,
             _get_body_file_values(robot, body.id),
-            words,
+            description,
             limits={"mass.offset": offsets, "payload": loads},
             mass=mass,
         )
-        found["body"].append(spot)
+        places["body"].append(spot)
     for name, unit in channels:
-        _, _, of = name.partition(".")
-        coordinate = numbers.get(of) if name.startswith(("q.", "qd.", "tau.")) else None
-        on = found["joint"][coordinate] if coordinate is not None else None
-        kind, size = (on.kind, on.size) if on else ("hinge", 1.0)
-        words = f"channel {name}"
-        found["channel"].append(
-            EffectPlace(name, kind, coordinate, name, unit, size, 1.0, {}, words)
+        _, _, joint_name = name.partition(".")
+        coordinate = numbers.get(joint_name) if name.startswith(("q.", "qd.", "tau.")) else None
+        joint_place = places["joint"][coordinate] if coordinate is not None else None
+        kind, size = (joint_place.kind, joint_place.size) if joint_place else ("hinge", 1.0)
+        description = f"channel {name}"
+        places["channel"].append(
+            EffectPlace(name, kind, coordinate, name, unit, size, 1.0, {}, description)
         )
-    return found
+    return places
 
 
 def _make_actuator_place(
@@ -186,9 +186,9 @@ def _make_actuator_place(
     """
     if actuator.motion is None:
         return None
-    moved = [place for place in joints if place.name in actuator.moves]
-    size = max((place.size for place in moved), default=STANDARD_GRAVITY * mass)
-    inertia = max((place.inertia for place in moved), default=mass)
+    moved_joints = [place for place in joints if place.name in actuator.moves]
+    size = max((place.size for place in moved_joints), default=STANDARD_GRAVITY * mass)
+    inertia = max((place.inertia for place in moved_joints), default=mass)
     return EffectPlace(actuator.name, actuator.motion, None, "", "", size, inertia, {}, "")
 
 

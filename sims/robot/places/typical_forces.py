@@ -52,7 +52,7 @@ def compute_joint_scales(robot: RobotModel) -> JointScales:
     places = [joint.velocity for joint in joints]
     rng = np.random.default_rng(7)
     weights, inertias = [], []
-    whole = np.zeros((model.nv, model.nv))
+    mass_matrix = np.zeros((model.nv, model.nv))
     for _ in range(POSE_COUNT):
         data.qpos[:] = model.qpos0
         data.qvel[:] = 0.0
@@ -61,9 +61,9 @@ def compute_joint_scales(robot: RobotModel) -> JointScales:
             low, high = joint.range or (start - DEFAULT_JOINT_RANGE, start + DEFAULT_JOINT_RANGE)
             data.qpos[joint.position] = rng.uniform(low, high)
         mujoco.mj_forward(model, data)
-        mujoco.mj_fullM(model, data, whole)
+        mujoco.mj_fullM(model, data, mass_matrix)
         weights.append(np.abs(data.qfrc_bias[places]))
-        inertias.append(np.diagonal(whole)[places])
+        inertias.append(np.diagonal(mass_matrix)[places])
     inertia = np.mean(inertias, axis=0)
     force = np.maximum(np.max(weights, axis=0), TYPICAL_ACCELERATION * inertia)
     return JointScales(np.maximum(force, MIN_FORCE), np.maximum(inertia, 1e-9))
@@ -77,22 +77,22 @@ def coefficient_scales(robot: RobotModel) -> JointScales:
     of the same kind. So a link whose inertia the file omits (1e-9 kg m^2) does not make the ranges
     of its joint vanish.
     """
-    own = compute_joint_scales(robot)
-    force, inertia = own.force.copy(), own.inertia.copy()
+    joint_scales = compute_joint_scales(robot)
+    force, inertia = joint_scales.force.copy(), joint_scales.inertia.copy()
     model = robot.compiled
     joints = [joint for joint in robot.joints if joint.has_one_coordinate]
-    last: dict[tuple[int, str], int] = {}
+    latest_joints: dict[tuple[int, str], int] = {}
     # Bodies are numbered from the base outwards, so a parent joint has its final value already.
     for number, joint in enumerate(joints):
         body = int(model.jnt_bodyid[joint.id])
-        parent = last.get((body, joint.kind))
+        parent = latest_joints.get((body, joint.kind))
         while parent is None and body:
             body = int(model.body_parentid[body])
-            parent = last.get((body, joint.kind))
+            parent = latest_joints.get((body, joint.kind))
         if parent is not None:
             force[number] = max(force[number], NEIGHBOUR * force[parent])
             inertia[number] = max(inertia[number], NEIGHBOUR * inertia[parent])
-        last[int(model.jnt_bodyid[joint.id]), joint.kind] = number
+        latest_joints[int(model.jnt_bodyid[joint.id]), joint.kind] = number
     return JointScales(force, inertia)
 
 
