@@ -106,15 +106,15 @@ class Explanation:
             folder / "verdict.json": self._format_json(),
             folder / "extended.toml": extending.format_extended(self.extended, folder),
         }
-        if apart := build_consistency_rows(self.story):
-            contents[folder / "apart.csv"] = csv_text(AGREEMENT_COLUMNS, apart)
+        if consistency_rows := build_consistency_rows(self.story):
+            contents[folder / "apart.csv"] = csv_text(AGREEMENT_COLUMNS, consistency_rows)
         contents |= {folder / name: text for name, text in self._robot_files.contents.items()}
         if ranges:
             # This import is needed only if ranges are requested.
             from bench.diagnosis.randomization.files import range_files
 
-            found = range_files(self.ranges, self.extended, folder)
-            contents |= {folder / name: text for name, text in found.items()}
+            range_contents = range_files(self.ranges, self.extended, folder)
+            contents |= {folder / name: text for name, text in range_contents.items()}
         for name, figure in figures.items():
             contents[folder / f"{name}.png"] = figure.png
             if figure.pdf is not None:

@@ -43,9 +43,9 @@ def build_robot_files(extended: ExtendedSimulator) -> ExtendedRobotFiles:
     # Models with all meshes are compiled several times, which needs the memory of the search.
     release_free_memory()
     causes, left_out = written_causes(collect_causes(extended))
-    done = write_model_files(kind.robot, causes, extended.title)
+    written_files = write_model_files(kind.robot, causes, extended.title)
     try:
-        check_written_files(kind.robot, causes, done)
+        check_written_files(kind.robot, causes, written_files)
     except RuntimeError as error:
         # An error here must not discard the result of minutes of search.
         return ExtendedRobotFiles({}, (f"no model file is written, by a fault of simgap: {error}",))
@@ -54,9 +54,12 @@ def build_robot_files(extended: ExtendedSimulator) -> ExtendedRobotFiles:
     except OSError:
         # The file was deleted after it was read; changes are then shown without the old text.
         before = ""
-    after = done.xml if done.urdf is None else done.urdf
+    after = written_files.xml if written_files.urdf is None else written_files.urdf
     return ExtendedRobotFiles(
-        _collect_written_files(done), (*left_out, *done.notes), before, strip_heading(after or "")
+        _collect_written_files(written_files),
+        (*left_out, *written_files.notes),
+        before,
+        strip_heading(after or ""),
     )
 
 
@@ -73,34 +76,36 @@ def written_causes(
     Returns:
         The selected causes, and a line for each number that is left out.
     """
-    kept: dict[str, Mapping[str, FittedValue]] = {}
+    selected_causes: dict[str, Mapping[str, FittedValue]] = {}
     left_out = []
     for effect, numbers in causes.items():
         if effect.startswith("numerics."):
-            kept[effect] = numbers
+            selected_causes[effect] = numbers
             continue
         # Each place of a family is handled alone; coefficients of one place belong together.
-        bad = {key.partition("@")[2]: n for key, n in numbers.items() if not n.is_result}
-        own = {key: n for key, n in numbers.items() if key.partition("@")[2] not in bad}
-        if own:
-            kept[effect] = own
-        for place, one in bad.items():
+        unidentified = {key.partition("@")[2]: n for key, n in numbers.items() if not n.is_result}
+        selected_numbers = {
+            key: n for key, n in numbers.items() if key.partition("@")[2] not in unidentified
+        }
+        if selected_numbers:
+            selected_causes[effect] = selected_numbers
+        for place, fitted in unidentified.items():
             # A number that was never fitted has the value of the model file.
-            if one.at_bound is None and not one.value:
+            if fitted.at_bound is None and not fitted.value:
                 continue
-            end = {"low": "lower", "high": "upper", None: ""}[one.at_bound]
-            why = f"lies at the {end} bound of its range" if end else "has no finite interval"
+            end = {"low": "lower", "high": "upper", None: ""}[fitted.at_bound]
+            reason = f"lies at the {end} bound of its range" if end else "has no finite interval"
             name = effect if not place else f"{effect.partition('@')[0]}@{place}"
             left_out.append(
-                f"{name} is not written to the model file: its value, {one.value:.3g} {one.unit}, "
-                f"{why} and is not a result"
+                f"{name} is not written to the model file: its value, {fitted.value:.3g} "
+                f"{fitted.unit}, {reason} and is not a result"
             )
-    return kept, tuple(left_out)
+    return selected_causes, tuple(left_out)
 
 
-def _collect_written_files(done: WrittenModelFiles) -> dict[str, str]:
+def _collect_written_files(written_files: WrittenModelFiles) -> dict[str, str]:
     """Return the content of each extended model file that was written, by file name."""
-    contents = {"extended.xml": done.xml, "extended.urdf": done.urdf}
+    contents = {"extended.xml": written_files.xml, "extended.urdf": written_files.urdf}
     return {name: content for name, content in contents.items() if content is not None}
 
 
@@ -128,11 +133,11 @@ def _list_numerics_causes(kind: Any) -> dict[str, Mapping[str, FittedValue]]:
     """
     from sims.robot.integrator_settings import INTEGRATOR_IDS, read_integrator_settings
 
-    own, numerics = read_integrator_settings(kind.robot), kind.numerics
+    file_settings, numerics = read_integrator_settings(kind.robot), kind.numerics
     changed: dict[str, Mapping[str, FittedValue]] = {}
-    if numerics.timestep != own.timestep:
+    if numerics.timestep != file_settings.timestep:
         changed["numerics.step"] = {"step": FittedValue(numerics.timestep, "s", None, None)}
-    if numerics.integrator != own.integrator:
+    if numerics.integrator != file_settings.integrator:
         number = INTEGRATOR_IDS[numerics.integrator]
         changed["numerics.integrator"] = {"integrator": FittedValue(number, "1", None, None)}
     return changed

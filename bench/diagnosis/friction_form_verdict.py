@@ -28,8 +28,8 @@ _HOLDS = ", and smaller forces do not start it"
 def soft_kind(kind: type[SystemSimulator]) -> type[SystemSimulator]:
     """Return the simulator class of a robot with dry friction in MuJoCo's soft form."""
     robot: Any = kind
-    soft: type[SystemSimulator] = robot.with_friction_form("soft")
-    return soft
+    soft_simulator: type[SystemSimulator] = robot.with_friction_form("soft")
+    return soft_simulator
 
 
 def has_dry_friction(world: RunEvaluator, names: Iterable[str]) -> bool:
@@ -44,9 +44,9 @@ def has_dry_friction(world: RunEvaluator, names: Iterable[str]) -> bool:
     robot: Any = world.kind
     if not robot.has_model:
         return False
-    freed: list[type[Effect]] = list(robot.system.freed_effects)
-    plain = [plain_friction(world, name) for name in names]
-    effects = [*(type(world.available_effects[name]) for name in plain), *freed]
+    freed_effects: list[type[Effect]] = list(robot.system.freed_effects)
+    plain_names = [plain_friction(world, name) for name in names]
+    effects = [*(type(world.available_effects[name]) for name in plain_names), *freed_effects]
     return any(_is_dry_friction(effect) for effect in effects)
 
 
@@ -67,7 +67,7 @@ def form_of(world: RunEvaluator, name: str) -> str | None:
     return "soft" if is_soft else None
 
 
-def with_solver_parameters(world: RunEvaluator, name: str, says: str) -> str:
+def with_solver_parameters(world: RunEvaluator, name: str, description: str) -> str:
     """Add the soft form to the description of an effect, before the place in brackets at its end.
 
     For example ``..., in MuJoCo's soft form (solreffriction 0.02 1) (at joint elbow)``.
@@ -75,7 +75,7 @@ def with_solver_parameters(world: RunEvaluator, name: str, says: str) -> str:
     Args:
         world: Run evaluator with the effect.
         name: Name of the effect.
-        says: Description of the effect.
+        description: Description of the effect.
     """
     robot: Any = world.kind
     effect = type(world.available_effects[name])
@@ -85,7 +85,7 @@ def with_solver_parameters(world: RunEvaluator, name: str, says: str) -> str:
     dofs = [joints[place].velocity for place in places]
     parameters = {tuple(robot.robot.compiled.dof_solref[dof].tolist()) for dof in dofs}
     text = " or ".join(" ".join(f"{value:g}" for value in pair) for pair in sorted(parameters))
-    sentence, bracket, place = says.partition(" (at ")
+    sentence, bracket, place = description.partition(" (at ")
     sentence = sentence.removesuffix(_HOLDS)
     return f"{sentence}, in MuJoCo's soft form (solreffriction {text}){bracket}{place}"
 
@@ -102,15 +102,15 @@ def is_likelier_soft(models: ModelSet, model: FittedModel, margin: float) -> boo
     """
     if not has_dry_friction(models.world, model.effects) or has_soft_form(models.world):
         return False
-    other = models.world.with_kind(soft_kind(models.world.kind))
+    soft_world = models.world.with_kind(soft_kind(models.world.kind))
     try:
-        return choose_friction_form(models, model, other, margin) is not None
+        return choose_friction_form(models, model, soft_world, margin) is not None
     finally:
-        other.close()
+        soft_world.close()
 
 
 def choose_friction_form(
-    models: ModelSet, model: FittedModel, other: RunEvaluator, margin: float
+    models: ModelSet, model: FittedModel, other_world: RunEvaluator, margin: float
 ) -> FittedModel | None:
     """Refit a model with the other form of dry friction, and return it if it is likelier.
 
@@ -121,13 +121,14 @@ def choose_friction_form(
     Args:
         models: Models of the present form, with their noise and frozen parameters.
         model: One of these models, for which `has_dry_friction` is true.
-        other: Run evaluator of the same runs and parameters, with a simulator of the other form.
+        other_world: Run evaluator of the same runs and parameters, with a simulator of the other
+            form.
         margin: Minimum gain in twice the log-likelihood.
 
     Returns:
         The model in the other form; None if the present form is kept.
     """
-    fitted = _refit_in(other, models, model)
+    fitted = _refit_in(other_world, models, model)
     gain = fitted.likelihood.value - model.likelihood.value
     return fitted if gain >= margin else None
 
@@ -139,22 +140,24 @@ def _refit_in(world: RunEvaluator, models: ModelSet, model: FittedModel) -> Fitt
     """
     names, theta = with_plain_friction(models.world, model.effects, model.fit.theta)
     # The random numbers of these models do not affect the result.
-    others = ModelSet(world, models.noise, models.frozen, make_rng("friction form"), models.stated)
-    fitted = others.fit_one(FitStart(names, theta, model.fit.states))
+    other_models = ModelSet(
+        world, models.noise, models.frozen, make_rng("friction form"), models.stated
+    )
+    fitted = other_models.fit_one(FitStart(names, theta, model.fit.states))
     if models.world.correction is None:
         return fitted
     # Both forms are compared without the discretisation error of the integrator.
     from bench.diagnosis.fitting.linearised_runs import correct_discretisation
 
     correct_discretisation(world, models.noise, fitted.fit.theta, fitted.fit.states)
-    others.models.clear()
-    return others.fit_one(fitted.fit.make_start())
+    other_models.models.clear()
+    return other_models.fit_one(fitted.fit.make_start())
 
 
 def _is_dry_friction(effect: type[Effect]) -> bool:
     """Return whether an effect, or a member of a family, acts through `frictionloss`."""
     members = getattr(effect, "members", ())
-    return issubclass(effect, Friction) or any(isinstance(one, Friction) for one in members)
+    return issubclass(effect, Friction) or any(isinstance(member, Friction) for member in members)
 
 
 def plain_friction(world: RunEvaluator, name: str) -> str:
@@ -185,14 +188,14 @@ def with_plain_friction(
     Returns:
         Names of the effects and parameters of the model without these states.
     """
-    theta, plain = theta.copy(), dict[str, None]()
+    theta, plain_names = theta.copy(), dict[str, None]()
     for name in names:
         friction = plain_friction(world, name)
-        plain[friction] = None
+        plain_names[friction] = None
         if friction != name:
             # The first coefficient of both effects is the limit of the friction force.
             theta[world.get_coefficient_indices(friction)[0]] += theta[
                 world.get_coefficient_indices(name)[0]
             ]
             theta[world.get_coefficient_indices(name)] = 0.0
-    return tuple(plain), theta
+    return tuple(plain_names), theta

@@ -76,7 +76,10 @@ class ParameterIdentifiability:
 
 
 def assess_identifiability(
-    world: RunEvaluator, noise: NoiseModel, fit: TrajectoryFit, found: DirectionSet | None = None
+    world: RunEvaluator,
+    noise: NoiseModel,
+    fit: TrajectoryFit,
+    direction_set: DirectionSet | None = None,
 ) -> tuple[ParameterIdentifiability, ...]:
     """Assess the identifiability of every free parameter and of every cause.
 
@@ -84,24 +87,28 @@ def assess_identifiability(
         world: Run evaluator of the runs.
         noise: Noise of each channel.
         fit: Fit with its derivatives; the linearisation point.
-        found: Sensitivity directions of the causes at this point, if they are known.
+        direction_set: Sensitivity directions of the causes at this point, if they are known.
 
     Returns:
         Free parameters first, then causes, those with the narrowest intervals first.
     """
-    if found is None:
+    if direction_set is None:
         names = [
             name for name in world.library if world.available_effects[name].place != ALL_PLACES
         ]
-        found = compute_directions(world, fit, names)
-    return _Identified(world, noise, fit, found).numbers()
+        direction_set = compute_directions(world, fit, names)
+    return _Identified(world, noise, fit, direction_set).numbers()
 
 
 class _Identified:
     """Linearised runs at a fit, from which the identifiability of each number follows."""
 
     def __init__(
-        self, world: RunEvaluator, noise: NoiseModel, fit: TrajectoryFit, found: DirectionSet
+        self,
+        world: RunEvaluator,
+        noise: NoiseModel,
+        fit: TrajectoryFit,
+        direction_set: DirectionSet,
     ) -> None:
         """Scale the derivatives by the noise, and project the unknown initial states out of them.
 
@@ -109,7 +116,7 @@ class _Identified:
         the number of samples times channels of a run. `parameters` (R · n, q) has those by the q
         free parameters, without the part that a change of the initial states can reproduce.
         """
-        self.world, self.noise, self.fit, self.found = world, noise, fit, found
+        self.world, self.noise, self.fit, self.found = world, noise, fit, direction_set
         self.seen = np.isfinite(world.observed)
         q = fit.free.size
         jacobian = np.where(self.seen[..., None], fit.jacobian, 0.0)
@@ -132,36 +139,36 @@ class _Identified:
         precision = np.diag(compute_state_prior(self.world) ** -2.0)
         normal = np.matmul(b.transpose(0, 2, 1), b) + precision
         inner = np.linalg.solve(normal, np.matmul(b.transpose(0, 2, 1), columns))
-        left: Array = columns - np.matmul(b, inner)
-        runs, samples, count = left.shape
-        return left.reshape(runs * samples, count)
+        projected: Array = columns - np.matmul(b, inner)
+        runs, samples, count = projected.shape
+        return projected.reshape(runs * samples, count)
 
     def _assess_free_parameters(self) -> list[ParameterIdentifiability]:
         """Assess all free parameters from their joint covariance, eq. (1)."""
-        own = self.parameters
-        scale = np.sqrt(np.einsum("nk,nk->k", own, own))
-        touched = scale > 0
+        columns = self.parameters
+        scale = np.sqrt(np.einsum("nk,nk->k", columns, columns))
+        is_sensitive = scale > 0
         covariance = np.full((scale.size, scale.size), np.inf)
-        unit = own[:, touched] / scale[touched]
+        unit = columns[:, is_sensitive] / scale[is_sensitive]
         inverse = np.linalg.pinv(unit.T @ unit, rcond=1e-13, hermitian=True)
         values, vectors = np.linalg.eigh(unit.T @ unit)
-        lost = vectors[:, values < 1e-12]
-        inverse = inverse + 1e12 * lost @ lost.T
-        places = np.ix_(touched, touched)
-        covariance[places] = inverse / np.outer(scale[touched], scale[touched])
+        unidentified = vectors[:, values < 1e-12]
+        inverse = inverse + 1e12 * unidentified @ unidentified.T
+        places = np.ix_(is_sensitive, is_sensitive)
+        covariance[places] = inverse / np.outer(scale[is_sensitive], scale[is_sensitive])
         numbers = []
         for i, place in enumerate(self.fit.free.tolist()):
             parameter = self.world.parameters[place]
             sd = np.sqrt(max(float(covariance[i, i]), 0.0))
-            mixed = []
-            for j, other in enumerate(self.fit.free.tolist()):
-                if i != j and np.isfinite(covariance[i, j]) and touched[i] and touched[j]:
+            confounders = []
+            for j, other_place in enumerate(self.fit.free.tolist()):
+                if i != j and np.isfinite(covariance[i, j]) and is_sensitive[i] and is_sensitive[j]:
                     corr = covariance[i, j] / np.sqrt(covariance[i, i] * covariance[j, j])
-                    mixed.append((self.world.parameters[other].name, float(abs(corr))))
+                    confounders.append((self.world.parameters[other_place].name, float(abs(corr))))
             low, high = parameter.bounds
             numbers.append(
                 _classify_parameter(
-                    parameter.name, True, parameter.unit, Z95 * sd, (low, high), mixed
+                    parameter.name, True, parameter.unit, Z95 * sd, (low, high), confounders
                 )
             )
         # The fit has frozen parameters to which the runs are insensitive.
@@ -187,14 +194,14 @@ class _Identified:
             for p in self.found.candidates
             if world.available_effects[p.effect].place != ALL_PLACES
         ]
-        mine = [
+        is_at_one_place = [
             world.available_effects[p.effect].place != ALL_PLACES for p in self.found.candidates
         ]
-        values = self.found.responses[..., mine]
-        shown = np.where(self.seen[..., None], values, 0.0)
-        shown /= self.noise.sigma[:, None]
-        runs, _, _, count = shown.shape
-        columns = self._project_out_states(shown.reshape(runs, -1, count))
+        values = self.found.responses[..., is_at_one_place]
+        scaled_responses = np.where(self.seen[..., None], values, 0.0)
+        scaled_responses /= self.noise.sigma[:, None]
+        runs, _, _, count = scaled_responses.shape
+        columns = self._project_out_states(scaled_responses.reshape(runs, -1, count))
         if self.parameters.shape[1]:
             basis, _ = np.linalg.qr(self.parameters)
             columns -= basis @ (basis.T @ columns)
@@ -210,31 +217,33 @@ class _Identified:
                 best[key] = k
         chosen = list(best.values())
         units = columns[:, chosen] / np.maximum(powers[chosen], 1e-300)
-        alike = np.abs(units.T @ units)
+        correlations = np.abs(units.T @ units)
         numbers = []
-        for row, ((name, place), k) in zip(alike, best.items(), strict=True):
+        for row, ((name, place), k) in zip(correlations, best.items(), strict=True):
             parameter = world.parameters[world.get_coefficient_indices(name)[place]]
             probe = probes[k]
-            half = Z95 / powers[k] if powers[k] > 0 else np.inf
-            mixed = [
-                (other, float(likeness))
-                for (other, _), j, likeness in zip(best, chosen, row, strict=True)
-                if other != name and powers[j] > 0
+            half_width = Z95 / powers[k] if powers[k] > 0 else np.inf
+            confounders = [
+                (other_effect, float(correlation))
+                for (other_effect, _), j, correlation in zip(best, chosen, row, strict=True)
+                if other_effect != name and powers[j] > 0
             ]
-            single = sum(1 for own, _ in best if own == name) == 1
-            label = name if single else f"{name} {parameter.name.rpartition('.')[2]}"
+            is_single_coefficient = sum(1 for effect, _ in best if effect == name) == 1
+            label = name if is_single_coefficient else f"{name} {parameter.name.rpartition('.')[2]}"
             if probe.fixed:
                 # The effect of a limit or backlash is not proportional to it; it shows if it is
                 # reached.
-                own = _classify_parameter(
-                    label, False, parameter.unit, 0.0, parameter.bounds, mixed
+                limit = _classify_parameter(
+                    label, False, parameter.unit, 0.0, parameter.bounds, confounders
                 )
                 numbers.append(
-                    replace(own, half=np.nan, word=_rate_switching_effect(float(powers[k])))
+                    replace(limit, half=np.nan, word=_rate_switching_effect(float(powers[k])))
                 )
                 continue
             numbers.append(
-                _classify_parameter(label, False, parameter.unit, half, parameter.bounds, mixed)
+                _classify_parameter(
+                    label, False, parameter.unit, half_width, parameter.bounds, confounders
+                )
             )
         return numbers
 
@@ -250,9 +259,9 @@ def _classify_parameter(
     name: str,
     free: bool,
     unit: str,
-    half: float,
+    half_width: float,
     bounds: tuple[float, float],
-    mixed: Sequence[tuple[str, float]],
+    confounders: Sequence[tuple[str, float]],
 ) -> ParameterIdentifiability:
     """Classify a parameter by the width of its 95 % interval as a share of its plausible range.
 
@@ -260,18 +269,23 @@ def _classify_parameter(
         name: Name of the parameter or cause.
         free: Whether it is a free parameter of the model, not a possible cause.
         unit: Unit of its value.
-        half: Half the width of its 95 % interval; infinite if the data are insensitive to it.
+        half_width: Half the width of its 95 % interval; infinite if the data are insensitive to it.
         bounds: Plausible range.
-        mixed: Other parameters with their correlation; only the strongly correlated ones are kept.
+        confounders: Other parameters with their correlation; only the strongly correlated ones are
+            kept.
     """
     low, high = bounds
-    share = 2.0 * half / max(high - low, 1e-300)
-    word: IdentifiabilityLevel = "not identifiable"
+    share = 2.0 * half_width / max(high - low, 1e-300)
+    level: IdentifiabilityLevel = "not identifiable"
     if share <= WIDE:
-        word = "identifiable" if share <= NARROW else "weak"
-    near = sorted((m for m in mixed if m[1] > CONFOUNDING_CORRELATION), key=lambda m: -m[1])
-    others = tuple(dict(near[::-1]).items())[::-1][:MAX_NAMED_CONFOUNDERS]
-    return ParameterIdentifiability(name, free, unit, float(half), low, high, word, others)
+        level = "identifiable" if share <= NARROW else "weak"
+    strong_confounders = sorted(
+        (m for m in confounders if m[1] > CONFOUNDING_CORRELATION), key=lambda m: -m[1]
+    )
+    named_confounders = tuple(dict(strong_confounders[::-1]).items())[::-1][:MAX_NAMED_CONFOUNDERS]
+    return ParameterIdentifiability(
+        name, free, unit, float(half_width), low, high, level, named_confounders
+    )
 
 
 def format_identifiability(numbers: Sequence[ParameterIdentifiability], most: int = 8) -> list[str]:
@@ -283,29 +297,29 @@ def format_identifiability(numbers: Sequence[ParameterIdentifiability], most: in
     """
     lines = ["what this recording can determine (95 % intervals, white noise assumed):"]
     lines += [f"  {_format_parameter(number)}" for number in numbers if number.free]
-    causes = {word: [n for n in numbers if not n.free and n.word == word] for word in _WORDS}
-    counts = [f"{len(those)} {word}" for word, those in causes.items()]
+    causes = {level: [n for n in numbers if not n.free and n.word == level] for level in _WORDS}
+    counts = [f"{len(members)} {level}" for level, members in causes.items()]
     lines.append(f"causes, each by itself, surest first: {', '.join(counts)}")
     # A limit has no interval, and follows the causes that have one.
-    sure = sorted(causes["identifiable"], key=lambda number: bool(np.isnan(number.half)))
-    lines += [f"  {_format_parameter(number)}" for number in sure[:most]]
-    for word, those in (("identifiable too", sure[most:]), *list(causes.items())[1:]):
-        if those:
-            lines.append(f"  {word}: {listed(_count_effects(those), most)}")
-    if any(len(those) > most for those in causes.values()):
+    identifiable = sorted(causes["identifiable"], key=lambda number: bool(np.isnan(number.half)))
+    lines += [f"  {_format_parameter(number)}" for number in identifiable[:most]]
+    for level, members in (("identifiable too", identifiable[most:]), *list(causes.items())[1:]):
+        if members:
+            lines.append(f"  {level}: {listed(_count_effects(members), most)}")
+    if any(len(members) > most for members in causes.values()):
         lines.append("  every cause with its number: the same command with --json")
     return lines
 
 
 def _format_parameter(number: ParameterIdentifiability) -> str:
     """Format one parameter with its level, interval, range and confounded parameters."""
-    half = f"±{number.half:.2g} {number.unit}" if np.isfinite(number.half) else "untouched"
+    interval_text = f"±{number.half:.2g} {number.unit}" if np.isfinite(number.half) else "untouched"
     if np.isnan(number.half):
-        half = "a limit within reach"
-    other = listed([f"{name} ({corr:.3f})" for name, corr in number.mixed], 2)
-    mixed = f"; mixed up with {other}" if other else ""
+        interval_text = "a limit within reach"
+    confounder_text = listed([f"{name} ({corr:.3f})" for name, corr in number.mixed], 2)
+    confounding_note = f"; mixed up with {confounder_text}" if confounder_text else ""
     span = f"{number.low:.3g} to {number.high:.3g}"
-    return f"{number.word:16s} {number.name}: {half} of {span}{mixed}"
+    return f"{number.word:16s} {number.name}: {interval_text} of {span}{confounding_note}"
 
 
 def _count_effects(numbers: Sequence[ParameterIdentifiability]) -> list[str]:
@@ -314,7 +328,7 @@ def _count_effects(numbers: Sequence[ParameterIdentifiability]) -> list[str]:
     for number in numbers:
         effect, _, place = number.name.partition(" ")[0].partition("@")
         places.setdefault(effect, set()).add(place)
-    several = {name: len(at) for name, at in places.items()}
+    several = {name: len(effect_places) for name, effect_places in places.items()}
     return [f"{name} ({n} places)" if n > 1 else name for name, n in several.items()]
 
 
@@ -325,8 +339,8 @@ def listed(names: Sequence[str], most: int) -> str:
         names: Names.
         most: Maximum number of names to write.
     """
-    more = len(names) - most
-    return ", ".join(names[:most]) + (f" and {more} more" if more > 0 else "")
+    unnamed_count = len(names) - most
+    return ", ".join(names[:most]) + (f" and {unnamed_count} more" if unnamed_count > 0 else "")
 
 
 _WORDS: tuple[IdentifiabilityLevel, ...] = ("identifiable", "weak", "not identifiable")

@@ -53,15 +53,16 @@ class Reusable(Generic[Item]):
             number += 1
 
 
-def is_finer_step_better(gain: float, gap: float, left: float) -> bool:
+def is_finer_step_better(gain: float, gap: float, remaining_gap: float) -> bool:
     """Return whether a finer step is significantly better and alone closes a large part of the gap.
 
     Args:
         gain: Gain in twice the log-likelihood of the base model.
         gap: Excess RMS residual of the base model with the file's own step, in units of the noise.
-        left: Excess RMS residual of the base model with the finer step, in units of the noise.
+        remaining_gap: Excess RMS residual of the base model with the finer step, in units of the
+            noise.
     """
-    return gain >= SURE and gap - max(left, 0.0) >= PART * gap
+    return gain >= SURE and gap - max(remaining_gap, 0.0) >= PART * gap
 
 
 def is_finer_model_better(file: tuple[float, float], finer: tuple[float, float]) -> bool:
@@ -110,19 +111,19 @@ def _causes(coarse: CoarseStepFinding) -> list[Cause]:
     """
     from sims.robot.integrator_settings import INTEGRATOR_IDS
 
-    own, numerics = coarse.refinement.own, coarse.refinement.numerics
+    file_settings, numerics = coarse.refinement.own, coarse.refinement.numerics
     # At most two numbers are chosen, so Wilks' theorem gives this p-value of the gain.
-    chance = float(np.exp(-0.5 * min(coarse.gain, 1400.0)))
+    p_value = float(np.exp(-0.5 * min(coarse.gain, 1400.0)))
     error = (
         f"the file's own misses its fine motion by {coarse.refinement.error:.2g} times the noise"
     )
     causes = []
-    if numerics.integrator != own.integrator:
-        says = f"integrator = {numerics.integrator} follows the robot's motion; {error}"
+    if numerics.integrator != file_settings.integrator:
+        description = f"integrator = {numerics.integrator} follows the robot's motion; {error}"
         number = FittedValue(float(INTEGRATOR_IDS[numerics.integrator]), "1", None, None)
-        causes.append(Cause(INTEGRATOR, (), says, {"coefficient": number}, chance))
-    if numerics.timestep != own.timestep:
-        says = f"a time step of {numerics.timestep:g} s follows the robot's motion; {error}"
+        causes.append(Cause(INTEGRATOR, (), description, {"coefficient": number}, p_value))
+    if numerics.timestep != file_settings.timestep:
+        description = f"a time step of {numerics.timestep:g} s follows the robot's motion; {error}"
         number = FittedValue(numerics.timestep, "s", None, None)
-        causes.append(Cause(STEP, (), says, {"coefficient": number}, chance))
+        causes.append(Cause(STEP, (), description, {"coefficient": number}, p_value))
     return causes

@@ -38,18 +38,20 @@ def freeze_unidentified_parameters(
     Returns:
         The base model, fitted without these numbers.
     """
-    for turn in range(MAX_REFITS):
+    for iteration in range(MAX_REFITS):
         search = searching(base)
-        wide = find_unidentified_parameters(search, search.base_model)
-        places = [i for i in world.base.tolist() if world.parameters[i].name in wide]
+        unidentified = find_unidentified_parameters(search, search.base_model)
+        places = [i for i in world.base.tolist() if world.parameters[i].name in unidentified]
         if not places:
             break
-        # `wide` is sorted by the width of the intervals.
-        places.sort(key=lambda i: wide.index(world.parameters[i].name))
-        some = places if turn == MAX_REFITS - 1 else places[: (len(places) + 1) // 2]
+        # `unidentified` is sorted by the width of the intervals.
+        places.sort(key=lambda i: unidentified.index(world.parameters[i].name))
+        frozen_places = places if iteration == MAX_REFITS - 1 else places[: (len(places) + 1) // 2]
         theta = base.fit.theta.copy()
-        theta[some] = world.get_nominal_theta()[some]
-        base = replace(base, unidentified_parameters=base.unidentified_parameters | frozenset(some))
+        theta[frozen_places] = world.get_nominal_theta()[frozen_places]
+        base = replace(
+            base, unidentified_parameters=base.unidentified_parameters | frozenset(frozen_places)
+        )
         start = replace(base.fit.make_start(), theta=theta)
         base = replace(
             base,

@@ -52,10 +52,10 @@ def check_identifiability(
     recording, _ = segment_recording(recording, kind)
     engine = kind.default_engine if kind.own_engine else "batch"
     constants = () if kind.has_model else tuple(free)
-    with closing(ForkedWorkerPool(jobs)) as crew:
+    with closing(ForkedWorkerPool(jobs)) as worker_pool:
         world = RunEvaluator(kind, recording, recording.training(), engine, (), constants)
-        world.crew = crew
-        crew.register(world)
+        world.crew = worker_pool
+        worker_pool.register(world)
         floor = compute_noise_floor(world, recording)
         noise = NoiseModel(floor.sigma, np.zeros(len(floor.sigma)))
         base = fit_base_model(world, noise)

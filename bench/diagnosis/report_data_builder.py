@@ -133,19 +133,19 @@ class DiagnosisReportDataBuilder:
         if len(self.finding.causes) != 1:
             return ()
         (cause,) = self.finding.causes
-        alike = {cause.effect, *cause.alternatives, *self.finding.model.effects}
+        related_effects = {cause.effect, *cause.alternatives, *self.finding.model.effects}
         singles = [m for m in self.search.models.values() if len(m.effects) == 1]
-        others = [
+        other_models = [
             model
             for model in singles
-            if not alike & set(model.effects)
+            if not related_effects & set(model.effects)
             and np.isfinite(model.penalised_log_likelihood)
             # A trend of a coefficient is only visible in effects with a single coefficient.
             and len(self.search.world.get_coefficient_indices(model.effects[0])) == 1
         ]
-        if not others:
+        if not other_models:
             return ()
-        best = max(others, key=lambda model: model.penalised_log_likelihood)
+        best = max(other_models, key=lambda model: model.penalised_log_likelihood)
         (name,) = best.effects
         group_estimates = [
             consistency
@@ -157,14 +157,14 @@ class DiagnosisReportDataBuilder:
     def _assess_identifiability(self) -> tuple[ParameterIdentifiability, ...]:
         """Assess identifiability from the directions that the search has simulated."""
         key: frozenset[str] = frozenset()
-        scanned = self.search.cached_scans.get(key) or self.search.superseded_scans.get(key)
+        scan = self.search.cached_scans.get(key) or self.search.superseded_scans.get(key)
         directions = self.search.directions_known()
         if directions is not None:
             return assess_identifiability(self.search.world, self.search.noise, *directions)
-        if scanned is None:
+        if scan is None:
             return ()
         return assess_identifiability(
-            self.search.world, self.search.noise, scanned.at, scanned.directions
+            self.search.world, self.search.noise, scan.at, scan.directions
         )
 
     @property
@@ -208,7 +208,8 @@ class DiagnosisReportDataBuilder:
             strict=True,
         )
         return tuple(
-            ChannelInfo(c.name, c.unit, size, stated, step) for c, size, stated, step in rows
+            ChannelInfo(c.name, c.unit, noise_sigma, is_stated, step)
+            for c, noise_sigma, is_stated, step in rows
         )
 
     def _list_parameter_changes(self) -> Iterator[ParameterChange]:
@@ -222,13 +223,13 @@ class DiagnosisReportDataBuilder:
         after = self.assessor.collect_parameter_estimates(self.search, self.finding.model)
         for i in world.base.tolist():
             parameter = world.parameters[i]
-            touched = i not in self.base.fixed_parameters
+            is_free = i not in self.base.fixed_parameters
             yield ParameterChange(
                 parameter.name,
                 parameter.unit,
                 _get_value_and_interval(before[i]),
                 _get_value_and_interval(after[i]),
-                touched,
+                is_free,
                 (before[i].at_bound, after[i].at_bound),
                 in_file(after[i]),
             )
@@ -236,20 +237,20 @@ class DiagnosisReportDataBuilder:
     def _list_unexplained(self) -> Iterator[str]:
         """Yield sentences on what the extended model does not explain, and further notes."""
         world = self.assessor.fitting_evaluator
-        remains = self.finding.lack_of_fit
-        for channel in remains.channels_above_noise:
-            times = remains.excess[world.channels.index(channel)]
+        lack_of_fit = self.finding.lack_of_fit
+        for channel in lack_of_fit.channels_above_noise:
+            times = lack_of_fit.excess[world.channels.index(channel)]
             yield f"the residual of channel {channel} is {times:.3g} times its noise"
         # Without a result of the test for unmodelled forces there is no dependence to report.
-        if remains.has_structure and remains.where:
-            yield f"the residual behaves like a force that depends on {remains.where}"
-        untouched = [world.parameters[i].name for i in sorted(self.base.insensitive_parameters)]
-        if untouched:
-            names = ", ".join(untouched)
+        if lack_of_fit.has_structure and lack_of_fit.where:
+            yield f"the residual behaves like a force that depends on {lack_of_fit.where}"
+        insensitive = [world.parameters[i].name for i in sorted(self.base.insensitive_parameters)]
+        if insensitive:
+            names = ", ".join(insensitive)
             yield f"the data do not depend on {names}: kept at the nominal value"
-        vague = [world.parameters[i].name for i in sorted(self.base.unidentified_parameters)]
-        if vague:
-            names = ", ".join(vague)
+        unidentified = [world.parameters[i].name for i in sorted(self.base.unidentified_parameters)]
+        if unidentified:
+            names = ", ".join(unidentified)
             yield (
                 f"the data do not identify {names} together with the other parameters: kept at the "
                 "nominal value"
@@ -261,13 +262,13 @@ class DiagnosisReportDataBuilder:
         """Yield a warning for each base parameter whose fitted value is at a bound of its range."""
         for parameter in self._list_parameter_changes():
             values = parameter.before[0], parameter.after[0]
-            for when, value, bound in zip(
+            for fit_text, value, bound in zip(
                 ("in the base fit ", ""), values, parameter.bounds, strict=True
             ):
                 if bound is None:
                     continue
                 yield (
-                    f"{when}{parameter.name} lies at the {END[bound]} bound of its range, "
+                    f"{fit_text}{parameter.name} lies at the {END[bound]} bound of its range, "
                     f"{value:g} {parameter.unit}: larger ranges were not searched, and a "
                     "cause may compensate for a value beyond the bound. Check the "
                     "units and constants of the recording"
@@ -289,12 +290,12 @@ class DiagnosisReportDataBuilder:
         for cause in finding.causes:
             if cause.alternatives:
                 names = [cause.effect, *cause.alternatives]
-                placed = any("@" in name for name in names)
-                all_of_them = (
-                    format_effect_set(names, "and") if placed else _join_effect_names(names)
+                has_places = any("@" in name for name in names)
+                effects_text = (
+                    format_effect_set(names, "and") if has_places else _join_effect_names(names)
                 )
                 yield (
-                    f"{all_of_them} have the same influence on these runs, "
+                    f"{effects_text} have the same influence on these runs, "
                     "once parameters and initial states are fitted with each: "
                     "their likelihoods differ by odds of less than 33 to 1"
                 )

@@ -60,7 +60,7 @@ def compute_gap_locations(
     """
     parts = _list_parts(world, after, mark)
     residuals = [(world.observed - simulated) / sigma for simulated in (before, after)]
-    shown = []
+    locations = []
     for kind, label, mask in parts:
         # A run or phase without samples has no RMS.
         if not mask.any():
@@ -70,8 +70,8 @@ def compute_gap_locations(
             square = np.square(residual[mask]).mean()
             sizes.append(float(np.sqrt(square)))
         samples = int(mask.sum())
-        shown.append(GapLocation(kind, label, samples, *sizes))
-    return shown
+        locations.append(GapLocation(kind, label, samples, *sizes))
+    return locations
 
 
 def _list_parts(world: RunEvaluator, simulated: Array, mark: str) -> list[tuple[str, str, Mask]]:
@@ -80,19 +80,19 @@ def _list_parts(world: RunEvaluator, simulated: Array, mark: str) -> list[tuple[
     Each has its kind, its label and the mask (R, T, C) of its samples. `mark` is appended to the
     names of runs. `simulated` (R, T, C) determines the phases of the motion.
     """
-    seen = np.isfinite(world.observed)
-    runs, _, channels = seen.shape
+    observed_mask = np.isfinite(world.observed)
+    runs, _, channels = observed_mask.shape
     parts: list[tuple[str, str, Mask]] = []
     for r, track in enumerate(world.tracks):
-        of_run = np.arange(runs) == r
-        mask = seen & of_run[:, None, None]
+        is_run = np.arange(runs) == r
+        mask = observed_mask & is_run[:, None, None]
         parts.append(("run", track.name + mark, mask))
     for c, name in enumerate(world.channels):
-        of_channel = np.arange(channels) == c
-        parts.append(("channel", name, seen & of_channel))
+        is_channel = np.arange(channels) == c
+        parts.append(("channel", name, observed_mask & is_channel))
     # Phases come from the simulation, because noise of a measured speed would cause false ones.
-    for phase, where in detect_phases(world, simulated).items():
-        parts.append(("phase", phase, seen & where[:, :, None]))
+    for phase, phase_mask in detect_phases(world, simulated).items():
+        parts.append(("phase", phase, observed_mask & phase_mask[:, :, None]))
     return parts
 
 
@@ -113,13 +113,13 @@ def detect_phases(world: RunEvaluator, simulated: Array) -> dict[str, Mask]:
     # The lower limit avoids a division by zero if nothing moves; then all is at rest.
     largest = max(float(np.nanmax(speed)), 1e-300)
     # A reversal is slow for a moment too, so only a lasting state counts as rest.
-    still = _find_lasting_stretches(speed < REST_SPEED_SHARE * largest)
+    is_at_rest = _find_lasting_stretches(speed < REST_SPEED_SHARE * largest)
     if system.bounces:
-        impact = _find_impacts(world, simulated) & ~still
-        masks = {"flight": ~impact & ~still, "impact": impact, "at rest": still}
+        impact = _find_impacts(world, simulated) & ~is_at_rest
+        masks = {"flight": ~impact & ~is_at_rest, "impact": impact, "at rest": is_at_rest}
     else:
-        reversal = (speed < REVERSAL_SPEED_SHARE * largest) & ~still
-        masks = {"motion": ~reversal & ~still, "reversal": reversal, "at rest": still}
+        reversal = (speed < REVERSAL_SPEED_SHARE * largest) & ~is_at_rest
+        masks = {"motion": ~reversal & ~is_at_rest, "reversal": reversal, "at rest": is_at_rest}
     # This phase may overlap with the others, because an input can saturate in each of them.
     saturated = _find_saturation(world)
     if saturated.any():
@@ -138,8 +138,8 @@ def compute_speeds(world: RunEvaluator, simulated: Array) -> Array | None:
         Speed, 0 after the end of a run; None without recorded coordinates.
     """
     squares = np.zeros(simulated.shape[:2])
-    shown = [n for n in world.simulator.system.coordinates if n in world.channels]
-    for name in shown:
+    recorded_coordinates = [n for n in world.simulator.system.coordinates if n in world.channels]
+    for name in recorded_coordinates:
         values = simulated[:, :, world.channels.index(name)]
         for r, track in enumerate(world.tracks):
             size = len(track.observed)
@@ -147,18 +147,18 @@ def compute_speeds(world: RunEvaluator, simulated: Array) -> Array | None:
             if size > 1:
                 slope = np.gradient(values[r, :size], track.scenario.times)
                 squares[r, :size] += np.square(slope)
-    return np.sqrt(np.nan_to_num(squares)) if shown else None
+    return np.sqrt(np.nan_to_num(squares)) if recorded_coordinates else None
 
 
 def _find_lasting_stretches(mask: Mask) -> Mask:
     """Return where a mask is true for at least `MIN_CONSECUTIVE_SAMPLES` consecutive samples."""
     lasting = np.zeros_like(mask)
-    for row, out in zip(mask, lasting, strict=True):
+    for row, lasting_row in zip(mask, lasting, strict=True):
         # With zeros at both ends, changes come in pairs: start and end of each interval.
-        framed = np.concatenate([[0], row.astype(np.int8), [0]])
-        edges = np.flatnonzero(np.diff(framed))
+        padded = np.concatenate([[0], row.astype(np.int8), [0]])
+        edges = np.flatnonzero(np.diff(padded))
         for begin, end in zip(edges[::2], edges[1::2], strict=True):
-            out[begin:end] = end - begin >= MIN_CONSECUTIVE_SAMPLES
+            lasting_row[begin:end] = end - begin >= MIN_CONSECUTIVE_SAMPLES
     return lasting
 
 
@@ -170,13 +170,13 @@ def _find_impacts(world: RunEvaluator, simulated: Array) -> Mask:
         return mask
     height = simulated[:, :, world.channels.index(name)]
     # After the end of a shorter run heights are NaN, which are never lowest points.
-    before, here, behind = height[:, :-2], height[:, 1:-1], height[:, 2:]
+    previous_heights, heights, next_heights = height[:, :-2], height[:, 1:-1], height[:, 2:]
     with np.errstate(invalid="ignore"):
         # In a flat interval only the last sample counts, so that one impact is not counted twice.
-        low = (here <= before) & (here < behind)
-    low = np.pad(low, ((0, 0), (1, 1)))
+        is_lowest = (heights <= previous_heights) & (heights < next_heights)
+    is_lowest = np.pad(is_lowest, ((0, 0), (1, 1)))
     for shift in range(-IMPACT_MARGIN_SAMPLES, IMPACT_MARGIN_SAMPLES + 1):
-        mask |= np.roll(low, shift, axis=1)
+        mask |= np.roll(is_lowest, shift, axis=1)
     return mask
 
 
@@ -211,33 +211,33 @@ def compute_residual_profiles(
         sigma: (C,) noise of each channel.
     """
     name = world.simulator.system.reading(world.channels)
-    followed_by = _iterate_variables(world, after)
+    variables = _iterate_variables(world, after)
     if get_robot(world) is not None:
         name = _find_largest_residual_channel(world, before, sigma)
-        followed_by = _iterate_joint_variables(world, after, name)
+        variables = _iterate_joint_variables(world, after, name)
     c = world.channels.index(name)
-    shown = []
-    for variable, unit, values in followed_by:
-        good = np.isfinite(world.observed[:, :, c]) & np.isfinite(values)
-        followed = values[good]
-        edges = _compute_bin_edges(followed)
+    profiles = []
+    for variable, unit, values in variables:
+        is_finite = np.isfinite(world.observed[:, :, c]) & np.isfinite(values)
+        variable_values = values[is_finite]
+        edges = _compute_bin_edges(variable_values)
         if edges is None:
             continue
         # Values outside the edges count in the outermost bins.
-        places = np.searchsorted(edges, followed, side="right") - 1
+        places = np.searchsorted(edges, variable_values, side="right") - 1
         bins = np.clip(places, 0, PROFILE_BIN_COUNT - 1)
         counts = np.bincount(bins, minlength=PROFILE_BIN_COUNT).astype(np.float64)
         # The mean of an empty bin is NaN and is not drawn.
         with np.errstate(invalid="ignore", divide="ignore"):
             means = []
             for simulated in (before, after):
-                residual = (world.observed - simulated)[:, :, c][good]
+                residual = (world.observed - simulated)[:, :, c][is_finite]
                 means.append(np.bincount(bins, residual, PROFILE_BIN_COUNT) / counts)
             error = sigma[c] / np.sqrt(counts)
         error[counts == 0] = np.nan
         centres = (edges[1:] + edges[:-1]) / 2.0
-        shown.append(ResidualProfile(name, variable, unit, centres, means[0], means[1], error))
-    return shown
+        profiles.append(ResidualProfile(name, variable, unit, centres, means[0], means[1], error))
+    return profiles
 
 
 def get_robot(world: RunEvaluator) -> RobotModel | None:
@@ -251,8 +251,8 @@ def _find_largest_residual_channel(world: RunEvaluator, before: Array, sigma: Ar
     squares = np.square((world.observed - before) / sigma)
     sizes = []
     for c in range(len(world.channels)):
-        there = squares[:, :, c][np.isfinite(squares[:, :, c])]
-        sizes.append(float(there.mean()) if there.size else 0.0)
+        channel_squares = squares[:, :, c][np.isfinite(squares[:, :, c])]
+        sizes.append(float(channel_squares.mean()) if channel_squares.size else 0.0)
     return world.channels[int(np.argmax(sizes))]
 
 

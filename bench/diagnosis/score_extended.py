@@ -113,21 +113,23 @@ def _check_plugin(model: Path) -> None:
 
 
 def _load_robot(
-    model: Path, stated: ModelFileReference | None
+    model: Path, reference: ModelFileReference | None
 ) -> tuple[ExtendedSimulator, type[SystemSimulator]]:
     """Load a robot from its model file as a simulator, without fitted parameters and added effects.
 
-    `stated` has the actuators and the engine that the description of the recording specifies.
+    `reference` has the actuators and the engine that the description of the recording specifies.
     """
     from sims.robot.parsing.read_model_file import read_robot
 
-    tables = stated.actuators if stated else {}
+    tables = reference.actuators if reference else {}
     # A file written by explain contains the actuators of the recording already.
-    there = {actuator.name for actuator in read_robot(model).actuators}
-    lacking = {name: table for name, table in tables.items() if name not in there}
+    present_actuators = {actuator.name for actuator in read_robot(model).actuators}
+    missing_actuators = {
+        name: table for name, table in tables.items() if name not in present_actuators
+    }
     # An MJCF contains its own step and integrator, which may be a result of the diagnosis.
-    engine = stated.engine if stated and model.suffix == ".urdf" else {}
-    kind = cast(type[SystemSimulator], make_robot_simulator(model, lacking, engine))
+    engine = reference.engine if reference and model.suffix == ".urdf" else {}
+    kind = cast(type[SystemSimulator], make_robot_simulator(model, missing_actuators, engine))
     return ExtendedSimulator(kind.name, kind.name, None, "", {}, {}, {}, (), kind), kind
 
 
@@ -147,12 +149,14 @@ def _check_system(recording: Path, system: str, extended: ExtendedSimulator, mod
         )
 
 
-def _check_channels(recording: Path, extended: ExtendedSimulator, recorded: list[str]) -> None:
+def _check_channels(
+    recording: Path, extended: ExtendedSimulator, recorded_channels: list[str]
+) -> None:
     """Refuse a recording that lacks a channel of the model."""
     for channel in extended.observe:
         # Otherwise the error would cover fewer channels than the model was fitted to.
-        if channel not in recorded:
-            raise make_unknown_name_error(f"channel of {recording}", channel, recorded)
+        if channel not in recorded_channels:
+            raise make_unknown_name_error(f"channel of {recording}", channel, recorded_channels)
 
 
 def build_theta(world: RunEvaluator, extended: ExtendedSimulator) -> Array:
@@ -164,8 +168,8 @@ def build_theta(world: RunEvaluator, extended: ExtendedSimulator) -> Array:
     """
     # Missing parameters are nominal, and missing coefficients are off.
     theta = world.get_nominal_theta()
-    own = world.parameters[: world.own]
-    for place, parameter in enumerate(own):
+    base_parameters = world.parameters[: world.own]
+    for place, parameter in enumerate(base_parameters):
         if parameter.name in extended.parameters:
             number = extended.parameters[parameter.name]
             theta[place] = number.value
@@ -188,9 +192,9 @@ def _simulate_runs(world: RunEvaluator, extended: ExtendedSimulator, sigma: Arra
 
 def _compute_squared_errors(world: RunEvaluator, simulated: Array) -> Array:
     """Compute the squared errors (R, T, C); zero where no sample was observed."""
-    seen = np.isfinite(world.observed)
+    observed_mask = np.isfinite(world.observed)
     errors = world.observed - simulated
-    squares: Array = np.where(seen, np.square(errors), 0.0)
+    squares: Array = np.where(observed_mask, np.square(errors), 0.0)
     return squares
 
 
@@ -199,8 +203,8 @@ def _summarise_errors(world: RunEvaluator, squares: Array, sigma: Array) -> dict
 
     `squares` (R, T, C) has the squared errors, zero where no sample exists; `sigma` (C,) the noise.
     """
-    seen = np.isfinite(world.observed)
-    counts = seen.sum(axis=(0, 1))
+    observed_mask = np.isfinite(world.observed)
+    counts = observed_mask.sum(axis=(0, 1))
     rmse = {}
     for c, name in enumerate(world.channels):
         # A channel without samples has no error.
@@ -208,13 +212,13 @@ def _summarise_errors(world: RunEvaluator, squares: Array, sigma: Array) -> dict
             total = squares[:, :, c].sum()
             rmse[name] = float(np.sqrt(total / counts[c]))
     # Errors of different channels can be added in units of their noise.
-    in_noise = squares / np.square(sigma)
-    normalised = np.sqrt(in_noise.sum() / counts.sum())
+    normalised_squares = squares / np.square(sigma)
+    normalised = np.sqrt(normalised_squares.sum() / counts.sum())
     channels = world.simulator.channels
     return {
         "rmse": rmse,
         "normalised_rmse": float(normalised),
         "runs": len(world.runs),
-        "samples": int(seen.any(axis=2).sum()),
+        "samples": int(observed_mask.any(axis=2).sum()),
         "units": {channel.name: channel.unit for channel in channels},
     }

@@ -126,8 +126,8 @@ class HeldOutResult:
         before, after = _format_number(self.rmse_base), _format_number(self.rmse_extended)
         change = f"{before} -> {after} {self.unit}".rstrip()
         floor = _format_number(self.noise_floor)
-        closed = _format_number(self.gap_closed)
-        return f"Heldout({change}, floor {floor}, closed {closed})"
+        gap_closed = _format_number(self.gap_closed)
+        return f"Heldout({change}, floor {floor}, closed {gap_closed})"
 
 
 @dataclass(frozen=True, repr=False)
@@ -317,8 +317,8 @@ class Verdict:
 
     def __repr__(self) -> str:
         names = ", ".join(" or ".join([c.effect, *c.alternatives]) for c in self.causes)
-        found = f": {names}" if names else ""
-        return f"Verdict({self.verdict}{found}; {self.system}, {self.simulations} simulations)"
+        cause_text = f": {names}" if names else ""
+        return f"Verdict({self.verdict}{cause_text}; {self.system}, {self.simulations} simulations)"
 
 
 def to_finite_or_none(value: float) -> float | None:
@@ -334,14 +334,14 @@ def _convert_estimates(numbers: Mapping[str, FittedValue]) -> JsonDocument:
 
 def _convert_estimate(number: FittedValue) -> JsonDocument:
     """Return a fitted value as a JSON object with value, unit and interval."""
-    found: JsonDocument = {key: getattr(number, key) for key in ("value", "unit", "low", "high")}
+    document: JsonDocument = {key: getattr(number, key) for key in ("value", "unit", "low", "high")}
     # Empty fields are left out.
     for key in ("at_bound", "stated", "total", "total_unit"):
         if (value := getattr(number, key)) not in (None, ""):
-            found[key] = value
+            document[key] = value
     if number.usual_range is not None:
-        found["usual_range"] = list(number.usual_range)
-    return found
+        document["usual_range"] = list(number.usual_range)
+    return document
 
 
 def _read_estimates(document: Mapping[str, Any]) -> dict[str, FittedValue]:
@@ -349,8 +349,8 @@ def _read_estimates(document: Mapping[str, Any]) -> dict[str, FittedValue]:
 
 
 def _read_estimate(estimate: Mapping[str, Any]) -> FittedValue:
-    usual = estimate.get("usual_range")
-    ends = (float(usual[0]), float(usual[1])) if usual is not None else None
+    usual_range = estimate.get("usual_range")
+    ends = (float(usual_range[0]), float(usual_range[1])) if usual_range is not None else None
     return FittedValue(**{**estimate, "usual_range": ends})
 
 

@@ -144,8 +144,8 @@ class VerdictBuilder:
         result = {}
         for place, parameter in enumerate(self.fitting_evaluator.parameters):
             # Insensitive parameters stay nominal; effects that are not in the model are zero.
-            given = float(model.fit.theta[place]), np.nan, np.nan
-            value, low, high = fitted.get(place, given)
+            unfitted_estimate = float(model.fit.theta[place]), np.nan, np.nan
+            value, low, high = fitted.get(place, unfitted_estimate)
             if is_instant(parameter):
                 # The time of an event is only known to one sample spacing.
                 low, high = (
@@ -154,14 +154,20 @@ class VerdictBuilder:
                 )
             at_bound = bound_of(value, *ranges[place]) if place in fitted else None
             # JSON has no number for an unknown bound; at a bound the curvature gives no interval.
-            bounded = np.isfinite(low) and np.isfinite(high) and at_bound is None
-            ends = (low, high) if bounded else (None, None)
-            usual = self._get_plausible_range(place) if place in fitted else parameter.bounds
-            unusual = usual if not is_instant(parameter) and is_unusual(value, *usual) else None
+            is_bounded = np.isfinite(low) and np.isfinite(high) and at_bound is None
+            ends = (low, high) if is_bounded else (None, None)
+            plausible_range = (
+                self._get_plausible_range(place) if place in fitted else parameter.bounds
+            )
+            exceeded_range = (
+                plausible_range
+                if not is_instant(parameter) and is_unusual(value, *plausible_range)
+                else None
+            )
             unit = parameter.unit
             low_end, high_end = ends
             result[place] = FittedValue(
-                value, unit, low_end, high_end, at_bound, usual_range=unusual
+                value, unit, low_end, high_end, at_bound, usual_range=exceeded_range
             )
         return self._add_totals(model, result)
 
@@ -185,18 +191,22 @@ class VerdictBuilder:
         # This import is needed for robots only.
         from sims.robot.export.model_file_totals import totals
 
-        placed = list(self._iterate_fitted_effects(model))
-        fitted = [(effect, [numbers[i].value for i in places]) for effect, places in placed]
-        for (effect, places), made in zip(placed, totals(kind.robot, fitted), strict=True):
+        placed_effects = list(self._iterate_fitted_effects(model))
+        fitted = [(effect, [numbers[i].value for i in places]) for effect, places in placed_effects]
+        for (effect, places), effect_totals in zip(
+            placed_effects, totals(kind.robot, fitted), strict=True
+        ):
             # The model file keeps its gravity if the bodies are gravity-compensated.
-            keeps = is_gravity_compensated(effect.name, {"": numbers[places[0]]})
-            if keeps or not any(numbers[i].value for i in places):
+            is_compensated = is_gravity_compensated(effect.name, {"": numbers[places[0]]})
+            if is_compensated or not any(numbers[i].value for i in places):
                 continue
-            for i, found in zip(places, made, strict=True):
-                if found is not None:
-                    unit = found.unit if found.unit != numbers[i].unit else ""
-                    stated, total = found.stated, found.total
-                    numbers[i] = replace(numbers[i], stated=stated, total=total, total_unit=unit)
+            for i, number_total in zip(places, effect_totals, strict=True):
+                if number_total is not None:
+                    unit = number_total.unit if number_total.unit != numbers[i].unit else ""
+                    file_value, total = number_total.stated, number_total.total
+                    numbers[i] = replace(
+                        numbers[i], stated=file_value, total=total, total_unit=unit
+                    )
         return numbers
 
     def _iterate_fitted_effects(
@@ -246,10 +256,10 @@ class VerdictBuilder:
         if finding.verdict == "unknown" and self._is_refuted(search, finding):
             return replace(finding, verdict="adequate")
         numbers = self.collect_parameter_estimates(search, finding.model)
-        certain = [cause for cause in finding.causes if not cause.alternatives]
+        unambiguous_causes = [cause for cause in finding.causes if not cause.alternatives]
         places = [
             i
-            for cause in certain
+            for cause in unambiguous_causes
             for i in self.fitting_evaluator.get_coefficient_indices(cause.effect)
         ]
         results = all(numbers[i].is_result for i in places) and not self._is_at_bound(numbers)
@@ -264,20 +274,22 @@ class VerdictBuilder:
         """
         if finding.causes or finding.lack_of_fit.has_structure or finding.early_stop is not None:
             return False
-        tried = [model for model in search.models.values() if model.effects]
-        better = [
+        extended_models = [model for model in search.models.values() if model.effects]
+        better_effects = [
             model.effects
-            for model in tried
+            for model in extended_models
             if model.penalised_log_likelihood > search.base_model.penalised_log_likelihood
         ]
         held_out = finding.held_out_fits or {}
         excess = self._compute_held_out_excess(finding)
-        if not tried or (excess is not None and verdict_rules.misses_held_out_gap(excess, excess)):
+        if not extended_models or (
+            excess is not None and verdict_rules.misses_held_out_gap(excess, excess)
+        ):
             return False
         return not any(
             names not in held_out
             or held_out[names].penalised_log_likelihood > held_out[()].penalised_log_likelihood
-            for names in better
+            for names in better_effects
         )
 
     def _compute_held_out_excess(self, finding: DiagnosisResult) -> float | None:
@@ -285,8 +297,10 @@ class VerdictBuilder:
         runs, measured = self.held_out_evaluator, finding.held_out_fits
         if runs is None or measured is None or () not in measured:
             return None
-        left = (runs.observed - measured[()].simulated) / self.noise_floor.sigma
-        return float(np.sqrt(np.square(left[np.isfinite(runs.observed)]).mean())) - 1.0
+        normalised_residual = (runs.observed - measured[()].simulated) / self.noise_floor.sigma
+        return (
+            float(np.sqrt(np.square(normalised_residual[np.isfinite(runs.observed)]).mean())) - 1.0
+        )
 
     def _is_at_bound(self, numbers: Mapping[int, FittedValue]) -> bool:
         """Return whether a base parameter of the extended model is at a bound of its range.
@@ -301,11 +315,17 @@ class VerdictBuilder:
 
         It is the specified noise, or else the residual of a model without lack of fit.
         """
-        left = finding.model.likelihood.sigma
+        residual_sigma = finding.model.likelihood.sigma
         # The noise estimate assumes white noise, so the residual of a good model may exceed it.
-        usable = ~self.noise_floor.is_stated & np.isfinite(left) & (left > self.noise_floor.sigma)
+        is_usable = (
+            ~self.noise_floor.is_stated
+            & np.isfinite(residual_sigma)
+            & (residual_sigma > self.noise_floor.sigma)
+        )
         return np.where(
-            usable & (not finding.lack_of_fit.has_structure), left, self.noise_floor.sigma
+            is_usable & (not finding.lack_of_fit.has_structure),
+            residual_sigma,
+            self.noise_floor.sigma,
         )
 
     def _build_cause(self, evidence: CauseEvidence, numbers: dict[int, FittedValue]) -> Cause:
@@ -326,12 +346,14 @@ class VerdictBuilder:
             if c.least is None or c.least != c.most
         }
         form = form_of(world, evidence.effect)
-        says = effect.says
+        description = effect.says
         if form is not None:
-            says = with_solver_parameters(world, evidence.effect, says)
+            description = with_solver_parameters(world, evidence.effect, description)
         if world.kind.has_model and is_gravity_compensated(evidence.effect, by_name):
-            says = GRAVITY_COMPENSATED
-        return Cause(evidence.effect, evidence.alternatives, says, by_name, evidence.p_value, form)
+            description = GRAVITY_COMPENSATED
+        return Cause(
+            evidence.effect, evidence.alternatives, description, by_name, evidence.p_value, form
+        )
 
     def _list_counted_channels(self) -> list[int]:
         """List the channels with the same unit as the channel that sensor effects act on."""
@@ -340,7 +362,7 @@ class VerdictBuilder:
         reading = world.simulator.system.reading(world.channels)
         # Errors of different units cannot be added.
         unit = units[world.channels.index(reading)]
-        return [c for c, other in enumerate(units) if other == unit]
+        return [c for c, channel_unit in enumerate(units) if channel_unit == unit]
 
     def _compute_noise_floor(self, finding: DiagnosisResult) -> float:
         """Compute the RMS of the noise floor over the channels that count."""
@@ -370,11 +392,16 @@ class VerdictBuilder:
         # Without a prediction of the base model there is no gap to measure.
         if not np.isfinite(before[np.isfinite(runs.observed)]).all():
             return None
-        counted = self._list_counted_channels()
-        given = counted, self._compute_noise_floor(finding), rng, self._by_stretches
-        result = compute_held_out_gain(runs, before, after, *given)
+        counted_channels = self._list_counted_channels()
+        gain_arguments = (
+            counted_channels,
+            self._compute_noise_floor(finding),
+            rng,
+            self._by_stretches,
+        )
+        result = compute_held_out_gain(runs, before, after, *gain_arguments)
         return _build_held_out_result(
-            result, self.fitting_evaluator.simulator.channels[counted[0]].unit
+            result, self.fitting_evaluator.simulator.channels[counted_channels[0]].unit
         )
 
     def _list_candidates(
@@ -435,7 +462,7 @@ class VerdictBuilder:
         if runs is None or measured is None:
             return {}
         before = measured[()].simulated
-        found = {}
+        intervals = {}
         for names, simulated in measured.items():
             share = self._get_closed_share(finding, names)
             if len(names) != 1 or share is None or share <= MIN_REPORTED_GAIN:
@@ -443,16 +470,16 @@ class VerdictBuilder:
             # Each effect has its own random stream, so that its interval does not depend on the
             # others.
             rng = make_rng("held-out share", *names)
-            given = (
+            gain_arguments = (
                 self._list_counted_channels(),
                 self._compute_noise_floor(finding),
                 rng,
                 self._by_stretches,
             )
-            result = compute_held_out_gain(runs, before, simulated.simulated, *given)
+            result = compute_held_out_gain(runs, before, simulated.simulated, *gain_arguments)
             if np.isfinite(result.low) and np.isfinite(result.high):
-                found[names[0]] = result.low, result.high
-        return found
+                intervals[names[0]] = result.low, result.high
+        return intervals
 
     def _propose_next_run(
         self, search: EffectSearch, finding: DiagnosisResult
@@ -468,37 +495,37 @@ class VerdictBuilder:
             return _propose_identifying_run(finding.unidentified_parameters)
         # Causes come strongest first, and alternatives most plausible first.
         for cause in finding.causes:
-            for other in cause.alternatives:
-                rest = {name for name in finding.model.effects if name != cause.effect}
-                rival = search.models.get(frozenset({*rest, other}))
-                if rival is not None:
-                    return propose_discriminating_run(search, finding.model, rival)
+            for alternative in cause.alternatives:
+                other_effects = {name for name in finding.model.effects if name != cause.effect}
+                competing_model = search.models.get(frozenset({*other_effects, alternative}))
+                if competing_model is not None:
+                    return propose_discriminating_run(search, finding.model, competing_model)
         return None
 
 
 def _compute_rmse(world: RunEvaluator, simulated: Array, channels: list[int]) -> float:
     """Compute the RMS error over the channels that count, in their unit."""
-    seen = np.isfinite(world.observed)[..., channels]
-    error = (world.observed - simulated)[..., channels][seen]
+    observed_mask = np.isfinite(world.observed)[..., channels]
+    error = (world.observed - simulated)[..., channels][observed_mask]
     return float(np.sqrt(np.square(error).mean()))
 
 
-def _propose_identifying_run(vague: tuple[str, ...]) -> DiscriminatingRun:
+def _propose_identifying_run(unidentified: tuple[str, ...]) -> DiscriminatingRun:
     """Propose how to identify parameters that the data do not identify."""
-    several = len(vague) > 1
-    how = "they act differently from each other" if several else "it makes a difference"
-    names = " and ".join(vague)
-    return DiscriminatingRun(f"Measure {names} apart, or record runs in which {how}")
+    several = len(unidentified) > 1
+    condition_text = "they act differently from each other" if several else "it makes a difference"
+    names = " and ".join(unidentified)
+    return DiscriminatingRun(f"Measure {names} apart, or record runs in which {condition_text}")
 
 
-def _build_held_out_result(found: HeldOutGain, unit: str) -> HeldOutResult:
+def _build_held_out_result(gain: HeldOutGain, unit: str) -> HeldOutResult:
     """Convert a gain to the form of the verdict; an interval that the data do not give is None."""
     return HeldOutResult(
-        to_finite_or_none(found.base),
-        to_finite_or_none(found.extended),
-        to_finite_or_none(found.floor),
-        to_finite_or_none(found.gap_closed),
-        to_finite_or_none(found.low),
-        to_finite_or_none(found.high),
+        to_finite_or_none(gain.base),
+        to_finite_or_none(gain.extended),
+        to_finite_or_none(gain.floor),
+        to_finite_or_none(gain.gap_closed),
+        to_finite_or_none(gain.low),
+        to_finite_or_none(gain.high),
         unit,
     )

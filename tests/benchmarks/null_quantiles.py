@@ -44,7 +44,7 @@ def chances(test, seen, memory, count):
         noise = correlated(rng, memory, SIGMA, seen.shape)
         residual = test.project_out(noise[None])[0]
         bias = (test.project_out, None)
-        drawn = (draw_surrogates(residual, seen, SURROGATES, rng, left=f) for f in bias)
+        drawn = (draw_surrogates(residual, seen, SURROGATES, rng, project_out=f) for f in bias)
         found.append([test.compute_scores(residual, some).p_value for some in drawn])
     return np.array(found).T
 

@@ -105,7 +105,7 @@ def explain_batch(
             else LogResult(log.name, log.digest, error=_format_error(result))
         )
         rows[log.name] = row
-        ordered = [rows[each.name] for each in logs if each.name in rows]
+        ordered = [rows[batch_log.name] for batch_log in logs if batch_log.name in rows]
         _write_results(out, ordered)
         done(row)
         if stop():
@@ -130,9 +130,11 @@ def explain_log(log: BatchLog, settings: Mapping[str, Any], pdf: bool = False) -
         return LogResult(log.name, log.digest, error=get_first_line(error))
     document = explanation.answer.to_document()
     held_out = document["heldout"]
-    closed = held_out["gap_closed"] if held_out else None
+    gap_closed = held_out["gap_closed"] if held_out else None
     causes = tuple(document["causes"])
-    return LogResult(log.name, log.digest, document["verdict"], causes, closed, document["seconds"])
+    return LogResult(
+        log.name, log.digest, document["verdict"], causes, gap_closed, document["seconds"]
+    )
 
 
 def _format_error(error: object) -> str:

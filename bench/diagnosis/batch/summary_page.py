@@ -102,7 +102,7 @@ def render_summary_page(rows: Sequence[LogResult], batch: BatchPageInput) -> str
     tables = {"each": logs, "logs": summary_tables.read_log_table(rows), **charts.tables}
     for name, table in tables.items():
         page.add_table(name, table)
-    closed = logs["gap_closed"][logs["causes"] != ""].dropna()
+    closed_shares = logs["gap_closed"][logs["causes"] != ""].dropna()
     return page.render(
         _TEMPLATE,
         rows=rows,
@@ -110,8 +110,10 @@ def render_summary_page(rows: Sequence[LogResult], batch: BatchPageInput) -> str
         table_file=LOGS_TABLE_FILE,
         verdicts=_format_verdicts(rows),
         causes=_list_causes(rows, numbers, batch),
-        closed=_ClosedShare(closed.median(), closed.min(), closed.max(), len(closed))
-        if len(closed)
+        closed=_ClosedShare(
+            closed_shares.median(), closed_shares.min(), closed_shares.max(), len(closed_shares)
+        )
+        if len(closed_shares)
         else None,
         failed=[row for row in rows if row.error],
         is_numbered=not charts.has_names,
@@ -243,28 +245,34 @@ def _make_log_axis(logs: pd.DataFrame) -> Axis:
 def _make_number_panels(numbers: pd.DataFrame, across: Axis) -> list[Panel]:
     """Make a panel for each number of a cause, the most common first."""
     panels = []
-    for what in dict.fromkeys(numbers["what"].astype(str)):
-        name, _, label = what.rpartition(": ")
-        series = (Series("each log", "value", _AFTER, {"what": what}, "low", "high", "points"),)
-        up = Axis(label, scales=("linear",))
-        panels.append(Panel(name, "found", "place", series, across, up, {"number": what}))
+    for label_with_cause in dict.fromkeys(numbers["what"].astype(str)):
+        name, _, label = label_with_cause.rpartition(": ")
+        series = (
+            Series(
+                "each log", "value", _AFTER, {"what": label_with_cause}, "low", "high", "points"
+            ),
+        )
+        value_axis = Axis(label, scales=("linear",))
+        panels.append(
+            Panel(name, "found", "place", series, across, value_axis, {"number": label_with_cause})
+        )
     return panels
 
 
 def _make_held_out_panels(logs: pd.DataFrame, across: Axis) -> list[Panel]:
     """Make the panel of the errors on held-out runs, in noise floors; none without errors."""
     errors = logs[["before", "after"]]
-    measured = int(errors.map(lambda error: isfinite(error) and error > 0).all(axis=1).sum())
-    if not measured:
+    log_count = int(errors.map(lambda error: isfinite(error) and error > 0).all(axis=1).sum())
+    if not log_count:
         return []
     series = (
         Series("before: tuned simulation", "before", _BEFORE, draw="points"),
         Series("after: with the causes found", "after", _AFTER, draw="points"),
     )
-    up = Axis("error on held-out runs [noise floors]", "log", holds=(1.0,))
-    title = "One log" if measured == 1 else f"{measured} logs"
+    error_axis = Axis("error on held-out runs [noise floors]", "log", holds=(1.0,))
+    title = "One log" if log_count == 1 else f"{log_count} logs"
     rules = (ReferenceLine(1.0, "noise floor"),)
-    return [Panel(title, "held-out", "place", series, across, up, rules=rules)]
+    return [Panel(title, "held-out", "place", series, across, error_axis, rules=rules)]
 
 
 def draw_summary_figure(

@@ -86,12 +86,17 @@ def build_number_table(rows: Sequence[LogResult]) -> pd.DataFrame:
         for cause in row.causes:
             for name, number in cause["coefficients"].items():
                 label = format_label(place_of(name), number["unit"], LONGEST_NAME)
-                what = f"{format_cause(cause)}: {label}"
-                cells = {"cause": format_cause(cause), "name": name, "what": what, **number}
+                label_with_cause = f"{format_cause(cause)}: {label}"
+                cells = {
+                    "cause": format_cause(cause),
+                    "name": name,
+                    "what": label_with_cause,
+                    **number,
+                }
                 lines.append({"number": log_number, "log": row.log, **cells})
     columns = ["number", "log", "cause", "name", "what", "value", "low", "high", "unit"]
     frame = pd.DataFrame(lines, columns=columns)
     frame = frame.astype(dict.fromkeys(["value", "low", "high"], float))
-    often = frame["what"].map(frame["what"].value_counts())
-    order = often.sort_values(ascending=False, kind="stable").index
+    frequency = frame["what"].map(frame["what"].value_counts())
+    order = frequency.sort_values(ascending=False, kind="stable").index
     return frame.loc[order].reset_index(drop=True)

@@ -143,11 +143,13 @@ def list_absent_effects(subject: SheetSubject, extended: ExtendedSimulator) -> I
     ]
     modelled = {*local_effects, *extended.effects}
     effects = {effect.name: effect for effect in subject.list_effects()}
-    simpler = {
-        other for name in local_effects for other in getattr(effects.get(name), "contains", ())
+    simpler_effects = {
+        contained_effect
+        for name in local_effects
+        for contained_effect in getattr(effects.get(name), "contains", ())
     }
     for name in effects:
-        if name not in modelled | simpler and name.partition("@")[2] != ALL_PLACES:
+        if name not in modelled | simpler_effects and name.partition("@")[2] != ALL_PLACES:
             yield name
 
 

@@ -171,7 +171,7 @@ def _add_small_gaps(
     Otherwise the smallest direction may already be detectable, and the limit is not known.
     Each size is half the previous one, `GAP_HALVINGS` times.
     """
-    smallest: dict[str, CandidateDirection] = {}
+    smallest_probes: dict[str, CandidateDirection] = {}
     for probe in directions.candidates:
         is_backlash = (
             probe.fixed
@@ -179,22 +179,24 @@ def _add_small_gaps(
             not in NONLINEAR_COEFFICIENT_KINDS
         )
         if is_backlash and (
-            probe.effect not in smallest
-            or probe.coefficients[0] < smallest[probe.effect].coefficients[0]
+            probe.effect not in smallest_probes
+            or probe.coefficients[0] < smallest_probes[probe.effect].coefficients[0]
         ):
-            smallest[probe.effect] = probe
-    smaller = [
+            smallest_probes[probe.effect] = probe
+    smaller_probes = [
         replace(p, coefficients=p.coefficients * 0.5**n)
-        for p in smallest.values()
+        for p in smallest_probes.values()
         for n in range(1, GAP_HALVINGS + 1)
     ]
-    if not smaller:
+    if not smaller_probes:
         return directions
     values = np.nan_to_num(
-        compute_responses(evaluator, fit, [(probe.effect, probe.coefficients) for probe in smaller])
+        compute_responses(
+            evaluator, fit, [(probe.effect, probe.coefficients) for probe in smaller_probes]
+        )
     )
     return DirectionSet(
-        (*directions.candidates, *smaller),
+        (*directions.candidates, *smaller_probes),
         np.concatenate([directions.responses, np.moveaxis(values, 0, -1)], axis=3),
     )
 
@@ -225,7 +227,7 @@ class _Shown:
         world: RunEvaluator,
         noise: NoiseModel,
         fit: TrajectoryFit,
-        found: DirectionSet,
+        direction_set: DirectionSet,
         residual: Array,
     ) -> None:
         """Compute the information on each candidate coefficient, eq. (1), and its step, eq. (2).
@@ -237,23 +239,27 @@ class _Shown:
         information of eq. (1) that remains, and `leaning` (K,) the estimate after one Gauss-Newton
         step from zero, eq. (2).
         """
-        self.world, self.found = world, found
+        self.world, self.found = world, direction_set
         self.q = fit.free.size
         self.places = fit.free.tolist()
         self.free = tuple(world.parameters[i].name for i in fit.free.tolist())
-        own, states = fit.jacobian[..., : self.q], fit.jacobian[..., self.q :]
-        columns = np.concatenate([own, found.responses, residual[..., None], states], axis=3)
-        curved = compute_fisher_blocks_from_jacobian(
-            world, columns, columns.shape[3] - states.shape[3], noise
+        parameter_columns, state_columns = fit.jacobian[..., : self.q], fit.jacobian[..., self.q :]
+        columns = np.concatenate(
+            [parameter_columns, direction_set.responses, residual[..., None], state_columns], axis=3
         )
-        own_sum = curved.own.sum(axis=0)
-        self.left, _ = compute_schur_complement(own_sum, curved.cross, curved.inner)
+        fisher_blocks = compute_fisher_blocks_from_jacobian(
+            world, columns, columns.shape[3] - state_columns.shape[3], noise
+        )
+        own_sum = fisher_blocks.own.sum(axis=0)
+        self.left, _ = compute_schur_complement(own_sum, fisher_blocks.cross, fisher_blocks.inner)
         inner = slice(0, self.q)
         self.covariance = invert_scaled(own_sum[inner, inner], self.left[inner, inner])
-        beside = self.left[self.q : -1, : self.q]
-        self.along = along = beside @ self.covariance
-        raw = np.diagonal(self.left)[self.q : -1]
-        self.powers = np.maximum(raw - np.einsum("kq,kq->k", along, beside), 0.0)  # (1)
+        cross_products = self.left[self.q : -1, : self.q]
+        self.along = along = cross_products @ self.covariance
+        raw_powers = np.diagonal(self.left)[self.q : -1]
+        self.powers = np.maximum(
+            raw_powers - np.einsum("kq,kq->k", along, cross_products), 0.0
+        )  # (1)
         pull = self.left[self.q : -1, -1] - along @ self.left[: self.q, -1]
         self.leaning = pull / np.maximum(self.powers, 1e-300)  # (2)
 
@@ -266,19 +272,21 @@ class _Shown:
                 shapes.setdefault((probe.effect, probe.place), []).append(k)
         best = {key: probe_indices[0] for key, probe_indices in shapes.items()}
         limits = dict.fromkeys(probe.effect for probe in self.found.candidates if probe.fixed)
-        reaches = {}
+        detection_limits = {}
         for (name, place), probe_indices in shapes.items():
             # At that shape a richer law may be equivalent to a simpler one that it contains.
             new_shapes = [
                 k for k in probe_indices if not self._is_covered_by_simpler_effect(name, k, best)
             ]
             if name not in limits and new_shapes:
-                reaches[name, self._get_coefficient_name(name, place)] = (
+                detection_limits[name, self._get_coefficient_name(name, place)] = (
                     self._compute_proportional_limit(new_shapes[0])
                 )
         for name in limits:
-            reaches[name, self._get_coefficient_name(name, 0)] = self._compute_switching_limit(name)
-        return DetectionLimits(self.free, self.covariance, reaches, prediction_half_widths)
+            detection_limits[name, self._get_coefficient_name(name, 0)] = (
+                self._compute_switching_limit(name)
+            )
+        return DetectionLimits(self.free, self.covariance, detection_limits, prediction_half_widths)
 
     def _get_coefficient_name(self, effect: str, place: int) -> str:
         return self.world.available_effects[effect].on(self.world.simulator.system)[place].name
@@ -323,13 +331,13 @@ class _Shown:
 
         The simpler effect may be in the model or not.
         """
-        simpler = set(self.world.available_effects[name].contains)
-        others = [self.q + j for (other, _), j in best.items() if other in simpler]
-        for other in simpler & set(self.world.slots):
-            there = self.world.get_coefficient_indices(other)
-            others += [j for j, place in enumerate(self.places) if place in there]
+        simpler_effects = set(self.world.available_effects[name].contains)
+        other_columns = [self.q + j for (effect, _), j in best.items() if effect in simpler_effects]
+        for effect in simpler_effects & set(self.world.slots):
+            effect_places = self.world.get_coefficient_indices(effect)
+            other_columns += [j for j, place in enumerate(self.places) if place in effect_places]
         i = self.q + k
-        for j in others:
+        for j in other_columns:
             scale = np.sqrt(self.left[i, i] * self.left[j, j])
             if scale > 0 and abs(self.left[i, j]) / scale > SAME_COEFFICIENT_CORRELATION:
                 return True
@@ -345,17 +353,22 @@ class _Shown:
         probes = [
             (k, p) for k, p in enumerate(self.found.candidates) if p.effect == name and p.fixed
         ]
-        sized = sorted((float(p.coefficients[0]), k) for k, p in probes)
-        sizes = [
-            size for size, k in sized if np.sqrt(self.powers[k]) >= MIN_DETECTABLE_LIMIT_SIGMAS
+        sizes_with_index = sorted((float(p.coefficients[0]), k) for k, p in probes)
+        detectable_sizes = [
+            size
+            for size, k in sizes_with_index
+            if np.sqrt(self.powers[k]) >= MIN_DETECTABLE_LIMIT_SIGMAS
         ]
         # A limit has more influence the smaller it is, and backlash the larger it is.
-        least, most = (self.left[self.q + k, self.q + k] for _, k in (sized[0], sized[-1]))
-        below = bool(least > most)
-        if not sizes:
-            return DetectionLimit(np.inf, limit="below" if below else "above")
+        smallest_information, largest_information = (
+            self.left[self.q + k, self.q + k]
+            for _, k in (sizes_with_index[0], sizes_with_index[-1])
+        )
+        is_upper_limit = bool(smallest_information > largest_information)
+        if not detectable_sizes:
+            return DetectionLimit(np.inf, limit="below" if is_upper_limit else "above")
         return (
-            DetectionLimit(max(sizes), limit="below")
-            if below
-            else DetectionLimit(min(sizes), limit="above")
+            DetectionLimit(max(detectable_sizes), limit="below")
+            if is_upper_limit
+            else DetectionLimit(min(detectable_sizes), limit="above")
         )

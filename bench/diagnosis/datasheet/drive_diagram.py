@@ -131,44 +131,44 @@ def compute_drive_diagram(
     """
     joint = _Joint(subject, extended)
     zero = np.zeros(1)
-    alone = float(joint.friction(zero, zero)[0])
-    reach = strongest or DEFAULT_LOAD_FACTOR * alone or 1.0
+    no_load_friction = float(joint.friction(zero, zero)[0])
+    reach = strongest or DEFAULT_LOAD_FACTOR * no_load_friction or 1.0
     load = np.linspace(-reach, reach, LOAD_POINT_COUNT)
     search_range = MAX_FORCE_FACTOR * reach
 
-    def ahead(u: Array, p: Array) -> Array:
+    def forward_balance(u: Array, p: Array) -> Array:
         return u - p + joint.pull(u, p) - joint.friction(u, p)  # (1)
 
-    def behind(u: Array, p: Array) -> Array:
+    def backward_balance(u: Array, p: Array) -> Array:
         return u - p + joint.pull(u, p) + joint.friction(u, p)  # (2)
 
-    def unpowered(p: Array) -> Array:
-        return -behind(np.zeros_like(p), p)
+    def unpowered_balance(p: Array) -> Array:
+        return -backward_balance(np.zeros_like(p), p)
 
     return DriveDiagram(
         "N" if joint.system.kind == "linear" else "N*m",
         load,
-        _find_roots(lambda u: ahead(u, load), search_range, LOAD_POINT_COUNT),
-        _find_roots(lambda u: behind(u, load), search_range, LOAD_POINT_COUNT),
-        float(_find_roots(lambda u: ahead(u, zero), search_range, 1)[0]),
-        float(_find_roots(unpowered, search_range, 1)[0]),
+        _find_roots(lambda u: forward_balance(u, load), search_range, LOAD_POINT_COUNT),
+        _find_roots(lambda u: backward_balance(u, load), search_range, LOAD_POINT_COUNT),
+        float(_find_roots(lambda u: forward_balance(u, zero), search_range, 1)[0]),
+        float(_find_roots(unpowered_balance, search_range, 1)[0]),
         joint.names,
         reach,
         joint.without,
     )
 
 
-def _find_roots(growing: Callable[[Array], Array], search_range: float, count: int) -> Array:
+def _find_roots(function: Callable[[Array], Array], search_range: float, count: int) -> Array:
     """Find zeros (N,) of increasing functions by bisection; infinite outside the range."""
     low, high = np.full(count, -search_range), np.full(count, search_range)
-    never, always = growing(high) <= 0, growing(low) > 0
+    is_below_zero, is_above_zero = function(high) <= 0, function(low) > 0
     for _ in range(BISECTION_STEPS):
         middle = 0.5 * (low + high)
-        above = growing(middle) > 0
-        low, high = np.where(above, low, middle), np.where(above, middle, high)
+        is_positive = function(middle) > 0
+        low, high = np.where(is_positive, low, middle), np.where(is_positive, middle, high)
     # A zero is only found up to the rounding error of the bisection.
     middle = np.where(np.abs(high) < ROUNDING_SHARE * search_range, 0.0, 0.5 * (low + high))
-    root: Array = np.where(never, np.inf, np.where(always, -np.inf, middle))
+    root: Array = np.where(is_below_zero, np.inf, np.where(is_above_zero, -np.inf, middle))
     return root
 
 
@@ -195,14 +195,16 @@ class _Joint:
             if issubclass(law, HiddenStateEffect):
                 self.without = (*self.without, law.name)
             elif law.at == "joint" and issubclass(law, Friction | Force):
-                c = np.array([values.get(one.name, 0.0) for one in law.coefficients])
+                c = np.array(
+                    [values.get(law_coefficient.name, 0.0) for law_coefficient in law.coefficients]
+                )
                 self.laws.append((law(), c[:, None, None]))
-        stated = (
+        file_friction = (
             subject.get_model_file_value(f"friction.coulomb@{subject.joint}")
             if subject.joint
             else None
         )
-        self.stated = 0.0 if stated is None else stated.value
+        self.stated = 0.0 if file_friction is None else file_friction.value
         self.names = tuple(law.name for law, _ in self.laws)
 
     def friction(self, drive: Array, load: Array) -> Array:
@@ -233,10 +235,10 @@ class _Joint:
 
         Friction and force laws are evaluated at this state.
         """
-        nothing = np.zeros((len(drive), 1))
+        zeros = np.zeros((len(drive), 1))
         inputs = {"drive": drive[:, None], "load": load[:, None]}
         return StateSnapshot(
-            self.system, np.zeros((len(drive), 0)), {}, nothing, nothing, nothing, inputs
+            self.system, np.zeros((len(drive), 0)), {}, zeros, zeros, zeros, inputs
         )
 
 

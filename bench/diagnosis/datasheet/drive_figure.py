@@ -85,12 +85,14 @@ def draw_diagram(axes: Axes, diagram: DriveDiagram) -> None:
     """
     reach, unit = diagram.reach, format_unit(diagram.unit)
     load = diagram.load
-    ahead, back = (np.clip(side, -2 * reach, 2 * reach) for side in (diagram.forward, diagram.back))
-    axes.fill_between(load, ahead, 2 * reach, color=style.PALE_BLUE, linewidth=0)
-    axes.fill_between(load, back, ahead, color=style.HELD_OUT_GREY, linewidth=0)
-    axes.fill_between(load, -2 * reach, back, color=style.PALE_RUST, linewidth=0)
-    axes.plot(load, ahead, color=style.BLUE, linewidth=1.5)
-    axes.plot(load, back, color=style.VERMILION, linewidth=1.5, linestyle=(0, (5, 2)))
+    forward, backward = (
+        np.clip(boundary, -2 * reach, 2 * reach) for boundary in (diagram.forward, diagram.back)
+    )
+    axes.fill_between(load, forward, 2 * reach, color=style.PALE_BLUE, linewidth=0)
+    axes.fill_between(load, backward, forward, color=style.HELD_OUT_GREY, linewidth=0)
+    axes.fill_between(load, -2 * reach, backward, color=style.PALE_RUST, linewidth=0)
+    axes.plot(load, forward, color=style.BLUE, linewidth=1.5)
+    axes.plot(load, backward, color=style.VERMILION, linewidth=1.5, linestyle=(0, (5, 2)))
     axes.plot(load, load, color=style.CONNECTOR_GREY, linewidth=0.8, linestyle=":")
     axes.axhline(0.0, color=style.ZERO_LINE_GREY, linewidth=0.6)
     axes.axvline(0.0, color=style.ZERO_LINE_GREY, linewidth=0.6)
@@ -109,7 +111,7 @@ def draw_diagram(axes: Axes, diagram: DriveDiagram) -> None:
     axes.text(0.55 * reach, -0.75 * reach, "moves back", **text_style)
     axes.text(0.72 * reach, 0.25 * reach, "back-driven:\nthe load slips", **text_style)
     middle = 0.62 * reach
-    if np.interp(middle, load, ahead - back) > 0.15 * reach:
+    if np.interp(middle, load, forward - backward) > 0.15 * reach:
         axes.text(middle, middle, "holds", **text_style)
     axes.set(
         xlim=(-reach, reach),
@@ -220,30 +222,32 @@ def _draw_effects_not_shown(
     """
     rows = []
     names = [format_short_name(row) for row in content.rows if row.number is None]
-    longest = min(max(map(len, names), default=0), _NAME_LETTERS)
+    name_length = min(max(map(len, names), default=0), _NAME_LETTERS)
     # A character of the monospaced font is 0.602 of its size wide.
-    beside_name = (0.602 * size / POINTS * longest + 0.12) / A4_INCHES[0]
+    beside_name = (0.602 * size / POINTS * name_length + 0.12) / A4_INCHES[0]
     letters = int((0.45 - beside_name) * A4_INCHES[0] * POINTS / (_LETTER * size))
     for row in content.rows:
         if row.number is None:
-            mixed = format_confounding(row)
-            said = format_detection_limit(row) + (
-                f" (mixed up with {mixed})" if mixed and row.detection_limit else ""
+            confounding = format_confounding(row)
+            limit_text = format_detection_limit(row) + (
+                f" (mixed up with {confounding})" if confounding and row.detection_limit else ""
             )
-            lines = textwrap.wrap(said, letters)
+            lines = textwrap.wrap(limit_text, letters)
             rows.append((format_short_name(row), lines))
     line = _SMALL * 1.2 * size / _SMALL_SIZE
     heights = [len(lines) for _, lines in rows]
-    half = next((i for i in range(len(rows) + 1) if 2 * sum(heights[:i]) >= sum(heights)), 0)
-    tallest = line * max(sum(heights[:half]), sum(heights[half:]))
+    split_row = next((i for i in range(len(rows) + 1) if 2 * sum(heights[:i]) >= sum(heights)), 0)
+    tallest = line * max(sum(heights[:split_row]), sum(heights[split_row:]))
     # A long table must not overlap the foot of the page.
     begins = max(begins, 0.045 + tallest)
-    for column, part in enumerate((rows[:half], rows[half:])):
+    for column, part in enumerate((rows[:split_row], rows[split_row:])):
         x, y = _MARGIN + 0.45 * column, begins
         for name, lines in part:
-            figure.text(x, y, sanitise(name, longest), va="top", fontsize=size, family="monospace")
-            said = "\n".join(lines)
-            figure.text(x + beside_name, y, said, va="top", fontsize=size, linespacing=1.25)
+            figure.text(
+                x, y, sanitise(name, name_length), va="top", fontsize=size, family="monospace"
+            )
+            limit_text = "\n".join(lines)
+            figure.text(x + beside_name, y, limit_text, va="top", fontsize=size, linespacing=1.25)
             y -= line * len(lines)
     heading = "Not shown by these data, and how small a number they would have shown (95 %)"
     figure.text(_MARGIN, begins + 0.018, heading, weight="bold", va="top")
@@ -257,8 +261,8 @@ def _draw_diagram_text(figure: Figure, diagram: DriveDiagram, x: float, y: float
     unit = diagram.unit
     lines = [f"starts without a load at {append_unit(format_number(diagram.breakaway), unit)}"]
     load = append_unit(format_number(diagram.backdrive), unit)
-    turned = np.isfinite(diagram.backdrive)
-    lines.append(f"without power a load of {load} turns it" if turned else "locks itself")
+    is_backdrivable = np.isfinite(diagram.backdrive)
+    lines.append(f"without power a load of {load} turns it" if is_backdrivable else "locks itself")
     laws = sanitise(", ".join(diagram.laws), 100)
     lines.append(f"laws: {laws or 'none, no friction at rest'}")
     if diagram.without:

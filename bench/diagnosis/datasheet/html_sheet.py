@@ -82,6 +82,6 @@ def _describe_rest_forces(diagram: DriveDiagram) -> str:
 
 
 def _format_runs(runs: Sequence[str]) -> str:
-    named = f"runs {', '.join(runs[:_NAMED_RUNS])}" if len(runs) > 1 else f"run {runs[0]}"
-    more = len(runs) - _NAMED_RUNS
-    return f"{named} and {more} more" if more > 0 else named
+    named_runs = f"runs {', '.join(runs[:_NAMED_RUNS])}" if len(runs) > 1 else f"run {runs[0]}"
+    unnamed_count = len(runs) - _NAMED_RUNS
+    return f"{named_runs} and {unnamed_count} more" if unnamed_count > 0 else named_runs

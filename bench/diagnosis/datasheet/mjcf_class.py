@@ -160,17 +160,20 @@ def _render_class(
 
 def make_class_name(name: str) -> str:
     """Convert a name to one that is valid as a class name in XML and MuJoCo."""
-    plain = re.sub(r"[^A-Za-z0-9_.-]+", "_", name).strip("_")
-    return plain or "drive"
+    valid_name = re.sub(r"[^A-Za-z0-9_.-]+", "_", name).strip("_")
+    return valid_name or "drive"
 
 
 def _format_file(facts: SheetContent, classes: Sequence[_Class]) -> str:
     """Format the classes as a file that MuJoCo loads and that others can include."""
     title = facts.recording.title or facts.recording.path.stem
     heading = f"{make_class_name(facts.name)}: data sheet from {title}; written by simgap datasheet"
-    safe = re.sub(r"-(?=-)", "- ", heading)
+    escaped_heading = re.sub(r"-(?=-)", "- ", heading)
     inner = "\n".join(rendered.text for rendered in classes).replace("\n", "\n    ")
-    return f"<mujoco>\n  <!-- {safe} -->\n  <default>\n    {inner}\n  </default>\n</mujoco>\n"
+    return (
+        f"<mujoco>\n  <!-- {escaped_heading} -->\n"
+        f"  <default>\n    {inner}\n  </default>\n</mujoco>\n"
+    )
 
 
 @dataclass(frozen=True)
@@ -234,9 +237,9 @@ def _map_effects_to_model(
             )
             continue
         place = places.get(effect.at, "")
-        off = FittedValue(0.0, "1", None, None)
+        zero_value = FittedValue(0.0, "1", None, None)
         coefficients = {
-            c.name: numbers.get(c.name, off) for c in effect.on(facts.subject.kind.system)
+            c.name: numbers.get(c.name, zero_value) for c in effect.on(facts.subject.kind.system)
         }
         causes[f"{name}@{place}" if place else name] = coefficients
     if dry_friction:
@@ -306,7 +309,7 @@ def _describe_log_for_model(
     path = facts.recording.path
     if path.suffix != ".csv" or any(run.log for run in facts.recording.runs):
         return
-    stated = read_toml(get_description_path(path))
+    log_description = read_toml(get_description_path(path))
     file = relpath(path.resolve(), folder.resolve())
     document: dict[str, Any] = {
         "model": f"{stem}.xml",
@@ -318,7 +321,7 @@ def _describe_log_for_model(
         },
     }
     for kind in ("channels", "inputs"):
-        for name, description in stated.get(kind, {}).items():
+        for name, description in log_description.get(kind, {}).items():
             if name in model.signals:
                 document[kind][model.signals[name]] = {"file": file, "column": name, **description}
     yield f"{stem}.toml", tomli_w.dumps(document)

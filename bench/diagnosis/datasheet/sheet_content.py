@@ -50,7 +50,7 @@ class SheetContent:
 
     def document(self) -> dict[str, Any]:
         """Return the content of sheet.toml."""
-        named = {row.name: row.to_document() for row in self.rows}
+        rows_by_name = {row.name: row.to_document() for row in self.rows}
         joint = {"joint": self.subject.joint} if self.subject.joint else {}
         return {
             "format": FORMAT_VERSION,
@@ -61,7 +61,7 @@ class SheetContent:
             "runs": [run.name for run in self.recording.training()],
             "verdict": self.verdict.verdict,
             "elsewhere": list(self.elsewhere()),
-            "quantities": named,
+            "quantities": rows_by_name,
             **self._describe_rest(),
         }
 
@@ -125,8 +125,13 @@ class SheetContent:
             if r.number
         ]
         absent = [row.name for row in self.rows if row.number is None]
-        named, unnamed_count = absent[:NAMES_IN_TERMINAL], len(absent) - NAMES_IN_TERMINAL
+        absent_names, unnamed_count = absent[:NAMES_IN_TERMINAL], len(absent) - NAMES_IN_TERMINAL
         if unnamed_count > 0:
-            named = [*named, f"{unnamed_count} more (the sheet says how small each could be)"]
-        lines.append(f"not shown by these data: {sanitise(joined(named), 2000) or 'nothing'}")
+            absent_names = [
+                *absent_names,
+                f"{unnamed_count} more (the sheet says how small each could be)",
+            ]
+        lines.append(
+            f"not shown by these data: {sanitise(joined(absent_names), 2000) or 'nothing'}"
+        )
         return lines

@@ -149,8 +149,8 @@ class _Rows:
                     / step
                 )
             spread = np.array(slopes)
-            half = Z95 * float(np.sqrt(max(spread @ covariance @ spread, 0.0)))
-            number = FittedValue(value, derived.unit, value - half, value + half)
+            half_width = Z95 * float(np.sqrt(max(spread @ covariance @ spread, 0.0)))
+            number = FittedValue(value, derived.unit, value - half_width, value + half_width)
             row = SheetRow(derived.name, derived.says, "system", "derived", derived.unit, number)
             yield replace(row, strongest=derived.strongest)
 
@@ -161,8 +161,10 @@ class _Rows:
                 nominal = FittedValue(parameter.nominal, parameter.unit, None, None)
                 # A parameter that is not in the file has its nominal value.
                 number = self.extended.parameters.get(parameter.name, nominal)
-                says = parameter.says or parameter.name
-                row = _make_fitted_row(parameter.name, says, "system", "fitted", number, None)
+                description = parameter.says or parameter.name
+                row = _make_fitted_row(
+                    parameter.name, description, "system", "fitted", number, None
+                )
                 yield replace(
                     row, prediction_half_width=self.shown.prediction_half_widths.get(parameter.name)
                 )
@@ -191,7 +193,9 @@ class _Rows:
                     # A coefficient of zero means that the effect is absent; its detection limit is
                     # computed.
                     continue
-                has_several = sum(other == effect for other, _, _ in local_coefficients) > 1
+                has_several = (
+                    sum(other_effect == effect for other_effect, _, _ in local_coefficients) > 1
+                )
                 label = f"{effect} {coefficient}" if has_several else effect
                 row = self._make_effect_row(effect, label, number, "found", self._find_cause(name))
                 if _is_nothing(number):
@@ -209,13 +213,13 @@ class _Rows:
         It is known only if several runs or logs identify the value. For a number of the model file
         it is converted to the unit of that number.
         """
-        half, stated = (
+        half_width, file_value = (
             self.shown.prediction_half_widths.get(parameter),
             self.subject.get_model_file_value(effect),
         )
-        if half is None or stated is None:
-            return replace(row, prediction_half_width=half)
-        return replace(row, prediction_half_width=stated.compute_half_width(half))
+        if half_width is None or file_value is None:
+            return replace(row, prediction_half_width=half_width)
+        return replace(row, prediction_half_width=file_value.compute_half_width(half_width))
 
     def _make_hidden_row(self, row: SheetRow, effect: str, number: FittedValue) -> SheetRow:
         """Build the row of a cause at other places that is not shown here."""
@@ -232,13 +236,13 @@ class _Rows:
 
     def absent(self) -> Iterator[SheetRow]:
         """Yield the effects that are not in the model, with their detection limits."""
-        for (effect, coefficient), reach in self.shown.reaches.items():
-            several = len({c for e, c in self.shown.reaches if e == effect}) > 1
-            label = f"{effect} {coefficient}" if several else effect
-            placed = library.find_effect(effect, self.subject.kind.system)
-            c = next(c for c in placed.coefficients if c.name == coefficient)
+        for (effect, coefficient), detection_limit in self.shown.reaches.items():
+            has_several = len({c for e, c in self.shown.reaches if e == effect}) > 1
+            label = f"{effect} {coefficient}" if has_several else effect
+            placed_effect = library.find_effect(effect, self.subject.kind.system)
+            c = next(c for c in placed_effect.coefficients if c.name == coefficient)
             unit = c.unit_on(self.subject.kind.system, self.extended.observe) or "1"
-            yield self._make_absent_effect_row(effect, label, unit, reach)
+            yield self._make_absent_effect_row(effect, label, unit, detection_limit)
 
     def _make_absent_effect_row(
         self, effect: str, label: str, unit: str, reach: DetectionLimit
@@ -248,27 +252,27 @@ class _Rows:
         If the effect changes a number of the model file, the limit is converted to the unit of that
         number. `label` is the name of the row, and `unit` the unit of the coefficient.
         """
-        stated = self.subject.get_model_file_value(effect)
+        file_value = self.subject.get_model_file_value(effect)
         value = None
-        if stated is not None:
-            unit, value = stated.unit, stated.value
+        if file_value is not None:
+            unit, value = file_value.unit, file_value.value
             reach = replace(
                 reach,
-                size=stated.compute_half_width(reach.size),
-                estimate_if_fitted=stated.compute_half_width(reach.estimate_if_fitted),
+                size=file_value.compute_half_width(reach.size),
+                estimate_if_fitted=file_value.compute_half_width(reach.estimate_if_fitted),
             )
-        instead = tuple(c.effect for c in self.verdict.causes if effect in c.alternatives)
-        says = format_effect_name(effect.partition("@")[0])
+        alternatives = tuple(c.effect for c in self.verdict.causes if effect in c.alternatives)
+        description = format_effect_name(effect.partition("@")[0])
         part = library.find_effect(effect, self.subject.kind.system).at
         return SheetRow(
             label,
-            says,
+            description,
             part,
             "not shown",
             unit,
             stated=value,
             detection_limit=reach,
-            alternatives=instead,
+            alternatives=alternatives,
         )
 
     def _make_effect_row(
@@ -289,12 +293,17 @@ class _Rows:
             state: State of the quantity, such as ``fitted`` or ``found``.
             cause: Cause in the verdict, for its p-value and alternatives; None for a parameter.
         """
-        placed = library.find_effect(effect, self.subject.kind.system)
-        stated = self.subject.get_model_file_value(effect)
-        if stated is not None:
-            number = stated.compute_total(number)
+        placed_effect = library.find_effect(effect, self.subject.kind.system)
+        file_value = self.subject.get_model_file_value(effect)
+        if file_value is not None:
+            number = file_value.compute_total(number)
         row = _make_fitted_row(
-            label, format_effect_name(effect.partition("@")[0]), placed.at, state, number, stated
+            label,
+            format_effect_name(effect.partition("@")[0]),
+            placed_effect.at,
+            state,
+            number,
+            file_value,
         )
         if cause is None:
             return row
@@ -307,11 +316,16 @@ class _Rows:
 
 
 def _make_fitted_row(
-    name: str, says: str, part: str, state: QuantityState, number: FittedValue, stated: Any
+    name: str,
+    description: str,
+    part: str,
+    state: QuantityState,
+    number: FittedValue,
+    file_value: Any,
 ) -> SheetRow:
-    """Build a row with a fitted value and, unless `stated` is None, the model file's value."""
-    value = None if stated is None else stated.value
-    return SheetRow(name, says, part, state, number.unit, number, value)
+    """Build a row with a fitted value and, unless `file_value` is None, the model file's value."""
+    nominal = None if file_value is None else file_value.value
+    return SheetRow(name, description, part, state, number.unit, number, nominal)
 
 
 def _get_coefficient_part(place: str) -> str:
@@ -325,7 +339,7 @@ def _is_nothing(number: FittedValue) -> bool:
     return number.low <= 0 <= number.high
 
 
-def _make_number_limit(number: FittedValue, stated: ModelFileValue | None) -> DetectionLimit:
+def _make_number_limit(number: FittedValue, file_value: ModelFileValue | None) -> DetectionLimit:
     low, high = number.low or 0.0, number.high or 0.0
     size = max(abs(low), abs(high))
-    return DetectionLimit(size if stated is None else stated.compute_half_width(size))
+    return DetectionLimit(size if file_value is None else file_value.compute_half_width(size))

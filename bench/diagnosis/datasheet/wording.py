@@ -50,10 +50,10 @@ def format_name(row: SheetRow) -> str:
 
 def format_short_name(row: SheetRow) -> str:
     """Return the name of the row without the joint or actuator that the whole sheet describes."""
-    effect, _, rest = row.name.partition("@")
-    if not rest:
+    effect, _, placed_name = row.name.partition("@")
+    if not placed_name:
         return row.name
-    place, _, coefficient = rest.partition(" ")
+    place, _, coefficient = placed_name.partition(" ")
     channel = place.partition(".")[0] if row.part == "channel" else ""
     return " ".join(part for part in (effect, coefficient, channel) if part)
 
@@ -77,9 +77,11 @@ def format_evidence(row: SheetRow, short: bool = False) -> str:
     unjudged_text = "not judged" if short else "the search ended before it was judged"
     parts = [format_p_value(row.p_value) if is_judged else unjudged_text]
     if row.share is not None:
-        closed = format_percent(row.share)
+        closed_share = format_percent(row.share)
         parts.append(
-            f"{closed} held out" if short else f"alone it closes {closed} of the held-out gap"
+            f"{closed_share} held out"
+            if short
+            else f"alone it closes {closed_share} of the held-out gap"
         )
     if row.alternatives:
         parts.append(f"{joined(row.alternatives, 'or')} explains the data equally well")

@@ -91,8 +91,8 @@ def is_unusual(value: float, low: float, high: float) -> bool:
         low: lower end of the range.
         high: upper end of the range.
     """
-    near = AT_BOUND * (high - low)
-    return not low - near <= value <= high + near
+    tolerance = AT_BOUND * (high - low)
+    return not low - tolerance <= value <= high + tolerance
 
 
 def bound_of(value: float, low: float, high: float) -> Bound | None:
@@ -103,11 +103,11 @@ def bound_of(value: float, low: float, high: float) -> Bound | None:
         low: lower end of the range.
         high: upper end of the range.
     """
-    near = AT_BOUND * (high - low)
+    tolerance = AT_BOUND * (high - low)
     # A range may be a thousand times as wide as the distance of its bound from zero.
-    if value <= low + min(near, NEAR * abs(low)):
+    if value <= low + min(tolerance, NEAR * abs(low)):
         return "low"
-    return "high" if value >= high - min(near, NEAR * abs(high)) else None
+    return "high" if value >= high - min(tolerance, NEAR * abs(high)) else None
 
 
 def _within(bounds: tuple[float, float], coefficient: Coefficient) -> tuple[float, float]:
@@ -129,23 +129,25 @@ def _bounds(
     of the runs, because the data cannot show slower changes.
     """
     low, high = parameter.bounds
-    longest = world.longest
+    longest_run = world.longest
     if is_instant(parameter):
         return world.clock
     if parameter.unit == "Hz":
         # The lower bound is at most half of the upper bound, so that the range is not empty.
-        low = min(max(low, MIN_CYCLES_PER_RUN / longest), high / 2.0)
+        low = min(max(low, MIN_CYCLES_PER_RUN / longest_run), high / 2.0)
     # A positive lower bound marks a shape parameter, such as a frequency, a rate or a sharpness.
     if low > 0:
         return low, high
     if parameter.unit == "s":
         # Delays longer than a run look constant within it.
-        return max(MAX_RANGE_FACTOR * low, -longest), min(MAX_RANGE_FACTOR * high, longest)
+        return max(MAX_RANGE_FACTOR * low, -longest_run), min(MAX_RANGE_FACTOR * high, longest_run)
     # A term that grows with the square of a force does not cause sticking by itself.
-    dry = isinstance(effect, Friction) and not parameter.unit.startswith(INVERSE_FORCE_UNITS)
-    beyond = MAX_RANGE_FACTOR_DRY_FRICTION if dry else MAX_RANGE_FACTOR
+    is_dry_friction = isinstance(effect, Friction) and not parameter.unit.startswith(
+        INVERSE_FORCE_UNITS
+    )
+    range_factor = MAX_RANGE_FACTOR_DRY_FRICTION if is_dry_friction else MAX_RANGE_FACTOR
     # The limits of a robot coefficient refer to the total with the value of the model file.
     if world.kind.has_model and coefficient.least is not None:
-        beyond = BEYOND_MODEL
+        range_factor = BEYOND_MODEL
     # A coefficient whose sign is part of the definition of its effect has a lower bound of zero.
-    return beyond * low, beyond * high
+    return range_factor * low, range_factor * high

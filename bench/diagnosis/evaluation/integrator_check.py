@@ -65,13 +65,15 @@ class StepRefinement(NamedTuple):
     error: float
     corrected_error: float
 
-    def is_accurate_enough(self, left: float) -> bool:
+    def is_accurate_enough(self, residual_rms: float) -> bool:
         """Return whether the step is fine enough for a model with the given residual.
 
         Args:
-            left: RMS residual of the model, in units of the noise.
+            residual_rms: RMS residual of the model, in units of the noise.
         """
-        return self.corrected_error < max(MAX_CORRECTED_ERROR, MAX_ERROR_TO_RESIDUAL_RATIO * left)
+        return self.corrected_error < max(
+            MAX_CORRECTED_ERROR, MAX_ERROR_TO_RESIDUAL_RATIO * residual_rms
+        )
 
 
 def find_step_refinements(world: RunEvaluator, noise: NoiseModel) -> Iterator[StepRefinement]:
@@ -87,36 +89,40 @@ def find_step_refinements(world: RunEvaluator, noise: NoiseModel) -> Iterator[St
     kind = world.kind
     assert issubclass(kind, RobotSimulator)
     motions = _ReferenceMotions(world, noise, kind)
-    own = kind.numerics
-    reference = motions.reference(own)
+    model_settings = kind.numerics
+    reference = motions.reference(model_settings)
     if reference is None:
         return
-    error = motions.apart(motions.of(own), reference)
+    error = motions.apart(motions.of(model_settings), reference)
     if not error > MIN_DISCRETISATION_ERROR:
         return
-    for numerics in _settings(own):
-        rest = motions.apart(motions.of(numerics), reference)
-        if rest < max(
+    for numerics in _settings(model_settings):
+        corrected_error = motions.apart(motions.of(numerics), reference)
+        if corrected_error < max(
             MAX_CORRECTED_ERROR, min(MAX_CORRECTED_ERROR_FAR_FIT, error / MIN_ERROR_REDUCTION)
         ):
             yield StepRefinement(
-                kind.with_integrator_settings(numerics), own, numerics, error, rest
+                kind.with_integrator_settings(numerics),
+                model_settings,
+                numerics,
+                error,
+                corrected_error,
             )
 
 
-def _settings(own: IntegratorSettings) -> Iterator[IntegratorSettings]:
+def _settings(model_settings: IntegratorSettings) -> Iterator[IntegratorSettings]:
     """Yield finer time steps and other integrators than the robot's own, the cheapest first.
 
     A step of RK4 costs 3.3 times as much as one of the other integrators.
     """
-    step, integrator = own
+    step, integrator = model_settings
     cost = {"RK4": 3.3}
-    tried = []
+    settings_by_cost = []
     for parts in (1, 2, 5, MAX_STEP_DIVISIONS):
         for name in dict.fromkeys((integrator, STIFF_INTEGRATOR, "RK4")):
             if (parts, name) != (1, integrator):
-                tried.append((parts * cost.get(name, 1.0), parts, name))
-    for _, parts, name in sorted(tried, key=lambda entry: entry[0]):
+                settings_by_cost.append((parts * cost.get(name, 1.0), parts, name))
+    for _, parts, name in sorted(settings_by_cost, key=lambda entry: entry[0]):
         yield IntegratorSettings(step / parts, name)
 
 
@@ -149,39 +155,41 @@ class _ReferenceMotions:
         world.simulations += count
         return simulator.simulate_batch(theta, scenarios, states)
 
-    def reference(self, own: IntegratorSettings) -> Array | None:
+    def reference(self, model_settings: IntegratorSettings) -> Array | None:
         """Return the converged motion of the robot (R, T, C); None if no integrator converges.
 
         A motion has converged if halving the time step hardly changes it. RK4 is tried first; for
         stiff motions the step of an implicit integrator is extrapolated to zero, eq. (1).
         """
         for parts in (1, 2, 5):
-            coarse, fine = (
-                self.of(IntegratorSettings(own.timestep / n, "RK4")) for n in (parts, 2 * parts)
+            coarse, refined = (
+                self.of(IntegratorSettings(model_settings.timestep / n, "RK4"))
+                for n in (parts, 2 * parts)
             )
-            if self.apart(coarse, fine) < CONVERGENCE_TOLERANCE:
-                return fine
+            if self.apart(coarse, refined) < CONVERGENCE_TOLERANCE:
+                return refined
         for parts in (2, 5):
             pairs = []
             for n in (parts, 2 * parts):
-                coarse, fine = (
-                    self.of(IntegratorSettings(own.timestep / k, STIFF_INTEGRATOR))
+                coarse, refined = (
+                    self.of(IntegratorSettings(model_settings.timestep / k, STIFF_INTEGRATOR))
                     for k in (n, 2 * n)
                 )
-                pairs.append(2.0 * fine - coarse)  # (1)
+                pairs.append(2.0 * refined - coarse)  # (1)
             if self.apart(*pairs) < CONVERGENCE_TOLERANCE:
                 return pairs[1]
         return None
 
-    def apart(self, one: Array, other: Array) -> float:
+    def apart(self, first: Array, second: Array) -> float:
         """Return the RMS difference in units of the noise; infinite if a simulation fails.
 
         Only available samples of the recording are compared.
         """
-        there = [np.isfinite(track.observed) for track in self._tracks]
+        observed_masks = [np.isfinite(track.observed) for track in self._tracks]
         squares = []
-        for run, seen in enumerate(there):
-            apart = (one[run, : len(seen)] - other[run, : len(seen)]) / self._noise.sigma
-            squares.append(np.square(apart[seen]))
+        for run, observed_mask in enumerate(observed_masks):
+            samples = slice(len(observed_mask))
+            difference = (first[run, samples] - second[run, samples]) / self._noise.sigma
+            squares.append(np.square(difference[observed_mask]))
         size = float(np.sqrt(np.concatenate(squares).mean()))
         return size if np.isfinite(size) else float("inf")

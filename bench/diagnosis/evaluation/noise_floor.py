@@ -60,7 +60,7 @@ def compute_noise_floor(world: RunEvaluator, recording: Recording) -> NoiseFloor
         world: the runs for fitting; its simulator defines the channels.
         recording: the recording with all its runs.
     """
-    sigmas, stated, steps, doubts = [], [], [], []
+    sigmas, is_stated, steps, uncertainties = [], [], [], []
     for channel in world.simulator.channels:
         signals = [(run.times, run.channels[channel.name]) for run in recording.runs]
         samples = [y[np.isfinite(y)] for _, y in signals]
@@ -68,25 +68,27 @@ def compute_noise_floor(world: RunEvaluator, recording: Recording) -> NoiseFloor
         # Estimate also if the noise is specified, because the step shows whether the channel is
         # quantised.
         estimate = estimate_noise(signals)
-        known = recording.noise.get(channel.name, 0.0) > 0
-        sigma = recording.noise[channel.name] if known else estimate.sigma
+        is_specified = recording.noise.get(channel.name, 0.0) > 0
+        sigma = recording.noise[channel.name] if is_specified else estimate.sigma
 
         # No simulation is accurate enough for a noise floor of zero.
-        least = max(INTEGRATION_ERROR_SHARE * range_of(values), MIN_SIGMA)
+        min_sigma = max(INTEGRATION_ERROR_SHARE * range_of(values), MIN_SIGMA)
         # There may be too few samples; a channel that never changes does not show its noise.
-        if not np.isfinite(sigma) or (not known and is_constant(values)):
+        if not np.isfinite(sigma) or (not is_specified and is_constant(values)):
             sigma = DEFAULT_FLOOR_SHARE * channel.scale
-        sigmas.append(max(sigma, least))
-        stated.append(known)
+        sigmas.append(max(sigma, min_sigma))
+        is_stated.append(is_specified)
         steps.append(estimate.step)
-        doubts.append(
-            0.0 if known else MEDIAN_SIGMA_ERROR_FACTOR / max(values.size, MIN_SAMPLES) ** 0.5
+        uncertainties.append(
+            0.0
+            if is_specified
+            else MEDIAN_SIGMA_ERROR_FACTOR / max(values.size, MIN_SAMPLES) ** 0.5
         )
     return NoiseFloor(
         sigma=np.array(sigmas),
-        is_stated=np.array(stated),
+        is_stated=np.array(is_stated),
         quantisation_step=np.array(steps),
-        uncertainty=np.array(doubts),
+        uncertainty=np.array(uncertainties),
     )
 
 

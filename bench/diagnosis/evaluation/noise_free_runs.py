@@ -54,11 +54,11 @@ def _missing(recording: Recording, name: str) -> float:
     """Return the standard deviation of the noise to add; 0 for noisy or constant channels."""
     signals = [(run.times, run.channels[name]) for run in recording.runs if name in run.channels]
     values = np.concatenate([y[np.isfinite(y)] for _, y in signals])
-    least = INTEGRATION_ERROR_SHARE * range_of(values)
-    if least < MIN_SIGMA:
+    min_sigma = INTEGRATION_ERROR_SHARE * range_of(values)
+    if min_sigma < MIN_SIGMA:
         return 0.0
     # The estimate is not finite if all runs are too short for the differences.
-    return least if differences_sigma(signals, ORDER) < FREE * least else 0.0
+    return min_sigma if differences_sigma(signals, ORDER) < FREE * min_sigma else 0.0
 
 
 def _noisy(run: Run, sizes: dict[str, float]) -> Run:

@@ -68,18 +68,18 @@ def _unit(phi: float) -> NoiseModel:
     return NoiseModel(np.ones(1), np.array([phi]))
 
 
-def _has_predecessor(seen: Mask) -> Mask:
+def _has_predecessor(observed_mask: Mask) -> Mask:
     """Return whether each sample but the first has a direct predecessor (R, T - 1, C)."""
-    follows: Mask = seen[:, 1:] & seen[:, :-1]
-    return follows
+    has_predecessor: Mask = observed_mask[:, 1:] & observed_mask[:, :-1]
+    return has_predecessor
 
 
-def whiten(values: Array, seen: Mask, noise: NoiseModel) -> Array:
+def whiten(values: Array, observed_mask: Mask, noise: NoiseModel) -> Array:
     """Whiten values by (2).
 
     Args:
         values: (R, T, C, ...) noise, or derivatives of noisy signals, because (2) is linear.
-        seen: (R, T, C) mask of available samples; the others become zero.
+        observed_mask: (R, T, C) mask of available samples; the others become zero.
         noise: noise of each channel.
 
     Returns:
@@ -94,24 +94,24 @@ def whiten(values: Array, seen: Mask, noise: NoiseModel) -> Array:
 
     # A second pass over all samples, which white noise does not need.
     if phi.any():
-        pairs = _has_predecessor(seen)
-        follows = pairs.reshape(*pairs.shape, *extra)
+        pairs = _has_predecessor(observed_mask)
+        has_predecessor = pairs.reshape(*pairs.shape, *extra)
         # Values of missing samples are arbitrary, even NaN, and must not affect the next sample.
-        before = np.where(follows, result[:, :-1], 0.0)
-        latter = result[:, 1:]
-        innovations = (latter - phi * before) / np.sqrt(1.0 - phi * phi)
-        result[:, 1:] = np.where(follows, innovations, latter)
+        previous_samples = np.where(has_predecessor, result[:, :-1], 0.0)
+        samples = result[:, 1:]
+        innovations = (samples - phi * previous_samples) / np.sqrt(1.0 - phi * phi)
+        result[:, 1:] = np.where(has_predecessor, innovations, samples)
 
-    if not seen.all():
-        result = np.where(seen.reshape(*seen.shape, *extra), result, 0.0)
+    if not observed_mask.all():
+        result = np.where(observed_mask.reshape(*observed_mask.shape, *extra), result, 0.0)
     return result
 
 
-def compute_log_determinant(seen: Mask, phi: Array | float) -> float:
+def compute_log_determinant(observed_mask: Mask, phi: Array | float) -> float:
     """Return half the log-determinant of whitening at unit variance, -m/2 log(1 - φ²) of (3)."""
-    follows = _has_predecessor(seen).sum(axis=(0, 1))
+    predecessor_counts = _has_predecessor(observed_mask).sum(axis=(0, 1))
     logarithms = np.log1p(-np.square(phi))
-    return float(-0.5 * (follows * logarithms).sum())
+    return float(-0.5 * (predecessor_counts * logarithms).sum())
 
 
 @dataclass(frozen=True)
@@ -131,30 +131,34 @@ class Likelihood:
     phi: Array
 
 
-def maximise_likelihood(residual: Array, seen: Mask, lost: float = 0.0) -> Likelihood:
+def maximise_likelihood(
+    residual: Array, observed_mask: Mask, fitted_freedom: float = 0.0
+) -> Likelihood:
     """Maximise the likelihood of a residual over the noise of each channel.
 
     Args:
         residual: (R, T, C) residual of a model.
-        seen: (R, T, C) mask of available samples.
-        lost: degrees of freedom used by the fit, subtracted from the samples when sigma is
-            estimated.
+        observed_mask: (R, T, C) mask of available samples.
+        fitted_freedom: degrees of freedom used by the fit, subtracted from the samples when sigma
+            is estimated.
     """
     total = 0.0
     sigmas: list[float] = []
     phis: list[float] = []
     # The degrees of freedom of the fit are distributed over the channels by their samples.
-    samples = max(int(seen.sum()), 1)
-    share = max(1.0 - lost / samples, MIN_EFFECTIVE_SAMPLE_SHARE)
+    samples = max(int(observed_mask.sum()), 1)
+    share = max(1.0 - fitted_freedom / samples, MIN_EFFECTIVE_SAMPLE_SHARE)
     for c in range(residual.shape[2]):
         channel = slice(c, c + 1)
-        here = seen[:, :, channel]
+        channel_mask = observed_mask[:, :, channel]
         # A channel without samples has no likelihood and no noise.
-        if not here.any():
+        if not channel_mask.any():
             sigmas.append(np.nan)
             phis.append(0.0)
             continue
-        value, phi, variance = _maximise_channel_likelihood(residual[:, :, channel], here, share)
+        value, phi, variance = _maximise_channel_likelihood(
+            residual[:, :, channel], channel_mask, share
+        )
         total += value
         sigmas.append(variance**0.5)
         phis.append(phi)
@@ -163,7 +167,7 @@ def maximise_likelihood(residual: Array, seen: Mask, lost: float = 0.0) -> Likel
 
 def _maximise_channel_likelihood(
     residual: Array,
-    seen: Mask,
+    observed_mask: Mask,
     share: float,
 ) -> tuple[float, float, float]:
     """Return the maximum of (4) for one channel (R, T, 1), with its correlation and variance.
@@ -173,42 +177,44 @@ def _maximise_channel_likelihood(
 
     Args:
         residual: (R, T, 1) residual.
-        seen: (R, T, 1) mask of available samples.
+        observed_mask: (R, T, 1) mask of available samples.
         share: share of the samples that remain as degrees of freedom.
     """
-    count = int(seen.sum())
+    count = int(observed_mask.sum())
     best = (-np.inf, 0.0, 0.0)
-    for phi in _list_nearby_phis(residual, seen):
-        w = whiten(residual, seen, _unit(phi))
+    for phi in _list_nearby_phis(residual, observed_mask):
+        w = whiten(residual, observed_mask, _unit(phi))
         power = float((w * w).sum())
         variance = max(power / count, MIN_VARIANCE)
         # Equation (4) with the determinant of whitening.
-        determinant = 2.0 * compute_log_determinant(seen, phi)
+        determinant = 2.0 * compute_log_determinant(observed_mask, phi)
         value = -count * np.log(variance) + determinant
         hypothesis = (value, phi, variance / share)
         best = max(best, hypothesis)
     return best
 
 
-def _list_nearby_phis(residual: Array, seen: Mask) -> Array:
+def _list_nearby_phis(residual: Array, observed_mask: Mask) -> Array:
     """Return AR(1) correlations to try for a channel, near the residual's sample correlation.
 
     Zero (white noise) is always included.
     """
-    follows = _has_predecessor(seen)
-    former = residual[:, :-1][follows]
-    latter = residual[:, 1:][follows]
-    power = float(former @ former)
+    has_predecessor = _has_predecessor(observed_mask)
+    previous_samples = residual[:, :-1][has_predecessor]
+    next_samples = residual[:, 1:][has_predecessor]
+    power = float(previous_samples @ previous_samples)
     # The correlation of zeros is not defined.
-    own = float(former @ latter) / power if power > 0 else 0.0
-    tried = own + np.array(PHI_OFFSETS)
-    around = np.clip(tried, MIN_PHI, MAX_PHI)
+    sample_phi = float(previous_samples @ next_samples) / power if power > 0 else 0.0
+    candidate_phis = sample_phi + np.array(PHI_OFFSETS)
+    clipped_phis = np.clip(candidate_phis, MIN_PHI, MAX_PHI)
     # White noise is always one of the hypotheses.
-    correlations: Array = np.unique(np.append(around, 0.0))
+    correlations: Array = np.unique(np.append(clipped_phis, 0.0))
     return correlations
 
 
-def compute_portmanteau_p_value(residual: Array, seen: Mask, found: Likelihood) -> float:
+def compute_portmanteau_p_value(
+    residual: Array, observed_mask: Mask, likelihood: Likelihood
+) -> float:
     """Return the p-value of the hypothesis that a residual is AR(1) noise.
 
     Portmanteau test of the whitened residual: if its autocorrelations r_k at h lags are those of
@@ -221,18 +227,18 @@ def compute_portmanteau_p_value(residual: Array, seen: Mask, found: Likelihood) 
 
     Args:
         residual: (R, T, C) residual of a model.
-        seen: (R, T, C) mask of available samples.
-        found: likelihood of the residual, which contains the fitted correlations.
+        observed_mask: (R, T, C) mask of available samples.
+        likelihood: likelihood of the residual, which contains the fitted correlations.
     """
-    least = 1.0
-    for c, phi in enumerate(found.phi.tolist()):
+    min_p_value = 1.0
+    for c, phi in enumerate(likelihood.phi.tolist()):
         channel = slice(c, c + 1)
-        here = seen[:, :, channel]
-        white = whiten(residual[:, :, channel], here, _unit(phi))
-        count = max(int(here.sum()), 2)
+        channel_mask = observed_mask[:, :, channel]
+        white = whiten(residual[:, :, channel], channel_mask, _unit(phi))
+        count = max(int(channel_mask.sum()), 2)
         statistic = count * (count + 2.0) * _correlated(white[:, :, 0], count)  # (5)
-        least = min(least, chi_squared_tail(PORTMANTEAU_LAGS - 1, statistic))
-    return min(1.0, least * len(found.phi))
+        min_p_value = min(min_p_value, chi_squared_tail(PORTMANTEAU_LAGS - 1, statistic))
+    return min(1.0, min_p_value * len(likelihood.phi))
 
 
 def _correlated(w: Array, count: int) -> float:

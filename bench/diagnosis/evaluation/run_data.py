@@ -74,11 +74,20 @@ def prepare_run(
     fixed = {*run.initial, *_find_unobserved_states(simulator)}
     # Initial values that are not states of the system, such as the pose of a floating base, are not
     # part of a batch element.
-    begun = {name: value for name, value in run.initial.items() if name not in states}
+    other_initial_values = {
+        name: value for name, value in run.initial.items() if name not in states
+    }
     return RunData(
         name=run.name,
         scenario=Scenario(
-            run.times, begun, run.inputs, constants, run.linear, run.offset, run.before, run.off
+            run.times,
+            other_initial_values,
+            run.inputs,
+            constants,
+            run.linear,
+            run.offset,
+            run.before,
+            run.off,
         ),
         observed=np.stack(columns, axis=1),
         initial_state_guess=np.array([guesses[name] for name in states]),
@@ -128,13 +137,13 @@ def _find_unobserved_states(simulator: SystemSimulator) -> set[str]:
 
     They keep their defaults, because the data cannot determine them.
     """
-    system, shown = simulator.system, {c.name for c in simulator.channels}
+    system, recorded_channels = simulator.system, {c.name for c in simulator.channels}
     hidden = set()
     pairs = zip(system.coordinates, system.rates, strict=False)
     for axis, (coordinate, rate) in enumerate(pairs):
-        about = {coordinate, rate, f"accel_{coordinate}"}
+        related_channels = {coordinate, rate, f"accel_{coordinate}"}
         # Biases and springs act on the primary coordinate, so its states are always estimated.
-        if axis != system.primary and not about & shown:
+        if axis != system.primary and not related_channels & recorded_channels:
             hidden |= {coordinate, rate}
     return hidden
 
@@ -149,8 +158,8 @@ def take_first_samples(scenario: Scenario, samples: int) -> Scenario:
     if samples >= scenario.times.size:
         return scenario
     inputs = {name: signal[:samples] for name, signal in scenario.inputs.items()}
-    off = {name: mask[:samples] for name, mask in scenario.off.items()}
-    return replace(scenario, times=scenario.times[:samples], inputs=inputs, off=off)
+    off_masks = {name: mask[:samples] for name, mask in scenario.off.items()}
+    return replace(scenario, times=scenario.times[:samples], inputs=inputs, off=off_masks)
 
 
 def estimate_initial_value_and_slope(times: Array, values: Array) -> tuple[float, float]:
@@ -163,9 +172,9 @@ def estimate_initial_value_and_slope(times: Array, values: Array) -> tuple[float
     Returns:
         The value and the slope; 0 where there are too few samples.
     """
-    seen = np.isfinite(values)
-    t = times[seen][:INITIAL_GUESS_SAMPLES] - times[0]
-    y = values[seen][:INITIAL_GUESS_SAMPLES]
+    is_available = np.isfinite(values)
+    t = times[is_available][:INITIAL_GUESS_SAMPLES] - times[0]
+    y = values[is_available][:INITIAL_GUESS_SAMPLES]
     if t.size == 0:
         return 0.0, 0.0
     if t.size < MIN_SAMPLES_FOR_SLOPE:

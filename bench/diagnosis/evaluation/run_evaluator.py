@@ -141,15 +141,15 @@ class RunEvaluator:
         self.runs = tuple(runs)
         self.extra = tuple(extra)
         usable = library.list_effects_for(kind.system)
-        recorded = {*self.runs[0].channels, *(c.name for c in kind.inputs)}
+        recorded_signals = {*self.runs[0].channels, *(c.name for c in kind.inputs)}
         # An effect on a channel that is not recorded is not observable.
-        shown = [
+        observable_effects = [
             name
             for name, effect in usable.items()
-            if _is_effect_observable(effect, recorded)
+            if _is_effect_observable(effect, recorded_signals)
             and (effect.hook != "hidden" or kind.has_model or engine in HIDDEN_STATE_ENGINES)
         ]
-        self.library = shown if candidates is None else list(candidates)
+        self.library = observable_effects if candidates is None else list(candidates)
         self.simulator, self._fine = self._simulators()
 
         # Theta has three parts: base parameters, freed constants, coefficients.
@@ -198,25 +198,25 @@ class RunEvaluator:
         effects: list[str | type[Effect]] = list(self.library)
         effects += [effect for effect in self.extra if effect.fits(kind.system)]
         # Channels follow the order of the simulator, not that of the columns of the log.
-        recorded = self.runs[0].channels
-        observe = [c.name for c in kind.channels if c.name in recorded]
-        usual: dict[str, Any] = {}
-        fine: dict[str, Any] = {}
+        recorded_channels = self.runs[0].channels
+        observe = [c.name for c in kind.channels if c.name in recorded_channels]
+        default_settings: dict[str, Any] = {}
+        fine_settings: dict[str, Any] = {}
         # The other engines choose their steps themselves.
         if self.engine == "batch":
-            usual = {
+            default_settings = {
                 "time_step": MAX_TIME_STEP,
                 "turn": MAX_PHASE_PER_STEP,
                 "patience": MAX_STEP_COUNT_FACTOR,
             }
-            fine = {**usual, "time_step": MAX_TIME_STEP_FILTERED}
+            fine_settings = {**default_settings, "time_step": MAX_TIME_STEP_FILTERED}
 
-        def made(settings: dict[str, Any]) -> SystemSimulator:
+        def make_simulator(settings: dict[str, Any]) -> SystemSimulator:
             """Create a simulator of the recorded channels with all effects."""
             constants = self.recording.constants
             return kind(constants, observe, engine=self.engine, effects=effects, **settings)
 
-        return made(usual), made(fine)
+        return make_simulator(default_settings), make_simulator(fine_settings)
 
     def _padded(self) -> Array:
         """Return the observations (R, T, C) of all runs, NaN after the end of a shorter run."""
@@ -371,12 +371,14 @@ class RunEvaluator:
         if self.has_linearisation:
             lanes = zip(theta, runs.tolist(), states, strict=True)
             keys = [
-                b"".join((repr((share, run)).encode(), own.tobytes(), begin.tobytes()))
-                for own, run, begin in lanes
+                b"".join((repr((share, run)).encode(), element_theta.tobytes(), begin.tobytes()))
+                for element_theta, run, begin in lanes
             ]
-            new = self._cache.missing(keys)
-            made = self._simulate(theta[new], runs[new], states[new], share)
-            self._cache.fill(keys, new, made, result)
+            missing_indices = self._cache.missing(keys)
+            new_results = self._simulate(
+                theta[missing_indices], runs[missing_indices], states[missing_indices], share
+            )
+            self._cache.fill(keys, missing_indices, new_results, result)
         else:
             # Results are not cached here: the slowest element of a call sets the steps of all
             # elements, so an element differs in its last digits from call to call.
@@ -400,19 +402,21 @@ class RunEvaluator:
         # The slowest element of a call sets its steps, so elements that need many steps are
         # simulated separately.
         kinds = self.group_compatible(theta)
-        together = max(MIN_BATCH_SIZE, MAX_BATCH_SAMPLES // length)
+        max_batch_size = max(MIN_BATCH_SIZE, MAX_BATCH_SAMPLES // length)
         if self.is_cheap_to_split:
-            together = min(together, max(MIN_CHUNK_SIZE, int(MAX_CHUNK_SAMPLES / (share * length))))
+            max_batch_size = min(
+                max_batch_size, max(MIN_CHUNK_SIZE, int(MAX_CHUNK_SAMPLES / (share * length)))
+            )
         parts, calls = [], []
         for kind in np.unique(kinds):
             lanes = np.flatnonzero(kinds == kind)
-            for part in np.array_split(lanes, -(-lanes.size // together)):
+            for part in np.array_split(lanes, -(-lanes.size // max_batch_size)):
                 parts.append(part)
                 calls.append((bool(kind >= 2), theta[part], runs[part], states[part], share))
         for number, simulated in self.crew.map_unordered(self, _simulated, calls):
-            last = simulated.shape[1]
-            result[parts[number], :last] = simulated
-            result[parts[number], last:] = np.nan
+            sample_count = simulated.shape[1]
+            result[parts[number], :sample_count] = simulated
+            result[parts[number], sample_count:] = np.nan
         return result
 
     def with_runs(self, runs: Sequence[Run]) -> RunEvaluator:
@@ -421,7 +425,7 @@ class RunEvaluator:
         It shares the parameters, the grids of shape parameters, the search control and the worker
         pool.
         """
-        other = RunEvaluator(
+        evaluator = RunEvaluator(
             self.kind,
             self.recording,
             runs,
@@ -432,23 +436,23 @@ class RunEvaluator:
         )
         # Periodic effects continue from segment to segment, and a value found in one segment holds
         # in all of them.
-        other.longest = self.longest
-        other.parameters = self.parameters
-        other.clock = self.clock
+        evaluator.longest = self.longest
+        evaluator.parameters = self.parameters
+        evaluator.clock = self.clock
         # Ranges are computed now, because those of segments would differ.
         for name in self.channels:
             self._range(name)
-        other._travels = self._travels
-        other.watch = self.watch
-        other.crew = self.crew
-        return other
+        evaluator._travels = self._travels
+        evaluator.watch = self.watch
+        evaluator.crew = self.crew
+        return evaluator
 
     def with_kind(self, kind: type[SystemSimulator]) -> RunEvaluator:
         """Return a run evaluator of the same runs with another simulator of the same system.
 
         Parameters keep their indices, so that fitted models can be compared between the simulators.
         """
-        other = RunEvaluator(
+        evaluator = RunEvaluator(
             kind,
             self.recording,
             self.runs,
@@ -457,13 +461,13 @@ class RunEvaluator:
             free=[p.name for p in self.freed],
             candidates=self.library,
         )
-        other.parameters = self.parameters
-        other.watch, other.crew = self.watch, self.crew
-        other.followed, other.guess = self.followed, self.guess
-        other.derivatives, other.identified = self.derivatives, self.identified
-        other.state_prior = self.state_prior
-        self.crew.register(other)
-        return other
+        evaluator.parameters = self.parameters
+        evaluator.watch, evaluator.crew = self.watch, self.crew
+        evaluator.followed, evaluator.guess = self.followed, self.guess
+        evaluator.derivatives, evaluator.identified = self.derivatives, self.identified
+        evaluator.state_prior = self.state_prior
+        self.crew.register(evaluator)
+        return evaluator
 
     def simulator_of(self, kind: type[SystemSimulator]) -> SystemSimulator:
         """Return another simulator of the same system with the same effects and channels."""
@@ -502,7 +506,10 @@ class RunEvaluator:
             ]
         # Elements of one run share its scenario object, so the simulator prepares it only once.
         scenarios = [self._parts[share][run] for run in runs]
-        return [self._freed_in(one, own) for one, own in zip(scenarios, theta, strict=True)]
+        return [
+            self._freed_in(scenario, element_theta)
+            for scenario, element_theta in zip(scenarios, theta, strict=True)
+        ]
 
     def simulate_batch(
         self, fine: bool, theta: Array, runs: Indices, states: Array, share: float
@@ -522,8 +529,8 @@ class RunEvaluator:
         simulator = self._fine if fine else self.simulator
         scenarios = self._scenarios(theta, runs, share)
         # The simulator does not treat freed constants as parameters.
-        freed = np.arange(self.own, self.base.size)
-        lanes = np.delete(theta, freed, axis=1)
+        freed_indices = np.arange(self.own, self.base.size)
+        lanes = np.delete(theta, freed_indices, axis=1)
         initial = dict(zip(self.states, states.T, strict=True))
         return simulator.simulate_batch(lanes, scenarios, initial)
 
@@ -543,17 +550,19 @@ class RunEvaluator:
         self.simulations += len(theta)
         length = max(scenario.times.size for scenario in scenarios)
         result = np.full((len(theta), length, len(self.channels)), np.nan)
-        together = max(MIN_CHUNK_SIZE, MAX_BATCH_SAMPLES // length)
-        freed = np.arange(self.own, self.base.size)
+        max_batch_size = max(MIN_CHUNK_SIZE, MAX_BATCH_SAMPLES // length)
+        freed_indices = np.arange(self.own, self.base.size)
         kinds = self.group_compatible(theta)
         for kind in np.unique(kinds):
             simulator = self._fine if kind >= 2 else self.simulator
             lanes = np.flatnonzero(kinds == kind)
-            for part in np.array_split(lanes, -(-lanes.size // together)):
-                own = [self._freed_in(scenarios[i], theta[i]) for i in part]
+            for part in np.array_split(lanes, -(-lanes.size // max_batch_size)):
+                part_scenarios = [self._freed_in(scenarios[i], theta[i]) for i in part]
                 initial = dict(zip(self.states, states[part].T, strict=True))
-                seen = simulator.simulate_batch(np.delete(theta[part], freed, 1), own, initial)
-                result[part, : seen.shape[1]] = seen
+                observations = simulator.simulate_batch(
+                    np.delete(theta[part], freed_indices, 1), part_scenarios, initial
+                )
+                result[part, : observations.shape[1]] = observations
         return result
 
     def _freed_in(self, scenario: Scenario, theta: Array) -> Scenario:
@@ -561,8 +570,8 @@ class RunEvaluator:
         if not self.freed:
             return scenario
         values = theta[self.own : self.base.size].tolist()
-        freed = {p.name: value for p, value in zip(self.freed, values, strict=True)}
-        return replace(scenario, constants={**scenario.constants, **freed})
+        freed_constants = {p.name: value for p, value in zip(self.freed, values, strict=True)}
+        return replace(scenario, constants={**scenario.constants, **freed_constants})
 
     def make_observing_simulator(
         self, observe: Sequence[str], effects: Sequence[str]
@@ -575,7 +584,7 @@ class RunEvaluator:
             observe: names of the channels.
             effects: names of the effects.
         """
-        own: list[str | type[Effect]] = [
+        effect_types: list[str | type[Effect]] = [
             next((e for e in self.extra if e.name == name), name) for name in effects
         ]
         settings: dict[str, Any] = {}
@@ -586,24 +595,26 @@ class RunEvaluator:
                 "patience": MAX_STEP_COUNT_FACTOR,
             }
         constants = self.recording.constants
-        return self.kind(constants, list(observe), engine=self.engine, effects=own, **settings)
+        return self.kind(
+            constants, list(observe), engine=self.engine, effects=effect_types, **settings
+        )
 
-    def follow(self, followed: Any) -> None:
+    def follow(self, filtered_runs: Any) -> None:
         """Use the results of a state filter for the runs of a robot.
 
         The filter provides guesses, derivatives and prior standard deviations of the initial
         states.
 
         Args:
-            followed: filtered runs, a
+            filtered_runs: filtered runs, a
                 `bench.diagnosis.kalman.candidate_responses.FollowedRuns`.
         """
-        self.followed = followed
-        begun = followed.first_states()
-        fine = np.isfinite(begun).all()
-        self.guess = np.where(self.known | ~fine, self.guess, begun)
-        self.derivatives = followed.state_sensitivities()
-        self.state_prior = followed.state_prior()
+        self.followed = filtered_runs
+        initial_states = filtered_runs.first_states()
+        is_finite = np.isfinite(initial_states).all()
+        self.guess = np.where(self.known | ~is_finite, self.guess, initial_states)
+        self.derivatives = filtered_runs.state_sensitivities()
+        self.state_prior = filtered_runs.state_prior()
 
     def close(self) -> None:
         """Release the resources of the engine."""
@@ -611,10 +622,10 @@ class RunEvaluator:
         self._fine.close()
 
 
-def _is_effect_observable(effect: type[Effect], recorded: set[str]) -> bool:
+def _is_effect_observable(effect: type[Effect], recorded_signals: set[str]) -> bool:
     """Return whether all signals that an effect (or effect family) acts on are recorded."""
     members = members_of(effect)
-    return all(not member.signal or member.signal in recorded for member in members)
+    return all(not member.signal or member.signal in recorded_signals for member in members)
 
 
 def _simulated(world: RunEvaluator, *call: Any) -> Array:
@@ -656,9 +667,9 @@ def _allocate_coefficients(simulator: SystemSimulator, first: int) -> dict[str, 
     slots = {}
     # Use the order of the simulator, which is the order of its parameters.
     for effect in simulator.effects:
-        last = first + len(effect.on(simulator.system))
-        slots[effect.name] = slice(first, last)
-        first = last
+        end = first + len(effect.on(simulator.system))
+        slots[effect.name] = slice(first, end)
+        first = end
     return slots
 
 

@@ -37,13 +37,14 @@ def thin_runs(world: RunEvaluator) -> RunEvaluator | None:
         long as an engine step, or if a channel would lose too many samples.
     """
     total = int(world.lengths.sum())
-    most = total // MIN_THINNED_SAMPLES
-    factors = [min(_factor(run), most) for run in world.runs]
+    max_factor = total // MIN_THINNED_SAMPLES
+    factors = [min(_factor(run), max_factor) for run in world.runs]
     if total < MIN_SAMPLES_TO_THIN or max(factors) < 2:
         return None
     runs = [_take_every_nth(run, factor) for run, factor in zip(world.runs, factors, strict=True)]
     if not all(
-        _shown(few, run, factor) for few, run, factor in zip(runs, world.runs, factors, strict=True)
+        _shown(thinned_run, run, factor)
+        for thinned_run, run, factor in zip(runs, world.runs, factors, strict=True)
     ):
         return None
     return world.with_runs(runs)
@@ -74,18 +75,18 @@ def _take_every_nth(run: Run, factor: int) -> Run:
 
 def _means(times: Array, values: Array, first: Indices) -> Array:
     """Return the mean of an input between kept samples; the value itself after the last one."""
-    lasting = np.diff(times, append=times[-1])
+    durations = np.diff(times, append=times[-1])
     # The last sample has no duration; a tiny one avoids 0 / 0 in its block.
-    lasting[-1] = 1e-9 * max(float(times[-1] - times[0]), 1e-9)
-    means: Array = np.add.reduceat(values * lasting, first) / np.add.reduceat(lasting, first)
+    durations[-1] = 1e-9 * max(float(times[-1] - times[0]), 1e-9)
+    means: Array = np.add.reduceat(values * durations, first) / np.add.reduceat(durations, first)
     return means
 
 
-def _shown(few: Run, run: Run, factor: int) -> bool:
+def _shown(thinned_run: Run, run: Run, factor: int) -> bool:
     """Return whether every channel keeps about its expected number of samples."""
     for name, values in run.channels.items():
-        before = int(np.isfinite(values).sum())
-        left = int(np.isfinite(few.channels[name]).sum())
-        if left < MIN_CHANNEL_SAMPLE_SHARE * before / factor:
+        sample_count = int(np.isfinite(values).sum())
+        thinned_count = int(np.isfinite(thinned_run.channels[name]).sum())
+        if thinned_count < MIN_CHANNEL_SAMPLE_SHARE * sample_count / factor:
             return False
     return True

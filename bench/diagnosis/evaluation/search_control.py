@@ -178,18 +178,18 @@ class SearchControl:
         self._now = weight
         self._looks = -1
 
-    def report_and_check(self, what: str) -> None:
+    def report_and_check(self, step_text: str) -> None:
         """Report the next step, and check that the search may continue.
 
         Raises:
             SearchStoppedError: the search has to end.
         """
         self.check_not_stopped()
-        self.report(what)
+        self.report(step_text)
 
-    def report(self, what: str) -> None:
+    def report(self, step_text: str) -> None:
         """Report the next step without a check, where fits stop by themselves."""
-        self._what = what
+        self._what = step_text
         self._looks += 1
         self._advance(0.0)
 
@@ -212,9 +212,9 @@ class SearchControl:
         self._left |= self.should_stop()
         return self._left
 
-    def record_abandoned_fit(self, left: bool) -> None:
+    def record_abandoned_fit(self, is_abandoned: bool) -> None:
         """Record whether a fit was stopped in another process."""
-        self._left |= left
+        self._left |= is_abandoned
 
     def has_abandoned_fits(self) -> bool:
         """Return whether any fit was stopped early."""
@@ -227,10 +227,10 @@ class SearchControl:
             held_out: whether there are held-out runs.
         """
         names = list(QUESTION_TEXTS)
-        open_ones = names[names.index(self._question) :]
+        skipped_questions = names[names.index(self._question) :]
         if not held_out:
-            open_ones = [name for name in open_ones if name != "held_out"]
-        return EarlyStop(self._by or "interrupt", self._what, tuple(open_ones))
+            skipped_questions = [name for name in skipped_questions if name != "held_out"]
+        return EarlyStop(self._by or "interrupt", self._what, tuple(skipped_questions))
 
     def _advance(self, share: float) -> None:
         """Report the finished share of the search.
@@ -240,12 +240,12 @@ class SearchControl:
         """
         remaining = (1.0 - PROGRESS_STEP_SHARE) ** self._looks
         # Earlier steps have taken their shares; the fit is a part of the present step.
-        within = 1.0 - remaining * (1.0 - PROGRESS_STEP_SHARE * share)
+        finished_share = 1.0 - remaining * (1.0 - PROGRESS_STEP_SHARE * share)
         total = self._done + self._now + self._ahead
-        done = (self._done + self._now * within) / total
-        self._listener.completed(done)
+        total_share = (self._done + self._now * finished_share) / total
+        self._listener.completed(total_share)
         if self._progress is not None:
-            self._progress(done, self._what)
+            self._progress(total_share, self._what)
 
 
 def _list_later_weights(question: str) -> float:

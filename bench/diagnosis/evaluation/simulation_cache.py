@@ -42,10 +42,10 @@ class LaneCache:
             results: (N, T, C) results of these elements.
             out: (L, T, C) output array for the results of all elements.
         """
-        new = {keys[place]: row for place, row in zip(places, results, strict=True)}
+        new_results = {keys[place]: row for place, row in zip(places, results, strict=True)}
         for place, key in enumerate(keys):
-            out[place] = new[key] if key in new else self._held[key]
-        for key, row in new.items():
+            out[place] = new_results[key] if key in new_results else self._held[key]
+        for key, row in new_results.items():
             # Store a copy: a view would keep the results of a whole call in memory.
             self._held[key] = row.copy()
             self._bytes += row.nbytes

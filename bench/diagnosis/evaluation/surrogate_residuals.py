@@ -51,42 +51,52 @@ MIN_INNOVATIONS = 10
 
 def draw_surrogates(
     residual: Array,
-    seen: Mask,
+    observed_mask: Mask,
     count: int,
     rng: np.random.Generator,
     largest: int = 6,
-    left: Callable[[Array], Array] | None = None,
+    project_out: Callable[[Array], Array] | None = None,
 ) -> Array:
     """Draw residuals (count, R, T, C) with the spectrum of a given residual.
 
     Args:
         residual: (R, T, C) residual of a model, zero where no sample exists.
-        seen: (R, T, C) mask of available samples; the surrogates are zero elsewhere.
+        observed_mask: (R, T, C) mask of available samples; the surrogates are zero elsewhere.
         count: number of surrogates.
         rng: random numbers for the innovations.
         largest: maximum order of the autoregression.
-        left: callback that returns the residual of a fit to noise (count, R, T, C); without it the
-            bias is not corrected.
+        project_out: callback that returns the residual of a fit to noise (count, R, T, C); without
+            it the bias is not corrected.
     """
     channels = residual.shape[2]
-    weights = [_autoregression(residual[..., c], seen[..., c], largest) for c in range(channels)]
+    weights = [
+        _autoregression(residual[..., c], observed_mask[..., c], largest) for c in range(channels)
+    ]
     # White noise has no correlation that a fit could reduce.
-    if left is not None and any(w.size for w in weights):
-        pilots = int(np.clip(PILOT_SAMPLE_COUNT // max(int(seen.sum()), 1), *PILOT_COUNT_RANGE))
-        leavings = left(_simulate_autoregression(residual, seen, weights, pilots, rng))
+    if project_out is not None and any(w.size for w in weights):
+        pilot_count = int(
+            np.clip(PILOT_SAMPLE_COUNT // max(int(observed_mask.sum()), 1), *PILOT_COUNT_RANGE)
+        )
+        projected_pilots = project_out(
+            _simulate_autoregression(residual, observed_mask, weights, pilot_count, rng)
+        )
         for c in range(channels):
-            weights[c] = _correct_bias(weights[c], leavings[..., c], seen[..., c])
-    return _simulate_autoregression(residual, seen, weights, count, rng)
+            weights[c] = _correct_bias(weights[c], projected_pilots[..., c], observed_mask[..., c])
+    return _simulate_autoregression(residual, observed_mask, weights, count, rng)
 
 
 def _simulate_autoregression(
-    residual: Array, seen: Mask, weights: Sequence[Array], count: int, rng: np.random.Generator
+    residual: Array,
+    observed_mask: Mask,
+    weights: Sequence[Array],
+    count: int,
+    rng: np.random.Generator,
 ) -> Array:
     """Simulate the autoregressions (1) with resampled innovations of a residual.
 
     Args:
         residual: (R, T, C) residual.
-        seen: (R, T, C) mask of available samples.
+        observed_mask: (R, T, C) mask of available samples.
         weights: weights (p,) of each channel.
         count: number of surrogates.
         rng: random numbers for the innovations.
@@ -96,39 +106,45 @@ def _simulate_autoregression(
     """
     runs, length, channels = residual.shape
     result = np.zeros((count, runs, length, channels))
-    for c, own in enumerate(weights):
-        here = seen[:, :, c]
-        filled = np.where(here, residual[:, :, c], 0.0)
-        innovations = _centred(filled, here, own)
+    for c, channel_weights in enumerate(weights):
+        channel_mask = observed_mask[:, :, c]
+        filled = np.where(channel_mask, residual[:, :, c], 0.0)
+        innovations = _centred(filled, channel_mask, channel_weights)
         step = max(
             MAX_CHUNK_SIZE // ((length + BURN_IN_SAMPLES) * runs), MIN_CHUNK_WIDTH // runs, 1
         )
         for first in range(0, count, step):
-            some = result[first : first + step, :, :, c]
-            drawn = rng.choice(innovations, size=(length + BURN_IN_SAMPLES, len(some), runs))
+            surrogates = result[first : first + step, :, :, c]
+            drawn_innovations = rng.choice(
+                innovations, size=(length + BURN_IN_SAMPLES, len(surrogates), runs)
+            )
             # Time is the first axis of the simulation, and the last axis here.
-            driven = np.moveaxis(_drive_autoregression(own, drawn)[BURN_IN_SAMPLES:], 0, 2)
-            some[...] = np.where(here, driven, 0.0)
+            simulated = np.moveaxis(
+                _drive_autoregression(channel_weights, drawn_innovations)[BURN_IN_SAMPLES:], 0, 2
+            )
+            surrogates[...] = np.where(channel_mask, simulated, 0.0)
     return result
 
 
-def _correct_bias(weights: Array, leavings: Array, seen: Mask) -> Array:
+def _correct_bias(weights: Array, projected_pilots: Array, observed_mask: Mask) -> Array:
     """Correct weights (p,) for the bias of a fit, by (2).
 
     Args:
         weights: (p,) weights of an autoregression.
-        leavings: (count, R, T) residuals of the fit to noise with these weights.
-        seen: (R, T) mask of available samples.
+        projected_pilots: (count, R, T) residuals of the fit to noise with these weights.
+        observed_mask: (R, T) mask of available samples.
     """
     order = weights.size
-    count, *shape = leavings.shape
-    covariances = _autocovariances(leavings.reshape(-1, shape[1]), np.tile(seen, (count, 1)), order)
-    found, _ = _yule_walker(covariances, order)
+    count, *shape = projected_pilots.shape
+    covariances = _autocovariances(
+        projected_pilots.reshape(-1, shape[1]), np.tile(observed_mask, (count, 1)), order
+    )
+    estimated_weights, _ = _yule_walker(covariances, order)
     # If no autoregression of this order is found, the bias is unknown.
-    if found.size != order:
+    if estimated_weights.size != order:
         return weights
     for share in BIAS_CORRECTION_SHARES:
-        corrected = weights + share * (weights - found)
+        corrected = weights + share * (weights - estimated_weights)
         if _max_root(corrected) <= MAX_ROOT:
             return corrected
     return weights
@@ -144,44 +160,48 @@ def _drive_autoregression(weights: Array, innovations: Array) -> Array:
         return innovations
     flat = innovations.reshape(len(innovations), -1)
     # The weight of the oldest sample comes first, in the order of the samples.
-    backwards = weights[::-1]
+    reversed_weights = weights[::-1]
     # A sample depends only on earlier ones, which are complete by then.
     for t in range(1, len(flat)):
         before = flat[max(t - order, 0) : t]
-        flat[t] += backwards[order - len(before) :] @ before
+        flat[t] += reversed_weights[order - len(before) :] @ before
     return innovations
 
 
-def _autoregression(values: Array, seen: Mask, largest: int) -> Array:
+def _autoregression(values: Array, observed_mask: Mask, largest: int) -> Array:
     """Fit an autoregression to values (R, T); no weights if it has too few innovations."""
-    filled = np.where(seen, values, 0.0)
-    covariances = _autocovariances(filled, seen, min(largest, seen.shape[1] - 1))
-    weights = _select_order_by_aic(covariances, int(seen.sum()))
-    return weights if _innovations(filled, seen, weights).size >= MIN_INNOVATIONS else np.zeros(0)
+    filled = np.where(observed_mask, values, 0.0)
+    covariances = _autocovariances(filled, observed_mask, min(largest, observed_mask.shape[1] - 1))
+    weights = _select_order_by_aic(covariances, int(observed_mask.sum()))
+    return (
+        weights
+        if _innovations(filled, observed_mask, weights).size >= MIN_INNOVATIONS
+        else np.zeros(0)
+    )
 
 
-def _centred(filled: Array, seen: Mask, weights: Array) -> Array:
+def _centred(filled: Array, observed_mask: Mask, weights: Array) -> Array:
     """Return the innovations (n,) minus their mean; the samples themselves if there are too few."""
-    innovations = _innovations(filled, seen, weights)
+    innovations = _innovations(filled, observed_mask, weights)
     if innovations.size < MIN_INNOVATIONS:
-        return filled[seen] if seen.any() else np.zeros(1)
+        return filled[observed_mask] if observed_mask.any() else np.zeros(1)
     # A nonzero mean would accumulate to an offset of the surrogates.
     centred: Array = innovations - innovations.mean()
     return centred
 
 
-def _autocovariances(filled: Array, seen: Mask, largest: int) -> Array:
+def _autocovariances(filled: Array, observed_mask: Mask, largest: int) -> Array:
     """Estimate the autocovariances (largest + 1,) of values (R, T) at the lags 0 to `largest`.
 
-    Missing samples are zero in `filled`; only pairs of available samples (`seen`) count.
+    Missing samples are zero in `filled`; only pairs of available samples (`observed_mask`) count.
     """
-    length = seen.shape[1]
+    length = observed_mask.shape[1]
     covariances = []
     for lag in range(largest + 1):
-        former, latter = slice(0, length - lag), slice(lag, length)
+        earlier_samples, later_samples = slice(0, length - lag), slice(lag, length)
         # Missing samples add nothing to the sum, so their pairs are not counted either.
-        pairs = seen[:, latter] & seen[:, former]
-        products = filled[:, latter] * filled[:, former]
+        pairs = observed_mask[:, later_samples] & observed_mask[:, earlier_samples]
+        products = filled[:, later_samples] * filled[:, earlier_samples]
         covariances.append(float(products.sum()) / max(int(pairs.sum()), 1))
     return np.array(covariances)
 
@@ -191,28 +211,28 @@ def _select_order_by_aic(covariances: Array, count: int) -> Array:
     best = np.inf
     weights = np.zeros(0)
     for order in range(len(covariances)):
-        solved, variance = _yule_walker(covariances, order)
+        order_weights, variance = _yule_walker(covariances, order)
         criterion = count * np.log(max(variance, MIN_VARIANCE)) + 2.0 * order
         if criterion < best - MIN_AIC_GAIN:
             best = criterion
-            weights = solved
+            weights = order_weights
     return weights
 
 
-def _innovations(filled: Array, seen: Mask, weights: Array) -> Array:
+def _innovations(filled: Array, observed_mask: Mask, weights: Array) -> Array:
     """Return the innovations u_t (n,) of eq. (1): samples minus their prediction from earlier ones.
 
     Times at which one of the required samples is missing are left out.
     """
-    order, length = weights.size, seen.shape[1]
+    order, length = weights.size, observed_mask.shape[1]
     predicted = np.zeros(1)
     # A sample and all samples that predict it.
-    complete = seen[:, order:]
+    is_complete = observed_mask[:, order:]
     for k, weight in enumerate(weights, start=1):
-        earlier = slice(order - k, length - k)
-        predicted = predicted + weight * filled[:, earlier]
-        complete = complete & seen[:, earlier]
-    innovations: Array = (filled[:, order:] - predicted)[complete]
+        lagged_samples = slice(order - k, length - k)
+        predicted = predicted + weight * filled[:, lagged_samples]
+        is_complete = is_complete & observed_mask[:, lagged_samples]
+    innovations: Array = (filled[:, order:] - predicted)[is_complete]
     return innovations
 
 

@@ -38,8 +38,8 @@ def on_time_scale(parameter: Parameter, longest: float, spacing: float) -> Param
             high = max(high, LASTING * longest)
         else:
             # A delay may have either sign, so both ends are scaled by the same factor.
-            times = max(1.0, SHARE * longest / high)
-            low, high = times * low, times * high
+            factor = max(1.0, SHARE * longest / high)
+            low, high = factor * low, factor * high
     elif parameter.unit == "Hz" and spacing > 0 and 0.5 / spacing < high:
         high = 0.5 / spacing
         low = min(low, high / DECADES)

@@ -128,17 +128,17 @@ class ForkedWorkerPool:
         Yields:
             The number of an item and its result.
         """
-        several = self._jobs > 1 and len(items) > 1
-        if several and self._spent >= PARALLEL_THRESHOLD_SECONDS:
+        is_parallel = self._jobs > 1 and len(items) > 1
+        if is_parallel and self._spent >= PARALLEL_THRESHOLD_SECONDS:
             self._ready(world)
-        if several and self._team:
+        if is_parallel and self._team:
             yield from self._shared(world, task, items)
             return
         for number, item in enumerate(items):
-            begun = time.perf_counter()
+            start_time = time.perf_counter()
             result = task(world, *item)
-            if several:
-                self._spent += time.perf_counter() - begun
+            if is_parallel:
+                self._spent += time.perf_counter() - start_time
             yield number, result
 
     def register(self, world: SharedState) -> None:
@@ -147,7 +147,7 @@ class ForkedWorkerPool:
 
     def forget(self, world: SharedState) -> None:
         """Start new workers before the next work on a world, because it has changed."""
-        self._known = [known for known in self._known if known is not world]
+        self._known = [known_world for known_world in self._known if known_world is not world]
 
     def close(self) -> None:
         """Kill all workers, and continue without them."""
@@ -176,8 +176,8 @@ class ForkedWorkerPool:
     def _start(self) -> None:
         """Fork the workers, each with its own pipe to this process.
 
-        A forked worker inherits the registered worlds without a copy. `told` has the arguments of
-        the worker's main function.
+        A forked worker inherits the registered worlds without a copy. `worker_arguments` has the
+        arguments of the worker's main function.
         """
         if self._ending is None:
             self._ending = mmap.mmap(-1, 1)
@@ -186,15 +186,17 @@ class ForkedWorkerPool:
         # to them.
         gc.freeze()
         for _ in range(self._jobs):
-            mine, theirs = context.Pipe()
+            parent_end, worker_end = context.Pipe()
             # A worker that inherits ends of other pipes would keep the workers of these pipes
             # alive.
-            others = [mine, *(worker.pipe for worker in self._team)]
-            told = (self._known, theirs, others, self._ending, os.getpid())
-            process = context.Process(target=_work, args=told, daemon=True, name="explain")
+            other_pipes = [parent_end, *(worker.pipe for worker in self._team)]
+            worker_arguments = (self._known, worker_end, other_pipes, self._ending, os.getpid())
+            process = context.Process(
+                target=_work, args=worker_arguments, daemon=True, name="explain"
+            )
             process.start()
-            theirs.close()
-            self._team.append(_Worker(process, mine))
+            worker_end.close()
+            self._team.append(_Worker(process, parent_end))
         gc.unfreeze()
 
     def _shared(
@@ -206,45 +208,45 @@ class ForkedWorkerPool:
         """Distribute the items of a task among the workers, and yield each result as it arrives.
 
         An item is processed again if its worker dies; without any worker, the items are processed
-        in this process. `waiting` has the numbers of unprocessed items, `busy` the item number of
+        in this process. `unprocessed` has the numbers of these items, `busy` the item number of
         each working pipe, and `free` the idle pipes. `place` is the index by which the workers know
         the world.
 
         An error in a task is raised after all other items are finished.
         """
         errors: dict[int, tuple[Exception, str]] = {}
-        waiting = list(range(len(items)))[::-1]
+        unprocessed = list(range(len(items)))[::-1]
         busy: dict[Connection, int] = {}
         free = [worker.pipe for worker in self._team]
-        place = next(i for i, known in enumerate(self._known) if known is world)
-        while waiting or busy:
-            while free and waiting:
+        place = next(i for i, known_world in enumerate(self._known) if known_world is world)
+        while unprocessed or busy:
+            while free and unprocessed:
                 pipe = free.pop()
-                number = waiting.pop()
+                number = unprocessed.pop()
                 if _sent(pipe, (place, task, items[number])):
                     busy[pipe] = number
                 else:
                     self._lose(pipe)
-                    waiting.append(number)
+                    unprocessed.append(number)
             # All workers are gone, so the remaining items are processed here.
             if not busy:
-                yield from ((number, task(world, *items[number])) for number in waiting)
+                yield from ((number, task(world, *items[number])) for number in unprocessed)
                 break
             for pipe in self._heard(list(busy), world):
                 number = busy.pop(pipe)
-                answer = _received(pipe)
-                if answer is None:
+                reply = _received(pipe)
+                if reply is None:
                     # The worker died, perhaps for lack of memory, so its item is processed again.
                     self._lose(pipe)
-                    waiting.append(number)
+                    unprocessed.append(number)
                     continue
                 free.append(pipe)
-                world.simulations += answer.simulations
-                world.watch.record_abandoned_fit(answer.left)
-                if answer.error is not None:
-                    errors[number] = answer.error, answer.trace
+                world.simulations += reply.simulations
+                world.watch.record_abandoned_fit(reply.left)
+                if reply.error is not None:
+                    errors[number] = reply.error, reply.trace
                 else:
-                    yield number, answer.result
+                    yield number, reply.result
         # Raise the error of the first item in order, whichever error arrived first.
         for number in sorted(errors):
             error, trace = errors[number]
@@ -253,11 +255,11 @@ class ForkedWorkerPool:
     def _heard(self, pipes: list[Connection], world: SharedState) -> list[Any]:
         """Wait for replies and return their pipes; tell workers to stop if the search must end."""
         while True:
-            ready = connection.wait(pipes, POLL_INTERVAL_SECONDS)
+            ready_pipes = connection.wait(pipes, POLL_INTERVAL_SECONDS)
             if self._ending is not None and world.watch.should_stop():
                 self._ending[0] = 1
-            if ready:
-                return ready
+            if ready_pipes:
+                return ready_pipes
 
     def _lose(self, pipe: Connection) -> None:
         """Kill the worker at the other end of a pipe, and remove it from the pool."""
@@ -271,7 +273,7 @@ class ForkedWorkerPool:
 
 def _is_same_array(worlds: Sequence[SharedState], world: SharedState) -> bool:
     """Return whether a world is one of the given objects (by identity, not equality)."""
-    return any(one is world for one in worlds)
+    return any(other_world is world for other_world in worlds)
 
 
 def count_available_cores() -> int:
@@ -295,16 +297,16 @@ def can_fork() -> bool:
 class _Pickler(pickle.Pickler):
     """Pickler that keeps the memory order of arrays, because sums depend on it in the last bit."""
 
-    def reducer_override(self, thing: Any) -> Any:
+    def reducer_override(self, value: Any) -> Any:
         """Pickle an array that is not C-contiguous together with the order of its axes in memory.
 
         Pickle itself would not keep every memory order. All other objects are pickled as usual,
         which `NotImplemented` requests.
         """
-        if type(thing) is not np.ndarray or thing.ndim < 2 or thing.flags.c_contiguous:
+        if type(value) is not np.ndarray or value.ndim < 2 or value.flags.c_contiguous:
             return NotImplemented
-        order = np.argsort([-abs(stride) for stride in thing.strides], kind="stable")
-        return _restore_axes, (np.ascontiguousarray(thing.transpose(order)), np.argsort(order))
+        order = np.argsort([-abs(stride) for stride in value.strides], kind="stable")
+        return _restore_axes, (np.ascontiguousarray(value.transpose(order)), np.argsort(order))
 
 
 def _restore_axes(values: Array, order: Array) -> Array:
@@ -331,16 +333,16 @@ def _sent(pipe: Connection, message: Any) -> bool:
 def _received(pipe: Connection) -> _Answer | None:
     """Return the reply of a worker, or None if the worker is gone."""
     try:
-        answer: _Answer = pickle.loads(pipe.recv_bytes())
+        reply: _Answer = pickle.loads(pipe.recv_bytes())
     except (EOFError, OSError):
         return None
-    return answer
+    return reply
 
 
 def _work(
     worlds: Sequence[SharedState],
     pipe: Connection,
-    others: list[Connection],
+    other_pipes: list[Connection],
     ending: mmap.mmap,
     parent: int,
 ) -> None:
@@ -349,7 +351,7 @@ def _work(
     Args:
         worlds: objects that the worker inherits; a request names one by its index.
         pipe: connection to the parent.
-        others: inherited ends of other pipes, which the worker closes.
+        other_pipes: inherited ends of other pipes, which the worker closes.
         ending: one shared byte; a value other than zero asks all workers to stop.
         parent: process id of the parent.
     """
@@ -360,8 +362,8 @@ def _work(
     # The parent may have ended before the kernel signal was requested.
     if os.getppid() != parent:
         return
-    for other in others:
-        other.close()
+    for other_pipe in other_pipes:
+        other_pipe.close()
     for world in worlds:
         world.crew = ForkedWorkerPool()
     while True:

@@ -135,17 +135,17 @@ class RigModel:
         for name, value in self._iterate_initial_states():
             yield replace(plan, states=tuple((dict(plan.states) | {name: value}).items()))
         for name, values in self._list_adjustable_constants().items():
-            rest = tuple(pair for pair in plan.constants if pair[0] != name)
+            other_constants = tuple(pair for pair in plan.constants if pair[0] != name)
             for value in values:
-                yield replace(plan, constants=(*rest, (name, value)))
+                yield replace(plan, constants=(*other_constants, (name, value)))
         if plan.driven_inputs:
             for level in COMMAND_OFFSET_FACTORS:
                 yield replace(plan, level=level)
             for size in COMMAND_SIZE_FACTORS:
                 yield replace(plan, size=size)
-        for coarser in HOLD_FACTORS:
-            if self.seconds / (self.step * coarser) >= MIN_SAMPLES:
-                yield replace(plan, hold_factor=coarser)
+        for hold_factor in HOLD_FACTORS:
+            if self.seconds / (self.step * hold_factor) >= MIN_SAMPLES:
+                yield replace(plan, hold_factor=hold_factor)
 
     def _iterate_initial_states(self) -> Iterator[tuple[str, float]]:
         """Yield other initial states, each as a name and a value.
@@ -154,21 +154,24 @@ class RigModel:
         initial rates that were recorded, in both directions.
         """
         system, world = self.world.simulator.system, self.world
-        unseen = {world.states[i] for i in np.flatnonzero(world.known.all(axis=0))}
+        unobserved_states = {world.states[i] for i in np.flatnonzero(world.known.all(axis=0))}
         for name in system.coordinates:
-            base = float(self.begin[world.states.index(name)])
+            usual_value = float(self.begin[world.states.index(name)])
             values = [
-                share * base if abs(base) > REST_STATE else share for share in INITIAL_STATE_FACTORS
+                share * usual_value if abs(usual_value) > REST_STATE else share
+                for share in INITIAL_STATE_FACTORS
             ]
             # Outside its range a joint begins at the limit, which is tried only once.
             reachable = dict.fromkeys(self._clip_to_joint_range(name, value) for value in values)
-            for value in reachable if name not in unseen else ():
+            for value in reachable if name not in unobserved_states else ():
                 yield name, value
         if world.kind.has_model:
             return
         for name in system.rates:
             fastest = float(np.abs(world.guess[:, world.states.index(name)]).max())
-            for value in (fastest, -fastest) if fastest > REST_RATE and name not in unseen else ():
+            for value in (
+                (fastest, -fastest) if fastest > REST_RATE and name not in unobserved_states else ()
+            ):
                 yield name, value
 
     def _list_adjustable_constants(self) -> dict[str, list[float]]:
@@ -177,7 +180,11 @@ class RigModel:
         for run in self.world.runs:
             for name, value in run.constants.items():
                 values.setdefault(name, set()).add(value)
-        return {name: sorted(own) for name, own in values.items() if len(own) > 1}
+        return {
+            name: sorted(values_of_constant)
+            for name, values_of_constant in values.items()
+            if len(values_of_constant) > 1
+        }
 
     # -- runs
 
@@ -191,12 +198,12 @@ class RigModel:
         states = self.begin.copy()
         limited = []
         for number, name in enumerate(plan.driven_inputs):
-            own = plan.size * _compute_command(
+            signal = plan.size * _compute_command(
                 plan.form, times, self.step, np.random.default_rng(number)
             )
-            wanted = self.rest[name] + self.largest[name] * (own + plan.level)
-            inputs[name] = self._limit_command(name, wanted)
-            limited += [name] if (inputs[name] != wanted).any() else []
+            command = self.rest[name] + self.largest[name] * (signal + plan.level)
+            inputs[name] = self._limit_command(name, command)
+            limited += [name] if (inputs[name] != command).any() else []
         for name, value in plan.states:
             states[self.world.states.index(name)] = value
         constants = {**self.old.constants, **dict(plan.constants)}
@@ -218,18 +225,18 @@ class RigModel:
             limited: Names of the inputs that were clipped to the limits of the setup.
         """
         if plan.driven_inputs:
-            what = plan.driven_inputs[0] if len(plan.driven_inputs) == 1 else "all inputs"
-            text = f"{what}: {plan.form}, {plan.size:g} times as large as so far"
+            input_text = plan.driven_inputs[0] if len(plan.driven_inputs) == 1 else "all inputs"
+            text = f"{input_text}: {plan.form}, {plan.size:g} times as large as so far"
         else:
             text = "let it go"
         if plan.level:
-            middles = [f"{name} = {np.median(inputs[name]):.3g}" for name in plan.driven_inputs]
-            text += f", about {', '.join(middles)}"
+            medians = [f"{name} = {np.median(inputs[name]):.3g}" for name in plan.driven_inputs]
+            text += f", about {', '.join(medians)}"
         for name in limited:
             low, high = self.limits.commands[name]
             text += f", {name} limited to {low:.4g} to {high:.4g}"
-        begins = [f"{name} = {value:.3g}" for name, value in plan.states]
-        text += f", from {', '.join(begins)}" if begins else ""
+        initial_texts = [f"{name} = {value:.3g}" for name, value in plan.states]
+        text += f", from {', '.join(initial_texts)}" if initial_texts else ""
         if plan.constants:
             text += ", with " + ", ".join(f"{name} = {value:.4g}" for name, value in plan.constants)
         if plan.hold_factor > 1:
@@ -274,9 +281,11 @@ def _compute_command(form: str, times: Array, step: float, rng: np.random.Genera
     if form == "a push, then let go":
         return np.where(share < RELEASE_SHARE, 1.0, 0.0)
     seconds = float(times[-1])
-    # Frequencies in Hz: `slow` is one cycle in the run, but 0.1 to 0.5; `fast` has at least ten
-    # samples in a cycle, but is at most 8.
-    slow = min(max(1.0 / max(seconds, step), 0.1), 0.5)
-    fast = max(min(8.0, 0.1 / step), 2.0 * slow)
-    text = COMMAND_FORMS[form].format(slow=slow, middle=min(1.0, 0.5 * fast), fast=fast)
+    # In Hz. The slow frequency has one cycle in the run, but is 0.1 to 0.5 Hz. The fast one has at
+    # least ten samples in a cycle, but is at most 8 Hz.
+    slow_frequency = min(max(1.0 / max(seconds, step), 0.1), 0.5)
+    fast_frequency = max(min(8.0, 0.1 / step), 2.0 * slow_frequency)
+    text = COMMAND_FORMS[form].format(
+        slow=slow_frequency, middle=min(1.0, 0.5 * fast_frequency), fast=fast_frequency
+    )
     return evaluate_signal(text, times, rng)

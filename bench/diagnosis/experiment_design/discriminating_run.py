@@ -83,39 +83,52 @@ class _Run(NamedTuple):
 
 
 def propose_discriminating_run(
-    models: ModelSet, model: FittedModel, rival: FittedModel
+    models: ModelSet, model: FittedModel, competing_model: FittedModel
 ) -> DiscriminatingRun:
     """Propose a run or measurement that distinguishes a model from a competing model.
 
     Args:
         models: Collection that contains both models.
         model: Model of the present diagnosis.
-        rival: Competing model that explains the data as well.
+        competing_model: Competing model that explains the data as well.
     """
     world = models.world
-    says = ""
+    description = ""
     change: dict[str, float] = {}
-    largest = 0.0
-    apart = [
-        (_compute_discrimination(world, run, model, rival, models.noise.sigma), run)
+    largest_discrimination = 0.0
+    runs_by_discrimination = [
+        (_compute_discrimination(world, run, model, competing_model, models.noise.sigma), run)
         for run in _iterate_changed_runs(world)
     ]
     # A run that cannot be simulated with both models is not proposed.
-    apart = [(size, run) for size, run in apart if np.isfinite(size) and size > 0.0]
-    apart.sort(key=lambda entry: -entry[0])
+    runs_by_discrimination = [
+        (size, run) for size, run in runs_by_discrimination if np.isfinite(size) and size > 0.0
+    ]
+    runs_by_discrimination.sort(key=lambda entry: -entry[0])
     is_limited = False
-    if found := _find_first_within_limits(world, (model, rival), apart):
-        largest, (says, change, _, _) = found
-        is_limited = largest < MIN_DISCRIMINATION_SIGMAS <= apart[0][0]
+    if first_run := _find_first_within_limits(
+        world, (model, competing_model), runs_by_discrimination
+    ):
+        largest_discrimination, (description, change, _, _) = first_run
+        is_limited = (
+            largest_discrimination < MIN_DISCRIMINATION_SIGMAS <= runs_by_discrimination[0][0]
+        )
     # Effects that both models have are not in question.
-    names = set(model.effects)
-    rivals = set(rival.effects)
-    mine = " and ".join(sorted(names - rivals))
-    other = " and ".join(sorted(rivals - names))
-    if largest < MIN_DISCRIMINATION_SIGMAS:
-        return DiscriminatingRun(_explain_no_run(world, mine, other, is_limited), {}, largest)
-    says = f"{says}: there {mine} and {other} differ by {largest:.3g} times the noise"
-    return DiscriminatingRun(says, change, largest)
+    effects = set(model.effects)
+    competing_names = set(competing_model.effects)
+    model_effects = " and ".join(sorted(effects - competing_names))
+    competing_effects = " and ".join(sorted(competing_names - effects))
+    if largest_discrimination < MIN_DISCRIMINATION_SIGMAS:
+        return DiscriminatingRun(
+            _explain_no_run(world, model_effects, competing_effects, is_limited),
+            {},
+            largest_discrimination,
+        )
+    description += (
+        f": there {model_effects} and {competing_effects} differ by "
+        f"{largest_discrimination:.3g} times the noise"
+    )
+    return DiscriminatingRun(description, change, largest_discrimination)
 
 
 def _find_first_within_limits(
@@ -142,31 +155,34 @@ def _find_first_within_limits(
     from bench.diagnosis.experiment_design.safety_limits import RigLimits
 
     limits = RigLimits(world, models[0])
-    for apart, run in runs:
+    for discrimination, run in runs:
         candidate = RigRun(RunPlan(), run.says, run.scenario, run.states)
-        if apart < MIN_DISCRIMINATION_SIGMAS or all(
+        if discrimination < MIN_DISCRIMINATION_SIGMAS or all(
             limits(model, [candidate])[0] for model in models
         ):
-            return apart, run
+            return discrimination, run
     return 0.0, runs[0][1]
 
 
-def _explain_no_run(world: RunEvaluator, mine: str, other: str, is_limited: bool) -> str:
+def _explain_no_run(
+    world: RunEvaluator, model_effects: str, competing_effects: str, is_limited: bool
+) -> str:
     """Write what to do if no such run would discriminate, or none within the limits of a robot."""
     channels = [channel.name for channel in world.kind.channels]
-    unseen = ", ".join(name for name in channels if name not in world.channels)
-    instead = "measure one of the causes directly"
+    unrecorded = ", ".join(name for name in channels if name not in world.channels)
+    advice = "measure one of the causes directly"
     # Another sensor may measure a difference where these sensors agree.
-    if unseen:
-        instead = f"record {unseen} besides"
+    if unrecorded:
+        advice = f"record {unrecorded} besides"
     if is_limited:
         return (
-            f"No run of this kind within the limits of the model file would tell {mine} from "
-            f"{other}; {instead}, or let simgap design search for other commands"
+            "No run of this kind within the limits of the model file would tell "
+            f"{model_effects} from {competing_effects}; {advice}, "
+            "or let simgap design search for other commands"
         )
     return (
-        f"No run of this kind would tell {mine} from {other}: "
-        f"their predictions agree within the noise; {instead}"
+        f"No run of this kind would tell {model_effects} from {competing_effects}: "
+        f"their predictions agree within the noise; {advice}"
     )
 
 
@@ -194,11 +210,13 @@ def _get_first_run(world: RunEvaluator, limits: StatedLimits) -> _Run:
         0.0 if name in rates else _clip(value, limits.states.get(name))
         for name, value in zip(world.states, track.initial_state_guess, strict=True)
     ]
-    given = track.scenario.inputs
-    inputs = {name: _clip(values, limits.commands.get(name)) for name, values in given.items()}
-    is_limited = any((inputs[name] != values).any() for name, values in given.items())
-    says = ", with commands limited as the model file states" if is_limited else ""
-    return _Run(says, {}, replace(track.scenario, inputs=inputs), np.array(states))
+    recorded_inputs = track.scenario.inputs
+    inputs = {
+        name: _clip(values, limits.commands.get(name)) for name, values in recorded_inputs.items()
+    }
+    is_limited = any((inputs[name] != values).any() for name, values in recorded_inputs.items())
+    limit_note = ", with commands limited as the model file states" if is_limited else ""
+    return _Run(limit_note, {}, replace(track.scenario, inputs=inputs), np.array(states))
 
 
 def _clip(values: Any, limits: Interval | None) -> Any:
@@ -209,14 +227,14 @@ def _clip(values: Any, limits: Interval | None) -> Any:
 def _lengthen_run(first: _Run) -> _Run:
     """Return the run recorded for twice the time, with its inputs repeated from the beginning."""
     times = first.scenario.times
-    later = times[1:] - times[0]
-    twice = np.concatenate([times, times[-1] + later])
+    later_times = times[1:] - times[0]
+    doubled_times = np.concatenate([times, times[-1] + later_times])
     inputs = {}
     for name, signal in first.scenario.inputs.items():
         # The inputs are repeated from the beginning.
         inputs[name] = np.concatenate([signal, signal[1:]])
-    scenario = replace(first.scenario, times=twice, inputs=inputs)
-    seconds = float(twice[-1] - twice[0])
+    scenario = replace(first.scenario, times=doubled_times, inputs=inputs)
+    seconds = float(doubled_times[-1] - doubled_times[0])
     change = {"seconds": seconds}
     return _Run(f"Record twice as long{first.says}", change, scenario, first.states)
 
@@ -230,8 +248,8 @@ def _change_initial_states(
     """
     system = world.simulator.system
     height = len(system.coordinates) - 1
-    named = zip(world.states, _list_state_units(world), strict=True)
-    for place, (name, unit) in enumerate(named):
+    states_with_units = zip(world.states, _list_state_units(world), strict=True)
+    for place, (name, unit) in enumerate(states_with_units):
         above_ground = system.bounces and place == height
         if world.kind.has_model and name not in system.coordinates:
             continue
@@ -241,14 +259,14 @@ def _change_initial_states(
                 continue
             states = first.states.copy()
             value = float(states[place])
-            moving = abs(value) > REST_STATE
-            value = share * value if moving else share
+            is_nonzero = abs(value) > REST_STATE
+            value = share * value if is_nonzero else share
             if above_ground:
                 value = max(value, MIN_DROP_HEIGHT)
             value = float(_clip(value, limits.states.get(name)))
             states[place] = value
-            says = f"Start with {name} = {value:.3g} {unit}{first.says}"
-            yield _Run(says, {name: value}, first.scenario, states)
+            description = f"Start with {name} = {value:.3g} {unit}{first.says}"
+            yield _Run(description, {name: value}, first.scenario, states)
 
 
 def _scale_inputs(world: RunEvaluator, first: _Run, limits: StatedLimits) -> Iterator[_Run]:
@@ -261,16 +279,20 @@ def _scale_inputs(world: RunEvaluator, first: _Run, limits: StatedLimits) -> Ite
         if not signal.any():
             continue
         low, high = limits.commands.get(name, UNLIMITED)
-        most = _compute_largest_share(signal, (low, high))
-        for share in dict.fromkeys(min(share, most) for share in shares):
-            driven = share * signal
-            if 1.0 / LARGER < share < LARGER or driven.min() < low or driven.max() > high:
+        largest_share = _compute_largest_share(signal, (low, high))
+        for share in dict.fromkeys(min(share, largest_share) for share in shares):
+            scaled_signal = share * signal
+            if (
+                1.0 / LARGER < share < LARGER
+                or scaled_signal.min() < low
+                or scaled_signal.max() > high
+            ):
                 continue
-            inputs = {**first.scenario.inputs, name: driven}
+            inputs = {**first.scenario.inputs, name: scaled_signal}
             size = "smaller" if share < 1 else "larger"
-            says = f"Make the input {name} {size}, {share:.3g} times what it was{first.says}"
+            description = f"Make the input {name} {size}, {share:.3g} times what it was{first.says}"
             scenario = replace(first.scenario, inputs=inputs)
-            yield _Run(says, {name: share}, scenario, first.states)
+            yield _Run(description, {name: share}, scenario, first.states)
 
 
 def _compute_largest_share(signal: Array, limits: Interval) -> float:
@@ -288,39 +310,41 @@ def _list_state_units(world: RunEvaluator) -> list[str]:
     """List the units of the states: coordinates, their rates, and further states."""
     system = world.simulator.system
     units = {channel.name: channel.unit for channel in world.kind.channels}
-    lengths = [units.get(name, "m") for name in system.coordinates]
-    rates = [f"{unit}/s" for unit in lengths]
+    coordinate_units = [units.get(name, "m") for name in system.coordinates]
+    rate_units = [f"{unit}/s" for unit in coordinate_units]
     # A user-defined system may have further states after the rates, in any unit.
-    further = system.rates[len(lengths) :]
-    others = [units.get(name, "SI") for name in further]
-    return [*lengths, *rates, *others]
+    further_states = system.rates[len(coordinate_units) :]
+    further_units = [units.get(name, "SI") for name in further_states]
+    return [*coordinate_units, *rate_units, *further_units]
 
 
 def _compute_discrimination(
-    world: RunEvaluator, run: _Run, model: FittedModel, rival: FittedModel, sigma: Array
+    world: RunEvaluator, run: _Run, model: FittedModel, competing_model: FittedModel, sigma: Array
 ) -> float:
     """Simulate a run with two models, and compute the RMS of their difference, eq. (1).
 
     The larger it is, the more clearly the run shows which model is right. `sigma` (C,) has the
     noise.
     """
-    both = [model.fit.theta, rival.fit.theta]
+    model_thetas = [model.fit.theta, competing_model.fit.theta]
     # Freed constants are fitted with the parameters, but passed to the simulator as constants.
     places = world.base[world.own :]
-    theta = np.delete(np.stack(both), places, axis=1)
+    theta = np.delete(np.stack(model_thetas), places, axis=1)
     names = [parameter.name for parameter in world.freed]
     scenarios = []
-    for fitted in both:
-        values = fitted[places].tolist()
-        freed = dict(zip(names, values, strict=True))
-        constants = {**run.scenario.constants, **freed}
+    for model_theta in model_thetas:
+        values = model_theta[places].tolist()
+        freed_constants = dict(zip(names, values, strict=True))
+        constants = {**run.scenario.constants, **freed_constants}
         scenarios.append(replace(run.scenario, constants=constants))
 
     # Each model is one batch element of the call, both with the same initial states.
     initial = {}
     for name, value in zip(world.states, run.states.tolist(), strict=True):
         initial[name] = np.full(2, value)
-    mine, other = world.simulator.simulate_batch(theta, scenarios, initial)
+    model_prediction, competing_prediction = world.simulator.simulate_batch(
+        theta, scenarios, initial
+    )
     world.simulations += 2
-    apart = (mine - other) / sigma
-    return float(np.sqrt(np.square(apart).mean()))  # (1)
+    whitened_difference = (model_prediction - competing_prediction) / sigma
+    return float(np.sqrt(np.square(whitened_difference).mean()))  # (1)

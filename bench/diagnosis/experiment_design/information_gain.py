@@ -109,7 +109,7 @@ def get_sort_key(entry: RunValue) -> tuple[float, str]:
 class RunRanker:
     """Ranker of candidate runs for some models, the first of which is the present diagnosis."""
 
-    def __init__(self, models: ModelSet, rivals: Sequence[FittedModel]) -> None:
+    def __init__(self, models: ModelSet, competing_models: Sequence[FittedModel]) -> None:
         """Prepare the noise, the limits of the setup, and the covariances of the parameters.
 
         `known` has the covariance of the parameters of each model, as C in eq. (1). `pairs` has all
@@ -118,10 +118,10 @@ class RunRanker:
         (s,) marks the initial states that have to be estimated.
         """
         self.models, self.world = models, models.world
-        self.known = [_compute_prior_covariance(models, one) for one in rivals]
-        self.noise: NoiseModel = compute_fisher_blocks(models, rivals[0]).noise
-        self.limits = RigLimits(self.world, rivals[0])
-        count = len(rivals)
+        self.known = [_compute_prior_covariance(models, model) for model in competing_models]
+        self.noise: NoiseModel = compute_fisher_blocks(models, competing_models[0]).noise
+        self.limits = RigLimits(self.world, competing_models[0])
+        count = len(competing_models)
         self.pairs = list(permutations(range(count), 2))
         self.most = MAX_USEFUL_DISCRIMINATION * len(self.pairs) / 2 if self.pairs else np.inf
         self.patience = FEWER if self.world.kind.has_model else MANY
@@ -131,15 +131,23 @@ class RunRanker:
 
     def rank_runs(self, runs: Sequence[CandidateRun]) -> list[RunValue]:
         """Return the runs within the limits, the best first, by (1) to first order or by (2)."""
-        stands = self.known[0].model
-        able = [run for run, may in zip(runs, self.limits(stands, runs), strict=True) if may]
+        diagnosed_model = self.known[0].model
+        allowed_runs = [
+            run
+            for run, is_allowed in zip(runs, self.limits(diagnosed_model, runs), strict=True)
+            if is_allowed
+        ]
         if self.world.kind.has_model:
-            able = self._select_distinct_runs(able)
+            allowed_runs = self._select_distinct_runs(allowed_runs)
         entries = []
-        for run in able:
-            slopes = [self._linearise_run(run, one, one.model.fit.theta) for one in self.known]
-            if all(one is not None for one in slopes):
-                entries.append(self._rank_run(run, [one for one in slopes if one is not None]))
+        for run in allowed_runs:
+            linearisations = [
+                self._linearise_run(run, one, one.model.fit.theta) for one in self.known
+            ]
+            if all(one is not None for one in linearisations):
+                entries.append(
+                    self._rank_run(run, [one for one in linearisations if one is not None])
+                )
         return sorted(entries, key=get_sort_key)
 
     def _rank_run(self, run: CandidateRun, slopes: Sequence[_LinearisedRun]) -> RunValue:
@@ -152,10 +160,10 @@ class RunRanker:
             value = _compute_information_gain(slopes[0], self.known[0])
             return RunValue(run, np.array([value]), value)
         values = np.zeros((len(slopes), len(slopes)))
-        for true, rival in self.pairs:
-            gap = slopes[true].centre - slopes[rival].centre
-            values[true, rival] = _compute_remaining_difference(
-                gap, slopes[rival], self.known[rival]
+        for true, competing_index in self.pairs:
+            gap = slopes[true].centre - slopes[competing_index].centre
+            values[true, competing_index] = _compute_remaining_difference(
+                gap, slopes[competing_index], self.known[competing_index]
             )[0]
         return RunValue(run, values, _sum_discrimination(values))
 
@@ -164,13 +172,13 @@ class RunRanker:
         if not self.pairs:
             return entry._replace(is_exact=True)
         values = entry.values.copy()
-        for true, rival in self.pairs:
-            values[true, rival] = self._compute_discrimination(
-                entry.run, self.known[true], self.known[rival]
+        for true, competing_index in self.pairs:
+            values[true, competing_index] = self._compute_discrimination(
+                entry.run, self.known[true], self.known[competing_index]
             )
         # The run must be within the limits, whichever model is true.
-        for one in self.known[1:]:
-            if not self.limits(one.model, [entry.run])[0]:
+        for known_model in self.known[1:]:
+            if not self.limits(known_model.model, [entry.run])[0]:
                 values[:] = 0.0
         return RunValue(entry.run, values, _sum_discrimination(values), is_exact=True)
 
@@ -181,10 +189,10 @@ class RunRanker:
         """
         sizes = []
         for run in runs:
-            thetas = [one.model.fit.theta for one in self.known]
-            seen = self._whiten(self._simulate_run(run, thetas, [run.states] * len(thetas)))
-            gaps = [seen[b] - seen[a] for a, b in combinations(range(len(seen)), 2)]
-            gaps = gaps or [seen[0] - seen[0].mean()]
+            thetas = [known_model.model.fit.theta for known_model in self.known]
+            whitened = self._whiten(self._simulate_run(run, thetas, [run.states] * len(thetas)))
+            gaps = [whitened[b] - whitened[a] for a, b in combinations(range(len(whitened)), 2)]
+            gaps = gaps or [whitened[0] - whitened[0].mean()]
             size = float(sum(np.log1p(np.square(gap).sum()) for gap in gaps))
             sizes.append(size if np.isfinite(size) else -np.inf)
         order = np.argsort(-np.array(sizes), kind="stable")
@@ -201,13 +209,13 @@ class RunRanker:
 
     def _whiten(self, values: Array) -> Array:
         """Whiten observations, or differences of them, to (L, n)."""
-        seen = np.ones((1, *values.shape[1:]), dtype=np.bool_)
+        is_observed = np.ones((1, *values.shape[1:]), dtype=np.bool_)
         lanes = np.moveaxis(values, 0, -1)[None]
-        result: Array = np.moveaxis(whiten(lanes, seen, self.noise)[0], -1, 0)
+        result: Array = np.moveaxis(whiten(lanes, is_observed, self.noise)[0], -1, 0)
         return result.reshape(len(values), -1)
 
     def _linearise_run(
-        self, run: CandidateRun, known: _Known, at: Array, states: Array | None = None
+        self, run: CandidateRun, known_model: _Known, theta: Array, states: Array | None = None
     ) -> _LinearisedRun | None:
         """Linearise a run at a parameter vector and an initial state.
 
@@ -216,61 +224,81 @@ class RunRanker:
             the initial state so much that its result could not be interpreted.
         """
         begin = run.states if states is None else states
-        free = known.model.fit.free.tolist()
-        thetas = [at] * (1 + len(free) + int(self.free.sum()))
+        free = known_model.model.fit.free.tolist()
+        thetas = [theta] * (1 + len(free) + int(self.free.sum()))
         for row, place in enumerate(free):
-            moved = at.copy()
-            moved[place] += known.spread[row]
-            thetas[1 + row] = moved
+            displaced_theta = theta.copy()
+            displaced_theta[place] += known_model.spread[row]
+            thetas[1 + row] = displaced_theta
         shifts = STATE_STEP_SHARE * np.eye(begin.size)[self.free]
         begins = [begin] * (1 + len(free)) + [begin + shift for shift in shifts]
-        seen = self._simulate_run(run, thetas, begins)
-        if not np.isfinite(seen).all():
+        simulated = self._simulate_run(run, thetas, begins)
+        if not np.isfinite(simulated).all():
             return None
-        apart = np.abs(seen[1 + len(free) :] - seen[0])
+        differences = np.abs(simulated[1 + len(free) :] - simulated[0])
         sizes = np.array([channel.scale for channel in self.world.simulator.channels])
-        if apart.size and (apart / sizes).max() > MAX_STATE_STEP_GROWTH * STATE_STEP_SHARE:
+        if (
+            differences.size
+            and (differences / sizes).max() > MAX_STATE_STEP_GROWTH * STATE_STEP_SHARE
+        ):
             return None
-        lanes = self._whiten(np.concatenate([seen[:1], seen[1:] - seen[0]]))
-        numbers, initial = lanes[1 : 1 + len(free)], lanes[1 + len(free) :]
-        return _LinearisedRun(lanes[0], numbers.T, initial.T / STATE_STEP_SHARE)
+        lanes = self._whiten(np.concatenate([simulated[:1], simulated[1:] - simulated[0]]))
+        parameter_responses, state_responses = lanes[1 : 1 + len(free)], lanes[1 + len(free) :]
+        return _LinearisedRun(lanes[0], parameter_responses.T, state_responses.T / STATE_STEP_SHARE)
 
-    def _compute_discrimination(self, run: CandidateRun, true: _Known, rival: _Known) -> float:
+    def _compute_discrimination(
+        self, run: CandidateRun, true: _Known, competing_model: _Known
+    ) -> float:
         """Compute the discrimination T of eq. (1) of a run, to which the competitor is refitted.
 
-        The prediction of the model `true` takes the place of the recording. The fit of `rival` by
-        Levenberg-Marquardt may move its parameters as far as the present data allow.
+        The prediction of the model `true` takes the place of the recording. The fit of
+        `competing_model` by Levenberg-Marquardt may move its parameters as far as the present data
+        allow.
         """
-        fit = rival.model.fit
-        shown = self._simulate_run(run, [true.model.fit.theta], [run.states])
-        aim = self._whiten(shown)[0]
-        at, states, gone = fit.theta.copy(), run.states.copy(), np.zeros(fit.free.size)
-        slopes, damping = self._linearise_run(run, rival, at), 1e-6
-        if slopes is None or not np.isfinite(aim).all():
+        fit = competing_model.model.fit
+        simulated = self._simulate_run(run, [true.model.fit.theta], [run.states])
+        target = self._whiten(simulated)[0]
+        theta, states, deviation = fit.theta.copy(), run.states.copy(), np.zeros(fit.free.size)
+        linearisation, damping = self._linearise_run(run, competing_model, theta), 1e-6
+        if linearisation is None or not np.isfinite(target).all():
             return 0.0
-        least = float(np.square(aim - slopes.centre).sum())
+        lowest_cost = float(np.square(target - linearisation.centre).sum())
         for _ in range(MAX_FIT_ITERATIONS):
             if damping > MAX_DAMPING:
                 break
-            _, step, moved = _compute_remaining_difference(
-                aim - slopes.centre, slopes, rival, gone, damping
+            _, step, state_step = _compute_remaining_difference(
+                target - linearisation.centre, linearisation, competing_model, deviation, damping
             )
-            tried, begin = at.copy(), states.copy()
-            tried[fit.free] += step * rival.spread
-            begin[self.free] += moved
-            after = self._linearise_run(run, rival, tried, begin)
-            own = np.inf if after is None else float(np.square(aim - after.centre).sum())
-            cost = own + float((gone + step) @ rival.inverse @ (gone + step))
-            if after is None or not cost < least:
+            trial_theta, trial_states = theta.copy(), states.copy()
+            trial_theta[fit.free] += step * competing_model.spread
+            trial_states[self.free] += state_step
+            trial_linearisation = self._linearise_run(
+                run, competing_model, trial_theta, trial_states
+            )
+            residual_cost = (
+                np.inf
+                if trial_linearisation is None
+                else float(np.square(target - trial_linearisation.centre).sum())
+            )
+            cost = residual_cost + float(
+                (deviation + step) @ competing_model.inverse @ (deviation + step)
+            )
+            if trial_linearisation is None or not cost < lowest_cost:
                 # The step was too long or failed, so the next one is much shorter (Marquardt).
                 damping *= 100.0
                 continue
-            done = least - cost < 1e-3 * least
-            at, states, gone, slopes, least = tried, begin, gone + step, after, cost
+            is_converged = lowest_cost - cost < 1e-3 * lowest_cost
+            theta, states, deviation, linearisation, lowest_cost = (
+                trial_theta,
+                trial_states,
+                deviation + step,
+                trial_linearisation,
+                cost,
+            )
             damping /= 10.0
-            if done:
+            if is_converged:
                 break
-        return least
+        return lowest_cost
 
 
 def _compute_prior_covariance(models: ModelSet, model: FittedModel) -> _Known:
@@ -280,26 +308,30 @@ def _compute_prior_covariance(models: ModelSet, model: FittedModel) -> _Known:
     its bounds: otherwise the step of a parameter that the data hardly determine would be too large
     for a derivative.
     """
-    own = compute_covariance(models, model)
+    covariance = compute_covariance(models, model)
     bounds = np.array([models.world.parameters[i].bounds for i in model.fit.free]).reshape(-1, 2)
     # At most a tenth of the range, because derivatives are finite differences with this step.
-    widest = 0.1 * (bounds[:, 1] - bounds[:, 0])
-    spread = np.minimum(np.sqrt(np.maximum(np.diagonal(own), 1e-300)), widest)
-    inverse = np.asarray(np.linalg.pinv(own / np.outer(spread, spread), hermitian=True))
+    max_spread = 0.1 * (bounds[:, 1] - bounds[:, 0])
+    spread = np.minimum(np.sqrt(np.maximum(np.diagonal(covariance), 1e-300)), max_spread)
+    inverse = np.asarray(np.linalg.pinv(covariance / np.outer(spread, spread), hermitian=True))
     return _Known(model, np.asarray(spread), inverse)
 
 
 def _sum_discrimination(values: Array) -> float:
     """Sum the discrimination over all pairs; each pair counts up to `MAX_USEFUL_DISCRIMINATION`."""
-    least = np.minimum(values, values.T)
-    return float(np.minimum(least[np.triu_indices(len(least), 1)], MAX_USEFUL_DISCRIMINATION).sum())
+    discrimination = np.minimum(values, values.T)
+    return float(
+        np.minimum(
+            discrimination[np.triu_indices(len(discrimination), 1)], MAX_USEFUL_DISCRIMINATION
+        ).sum()
+    )
 
 
 def _compute_remaining_difference(
     gap: Array,
     slopes: _LinearisedRun,
-    known: _Known,
-    gone: Array | None = None,
+    known_model: _Known,
+    deviation: Array | None = None,
     damping: float = 1e-9,
 ) -> tuple[float, Array, Array]:
     """Compute (1) to first order, and the steps of parameters and states at its minimum.
@@ -307,27 +339,30 @@ def _compute_remaining_difference(
     Args:
         gap: (n,) residual of the competing model.
         slopes: Linearisation of the competing model.
-        known: Information of the present runs on the competing model.
-        gone: (q,) difference of its parameters from their present estimates, in units of spread.
+        known_model: Information of the present runs on the competing model.
+        deviation: (q,) difference of its parameters from their present estimates, in units of
+            `spread`.
         damping: Levenberg-Marquardt damping of the step.
     """
-    q = len(known.spread)
-    gone = np.zeros(q) if gone is None else gone
+    q = len(known_model.spread)
+    deviation = np.zeros(q) if deviation is None else deviation
     columns = np.concatenate([slopes.numbers, slopes.states], axis=1)
     normal, pull = columns.T @ columns, columns.T @ gap
-    normal[:q, :q] += known.inverse
-    pull[:q] -= known.inverse @ gone
+    normal[:q, :q] += known_model.inverse
+    pull[:q] -= known_model.inverse @ deviation
     damped = normal + damping * np.diag(np.diagonal(normal)) + 1e-18 * np.eye(len(normal))
     step = np.linalg.solve(damped, pull)
-    begun = float(gap @ gap + gone @ known.inverse @ gone)
-    least = begun - 2.0 * float(pull @ step) + float(step @ normal @ step)
-    return max(least, 0.0), step[:q], step[q:]
+    initial_cost = float(gap @ gap + deviation @ known_model.inverse @ deviation)
+    minimum_cost = initial_cost - 2.0 * float(pull @ step) + float(step @ normal @ step)
+    return max(minimum_cost, 0.0), step[:q], step[q:]
 
 
-def _compute_information_gain(slopes: _LinearisedRun, known: _Known) -> float:
+def _compute_information_gain(slopes: _LinearisedRun, known_model: _Known) -> float:
     """Compute (2), the logarithm of the decrease of the uncertainty."""
     basis, _ = np.linalg.qr(slopes.states)
-    own = slopes.numbers - basis @ (basis.T @ slopes.numbers)
-    scaled = np.linalg.pinv(known.inverse, hermitian=True)
-    _, value = np.linalg.slogdet(np.eye(len(scaled)) + scaled @ (own.T @ own))
+    projected_slopes = slopes.numbers - basis @ (basis.T @ slopes.numbers)
+    covariance = np.linalg.pinv(known_model.inverse, hermitian=True)
+    _, value = np.linalg.slogdet(
+        np.eye(len(covariance)) + covariance @ (projected_slopes.T @ projected_slopes)
+    )
     return float(0.5 * value)

@@ -84,28 +84,28 @@ def _compute_command_range(robot: Any, actuator: Any) -> Interval:
 
     It is in the unit of the control: a force for a motor, a position or velocity for a servo.
     """
-    own = actuator.range or UNLIMITED
+    interval = actuator.range or UNLIMITED
     if actuator.joint is None:
-        return own
+        return interval
     joint = robot.joint(actuator.joint)
     gear = float(robot.compiled.actuator_gear[actuator.id, 0])
     if actuator.kind == "motor":
         # The actuator force is gain times control, and the joint force is gear times actuator
         # force.
         gain = float(robot.compiled.actuator_gainprm[actuator.id, 0])
-        own = _intersect(own, _divide_interval(actuator.force, gain))
+        interval = _intersect(interval, _divide_interval(actuator.force, gain))
         # Several motors of a joint may act at the same time.
         motors = [a for a in robot.actuators if a.joint == joint.name and a.kind == "motor"]
         return _intersect(
-            own, _divide_interval(_get_effort_limit(robot, joint), gear * gain * len(motors))
+            interval, _divide_interval(_get_effort_limit(robot, joint), gear * gain * len(motors))
         )
     # The set point of a servo is the gear times the desired value at the joint.
     if actuator.kind in ("position", "pid"):
-        own = _intersect(own, _multiply_interval(joint.range, gear))
+        interval = _intersect(interval, _multiply_interval(joint.range, gear))
     elif actuator.kind == "velocity" and joint.name in robot.speeds:
         speed = robot.speeds[joint.name]
-        own = _intersect(own, _multiply_interval((-speed, speed), gear))
-    return own
+        interval = _intersect(interval, _multiply_interval((-speed, speed), gear))
+    return interval
 
 
 def _get_effort_limit(robot: Any, joint: Any) -> Interval:
@@ -116,10 +116,10 @@ def _get_effort_limit(robot: Any, joint: Any) -> Interval:
     return low, high
 
 
-def _intersect(one: Interval, other: Interval) -> Interval:
+def _intersect(first: Interval, second: Interval) -> Interval:
     """Intersect two intervals; return the first if they are disjoint."""
-    low, high = max(one[0], other[0]), min(one[1], other[1])
-    return (low, high) if low <= high else one
+    low, high = max(first[0], second[0]), min(first[1], second[1])
+    return (low, high) if low <= high else first
 
 
 def _multiply_interval(interval: Interval | None, factor: float) -> Interval:

@@ -93,7 +93,7 @@ class NextRunDesign:
 def design_next_run(
     models: ModelSet,
     model: FittedModel,
-    rivals: Sequence[FittedModel],
+    competing_models: Sequence[FittedModel],
     seconds: float,
     longest: float,
 ) -> NextRunDesign | None:
@@ -102,7 +102,7 @@ def design_next_run(
     Args:
         models: Collection that contains all of the models.
         model: Model of the present diagnosis.
-        rivals: Competing models that explain the data as well; empty if there are none.
+        competing_models: Competing models that explain the data as well; empty if there are none.
         seconds: Duration of the run in seconds.
         longest: Maximum duration in seconds, if a run of `seconds` does not decide.
 
@@ -110,90 +110,106 @@ def design_next_run(
         The design; None if no run can be simulated.
     """
     rig = RigModel(models.world, seconds)
-    judge = RunRanker(models, [model, *rivals])
-    found = judge.rank_runs([rig.make_run(plan) for plan in rig.list_basic_plans()])
-    asked = {entry.run.plan for entry in found}
+    ranker = RunRanker(models, [model, *competing_models])
+    ranked_runs = ranker.rank_runs([rig.make_run(plan) for plan in rig.list_basic_plans()])
+    evaluated_plans = {entry.run.plan for entry in ranked_runs}
     for _ in range(MAX_VARIATION_ROUNDS):
-        found = _evaluate_fully(judge, found)
-        if not found or found[0].value >= judge.most or models.world.watch.has_abandoned_fits():
+        ranked_runs = _evaluate_fully(ranker, ranked_runs)
+        if (
+            not ranked_runs
+            or ranked_runs[0].value >= ranker.most
+            or models.world.watch.has_abandoned_fits()
+        ):
             break
         plans = [
             plan
-            for entry in found[:PLANS_VARIED_PER_ROUND]
+            for entry in ranked_runs[:PLANS_VARIED_PER_ROUND]
             for plan in rig.list_variants(entry.run.plan)
         ]
-        new = [plan for plan in dict.fromkeys(plans) if plan not in asked]
-        asked.update(new)
-        found = [*found, *judge.rank_runs([rig.make_run(plan) for plan in new])]
-    found = _evaluate_fully(judge, found)
-    if found and _would_longer_run_help(found[0], longest / seconds):
-        longer = RigModel(models.world, longest)
-        long = judge.rank_runs(
-            [longer.make_run(entry.run.plan) for entry in found[:PLANS_TESTED_FOR_LENGTH]]
+        new_plans = [plan for plan in dict.fromkeys(plans) if plan not in evaluated_plans]
+        evaluated_plans.update(new_plans)
+        ranked_runs = [*ranked_runs, *ranker.rank_runs([rig.make_run(plan) for plan in new_plans])]
+    ranked_runs = _evaluate_fully(ranker, ranked_runs)
+    if ranked_runs and _would_longer_run_help(ranked_runs[0], longest / seconds):
+        longer_rig = RigModel(models.world, longest)
+        longer_runs = ranker.rank_runs(
+            [longer_rig.make_run(entry.run.plan) for entry in ranked_runs[:PLANS_TESTED_FOR_LENGTH]]
         )
-        found = sorted([found[0], *_evaluate_fully(judge, long)[:1]], key=get_sort_key)
-    return _describe_best_run(models, [model, *rivals], rig, found[0]) if found else None
+        ranked_runs = sorted(
+            [ranked_runs[0], *_evaluate_fully(ranker, longer_runs)[:1]], key=get_sort_key
+        )
+    return (
+        _describe_best_run(models, [model, *competing_models], rig, ranked_runs[0])
+        if ranked_runs
+        else None
+    )
 
 
 def _would_longer_run_help(best: RunValue, times: float) -> bool:
     """Return whether a longer run may distinguish models that the best run does not."""
-    least = np.minimum(best.values, best.values.T)
-    untold = least[(least > 0) & (least <= DISCRIMINATION_THRESHOLD)]
+    discrimination = np.minimum(best.values, best.values.T)
+    undistinguished = discrimination[
+        (discrimination > 0) & (discrimination <= DISCRIMINATION_THRESHOLD)
+    ]
     return (
         times > 1.0
         and best.values.ndim == 2
-        and bool((untold * 2.0 * times > DISCRIMINATION_THRESHOLD).any())
+        and bool((undistinguished * 2.0 * times > DISCRIMINATION_THRESHOLD).any())
     )
 
 
-def _evaluate_fully(judge: RunRanker, found: Sequence[RunValue]) -> list[RunValue]:
+def _evaluate_fully(ranker: RunRanker, runs: Sequence[RunValue]) -> list[RunValue]:
     """Sort runs by value, after exact evaluation of the first ones.
 
     Linearised values tend to be too high.
     """
-    ranked = sorted(found, key=get_sort_key)
-    for _ in range(judge.patience):
+    ranked = sorted(runs, key=get_sort_key)
+    for _ in range(ranker.patience):
         first = next(
             (k for k, entry in enumerate(ranked[:PLANS_VARIED_PER_ROUND]) if not entry.is_exact),
             None,
         )
-        if first is None or (ranked[0].is_exact and ranked[0].value >= judge.most):
+        if first is None or (ranked[0].is_exact and ranked[0].value >= ranker.most):
             break
-        ranked[first] = judge.evaluate_exactly(ranked[first])
+        ranked[first] = ranker.evaluate_exactly(ranked[first])
         ranked.sort(key=get_sort_key)
     # Runs that are evaluated exactly come before those that are only linearised.
     return sorted(ranked, key=lambda entry: (not entry.is_exact, *get_sort_key(entry)))
 
 
 def _describe_best_run(
-    models: ModelSet, among: Sequence[FittedModel], rig: RigModel, entry: RunValue
+    models: ModelSet, models_compared: Sequence[FittedModel], rig: RigModel, entry: RunValue
 ) -> NextRunDesign:
     """Describe the best run, and what it is expected to tell, for the report.
 
     Args:
         models: Fitted models of the recording.
-        among: The present diagnosis, followed by the models that compete with it.
+        models_compared: The present diagnosis, followed by the models that compete with it.
         rig: Experimental setup.
         entry: Best run with its value.
     """
-    run, rivals = entry.run, among[1:]
+    run, competing_models = entry.run, models_compared[1:]
     discrimination: dict[str, float] = {}
     groups: tuple[tuple[str, ...], ...] = ()
-    effect, gain = "", float(entry.values[0]) if not rivals else 0.0
-    if rivals:
-        least = np.minimum(entry.values, entry.values.T)
-        stands = among[0]
-        names = [_list_other_effects(one, stands) for one in rivals]
-        effect = _list_other_effects(stands, rivals[0])
+    effect, gain = "", float(entry.values[0]) if not competing_models else 0.0
+    if competing_models:
+        pair_discrimination = np.minimum(entry.values, entry.values.T)
+        diagnosed_model = models_compared[0]
+        names = [
+            _list_other_effects(competing_model, diagnosed_model)
+            for competing_model in competing_models
+        ]
+        effect = _list_other_effects(diagnosed_model, competing_models[0])
         discrimination = {
-            name: float(value) for name, value in zip(names, least[0, 1:], strict=True)
+            name: float(value)
+            for name, value in zip(names, pair_discrimination[0, 1:], strict=True)
         }
-        groups = tuple(_iterate_connected_groups([effect, *names], least))
+        groups = tuple(_iterate_connected_groups([effect, *names], pair_discrimination))
         gain = min(discrimination.values())
     constants = dict(run.plan.constants)
     return NextRunDesign(
         says=run.says,
-        by="T" if rivals else "D",
+        by="T" if competing_models else "D",
         gain=gain,
         effect=effect,
         discrimination=discrimination,
@@ -205,18 +221,24 @@ def _describe_best_run(
     )
 
 
-def _list_other_effects(model: FittedModel, than: FittedModel) -> str:
+def _list_other_effects(model: FittedModel, other_model: FittedModel) -> str:
     """Return the effects that one model has and the other does not have."""
-    return " and ".join(name for name in model.effects if name not in than.effects)
+    return " and ".join(name for name in model.effects if name not in other_model.effects)
 
 
-def _iterate_connected_groups(names: Sequence[str], least: Array) -> Iterator[tuple[str, ...]]:
+def _iterate_connected_groups(
+    names: Sequence[str], discrimination: Array
+) -> Iterator[tuple[str, ...]]:
     """Yield connected groups of names that are linked by pairs that are not distinguished."""
-    left = list(range(len(names)))
-    while left:
-        group, new = [], [left[0]]
-        while new:
-            group += new
-            left = [place for place in left if place not in new]
-            new = [b for b in left if any(least[a, b] <= DISCRIMINATION_THRESHOLD for a in new)]
+    remaining = list(range(len(names)))
+    while remaining:
+        group, added = [], [remaining[0]]
+        while added:
+            group += added
+            remaining = [place for place in remaining if place not in added]
+            added = [
+                b
+                for b in remaining
+                if any(discrimination[a, b] <= DISCRIMINATION_THRESHOLD for a in added)
+            ]
         yield tuple(names[place] for place in sorted(group))

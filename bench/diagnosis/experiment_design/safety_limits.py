@@ -69,8 +69,10 @@ class RigLimits:
         if not runs:
             return []
         states = np.array([run.states for run in runs])
-        seen = self._simulate_monitored_channels(model, [run.scenario for run in runs], states)
-        return [self._is_within_limits(channels) for channels in seen]
+        simulated_channels = self._simulate_monitored_channels(
+            model, [run.scenario for run in runs], states
+        )
+        return [self._is_within_limits(channels) for channels in simulated_channels]
 
     # -- monitored channels
 
@@ -79,12 +81,12 @@ class RigLimits:
         """Names of the monitored channels."""
         kind = self.world.kind
         if not kind.has_model:
-            moving = {*kind.system.coordinates, *kind.system.rates, *self.world.channels}
-            return [c.name for c in kind.channels if c.name in moving]
+            monitored_names = {*kind.system.coordinates, *kind.system.rates, *self.world.channels}
+            return [c.name for c in kind.channels if c.name in monitored_names]
         names = {
-            f"{what}.{joint.name}"
+            f"{quantity}.{joint.name}"
             for joint in self._single_coordinate_joints
-            for what in ("q", "qd", "tau")
+            for quantity in ("q", "qd", "tau")
         }
         return [c.name for c in kind.channels if c.name in names]
 
@@ -103,17 +105,21 @@ class RigLimits:
         simulator = world.make_observing_simulator(self.monitored_channels, model.effects)
         try:
             theta = np.array([[values.get(p.name, 0.0) for p in simulator.parameters]])
-            freed = {p.name: values[p.name] for p in world.freed}
-            own = [replace(s, constants={**s.constants, **freed}) for s in scenarios]
+            freed_constants = {p.name: values[p.name] for p in world.freed}
+            model_scenarios = [
+                replace(s, constants={**s.constants, **freed_constants}) for s in scenarios
+            ]
             initial = dict(zip(world.states, states.T, strict=True))
-            result = simulator.simulate_batch(np.repeat(theta, len(own), 0), own, initial)
+            result = simulator.simulate_batch(
+                np.repeat(theta, len(model_scenarios), 0), model_scenarios, initial
+            )
         finally:
             simulator.close()
-        world.simulations += len(own)
+        world.simulations += len(model_scenarios)
         names = [channel.name for channel in simulator.channels]
         return [
             dict(zip(names, lane[: scenario.times.size].T, strict=True))
-            for lane, scenario in zip(result, own, strict=True)
+            for lane, scenario in zip(result, model_scenarios, strict=True)
         ]
 
     # -- limits
@@ -124,26 +130,38 @@ class RigLimits:
         It is the limit in the model file if there is one, else the range of the present runs,
         widened.
         """
-        ends = {}
+        recorded_ranges = {}
         for name in self.monitored_channels:
             values = np.concatenate([run[name] for run in self.past])
             values = values[np.isfinite(values)]
-            ends[name] = (float(values.min()), float(values.max())) if values.size else (0.0, 0.0)
+            recorded_ranges[name] = (
+                (float(values.min()), float(values.max())) if values.size else (0.0, 0.0)
+            )
         scales = {channel.name: channel.scale for channel in self.world.kind.channels}
         if not self.world.kind.has_model:
-            return {name: _widen_range(*ends[name], scales[name]) for name in ends}
-        stated = stated_limits(self.world).channels
+            return {
+                name: _widen_range(*recorded_ranges[name], scales[name]) for name in recorded_ranges
+            }
+        stated_channels = stated_limits(self.world).channels
         bounds = {}
-        for name, (low, high) in ends.items():
-            if name in stated:
-                bounds[name] = _widen_by_stop(stated[name], (low, high), name.startswith("q."))
+        for name, (low, high) in recorded_ranges.items():
+            if name in stated_channels:
+                bounds[name] = _widen_by_stop(
+                    stated_channels[name], (low, high), name.startswith("q.")
+                )
             elif name.startswith("q."):
                 bounds[name] = _widen_range(low, high, scales[name])
             else:
                 kind = name.partition(".")[0]
-                most = max(max(map(abs, own)) for key, own in ends.items() if key.startswith(kind))
-                own = SPEED_AND_FORCE_FACTOR * max(abs(low), abs(high), IDLE_JOINT_SHARE * most)
-                bounds[name] = -own, own
+                largest = max(
+                    max(map(abs, limit))
+                    for key, limit in recorded_ranges.items()
+                    if key.startswith(kind)
+                )
+                limit = SPEED_AND_FORCE_FACTOR * max(
+                    abs(low), abs(high), IDLE_JOINT_SHARE * largest
+                )
+                bounds[name] = -limit, limit
         return bounds
 
     def _is_within_limits(self, channels: Mapping[str, Array]) -> bool:
@@ -156,10 +174,10 @@ class RigLimits:
         """
         for name, values in channels.items():
             low, high = self.bounds[name]
-            slack = 1e-9 * max(abs(low), abs(high)) if np.isfinite([low, high]).all() else 0.0
+            tolerance = 1e-9 * max(abs(low), abs(high)) if np.isfinite([low, high]).all() else 0.0
             if not np.isfinite(values).all():
                 return False
-            if values.min() < low - slack or values.max() > high + slack:
+            if values.min() < low - tolerance or values.max() > high + tolerance:
                 return False
         return (
             not self.world.kind.has_model
@@ -172,15 +190,17 @@ class RigLimits:
         return frozenset().union(*(find_contacts(self.world.kind, run) for run in self.past))
 
 
-def _widen_by_stop(stated: Interval, past: Interval, is_position: bool) -> Interval:
+def _widen_by_stop(stated_range: Interval, recorded_range: Interval, is_position: bool) -> Interval:
     """Return the specified limits; a position range is widened a little if stops were pressed."""
-    low, high = stated
+    low, high = stated_range
     if not is_position:
-        return stated
-    slack = STOP * (high - low)
-    return max(min(low, past[0]), low - slack), min(max(high, past[1]), high + slack)
+        return stated_range
+    max_widening = STOP * (high - low)
+    return max(min(low, recorded_range[0]), low - max_widening), min(
+        max(high, recorded_range[1]), high + max_widening
+    )
 
 
 def _widen_range(low: float, high: float, scale: float) -> tuple[float, float]:
-    slack = TRAVEL_FACTOR * max(high - low, scale)
-    return low - slack, high + slack
+    margin = TRAVEL_FACTOR * max(high - low, scale)
+    return low - margin, high + margin

@@ -76,19 +76,21 @@ class BaseFit:
         return self.insensitive_parameters | self.unidentified_parameters
 
 
-def fit_base_model(world: RunEvaluator, noise: NoiseModel, given: Array | None = None) -> BaseFit:
+def fit_base_model(
+    world: RunEvaluator, noise: NoiseModel, initial_base: Array | None = None
+) -> BaseFit:
     """Fit base parameters and initial states.
 
     Args:
         world: the runs.
         noise: noise that weights the channels.
-        given: (b,) base parameters to start from, for example from a tuner; None for a multi-start
-            over the bounds.
+        initial_base: (b,) base parameters to start from, for example from a tuner; None for a
+            multi-start over the bounds.
 
     Returns:
         The best fit, with insensitive parameters at their nominal values.
     """
-    thetas = _starts(world, given)
+    thetas = _starts(world, initial_base)
     starts = [FitStart((), theta, world.guess) for theta in thetas]
     # Simulating a start costs far less than fitting it, so the starts are reduced first.
     world.watch.report(f"base fit from {len(starts)} starts")
@@ -109,20 +111,20 @@ def fit_base_model(world: RunEvaluator, noise: NoiseModel, given: Array | None =
         # later fits. The import is local, because only robots need it.
         from bench.diagnosis.fitting.linearised_runs import compute_state_jacobian
 
-        compute_state_jacobian(world, best.theta, best.states, anew=True)
+        compute_state_jacobian(world, best.theta, best.states, is_recomputed=True)
         best = TrajectoryFitter(world, noise).fit_models([best.make_start()], FINAL_ITERATIONS)[0]
 
     # An insensitive parameter is set to nominal, because the value that the search reached means
     # nothing.
     places = world.base.tolist()
-    untouched = frozenset(i for i in places if not _is_sensitive(world, best, i, noise))
-    if untouched:
-        kept = list(untouched)
+    insensitive = frozenset(i for i in places if not _is_sensitive(world, best, i, noise))
+    if insensitive:
+        insensitive_places = list(insensitive)
         theta = best.theta.copy()
-        theta[kept] = world.get_nominal_theta()[kept]
+        theta[insensitive_places] = world.get_nominal_theta()[insensitive_places]
         start = replace(best.make_start(), theta=theta)
-        best = TrajectoryFitter(world, noise, untouched).fit_models([start], FINAL_ITERATIONS)[0]
-    return BaseFit(best, untouched)
+        best = TrajectoryFitter(world, noise, insensitive).fit_models([start], FINAL_ITERATIONS)[0]
+    return BaseFit(best, insensitive)
 
 
 def correct_discretisation(world: RunEvaluator, noise: NoiseModel, base: BaseFit) -> BaseFit:
@@ -145,15 +147,15 @@ def correct_discretisation(world: RunEvaluator, noise: NoiseModel, base: BaseFit
     return replace(base, fit=fit)
 
 
-def _starts(world: RunEvaluator, given: Array | None) -> list[Array]:
+def _starts(world: RunEvaluator, initial_base: Array | None) -> list[Array]:
     """Return parameter vectors (P,) from which the base model is fitted.
 
-    They are the `given` base parameters (b,), or the nominal ones and a regular grid over the
-    bounds.
+    They have the base parameters `initial_base` (b,), or the nominal ones and a regular grid over
+    the bounds.
     """
     nominal = world.get_nominal_theta()
-    if given is not None:
-        nominal[world.base] = given
+    if initial_base is not None:
+        nominal[world.base] = initial_base
         return [nominal]
     parameters = [world.parameters[i] for i in world.base]
     starts = [nominal]
@@ -199,7 +201,7 @@ def costs_of_starts(
     noise: NoiseModel,
     starts: Sequence[FitStart],
     share: float = FIT_HORIZONS[0].share,
-    lost: float = FAILED_SAMPLE_RESIDUAL,
+    failed_residual: float = FAILED_SAMPLE_RESIDUAL,
 ) -> Array:
     """Return the sum of squares of each start over the first samples of the runs.
 
@@ -208,7 +210,7 @@ def costs_of_starts(
         noise: noise that weights the channels.
         starts: parameters and initial states.
         share: initial share of each run that counts.
-        lost: residual of a sample that could not be simulated.
+        failed_residual: residual of a sample that could not be simulated.
     """
     count, runs = len(starts), len(world.tracks)
     thetas = [s.theta for s in starts]
@@ -219,8 +221,8 @@ def costs_of_starts(
     simulated = simulated.reshape(count, runs, *simulated.shape[1:])
 
     # An abandoned start has no samples, and must not seem to fit them.
-    left = np.nan_to_num(world.observed - simulated, nan=lost)
-    residuals = np.where(world.get_sample_mask(share), left, 0.0) / noise.sigma
+    unmasked_residuals = np.nan_to_num(world.observed - simulated, nan=failed_residual)
+    residuals = np.where(world.get_sample_mask(share), unmasked_residuals, 0.0) / noise.sigma
     costs: Array = np.square(residuals).sum(axis=(1, 2, 3))
     return costs
 
@@ -238,6 +240,6 @@ def _is_sensitive(world: RunEvaluator, fit: TrajectoryFit, place: int, noise: No
     low, high = world.parameters[place].bounds
     change = fit.jacobian[..., columns[0]] * (high - low) / noise.sigma
     # Count only available samples.
-    shown = change[np.isfinite(world.observed)]
-    sigmas = np.sqrt(np.square(shown).sum())
+    available_change = change[np.isfinite(world.observed)]
+    sigmas = np.sqrt(np.square(available_change).sum())
     return float(sigmas) > MIN_SENSITIVITY_SIGMAS

@@ -58,20 +58,20 @@ def fit_wider(
     Returns:
         The base model, and the new ranges by name; empty if no parameter is at a bound.
     """
-    found: dict[str, Bounds] = {}
+    new_bounds: dict[str, Bounds] = {}
     for _ in range(ROUNDS):
         places = at_bounds(world, base)
         if not places or world.watch.has_abandoned_fits():
             break
         for i in places:
             parameter = world.parameters[i]
-            found[parameter.name] = widened(parameter, limits_of(world, i))
-        use_bounds(world, found)
+            new_bounds[parameter.name] = widened(parameter, limits_of(world, i))
+        use_bounds(world, new_bounds)
         fit = TrajectoryFitter(world, noise, base.fixed_parameters).fit_models(
             [base.fit.make_start()], FINAL_ITERATIONS
         )[0]
         base = replace(base, fit=fit)
-    return base, found
+    return base, new_bounds
 
 
 def range_around(world: RunEvaluator, place: int, value: float | None = None) -> Bounds:
@@ -94,17 +94,17 @@ def range_around(world: RunEvaluator, place: int, value: float | None = None) ->
     return parameter.bounds
 
 
-def use_bounds(world: RunEvaluator, found: Mapping[str, Bounds]) -> None:
+def use_bounds(world: RunEvaluator, new_bounds: Mapping[str, Bounds]) -> None:
     """Replace the ranges of parameters of a world.
 
     Args:
         world: the runs for fitting; its parameters are replaced.
-        found: new range of each parameter, by name.
+        new_bounds: new range of each parameter, by name.
     """
-    if not found:
+    if not new_bounds:
         return
     world.parameters = tuple(
-        replace(p, bounds=found[p.name], training=None) if p.name in found else p
+        replace(p, bounds=new_bounds[p.name], training=None) if p.name in new_bounds else p
         for p in world.parameters
     )
     # Workers that were forked before still have the narrow ranges.
@@ -122,10 +122,10 @@ def limits_of(world: RunEvaluator, place: int) -> Bounds:
     if world.kind.has_model:
         coefficient = _coefficient(world.kind, parameter.name)
         if coefficient is not None:
-            least, most = coefficient.least, coefficient.most
+            lower_limit, upper_limit = coefficient.least, coefficient.most
             return (
-                -np.inf if least is None else least,
-                BEYOND_MODEL * coefficient.plausible[0][1] if most is None else most,
+                -np.inf if lower_limit is None else lower_limit,
+                BEYOND_MODEL * coefficient.plausible[0][1] if upper_limit is None else upper_limit,
             )
     return _limits(parameter)
 

@@ -29,12 +29,12 @@ Larger values come from an unstable motion, which says nothing about motions nea
 def is_finite_response(changes: Array) -> Mask:
     """Return a mask of usable changes: not NaN, and of a magnitude below `MAX_RESPONSE`."""
     # Two comparisons avoid the modulus, which would copy one of the largest arrays.
-    near: Mask = (changes > -MAX_RESPONSE) & (changes < MAX_RESPONSE)
-    return near
+    is_finite: Mask = (changes > -MAX_RESPONSE) & (changes < MAX_RESPONSE)
+    return is_finite
 
 
 def build_displaced_inputs(
-    start: FitStart, free: Indices, steps: Array, unknown: Indices
+    start: FitStart, free: Indices, steps: Array, state_indices: Indices
 ) -> tuple[Array, Array]:
     """Build the inputs of a finite-difference Jacobian.
 
@@ -45,19 +45,19 @@ def build_displaced_inputs(
         start: point of the derivatives.
         free: (q,) indices of the fitted parameters.
         steps: (q + s,) displacements.
-        unknown: (n,) indices of the initial states to displace.
+        state_indices: (n,) indices of the initial states to displace.
 
     Returns:
         Parameters (1 + q + n, P) and initial states (1 + q + n, R, s).
     """
-    q, count = free.size, unknown.size
+    q, count = free.size, state_indices.size
     theta = np.tile(start.theta, (1 + q + count, 1))
     states = np.tile(start.states, (1 + q + count, 1, 1))
     for j, place in enumerate(free):
         theta[1 + j, place] += steps[j]
     # An initial state influences only its own run, so one batch element per run gives all
     # derivatives.
-    for j, place in enumerate(unknown):
+    for j, place in enumerate(state_indices):
         states[1 + q + j, :, place] += steps[q + place]
     return theta, states
 
@@ -76,7 +76,7 @@ def compute_difference_steps(jacobian: Array, noise: NoiseModel, widths: Array) 
     largest = np.concatenate([MAX_STEP * widths, states])
     # An unknown without any response gets the maximum step.
     with np.errstate(divide="ignore"):
-        wanted = TARGET_RESPONSE_SIGMAS / np.where(responses > 0, responses, 1e-300)
+        target_steps = TARGET_RESPONSE_SIGMAS / np.where(responses > 0, responses, 1e-300)
     # Below the minimum step rounding dominates, above the maximum step curvature.
-    steps: Array = np.clip(wanted, MIN_STEP_RATIO * largest, largest)
+    steps: Array = np.clip(target_steps, MIN_STEP_RATIO * largest, largest)
     return steps

@@ -101,8 +101,8 @@ class KnownJacobian(NamedTuple):
 
         It is used for a model with fewer effects than the one whose derivatives are known.
         """
-        kept = [j for j, place in enumerate(self.free.tolist()) if place not in places]
-        return KnownJacobian(self.free[kept], self.jacobian[..., kept])
+        kept_columns = [j for j, place in enumerate(self.free.tolist()) if place not in places]
+        return KnownJacobian(self.free[kept_columns], self.jacobian[..., kept_columns])
 
     def add_parameters(self, places: Sequence[int], jacobian: Array) -> KnownJacobian:
         """Return the derivatives together with those by further parameters.
@@ -228,8 +228,8 @@ class FitState:
         This is the case if the model is near the data, but its derivatives by parameters had to be
         recomputed several times.
         """
-        slow = self.rough and self.by_states is None and self.renewals >= SHARED_RENEWALS
-        return slow and not self._is_far(self.point.cost)
+        is_slow = self.rough and self.by_states is None and self.renewals >= SHARED_RENEWALS
+        return is_slow and not self._is_far(self.point.cost)
 
     def get_tolerance(self, cost: float) -> float:
         """Return the decrease of the cost by a step below which the fit has converged.
@@ -254,15 +254,15 @@ class FitState:
 
     def make_fit(self) -> TrajectoryFit:
         """Return the best point so far as a fitted model."""
-        at = self.point
+        point = self.point
         return TrajectoryFit(
-            at.start.effects,
-            at.start.theta,
-            at.start.states,
+            point.start.effects,
+            point.start.theta,
+            point.start.states,
             self.free,
-            at.simulated,
-            at.jacobian,
-            at.cost,
+            point.simulated,
+            point.jacobian,
+            point.cost,
             self.has_own_jacobian,
         )
 
@@ -272,29 +272,37 @@ class FitState:
         The step of a parameter at its upper bound points inward.
         """
         steps = self.steps.copy()
-        own = steps[: self.free.size]
-        own[theta[self.free] + own > self.high] *= -1.0
+        parameter_steps = steps[: self.free.size]
+        parameter_steps[theta[self.free] + parameter_steps > self.high] *= -1.0
         return steps
 
-    def update_jacobian(self, reached: FitPoint) -> Array:
+    def update_jacobian(self, new_point: FitPoint) -> Array:
         """Return derivatives (R, T, C, q + s) at a new point by Broyden's update (4), run by run.
 
         Args:
-            reached: the point that the step has reached.
+            new_point: the point that the step has reached.
         """
-        at = self.point
+        point = self.point
         # Samples after the end of a shorter run are NaN, and count as unchanged.
-        shown = np.nan_to_num(reached.simulated - at.simulated)
-        shared = (reached.start.theta - at.start.theta)[self.free]
-        own = reached.start.states - at.start.states
-        moved = np.concatenate([np.broadcast_to(shared, (len(own), shared.size)), own], axis=1)
-        weighed = moved / np.square(self.steps)
-        length = np.sum(weighed * moved, axis=1)
+        observed_change = np.nan_to_num(new_point.simulated - point.simulated)
+        parameter_change = (new_point.start.theta - point.start.theta)[self.free]
+        state_changes = new_point.start.states - point.start.states
+        displacement = np.concatenate(
+            [
+                np.broadcast_to(parameter_change, (len(state_changes), parameter_change.size)),
+                state_changes,
+            ],
+            axis=1,
+        )
+        scaled_displacement = displacement / np.square(self.steps)
+        length = np.sum(scaled_displacement * displacement, axis=1)
         # A run in which nothing was moved gives no information.
-        along = weighed / np.where(length > 0, length, np.inf)[:, None]
-        missed = shown - np.einsum("rtcq,rq->rtc", at.jacobian, moved)
-        learnt: Array = at.jacobian + missed[..., None] * along[:, None, None, :]  # (4)
-        return learnt
+        broyden_weights = scaled_displacement / np.where(length > 0, length, np.inf)[:, None]
+        prediction_error = observed_change - np.einsum("rtcq,rq->rtc", point.jacobian, displacement)
+        updated_jacobian: Array = (
+            point.jacobian + prediction_error[..., None] * broyden_weights[:, None, None, :]
+        )  # (4)
+        return updated_jacobian
 
     def mark_converged(self) -> None:
         """Mark the fit as converged if its derivatives belong to the present point.
@@ -306,26 +314,27 @@ class FitState:
         else:
             self.is_jacobian_stale = self.is_waiting = True
 
-    def accept_step(self, gained: float, cost: float, own: bool) -> None:
+    def accept_step(self, decrease: float, cost: float, is_own_jacobian: bool) -> None:
         """Update the damping and the convergence state after an accepted step.
 
         Args:
-            gained: decrease of the cost.
+            decrease: decrease of the cost.
             cost: new cost.
-            own: whether the derivatives were computed at the point where the step began.
+            is_own_jacobian: whether the derivatives were computed at the point where the step
+                began.
         """
-        ratio = gained / max(self.predicted_decrease, 1e-300)  # (1)
+        ratio = decrease / max(self.predicted_decrease, 1e-300)  # (1)
         self.is_jacobian_stale = (
             not self.has_own_jacobian and abs(ratio - 1.0) > JACOBIAN_REUSE_TOLERANCE
         )
         factor = max(MIN_DAMPING_FACTOR, 1.0 - (2.0 * ratio - 1.0) ** 3)
         self.damping = max(self.damping * factor, MIN_DAMPING)  # (2)
         self.growth = INITIAL_DAMPING_GROWTH
-        stagnant = ratio < STAGNANT_RATIO and gained < STAGNANT_SHARE * cost
-        if own and not self.is_final_fit and stagnant and self._is_far(cost):
+        is_stagnant = ratio < STAGNANT_RATIO and decrease < STAGNANT_SHARE * cost
+        if is_own_jacobian and not self.is_final_fit and is_stagnant and self._is_far(cost):
             self.is_finished = True
         # With derivatives of the present point the fit has converged; with others it may have.
-        if gained < self.get_tolerance(cost):
+        if decrease < self.get_tolerance(cost):
             self.mark_converged()
 
     def reject_step(self) -> None:
@@ -353,9 +362,9 @@ class FitState:
             jacobian: (R, T, C, q + s) whitened derivatives.
         """
         # Direction of steepest descent of the cost.
-        pushed = np.einsum("rtc,rtcq->q", residual, jacobian[..., : self.free.size])
-        here = self.point.start.theta[self.free]
-        below = (here <= self.low) & (pushed < 0)
-        above = (here >= self.high) & (pushed > 0)
-        stuck: Mask = below | above
-        return stuck
+        descent = np.einsum("rtc,rtcq->q", residual, jacobian[..., : self.free.size])
+        values = self.point.start.theta[self.free]
+        is_blocked_below = (values <= self.low) & (descent < 0)
+        is_blocked_above = (values >= self.high) & (descent > 0)
+        is_blocked: Mask = is_blocked_below | is_blocked_above
+        return is_blocked

@@ -76,11 +76,11 @@ class _ArrowheadEquations:
     gradient: Array
     pull: Array
 
-    def solved(self, stuck: Mask) -> tuple[Array, Array]:
+    def solved(self, blocked_mask: Mask) -> tuple[Array, Array]:
         """Solve the normal equations by the Schur complement, eqs. (4) and (5).
 
         Args:
-            stuck: (q,) mask of parameters that do not move, because they are at a bound.
+            blocked_mask: (q,) mask of parameters that do not move, because they are at a bound.
 
         Returns:
             The steps of the shared parameters (q,) and of the initial states (R, s); NaN if the
@@ -92,26 +92,26 @@ class _ArrowheadEquations:
         inverse_pull = np.linalg.solve(self.inner, columns)[:, :, 0]
 
         # Right-hand side of (4).
-        right = self.gradient - np.einsum("rqs,rs->q", self.cross, inverse_pull)
+        right_hand_side = self.gradient - np.einsum("rqs,rs->q", self.cross, inverse_pull)
 
-        shared = np.zeros(len(right))
-        moves = ~stuck
-        if moves.any():
-            free = schur[np.ix_(moves, moves)]
+        parameter_step = np.zeros(len(right_hand_side))
+        is_free = ~blocked_mask
+        if is_free.any():
+            free = schur[np.ix_(is_free, is_free)]
             # Scale the parameters: curvatures of an outlet of 1e-6 m^2 and of a lag of seconds
             # differ by more than double precision resolves, and the smaller one would be treated as
             # zero.
-            scale = np.sqrt(np.maximum(np.diagonal(self.shared)[moves], MIN_DIAGONAL))
+            scale = np.sqrt(np.maximum(np.diagonal(self.shared)[is_free], MIN_DIAGONAL))
             scaled = free / np.outer(scale, scale)
             if not np.isfinite(scaled).all():
                 # Derivatives of an unstable motion give no usable step.
-                return np.full(len(right), np.nan), np.full(self.pull.shape, np.nan)
+                return np.full(len(right_hand_side), np.nan), np.full(self.pull.shape, np.nan)
             # Least squares takes the shortest step if parameters have the same response.
-            solution = np.linalg.lstsq(scaled, right[moves] / scale, rcond=None)
-            shared[moves] = solution[0] / scale
+            solution = np.linalg.lstsq(scaled, right_hand_side[is_free] / scale, rcond=None)
+            parameter_step[is_free] = solution[0] / scale
 
-        own = inverse_pull - np.einsum("rsq,q->rs", inverse_cross, shared)  # (5)
-        return shared, own
+        state_steps = inverse_pull - np.einsum("rsq,q->rs", inverse_cross, parameter_step)  # (5)
+        return parameter_step, state_steps
 
 
 def compute_schur_complement(shared: Array, cross: Array, inner: Array) -> tuple[Array, Array]:
@@ -126,28 +126,28 @@ def compute_schur_complement(shared: Array, cross: Array, inner: Array) -> tuple
         The matrix (q, q) of (4), and all V_i⁻¹ W_iᵀ (R, s, q).
     """
     transposed = cross.transpose(0, 2, 1)
-    solved = np.linalg.solve(inner, transposed)
-    inverse_cross = np.asarray(solved, dtype=np.float64)
+    solution = np.linalg.solve(inner, transposed)
+    inverse_cross = np.asarray(solution, dtype=np.float64)
     products = np.matmul(cross, inverse_cross)
     schur: Array = shared - products.sum(axis=0)  # (4), its left side
     return schur, inverse_cross
 
 
-def hold_known_states(inner: Array, cross: Array, known: Mask) -> tuple[Array, Array]:
+def hold_known_states(inner: Array, cross: Array, known_mask: Mask) -> tuple[Array, Array]:
     """Fix known initial states in the normal equations.
 
     Args:
         inner: (R, s, s) all V_i.
         cross: (R, q, s) all W_i.
-        known: (R, s) mask of known initial states.
+        known_mask: (R, s) mask of known initial states.
 
     Returns:
         V_i and W_i, in which no parameter and no other state is coupled to a known state.
     """
     # The equation of a known state becomes: its step is zero.
-    touched = known[:, :, None] | known[:, None, :]
-    alone = np.where(touched, np.eye(inner.shape[1]), inner)
-    return alone, np.where(known[:, None, :], 0.0, cross)
+    is_coupled = known_mask[:, :, None] | known_mask[:, None, :]
+    decoupled = np.where(is_coupled, np.eye(inner.shape[1]), inner)
+    return decoupled, np.where(known_mask[:, None, :], 0.0, cross)
 
 
 def compute_gauss_newton_step(
@@ -156,9 +156,9 @@ def compute_gauss_newton_step(
     q: int,
     drift: Array,
     prior: Array,
-    known: Mask,
+    known_mask: Mask,
     damping: float,
-    stuck: Mask,
+    blocked_mask: Mask,
 ) -> GaussNewtonStep:
     """Compute one damped Gauss-Newton step.
 
@@ -168,16 +168,20 @@ def compute_gauss_newton_step(
         q: number of shared parameters.
         drift: (R, s) the d of (1): deviations of initial states from their guesses, in sigmas.
         prior: (s,) the π of (1).
-        known: (R, s) initial states that do not move.
+        known_mask: (R, s) initial states that do not move.
         damping: Levenberg-Marquardt damping λ.
-        stuck: (q,) parameters that do not move.
+        blocked_mask: (q,) parameters that do not move.
     """
     runs, size = len(residual), jacobian.shape[3]
     j = jacobian.reshape(runs, -1, size)
     r = residual.reshape(runs, -1)
-    arrow = _apply_damping(_assemble_normal_equations(j, r, q, drift, prior), damping, known)
-    shared, own = arrow.solved(stuck)
-    return GaussNewtonStep(shared, own, _predict_decrease(j, r, drift, prior, shared, own))
+    arrow = _apply_damping(_assemble_normal_equations(j, r, q, drift, prior), damping, known_mask)
+    parameter_step, state_steps = arrow.solved(blocked_mask)
+    return GaussNewtonStep(
+        parameter_step,
+        state_steps,
+        _predict_decrease(j, r, drift, prior, parameter_step, state_steps),
+    )
 
 
 def _assemble_normal_equations(
@@ -196,31 +200,33 @@ def _assemble_normal_equations(
         drift: (R, s) d of eq. (1).
         prior: (s,) π of eq. (1).
     """
-    own = slice(q, j.shape[2])
+    state_columns = slice(q, j.shape[2])
     # One product contains all AᵀA, AᵀB and BᵀB, another one all Aᵀr and Bᵀr.
     transposed = j.transpose(0, 2, 1)
     normal = np.matmul(transposed, j)
     residuals = r[:, :, None]
-    right = np.matmul(transposed, residuals)[:, :, 0]
+    right_hand_side = np.matmul(transposed, residuals)[:, :, 0]
     return _ArrowheadEquations(
         shared=normal[:, :q, :q].sum(axis=0),  # U
-        cross=normal[:, :q, own].copy(),  # W
-        inner=normal[:, own, own] + np.diag(1.0 / prior**2),  # V
-        gradient=right[:, :q].sum(axis=0),  # a
-        pull=right[:, own] - drift / prior,  # b
+        cross=normal[:, :q, state_columns].copy(),  # W
+        inner=normal[:, state_columns, state_columns] + np.diag(1.0 / prior**2),  # V
+        gradient=right_hand_side[:, :q].sum(axis=0),  # a
+        pull=right_hand_side[:, state_columns] - drift / prior,  # b
     )
 
 
-def _apply_damping(arrow: _ArrowheadEquations, damping: float, known: Mask) -> _ArrowheadEquations:
+def _apply_damping(
+    arrow: _ArrowheadEquations, damping: float, known_mask: Mask
+) -> _ArrowheadEquations:
     """Add the damping λ times their own diagonals to U and V, and hold known initial states fixed.
 
     A small ridge is always added to U, so that it can be inverted if parameters have the same
-    response. `known` (R, s) marks the known initial states.
+    response. `known_mask` (R, s) marks the known initial states.
     """
     diagonal = np.einsum("rii->ri", arrow.inner)
     inner = arrow.inner + damping * diagonal[:, :, None] * np.eye(arrow.inner.shape[1])
-    inner, cross = hold_known_states(inner, arrow.cross, known)
-    pull = np.where(known, 0.0, arrow.pull)
+    inner, cross = hold_known_states(inner, arrow.cross, known_mask)
+    pull = np.where(known_mask, 0.0, arrow.pull)
 
     scale = np.maximum(np.diagonal(arrow.shared), MIN_DIAGONAL)
     shared = arrow.shared + np.diag(damping * scale + RIDGE_SHARE * scale + MIN_DIAGONAL)
@@ -232,19 +238,19 @@ def _predict_decrease(
     r: Array,
     drift: Array,
     prior: Array,
-    shared: Array,
-    own: Array,
+    parameter_step: Array,
+    state_steps: Array,
 ) -> float:
     """Return the decrease of the cost by a step if the residual were linear, eq. (6).
 
     The damping is adapted to how well the actual decrease agrees with it. Arguments are those of
-    `_assemble_normal_equations`, with the steps `shared` (q,) and `own` (R, s).
+    `_assemble_normal_equations`, with the steps `parameter_step` (q,) and `state_steps` (R, s).
     """
-    repeated = np.tile(shared, (len(r), 1))
-    steps = np.concatenate([repeated, own], axis=1)
+    repeated = np.tile(parameter_step, (len(r), 1))
+    steps = np.concatenate([repeated, state_steps], axis=1)
     changes = np.matmul(j, steps[:, :, None])[:, :, 0]
-    left = r - changes
-    after = drift + own / prior
-    promised = float((r * r).sum() - (left * left).sum())
-    promised += float((drift**2).sum() - (after**2).sum())
-    return promised
+    remaining_residual = r - changes
+    remaining_drift = drift + state_steps / prior
+    predicted_decrease = float((r * r).sum() - (remaining_residual * remaining_residual).sum())
+    predicted_decrease += float((drift**2).sum() - (remaining_drift**2).sum())
+    return predicted_decrease

@@ -37,23 +37,23 @@ def compute_effect_responses(
     """
     runs, length, channels = world.observed.shape
     result: Array = np.full((len(added), runs, length, channels), np.nan, dtype=np.float32)
-    kept = world.simulated
+    cached_responses = world.simulated
     keys = [(name, c.tobytes()) for name, c in added]
-    asked = [i for i, key in enumerate(keys) if key not in kept]
-    calls = [(run, theta, states[run], [added[i] for i in asked]) for run in range(runs)]
-    for run, (values, looks) in world.crew.map_unordered(world, _responses, calls):
+    missing_indices = [i for i, key in enumerate(keys) if key not in cached_responses]
+    calls = [(run, theta, states[run], [added[i] for i in missing_indices]) for run in range(runs)]
+    for run, (values, simulation_count) in world.crew.map_unordered(world, _responses, calls):
         # Values that overflow single precision become infinite here.
         with np.errstate(over="ignore"):
-            result[asked, run, : values.shape[1]] = values
-        world.simulations += looks
+            result[missing_indices, run, : values.shape[1]] = values
+        world.simulations += simulation_count
     result[~is_finite_response(result)] = np.nan
     for i, key in enumerate(keys):
-        if key in kept:
-            result[i] = kept[key]
+        if key in cached_responses:
+            result[i] = cached_responses[key]
         elif is_series_effect(world.available_effects[key[0]]):
             # Responses without a linearisation are simulated, and are similar in all models near
             # the data.
-            kept[key] = result[i].copy()
+            cached_responses[key] = result[i].copy()
     return result
 
 
@@ -65,26 +65,28 @@ def _responses(
     The second result is the number of simulations that were needed. `states` (s,) is the initial
     state of the run.
     """
-    about = _get_linearisation(world, run, theta, states)
-    return about.compute_effect_responses([(world.available_effects[name], c) for name, c in added])
+    linearisation = _get_linearisation(world, run, theta, states)
+    return linearisation.compute_effect_responses(
+        [(world.available_effects[name], c) for name, c in added]
+    )
 
 
 def compute_state_jacobian(
-    world: RunEvaluator, theta: Array, states: Array, anew: bool = False
+    world: RunEvaluator, theta: Array, states: Array, is_recomputed: bool = False
 ) -> Array:
     """Return derivatives (R, T, C, s) of the runs by their initial states.
 
-    They are those about the first requested model, or about this one if `anew` is set. Initial
-    states act similarly in all models near the data, and a fit with derivatives of another such
-    model converges to the same result.
+    They are those about the first requested model, or about this one if `is_recomputed` is set.
+    Initial states act similarly in all models near the data, and a fit with derivatives of another
+    such model converges to the same result.
 
     Args:
         world: the runs of a robot.
         theta: (P,) parameters.
         states: (R, s) initial states.
-        anew: whether to recompute the derivatives about this model and store them.
+        is_recomputed: whether to recompute the derivatives about this model and store them.
     """
-    if world.derivatives is None or anew:
+    if world.derivatives is None or is_recomputed:
         world.derivatives = begun_about(world, theta, states)
     return world.derivatives
 
@@ -120,17 +122,19 @@ def _get_linearisation(
     `theta` is (P,), `states` (s,): positions first, then velocities.
     """
     key = run, theta.tobytes(), states.tobytes()
-    kept = world.neighbourhoods
-    about: RunLinearisation | None = kept.pop(key, None)
-    if about is None:
-        half = len(world.states) // 2
+    cache = world.neighbourhoods
+    linearisation: RunLinearisation | None = cache.pop(key, None)
+    if linearisation is None:
+        coordinate_count = len(world.states) // 2
         scenario = world.tracks[run].scenario
-        about = RunLinearisation(world.simulator, theta, scenario, states[:half], states[half:])
-    kept[key] = about
+        linearisation = RunLinearisation(
+            world.simulator, theta, scenario, states[:coordinate_count], states[coordinate_count:]
+        )
+    cache[key] = linearisation
     # Drop the linearisations that were not used for the longest time.
-    for old in list(kept)[: -len(world.tracks)]:
-        del kept[old]
-    return about
+    for oldest_key in list(cache)[: -len(world.tracks)]:
+        del cache[oldest_key]
+    return linearisation
 
 
 def correct_discretisation(
@@ -160,16 +164,16 @@ def correct_discretisation(
     runs = len(world.tracks)
     scenarios = [track.scenario for track in world.tracks]
     lanes = np.tile(theta, (runs, 1))
-    begun = dict(zip(world.states, states.T, strict=True))
-    half = world.kind.with_half_step()
-    seen = [world.simulator.simulate_batch(lanes, scenarios, begun)]
-    for kind in (half, half.with_half_step()):
+    initial_states = dict(zip(world.states, states.T, strict=True))
+    half_step_kind = world.kind.with_half_step()
+    simulated = [world.simulator.simulate_batch(lanes, scenarios, initial_states)]
+    for kind in (half_step_kind, half_step_kind.with_half_step()):
         finer = kind(world.recording.constants, world.channels, effects=effects)
-        seen.append(finer.simulate_batch(lanes, scenarios, begun))
+        simulated.append(finer.simulate_batch(lanes, scenarios, initial_states))
     # In units of a run with the usual step: 1 + 2 with half of the step + 4 with a quarter.
     world.simulations += 7 * runs
-    left = 2.0 * seen[2] - seen[1] - seen[0]  # (1)
-    sizes = np.square(left / noise.sigma)[np.isfinite(world.observed)]
+    correction = 2.0 * simulated[2] - simulated[1] - simulated[0]  # (1)
+    sizes = np.square(correction / noise.sigma)[np.isfinite(world.observed)]
     # A large error cannot be removed by this correction.
     if float(np.sqrt(sizes.mean())) < MAX_CORRECTABLE_ERROR:
-        world.correction = np.nan_to_num(left)
+        world.correction = np.nan_to_num(correction)

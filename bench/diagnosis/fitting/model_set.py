@@ -124,8 +124,8 @@ class ModelSet:
 
     def compute_residual(self, fit: TrajectoryFit) -> Array:
         """Return observed minus simulated (R, T, C), zero where no sample exists."""
-        left = self.world.observed - fit.simulated
-        residual: Array = np.where(self.observed_mask, left, 0.0)
+        unmasked_residual = self.world.observed - fit.simulated
+        residual: Array = np.where(self.observed_mask, unmasked_residual, 0.0)
         return residual
 
     def add_fit(self, fit: TrajectoryFit) -> FittedModel:
@@ -152,14 +152,16 @@ class ModelSet:
 
     def _of(self, fit: TrajectoryFit) -> FittedModel:
         """Return a fit with its likelihood and its merit (1), the penalised log-likelihood."""
-        free = fit.free.size + count_identified_states(self.world, fit, self.noise)
+        freedom = fit.free.size + count_identified_states(self.world, fit, self.noise)
         # A model that could not be simulated is stored, too, so that it is not tried again.
-        found = _LOST
+        likelihood = _LOST
         if np.isfinite(fit.cost):
-            found = maximise_likelihood(self.compute_residual(fit), self.observed_mask, free)
-        chance = sum(self.get_effect_penalty(name) for name in fit.effects)
-        merit = found.value - free * self.parameter_penalty - chance  # (1)
-        return FittedModel(fit, found, merit)
+            likelihood = maximise_likelihood(
+                self.compute_residual(fit), self.observed_mask, freedom
+            )
+        effect_penalty = sum(self.get_effect_penalty(name) for name in fit.effects)
+        merit = likelihood.value - freedom * self.parameter_penalty - effect_penalty  # (1)
+        return FittedModel(fit, likelihood, merit)
 
     def with_sensitivities(self, start: FitStart) -> FitStart:
         """Return the start with derivatives that are known near it, to save their computation.
@@ -220,11 +222,11 @@ class ModelSet:
             starts = self._sifted(starts, noise)
         # Sums of squares with different weights are not comparable.
         racing = race and noise is self.noise
-        reached = self._reached(starts) if racing else np.inf
+        lowest_cost = self._reached(starts) if racing else np.inf
         fitter = TrajectoryFitter(self.world, noise, self.frozen)
         watch.stage(_fitting(starts), len(starts))
         for fit in fitter.fit_models(
-            starts, MAX_ITERATIONS, race=race, reached=reached, finished=watch.advance
+            starts, MAX_ITERATIONS, race=race, lowest_cost=lowest_cost, finished=watch.advance
         ):
             self.add_fit(fit)
         # A fit that was stopped early is stored, but not evaluated.
@@ -266,13 +268,17 @@ class ModelSet:
         """
         if model.fit.is_own_jacobian or not np.isfinite(model.fit.cost):
             return model
-        known = self.models.get(frozenset(model.effects))
-        if known is not None and known.fit.is_own_jacobian and known.fit.theta is model.fit.theta:
-            return known
+        stored_model = self.models.get(frozenset(model.effects))
+        if (
+            stored_model is not None
+            and stored_model.fit.is_own_jacobian
+            and stored_model.fit.theta is model.fit.theta
+        ):
+            return stored_model
         fitter = TrajectoryFitter(self.world, self.noise, self.frozen)
         (fit,) = fitter.fit_models([model.fit.make_start()], iterations=0)
         result = replace(model, fit=replace(model.fit, jacobian=fit.jacobian, is_own_jacobian=True))
-        if known is model:
+        if stored_model is model:
             self.models[frozenset(model.effects)] = result
         return result
 
@@ -287,27 +293,29 @@ class ModelSet:
         self.world.watch.stage("refining the model")
         squares = TrajectoryFitter(self.world, self.noise).compute_cost
         for _ in range(MAX_REWEIGHTED_FITS):
-            left = model.likelihood
+            likelihood = model.likelihood
             if not np.isfinite(model.fit.cost):
                 break
             # A channel without samples has no noise, and a channel without noise would have
             # infinite weight.
-            sigma = np.where(np.isfinite(left.sigma), left.sigma, self.noise.sigma)
-            noise = NoiseModel(np.maximum(sigma, MIN_SIGMA_SHARE * self.noise.sigma), left.phi)
+            sigma = np.where(np.isfinite(likelihood.sigma), likelihood.sigma, self.noise.sigma)
+            noise = NoiseModel(
+                np.maximum(sigma, MIN_SIGMA_SHARE * self.noise.sigma), likelihood.phi
+            )
             fitter = TrajectoryFitter(self.world, noise, self.frozen, exact=True)
             (fit,) = fitter.fit_models([model.fit.make_start()], MAX_ITERATIONS)
             if self.world.watch.has_abandoned_fits():
                 break
-            other = self._of(replace(fit, cost=squares(fit)))
-            if other.fit.cost > MAX_REWEIGHTED_SQUARES_RATIO * squares(model.fit):
+            refitted = self._of(replace(fit, cost=squares(fit)))
+            if refitted.fit.cost > MAX_REWEIGHTED_SQUARES_RATIO * squares(model.fit):
                 break
-            gain = other.penalised_log_likelihood - model.penalised_log_likelihood
+            gain = refitted.penalised_log_likelihood - model.penalised_log_likelihood
             if gain < MIN_GAIN_FOR_REWEIGHTING:
                 if gain > 0:
                     # The fits are so close that scores about the old one remain valid.
-                    model = self.models[frozenset(other.effects)] = other
+                    model = self.models[frozenset(refitted.effects)] = refitted
                 break
-            model = self._entered(other)
+            model = self._entered(refitted)
         return model
 
     def _sifted(self, starts: Sequence[FitStart], noise: NoiseModel) -> list[FitStart]:
@@ -316,29 +324,29 @@ class ModelSet:
         Each fit horizon is a longer part of the runs, with fewer models; the last horizon, whole
         runs, is left to the caller.
         """
-        begun = list(starts)
+        remaining_starts = list(starts)
         # Patient fits keep all candidates at first, but only a few may be fitted to whole runs.
         for horizon, count in zip(FIT_HORIZONS[:-1], MODELS_KEPT_PER_HORIZON, strict=True):
             fitter = TrajectoryFitter(self.world, noise, self.frozen, horizon.share)
-            fits = fitter.fit_models(begun, horizon.iterations)
+            fits = fitter.fit_models(remaining_starts, horizon.iterations)
             fits.sort(key=lambda fit: fit.cost)
-            begun = [fit.make_start() for fit in fits[:count]]
-        return begun
+            remaining_starts = [fit.make_start() for fit in fits[:count]]
+        return remaining_starts
 
     def _reached(self, starts: Sequence[FitStart]) -> float:
         """Return the lowest cost of fitted models that are at most as large as the starts.
 
         Fits that fall far behind this cost are stopped early. It is infinite without such models.
         """
-        most = max(len(start.effects) for start in starts)
-        known = self.models.values()
-        costs = [m.fit.cost for m in known if 0 < len(m.effects) <= most]
+        max_size = max(len(start.effects) for start in starts)
+        fitted_models = self.models.values()
+        costs = [m.fit.cost for m in fitted_models if 0 < len(m.effects) <= max_size]
         return min(costs, default=np.inf)
 
     def get_best(self, size: int) -> FittedModel | None:
         """Return the model of `size` effects with the highest merit; None if none was fitted."""
-        known = self.models.values()
-        models = [m for m in known if len(m.effects) == size]
+        fitted_models = self.models.values()
+        models = [m for m in fitted_models if len(m.effects) == size]
         return max(models, key=lambda m: m.penalised_log_likelihood) if models else None
 
     def compute_excess(self, model: FittedModel) -> float:
@@ -358,22 +366,22 @@ class ModelSet:
         """
         sigma = model.likelihood.sigma
         # A channel without samples has no sigma, and its weight has no influence.
-        left = np.where(np.isfinite(sigma), sigma, 0.0)
-        return NoiseModel(np.maximum(self.noise.sigma, left), self.noise.phi)
+        residual_sigma = np.where(np.isfinite(sigma), sigma, 0.0)
+        return NoiseModel(np.maximum(self.noise.sigma, residual_sigma), self.noise.phi)
 
 
 def _format_starts(starts: Sequence[FitStart]) -> str:
     """Return a short description of the models of these starts, for the progress display."""
     names = list(dict.fromkeys(" + ".join(start.effects) or "the base model" for start in starts))
-    more = f" and {len(names) - 1} more" if len(names) > 1 else ""
-    return f"{names[0]}{more}" if names else "nothing"
+    others_text = f" and {len(names) - 1} more" if len(names) > 1 else ""
+    return f"{names[0]}{others_text}" if names else "nothing"
 
 
 def _fitting(starts: Sequence[FitStart]) -> str:
     """Return the name of the stage that fits these models, for the progress display."""
     size = max((len(start.effects) for start in starts), default=0)
-    one, several = _SIZES.get(size, (f"set of {size} effects", f"sets of {size} effects"))
-    return f"fitting {one if len(starts) == 1 else several}"
+    singular, plural = _SIZES.get(size, (f"set of {size} effects", f"sets of {size} effects"))
+    return f"fitting {singular if len(starts) == 1 else plural}"
 
 
 def count_identified_states(world: RunEvaluator, fit: TrajectoryFit, noise: NoiseModel) -> float:
@@ -391,10 +399,10 @@ def count_identified_states(world: RunEvaluator, fit: TrajectoryFit, noise: Nois
         fit: the fitted model.
         noise: noise of each channel.
     """
-    seen = np.isfinite(world.observed)
+    observed_mask = np.isfinite(world.observed)
     states = fit.jacobian[..., fit.free.size :]
-    counted = np.where(seen[..., None], states, 0.0)
-    scaled = counted / noise.sigma[:, None]
+    observed_states = np.where(observed_mask[..., None], states, 0.0)
+    scaled = observed_states / noise.sigma[:, None]
     # The shape is written out, because -1 is ambiguous if there are no states.
     runs, length, channels, size = scaled.shape
     columns = scaled.reshape(runs, length * channels, size) * compute_state_prior(world)
@@ -403,8 +411,8 @@ def count_identified_states(world: RunEvaluator, fit: TrajectoryFit, noise: Nois
     normal = np.matmul(columns.transpose(0, 2, 1), columns)
     eigenvalues = np.linalg.eigvalsh(normal)
     # Rounding may make an eigenvalue slightly negative.
-    fixed = eigenvalues / (1.0 + np.maximum(eigenvalues, 0.0))  # (2)
-    return float(fixed.clip(0.0, 1.0).sum())
+    freedoms = eigenvalues / (1.0 + np.maximum(eigenvalues, 0.0))  # (2)
+    return float(freedoms.clip(0.0, 1.0).sum())
 
 
 _LOST = Likelihood(-np.inf, np.zeros(0), np.zeros(0))

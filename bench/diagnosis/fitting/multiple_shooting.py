@@ -57,7 +57,7 @@ def make_segment_evaluator(world: RunEvaluator) -> RunEvaluator | None:
     """
     if world.simulator.system.bounces or world.simulator.system.afloat:
         return None
-    runs = [piece for run in world.runs for piece in _split_run(run)]
+    runs = [segment for run in world.runs for segment in _split_run(run)]
     if len(runs) == len(world.runs):
         return None
     return world.with_runs(runs)
@@ -67,22 +67,24 @@ def _split_run(run: Run) -> list[Run]:
     """Split a run into segments of equal length, or return it whole if one is too sparse."""
     # A time counts as sampled if any channel has a sample.
     values = np.stack(list(run.channels.values()))
-    seen: Mask = np.any(np.isfinite(values), axis=0)
-    count = int(np.clip(seen.sum() // MIN_MEAN_SEGMENT_SAMPLES, 1, SEGMENTS_PER_RUN))
+    is_sampled: Mask = np.any(np.isfinite(values), axis=0)
+    count = int(np.clip(is_sampled.sum() // MIN_MEAN_SEGMENT_SAMPLES, 1, SEGMENTS_PER_RUN))
     edges = np.linspace(0, run.times.size, count + 1).astype(int)
     parts = [slice(a, b) for a, b in pairwise(edges)]
     # Segments have equal length, but one of them may have too many missing samples.
-    if any(seen[part].sum() < MIN_MEAN_SEGMENT_SAMPLES // MAX_MISSING_FACTOR for part in parts):
+    if any(
+        is_sampled[part].sum() < MIN_MEAN_SEGMENT_SAMPLES // MAX_MISSING_FACTOR for part in parts
+    ):
         return [run]
     return [run.part(part, f"{run.name}.{n}") for n, part in enumerate(parts)]
 
 
-def join_segment_fits(world: RunEvaluator, found: TrajectoryFit) -> FitStart:
+def join_segment_fits(world: RunEvaluator, segment_fit: TrajectoryFit) -> FitStart:
     """Return the start of a fit of the whole runs from a fit of their segments.
 
     Args:
         world: the whole runs.
-        found: fit of the segments of `world`.
+        segment_fit: fit of the segments of `world`.
 
     Returns:
         The fitted parameters, with the initial states of the first segment of each run.
@@ -90,7 +92,7 @@ def join_segment_fits(world: RunEvaluator, found: TrajectoryFit) -> FitStart:
     counts = [len(_split_run(run)) for run in world.runs]
     # The initial state of a run is that of its first segment.
     first = np.cumsum([0, *counts])[:-1]
-    return FitStart(found.effects, found.theta, found.states[first])
+    return FitStart(segment_fit.effects, segment_fit.theta, segment_fit.states[first])
 
 
 def forgets_initial_state(world: RunEvaluator, noise: NoiseModel, derivatives: Array) -> bool:
@@ -104,11 +106,14 @@ def forgets_initial_state(world: RunEvaluator, noise: NoiseModel, derivatives: A
         derivatives: (R, T, C, s) derivatives of the simulated runs by their initial states; zero
             for known states.
     """
-    seen = np.isfinite(world.observed)[..., None]
-    sizes = np.abs(np.where(seen, derivatives / noise.sigma[:, None], 0.0)).max(axis=2)
+    observed_mask = np.isfinite(world.observed)[..., None]
+    sizes = np.abs(np.where(observed_mask, derivatives / noise.sigma[:, None], 0.0)).max(axis=2)
     for run, length in zip(sizes, world.lengths, strict=True):
-        last = run[int((1.0 - RUN_END_SHARE) * length) : int(length)]
+        last_samples = run[int((1.0 - RUN_END_SHARE) * length) : int(length)]
         # If all initial states of a run are known, the decay of their influence cannot be measured.
-        if not run.any() or (last.max(axis=0) > MAX_STATE_INFLUENCE * run.max(axis=0)).any():
+        if (
+            not run.any()
+            or (last_samples.max(axis=0) > MAX_STATE_INFLUENCE * run.max(axis=0)).any()
+        ):
             return False
     return True

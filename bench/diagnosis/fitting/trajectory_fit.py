@@ -66,26 +66,26 @@ def iterate_rounds(iterations: int, race: bool) -> Iterator[RacingRound]:
     """
     first = 0
     while first < iterations or not first:
-        last = iterations
+        end = iterations
         if race:
-            last = min(
+            end = min(
                 iterations,
                 first + ITERATIONS_PER_ROUND if first else MIN_ITERATIONS_BEFORE_ELIMINATION,
             )
-        yield RacingRound(first, last, max(iterations, 1))
+        yield RacingRound(first, end, max(iterations, 1))
         if not iterations:
             return
-        first = last
+        first = end
 
 
-def eliminate_losing_fits(problems: Sequence[FitState], reached: float) -> None:
+def eliminate_losing_fits(problems: Sequence[FitState], lowest_cost: float) -> None:
     """Mark fits as done if several more steps would not bring them close to the best cost.
 
     Args:
         problems: states of the fits; `done` is set in place.
-        reached: lowest cost of other fits.
+        lowest_cost: lowest cost of other fits.
     """
-    best = min(reached, *(p.point.cost for p in problems))
+    best = min(lowest_cost, *(p.point.cost for p in problems))
     for p in problems:
         p.is_finished |= (
             p.point.cost - PREDICTED_DECREASE_FACTOR * p.predicted_decrease
@@ -135,7 +135,7 @@ class TrajectoryFitter:
         starts: Sequence[FitStart],
         iterations: int = 12,
         race: bool = False,
-        reached: float = np.inf,
+        lowest_cost: float = np.inf,
         finished: Callable[[], None] = lambda: None,
     ) -> list[TrajectoryFit]:
         """Fit each model from its start.
@@ -143,8 +143,8 @@ class TrajectoryFitter:
         Args:
             starts: starts of the fits; one or more.
             iterations: maximum number of steps of each fit.
-            race: whether to stop fits that are far behind the best fit or behind `reached`.
-            reached: lowest cost of other models.
+            race: whether to stop fits that are far behind the best fit or behind `lowest_cost`.
+            lowest_cost: lowest cost of other models.
             finished: called once for each model whose fit has ended.
 
         Returns:
@@ -153,13 +153,13 @@ class TrajectoryFitter:
         problems = [self._problem(start) for start in starts]
         for leg in iterate_rounds(iterations, race):
             # Unfinished fits continue in groups, which exchange nothing within a round.
-            going = [i for i, problem in enumerate(problems) if not problem.is_finished]
-            if not going or (
+            unfinished = [i for i, problem in enumerate(problems) if not problem.is_finished]
+            if not unfinished or (
                 leg.first and self.world.watch.should_abandon_fit(leg.first / iterations)
             ):
                 break
-            best = min(reached, *(problem.point.cost for problem in problems))
-            groups = self._groups(problems, going)
+            best = min(lowest_cost, *(problem.point.cost for problem in problems))
+            groups = self._groups(problems, unfinished)
             calls = [(self._terms(), [problems[i] for i in g], leg, race, best) for g in groups]
             for number, members in self.world.crew.map_unordered(self.world, _advance_group, calls):
                 for i, problem in zip(groups[number], members, strict=True):
@@ -175,7 +175,7 @@ class TrajectoryFitter:
         """
         return self.noise, self.frozen, self.share, self.parameters, self.exact
 
-    def _groups(self, problems: Sequence[FitState], going: Sequence[int]) -> list[list[int]]:
+    def _groups(self, problems: Sequence[FitState], unfinished: Sequence[int]) -> list[list[int]]:
         """Split unfinished fits into groups of about `GROUP_COST_SAMPLES` simulated samples.
 
         Each group has models of one kind as far as possible. There is only one group if large
@@ -183,69 +183,78 @@ class TrajectoryFitter:
         """
         world = self.world
         if not world.is_cheap_to_split:
-            return [list(going)]
+            return [list(unfinished)]
         runs, length, _ = world.observed.shape
-        unknown = self._moved_states().size
-        lanes = sum(1 + problems[i].free.size + unknown for i in going) * runs
-        cost = lanes * length * self.share + ALGEBRA_COST_SAMPLES * len(going)
+        state_count = self._moved_states().size
+        lanes = sum(1 + problems[i].free.size + state_count for i in unfinished) * runs
+        cost = lanes * length * self.share + ALGEBRA_COST_SAMPLES * len(unfinished)
         # Compiled batch elements are stepped in parallel, however long they are.
         count = int(np.ceil(min(cost / GROUP_COST_SAMPLES, lanes / MIN_CHUNK_SIZE)))
-        kinds = world.group_compatible(np.stack([problems[i].point.start.theta for i in going]))
-        order = [going[i] for i in np.argsort(kinds, kind="stable")]
+        kinds = world.group_compatible(
+            np.stack([problems[i].point.start.theta for i in unfinished])
+        )
+        order = [unfinished[i] for i in np.argsort(kinds, kind="stable")]
         parts = np.array_split(order, min(count, len(order)))
         return [part.tolist() for part in parts]
 
     def advance_round(
-        self, problems: Sequence[FitState], leg: RacingRound, race: bool, reached: float
+        self, problems: Sequence[FitState], leg: RacingRound, race: bool, lowest_cost: float
     ) -> list[FitState]:
         """Advance fits by one racing round.
 
         Args:
             problems: states of the fits.
             leg: the steps to make.
-            race: whether to stop fits that are far behind the best fit or behind `reached`.
-            reached: lowest cost of other models, including those of other groups.
+            race: whether to stop fits that are far behind the best fit or behind `lowest_cost`.
+            lowest_cost: lowest cost of other models, including those of other groups.
 
         Returns:
             The fits after the round.
         """
         # Mask of the samples that count, (R, T, C).
-        seen = self.world.get_sample_mask(self.share)
+        sample_mask = self.world.get_sample_mask(self.share)
         if not leg.first:
-            self._begin(problems, seen)
+            self._begin(problems, sample_mask)
         for iteration in range(leg.first, leg.last):
             # In the first steps even the correct model may be far behind.
             if race and iteration >= MIN_ITERATIONS_BEFORE_ELIMINATION:
-                eliminate_losing_fits(problems, reached)
+                eliminate_losing_fits(problems, lowest_cost)
             self._renew(
-                problems, seen, waiting=not race or iteration >= MIN_ITERATIONS_BEFORE_ELIMINATION
+                problems,
+                sample_mask,
+                includes_waiting=not race or iteration >= MIN_ITERATIONS_BEFORE_ELIMINATION,
             )
-            trials = list(self._trials(problems, seen))
+            trials = list(self._trials(problems, sample_mask))
             if not trials and any(p.is_waiting and not p.is_finished for p in problems):
                 continue
             # The caller checks whether the fit was stopped early here.
             if not trials or self.world.watch.should_abandon_fit(iteration / leg.all):
                 break
-            made = self._plain_points if self.world.has_linearisation else self._points
-            for (problem, _), point in zip(trials, made(trials, seen), strict=True):
+            make_points = self._plain_points if self.world.has_linearisation else self._points
+            for (problem, _), point in zip(trials, make_points(trials, sample_mask), strict=True):
                 self._judge(problem, point)
         return list(problems)
 
-    def _begin(self, problems: Sequence[FitState], seen: Mask) -> None:
+    def _begin(self, problems: Sequence[FitState], sample_mask: Mask) -> None:
         """Simulate the start of each fit, and compute its derivatives unless they are known."""
-        nearby = [p for p in problems if self._knows(p)]
-        others = [p for p in problems if not self._knows(p)]
-        if others:
-            begun = self._points([(p, p.point.start) for p in others], seen)
-            for problem, point in zip(others, begun, strict=True):
+        known_problems = [p for p in problems if self._knows(p)]
+        unknown_problems = [p for p in problems if not self._knows(p)]
+        if unknown_problems:
+            points = self._points([(p, p.point.start) for p in unknown_problems], sample_mask)
+            for problem, point in zip(unknown_problems, points, strict=True):
                 self._take(problem, point)
-        if nearby:
-            begun = self._plain_points([(p, p.point.start) for p in nearby], seen)
-            for problem, point in zip(nearby, begun, strict=True):
+        if known_problems:
+            points = self._plain_points([(p, p.point.start) for p in known_problems], sample_mask)
+            for problem, point in zip(known_problems, points, strict=True):
                 assert point.start.known is not None
-                own = self._begun(problem, point.start, point.simulated.shape[1])
-                known = point.start.known.jacobian[:, : point.simulated.shape[1]]
-                self._take(problem, replace(point, jacobian=np.concatenate([known, own], axis=3)))
+                state_jacobian = self._begun(problem, point.start, point.simulated.shape[1])
+                parameter_jacobian = point.start.known.jacobian[:, : point.simulated.shape[1]]
+                self._take(
+                    problem,
+                    replace(
+                        point, jacobian=np.concatenate([parameter_jacobian, state_jacobian], axis=3)
+                    ),
+                )
                 problem.has_own_jacobian = False
 
     def _knows(self, problem: FitState) -> bool:
@@ -253,35 +262,37 @@ class TrajectoryFitter:
 
         This saves one simulation per parameter. Only robots reuse derivatives.
         """
-        known = problem.point.start.known
+        known_jacobian = problem.point.start.known
         return (
             self.world.has_linearisation
-            and known is not None
-            and np.array_equal(known.free, problem.free)
+            and known_jacobian is not None
+            and np.array_equal(known_jacobian.free, problem.free)
         )
 
-    def _renew(self, problems: Sequence[FitState], seen: Mask, waiting: bool) -> None:
+    def _renew(
+        self, problems: Sequence[FitState], sample_mask: Mask, includes_waiting: bool
+    ) -> None:
         """Recompute the derivatives of fits whose present ones are not good enough.
 
-        Fits that can wait are included only if `waiting` is true.
+        Fits that can wait are included only if `includes_waiting` is true.
         """
-        stale = [
+        stale_problems = [
             p
             for p in problems
-            if p.is_jacobian_stale and not p.is_finished and (waiting or not p.is_waiting)
+            if p.is_jacobian_stale and not p.is_finished and (includes_waiting or not p.is_waiting)
         ]
-        if not stale:
+        if not stale_problems:
             return
-        for problem in stale:
+        for problem in stale_problems:
             problem.renewals += 1
             if problem.needs_own_states:
                 # Imported here, because only robots need it.
                 from bench.diagnosis.fitting.linearised_runs import begun_about
 
-                at = problem.point.start
-                problem.by_states = begun_about(self.world, at.theta, at.states)
-        points = self._points([(p, p.point.start) for p in stale], seen)
-        for problem, point in zip(stale, points, strict=True):
+                start = problem.point.start
+                problem.by_states = begun_about(self.world, start.theta, start.states)
+        points = self._points([(p, p.point.start) for p in stale_problems], sample_mask)
+        for problem, point in zip(stale_problems, points, strict=True):
             self._take(problem, point)
 
     def _problem(self, start: FitStart) -> FitState:
@@ -300,16 +311,16 @@ class TrajectoryFitter:
         low, high = table.T
 
         # Plausible ranges scale the finite differences; a fit may go far beyond them.
-        plausible = [world.parameters[i].bounds for i in free]
-        widths = np.array([b - a for a, b in plausible], dtype=np.float64)
+        plausible_ranges = [world.parameters[i].bounds for i in free]
+        widths = np.array([b - a for a, b in plausible_ranges], dtype=np.float64)
         state_steps = np.full(len(world.states), INITIAL_STATE_STEP)
 
         # A start may have a size from a score test, or come from wider bounds.
         theta = start.theta.copy()
         theta[free] = np.clip(theta[free], low, high)
-        begun = FitStart(start.effects, theta, start.states.copy(), start.known)
+        clipped_start = FitStart(start.effects, theta, start.states.copy(), start.known)
         return FitState(
-            point=FitPoint(begun, np.empty(0), np.empty(0), np.inf),
+            point=FitPoint(clipped_start, np.empty(0), np.empty(0), np.inf),
             free=np.array(free, dtype=np.intp),
             low=low,
             high=high,
@@ -320,7 +331,7 @@ class TrajectoryFitter:
             samples=int(world.get_sample_mask(self.share).sum()),
         )
 
-    def _points(self, trials: Sequence[_TrialStep], seen: Mask) -> list[FitPoint]:
+    def _points(self, trials: Sequence[_TrialStep], sample_mask: Mask) -> list[FitPoint]:
         """Simulate trial points together with their derivatives and cost.
 
         One engine call contains every run of every model with every unknown displaced, so it
@@ -328,15 +339,15 @@ class TrajectoryFitter:
         unknown.
         """
         runs, size = self.world.guess.shape
-        unknown = self._moved_states()
+        state_indices = self._moved_states()
         steps = [problem.compute_inward_steps(start.theta) for problem, start in trials]
-        moved = [
-            build_displaced_inputs(start, problem.free, step, unknown)
+        displaced_inputs = [
+            build_displaced_inputs(start, problem.free, step, state_indices)
             for (problem, start), step in zip(trials, steps, strict=True)
         ]
         # Batch elements are ordered by model, then by unknown, then by run.
-        thetas = np.concatenate([np.repeat(theta, runs, axis=0) for theta, _ in moved])
-        states = np.concatenate([begin.reshape(-1, size) for _, begin in moved])
+        thetas = np.concatenate([np.repeat(theta, runs, axis=0) for theta, _ in displaced_inputs])
+        states = np.concatenate([begin.reshape(-1, size) for _, begin in displaced_inputs])
         lanes = np.tile(np.arange(runs), len(thetas) // runs)
         simulated = self.world.simulate(thetas, lanes, states, self.share)
         simulated = simulated.reshape(-1, runs, *simulated.shape[1:])
@@ -345,17 +356,17 @@ class TrajectoryFitter:
         first = 0
         for (problem, start), step in zip(trials, steps, strict=True):
             # The first element is not displaced; each other one has one unknown displaced.
-            last = first + 1 + problem.free.size + unknown.size
-            part = simulated[first:last]
-            first = last
-            jacobian = self._derivatives(part, step, unknown)
+            end = first + 1 + problem.free.size + state_indices.size
+            part = simulated[first:end]
+            first = end
+            jacobian = self._derivatives(part, step, state_indices)
             if self.world.has_linearisation:
                 jacobian[..., problem.free.size :] = self._begun(problem, start, part.shape[2])
-            cost = self._cost(part[0], start.states, seen)
+            cost = self._cost(part[0], start.states, sample_mask)
             points.append(FitPoint(start, part[0], jacobian, cost))
         return points
 
-    def _plain_points(self, trials: Sequence[_TrialStep], seen: Mask) -> list[FitPoint]:
+    def _plain_points(self, trials: Sequence[_TrialStep], sample_mask: Mask) -> list[FitPoint]:
         """Simulate trial points, and give each the derivatives of its fit's present point.
 
         `_judge` updates these derivatives if the point is accepted.
@@ -368,7 +379,9 @@ class TrajectoryFitter:
             self.share,
         ).reshape(len(trials), runs, *self.world.observed.shape[1:])
         return [
-            FitPoint(start, part, problem.point.jacobian, self._cost(part, start.states, seen))
+            FitPoint(
+                start, part, problem.point.jacobian, self._cost(part, start.states, sample_mask)
+            )
             for (problem, start), part in zip(trials, simulated, strict=True)
         ]
 
@@ -394,10 +407,10 @@ class TrajectoryFitter:
         if shared is None:
             shared = compute_state_jacobian(world, start.theta, start.states)
         derivatives = shared[:, :samples]
-        kept: Array = derivatives * ~world.known[:, None, None, :]
-        return kept
+        masked_derivatives: Array = derivatives * ~world.known[:, None, None, :]
+        return masked_derivatives
 
-    def _derivatives(self, part: Array, steps: Array, unknown: Indices) -> Array:
+    def _derivatives(self, part: Array, steps: Array, state_indices: Indices) -> Array:
         """Compute finite-difference derivatives (R, T, C, q + s).
 
         They are zero for known initial states, which therefore absorb nothing of the residual.
@@ -405,11 +418,11 @@ class TrajectoryFitter:
         Args:
             part: (1 + q + n, R, T, C) simulation without and with each unknown displaced.
             steps: (q + s,) displacements.
-            unknown: (n,) indices of the initial states that are displaced.
+            state_indices: (n,) indices of the initial states that are displaced.
         """
-        known = self.world.known
-        q = steps.size - known.shape[1]
-        columns = np.concatenate([np.arange(q), q + unknown])
+        known_mask = self.world.known
+        q = steps.size - known_mask.shape[1]
+        columns = np.concatenate([np.arange(q), q + state_indices])
         # An abandoned batch element is NaN, so the effect of its unknown is not known.
         with np.errstate(all="ignore"):
             quotients = np.moveaxis(part[1:] - part[0], 0, -1) / steps[columns]
@@ -418,7 +431,7 @@ class TrajectoryFitter:
             return jacobian
         quotients, jacobian = jacobian, np.zeros((*part.shape[1:], steps.size))
         jacobian[..., columns] = quotients
-        jacobian[..., q:] *= ~known[:, None, None, :]
+        jacobian[..., q:] *= ~known_mask[:, None, None, :]
         return jacobian
 
     def _take(self, problem: FitState, point: FitPoint) -> None:
@@ -427,9 +440,9 @@ class TrajectoryFitter:
         problem.has_own_jacobian, problem.is_jacobian_stale, problem.is_waiting = True, False, False
         problem.steps = compute_difference_steps(point.jacobian, self.noise, problem.widths)
 
-    def _residual(self, simulated: Array, seen: Mask) -> Array:
+    def _residual(self, simulated: Array, sample_mask: Mask) -> Array:
         """Return observed minus simulated (R, T, C), zero where no sample counts."""
-        residual: Array = np.where(seen, self.world.observed - simulated, 0.0)
+        residual: Array = np.where(sample_mask, self.world.observed - simulated, 0.0)
         return residual
 
     def _drift(self, states: Array) -> Array:
@@ -447,20 +460,20 @@ class TrajectoryFitter:
         """
         return self._cost(fit.simulated, fit.states, self.world.get_sample_mask(self.share))
 
-    def _cost(self, simulated: Array, states: Array, seen: Mask) -> float:
+    def _cost(self, simulated: Array, states: Array, sample_mask: Mask) -> float:
         """Return the cost, eq. (1) of `gauss_newton`: the whitened residual and the prior, squared.
 
         It is infinite if the simulation was abandoned.
         """
-        residual = self._residual(simulated, seen)
+        residual = self._residual(simulated, sample_mask)
         # An abandoned batch element is NaN, which cannot be compared.
         if not np.isfinite(residual).all():
             return np.inf
-        w = whiten(residual, seen, self.noise)
+        w = whiten(residual, sample_mask, self.noise)
         drift = self._drift(states)
         return float((w * w).sum() + (drift * drift).sum())
 
-    def _trials(self, problems: Sequence[FitState], seen: Mask) -> Iterator[_TrialStep]:
+    def _trials(self, problems: Sequence[FitState], sample_mask: Mask) -> Iterator[_TrialStep]:
         """Propose the next point of each fit that is neither finished nor waiting.
 
         A fit without a useful step is marked as finished or waiting and yields nothing.
@@ -468,30 +481,30 @@ class TrajectoryFitter:
         for problem in problems:
             if problem.is_finished or problem.is_waiting:
                 continue
-            trial = self._trial(problem, seen)
-            if trial is not None:
-                yield problem, trial
+            next_start = self._trial(problem, sample_mask)
+            if next_start is not None:
+                yield problem, next_start
 
-    def _trial(self, problem: FitState, seen: Mask) -> FitStart | None:
+    def _trial(self, problem: FitState, sample_mask: Mask) -> FitStart | None:
         """Return the next parameters and initial states to try.
 
         If no decrease is predicted, mark the fit as finished or waiting, and return None.
         """
-        at = problem.point
+        point = problem.point
         # There is no descent direction from a point that could not be simulated.
-        if not np.isfinite(at.cost):
+        if not np.isfinite(point.cost):
             problem.is_finished = True
             return None
 
-        left = self._residual(at.simulated, seen)
-        derivatives = np.where(seen[..., None], at.jacobian, 0.0)
-        residual = whiten(left, seen, self.noise)
-        jacobian = whiten(derivatives, seen, self.noise)
+        unwhitened_residual = self._residual(point.simulated, sample_mask)
+        derivatives = np.where(sample_mask[..., None], point.jacobian, 0.0)
+        residual = whiten(unwhitened_residual, sample_mask, self.noise)
+        jacobian = whiten(derivatives, sample_mask, self.noise)
         step = compute_gauss_newton_step(
             residual,
             jacobian,
             problem.free.size,
-            self._drift(at.start.states),
+            self._drift(point.start.states),
             compute_state_prior(self.world),
             self.world.known,
             problem.damping,
@@ -503,17 +516,17 @@ class TrajectoryFitter:
         # The fit has converged, no step is short enough, or numbers overflow.
         if (
             not np.isfinite(step.predicted_decrease)
-            or step.predicted_decrease < problem.get_tolerance(at.cost)
+            or step.predicted_decrease < problem.get_tolerance(point.cost)
             or problem.damping > MAX_DAMPING
         ):
             problem.mark_converged()
             return None
 
         # Copy the parameters, because the old point is still needed if the trial is rejected.
-        theta = at.start.theta.copy()
-        moved = theta[problem.free] + step.parameter_step
-        theta[problem.free] = np.clip(moved, problem.low, problem.high)
-        return replace(at.start, theta=theta, states=at.start.states + step.state_steps)
+        theta = point.start.theta.copy()
+        trial_values = theta[problem.free] + step.parameter_step
+        theta[problem.free] = np.clip(trial_values, problem.low, problem.high)
+        return replace(point.start, theta=theta, states=point.start.states + step.state_steps)
 
     def _judge(self, problem: FitState, point: FitPoint) -> None:
         """Accept a trial point if its cost is lower, else reject it, and update the damping.
@@ -521,14 +534,14 @@ class TrajectoryFitter:
         The derivatives of a robot are updated by Broyden's method instead of simulations.
         """
         gained = problem.point.cost - point.cost
-        own = problem.has_own_jacobian
+        is_own_jacobian = problem.has_own_jacobian
         if point.cost < problem.point.cost:
             if self.world.has_linearisation:
                 problem.point = replace(point, jacobian=problem.update_jacobian(point))
                 problem.has_own_jacobian = not problem.free.size
             else:
                 self._take(problem, point)
-            problem.accept_step(gained, point.cost, own)
+            problem.accept_step(gained, point.cost, is_own_jacobian)
         else:
             problem.reject_step()
 
@@ -545,8 +558,10 @@ def compute_state_prior(world: RunEvaluator) -> Array:
     """
     if world.state_prior is not None:
         return world.state_prior
-    system, shown = world.simulator.system, set(world.channels)
+    system, recorded_channels = world.simulator.system, set(world.channels)
     # Samples of a coordinate also show its rate; a user-defined system may have further states.
     pairs = dict(zip(system.rates, system.coordinates, strict=False))
-    measured = [name in shown or pairs.get(name) in shown for name in world.states]
+    measured = [
+        name in recorded_channels or pairs.get(name) in recorded_channels for name in world.states
+    ]
     return np.where(measured, OBSERVED_STATE_PRIOR_SIGMA, UNOBSERVED_STATE_PRIOR_SIGMA)

@@ -47,7 +47,7 @@ def fit(context: SearchContext, start: FitStart) -> FittedModel:
     if is_explained(context, fitted) or not np.isfinite(fitted.fit.cost):
         return fitted
     derivatives_before = world.derivatives
-    compute_state_jacobian(world, fitted.fit.theta, fitted.fit.states, anew=True)
+    compute_state_jacobian(world, fitted.fit.theta, fitted.fit.states, is_recomputed=True)
     fitted = search.fit_one(fitted.fit.make_start())
     if not is_explained(context, fitted):
         # Derivatives about a wrong motion are not valid for other models.
@@ -117,7 +117,9 @@ def lowest_of_each(
     """
     if not starts:
         return []
-    costs = costs_of_starts(context.world, context.search.noise, starts, share=1.0, lost=np.inf)
+    costs = costs_of_starts(
+        context.world, context.search.noise, starts, share=1.0, failed_residual=np.inf
+    )
     lowest: dict[tuple[str, ...], tuple[float, FitStart]] = {}
     for i in np.argsort(costs, kind="stable").tolist():
         lowest.setdefault(starts[i].effects, (float(costs[i]), starts[i]))

@@ -17,8 +17,8 @@ WIDTH = 96
 
 def literal(text: str) -> str:
     """Format text from a file as an ASCII Python literal that cannot end early or become code."""
-    plain = not {"'", '"'} & set(text)
-    return f'"{ascii(text)[1:-1]}"' if plain else ascii(text)
+    has_no_quotes = not {"'", '"'} & set(text)
+    return f'"{ascii(text)[1:-1]}"' if has_no_quotes else ascii(text)
 
 
 def number(value: float) -> str:
@@ -36,25 +36,25 @@ def comment(texts: str | Sequence[str], indent: str = "") -> str:
     begin = f"{indent}# "
     lines: list[str] = []
     for text in [texts] if isinstance(texts, str) else texts:
-        plain = sanitise(text, 2000)
+        sanitised_text = sanitise(text, 2000)
         lines += textwrap.wrap(
-            plain, WIDTH, initial_indent=begin, subsequent_indent=begin, break_long_words=False,
-            break_on_hyphens=False,
+            sanitised_text, WIDTH, initial_indent=begin, subsequent_indent=begin,
+            break_long_words=False, break_on_hyphens=False,
         )  # fmt: skip
     return "\n".join(lines)
 
 
 def identifiers(names: Iterable[str]) -> Iterator[str]:
     """Yield an identifier for each name that differs from all earlier ones."""
-    used: set[str] = set()
+    used_identifiers: set[str] = set()
     for name in names:
         base = re.sub(r"\W+", "_", name, flags=re.ASCII).strip("_").lower() or "range"
         base = base if base[0].isalpha() else f"n_{base}"
         identifier, count = base, 1
-        while identifier in used:
+        while identifier in used_identifiers:
             count += 1
             identifier = f"{base}_{count}"
-        used.add(identifier)
+        used_identifiers.add(identifier)
         yield identifier
 
 

@@ -37,7 +37,7 @@ def range_files(
         return {}
     import tomli_w
 
-    rows = [each.document() for each in ranges.ranges]
+    rows = [entry.document() for entry in ranges.ranges]
     assert extended.robot is not None
     document: dict[str, Any] = {
         "format": FORMAT,
@@ -48,7 +48,7 @@ def range_files(
     }
     table = [[_format_cell(row.get(column)) for column in COLUMNS] for row in rows]
     tables = {"ranges.toml": tomli_w.dumps(document), "ranges.csv": csv_text(COLUMNS, table)}
-    if not any(each.fields for each in ranges.ranges):
+    if not any(entry.fields for entry in ranges.ranges):
         return tables
     robot = getattr(extended.kind, "robot", None)
     return {

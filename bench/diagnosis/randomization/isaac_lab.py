@@ -60,7 +60,7 @@ def isaac_lab_code(ranges: RandomizationRanges, extended: ExtendedSimulator, rob
         "ranges_isaac_lab.py",
         heading=list_heading(extended, "Isaac Lab", ranges.left_out),
         terms=list(zip(identifiers(term.name for term in terms), terms, strict=True)),
-        missing=[f"- {sentences[each]}" for each in missing],
+        missing=[f"- {sentences[entry]}" for entry in missing],
     )
 
 
@@ -72,53 +72,54 @@ def _build_terms(
     `sentences` has the comment for each range.
     """
     by_effect: dict[str, dict[str, list[RandomizationRange]]] = {}
-    for each in ranges.ranges:
-        by_effect.setdefault(each.effect, {}).setdefault(each.name, []).append(each)
+    for entry in ranges.ranges:
+        by_effect.setdefault(entry.effect, {}).setdefault(entry.name, []).append(entry)
     terms: list[Term] = []
     for effect, function, key in (
         ("friction.coulomb", "randomize_joint_parameters", "friction_distribution_params"),
         ("inertia.armature", "randomize_joint_parameters", "armature_distribution_params"),
     ):
-        for name, (each,) in by_effect.pop(effect, {}).items():
+        for name, (entry,) in by_effect.pop(effect, {}).items():
             notes = [FRICTION_NOTE] if effect == "friction.coulomb" else []
             terms.append(
                 _build_joint_term(
-                    each.field, name, function, key, _get_ends(each), [sentences[each], *notes]
+                    entry.field, name, function, key, _get_ends(entry), [sentences[entry], *notes]
                 )
             )
     terms += _make_gain_terms(by_effect, sentences, robot)
-    for name, (each,) in by_effect.pop("mass.scale", {}).items():
-        params = {"mass_distribution_params": _format_pair(*_get_ends(each)), "operation": '"abs"'}
+    for name, (entry,) in by_effect.pop("mass.scale", {}).items():
+        params = {"mass_distribution_params": _format_pair(*_get_ends(entry)), "operation": '"abs"'}
         if name in by_effect.get("inertia.scale", {}):
             # The range of the inertia already includes the scaling by the mass.
             params["recompute_inertia"] = "False"
         terms.append(
             _build_body_term(
-                "body_mass", name, "randomize_rigid_body_mass", params, [sentences[each]]
+                "body_mass", name, "randomize_rigid_body_mass", params, [sentences[entry]]
             )
         )
     for name, offsets in by_effect.pop("mass.offset", {}).items():
         pairs = [
-            f'"{each.coefficient}": {_format_pair(each.minimum, each.maximum)}' for each in offsets
+            f'"{entry.coefficient}": {_format_pair(entry.minimum, entry.maximum)}'
+            for entry in offsets
         ]
         params = {"com_range": "{" + ", ".join(pairs) + "}"}
-        notes = [sentences[each] for each in offsets]
+        notes = [sentences[entry] for entry in offsets]
         terms.append(_build_body_term("body_ipos", name, "randomize_rigid_body_com", params, notes))
-    for name, (each,) in by_effect.pop("inertia.scale", {}).items():
+    for name, (entry,) in by_effect.pop("inertia.scale", {}).items():
         params = {
-            "inertia_distribution_params": _format_pair(each.minimum, each.maximum),
+            "inertia_distribution_params": _format_pair(entry.minimum, entry.maximum),
             "operation": '"scale"',
             "diagonal_only": "False",
         }
-        notes = [sentences[each], "This term exists since Isaac Lab 3."]
+        notes = [sentences[entry], "This term exists since Isaac Lab 3."]
         function = "randomize_rigid_body_inertia"
         terms.append(_build_body_term("body_inertia", name, function, params, notes))
     terms += _make_gravity_term(by_effect, sentences, robot)
     return terms, [
-        each
+        entry
         for ranges_by_place in by_effect.values()
         for by_place in ranges_by_place.values()
-        for each in by_place
+        for entry in by_place
     ]
 
 
@@ -139,20 +140,22 @@ def _make_gain_terms(
         ends = _sum_ranges(
             [_convert_gain_to_joint(robot, stiffness, name, 1) for name in actuators]
         )
-        notes = [sentences[each] for name in actuators for each in stiffness.get(name, ())]
+        notes = [sentences[entry] for name in actuators for entry in stiffness.get(name, ())]
         key = "stiffness_distribution_params"
         yield _build_joint_term("stiffness", joint, function, key, ends, notes)
     for joint in dict.fromkeys([*passive, *_group_by_joint(robot, damping)]):
-        names = [each.name for each in robot.actuators if each.joint == joint]
+        names = [actuator.name for actuator in robot.actuators if actuator.joint == joint]
         parts = [_convert_gain_to_joint(robot, damping, name, 2) for name in names]
-        stated = float(robot.compiled.dof_damping[robot.joint(joint).velocity])
+        damping_in_file = float(robot.compiled.dof_damping[robot.joint(joint).velocity])
         damping_ranges = passive.get(joint)
-        parts.append(_get_ends(damping_ranges[0]) if damping_ranges else (stated, stated))
+        parts.append(
+            _get_ends(damping_ranges[0]) if damping_ranges else (damping_in_file, damping_in_file)
+        )
         joint_ranges = [
             *(damping_ranges or ()),
-            *(each for name in names for each in damping.get(name, ())),
+            *(entry for name in names for entry in damping.get(name, ())),
         ]
-        notes = [*(sentences[each] for each in joint_ranges), DAMPING_NOTE]
+        notes = [*(sentences[entry] for entry in joint_ranges), DAMPING_NOTE]
         key = "damping_distribution_params"
         yield _build_joint_term("damping", joint, function, key, _sum_ranges(parts), notes)
 
@@ -176,8 +179,8 @@ def _convert_gain_to_joint(
     if name in ranges:
         low, high = _get_ends(ranges[name][0])
         return share * low, share * high
-    stated = -share * float(robot.compiled.actuator_biasprm[actuator_id, term])
-    return stated, stated
+    gain_in_file = -share * float(robot.compiled.actuator_biasprm[actuator_id, term])
+    return gain_in_file, gain_in_file
 
 
 def _make_gravity_term(
@@ -186,24 +189,24 @@ def _make_gravity_term(
     robot: Any,
 ) -> Iterator[Term]:
     """Yield the term that randomises the gravity vector, if its size or direction has a range."""
-    scale = [each for ranges in by_effect.pop("gravity.scale", {}).values() for each in ranges]
-    tilt = [each for ranges in by_effect.pop("gravity.tilt", {}).values() for each in ranges]
+    scale = [entry for ranges in by_effect.pop("gravity.scale", {}).values() for entry in ranges]
+    tilt = [entry for ranges in by_effect.pop("gravity.tilt", {}).values() for entry in ranges]
     if not scale and not tilt:
         return
-    stated = np.asarray(robot.compiled.opt.gravity, dtype=float)
-    low, high = stated.copy(), stated.copy()
-    for each in scale:
-        ends = np.stack([each.minimum * stated, each.maximum * stated])
+    gravity_in_file = np.asarray(robot.compiled.opt.gravity, dtype=float)
+    low, high = gravity_in_file.copy(), gravity_in_file.copy()
+    for entry in scale:
+        ends = np.stack([entry.minimum * gravity_in_file, entry.maximum * gravity_in_file])
         low, high = ends.min(axis=0), ends.max(axis=0)
-    for each in tilt:
-        axis = AXES.index(each.coefficient)
-        low[axis], high[axis] = each.low, each.high
+    for entry in tilt:
+        axis = AXES.index(entry.coefficient)
+        low[axis], high[axis] = entry.low, entry.high
     vectors = [f"[{', '.join(number(value) for value in end)}]" for end in (low, high)]
     params = {
         "gravity_distribution_params": f"({', '.join(vectors)})",
         "operation": '"abs"',
     }
-    notes = [sentences[each] for each in (*scale, *tilt)]
+    notes = [sentences[entry] for entry in (*scale, *tilt)]
     yield Term("gravity", "randomize_physics_scene_gravity", params, notes)
 
 
@@ -254,8 +257,8 @@ def _format_asset(key: str, name: str) -> str:
     return f'SceneEntityCfg("robot", {key}=[{literal(re.escape(name))}])'
 
 
-def _get_ends(each: RandomizationRange) -> tuple[float, float]:
-    return each.low, each.high
+def _get_ends(entry: RandomizationRange) -> tuple[float, float]:
+    return entry.low, entry.high
 
 
 def _sum_ranges(parts: Sequence[tuple[float, float]]) -> tuple[float, float]:

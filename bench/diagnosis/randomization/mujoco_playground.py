@@ -33,7 +33,7 @@ def mujoco_playground_code(
     # Setting the mass also scales the inertia, and setting the size of gravity its components, so
     # inertia and components are set afterwards.
     with_fields = sorted((r for r in ranges.ranges if r.fields), key=_is_last)
-    fields = dict.fromkeys(name for each in with_fields for name in _list_fields(each))
+    fields = dict.fromkeys(name for entry in with_fields for name in _list_fields(entry))
     places = dict.fromkeys((r.kind, r.name) for r in with_fields if r.kind in OBJECTS)
     return render_code(
         "ranges_mujoco_playground.py",
@@ -50,19 +50,19 @@ def mujoco_playground_code(
     )
 
 
-def _is_last(each: RandomizationRange) -> bool:
-    return each.effect in ("inertia.scale", "gravity.tilt")
+def _is_last(entry: RandomizationRange) -> bool:
+    return entry.effect in ("inertia.scale", "gravity.tilt")
 
 
-def _list_fields(each: RandomizationRange) -> list[str]:
+def _list_fields(entry: RandomizationRange) -> list[str]:
     """List the names of the fields that a range sets."""
-    names = [field.name for field in each.fields]
-    return [*names, "body_inertia"] if each.effect == "mass.scale" else names
+    names = [field.name for field in entry.fields]
+    return [*names, "body_inertia"] if entry.effect == "mass.scale" else names
 
 
-def _format_index(each: RandomizationRange, place: str, address: tuple[int, ...]) -> str:
+def _format_index(entry: RandomizationRange, place: str, address: tuple[int, ...]) -> str:
     """Format the index of an element, based on the variable of its joint, body or actuator."""
     if not place:
         return ", ".join(str(k) for k in address)
-    first = f"model.jnt_dofadr[{place}]" if each.field.startswith("dof_") else place
+    first = f"model.jnt_dofadr[{place}]" if entry.field.startswith("dof_") else place
     return ", ".join([first, *(str(k) for k in address[1:])])

@@ -128,21 +128,21 @@ def randomization_ranges(answer: Verdict, extended: ExtendedSimulator) -> Random
     # This import is needed for robots only.
     from sims.robot.fitted_causes import expand_families
 
-    named = {cause.effect for cause in answer.causes if not cause.alternatives}
+    unambiguous_effects = {cause.effect for cause in answer.causes if not cause.alternatives}
     left_out = [
         f"{cause.effect} is not in the ranges: these data cannot tell it from "
         f"{joined(cause.alternatives, 'or')}"
         for cause in answer.causes
         if cause.alternatives
     ]
-    freed = {effect.name for effect in kind.system.freed_effects}
+    freed_effects = {effect.name for effect in kind.system.freed_effects}
     causes_by_name = {
         name: numbers
         for name, numbers in collect_causes(extended).items()
         if not name.startswith("numerics.")
     }
     causes = [
-        (cause, name in freed, name in freed or name in named)
+        (cause, name in freed_effects, name in freed_effects or name in unambiguous_effects)
         for name, numbers in causes_by_name.items()
         for cause in expand_families(kind.robot, {name: numbers})
     ]
@@ -151,11 +151,11 @@ def randomization_ranges(answer: Verdict, extended: ExtendedSimulator) -> Random
     for number, (cause, is_free, is_wanted) in enumerate(causes):
         for coefficient, fitted in cause.numbers.items() if is_wanted else ():
             entry = _Entry(cause, is_free, coefficient)
-            if why := _find_missing_range_reason(fitted, entry):
-                left_out += [why] if is_free or fitted.value or fitted.at_bound else []
+            if reason := _find_missing_range_reason(fitted, entry):
+                left_out += [reason] if is_free or fitted.value or fitted.at_bound else []
             else:
                 ranges.append(_convert_to_range(kind.robot, totals, number, entry))
-    if ranges and not any(one.fields for one in ranges):
+    if ranges and not any(item.fields for item in ranges):
         left_out.append(NO_FIELD)
     if not ranges:
         left_out.append(NOTHING_FOUND.format(verdict=answer.verdict))
@@ -171,14 +171,16 @@ def _find_missing_range_reason(number: FittedValue, entry: _Entry) -> str:
         name = f"{name} ({entry.coefficient})"
     if number.at_bound is not None:
         end = {"low": "lower", "high": "upper"}[number.at_bound]
-        why = f"its value, {number.value:.3g} {number.unit}, lies at the {end} bound of its range"
+        reason = (
+            f"its value, {number.value:.3g} {number.unit}, lies at the {end} bound of its range"
+        )
     elif number.low is None or number.high is None:
-        why = f"its value, {number.value:.3g} {number.unit}, has no finite interval"
+        reason = f"its value, {number.value:.3g} {number.unit}, has no finite interval"
     elif is_gravity_compensated(entry.cause.effect, entry.cause.numbers):
-        why = 'gravity is compensated; extended.xml says so with gravcomp="1"'
+        reason = 'gravity is compensated; extended.xml says so with gravcomp="1"'
     else:
         return ""
-    return f"{name} is not in the ranges: {why}"
+    return f"{name} is not in the ranges: {reason}"
 
 
 class _Totals:
@@ -268,14 +270,14 @@ def _convert_to_range(
 
 def texts(ranges: RandomizationRanges) -> Iterator[tuple[RandomizationRange, str]]:
     """Yield each range with a sentence that describes it."""
-    for one in ranges.ranges:
-        where = f"{one.kind} {one.name}" if one.name else "the world"
-        what = one.field or f"effect {one.effect}"
-        what += "" if one.coefficient == "coefficient" else f" ({one.coefficient})"
-        stated = "" if one.nominal is None else f"{one.nominal:.4g} in the model file, "
-        unit = "" if one.unit == "1" else f" {one.unit}"
+    for entry in ranges.ranges:
+        place_text = f"{entry.kind} {entry.name}" if entry.name else "the world"
+        quantity = entry.field or f"effect {entry.effect}"
+        quantity += "" if entry.coefficient == "coefficient" else f" ({entry.coefficient})"
+        value_in_file = "" if entry.nominal is None else f"{entry.nominal:.4g} in the model file, "
+        unit = "" if entry.unit == "1" else f" {entry.unit}"
         yield (
-            one,
-            f"{what} of {where}: {stated}{one.value:.4g} ({one.low:.4g} to {one.high:.4g}){unit} "
-            f"with {one.cause}",
+            entry,
+            f"{quantity} of {place_text}: {value_in_file}{entry.value:.4g} "
+            f"({entry.low:.4g} to {entry.high:.4g}){unit} with {entry.cause}",
         )

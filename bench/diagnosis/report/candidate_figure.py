@@ -88,9 +88,9 @@ def candidates_figure(report: DiagnosisReportData) -> Figure:
     has_shares = any(candidate.heldout_gain is not None for candidate in candidates)
 
     # Names of causes are bold, which is a little wider.
-    left = _EDGE + 0.12 + text_width(names, _NAME_SIZE, "bold")
+    left_margin = _EDGE + 0.12 + text_width(names, _NAME_SIZE, "bold")
     shares_width = _SHARES_WIDTH + _SHARE_TEXTS_WIDTH if has_shares else 0.0
-    width = max(left + shares_width + _SCORES_WIDTH + _SCORE_TEXTS_WIDTH + _EDGE, 7.0)
+    width = max(left_margin + shares_width + _SCORES_WIDTH + _SCORE_TEXTS_WIDTH + _EDGE, 7.0)
     # All rows have the height of the longest name, so that bars are evenly spaced.
     row = _ROW + _LINE * most_lines(names)
     handles, labels = _make_legend(report)
@@ -102,11 +102,11 @@ def candidates_figure(report: DiagnosisReportData) -> Figure:
     )
     bottom, size = _BOTTOM / height, row * len(candidates) / height
     scores = axes[0, -1]
-    scores.set_position(((left + shares_width) / width, bottom, _SCORES_WIDTH / width, size))
+    scores.set_position(((left_margin + shares_width) / width, bottom, _SCORES_WIDTH / width, size))
     _draw_scores(scores, report, candidates, thickness=_BAR / row)
     if has_shares:
         shares = axes[0, 0]
-        shares.set_position((left / width, bottom, _SHARES_WIDTH / width, size))
+        shares.set_position((left_margin / width, bottom, _SHARES_WIDTH / width, size))
         _draw_shares(shares, report, candidates)
         scores.tick_params(axis="y", left=False, labelleft=False)
     _label_rows(axes[0, 0], report, candidates, names)
@@ -209,15 +209,15 @@ def _draw_scores(
     Small vertical lines are the scores of the same effect at other places. `thickness` is the
     height of a bar in rows.
     """
-    elsewhere = {entry.best.effect: entry.elsewhere for entry in rank_candidates(report)}
-    longest = 1e-9
+    other_places = {entry.best.effect: entry.elsewhere for entry in rank_candidates(report)}
+    longest_bar = 1e-9
     for row, candidate in enumerate(candidates):
         size = max(candidate.score, 0.0)
         bar_style = dict(_BARS[get_candidate_status(report, candidate.effect)])
         if _is_chance(report, candidate):
             bar_style["facecolor"] = "white"
         axis.barh(row, size, height=thickness, edgecolor=NEUTRAL_MARK, linewidth=0.6, **bar_style)
-        other_scores = [max(other.score, 0.0) for other in elsewhere.get(candidate.effect, ())]
+        other_scores = [max(member.score, 0.0) for member in other_places.get(candidate.effect, ())]
         axis.plot(
             other_scores,
             [row] * len(other_scores),
@@ -226,7 +226,7 @@ def _draw_scores(
             markersize=8,
             markeredgewidth=1.0,
         )
-        longest = max(longest, size, *other_scores)
+        longest_bar = max(longest_bar, size, *other_scores)
         text = format_number(candidate.score)
         if CERTAIN < candidate.p_value <= CHANCE:
             text += f"  ({_format_p_value(candidate.p_value)})"
@@ -239,7 +239,7 @@ def _draw_scores(
             fontsize=8,
             annotation_clip=False,
         )
-    axis.set_xlim(0.0, longest)
+    axis.set_xlim(0.0, longest_bar)
     axis.locator_params(axis="x", nbins=5)
     axis.set_xlabel("score: twice the gain in log likelihood")
     axis.set_title("Evidence on the fitted runs", fontsize=9.5, loc="left")
@@ -266,17 +266,21 @@ def _format_notes(report: DiagnosisReportData, candidates: Sequence[Candidate]) 
         counts += f"; held out: {_format_split_size(report.held_out)}"
     notes = [f"{counts}."]
     p_value_note = "p: probability of such a score by chance"
-    certain = [c.p_value for c in candidates if c.p_value <= CERTAIN]
-    by_chance = [c.p_value for c in candidates if _is_chance(report, c)]
-    if certain:
-        bars = "for all shown" if len(certain) == len(candidates) else "for grey or coloured bars"
-        p_value_note += f"; {_format_p_value(max(certain)).replace('=', '≤')} {bars}"
-    if by_chance:
-        bars = "for all shown" if len(by_chance) == len(candidates) else "for white bars"
-        p_value_note += f"; {_format_p_value(min(by_chance)).replace('=', '≥')} {bars}"
+    certain_p_values = [c.p_value for c in candidates if c.p_value <= CERTAIN]
+    chance_p_values = [c.p_value for c in candidates if _is_chance(report, c)]
+    if certain_p_values:
+        bars = (
+            "for all shown"
+            if len(certain_p_values) == len(candidates)
+            else "for grey or coloured bars"
+        )
+        p_value_note += f"; {_format_p_value(max(certain_p_values)).replace('=', '≤')} {bars}"
+    if chance_p_values:
+        bars = "for all shown" if len(chance_p_values) == len(candidates) else "for white bars"
+        p_value_note += f"; {_format_p_value(min(chance_p_values)).replace('=', '≥')} {bars}"
     notes.append(f"{p_value_note}.")
-    missing = sum(candidate.heldout_gain is None for candidate in candidates)
-    if 0 < missing < len(candidates):
+    unsimulated_count = sum(candidate.heldout_gain is None for candidate in candidates)
+    if 0 < unsimulated_count < len(candidates):
         notes[1] += f" Without a mark: not simulated on {report.validation_runs}."
     return notes
 

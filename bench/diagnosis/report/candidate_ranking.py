@@ -60,8 +60,11 @@ def rank_candidates(report: DiagnosisReportData) -> list[RankedCandidate]:
     for group in groups.values():
         # A diagnosed cause represents its effect even if another place has a higher score.
         heads = [c for c in group if c.effect in causes] or [_choose_representative(group)]
-        rest = tuple(c for c in group if c not in heads)
-        entries += [RankedCandidate(heads[0], rest), *(RankedCandidate(head) for head in heads[1:])]
+        other_members = tuple(c for c in group if c not in heads)
+        entries += [
+            RankedCandidate(heads[0], other_members),
+            *(RankedCandidate(head) for head in heads[1:]),
+        ]
     return sorted(entries, key=lambda entry: entry.best.score, reverse=True)
 
 
@@ -79,9 +82,13 @@ def select_shown_candidates(report: DiagnosisReportData) -> list[Candidate]:
     """Select the candidates to show, the highest score first; diagnosed causes are included."""
     ordered = [entry.best for entry in rank_candidates(report)]
     # A diagnosed cause is shown even with a low score.
-    unneeded = [c for c in ordered if get_candidate_status(report, c.effect) == "not needed"]
-    hidden = unneeded[max(0, MAX_SHOWN_CANDIDATES - len(ordered) + len(unneeded)) :]
-    return [c for c in ordered if c not in hidden]
+    unneeded_candidates = [
+        c for c in ordered if get_candidate_status(report, c.effect) == "not needed"
+    ]
+    hidden_candidates = unneeded_candidates[
+        max(0, MAX_SHOWN_CANDIDATES - len(ordered) + len(unneeded_candidates)) :
+    ]
+    return [c for c in ordered if c not in hidden_candidates]
 
 
 LONGEST_PLACE = 64
@@ -93,9 +100,9 @@ def shorten_effect_name(effect: str) -> str:
     base, place = split_effect_name(effect)
     if not place:
         return format_effect_name(effect)
-    where = (
+    place_text = (
         format_places(get_place_kind(effect), [place])
         if place == ALL_PLACES
         else f" at {sanitise(place, LONGEST_PLACE)}"
     )
-    return format_effect_name(base) + where
+    return format_effect_name(base) + place_text

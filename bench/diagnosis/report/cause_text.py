@@ -103,13 +103,13 @@ def format_lacking(causes: Sequence[Cause]) -> str:
 
     For example ``lacks wind, and linear drag or Coulomb friction``.
     """
-    lacking: list[str] = []
-    wrong_values: list[str] = []
-    either: list[str] = []
-    certain = [cause.effect for cause in causes if not cause.alternatives]
+    missing_texts: list[str] = []
+    wrong_value_texts: list[str] = []
+    mixed_texts: list[str] = []
+    certain_effects = [cause.effect for cause in causes if not cause.alternatives]
     # Causes without alternatives share one list; each other cause has its own "or" list.
-    for is_wrong, parts_list in ((False, lacking), (True, wrong_values)):
-        if names := [name for name in certain if is_parameter_error(name) == is_wrong]:
+    for is_wrong, parts_list in ((False, missing_texts), (True, wrong_value_texts)):
+        if names := [name for name in certain_effects if is_parameter_error(name) == is_wrong]:
             parts_list.append(joined([format_effect(name) for name in names]))
     for cause in causes:
         if not cause.alternatives:
@@ -118,13 +118,15 @@ def format_lacking(causes: Sequence[Cause]) -> str:
         wrong_names = [name for name in names if is_parameter_error(name)]
         missing_names = [name for name in names if name not in wrong_names]
         if wrong_names and missing_names:
-            missing = format_effect_set(missing_names)
-            either.append(f"either lacks {missing} or has {format_effect_set(wrong_names)}")
+            missing_text = format_effect_set(missing_names)
+            mixed_texts.append(
+                f"either lacks {missing_text} or has {format_effect_set(wrong_names)}"
+            )
         else:
-            (wrong_values if wrong_names else lacking).append(format_effect_set(names))
-    parts = [f"lacks {', and '.join(lacking)}"] if lacking else []
-    parts += [f"has {', and '.join(wrong_values)}"] if wrong_values else []
-    return ", and ".join([*parts, *either])
+            (wrong_value_texts if wrong_names else missing_texts).append(format_effect_set(names))
+    parts = [f"lacks {', and '.join(missing_texts)}"] if missing_texts else []
+    parts += [f"has {', and '.join(wrong_value_texts)}"] if wrong_value_texts else []
+    return ", and ".join([*parts, *mixed_texts])
 
 
 def format_causes(causes: Sequence[Cause]) -> str:
@@ -132,8 +134,8 @@ def format_causes(causes: Sequence[Cause]) -> str:
 
     For example ``wind, and linear drag or Coulomb friction``.
     """
-    sure = [format_effect(cause.effect) for cause in causes if not cause.alternatives]
-    parts = [joined(sure)] if sure else []
+    certain_names = [format_effect(cause.effect) for cause in causes if not cause.alternatives]
+    parts = [joined(certain_names)] if certain_names else []
     parts += [format_effect_set([c.effect, *c.alternatives]) for c in causes if c.alternatives]
     return ", and ".join(parts)
 
@@ -148,11 +150,11 @@ def format_number_error(cause: Cause) -> str:
         return sanitise(cause.says)
     if base in _STEPPED:
         return f"{_STEPPED[base]}: {sanitise(cause.says).rstrip('.')}"
-    say = _SIZED.get(base)
+    format_error = _SIZED.get(base)
     values = list(cause.coefficients.values())
-    if say is None or not place or place == ALL_PLACES or not values:
+    if format_error is None or not place or place == ALL_PLACES or not values:
         return ""
-    return say(
+    return format_error(
         format_places(get_place_kind(cause.effect), [place], is_parameter=True).strip(), values
     )
 

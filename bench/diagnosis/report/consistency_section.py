@@ -49,8 +49,8 @@ def format_consistency(report: DiagnosisReportData) -> list[str]:
         spread
         for spread in after
         if spread.is_consistent
-        and (earlier := before.get((spread.number, spread.by))) is not None
-        and not earlier.is_consistent
+        and (spread_before := before.get((spread.number, spread.by))) is not None
+        and not spread_before.is_consistent
     ]
     if reconciled and causes:
         names = list(dict.fromkeys(_get_number_name(spread) for spread in reconciled))
@@ -70,10 +70,10 @@ def format_consistency(report: DiagnosisReportData) -> list[str]:
             f"this difference speaks for {causes}"
         )
     inconsistent = _select_clearest([spread for spread in after if not spread.is_consistent])
-    named = inconsistent[:MAX_NAMED_PARAMETERS]
-    sentences += [_format_inconsistency(spread, effects) for spread in named]
-    if len(inconsistent) > len(named):
-        count = len(inconsistent) - len(named)
+    named_spreads = inconsistent[:MAX_NAMED_PARAMETERS]
+    sentences += [_format_inconsistency(spread, effects) for spread in named_spreads]
+    if len(inconsistent) > len(named_spreads):
+        count = len(inconsistent) - len(named_spreads)
         sentences.append(f"{count} more numbers differ between their groups")
     if after and not inconsistent:
         groups = _pluralise_group(after[0].by)
@@ -161,8 +161,8 @@ def _get_number_name(spread: ParameterConsistency) -> str:
     return sanitise(spread.number, 60)
 
 
-def _pluralise_group(by: str) -> str:
-    return f"{by}s" if by in ("run", "log") else f"values of {sanitise(by, 40)}"
+def _pluralise_group(grouping: str) -> str:
+    return f"{grouping}s" if grouping in ("run", "log") else f"values of {sanitise(grouping, 40)}"
 
 
 class AgreementRow(NamedTuple):

@@ -42,7 +42,7 @@ def build_candidate_table(report: DiagnosisReportData) -> Table:
     heads = {entry.best.effect for entry in rank_candidates(report)}
     has_causes = bool(report.verdict.causes)
     rows = []
-    for c in sorted(report.verdict.candidates, key=lambda one: -one.score):
+    for c in sorted(report.verdict.candidates, key=lambda candidate: -candidate.score):
         _, place = split_effect_name(c.effect)
         rows.append(
             {
@@ -119,19 +119,21 @@ def build_residual_profile_table(report: DiagnosisReportData) -> Table:
     rows = []
     for p in report.profiles:
         key = {"channel": sanitise(p.channel, 80), "variable": sanitise(p.variable, 80)}
-        whens = {"before": p.before} | ({"after": p.after} if has_extended_model(report) else {})
-        for when, means in whens.items():
+        means_by_model = {"before": p.before} | (
+            {"after": p.after} if has_extended_model(report) else {}
+        )
+        for model, means in means_by_model.items():
             for centre, mean, error in zip(p.centres, means, p.error, strict=True):
                 values = {"mean": mean, "low": mean - 2 * error, "high": mean + 2 * error}
-                rows.append({**key, "when": when, "at": centre, **values})
+                rows.append({**key, "when": model, "at": centre, **values})
     return Table.from_rows(rows)
 
 
 def list_less_informative_profiles(report: DiagnosisReportData) -> tuple[str, ...]:
     """List the names of the profiles that are not shown at first."""
-    shown = {id(profile) for profile in select_informative_profiles(report.profiles)}
+    shown_ids = {id(profile) for profile in select_informative_profiles(report.profiles)}
     return tuple(
-        _format_profile_name(profile) for profile in report.profiles if id(profile) not in shown
+        _format_profile_name(profile) for profile in report.profiles if id(profile) not in shown_ids
     )
 
 
@@ -142,18 +144,20 @@ def make_residual_profile_panels(report: DiagnosisReportData) -> list[Panel]:
         "after": EXTENDED_MODEL_STYLE._replace(marker="o"),
         "before": BASE_MODEL_STYLE._replace(marker="s"),
     }
-    whens = ("after", "before") if has_extended_model(report) else ("before",)
-    shown = {id(profile) for profile in select_informative_profiles(report.profiles)}
+    models = ("after", "before") if has_extended_model(report) else ("before",)
+    shown_ids = {id(profile) for profile in select_informative_profiles(report.profiles)}
     panels = []
-    for profile in sorted(report.profiles, key=lambda profile: id(profile) not in shown):
+    for profile in sorted(report.profiles, key=lambda profile: id(profile) not in shown_ids):
         channel, variable = sanitise(profile.channel, 80), sanitise(profile.variable, 80)
         series = []
-        for when in whens:
-            where = {"channel": channel, "variable": variable, "when": when}
-            series.append(Series(f"simulated {when}", "mean", styles[when], where, "low", "high"))
+        for model in models:
+            selection = {"channel": channel, "variable": variable, "when": model}
+            series.append(
+                Series(f"simulated {model}", "mean", styles[model], selection, "low", "high")
+            )
         # The title contains the full names; axes have no space for long ones.
         label = f"residual of {channel}" if len(channel) <= MAX_LABEL_LENGTH else "residual"
-        up = format_label(label, units.get(profile.channel, "1"), 60)
+        value_label = format_label(label, units.get(profile.channel, "1"), 60)
         panels.append(
             Panel(
                 _format_profile_name(profile),
@@ -164,7 +168,7 @@ def make_residual_profile_panels(report: DiagnosisReportData) -> list[Panel]:
                     format_label(brief(sanitise(variable), MAX_LABEL_LENGTH), profile.unit),
                     scales=("linear",),
                 ),
-                Axis(up, scales=("linear",), holds=(0.0,)),
+                Axis(value_label, scales=("linear",), holds=(0.0,)),
                 {"residual of": _format_profile_name(profile)},
                 height=230,
             )

@@ -94,9 +94,9 @@ def draw_figure(report: DiagnosisReportData, name: str) -> Figure:
     Raises:
         InputError: There is no figure of that name.
     """
-    known = list_figure_names(report)
-    if name not in known:
-        raise make_unknown_name_error("figure", name, known)
+    figure_names = list_figure_names(report)
+    if name not in figure_names:
+        raise make_unknown_name_error("figure", name, figure_names)
     with _apply_style():
         figure = _MAKERS[name](report)
         # Ticks take their style from the settings that are active when they are first drawn.
@@ -212,8 +212,10 @@ def _draw_overview(report: DiagnosisReportData) -> Figure:
     handles, labels = axes[0][0].get_legend_handles_labels()
     band, its_label = axes[1][0].get_legend_handles_labels()
     figure.legend([*handles, *band], [*labels, *its_label], loc="lower center", ncols=4, fontsize=9)
-    left = 0.75 / figure.get_figwidth()
-    figure.subplots_adjust(left=left, right=0.985, top=0.92, bottom=0.165, hspace=0.1, wspace=0.2)
+    left_margin = 0.75 / figure.get_figwidth()
+    figure.subplots_adjust(
+        left=left_margin, right=0.985, top=0.92, bottom=0.165, hspace=0.1, wspace=0.2
+    )
     return figure
 
 
@@ -294,8 +296,8 @@ class _FigureLayout(NamedTuple):
             text: Text of the heading.
         """
         # Hinting makes letters wider on the page than their outlines.
-        room = self.width - inches - 0.3
-        size = _HEADING_SIZE * min(1.0, room / text_width([text], _HEADING_SIZE))
+        available_width = self.width - inches - 0.3
+        size = _HEADING_SIZE * min(1.0, available_width / text_width([text], _HEADING_SIZE))
         y = 1 - self.up(_HEADING)
         self.figure.text(self.across(inches), y, text, fontsize=size, va="center")
 
@@ -315,17 +317,17 @@ def _draw_residual_locations(report: DiagnosisReportData) -> Figure:
     rows = min(2, len(profiles))
     columns = -(-len(profiles) // 2)
     names = place_names(places)
-    left = max(_NAMES, 0.25 + text_width(names, _STYLE["font.size"]))
-    profiles_from = left + _PROFILES_AFTER
+    left_margin = max(_NAMES, 0.25 + text_width(names, _STYLE["font.size"]))
+    profiles_from = left_margin + _PROFILES_AFTER
     # A single column of profiles is wider than one of several columns.
-    width = left + 3.3 + (3.1 * columns if columns != 1 else 4.4)
+    width = left_margin + 3.3 + (3.1 * columns if columns != 1 else 4.4)
     row = 0.27 + 0.13 * (most_lines(names) - 1)
     # Variables of robots have long names, which need several lines below the panels.
     label_height = 0.15 * (most_lines([profile_label(profile) for profile in profiles]) - 1)
     height = max(2.6 + row * len(places), 1.5 + (1.9 + label_height) * rows)
     figure, axes = make_panel_grid(1, 1, (width, height), layout=None)
     layout, axis = _FigureLayout(figure, width, height), axes[0, 0]
-    axis.set_position((left / width, 1.0 / height, 3.1 / width, 1 - 1.4 / height))
+    axis.set_position((left_margin / width, 1.0 / height, 3.1 / width, 1 - 1.4 / height))
     draw_gap_location_panel(axis, places, report)
     layout.heading(0.15, "Where the gap is")
     figure.legend(

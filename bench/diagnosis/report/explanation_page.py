@@ -245,9 +245,9 @@ def _make_bars(report: DiagnosisReportData) -> Iterator[Bar]:
     bars.append(("floor", "noise floor", held_out.noise_floor))
     # Bars are relative to the longest one; a failed simulation has no error and no bar.
     finite_values = [value for _, _, value in bars if value is not None and isfinite(value)]
-    longest = max(finite_values, default=0.0)
+    longest_value = max(finite_values, default=0.0)
     for kind, name, value in bars:
-        width = 100.0 * value / longest if value is not None and longest > 0 else 0.0
+        width = 100.0 * value / longest_value if value is not None and longest_value > 0 else 0.0
         yield Bar(kind, name, width, append_unit(format_number(value), get_held_out_unit(report)))
 
 
@@ -255,13 +255,13 @@ _FIGURES = ("robot", "overview", "where", "candidates")
 
 
 def _make_still(
-    report: DiagnosisReportData, drawn: Mapping[str, RenderedFigure], name: str
+    report: DiagnosisReportData, rendered_figures: Mapping[str, RenderedFigure], name: str
 ) -> PrintedFigure | None:
     """Return a figure of the page with its text alternative; None if it was not drawn.
 
-    `drawn` has the rendered figures by name.
+    `rendered_figures` has the rendered figures by name.
     """
-    figure = drawn.get(name)
+    figure = rendered_figures.get(name)
     if figure is None:
         return None
     return PrintedFigure(figure.svg or figure.png, figure.pdf, _describe_figure(report, name), name)
@@ -270,11 +270,11 @@ def _make_still(
 def _describe_figure(report: DiagnosisReportData, name: str) -> str:
     """Return the alternative text of a figure."""
     if name == "robot":
-        named = [
+        mark_texts = [
             f"{mark.kind} {sanitise(mark.name, 30)} ({sanitise(mark.says, 60)})"
             for mark in list_place_marks(report)
         ]
-        return f"The robot; marked: {joined(named) or 'nothing'}."
+        return f"The robot; marked: {joined(mark_texts) or 'nothing'}."
     if name == "overview":
         names = joined([sanitise(channel.name, 30) for channel in report.channels])
         sentence = f"Measured and simulated {names} of the run that fits worst, with the residual."

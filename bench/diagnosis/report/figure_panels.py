@@ -92,10 +92,10 @@ def select_gap_locations(places: Sequence[GapLocation]) -> list[GapLocation]:
         ("channel", MAX_GAP_LOCATIONS),
         ("phase", MAX_GAP_LOCATIONS),
     ):
-        of_kind = [p for p in measured if p.kind == kind]
-        worst = sorted(of_kind, key=lambda p: -p.before)[:most]
+        locations_of_kind = [p for p in measured if p.kind == kind]
+        worst_locations = sorted(locations_of_kind, key=lambda p: -p.before)[:most]
         # The original order is kept, because readers look for run 3 after run 2.
-        result += [p for p in of_kind if p in worst]
+        result += [p for p in locations_of_kind if p in worst_locations]
     return result
 
 
@@ -148,12 +148,12 @@ def _place_rows(axis: Axes, places: Sequence[GapLocation]) -> list[float]:
     """Return the vertical position of each row, and write a heading above each kind of place."""
     rows: list[float] = []
     for i, place in enumerate(places):
-        new = i == 0 or places[i - 1].kind != place.kind
+        is_new_kind = i == 0 or places[i - 1].kind != place.kind
         if not rows:
             rows.append(_FIRST)
         else:
-            rows.append(rows[-1] + (_NEXT_KIND if new else _NEXT))
-        if new:
+            rows.append(rows[-1] + (_NEXT_KIND if is_new_kind else _NEXT))
+        if is_new_kind:
             axis.text(
                 -0.035,
                 rows[-1] - 0.85,

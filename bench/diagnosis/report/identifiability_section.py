@@ -132,22 +132,28 @@ def build_identifiability_section(report: DiagnosisReportData) -> Identifiabilit
         return None
     rows = _list_rows(report)
     present = [status for status in _STANDINGS if any(row.standing == status for row in rows)]
-    unclear, clear = _separate_identifiable([row for row in rows if _get_place(row)])
-    count = len({split_effect_name(row.effect)[0] for row in clear})
+    unclear_rows, identifiable_rows = _separate_identifiable(
+        [row for row in rows if _get_place(row)]
+    )
+    count = len({split_effect_name(row.effect)[0] for row in identifiable_rows})
     ordered = sorted(rows, key=lambda row: _STANDINGS.index(row.standing))
     without_place = [row for row in rows if not _get_place(row)]
     columns = [s for s in _STANDINGS if any(row.standing == s for row in without_place)]
     return IdentifiabilitySection(
         counts=format_counts(report),
-        free=[_format_table_row(one, one.word) for one in report.identifiability if one.free],
+        free=[
+            _format_table_row(number, number.word)
+            for number in report.identifiability
+            if number.free
+        ],
         legend="; ".join(f"{_SIGNS[status]} {_LEGEND[status]}" for status in present),
-        matrices=_build_matrices(unclear),
+        matrices=_build_matrices(unclear_rows),
         family_headings=[f"{_SIGNS[status]} {_LEGEND[status]}" for status in columns],
         families=_build_family_table(without_place, columns),
         identifiable_heading=(
-            f"{count} {'more ' * bool(unclear)}effects that can be identified at every place"
+            f"{count} {'more ' * bool(unclear_rows)}effects that can be identified at every place"
         ),
-        identifiable_matrices=_build_matrices(clear),
+        identifiable_matrices=_build_matrices(identifiable_rows),
         all=[_format_table_row(row.number, _LEGEND[row.standing]) for row in ordered],
     )
 
@@ -158,9 +164,11 @@ def _separate_identifiable(rows: Sequence[_Row]) -> tuple[list[_Row], list[_Row]
     Returns:
         Rows of the other effects, and rows of effects that are identifiable at every place.
     """
-    telling = {split_effect_name(r.effect)[0] for r in rows if r.standing != "identifiable"}
-    first = [row for row in rows if split_effect_name(row.effect)[0] in telling]
-    return first, [row for row in rows if split_effect_name(row.effect)[0] not in telling]
+    unclear_effects = {split_effect_name(r.effect)[0] for r in rows if r.standing != "identifiable"}
+    unclear_rows = [row for row in rows if split_effect_name(row.effect)[0] in unclear_effects]
+    return unclear_rows, [
+        row for row in rows if split_effect_name(row.effect)[0] not in unclear_effects
+    ]
 
 
 def _build_matrices(rows: Sequence[_Row]) -> list[Matrix]:
@@ -175,8 +183,8 @@ def _build_matrices(rows: Sequence[_Row]) -> list[Matrix]:
 def format_counts(report: DiagnosisReportData) -> str:
     """Format how many causes are identifiable, and which were found."""
     rows = _list_rows(report)
-    words = [str("identifiable" if r.standing == "found" else r.number.word) for r in rows]
-    counts = {s: words.count(s) for s in _STANDINGS[2:]}
+    statuses = [str("identifiable" if r.standing == "found" else r.number.word) for r in rows]
+    counts = {s: statuses.count(s) for s in _STANDINGS[2:]}
     sentence = (
         f"Of {len(rows)} causes, each considered alone, this recording can identify "
         f"{counts['identifiable']} well, {counts['weak']} roughly and "
@@ -191,8 +199,8 @@ def format_counts(report: DiagnosisReportData) -> str:
 
 def _list_supported_causes(report: DiagnosisReportData) -> list[Cause]:
     """Return the causes that the verdict supports."""
-    vouched = report.verdict.verdict in ("named", "ambiguous", "partial")
-    return list(report.verdict.causes) if vouched else []
+    is_supported = report.verdict.verdict in ("named", "ambiguous", "partial")
+    return list(report.verdict.causes) if is_supported else []
 
 
 def _list_rows(report: DiagnosisReportData) -> list[_Row]:
@@ -207,10 +215,10 @@ def _list_rows(report: DiagnosisReportData) -> list[_Row]:
                 if place := split_effect_name(key)[1]:
                     status_by_effect.setdefault(f"{split_effect_name(name)[0]}@{place}", standing)
     rows = []
-    for one in report.identifiability:
-        if not one.free:
-            effect = one.name.partition(" ")[0]
-            rows.append(_Row(one, effect, status_by_effect.get(effect, one.word)))
+    for number in report.identifiability:
+        if not number.free:
+            effect = number.name.partition(" ")[0]
+            rows.append(_Row(number, effect, status_by_effect.get(effect, number.word)))
     return rows
 
 
@@ -280,9 +288,9 @@ def _build_family_table(
 def _join_effect_names(effects: Sequence[str]) -> str:
     """Join the names of at most `MAX_NAMED_CAUSES` different effects, and count the others."""
     unique = list(dict.fromkeys(effects))
-    shown = ", ".join(format_effect_name(effect) for effect in unique[:MAX_NAMED_CAUSES])
-    more = len(unique) - MAX_NAMED_CAUSES
-    return f"{shown} and {more} more" if more > 0 else shown
+    named_effects = ", ".join(format_effect_name(effect) for effect in unique[:MAX_NAMED_CAUSES])
+    unnamed_count = len(unique) - MAX_NAMED_CAUSES
+    return f"{named_effects} and {unnamed_count} more" if unnamed_count > 0 else named_effects
 
 
 def _format_half_interval(number: ParameterIdentifiability) -> str:

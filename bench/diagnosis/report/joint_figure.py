@@ -98,8 +98,8 @@ def list_joint_rows(report: DiagnosisReportData) -> list[JointRow]:
     rows = []
     for name, channels in joints.items():
         # The position is shown if it was recorded, otherwise the velocity or the torque.
-        shown = next(channels[q] for q in QUANTITY_LABELS if q in channels)
-        rows.append(JointRow(name, shown, channels))
+        shown_channel = next(channels[q] for q in QUANTITY_LABELS if q in channels)
+        rows.append(JointRow(name, shown_channel, channels))
     return rows + sensors
 
 
@@ -110,8 +110,8 @@ def _get_first_quantity(report: DiagnosisReportData) -> str:
 
 def _list_quantities(report: DiagnosisReportData) -> list[str]:
     """Return the recorded quantities of joints, such as position and velocity, in a fixed order."""
-    recorded = {channel.name.partition(".")[0] for channel in report.channels}
-    return [quantity for quantity in QUANTITY_LABELS if quantity in recorded]
+    recorded_quantities = {channel.name.partition(".")[0] for channel in report.channels}
+    return [quantity for quantity in QUANTITY_LABELS if quantity in recorded_quantities]
 
 
 def draw_joint_figure(report: DiagnosisReportData, view: RunView) -> Figure:
@@ -160,8 +160,8 @@ def _select_worst_rows(report: DiagnosisReportData, view: RunView) -> list[Joint
     def gap(row: JointRow) -> float:
         return max(_compute_residual_rms(report, view, c, "before") for c in row.channels.values())
 
-    worst = sorted(rows, key=gap, reverse=True)[:MAX_JOINTS]
-    return [row for row in rows if row in worst]
+    worst_rows = sorted(rows, key=gap, reverse=True)[:MAX_JOINTS]
+    return [row for row in rows if row in worst_rows]
 
 
 def _compute_residual_rms(report: DiagnosisReportData, view: RunView, c: int, model: str) -> float:

@@ -89,6 +89,6 @@ def name_missing_physics(
     explanation = MISSING_PHYSICS_NAMES.get((family, kind), "")
     text = explanation if isinstance(explanation, str) else explanation[0 if grows else 1]
     effect = text.partition("(")[2].rstrip(")")
-    if not text or any(one.partition("@")[0] == effect for one in known):
+    if not text or any(known_effect.partition("@")[0] == effect for known_effect in known):
         return f"{LAW_NAMES.get(family, 'something')} that depends on {name}"
     return text

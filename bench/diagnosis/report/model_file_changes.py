@@ -29,14 +29,14 @@ def find_model_file_changes(before: str, after: str) -> tuple[ModelFileChange, .
         before: Text of the file; empty if there is none of the same format.
         after: Text of the extended file, where comments precede the elements that they describe.
     """
-    old, new = _split_into_elements(before), _split_into_elements(after)
-    matcher = SequenceMatcher(None, old, new, autojunk=False)
+    old_elements, new_elements = _split_into_elements(before), _split_into_elements(after)
+    matcher = SequenceMatcher(None, old_elements, new_elements, autojunk=False)
     if matcher.ratio() < MIN_UNCHANGED_SHARE:
-        return tuple(_list_commented_elements(new))
+        return tuple(_list_commented_elements(new_elements))
     changes: list[ModelFileChange] = []
     for kind, i1, i2, j1, j2 in matcher.get_opcodes():
         if kind != "equal":
-            changes += _compare_blocks(old[i1:i2], new[j1:j2])
+            changes += _compare_blocks(old_elements[i1:i2], new_elements[j1:j2])
     return tuple(changes)
 
 

@@ -88,16 +88,20 @@ def build_motion_table(report: DiagnosisReportData, most: int = MAX_ROWS) -> Mot
     """
     runs = _sort_runs(report)
     count = len(report.channels)
-    shown = runs[: max(1, most // (MIN_ROWS_PER_CHANNEL * count))]
-    samples_per_run = max(MIN_ROWS_PER_CHANNEL, most // (len(shown) * count))
-    parts = [_format_rows(report, run, c, samples_per_run) for run in shown for c in range(count)]
+    shown_runs = runs[: max(1, most // (MIN_ROWS_PER_CHANNEL * count))]
+    samples_per_run = max(MIN_ROWS_PER_CHANNEL, most // (len(shown_runs) * count))
+    parts = [
+        _format_rows(report, run, c, samples_per_run) for run in shown_runs for c in range(count)
+    ]
     names = ["run", "channel", "t", "measured", "before"] + ["after"] * has_extended_model(report)
     names += ["residual_before"] + ["residual_after"] * has_extended_model(report)
     columns = [[cell for part in parts for cell in part[i]] for i in range(len(names))]
     frame = Table(dict(zip(names, columns, strict=True)))
-    longest = max(len(run.side.times[run.row]) for run in shown)
-    part_count = _count_parts(report, samples_per_run) if longest > samples_per_run else 0
-    return MotionTable(frame, tuple(shown), part_count, longest, len(runs) - len(shown))
+    longest_run = max(len(run.side.times[run.row]) for run in shown_runs)
+    part_count = _count_parts(report, samples_per_run) if longest_run > samples_per_run else 0
+    return MotionTable(
+        frame, tuple(shown_runs), part_count, longest_run, len(runs) - len(shown_runs)
+    )
 
 
 def _sort_runs(report: DiagnosisReportData) -> list[ShownRun]:
@@ -107,14 +111,14 @@ def _sort_runs(report: DiagnosisReportData) -> list[ShownRun]:
     runs = []
     for split in list_data_splits(report):
         squares = np.square((split.observed - split.before) / sigma)
-        use = ""
+        split_note = ""
         if split is report.held_out:
-            use = ", left out" if report.cross_validated else ", held out"
+            split_note = ", left out" if report.cross_validated else ", held out"
         for row, name in enumerate(split.names):
             finite = squares[row][np.isfinite(squares[row])]
             gap = float(np.sqrt(finite.mean())) if finite.size else 0.0
-            says = f"{sanitise(name, 40)}{use}: RMS residual {format_number(gap, 2)} σ"
-            runs.append(ShownRun(split, row, says, gap))
+            title = f"{sanitise(name, 40)}{split_note}: RMS residual {format_number(gap, 2)} σ"
+            runs.append(ShownRun(split, row, title, gap))
     first_run = (id(first.side), first.row)
     return sorted(runs, key=lambda run: ((id(run.side), run.row) != first_run, -run.gap))
 
@@ -138,9 +142,9 @@ def select_extreme_samples(signals: Sequence[Array], stretches: int) -> NDArray[
     """
     size = len(signals[0])
     edges = np.linspace(0, size, stretches + 1).astype(int)[:-1]
-    long = np.diff([*edges, size]).max()
+    part_length = np.diff([*edges, size]).max()
     # Each row holds one part; shorter parts are padded with values that are never extremes.
-    indices = np.minimum(edges[:, None] + np.arange(long), size - 1)
+    indices = np.minimum(edges[:, None] + np.arange(part_length), size - 1)
     is_inside = indices < np.append(edges[1:], size)[:, None]
     rows = np.arange(len(edges))
     chosen = [np.array([0, size - 1])]
@@ -257,20 +261,21 @@ def _list_hidden(
         gaps[name] = max(gaps.get(name, 0.0), by_name.get(report.channels[c].name, 0.0))
         counts[name] = counts.get(name, 0) + 1
     remaining = MAX_INITIAL_CHANNELS
-    visible: set[str] = set()
-    for name in sorted(gaps, key=lambda one: -gaps[one]):
-        if not visible or counts[name] <= remaining:
-            visible.add(name)
+    visible_names: set[str] = set()
+    for name in sorted(gaps, key=lambda candidate_name: -gaps[candidate_name]):
+        if not visible_names or counts[name] <= remaining:
+            visible_names.add(name)
             remaining -= counts[name]
-    return tuple(name for name in gaps if name not in visible)
+    return tuple(name for name in gaps if name not in visible_names)
 
 
 def _make_panels(
-    report: DiagnosisReportData, run: ShownRun, c: int, facets: dict[str, str], wide: bool
+    report: DiagnosisReportData, run: ShownRun, c: int, facets: dict[str, str], is_wide: bool
 ) -> tuple[Panel, Panel]:
     """Make two panels of channel number c of a run: its motion, and its residual in noise units.
 
-    `facets` has the values of the switches that show these panels; `wide` places them side by side.
+    `facets` has the values of the switches that show these panels. If `is_wide`, the panels are
+    placed side by side.
     """
     channel = report.channels[c]
     selection = {
@@ -295,8 +300,8 @@ def _make_panels(
         format_label(brief(sanitise(channel.name), 24), channel.unit), scales=("linear",)
     )
     band = (AxisSpan(-2.0, 2.0, "±2σ: 95 % of the noise", along="y"),)
-    tells = _make_tooltip_lines(format_unit(channel.unit), channel.sigma, extended)
-    heights = (_ROW, _ROW) if wide else (_TALL, _LOW)
+    tooltip_lines = _make_tooltip_lines(format_unit(channel.unit), channel.sigma, extended)
+    heights = (_ROW, _ROW) if is_wide else (_TALL, _LOW)
     above = Panel(
         name,
         MOTION_TABLE_NAME,
@@ -307,7 +312,7 @@ def _make_panels(
         facets,
         (),
         (),
-        tells,
+        tooltip_lines,
         heights[0],
     )
     below = Panel(
@@ -319,7 +324,7 @@ def _make_panels(
         residual,
         facets,
         spans=band,
-        tells=tells,
+        tells=tooltip_lines,
         height=heights[1],
     )
     return above, below
@@ -331,15 +336,15 @@ def _make_tooltip_lines(unit: str, sigma: float, extended: bool) -> tuple[Toolti
     They are the signals in `unit`, and the residuals both in that unit and in units of the noise.
     """
 
-    def residual(says: str, y: str, look: MarkStyle) -> TooltipLine:
-        return TooltipLine(says, y, "σ", look, sigma, unit)
+    def residual(label: str, y: str, style: MarkStyle) -> TooltipLine:
+        return TooltipLine(label, y, "σ", style, sigma, unit)
 
-    tells = [
+    tooltip_lines = [
         TooltipLine("measured", "measured", unit, MEASURED_STYLE),
         TooltipLine("before", "before", unit, BASE_MODEL_STYLE),
     ]
-    tells += [TooltipLine("after", "after", unit, EXTENDED_MODEL_STYLE)] * extended
-    tells.append(residual("residual before", "residual_before", BASE_MODEL_STYLE))
+    tooltip_lines += [TooltipLine("after", "after", unit, EXTENDED_MODEL_STYLE)] * extended
+    tooltip_lines.append(residual("residual before", "residual_before", BASE_MODEL_STYLE))
     if extended:
-        tells.append(residual("residual after", "residual_after", EXTENDED_MODEL_STYLE))
-    return tuple(tells)
+        tooltip_lines.append(residual("residual after", "residual_after", EXTENDED_MODEL_STYLE))
+    return tuple(tooltip_lines)

@@ -93,11 +93,11 @@ def format_details(report: DiagnosisReportData) -> Iterator[str]:
         yield format_simulation_count(report)
         return
     # For these verdicts, the description of an effect is part of the text above the details.
-    explained = verdict in ("named", "partial")
+    has_description_above = verdict in ("named", "partial")
     for cause in report.verdict.causes:
         name = f"{format_sentence(format_effect(cause.effect))[:-1]} ({sanitise(cause.effect, 60)})"
-        says = "" if explained else f"{_describe_within_sentence(cause)}; "
-        yield f"{name}: {says}{format_coefficients(cause)}"
+        description = "" if has_description_above else f"{_describe_within_sentence(cause)}; "
+        yield f"{name}: {description}{format_coefficients(cause)}"
     # The most important reasons come first; the page contains all of them.
     if report.why:
         yield "Why: " + " ".join(format_sentence(text) for text in report.why[:2])
@@ -112,8 +112,8 @@ def format_details(report: DiagnosisReportData) -> Iterator[str]:
         yield "Parameters: " + " ".join(sentences)
     # For a single log with consistent runs there is nothing to report.
     if any(
-        not one.is_consistent or one.by == "log"
-        for one in (*report.consistency.after, *report.consistency.before)
+        not spread.is_consistent or spread.by == "log"
+        for spread in (*report.consistency.after, *report.consistency.before)
     ):
         yield "Agreement between runs: " + " ".join(format_consistency(report))
     if report.lack_of_fit:
@@ -140,9 +140,9 @@ def format_headline(report: DiagnosisReportData) -> str:
     if verdict == "adequate":
         return "Nothing is missing from the simulation that these data can show."
     if verdict == "unidentifiable":
-        unknown = "it is not known what the simulation lacks"
+        parameters = joined(list_unidentified_parameters(report))
         return (
-            f"These data do not identify {joined(list_unidentified_parameters(report))}: {unknown}."
+            f"These data do not identify {parameters}: it is not known what the simulation lacks."
         )
     if verdict == "unknown" or not causes:
         conclusion = f"none of the {len(rank_candidates(report))} known causes explains it"
@@ -150,17 +150,16 @@ def format_headline(report: DiagnosisReportData) -> str:
         return f"Something is missing from the simulation, and {conclusion}."
     if verdict == "ambiguous":
         return f"The simulation {format_lacking(causes)}: these data do not show which."
-    if verdict == "partial" and (open_ones := [c for c in causes if c.open_numbers]):
-        return (
-            f"The simulation {format_lacking(causes)}, but {_format_unconfirmed_reason(open_ones)}."
-        )
+    if verdict == "partial" and (open_causes := [c for c in causes if c.open_numbers]):
+        reason = _format_unconfirmed_reason(open_causes)
+        return f"The simulation {format_lacking(causes)}, but {reason}."
     if bordering := report.verdict.bordering:
         (name, first), *_ = bordering.items()
         end = f"the {END[first.at_bound or 'high']} bound of its range"
         value = append_unit(format_number(first.value), first.unit)
-        why = f"parameter {sanitise(name, 60)} ends at {end}, {value}"
+        bound_text = f"parameter {sanitise(name, 60)} ends at {end}, {value}"
         return (
-            f"The simulation {format_lacking(causes)}, but {why}: "
+            f"The simulation {format_lacking(causes)}, but {bound_text}: "
             "the cause may stand for a value beyond it."
         )
     if verdict == "partial":
@@ -209,8 +208,8 @@ def undetermined(report: DiagnosisReportData) -> Iterator[str]:
             f"{END[fitted.at_bound or 'high']} bound of its range"
             for name, fitted in at_bounds
         ]
-        longer = any(fitted.unit == "s" for _, fitted in at_bounds)
-        remedy = "; for a time, record longer runs" * longer
+        is_time_at_bound = any(fitted.unit == "s" for _, fitted in at_bounds)
+        remedy = "; for a time, record longer runs" * is_time_at_bound
         yield (
             f"{'; '.join(parts)}. A value at a bound is not a result and has no interval: the data "
             "suggest a value beyond it, or another cause acts in a similar way. Check units and "
@@ -232,12 +231,14 @@ def _get_linking_verb(causes: Sequence[Cause]) -> str:
 def _format_early_stop_headline(verdict: Verdict) -> str:
     """Format the headline of a search that was stopped early, with its preliminary result."""
     if verdict.verdict == "partial":
-        lacking = format_lacking(verdict.causes)
-        return f"The simulation {lacking}; the search stopped before testing for further causes."
-    nothing = "The search stopped before it could say what the simulation lacks"
+        lacking_text = format_lacking(verdict.causes)
+        return (
+            f"The simulation {lacking_text}; the search stopped before testing for further causes."
+        )
+    no_result = "The search stopped before it could say what the simulation lacks"
     if not verdict.causes:
-        return f"{nothing}."
-    return f"{nothing}; best candidate so far: {format_causes(verdict.causes)}."
+        return f"{no_result}."
+    return f"{no_result}; best candidate so far: {format_causes(verdict.causes)}."
 
 
 def format_early_stop(report: DiagnosisReportData) -> str:
@@ -246,11 +247,11 @@ def format_early_stop(report: DiagnosisReportData) -> str:
     if cut is None:
         return ""
     reason = {"budget": "its time budget", "interrupt": "an interrupt"}[cut.reason]
-    open_ones = joined(
+    skipped_questions = joined(
         [QUESTION_TEXTS[name] for name in cut.skipped_questions if name in QUESTION_TEXTS]
     )
     last_step = f"; last step: {sanitise(cut.during_question, 80)}" if cut.during_question else ""
-    return f"The search was stopped by {reason}{last_step}. Not completed: {open_ones}."
+    return f"The search was stopped by {reason}{last_step}. Not completed: {skipped_questions}."
 
 
 def list_unidentified_parameters(report: DiagnosisReportData) -> list[str]:
@@ -290,12 +291,12 @@ def format_gain_and_caveats(report: DiagnosisReportData) -> Iterator[str]:
     yield from undetermined(report)
     if verdict == "partial" or (verdict == "named" and len(report.verdict.causes) > 1):
         # The headline describes a single diagnosed cause; several causes are described here.
-        sayings = [
+        cause_texts = [
             format_number_error(cause)
             or f"{format_effect(cause.effect)}: {_describe_within_sentence(cause)}"
             for cause in report.verdict.causes
         ]
-        yield format_sentence("; ".join(sayings))
+        yield format_sentence("; ".join(cause_texts))
     if verdict == "ambiguous":
         yield "To distinguish them: " + (format_next_run(report) or "no experiment is proposed.")
 
@@ -375,7 +376,8 @@ def _format_fitted_gain(report: DiagnosisReportData) -> str:
     It replaces the gain on held-out runs if that gain was not measured.
     """
     before, after = (
-        compute_normalised_rms(report, report.fitting, which) for which in ("before", "after")
+        compute_normalised_rms(report, report.fitting, model_stage)
+        for model_stage in ("before", "after")
     )
     error = f"the tuned simulation's error is {format_number(before)} times the noise"
     if report.verdict.causes:
@@ -400,8 +402,8 @@ def get_held_out_unit(report: DiagnosisReportData) -> str:
     units = list(dict.fromkeys(c.unit for c in report.channels))
     for unit in units:
         noises = [c.sigma for c in report.channels if c.unit == unit]
-        together = float(np.sqrt(np.mean([sigma**2 for sigma in noises])))
-        if isclose(together, floor or 0.0, rel_tol=0.02):
+        combined_noise = float(np.sqrt(np.mean([sigma**2 for sigma in noises])))
+        if isclose(combined_noise, floor or 0.0, rel_tol=0.02):
             return unit
     return units[0] if len(units) == 1 else "1"
 
@@ -416,11 +418,11 @@ def format_search_summary(report: DiagnosisReportData) -> str:
     if not candidates:
         return "There were no candidate causes."
     best = candidates[0]
-    where = " at every place" if has_placed_causes(report) else ""
-    count = f"{len(rank_candidates(report))} possible causes were tested{where}"
-    none = f"{count} and none is significant"
-    promising = f"{format_effect(best.effect)} ({format_p_value(best.p_value)})"
-    return f"{none}; the most promising is {promising}."
+    place_text = " at every place" if has_placed_causes(report) else ""
+    count = f"{len(rank_candidates(report))} possible causes were tested{place_text}"
+    no_significant_cause = f"{count} and none is significant"
+    best_candidate = f"{format_effect(best.effect)} ({format_p_value(best.p_value)})"
+    return f"{no_significant_cause}; the most promising is {best_candidate}."
 
 
 def format_detectable_gap(report: DiagnosisReportData) -> str:
@@ -445,12 +447,15 @@ def _select_worst_of_each_kind(
     """Select, from many channels, the one of each kind that hides most, in units of its noise."""
     if len(sizes) <= MAX_NAMED_CHANNELS:
         return list(sizes)
-    worst: dict[str, tuple[ChannelInfo, float]] = {}
+    worst_by_kind: dict[str, tuple[ChannelInfo, float]] = {}
     for channel, size in sizes:
         kind = channel.name.partition(".")[0]
-        if kind not in worst or size / channel.sigma > worst[kind][1] / worst[kind][0].sigma:
-            worst[kind] = channel, size
-    return list(worst.values())
+        if (
+            kind not in worst_by_kind
+            or size / channel.sigma > worst_by_kind[kind][1] / worst_by_kind[kind][0].sigma
+        ):
+            worst_by_kind[kind] = channel, size
+    return list(worst_by_kind.values())
 
 
 def compute_detectable_gap(report: DiagnosisReportData) -> Array:
@@ -562,15 +567,15 @@ def format_parameter_shift(report: DiagnosisReportData, p: ParameterChange) -> s
     return f"{name} {before} before, {after} after ({format_shift(p)}){end}"
 
 
-def tuned(p: ParameterChange, when: int) -> str:
+def tuned(p: ParameterChange, model_index: int) -> str:
     """Format a parameter's estimate with its interval, or the bound that it is at.
 
     Args:
         p: Parameter before and after.
-        when: 0 for the estimate before, 1 for the one after.
+        model_index: 0 for the estimate before, 1 for the one after.
     """
-    value, bound = (p.before, p.after)[when], p.bounds[when]
-    total = p.in_file if when else ""
+    value, bound = (p.before, p.after)[model_index], p.bounds[model_index]
+    total = p.in_file if model_index else ""
     if bound is not None:
         return at_bound(value[0], p.unit, bound) + total
     return append_unit(format_estimate(*value), p.unit) + total
@@ -578,16 +583,16 @@ def tuned(p: ParameterChange, when: int) -> str:
 
 def format_shift(p: ParameterChange) -> str:
     """Format the change of a parameter in percent, or as a number if it was zero before."""
-    move = p.after[0] - p.before[0]
-    if not move:
+    change = p.after[0] - p.before[0]
+    if not change:
         return "unchanged"
-    if abs(move) < LEAST_MOVE * abs(p.before[0]):
+    if abs(change) < LEAST_MOVE * abs(p.before[0]):
         return f"changes by less than {format_percent(LEAST_MOVE)}"
-    sign = "+" if move > 0 else ""
+    sign = "+" if change > 0 else ""
     # For zero a percentage is undefined, and a very large one is less clear than the number.
-    if not p.before[0] or abs(move / p.before[0]) > MAX_PERCENT_SHIFT:
-        return sign + append_unit(format_number(move, 2), p.unit)
-    return sign + format_percent(move / abs(p.before[0]))
+    if not p.before[0] or abs(change / p.before[0]) > MAX_PERCENT_SHIFT:
+        return sign + append_unit(format_number(change, 2), p.unit)
+    return sign + format_percent(change / abs(p.before[0]))
 
 
 def has_absorbed_gap(p: ParameterChange) -> bool:
@@ -595,12 +600,12 @@ def has_absorbed_gap(p: ParameterChange) -> bool:
 
     The change must exceed the combined 95 % intervals, and be at least `LEAST_MOVE` of the value.
     """
-    move = abs(p.after[0] - p.before[0])
+    change = abs(p.after[0] - p.before[0])
     # Without intervals, a minimum relative change is required instead.
     if not np.isfinite([*p.before, *p.after]).all():
-        return move > MIN_REPORTED_SHIFT * abs(p.before[0])
+        return change > MIN_REPORTED_SHIFT * abs(p.before[0])
     before, after = ((high - low) / 2.0 for _, low, high in (p.before, p.after))
-    return bool(move > np.hypot(before, after) and move >= LEAST_MOVE * abs(p.before[0]))
+    return bool(change > np.hypot(before, after) and change >= LEAST_MOVE * abs(p.before[0]))
 
 
 def format_next_run(report: DiagnosisReportData) -> str:

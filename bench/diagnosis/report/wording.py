@@ -125,14 +125,14 @@ def format_effect_name(effect: str) -> str:
 
 def format_sentence(text: object) -> str:
     """Format text as a sentence, with a capital first letter and a final period."""
-    plain = sanitise(text)
-    if not plain:
-        return plain
+    sanitised_text = sanitise(text)
+    if not sanitised_text:
+        return sanitised_text
     # A name with digits or underscores stays unchanged.
-    word = plain.split()[0].rstrip(",:;.").isalpha()
-    first = plain[0].upper() if word else plain[0]
-    stop = "" if plain[-1] in ".!?…" else "."
-    return first + plain[1:] + stop
+    is_word = sanitised_text.split()[0].rstrip(",:;.").isalpha()
+    first = sanitised_text[0].upper() if is_word else sanitised_text[0]
+    stop = "" if sanitised_text[-1] in ".!?…" else "."
+    return first + sanitised_text[1:] + stop
 
 
 def format_unit(unit: str) -> str:

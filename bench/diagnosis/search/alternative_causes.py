@@ -68,11 +68,11 @@ class AlternativeFinder:
         """Return p-value, gain and indistinguishable alternatives of one effect of the model.
 
         The gain is the increase of twice the log-likelihood over the model without the effect
-        (`rest`). `rivals` has pairs of distance and name, the effect itself included.
+        (`reduced_model`). `rivals` has pairs of distance and name, the effect itself included.
         """
-        rest = self._rest(model, effect)
-        gain = model.likelihood.value - rest.likelihood.value
-        p_value = self._p_value(rest, effect, gain)
+        reduced_model = self._rest(model, effect)
+        gain = model.likelihood.value - reduced_model.likelihood.value
+        p_value = self._p_value(reduced_model, effect, gain)
         rivals = self._rivals(model, effect)
         # Effects with implausible coefficients come last in their set.
         rivals.sort(key=lambda rival: (not self._is_plausible(rival[1]), rival))
@@ -96,23 +96,23 @@ class AlternativeFinder:
         """
         if self.simulates:
             return self.search.remove_effect(model, effect)
-        rest = frozenset(model.effects) - {effect}
-        return self.search.models.get(rest, self.search.base_model)
+        remaining_effects = frozenset(model.effects) - {effect}
+        return self.search.models.get(remaining_effects, self.search.base_model)
 
-    def _p_value(self, rest: FittedModel, effect: str, gain: float) -> float:
+    def _p_value(self, reduced_model: FittedModel, effect: str, gain: float) -> float:
         """Return the p-value of a gain about the model without the effect.
 
         It is the smaller one of the p-values of the gain and of the best score.
         """
         search = self.search
-        key = frozenset(rest.effects)
-        known = search.scores_by_effects.get(key)
-        if known is None and not self.simulates:
+        key = frozenset(reduced_model.effects)
+        stored_scores = search.scores_by_effects.get(key)
+        if stored_scores is None and not self.simulates:
             return search.best_p_values.get(key, 1.0)
-        scores = known or search.score_missing_effects(rest)
-        chances = dict(zip(scores.effects, scores.null_quantiles.tolist(), strict=True))
+        scores = stored_scores or search.score_missing_effects(reduced_model)
+        null_quantiles = dict(zip(scores.effects, scores.null_quantiles.tolist(), strict=True))
         # A score is linear and the gain of a fit is not; either may be more sensitive.
-        excess = gain - chances.get(effect, 0.0)
+        excess = gain - null_quantiles.get(effect, 0.0)
         by_refit = estimate_tail_p_value(scores.null_scores, np.array([excess]))
         by_score = search.best_p_values.get(key, 1.0)
         return min(by_score, by_refit)
@@ -126,22 +126,22 @@ class AlternativeFinder:
         """
         shared = set(model.effects) - {effect}
         rivals = [(0.0, effect)]
-        for other in list(self.search.models.values()):
-            names = set(other.effects)
-            same_size = len(names) == len(model.effects)
+        for other_model in list(self.search.models.values()):
+            names = set(other_model.effects)
+            has_same_size = len(names) == len(model.effects)
             # Only a model that differs in this one effect shows what could replace it.
-            if not same_size or not shared < names:
+            if not has_same_size or not shared < names:
                 continue
             (added,) = names - shared
             # Skip the model itself, and other fits of the same effects.
             if added == effect:
                 continue
-            behind = self._behind(model, other)
-            if is_indistinguishable(behind) and not self._buys_nothing(effect, added, behind):
-                rivals.append((behind, added))
+            distance = self._behind(model, other_model)
+            if is_indistinguishable(distance) and not self._buys_nothing(effect, added, distance):
+                rivals.append((distance, added))
         return self._without_richer(rivals)
 
-    def _buys_nothing(self, effect: str, other: str, behind: float) -> bool:
+    def _buys_nothing(self, effect: str, other_effect: str, distance: float) -> bool:
         """Return whether another effect needs more coefficients without reducing the excess enough.
 
         If the residual has structure, likelihoods do not account for the number of coefficients.
@@ -150,9 +150,11 @@ class AlternativeFinder:
         if not self.structure:
             return False
         slots = self.search.world.slots
-        mine, others = (int(slots[name].stop - slots[name].start) for name in (effect, other))
-        further = others - mine
-        return further > 0 and behind > further * convert_excess_ratio(
+        coefficient_count, other_count = (
+            int(slots[name].stop - slots[name].start) for name in (effect, other_effect)
+        )
+        further_count = other_count - coefficient_count
+        return further_count > 0 and distance > further_count * convert_excess_ratio(
             [MAX_RICHER_LAW_EXCESS_RATIO]
         )
 
@@ -165,34 +167,41 @@ class AlternativeFinder:
         effects = self.search.world.available_effects
         names = {name for _, name in rivals}
         return [
-            (behind, name) for behind, name in rivals if not names & set(effects[name].contains)
+            (distance, name) for distance, name in rivals if not names & set(effects[name].contains)
         ]
 
-    def _behind(self, model: FittedModel, other: FittedModel) -> float:
+    def _behind(self, model: FittedModel, other_model: FittedModel) -> float:
         """Return the distance of another model in twice the log-likelihood.
 
         It is negative if the other model is better. If the residual has structure that neither
         model explains, likelihoods only compare how each model mimics it. The distance then depends
         on the excesses.
         """
-        trial = self.held_out_validation
+        validation = self.held_out_validation
         # Held-out runs compare the models only if both were evaluated there.
-        if trial is not None and not {model.effects, other.effects} <= trial.held_out_fits.keys():
-            trial = None
+        if (
+            validation is not None
+            and not {model.effects, other_model.effects} <= validation.held_out_fits.keys()
+        ):
+            validation = None
         if self.structure:
-            left = self.search.compute_excess(other)
-            ratios = [compute_excess_ratio(left, self.search.compute_excess(model))]
-            if trial is not None:
-                left = trial.compute_excess(other.effects)
-                ratios.append(compute_excess_ratio(left, trial.compute_excess(model.effects)))
+            other_excess = self.search.compute_excess(other_model)
+            ratios = [compute_excess_ratio(other_excess, self.search.compute_excess(model))]
+            if validation is not None:
+                other_excess = validation.compute_excess(other_model.effects)
+                ratios.append(
+                    compute_excess_ratio(other_excess, validation.compute_excess(model.effects))
+                )
             return convert_excess_ratio(ratios)
-        behind = self._merit(model) - self._merit(other)
+        distance = self._merit(model) - self._merit(other_model)
         # Held-out runs are further data, so their log-likelihoods are added.
-        if trial is not None:
-            mine = trial.held_out_fits[model.effects]
-            others = trial.held_out_fits[other.effects]
-            behind += mine.penalised_log_likelihood - others.penalised_log_likelihood
-        return behind
+        if validation is not None:
+            held_out_fit = validation.held_out_fits[model.effects]
+            other_held_out_fit = validation.held_out_fits[other_model.effects]
+            distance += (
+                held_out_fit.penalised_log_likelihood - other_held_out_fit.penalised_log_likelihood
+            )
+        return distance
 
     def _merit(self, model: FittedModel) -> float:
         """Return the merit; for robots without the null-hypothesis penalty of single-shape effects.
@@ -203,12 +212,12 @@ class AlternativeFinder:
         world = self.search.world
         if not world.has_linearisation:
             return model.penalised_log_likelihood
-        lucky = 0.0
+        null_penalties = 0.0
         for name in model.effects:
             parameters = world.parameters[world.slots[name]]
             if not any(parameter.bounds[0] > 0 for parameter in parameters):
-                lucky += self.search.get_effect_penalty(name)
-        return model.penalised_log_likelihood + lucky
+                null_penalties += self.search.get_effect_penalty(name)
+        return model.penalised_log_likelihood + null_penalties
 
     def _is_plausible(self, effect: str) -> bool:
         """Return whether the best fit of an effect has coefficients in their plausible ranges.
@@ -216,10 +225,10 @@ class AlternativeFinder:
         The best fit is the model with the effect that has the highest penalised log-likelihood.
         """
         world = self.search.world
-        having = [m for m in self.search.models.values() if effect in m.effects]
-        if not having:
+        models_with_effect = [m for m in self.search.models.values() if effect in m.effects]
+        if not models_with_effect:
             return False
-        best = max(having, key=lambda m: m.penalised_log_likelihood)
+        best = max(models_with_effect, key=lambda m: m.penalised_log_likelihood)
         parameters = world.parameters[world.slots[effect]]
         values = best.fit.theta[world.slots[effect]]
         for parameter, value in zip(parameters, values, strict=True):

@@ -119,17 +119,17 @@ class DirectionSet:
 
 
 def compute_directions(
-    world: RunEvaluator, at: TrajectoryFit, names: Sequence[str]
+    world: RunEvaluator, fit: TrajectoryFit, names: Sequence[str]
 ) -> DirectionSet:
     """Compute the sensitivity directions of effects about a fitted model.
 
     Args:
         world: the runs.
-        at: the fitted model.
+        fit: the fitted model.
         names: names of effects that the model does not contain.
     """
-    probes = [probe for name in names for probe in first_probes(world, at, name)]
-    values = _responses(world, at, probes)
+    probes = [probe for name in names for probe in first_probes(world, fit, name)]
+    values = _responses(world, fit, probes)
     acting = _find_observable_probes(world, probes, values)
     # The first responses show which coefficients only modify, for effects that act at all.
     modified = list(_make_modifier_probes(world, probes, acting))
@@ -141,16 +141,18 @@ def compute_directions(
             values[row] = values[place]
     values = values[: places.size]
     if modified:
-        values = np.concatenate([values, _responses(world, at, modified)])
+        values = np.concatenate([values, _responses(world, fit, modified)])
     return DirectionSet(tuple(probes), np.moveaxis(values, 0, -1))
 
 
-def first_probes(world: RunEvaluator, at: TrajectoryFit, name: str) -> Iterator[CandidateDirection]:
+def first_probes(
+    world: RunEvaluator, fit: TrajectoryFit, name: str
+) -> Iterator[CandidateDirection]:
     """Yield a small value of every scaling coefficient of an effect, at every shape.
 
     Args:
         world: the runs.
-        at: the fitted model.
+        fit: the fitted model.
         name: name of the effect.
     """
     parameters = list_coefficients(world, name)
@@ -166,7 +168,7 @@ def first_probes(world: RunEvaluator, at: TrajectoryFit, name: str) -> Iterator[
     travel = world.get_effect_travel(name)
     grids = [
         parameters[i].bounds[:1]
-        if coefficients[i].of == "rotor" and _is_contained_in_model(world, at, name)
+        if coefficients[i].of == "rotor" and _is_contained_in_model(world, fit, name)
         else _make_shape_grid(world, parameters[i], coefficients[i].tried, travel)
         for i in shaping
     ]
@@ -175,8 +177,10 @@ def first_probes(world: RunEvaluator, at: TrajectoryFit, name: str) -> Iterator[
     # Scaling coefficients at one grid point act together, such as a sine and a cosine.
     for point in product(*grids):
         # A small limit of a force or a rate would remove all of it.
-        smooth = leading.of not in NONLINEAR_COEFFICIENT_KINDS and not effect.probe_points()
-        for place in scaling if smooth else ():
+        has_linear_response = (
+            leading.of not in NONLINEAR_COEFFICIENT_KINDS and not effect.probe_points()
+        )
+        for place in scaling if has_linear_response else ():
             low, high = parameters[place].bounds
             c = np.zeros(count)
             c[shaping] = point
@@ -192,24 +196,24 @@ def first_probes(world: RunEvaluator, at: TrajectoryFit, name: str) -> Iterator[
     if leading.of == "stop":
         yield from _make_end_stop_probes(world, name, group)
         return
-    least, _ = parameters[0].bounds
+    lowest, _ = parameters[0].bounds
     # A small limit does not act like a large one, so limits are tried at values that the input
     # reaches.
     if leading.of in NONLINEAR_COEFFICIENT_KINDS or (
-        leading.of in ("input", "error") and least == 0
+        leading.of in ("input", "error") and lowest == 0
     ):
         shapes = np.array(list(product(*grids)))
         yield from _make_limit_probes(world, name, group, shapes if shaping else None)
 
 
-def _is_contained_in_model(world: RunEvaluator, at: TrajectoryFit, name: str) -> bool:
+def _is_contained_in_model(world: RunEvaluator, fit: TrajectoryFit, name: str) -> bool:
     """Return whether the model already has a simpler effect that the effect `name` contains.
 
     The simpler effect may also be in the model as a member of a family (one effect at all places).
     """
-    effects = [world.available_effects[own] for own in at.effects]
-    there = {m.name for effect in effects for m in members_of(effect)}
-    return bool(there & set(world.available_effects[name].contains))
+    effects = [world.available_effects[effect_name] for effect_name in fit.effects]
+    model_effects = {m.name for effect in effects for m in members_of(effect)}
+    return bool(model_effects & set(world.available_effects[name].contains))
 
 
 def _make_end_stop_probes(
@@ -219,14 +223,14 @@ def _make_end_stop_probes(
 
     Each is one candidate that is valid only at its size. `first` is the number of its first group.
     """
-    either = [
+    end_stops = [
         c
         for side in (1.0, -1.0)
         for c in generate_end_stops(
             world, name, side, END_STOP_STIFFNESS_SHARES, END_STOP_DEPTH_SHARES
         )
     ]
-    for number, c in enumerate(either, start=first):
+    for number, c in enumerate(end_stops, start=first):
         yield CandidateDirection(
             effect=name, group=number, place=0, coefficients=c, signed=True, fixed=True
         )
@@ -247,16 +251,16 @@ def _make_limit_probes(
     if not largest.any():
         return
     # The error of a servo peaks briefly after a jump, as the rate of a command does.
-    seldom = {
+    shares_by_kind = {
         "input/s": RATE_LIMIT_SHARES,
         "input/s^2": ACCELERATION_LIMIT_SHARES,
         "error": RATE_LIMIT_SHARES,
         "travel": GAP_TRAVEL_SHARES,
         "give": COMPLIANCE_SHARES,
     }
-    of = world.available_effects[name].coefficients[0].of
-    levels = seldom.get(of, INPUT_LEVEL_SHARES)
-    if of == "travel" and world.has_linearisation:
+    kind = world.available_effects[name].coefficients[0].of
+    levels = shares_by_kind.get(kind, INPUT_LEVEL_SHARES)
+    if kind == "travel" and world.has_linearisation:
         # Simulating a robot costs a hundred times as much, so fewer sizes are tried.
         levels = GAP_TRAVEL_SHARES[1:4]
     sizes = [level * largest for level in levels]
@@ -274,25 +278,25 @@ def _make_limit_probes(
 
 
 def _make_shape_grid(
-    world: RunEvaluator, parameter: Parameter, tried: tuple[float, ...], travel: float
+    world: RunEvaluator, parameter: Parameter, specified_values: tuple[float, ...], travel: float
 ) -> Array:
     """Return the values to try of a shape parameter.
 
     Args:
         world: the runs.
         parameter: the shape parameter.
-        tried: values that the coefficient specifies itself, if any.
+        specified_values: values that the coefficient specifies itself, if any.
         travel: largest range of the position in one run.
     """
-    if tried:
-        return np.array(tried)
+    if specified_values:
+        return np.array(specified_values)
     low, high = parameter.bounds
     if parameter.unit == "Hz":
         # A periodic effect must complete a cycle within a run, otherwise any slow change would be
         # periodic.
-        seldom = max(low, MIN_CYCLES_PER_RUN / world.longest)
-        slowest = min(seldom, high / 2.0)
-        return _frequencies(slowest, high, world.longest)
+        min_frequency = max(low, MIN_CYCLES_PER_RUN / world.longest)
+        lowest_frequency = min(min_frequency, high / 2.0)
+        return _frequencies(lowest_frequency, high, world.longest)
     if _is_period(parameter, travel):
         frequencies = _frequencies(1.0 / high, 1.0 / low, travel)
         return 1.0 / frequencies
@@ -334,11 +338,11 @@ def generate_frequency_neighbours(world: RunEvaluator, fit: TrajectoryFit) -> It
         for number, place in enumerate(world.get_coefficient_indices(name)):
             parameter = world.parameters[place]
             value = float(fit.theta[place])
-            for moved in _shift_frequency_or_time(
+            for shifted_value in _shift_frequency_or_time(
                 world, parameter, value, world.get_effect_travel(name)
             ):
                 theta = fit.theta.copy()
-                theta[place] = np.clip(moved, *bounds[number])
+                theta[place] = np.clip(shifted_value, *bounds[number])
                 yield FitStart(fit.effects, theta, fit.states)
 
 
@@ -416,7 +420,7 @@ def _make_modifier_probes(
     does.
     """
     leading: dict[str, CandidateDirection] = {}
-    idle: list[CandidateDirection] = []
+    idle_probes: list[CandidateDirection] = []
     for probe, acts in zip(probes, acting, strict=True):
         if acts:
             leading.setdefault(probe.effect, probe)
@@ -427,9 +431,9 @@ def _make_modifier_probes(
             and not probe.fixed
             and world.available_effects[probe.effect].place != ALL_PLACES
         ):
-            idle.append(probe)
+            idle_probes.append(probe)
     modifiers: dict[str, list[CandidateDirection]] = {}
-    for probe in idle:
+    for probe in idle_probes:
         # An effect that does not act at all cannot be modified.
         if probe.effect in leading:
             modifiers.setdefault(probe.effect, []).append(probe)
@@ -461,7 +465,7 @@ def _grid_points(
 
 
 def _responses(
-    world: RunEvaluator, at: TrajectoryFit, probes: Sequence[CandidateDirection]
+    world: RunEvaluator, fit: TrajectoryFit, probes: Sequence[CandidateDirection]
 ) -> Array:
     """Compute the directions (K, R, T, C) of eq. (1): change of the runs per unit coefficient.
 
@@ -469,17 +473,17 @@ def _responses(
     """
     added = [(probe.effect, probe.coefficients) for probe in probes]
     # These are the largest arrays of a search, so all operations are in place.
-    values = compute_responses(world, at, added)
-    near = is_finite_response(values)
+    values = compute_responses(world, fit, added)
+    is_finite = is_finite_response(values)
     # A probe that the simulator cannot follow gets a direction of zeros.
-    if not near.all():
-        values[~near] = 0.0
+    if not is_finite.all():
+        values[~is_finite] = 0.0
     values /= _sizes(probes)[:, None, None, None]  # (1)
     return values
 
 
 def compute_responses(
-    world: RunEvaluator, at: TrajectoryFit, added: Sequence[tuple[str, Array]]
+    world: RunEvaluator, fit: TrajectoryFit, added: Sequence[tuple[str, Array]]
 ) -> Array:
     """Compute the changes of a fitted model's runs by one additional effect each.
 
@@ -487,7 +491,7 @@ def compute_responses(
 
     Args:
         world: the runs.
-        at: the fitted model.
+        fit: the fitted model.
         added: K effects with their coefficients.
 
     Returns:
@@ -497,27 +501,27 @@ def compute_responses(
         # Imported here, because only robots need it.
         from bench.diagnosis.fitting.linearised_runs import compute_effect_responses
 
-        return compute_effect_responses(world, at.theta, at.states, added)
-    values = simulate_with_effect(world, at, added)
-    values -= at.simulated
+        return compute_effect_responses(world, fit.theta, fit.states, added)
+    values = simulate_with_effect(world, fit, added)
+    values -= fit.simulated
     return values
 
 
 def simulate_with_effect(
-    world: RunEvaluator, at: TrajectoryFit, added: Sequence[tuple[str, Array]]
+    world: RunEvaluator, fit: TrajectoryFit, added: Sequence[tuple[str, Array]]
 ) -> Array:
     """Simulate the runs of a fitted model with one additional effect each.
 
     Args:
         world: the runs.
-        at: the fitted model.
+        fit: the fitted model.
         added: K effects with their coefficients.
 
     Returns:
         Observations (K, R, T, C).
     """
     runs = len(world.tracks)
-    theta = np.tile(at.theta, (len(added), 1))
+    theta = np.tile(fit.theta, (len(added), 1))
     for row, (name, c) in zip(theta, added, strict=True):
         row[world.slots[name]] = c
     # All candidates and runs are simulated in one engine call, as one batch.
@@ -525,6 +529,6 @@ def simulate_with_effect(
     simulated = world.simulate(
         theta=np.repeat(theta, runs, axis=0),
         runs=np.tile(np.arange(runs), count),
-        states=np.tile(at.states, (count, 1)),
+        states=np.tile(fit.states, (count, 1)),
     )
     return simulated.reshape(count, runs, *simulated.shape[1:])

@@ -111,38 +111,38 @@ class Inquiry:
         Raises:
             SearchStoppedError: the search had to end early.
         """
-        unfit = self.unfit_base()
-        if unfit is not None:
-            return unfit
+        early_result = self.unfit_base()
+        if early_result is not None:
+            return early_result
         search, base = self._search, self._search.base_model
         self._watch.begin_question("search")
         self._model = search_with_subsampling(search)
         self._watch.begin_question("rivals")
         self._model = search.simplify_laws(refine_best_model(search, self._model))
         self._model = search.fit_to_convergence(self._model)
-        told = self._model.effects
+        validated_effects = self._model.effects
         self._try()
         self._watch.begin_question("structure")
-        left = assess_lack_of_fit(search, self._model)
-        if search.thorough and self._fuller(left):
-            left = assess_lack_of_fit(search, self._model)
+        lack_of_fit = assess_lack_of_fit(search, self._model)
+        if search.thorough and self._fuller(lack_of_fit):
+            lack_of_fit = assess_lack_of_fit(search, self._model)
         self._watch.begin_question("alternatives")
-        model, causes = _select_preferred_model(search, self._trial, self._model, left)
-        trial = self._trial
-        if model.effects != told:
+        model, causes = _select_preferred_model(search, self._trial, self._model, lack_of_fit)
+        validation = self._trial
+        if model.effects != validated_effects:
             model = search.fit_to_convergence(model)
-            if trial is not None:
-                trial.evaluate_models([model])
+            if validation is not None:
+                validation.evaluate_models([model])
         self._watch.check_not_stopped()
         state = DiagnosisState(
             causes=len(causes),
             alternatives=any(cause.alternatives for cause in causes),
-            closed=compute_gap_closed(search, model, left),
-            unexplained=_is_unexplained(search, model, left),
-            missed=trial is not None and trial.has_unexplained_gap(model, left),
+            closed=compute_gap_closed(search, model, lack_of_fit),
+            unexplained=_is_unexplained(search, model, lack_of_fit),
+            missed=validation is not None and validation.has_unexplained_gap(model, lack_of_fit),
         )
         # Report the base model that was fitted first, even if the search found a better fit of it.
-        return self._finding(decide_verdict(state), base, model, causes, left)
+        return self._finding(decide_verdict(state), base, model, causes, lack_of_fit)
 
     def unfit_base(self) -> DiagnosisResult | None:
         """Return the result if causes cannot be searched, else None.
@@ -160,12 +160,17 @@ class Inquiry:
         if is_motionless(search):
             return _without_motion(search)
         base = search.base_model
-        vague = find_unidentified_parameters(search, base)
+        unidentified = find_unidentified_parameters(search, base)
         # Causes would represent values of parameters that the data do not determine.
-        if vague:
-            left = assess_lack_of_fit(search, base)
+        if unidentified:
+            lack_of_fit = assess_lack_of_fit(search, base)
             return DiagnosisResult(
-                decide_verdict(DiagnosisState(fixed=False)), base, base, (), left, vague
+                decide_verdict(DiagnosisState(fixed=False)),
+                base,
+                base,
+                (),
+                lack_of_fit,
+                unidentified,
             )
         return None
 
@@ -177,29 +182,34 @@ class Inquiry:
         if self._held_out is None or self._model is None:
             return
         self._watch.begin_question("held_out")
-        trial = _validate_on_held_out(self._search, self._model, self._held_out)
+        validation = _validate_on_held_out(self._search, self._model, self._held_out)
         # Unfinished fits of initial states would be held against their model.
         self._watch.check_not_stopped()
-        self._trial = trial
+        self._trial = validation
         # The effects that remain after dropping an idle one may have simpler forms.
         self._model = self._search.simplify_laws(
-            trial.drop_unhelpful_effects(self._search, self._model)
+            validation.drop_unhelpful_effects(self._search, self._model)
         )
 
-    def _fuller(self, left: LackOfFitResult) -> bool:
+    def _fuller(self, lack_of_fit: LackOfFitResult) -> bool:
         """Replace the model by one with more effects if held-out runs confirm it.
 
         Returns:
             Whether the model was replaced.
         """
-        found, trial, search = self._model, self._trial, self._search
-        if found is None or trial is None or not found.effects or not left.has_structure:
+        model, validation, search = self._model, self._trial, self._search
+        if (
+            model is None
+            or validation is None
+            or not model.effects
+            or not lack_of_fit.has_structure
+        ):
             return False
-        fuller = trial.find_better_extension(search, found)
-        if fuller is found:
+        extension = validation.find_better_extension(search, model)
+        if extension is model:
             return False
-        self._model = search.simplify_laws(search.fit_to_convergence(fuller))
-        trial.evaluate_models([self._model])
+        self._model = search.simplify_laws(search.fit_to_convergence(extension))
+        validation.evaluate_models([self._model])
         return True
 
     def so_far(self) -> DiagnosisResult:
@@ -211,15 +221,15 @@ class Inquiry:
         cut = self._watch.make_early_stop(self._held_out is not None)
         model = self._model or search.get_best_so_far()
         # The residual was not tested, so it is counted as structure and not as noise.
-        left = replace(assess_residual_size(search, model), p_value=0.0)
+        lack_of_fit = replace(assess_residual_size(search, model), p_value=0.0)
         alternatives = AlternativeFinder(search, self._trial, structure=False, simulates=False)
         causes = alternatives.collect_evidence(model)
-        share = compute_gap_closed(search, model, left)
+        share = compute_gap_closed(search, model, lack_of_fit)
         verdict = decide_early_stop_verdict(len(causes), share, cut.skipped_questions)
-        found = self._finding(
+        result = self._finding(
             verdict, search.base_model, model, causes, assess_residual_size(search, model)
         )
-        return replace(found, early_stop=cut)
+        return replace(result, early_stop=cut)
 
     def _finding(
         self,
@@ -227,11 +237,11 @@ class Inquiry:
         base: FittedModel,
         model: FittedModel,
         causes: tuple[CauseEvidence, ...],
-        left: LackOfFitResult,
+        lack_of_fit: LackOfFitResult,
     ) -> DiagnosisResult:
         """Bundle a verdict with its models, and with the held-out predictions if there are any."""
         measured = self._trial.held_out_fits if self._trial is not None else None
-        return DiagnosisResult(verdict, model, base, causes, left, held_out_fits=measured)
+        return DiagnosisResult(verdict, model, base, causes, lack_of_fit, held_out_fits=measured)
 
 
 def is_motionless(search: EffectSearch) -> bool:
@@ -244,20 +254,22 @@ def is_motionless(search: EffectSearch) -> bool:
     smallest = np.nanmin(observed, axis=(0, 1))
     ranges = largest - smallest
     # Parameters that do not influence the simulated runs were fixed by the base fit.
-    touched = len(search.frozen) != search.world.base.size
-    left = search.base_model.likelihood.sigma
-    return verdict_rules.is_motionless(ranges, left, search.noise.sigma, touched)
+    is_model_sensitive = len(search.frozen) != search.world.base.size
+    residual_sigma = search.base_model.likelihood.sigma
+    return verdict_rules.is_motionless(
+        ranges, residual_sigma, search.noise.sigma, is_model_sensitive
+    )
 
 
 def _without_motion(search: EffectSearch) -> DiagnosisResult:
     """Return the verdict "unidentifiable" for a recording without motion."""
     base, world = search.base_model, search.world
     # No parameter can be determined, and no test of the residual is meaningful.
-    vague = tuple(world.parameters[i].name for i in world.base)
+    unidentified = tuple(world.parameters[i].name for i in world.base)
     excess = base.likelihood.sigma / search.noise.sigma
-    nothing = LackOfFitResult(1.0, "", excess, ())
+    no_lack_of_fit = LackOfFitResult(1.0, "", excess, ())
     return DiagnosisResult(
-        decide_verdict(DiagnosisState(fixed=False)), base, base, (), nothing, vague
+        decide_verdict(DiagnosisState(fixed=False)), base, base, (), no_lack_of_fit, unidentified
     )
 
 
@@ -271,12 +283,12 @@ def find_unidentified_parameters(search: EffectSearch, base: FittedModel) -> tup
     variances = np.diagonal(compute_covariance(search, base))
     spread = np.sqrt(np.maximum(variances, 0.0))
     parameters = [search.world.parameters[place] for place in base.fit.free]
-    vague = []
+    unidentified = []
     for parameter, sd in zip(parameters, spread.tolist(), strict=True):
         low, high = parameter.bounds
         if not verdict_rules.is_identified(sd, low, high):
-            vague.append((sd / (high - low), parameter.name))
-    return tuple(name for _, name in sorted(vague, key=lambda one: -one[0]))
+            unidentified.append((sd / (high - low), parameter.name))
+    return tuple(name for _, name in sorted(unidentified, key=lambda entry: -entry[0]))
 
 
 def _validate_on_held_out(
@@ -294,25 +306,28 @@ def _validate_on_held_out(
     parts = [m for m in models if set(m.effects) < names]
     singles = [m for m in models if len(m.effects) == 1]
     singles.sort(key=lambda m: -m.penalised_log_likelihood)
-    near = list_competing_models(search, model)
-    trial = HeldOutValidation(held_out)
+    competing_models = list_competing_models(search, model)
+    validation = HeldOutValidation(held_out)
     # All models are evaluated together, so that initial states start from those of the nearest
     # model.
-    trial.evaluate_models(
-        [search.base_model, model, *near, *parts, *singles[:MAX_VALIDATED_SINGLES]]
+    validation.evaluate_models(
+        [search.base_model, model, *competing_models, *parts, *singles[:MAX_VALIDATED_SINGLES]]
     )
-    return trial
+    return validation
 
 
 def _select_preferred_model(
-    search: EffectSearch, trial: HeldOutValidation | None, model: FittedModel, left: LackOfFitResult
+    search: EffectSearch,
+    validation: HeldOutValidation | None,
+    model: FittedModel,
+    lack_of_fit: LackOfFitResult,
 ) -> tuple[FittedModel, tuple[CauseEvidence, ...]]:
     """Replace each effect by the preferred one of its indistinguishable alternatives.
 
     Return this model if it was fitted, else the given one, with the evidence for its effects.
-    `left` is the lack-of-fit result of the given model.
+    `lack_of_fit` is the lack-of-fit result of the given model.
     """
-    alternatives = AlternativeFinder(search, trial, left.has_structure)
+    alternatives = AlternativeFinder(search, validation, lack_of_fit.has_structure)
     causes = alternatives.collect_evidence(model)
     names = frozenset(cause.preferred for cause in causes)
     preferred = search.models.get(names, model)
@@ -321,7 +336,7 @@ def _select_preferred_model(
     return preferred, alternatives.collect_evidence(preferred)
 
 
-def _is_unexplained(search: EffectSearch, model: FittedModel, left: LackOfFitResult) -> bool:
+def _is_unexplained(search: EffectSearch, model: FittedModel, lack_of_fit: LackOfFitResult) -> bool:
     """Return whether the model lacks something: structure in the residual, or a significant effect.
 
     The p-value of the best missing effect (`chance`) comes from an earlier score test, or from one
@@ -330,12 +345,14 @@ def _is_unexplained(search: EffectSearch, model: FittedModel, left: LackOfFitRes
     chance = search.best_p_values.get(frozenset(model.effects))
     # A model with a residual above the noise was not scored, because the search did not need it.
     if chance is None:
-        loud = not left.has_structure and not search.is_noise_like(model)
-        chance = search.score_missing_effects(model).p_value if loud else 1.0
-    return verdict_rules.is_unexplained(left.has_structure, chance)
+        is_above_noise = not lack_of_fit.has_structure and not search.is_noise_like(model)
+        chance = search.score_missing_effects(model).p_value if is_above_noise else 1.0
+    return verdict_rules.is_unexplained(lack_of_fit.has_structure, chance)
 
 
-def compute_gap_closed(search: EffectSearch, model: FittedModel, left: LackOfFitResult) -> float:
+def compute_gap_closed(
+    search: EffectSearch, model: FittedModel, lack_of_fit: LackOfFitResult
+) -> float:
     """Return the share of the discrepancy on the fitted runs that a model removes.
 
     With the RMS residuals b of the base model and a of this model, in units of the noise, it is (b
@@ -344,12 +361,12 @@ def compute_gap_closed(search: EffectSearch, model: FittedModel, left: LackOfFit
     Args:
         search: the search.
         model: the extended model.
-        left: its lack-of-fit result.
+        lack_of_fit: its lack-of-fit result.
     """
-    own = model.likelihood.sigma
+    residual_sigma = model.likelihood.sigma
     # A residual without structure is noise, even if it exceeds an estimated noise floor.
-    usable = np.isfinite(own) & ~left.has_structure
-    floor = np.where(usable, own, search.noise.sigma)
+    usable = np.isfinite(residual_sigma) & ~lack_of_fit.has_structure
+    floor = np.where(usable, residual_sigma, search.noise.sigma)
     noise = np.maximum(floor, search.noise.sigma)
     before = _compute_normalised_rms(search, search.base_model, noise)
     after = _compute_normalised_rms(search, model, noise)
@@ -361,6 +378,6 @@ def compute_gap_closed(search: EffectSearch, model: FittedModel, left: LackOfFit
 
 def _compute_normalised_rms(search: EffectSearch, model: FittedModel, noise: Array) -> float:
     """Return the RMS over all samples of a model's residual divided by the noise `sigma` (C,)."""
-    left = search.compute_residual(model.fit) / noise
-    squares = np.square(left[search.observed_mask])
+    normalised_residual = search.compute_residual(model.fit) / noise
+    squares = np.square(normalised_residual[search.observed_mask])
     return float(np.sqrt(squares.mean()))

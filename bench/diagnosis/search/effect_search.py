@@ -125,13 +125,13 @@ class EffectSearch(ModelMoves):
         correct_discretisation(self.world, self.noise, model.fit.theta, model.fit.states)
         size = len(model.effects)
         # A richer effect may have fitted only the discretisation error.
-        near = [
+        close_models = [
             m
             for m in select_by_size(self, size)
             if m.penalised_log_likelihood
             > model.penalised_log_likelihood - STEP_CORRECTION_REFIT_DISTANCE
         ]
-        self.refit_models([m.fit.make_start() for m in near], race=False)
+        self.refit_models([m.fit.make_start() for m in close_models], race=False)
         return select_by_size(self, size)[0]
 
     def get_best_so_far(self) -> FittedModel:
@@ -145,12 +145,14 @@ class EffectSearch(ModelMoves):
         scores = self.scores_by_effects.get(frozenset(best.effects))
         if scores is None or not larger:
             return best
-        found = max(larger, key=lambda model: model.penalised_log_likelihood)
-        gain = found.likelihood.value - best.likelihood.value
-        real = self.compute_gain_p_value(scores, found, gain) <= EFFECT_P_VALUE_THRESHOLD
+        extension = max(larger, key=lambda model: model.penalised_log_likelihood)
+        gain = extension.likelihood.value - best.likelihood.value
+        is_significant = (
+            self.compute_gain_p_value(scores, extension, gain) <= EFFECT_P_VALUE_THRESHOLD
+        )
         return (
-            found
-            if real and found.penalised_log_likelihood > best.penalised_log_likelihood
+            extension
+            if is_significant and extension.penalised_log_likelihood > best.penalised_log_likelihood
             else best
         )
 
@@ -182,8 +184,8 @@ class EffectSearch(ModelMoves):
         First only the best smaller model is extended. If that does not explain the data, segments,
         further models of the beam or patient fits are used.
         """
-        smaller = select_beam(self, size - 1)
-        self.refit_extensions(smaller[:1], MAX_REFITTED_CANDIDATES)
+        smaller_models = select_beam(self, size - 1)
+        self.refit_extensions(smaller_models[:1], MAX_REFITTED_CANDIDATES)
         # Each further method needs more simulations, so it is skipped if the data are explained.
         if self._explained_by(size):
             return self.get_best(size)
@@ -191,9 +193,9 @@ class EffectSearch(ModelMoves):
         if self._explained_by(size):
             return self.get_best(size)
         if size == 1:
-            self.refit_extensions(smaller, MAX_REFITTED_CANDIDATES, patient=True)
+            self.refit_extensions(smaller_models, MAX_REFITTED_CANDIDATES, patient=True)
         else:
-            for members in self._turns(smaller[1:]):
+            for members in self._turns(smaller_models[1:]):
                 self.refit_extensions(members, MAX_REFITTED_CANDIDATES)
                 if self._explained_by(size):
                     break
@@ -294,8 +296,8 @@ def select_beam(search: EffectSearch, size: int) -> list[FittedModel]:
         for model in members
         if model.penalised_log_likelihood - base >= MIN_RELATIVE_GAIN_IN_BEAM * best_gain
     ][:BEAM_WIDTH]
-    nearest = sorted(members, key=lambda model: model.fit.cost)[:BEAM_WIDTH_BY_SQUARES]
-    return rivals + [model for model in nearest if model not in rivals]
+    nearest_models = sorted(members, key=lambda model: model.fit.cost)[:BEAM_WIDTH_BY_SQUARES]
+    return rivals + [model for model in nearest_models if model not in rivals]
 
 
 def is_hopeless(search: EffectSearch, larger: FittedModel) -> bool:
@@ -310,11 +312,11 @@ def is_hopeless(search: EffectSearch, larger: FittedModel) -> bool:
     # If two effects leave as much as the best single one, a third effect will not help.
     of_base = MAX_PAIR_EXCESS_SHARE * search.compute_excess(search.base_model)
     of_single = MAX_PAIR_EXCESS_SHARE_OF_SINGLE * min(_list_excesses(search, 1), default=np.inf)
-    left = search.compute_excess(larger)
+    excess = search.compute_excess(larger)
     if search.thorough:
         # The model to extend need not have the lowest excess, because merit is misleading there.
-        left = min(left, *_list_excesses(search, len(larger.effects)))
-    return left > min(of_base, of_single)
+        excess = min(excess, *_list_excesses(search, len(larger.effects)))
+    return excess > min(of_base, of_single)
 
 
 def _list_excesses(search: EffectSearch, size: int) -> list[float]:
@@ -337,16 +339,16 @@ def select_conservative_model(
         larger: the larger model.
     """
     # A model that contains the effects of the best one replaces none of them.
-    kept = set(best.effects) <= set(larger.effects)
-    if kept or search.compute_excess(larger) < MAX_REPLACEMENT_EXCESS_SHARE * search.compute_excess(
-        best
-    ):
+    is_extension = set(best.effects) <= set(larger.effects)
+    if is_extension or search.compute_excess(
+        larger
+    ) < MAX_REPLACEMENT_EXCESS_SHARE * search.compute_excess(best):
         return larger
-    built = [
+    extensions = [
         model
         for model in search.models.values()
         if set(best.effects) < set(model.effects)
         and len(model.effects) == len(best.effects) + 1
         and model.penalised_log_likelihood > best.penalised_log_likelihood
     ]
-    return max(built, key=lambda model: model.penalised_log_likelihood, default=best)
+    return max(extensions, key=lambda model: model.penalised_log_likelihood, default=best)

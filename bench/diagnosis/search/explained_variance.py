@@ -68,11 +68,11 @@ def group_directions(directions: DirectionSet) -> list[DirectionGroup]:
 
 def batch_groups(members: Sequence[DirectionGroup]) -> list[GroupBatch]:
     """Collect groups with equal sign constraints in batches, which are solved at once."""
-    alike: dict[tuple[bool, ...], list[int]] = {}
+    groups_by_signs: dict[tuple[bool, ...], list[int]] = {}
     for i, group in enumerate(members):
-        alike.setdefault(group.positive, []).append(i)
+        groups_by_signs.setdefault(group.positive, []).append(i)
     result = []
-    for positive, places in alike.items():
+    for positive, places in groups_by_signs.items():
         columns = [members[i].column_indices for i in places]
         result.append(
             GroupBatch(
@@ -106,15 +106,17 @@ def compute_explained_squares(
         return _solve_unconstrained(gram, cross)
     best = np.zeros((number, samples))
     coefficients = np.zeros((number, count))
-    rest = np.arange(number)
+    remaining_groups = np.arange(number)
     # Most effects have no constraint, and then all columns together explain most.
     if not any(positive):
-        solved = _solved(gram, cross, list(range(count)))
-        best[solved.groups] = solved.gain
-        coefficients[solved.groups] = solved.own
-        rest = np.setdiff1d(rest, solved.groups)
-    if rest.size:
-        best[rest], coefficients[rest] = _solve_best_subset(gram[rest], cross[rest], positive)
+        solution = _solved(gram, cross, list(range(count)))
+        best[solution.groups] = solution.gain
+        coefficients[solution.groups] = solution.own
+        remaining_groups = np.setdiff1d(remaining_groups, solution.groups)
+    if remaining_groups.size:
+        best[remaining_groups], coefficients[remaining_groups] = _solve_best_subset(
+            gram[remaining_groups], cross[remaining_groups], positive
+        )
     return best, coefficients
 
 
@@ -128,19 +130,19 @@ def _solve_best_subset(gram: Array, cross: Array, positive: Sequence[bool]) -> t
     best = np.zeros((number, samples))
     coefficients = np.zeros((number, count))
     for chosen in _enumerate_subsets(count):
-        solved = _solved(gram, cross, chosen)
-        held = [place for place, i in enumerate(chosen) if positive[i]]
-        former = best[solved.groups]
+        solution = _solved(gram, cross, chosen)
+        constrained = [place for place, i in enumerate(chosen) if positive[i]]
+        previous_best = best[solution.groups]
         # More columns must explain more than rounding error, otherwise the smaller subset is kept.
-        better = solved.gain > former * (1.0 + 1e-9)
-        if held:
-            better &= (solved.scaled[:, held] >= 0).all(axis=1)
-        best[solved.groups] = np.where(better, solved.gain, former)
+        is_better = solution.gain > previous_best * (1.0 + 1e-9)
+        if constrained:
+            is_better &= (solution.scaled[:, constrained] >= 0).all(axis=1)
+        best[solution.groups] = np.where(is_better, solution.gain, previous_best)
         # Columns outside the subset get zero coefficients.
-        improved = better[:, 0]
-        rows = solved.groups[improved]
+        is_improved = is_better[:, 0]
+        rows = solution.groups[is_improved]
         coefficients[rows] = 0.0
-        coefficients[rows[:, None], chosen] = solved.own[improved]
+        coefficients[rows[:, None], chosen] = solution.own[is_improved]
     return best, coefficients
 
 
@@ -175,18 +177,18 @@ def _solved(gram: Array, cross: Array, chosen: list[int]) -> _SubsetSolution:
     """
     products = gram[:, chosen][:, :, chosen]
     lengths = np.sqrt(np.maximum(np.diagonal(products, axis1=1, axis2=2), 0.0))
-    acting = np.flatnonzero((lengths > 0).all(axis=1))
-    scale = lengths[acting][:, :, None]
-    normal = products[acting] / scale / scale.transpose(0, 2, 1)
+    nonzero_groups = np.flatnonzero((lengths > 0).all(axis=1))
+    scale = lengths[nonzero_groups][:, :, None]
+    normal = products[nonzero_groups] / scale / scale.transpose(0, 2, 1)
     # Collinear columns have no unique solution, and a smaller subset explains the same.
-    apart = np.linalg.eigvalsh(normal)[:, 0] >= RANK_TOLERANCE
-    solvable = acting[apart]
-    scale = scale[apart]
-    right = cross[solvable[:, None], chosen] / scale
+    has_full_rank = np.linalg.eigvalsh(normal)[:, 0] >= RANK_TOLERANCE
+    solvable = nonzero_groups[has_full_rank]
+    scale = scale[has_full_rank]
+    right_hand_side = cross[solvable[:, None], chosen] / scale
     # With hundreds of right-hand sides, inverses are faster, and these matrices have unit
     # diagonals.
-    scaled = np.linalg.inv(normal[apart]) @ right
-    gain = np.einsum("nks,nks->ns", scaled, right)
+    scaled = np.linalg.inv(normal[has_full_rank]) @ right_hand_side
+    gain = np.einsum("nks,nks->ns", scaled, right_hand_side)
     return _SubsetSolution(solvable, gain, scaled, scaled[:, :, 0] / scale[:, :, 0])
 
 
@@ -202,16 +204,16 @@ def _solve_unconstrained(gram: Array, cross: Array) -> tuple[Array, Array]:
     Returns:
         The explained sums of squares (n, S), and the coefficients (n, k) for the first residual.
     """
-    # Some of many columns nearly repeat others, as overlapping hats do; their contribution is
-    # rounding.
+    # Some of many columns nearly repeat others, as overlapping basis functions do; their
+    # contribution is rounding.
     powers = np.diagonal(gram, axis1=1, axis2=2)
     scale = np.sqrt(np.maximum(powers, 1e-300))[:, :, None]
     values, vectors = np.linalg.eigh(gram / scale / scale.transpose(0, 2, 1))
-    counted = values > RANK_TOLERANCE * values[:, -1:]
-    weights = np.where(counted, 1.0 / np.where(counted, values, 1.0), 0.0)
+    is_counted = values > RANK_TOLERANCE * values[:, -1:]
+    weights = np.where(is_counted, 1.0 / np.where(is_counted, values, 1.0), 0.0)
     # In the eigenbasis G is diagonal, so h'G^-1 h is a sum with one term for each eigenvector.
-    right = vectors.transpose(0, 2, 1) @ (cross / scale)
-    solved = weights[:, :, None] * right
-    gain: Array = np.einsum("nks,nks->ns", right, solved)
-    coefficients = (vectors @ solved[:, :, :1]) / scale
+    right_hand_side = vectors.transpose(0, 2, 1) @ (cross / scale)
+    scaled_coefficients = weights[:, :, None] * right_hand_side
+    gain: Array = np.einsum("nks,nks->ns", right_hand_side, scaled_coefficients)
+    coefficients = (vectors @ scaled_coefficients[:, :, :1]) / scale
     return gain, coefficients[:, :, 0]

@@ -86,13 +86,16 @@ class HeldOutValidation:
             model: the model.
         """
         while model.effects and model.effects in self.held_out_fits:
-            smaller = self._smaller(search, model)
-            idle = [m for m in smaller if not self._helps(search, m, model)]
-            if not idle:
+            submodels = self._smaller(search, model)
+            models_without_idle_effect = [m for m in submodels if not self._helps(search, m, model)]
+            if not models_without_idle_effect:
                 return model
             # If several effects are idle, drop the one without which held-out runs are predicted
             # best.
-            model = max(idle, key=lambda m: self.held_out_fits[m.effects].penalised_log_likelihood)
+            model = max(
+                models_without_idle_effect,
+                key=lambda m: self.held_out_fits[m.effects].penalised_log_likelihood,
+            )
         return model
 
     def find_better_extension(self, search: EffectSearch, model: FittedModel) -> FittedModel:
@@ -107,80 +110,102 @@ class HeldOutValidation:
             model: the model that was found; it has been evaluated.
         """
         names = set(model.effects)
-        fuller = [m for m in search.models.values() if names < set(m.effects)]
-        fuller = sorted(fuller, key=lambda m: m.fit.cost)[:MAX_RICHER_MODELS]
-        known = search.models.values()
-        parts = [m for m in known if any(set(m.effects) < set(other.effects) for other in fuller)]
+        extensions = [m for m in search.models.values() if names < set(m.effects)]
+        extensions = sorted(extensions, key=lambda m: m.fit.cost)[:MAX_RICHER_MODELS]
+        fitted_models = search.models.values()
+        parts = [
+            m
+            for m in fitted_models
+            if any(set(m.effects) < set(extension.effects) for extension in extensions)
+        ]
         # The model is included again, so that all initial states start from the same values.
-        self.evaluate_models([model, *fuller, *parts])
-        borne = {m.effects: self._share(search, model, m) for m in fuller}
-        best = min(fuller, key=lambda m: borne[m.effects], default=model)
-        if best is model or not borne[best.effects] < 1.0:
+        self.evaluate_models([model, *extensions, *parts])
+        excess_shares = {m.effects: self._share(search, model, m) for m in extensions}
+        best = min(extensions, key=lambda m: excess_shares[m.effects], default=model)
+        if best is model or not excess_shares[best.effects] < 1.0:
             return model
-        lean = self.drop_unhelpful_effects(search, best)
-        return lean if names < set(lean.effects) else model
+        reduced_model = self.drop_unhelpful_effects(search, best)
+        return reduced_model if names < set(reduced_model.effects) else model
 
-    def _share(self, search: EffectSearch, model: FittedModel, fuller: FittedModel) -> float:
+    def _share(self, search: EffectSearch, model: FittedModel, larger: FittedModel) -> float:
         """Return the excess of a larger model relative to what its further effects must achieve.
 
         The value is one if the reduction is just enough; the worse of fitted and held-out runs
         counts.
         """
-        enough = MAX_PAIR_EXCESS_SHARE_OF_SINGLE ** (len(fuller.effects) - len(model.effects))
-        fitted = compute_excess_ratio(search.compute_excess(fuller), search.compute_excess(model))
-        unseen = compute_excess_ratio(
-            self.compute_excess(fuller.effects), self.compute_excess(model.effects)
+        required_ratio = MAX_PAIR_EXCESS_SHARE_OF_SINGLE ** (
+            len(larger.effects) - len(model.effects)
         )
-        return max(fitted, unseen) / enough
+        fitted_ratio = compute_excess_ratio(
+            search.compute_excess(larger), search.compute_excess(model)
+        )
+        held_out_ratio = compute_excess_ratio(
+            self.compute_excess(larger.effects), self.compute_excess(model.effects)
+        )
+        return max(fitted_ratio, held_out_ratio) / required_ratio
 
     def _smaller(self, search: EffectSearch, model: FittedModel) -> list[FittedModel]:
         """Return the evaluated models that consist of the model without one of its effects."""
         names = set(model.effects)
         size = len(names) - 1
-        smaller = []
-        for other in search.models.values():
+        submodels = []
+        for other_model in search.models.values():
             # A model that was not evaluated on held-out runs cannot be compared there.
-            if other.effects not in self.held_out_fits:
+            if other_model.effects not in self.held_out_fits:
                 continue
-            if len(other.effects) == size and set(other.effects) < names:
-                smaller.append(other)
-        return smaller
+            if len(other_model.effects) == size and set(other_model.effects) < names:
+                submodels.append(other_model)
+        return submodels
 
-    def _helps(self, search: EffectSearch, without: FittedModel, having: FittedModel) -> bool:
+    def _helps(
+        self, search: EffectSearch, reduced_model: FittedModel, full_model: FittedModel
+    ) -> bool:
         """Return whether the effect by which two models differ improves held-out predictions.
 
         It is also accepted if it explains the fitted runs, and held-out runs hardly show it.
         """
-        before = self.held_out_fits[without.effects].penalised_log_likelihood
-        after = self.held_out_fits[having.effects].penalised_log_likelihood
+        before = self.held_out_fits[reduced_model.effects].penalised_log_likelihood
+        after = self.held_out_fits[full_model.effects].penalised_log_likelihood
         # Both merit and excess are tested, because far from the noise merit alone may be mimicry.
-        excesses = self.compute_excess(without.effects), self.compute_excess(having.effects)
+        excesses = (
+            self.compute_excess(reduced_model.effects),
+            self.compute_excess(full_model.effects),
+        )
         if improves_held_out((before, after), excesses):
             return True
-        left, closed = search.compute_excess(without), search.compute_excess(having)
+        excess_without, excess_with = (
+            search.compute_excess(reduced_model),
+            search.compute_excess(full_model),
+        )
         # Errors of a motion without feedback accumulate, whatever their cause.
-        better = (
+        is_better = (
             after > before + INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO and excesses[1] < excesses[0]
         )
-        if better and closed < CLEARLY_CLOSED * left:
+        if is_better and excess_with < CLEARLY_CLOSED * excess_without:
             return True
         # A limit that no held-out run approaches cannot be tested there; the result would be
         # random.
-        faint = max(excesses) < HELD_OUT_EXCESS_THRESHOLD and is_indistinguishable(before - after)
-        return faint and left > HELD_OUT_EXCESS_THRESHOLD and explains_gap((left - closed) / left)
+        is_hardly_visible = max(excesses) < HELD_OUT_EXCESS_THRESHOLD and is_indistinguishable(
+            before - after
+        )
+        return (
+            is_hardly_visible
+            and excess_without > HELD_OUT_EXCESS_THRESHOLD
+            and explains_gap((excess_without - excess_with) / excess_without)
+        )
 
-    def has_unexplained_gap(self, model: FittedModel, left: LackOfFitResult) -> bool:
+    def has_unexplained_gap(self, model: FittedModel, lack_of_fit: LackOfFitResult) -> bool:
         """Return whether held-out runs show a discrepancy that the model does not remove.
 
         Args:
             model: the model, which has been evaluated.
-            left: its lack-of-fit result.
+            lack_of_fit: its lack-of-fit result.
         """
-        own = np.nan_to_num(model.likelihood.sigma)
+        residual_sigma = np.nan_to_num(model.likelihood.sigma)
         # The residual of fitted runs is noise if it has no structure; otherwise only the noise
         # floor is.
-        known = np.where(left.has_structure, 0.0, own)
-        noise = np.maximum(self.runs.noise.sigma, known)
+        known_noise = np.where(lack_of_fit.has_structure, 0.0, residual_sigma)
+        noise = np.maximum(self.runs.noise.sigma, known_noise)
         before = self.compute_excess((), noise)
         after = self.compute_excess(model.effects, noise)
         return misses_held_out_gap(before, after)

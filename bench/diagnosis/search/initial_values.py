@@ -49,23 +49,25 @@ def compute_reachable_levels(world: RunEvaluator, name: str) -> Array:
     """
     effect = world.available_effects[name]
     members = members_of(effect)
-    of = effect.coefficients[0].of
-    if of == "give":
+    kind = effect.coefficients[0].of
+    if kind == "give":
         # The coefficients after the first one are shape parameters.
         return np.array([list_coefficients(world, name)[0].bounds[1]])
-    if of == "drive" or (of == "level" and not _recorded(world, effect)):
+    if kind == "drive" or (kind == "level" and not _recorded(world, effect)):
         # The range of the quantity is not recorded, so the plausible range is used.
         return np.array([p.bounds[1] for p in list_coefficients(world, name)])
-    if of == "travel":
+    if kind == "travel":
         return np.array([world.get_effect_travel(name)])
-    found = {
+    level_functions = {
         "input/s": _max_input_rate,
         "input/s^2": _max_input_acceleration,
         "error": _max_servo_error,
         "level": _max_level,
     }
-    most = found.get(of, _largest)
-    return np.array([max(most(world, t, one) for t in world.tracks) for one in members])
+    level_function = level_functions.get(kind, _largest)
+    return np.array(
+        [max(level_function(world, t, member) for t in world.tracks) for member in members]
+    )
 
 
 def _command(track: RunData, effect: Effect) -> Array:
@@ -74,9 +76,9 @@ def _command(track: RunData, effect: Effect) -> Array:
     It is the first input if the effect names none, and zero if the run has no such input.
     """
     signals = track.scenario.inputs
-    nothing = np.zeros(track.scenario.times.size)
-    first = next(iter(signals.values()), nothing)
-    return signals.get(effect.signal, nothing) if effect.signal else first
+    zero_signal = np.zeros(track.scenario.times.size)
+    first_signal = next(iter(signals.values()), zero_signal)
+    return signals.get(effect.signal, zero_signal) if effect.signal else first_signal
 
 
 def _largest(world: RunEvaluator, track: RunData, effect: Effect) -> float:  # noqa: ARG001
@@ -86,8 +88,8 @@ def _largest(world: RunEvaluator, track: RunData, effect: Effect) -> float:  # n
 
 def _max_input_rate(world: RunEvaluator, track: RunData, effect: Effect) -> float:  # noqa: ARG001
     """Return the largest rate of change of an effect's input in a run, in its unit per second."""
-    risen = np.abs(np.diff(_command(track, effect)))
-    return float((risen / np.diff(track.scenario.times)).max(initial=0.0))
+    changes = np.abs(np.diff(_command(track, effect)))
+    return float((changes / np.diff(track.scenario.times)).max(initial=0.0))
 
 
 def _max_input_acceleration(world: RunEvaluator, track: RunData, effect: Effect) -> float:  # noqa: ARG001
@@ -110,8 +112,8 @@ def _recorded(world: RunEvaluator, effect: Effect) -> str:
 
 def _max_level(world: RunEvaluator, track: RunData, effect: Effect) -> float:
     """Return the maximum of the stored quantity, such as a tank's level, recorded in a run."""
-    shown = track.observed[:, world.channels.index(_recorded(world, effect))]
-    return float(np.nanmax(shown, initial=0.0))
+    levels = track.observed[:, world.channels.index(_recorded(world, effect))]
+    return float(np.nanmax(levels, initial=0.0))
 
 
 def _max_servo_error(world: RunEvaluator, track: RunData, effect: Effect) -> float:
@@ -124,13 +126,17 @@ def _max_servo_error(world: RunEvaluator, track: RunData, effect: Effect) -> flo
     name = system.coordinates[place]
     if name not in world.channels:
         return 0.0
-    turned = system.gear(place) * track.observed[:, world.channels.index(name)]
-    apart = _command(track, effect) - turned
-    return float(np.nanmax(np.abs(apart), initial=0.0))
+    motor_position = system.gear(place) * track.observed[:, world.channels.index(name)]
+    error = _command(track, effect) - motor_position
+    return float(np.nanmax(np.abs(error), initial=0.0))
 
 
 def generate_end_stops(
-    world: RunEvaluator, name: str, side: float, hardness: Sequence[float], depths: Sequence[float]
+    world: RunEvaluator,
+    name: str,
+    side: float,
+    stiffness_shares: Sequence[float],
+    depth_shares: Sequence[float],
 ) -> Iterator[Array]:
     """Yield coefficients (k,) of end stops on one side, for every stiffness and depth.
 
@@ -140,16 +146,18 @@ def generate_end_stops(
         world: the runs.
         name: name of the effect.
         side: 1 for the upper end, -1 for the lower end.
-        hardness: stiffnesses, as shares of the largest plausible one.
-        depths: depths within the range of the coordinate, as shares of the range.
+        stiffness_shares: stiffnesses, as shares of the largest plausible one.
+        depth_shares: depths within the range of the coordinate, as shares of the range.
     """
     low, high = world.get_coordinate_range(name)
     parameters = list_coefficients(world, name)
-    stiffest = parameters[0].bounds[1]
-    for part, share in product(hardness, depths) if low < high else ():
+    max_stiffness = parameters[0].bounds[1]
+    for stiffness_share, depth_share in (
+        product(stiffness_shares, depth_shares) if low < high else ()
+    ):
         c = np.zeros(len(parameters))
-        c[0] = side * part * stiffest
-        c[1] = (high if side > 0 else low) - side * share * (high - low)
+        c[0] = side * stiffness_share * max_stiffness
+        c[1] = (high if side > 0 else low) - side * depth_share * (high - low)
         yield c
 
 
@@ -189,11 +197,11 @@ def generate_equal_travel_end_stops(world: RunEvaluator, name: str, c: Array) ->
     if world.available_effects[name].coefficients[0].of != "stop" or not c[0]:
         return
     end = high if c[0] > 0 else low
-    for times in REFIT_STIFFNESS_FACTORS:
-        firmer = c.copy()
-        firmer[0] = times * c[0]
-        firmer[1] = end - (end - c[1]) * times**-0.4
-        yield firmer
+    for factor in REFIT_STIFFNESS_FACTORS:
+        end_stop = c.copy()
+        end_stop[0] = factor * c[0]
+        end_stop[1] = end - (end - c[1]) * factor**-0.4
+        yield end_stop
 
 
 def generate_event_times(world: RunEvaluator, name: str, c: Array) -> Iterator[Array]:
@@ -212,9 +220,13 @@ def generate_event_times(world: RunEvaluator, name: str, c: Array) -> Iterator[A
             continue
         first, last = world.clock
         stamps = np.unique(np.concatenate([track.scenario.times for track in world.tracks]))
-        between = (stamps[1:] + stamps[:-1]) / 2.0
-        near = between[np.abs(between - c[i]) <= (last - first) / (EVENT_TIME_COUNT + 1)]
-        for instant in near[:: -(-near.size // MAX_EVENT_TIME_SUBDIVISIONS) or 1].tolist():
-            moved = c.copy()
-            moved[i] = instant
-            yield moved
+        midpoints = (stamps[1:] + stamps[:-1]) / 2.0
+        near_midpoints = midpoints[
+            np.abs(midpoints - c[i]) <= (last - first) / (EVENT_TIME_COUNT + 1)
+        ]
+        for instant in near_midpoints[
+            :: -(-near_midpoints.size // MAX_EVENT_TIME_SUBDIVISIONS) or 1
+        ].tolist():
+            coefficients = c.copy()
+            coefficients[i] = instant
+            yield coefficients

@@ -1,7 +1,8 @@
 """Hat basis forces along single joints, for the lack-of-fit test of systems with several joints.
 
-They correspond to the hats of `search.lack_of_fit`, for systems in which each coordinate
-has its own drive and friction.
+A hat is a triangular basis function of time, position or speed: eq. (1) of
+`bench.diagnosis.search.lack_of_fit`. The forces here are for systems in which each coordinate has
+its own drive and friction.
 """
 
 from __future__ import annotations
@@ -45,14 +46,14 @@ class JointHatForce(Force):
             return np.zeros_like(moment.x)
         j = int(joint[acting[0], 0])
         x, v = moment.x[:, j, None], moment.v[:, j, None]
-        follows = int(variable[acting[0], 0])
-        value = (moment.t, x, np.abs(v))[follows]
+        variable_index = int(variable[acting[0], 0])
+        value = (moment.t, x, np.abs(v))[variable_index]
         # A hat that is off has zero width, which must not be a divisor.
         height = np.maximum(1.0 - np.abs(value - centre) / np.maximum(width, 1e-12), 0.0)
         dry = -v / (np.abs(v) + np.maximum(slow, 1e-9))
-        way = (np.ones_like(v), -v, dry)[int(direction[acting[0], 0])]
+        force_direction = (np.ones_like(v), -v, dry)[int(direction[acting[0], 0])]
         result = np.zeros_like(moment.x)
-        result[:, j] = (strength * height * way)[:, 0]
+        result[:, j] = (strength * height * force_direction)[:, 0]
         return result
 
 
@@ -76,7 +77,7 @@ def list_joint_families(world: RunEvaluator, slow: float) -> Iterator[JointHatFa
         slow: speed over which dry friction reverses its sign, as a share of the high speed of a
             joint.
     """
-    longest = world.longest
+    longest_run = world.longest
     for joint, name in enumerate(world.simulator.system.coordinates):
         if name not in world.channels:
             continue
@@ -84,16 +85,22 @@ def list_joint_families(world: RunEvaluator, slow: float) -> Iterator[JointHatFa
         # Quantiles instead of extremes, so that single outliers do not widen the range.
         low, high = (float(v) for v in np.nanquantile(values, [0.01, 0.99]))
         speed = _fastest(world, world.channels.index(name))
-        about = slow * speed
-        yield JointHatFamily(f"time, along {name}", joint, TIME, ALONG, 0.0, longest, about)
+        reversal_speed = slow * speed
+        yield JointHatFamily(
+            f"time, along {name}", joint, TIME, ALONG, 0.0, longest_run, reversal_speed
+        )
         if high > low:
-            for direction, how in ((ALONG, "along it"), (AGAINST, "against it"), (DRY, "dry")):
-                label = f"position {name}, {how}"
-                yield JointHatFamily(label, joint, POSITION, direction, low, high, about)
+            for direction, direction_text in (
+                (ALONG, "along it"),
+                (AGAINST, "against it"),
+                (DRY, "dry"),
+            ):
+                label = f"position {name}, {direction_text}"
+                yield JointHatFamily(label, joint, POSITION, direction, low, high, reversal_speed)
         if speed > 0:
-            for direction, how in ((AGAINST, "against it"), (DRY, "dry")):
-                label = f"speed of {name}, {how}"
-                yield JointHatFamily(label, joint, SPEED, direction, 0.0, speed, about)
+            for direction, direction_text in ((AGAINST, "against it"), (DRY, "dry")):
+                label = f"speed of {name}, {direction_text}"
+                yield JointHatFamily(label, joint, SPEED, direction, 0.0, speed, reversal_speed)
 
 
 def _fastest(world: RunEvaluator, channel: int) -> float:

@@ -100,16 +100,22 @@ class HatForce(Force):
         axes = moment.x.shape[1]
         variables = [moment.t, moment.speed, *(moment.x[:, k, None] for k in range(axes))]
         # The batch elements of one call follow different variables; each element has exactly one.
-        value = sum(np.where(variable == i, one, 0.0) for i, one in enumerate(variables))
+        value = sum(
+            np.where(variable == i, variable_value, 0.0)
+            for i, variable_value in enumerate(variables)
+        )
         # A hat that is off has zero width, which must not be a divisor.
         reach = np.maximum(width, 1e-12)
         distance = np.abs(value - centre) / reach
         height = np.maximum(1.0 - distance, 0.0)  # (1)
         # The force is smooth in the speed, so no step must be shortened where the motion reverses.
         dry = -moment.v / (moment.speed + np.maximum(slow, 1e-9))
-        ways = [-moment.v, dry, *(np.eye(axes)[axis] for axis in range(axes))]
-        chosen = sum(np.where(direction == i, way, 0.0) for i, way in enumerate(ways))
-        result: Array = strength * height * chosen
+        force_directions = [-moment.v, dry, *(np.eye(axes)[axis] for axis in range(axes))]
+        selected_direction = sum(
+            np.where(direction == i, force_direction, 0.0)
+            for i, force_direction in enumerate(force_directions)
+        )
+        result: Array = strength * height * selected_direction
         return result
 
 
@@ -152,20 +158,26 @@ def assess_lack_of_fit(models: ModelSet, model: FittedModel) -> LackOfFitResult:
         models: the models of the recording.
         model: the fitted model.
     """
-    world, stated = models.world, models.stated
-    quick = assess_residual_size(models, model)
+    world, is_noise_stated = models.world, models.stated
+    size_result = assess_residual_size(models, model)
     if not any(probe.name in world.slots for probe in (HatForce, JointHatForce)):
-        return quick
+        return size_result
     world.watch.report_and_check("a force of any shape")
-    known = models.force_of_any_shape(model)
-    level = get_structure_threshold(bool(stated.all()))
+    force_test = models.force_of_any_shape(model)
+    level = get_structure_threshold(bool(is_noise_stated.all()))
     # The linear innovations test decides if it finds no force; otherwise the force is simulated.
-    if known is not None and known[0] > level:
-        return LackOfFitResult(known[0], known[1], quick.excess, quick.channels_above_noise, level)
+    if force_test is not None and force_test[0] > level:
+        return LackOfFitResult(
+            force_test[0],
+            force_test[1],
+            size_result.excess,
+            size_result.channels_above_noise,
+            level,
+        )
     model = models.refine_jacobian(model)
     directions = compute_hat_directions(world, model)
     if not directions.candidates:
-        return quick
+        return size_result
     residual = models.compute_residual(model.fit)
     test = ScoreTest(
         model.fit, directions, models.observed_mask, models.compute_channel_weights(model)
@@ -175,13 +187,15 @@ def assess_lack_of_fit(models: ModelSet, model: FittedModel) -> LackOfFitResult:
         test,
         residual,
         lambda count: draw_surrogates(
-            residual, models.observed_mask, count, rng, left=test.project_out
+            residual, models.observed_mask, count, rng, project_out=test.project_out
         ),
         SURROGATE_COUNT,
     )
-    promise = scores.score - scores.null_quantiles
-    where = scores.effects[int(np.argmax(promise))]
-    return LackOfFitResult(scores.p_value, where, quick.excess, quick.channels_above_noise, level)
+    score_excess = scores.score - scores.null_quantiles
+    best_force = scores.effects[int(np.argmax(score_excess))]
+    return LackOfFitResult(
+        scores.p_value, best_force, size_result.excess, size_result.channels_above_noise, level
+    )
 
 
 def assess_residual_size(models: ModelSet, model: FittedModel) -> LackOfFitResult:
@@ -193,8 +207,8 @@ def assess_residual_size(models: ModelSet, model: FittedModel) -> LackOfFitResul
     """
     sigma = model.likelihood.sigma
     # A channel without samples has no sigma and no residual.
-    left = np.where(np.isfinite(sigma), sigma, 0.0)
-    excess = left / models.noise.sigma
+    residual_sigma = np.where(np.isfinite(sigma), sigma, 0.0)
+    excess = residual_sigma / models.noise.sigma
     channels = []
     for c, name in enumerate(models.world.channels):
         error = _sigma_standard_error(models, model, c)
@@ -273,8 +287,8 @@ def _on_joint(
     family: JointHatFamily, size: float, centre: float, width: float
 ) -> tuple[str, Array]:
     """Return the name of the effect and the coefficients of one hat force at a joint of a robot."""
-    follows = family.joint, family.variable, centre, width, family.direction, family.slow
-    return JointHatForce.name, np.array([size, *follows])
+    other_coefficients = family.joint, family.variable, centre, width, family.direction, family.slow
+    return JointHatForce.name, np.array([size, *other_coefficients])
 
 
 def _anywhere(
@@ -310,11 +324,13 @@ def _over_time(world: RunEvaluator) -> Iterator[_Family]:
     for track in world.tracks:
         times = track.scenario.times
         durations.append(float(times[-1] - times[0]))
-    longest = max(durations)
+    longest_run = max(durations)
     for axis, name in enumerate(world.simulator.system.coordinates):
         if name in world.channels:
-            yield _Family(f"time, along {name}", TIME_VARIABLE, AXIS_DIRECTION + axis, 0.0, longest)
-    yield _Family("time, against the motion", TIME_VARIABLE, VISCOUS_DIRECTION, 0.0, longest)
+            yield _Family(
+                f"time, along {name}", TIME_VARIABLE, AXIS_DIRECTION + axis, 0.0, longest_run
+            )
+    yield _Family("time, against the motion", TIME_VARIABLE, VISCOUS_DIRECTION, 0.0, longest_run)
 
 
 def _over_positions(world: RunEvaluator) -> Iterator[_Family]:

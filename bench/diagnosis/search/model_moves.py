@@ -48,10 +48,10 @@ class ModelMoves(ScoredModelSet):
             model: the model.
             name: name of the effect.
         """
-        rest = frozenset(n for n in model.effects if n != name)
-        if rest not in self.models:
+        remaining_effects = frozenset(n for n in model.effects if n != name)
+        if remaining_effects not in self.models:
             self._lessen(model, [name])
-        return self.models[rest]
+        return self.models[remaining_effects]
 
     def _lessen(self, model: FittedModel, names: Iterable[str]) -> None:
         """Fit and store the models that lack one of the effects `names`.
@@ -64,11 +64,11 @@ class ModelMoves(ScoredModelSet):
             # it is.
             theta = model.fit.theta.copy()
             theta[self.world.slots[name]] = 0.0
-            rest = tuple(n for n in model.effects if n != name)
-            known = model.fit.get_known_jacobian().drop_parameters(
+            remaining_effects = tuple(n for n in model.effects if n != name)
+            known_jacobian = model.fit.get_known_jacobian().drop_parameters(
                 self.world.get_coefficient_indices(name)
             )
-            starts.append(FitStart(rest, theta, model.fit.states, known))
+            starts.append(FitStart(remaining_effects, theta, model.fit.states, known_jacobian))
         self.refit_models(starts)
 
     def drop_unneeded_effects(self, model: FittedModel) -> FittedModel:
@@ -82,9 +82,9 @@ class ModelMoves(ScoredModelSet):
             self._lessened.add(key)
             self._lessen(model, model.effects)
         for name in model.effects:
-            smaller = self.remove_effect(model, name)
-            if smaller.penalised_log_likelihood >= model.penalised_log_likelihood:
-                return self.drop_unneeded_effects(smaller)
+            submodel = self.remove_effect(model, name)
+            if submodel.penalised_log_likelihood >= model.penalised_log_likelihood:
+                return self.drop_unneeded_effects(submodel)
         return model
 
     def simplify_laws(self, model: FittedModel) -> FittedModel:
@@ -96,14 +96,17 @@ class ModelMoves(ScoredModelSet):
         """
         for name in model.effects:
             for parts in self._parts(model, name):
-                other = self._with_parts(model, name, parts)
-                enough = (
+                simpler_model = self._with_parts(model, name, parts)
+                is_excess_close = (
                     self.compute_excess(model)
-                    > MAX_RICHER_LAW_EXCESS_RATIO * self.compute_excess(other)
+                    > MAX_RICHER_LAW_EXCESS_RATIO * self.compute_excess(simpler_model)
                     > 0.0
                 )
-                if other.penalised_log_likelihood >= model.penalised_log_likelihood or enough:
-                    return self.simplify_laws(other)
+                if (
+                    simpler_model.penalised_log_likelihood >= model.penalised_log_likelihood
+                    or is_excess_close
+                ):
+                    return self.simplify_laws(simpler_model)
         return model
 
     def _parts(self, model: FittedModel, name: str) -> Iterator[EffectStarts]:
@@ -113,30 +116,38 @@ class ModelMoves(ScoredModelSet):
         active member of a family.
         """
         effects, slots = self.world.available_effects, self.world.slots
-        own = model.fit.theta[slots[name]]
-        together, begin = EffectStarts(), 0
+        coefficients = model.fit.theta[slots[name]]
+        part_coefficients, begin = EffectStarts(), 0
         for part in effects[name].contains:
             if part in effects and effects[part].place == effects[name].place:
                 # The scaling coefficient of a contained law comes first in the law that contains
                 # it.
                 end = begin + slots[part].stop - slots[part].start
-                together[part], begin = own[begin:end], end
-        yield from ({part: c} for part, c in together.items())
+                part_coefficients[part], begin = coefficients[begin:end], end
+        yield from ({part: c} for part, c in part_coefficients.items())
         # If the shape parameter of a law lies outside the range of the data, the law acts as the
         # sum of its parts. One law with a time far longer than the runs replaces two simpler laws,
         # and fits the data immediately.
-        if len(together) > 1:
-            yield together
+        if len(part_coefficients) > 1:
+            yield part_coefficients
         members = getattr(effects[name], "members", ())
-        each = len(members[0].coefficients) if members else 0
+        coefficient_count = len(members[0].coefficients) if members else 0
         # A coefficient shared by all places says nothing about a single place.
-        if len(members) > 1 and own.size == each * len(members):
+        if len(members) > 1 and coefficients.size == coefficient_count * len(members):
             free = model.fit.free.tolist()
             columns = [free.index(place) for place in self.world.get_coefficient_indices(name)]
             responses = np.sqrt(np.square(model.fit.jacobian[..., columns]).sum(axis=(0, 1, 2)))
-            sizes = (np.abs(own) * responses).reshape(len(members), each).max(axis=1)
-            most = int(np.argmax(sizes))
-            yield {members[most].name: own[each * most : each * (most + 1)]}
+            sizes = (
+                (np.abs(coefficients) * responses)
+                .reshape(len(members), coefficient_count)
+                .max(axis=1)
+            )
+            largest_member = int(np.argmax(sizes))
+            yield {
+                members[largest_member].name: coefficients[
+                    coefficient_count * largest_member : coefficient_count * (largest_member + 1)
+                ]
+            }
 
     def _with_parts(self, model: FittedModel, name: str, parts: EffectStarts) -> FittedModel:
         """Fit the model with the simpler effects `parts` in place of the richer effect `name`.
@@ -148,11 +159,11 @@ class ModelMoves(ScoredModelSet):
         names = tuple(dict.fromkeys(chain.from_iterable(replaced)))
         key, step = frozenset(names), (frozenset(model.effects), frozenset(names))
         # A known model may be at a poor local minimum, so it is fitted again unless it is better.
-        behind = (
+        is_fit_needed = (
             key not in self.models
             or self.models[key].penalised_log_likelihood < model.penalised_log_likelihood
         )
-        if behind and step not in self._simplified:
+        if is_fit_needed and step not in self._simplified:
             self._simplified.add(step)
             theta = model.fit.theta.copy()
             theta[self.world.slots[name]] = 0.0

@@ -37,29 +37,31 @@ def refine_best_model(search: EffectSearch, model: FittedModel) -> FittedModel:
     size = len(model.effects)
     if search.settled_effects != frozenset(model.effects):
         model = _swap_each_effect(search, model)
-    around = list(generate_frequency_neighbours(search.world, model.fit))
+    neighbour_starts = list(generate_frequency_neighbours(search.world, model.fit))
     # Periodic effects have dozens of local minima.
-    if around:
+    if neighbour_starts:
         search.refit_from_segments(size)
-    near = list_competing_models(search, model)
-    parts = list_submodels(search, model)
+    competing_models = list_competing_models(search, model)
+    submodels = list_submodels(search, model)
     noise = _estimate_model_noise(search, model)
-    judged = [model]
+    compared_models = [model]
     # With structure in the residual, merit only compares how well models mimic it, so no rival
     # replaces the model.
     if noise is not None:
-        judged = [
+        compared_models = [
             m
-            for m in near
+            for m in competing_models
             if abs(model.penalised_log_likelihood - m.penalised_log_likelihood)
             < MAX_COMPETITOR_DISTANCE
         ] or [model]
-    starts = [m.fit.make_start() for m in near]
-    starts += [m.fit.make_start() for m in parts]
-    starts += [_make_swapped_start(search, model, m) for m in judged if _differs_in_one(model, m)]
-    search.refit_models([*starts, *around], noise)
+    starts = [m.fit.make_start() for m in competing_models]
+    starts += [m.fit.make_start() for m in submodels]
+    starts += [
+        _make_swapped_start(search, model, m) for m in compared_models if _differs_in_one(model, m)
+    ]
+    search.refit_models([*starts, *neighbour_starts], noise)
     # A refit that ends worse is not stored, so the table contains the best fit of each model.
-    refitted = [search.models[frozenset(m.effects)] for m in judged]
+    refitted = [search.models[frozenset(m.effects)] for m in compared_models]
     return max(refitted, key=lambda m: m.penalised_log_likelihood)
 
 
@@ -69,36 +71,40 @@ def _swap_each_effect(search: EffectSearch, model: FittedModel) -> FittedModel:
     Unlike `swap_effect`, which refits only the most promising candidates, all are fitted.
     """
     size = len(model.effects)
-    known = set(search.models)
-    smaller = [search.remove_effect(model, name) for name in model.effects]
-    search.refit_extensions(smaller, len(search.world.library))
+    known_effect_sets = set(search.models)
+    submodels = [search.remove_effect(model, name) for name in model.effects]
+    search.refit_extensions(submodels, len(search.world.library))
     best = model
-    for key, other in search.models.items():
+    for key, other_model in search.models.items():
         # The search has already compared the known models.
-        if key in known or len(key) != size:
+        if key in known_effect_sets or len(key) != size:
             continue
-        if other.penalised_log_likelihood > best.penalised_log_likelihood:
-            best = other
+        if other_model.penalised_log_likelihood > best.penalised_log_likelihood:
+            best = other_model
     return best
 
 
-def _differs_in_one(model: FittedModel, other: FittedModel) -> bool:
-    """Return whether `other` has all effects of a model of at least two effects except one."""
-    return len(model.effects) > 1 and len(set(model.effects) - set(other.effects)) == 1
+def _differs_in_one(model: FittedModel, other_model: FittedModel) -> bool:
+    """Return whether `other_model` has all effects except one of a model with several effects."""
+    return len(model.effects) > 1 and len(set(model.effects) - set(other_model.effects)) == 1
 
 
-def _make_swapped_start(search: EffectSearch, model: FittedModel, other: FittedModel) -> FitStart:
+def _make_swapped_start(
+    search: EffectSearch, model: FittedModel, other_model: FittedModel
+) -> FitStart:
     """Return a start for a rival in which all shared effects have the values of the model.
 
     A law with several coefficients converges to slightly different values each time, which would
     make equivalent models look different.
     """
-    (own,), (gone,) = (set(m.effects) - set(n.effects) for m, n in ((other, model), (model, other)))
+    (added_effect,), (removed_effect,) = (
+        set(m.effects) - set(n.effects) for m, n in ((other_model, model), (model, other_model))
+    )
     slots = search.world.slots
     theta = model.fit.theta.copy()
-    theta[slots[gone]] = 0.0
-    theta[slots[own]] = other.fit.theta[slots[own]]
-    return FitStart(other.effects, theta, model.fit.states)
+    theta[slots[removed_effect]] = 0.0
+    theta[slots[added_effect]] = other_model.fit.theta[slots[added_effect]]
+    return FitStart(other_model.effects, theta, model.fit.states)
 
 
 def list_competing_models(search: EffectSearch, model: FittedModel) -> list[FittedModel]:
@@ -110,23 +116,25 @@ def list_competing_models(search: EffectSearch, model: FittedModel) -> list[Fitt
     """
     size = len(model.effects)
     return [
-        other
-        for other in search.models.values()
-        if len(other.effects) == size and _is_competitive(search, other, model)
+        other_model
+        for other_model in search.models.values()
+        if len(other_model.effects) == size and _is_competitive(search, other_model, model)
     ]
 
 
-def _is_competitive(search: EffectSearch, other: FittedModel, model: FittedModel) -> bool:
+def _is_competitive(search: EffectSearch, other_model: FittedModel, model: FittedModel) -> bool:
     """Return whether two models are close in merit or in excess.
 
     Merit is misleading if the residual has structure.
     """
     if (
-        abs(model.penalised_log_likelihood - other.penalised_log_likelihood)
+        abs(model.penalised_log_likelihood - other_model.penalised_log_likelihood)
         < MAX_COMPETITOR_DISTANCE
     ):
         return True
-    return search.compute_excess(other) < MAX_COMPETITOR_EXCESS_RATIO * search.compute_excess(model)
+    return search.compute_excess(other_model) < MAX_COMPETITOR_EXCESS_RATIO * search.compute_excess(
+        model
+    )
 
 
 def list_submodels(search: EffectSearch, model: FittedModel) -> list[FittedModel]:
@@ -138,11 +146,11 @@ def list_submodels(search: EffectSearch, model: FittedModel) -> list[FittedModel
     """
     names = set(model.effects)
     size = len(names) - 1
-    smaller = []
-    for other in search.models.values():
-        if len(other.effects) == size and set(other.effects) < names:
-            smaller.append(other)
-    return smaller
+    submodels = []
+    for other_model in search.models.values():
+        if len(other_model.effects) == size and set(other_model.effects) < names:
+            submodels.append(other_model)
+    return submodels
 
 
 def _estimate_model_noise(search: EffectSearch, model: FittedModel) -> NoiseModel | None:

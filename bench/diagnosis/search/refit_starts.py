@@ -54,7 +54,7 @@ def select_refit_starts(
     world: RunEvaluator,
     noise: NoiseModel,
     model: FittedModel,
-    found: DirectionSet,
+    direction_set: DirectionSet,
     scores: CandidateScores,
     most: int,
     patient: bool,
@@ -65,7 +65,7 @@ def select_refit_starts(
         world: the runs.
         noise: noise of each channel.
         model: the model to extend.
-        found: sensitivity directions of the candidates.
+        direction_set: sensitivity directions of the candidates.
         scores: their scores.
         most: maximum number of candidates.
         patient: whether to include all candidates, or for robots up to `MAX_REFITS_THOROUGH`.
@@ -76,17 +76,19 @@ def select_refit_starts(
     if patient and world.has_linearisation:
         most, share = MAX_REFITS_THOROUGH, 0.0
     # If scores are less reliable, they only order the patient fits, and exclude none.
-    everything = patient and not world.has_linearisation
+    is_all_wanted = patient and not world.has_linearisation
     for i in _rank_candidates(
-        scores, most, share, everything, _find_simulated_scores(world, scores)
+        scores, most, share, is_all_wanted, _find_simulated_scores(world, scores)
     ):
         name = scores.effects[i]
         # The score peaks of an effect are fitted separately, because each may lead to its own
         # minimum.
         for peak, (group, scored) in enumerate(scores.peaks[i]):
-            known = _predict_jacobian(world, model, found, group, name)
-            for c in _list_start_sizes(world, found, group, scored, name):
-                start = replace(with_effect(world, model.fit.make_start(), name, c), known=known)
+            known_jacobian = _predict_jacobian(world, model, direction_set, group, name)
+            for c in _list_start_sizes(world, direction_set, group, scored, name):
+                start = replace(
+                    with_effect(world, model.fit.make_start(), name, c), known=known_jacobian
+                )
                 numbered.append((peak, start))
     # Patient fits begin with the first part of the runs, so starts are compared there.
     share = FIT_HORIZONS[0].share if patient else 1.0
@@ -112,7 +114,7 @@ def _find_simulated_scores(world: RunEvaluator, scores: CandidateScores) -> froz
 
 
 def _rank_candidates(
-    scores: CandidateScores, most: int, share: float, everything: bool, apart: frozenset[int]
+    scores: CandidateScores, most: int, share: float, is_all_wanted: bool, simulated: frozenset[int]
 ) -> list[int]:
     """Return the indices of the candidates to refit, the most promising first.
 
@@ -120,25 +122,27 @@ def _rank_candidates(
         scores: scores of all candidates.
         most: maximum number of candidates by their score.
         share: minimum score above the null level, as a share of the best one.
-        everything: whether to return all candidates.
-        apart: candidates scored by full simulation, which are selected separately.
+        is_all_wanted: whether to return all candidates.
+        simulated: candidates scored by full simulation, which are selected separately.
     """
-    promise = scores.score - scores.null_quantiles
-    ranked: list[int] = np.argsort(-promise, kind="stable").tolist()
-    if everything:
+    score_excess = scores.score - scores.null_quantiles
+    ranked: list[int] = np.argsort(-score_excess, kind="stable").tolist()
+    if is_all_wanted:
         return ranked
     # Far from the data, the score of a full simulation may exceed the first-order score of the true
     # effect, so such candidates are added to the others and displace none.
-    order = [i for i in ranked if i not in apart]
-    good = [i for i in order if promise[i] >= share * promise[order[0]]][:most]
+    order = [i for i in ranked if i not in simulated]
+    selected = [i for i in order if score_excess[i] >= share * score_excess[order[0]]][:most]
     by_squares = [
-        int(i) for i in np.argsort(-scores.white_noise_scores, kind="stable") if i not in apart
+        int(i) for i in np.argsort(-scores.white_noise_scores, kind="stable") if i not in simulated
     ]
-    besides = by_squares[:MAX_REFITS_BY_SQUARES]
-    leading = promise[order[0]] if order else -np.inf
-    whole = [i for i in ranked if i in apart and promise[i] >= leading][:MAX_REFITS_BY_SIMULATION]
-    good += [i for i in besides if i not in good]
-    return good + whole
+    selected_by_squares = by_squares[:MAX_REFITS_BY_SQUARES]
+    best_excess = score_excess[order[0]] if order else -np.inf
+    selected_by_simulation = [
+        i for i in ranked if i in simulated and score_excess[i] >= best_excess
+    ][:MAX_REFITS_BY_SIMULATION]
+    selected += [i for i in selected_by_squares if i not in selected]
+    return selected + selected_by_simulation
 
 
 def with_effect(world: RunEvaluator, start: FitStart, name: str, c: Array) -> FitStart:
@@ -154,16 +158,20 @@ def with_effect(world: RunEvaluator, start: FitStart, name: str, c: Array) -> Fi
     contained, theta = effect.contains, start.theta.copy()
     # An effect and one that it contains together would have no unique solution.
     for part in sorted(set(contained) & set(start.effects)):
-        own = world.slots[part]
-        c = effect.taking(c, part, theta[own])
-        theta[own] = 0.0
+        place = world.slots[part]
+        c = effect.taking(c, part, theta[place])
+        theta[place] = 0.0
     theta[world.slots[name]] = c
-    rest = [n for n in start.effects if n not in contained]
-    return FitStart((*rest, name), theta, start.states)
+    remaining_effects = [n for n in start.effects if n not in contained]
+    return FitStart((*remaining_effects, name), theta, start.states)
 
 
 def _predict_jacobian(
-    world: RunEvaluator, model: FittedModel, found: DirectionSet, group: DirectionGroup, name: str
+    world: RunEvaluator,
+    model: FittedModel,
+    direction_set: DirectionSet,
+    group: DirectionGroup,
+    name: str,
 ) -> KnownJacobian | None:
     """Return approximate derivatives of the model with one more effect of small size.
 
@@ -173,34 +181,44 @@ def _predict_jacobian(
     if not world.has_linearisation:
         return None
     columns = {
-        found.candidates[i].place: i for i in group.column_indices if not found.candidates[i].fixed
+        direction_set.candidates[i].place: i
+        for i in group.column_indices
+        if not direction_set.candidates[i].fixed
     }
     places = world.get_coefficient_indices(name)
     shaping = [i for i in range(len(places)) if world.parameters[places[i]].bounds[0] > 0]
     if not columns or shaping:
         return None
-    jacobian = np.zeros((*found.responses.shape[:3], len(places)))
+    jacobian = np.zeros((*direction_set.responses.shape[:3], len(places)))
     for place, column in columns.items():
-        jacobian[..., place] = found.responses[..., column]
+        jacobian[..., place] = direction_set.responses[..., column]
     contained = [
         world.get_coefficient_indices(n)
         for n in world.available_effects[name].contains
         if n in model.effects
     ]
-    gone = {place for span in contained for place in span}
-    return model.fit.get_known_jacobian().drop_parameters(gone).add_parameters(places, jacobian)
+    replaced_places = {place for span in contained for place in span}
+    return (
+        model.fit.get_known_jacobian()
+        .drop_parameters(replaced_places)
+        .add_parameters(places, jacobian)
+    )
 
 
 def _list_start_sizes(
-    world: RunEvaluator, found: DirectionSet, group: DirectionGroup, scored: Array, name: str
+    world: RunEvaluator,
+    direction_set: DirectionSet,
+    group: DirectionGroup,
+    estimate: Array,
+    name: str,
 ) -> Iterator[Array]:
     """Yield initial coefficients of an effect, from which its fit may reach different local minima.
 
-    They are the linear estimate `scored`, smaller shares of it, and shares of the plausible range.
-    `group` has the directions of the effect at one grid point.
+    They are the linear estimate (`estimate`), smaller shares of it, and shares of the plausible
+    range. `group` has the directions of the effect at one grid point.
     """
     bounds = compute_coefficient_bounds(world, name)
-    first = found.candidates[group.column_indices[0]]
+    first = direction_set.candidates[group.column_indices[0]]
     # A direction for one full size says nothing about other sizes.
     if first.fixed:
         yield first.coefficients
@@ -208,8 +226,8 @@ def _list_start_sizes(
         return
     for share in SIZE_SHARES:
         c = first.coefficients.copy()
-        for column, size in zip(group.column_indices, scored, strict=True):
-            place = found.candidates[column].place
+        for column, size in zip(group.column_indices, estimate, strict=True):
+            place = direction_set.candidates[column].place
             c[place] = share * float(np.clip(size, *bounds[place]))
         yield c
         yield from generate_event_times(world, name, c)
@@ -247,17 +265,17 @@ def _select_nearest_start(
     states = np.concatenate([s.states for s in starts])
     lanes = np.tile(np.arange(runs), count)
     # All starts are simulated in one engine call, as one batch.
-    seen = world.simulate(theta, lanes, states, share)
-    seen = seen.reshape(count, runs, *seen.shape[1:])
-    counted = world.get_sample_mask(share)
+    predictions = world.simulate(theta, lanes, states, share)
+    predictions = predictions.reshape(count, runs, *predictions.shape[1:])
+    sample_mask = world.get_sample_mask(share)
     best: dict[tuple[int, EffectNames], tuple[float, FitStart]] = {}
-    for (number, start), simulated in zip(numbered, seen, strict=True):
+    for (number, start), simulated in zip(numbered, predictions, strict=True):
         residual = world.observed - simulated
-        left = np.where(counted, residual, 0.0) / noise.sigma
-        cost = float(np.square(left).sum())
+        normalised_residual = np.where(sample_mask, residual, 0.0) / noise.sigma
+        cost = float(np.square(normalised_residual).sum())
         key = (number, start.effects)
-        nearest = best[key][0] if key in best else np.inf
+        lowest_cost = best[key][0] if key in best else np.inf
         # A failed simulation has the cost NaN, which is never the lowest.
-        if cost < nearest:
+        if cost < lowest_cost:
             best[key] = cost, start
     return [start for _, start in best.values()]

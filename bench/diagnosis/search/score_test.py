@@ -107,7 +107,7 @@ class ScoreTest:
     """
 
     def __init__(
-        self, at: TrajectoryFit, directions: DirectionSet, seen: Mask, noise: NoiseModel
+        self, fit: TrajectoryFit, directions: DirectionSet, observed_mask: Mask, noise: NoiseModel
     ) -> None:
         """Prepare what does not depend on the residual: groups, products and log-determinants.
 
@@ -117,11 +117,13 @@ class ScoreTest:
         """
         self._groups = group_directions(directions)
         self._batches = batch_groups(self._groups)
-        self._count = int(seen.sum())
+        self._count = int(observed_mask.sum())
         blocks = [batch.columns for batch in self._batches]
-        self._design = WhiteningDesign(at, directions.responses, seen, noise.sigma, blocks)
+        self._design = WhiteningDesign(
+            fit, directions.responses, observed_mask, noise.sigma, blocks
+        )
         self._determinants = {
-            phi: 2.0 * compute_log_determinant(seen, np.full(seen.shape[2], phi))
+            phi: 2.0 * compute_log_determinant(observed_mask, np.full(observed_mask.shape[2], phi))
             for phi in PHI_GRID
         }
 
@@ -141,9 +143,9 @@ class ScoreTest:
                 p-value.
         """
         # The residual comes first, and is scored with the same products as the surrogates.
-        drawn = np.zeros((0, *residual.shape)) if surrogate is None else surrogate
-        table = _BestScores(self._groups, 1 + len(drawn), self._count)
-        products = InnerProducts(self._design, residual[None], drawn)
+        surrogates = np.zeros((0, *residual.shape)) if surrogate is None else surrogate
+        table = _BestScores(self._groups, 1 + len(surrogates), self._count)
+        products = InnerProducts(self._design, residual[None], surrogates)
         # The sums of products from one pass over the samples serve every correlation of the grid.
         for phi, determinant in self._determinants.items():
             total, grams, cross = products.project(phi)
@@ -223,19 +225,20 @@ class _BestScores:
         """
         self._phi, self._determinant, self._total = phi, determinant, total
         self._gains[...] = 0.0
-        nothing = self._value(total, total)
-        self._without = np.maximum(self._without, nothing)
+        value_without_effects = self._value(total, total)
+        self._without = np.maximum(self._without, value_without_effects)
 
-    def _value(self, left: Array, total: Array) -> Array:
+    def _value(self, remaining_squares: Array, total_squares: Array) -> Array:
         """Return l(phi) of eq. (3), twice the log-likelihood, at the present correlation.
 
         Args:
-            left: sums of squares of the residual after the directions have explained their part.
-            total: sums of squares before, which limit the logarithm.
+            remaining_squares: sums of squares of the residual after the directions have explained
+                their part.
+            total_squares: sums of squares before, which limit the logarithm.
         """
         # A fully explained residual leaves only rounding, so the logarithm is bounded.
-        floor = 1e-12 * total + 1e-300
-        logarithms = np.log(np.maximum(left, floor))
+        floor = 1e-12 * total_squares + 1e-300
+        logarithms = np.log(np.maximum(remaining_squares, floor))
         result: Array = self._determinant - self._count * logarithms
         return result
 
@@ -252,13 +255,13 @@ class _BestScores:
         present, first = np.unique(rows[order], return_index=True)
         largest = np.maximum.reduceat(gain[order], first, axis=0)
         self._gains[present] = np.maximum(self._gains[present], largest)
-        own = self._value(self._total[0] - gain[:, 0], self._total[0])
+        value = self._value(self._total[0] - gain[:, 0], self._total[0])
         # The first residual is the observed one; only its coefficients are used as starts of fits.
-        better = own > self._values[batch.places]
-        places = batch.places[better]
-        self._values[places] = own[better]
+        is_better = value > self._values[batch.places]
+        places = batch.places[is_better]
+        self._values[places] = value[is_better]
         self._phis[places] = self._phi
-        self._coefficients[places, : coefficients.shape[1]] = coefficients[better]
+        self._coefficients[places, : coefficients.shape[1]] = coefficients[is_better]
 
     def end(self) -> None:
         """Finish a correlation: update the best likelihood of each effect from its groups."""
@@ -266,22 +269,24 @@ class _BestScores:
         self._best = np.maximum(self._best, values)
         # With phi = 0, whitening leaves sums of squares unchanged.
         if self._phi == 0 and len(self._names):
-            nothing = self._value(self._total[0], self._total[0])
-            self._white = np.maximum(values[:, 0] - nothing, 0.0)
+            value_without_effects = self._value(self._total[0], self._total[0])
+            self._white = np.maximum(values[:, 0] - value_without_effects, 0.0)
 
     def ranked(self) -> CandidateScores:
         """Return the scores of eq. (4) in descending order, with the p-value of eq. (5)."""
         gains = self._best - self._without  # (4)
         observed = gains[:, 0]
-        drawn = gains[:, 1:]
-        chance = np.zeros(len(self._names))
+        surrogate_gains = gains[:, 1:]
+        null_quantiles = np.zeros(len(self._names))
         p_value = 1.0
-        if drawn.shape[1]:
+        if surrogate_gains.shape[1]:
             # An effect with many shapes has higher scores under the null hypothesis, which must not
             # raise the level of other effects.
-            chance = np.quantile(drawn, NULL_QUANTILE, axis=1)
-            p_value = estimate_tail_p_value(drawn - chance[:, None], observed - chance)  # (5)
-        by_chance = drawn - chance[:, None]
+            null_quantiles = np.quantile(surrogate_gains, NULL_QUANTILE, axis=1)
+            p_value = estimate_tail_p_value(
+                surrogate_gains - null_quantiles[:, None], observed - null_quantiles
+            )  # (5)
+        null_scores = surrogate_gains - null_quantiles[:, None]
         order = np.argsort(-observed, kind="stable")
         phi = 0.0
         if order.size:
@@ -290,11 +295,11 @@ class _BestScores:
         return CandidateScores(
             effects=tuple(self._names[i] for i in order),
             score=observed[order],
-            null_quantiles=chance[order],
+            null_quantiles=null_quantiles[order],
             peaks=tuple(self._peaks(np.flatnonzero(self._rows == i)) for i in order),
             p_value=p_value,
             phi=phi,
-            null_scores=by_chance[order],
+            null_scores=null_scores[order],
             white_noise_scores=self._white[order],
         )
 
@@ -324,22 +329,22 @@ class _BestScores:
         return tuple(result)
 
 
-def estimate_tail_p_value(by_chance: Array, observed: Array) -> float:
+def estimate_tail_p_value(null_values: Array, observed: Array) -> float:
     """Return the p-value (5) of the largest observed value.
 
     Beyond the most extreme fifth of the surrogates, the tail is assumed to be exponential, as that
     of a likelihood ratio is.
 
     Args:
-        by_chance: (E, S) values of the surrogates; the maximum over E is compared.
+        null_values: (E, S) values of the surrogates; the maximum over E is compared.
         observed: (E,) observed values.
     """
     if not observed.size:
         return 1.0
-    largest = np.sort(by_chance.max(axis=0))
+    largest = np.sort(null_values.max(axis=0))
     value = float(observed.max())
     count = largest.size
-    above = int((largest >= value).sum())
+    exceedance_count = int((largest >= value).sum())
     # Counting cannot give less than one in the number of surrogates; smaller p-values are
     # extrapolated.
     first = int(TAIL_QUANTILE * count)
@@ -347,9 +352,9 @@ def estimate_tail_p_value(by_chance: Array, observed: Array) -> float:
     begin = extreme[0]
     if value <= begin or count < MIN_SURROGATES_FOR_TAIL:
         # The residual counts as one of the surrogates, so the p-value is never zero.
-        return (1.0 + above) / (1.0 + count)
+        return (1.0 + exceedance_count) / (1.0 + count)
     # The scale of an exponential distribution is its mean excess over the threshold.
-    beyond = extreme - begin
-    mean = max(float(beyond.mean()), 1e-9)
-    chance = TAIL_SHARE * np.exp(-(value - begin) / mean)
+    tail_excess = extreme - begin
+    mean_excess = max(float(tail_excess.mean()), 1e-9)
+    chance = TAIL_SHARE * np.exp(-(value - begin) / mean_excess)
     return float(chance)

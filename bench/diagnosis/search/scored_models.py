@@ -139,22 +139,24 @@ class ScoredModelSet(ModelSet):
             self._survey([model])
         if against is None:
             return self.scores_by_effects[key]
-        known = self.cached_scans[key]
+        stored_scan = self.cached_scans[key]
         self._look(model)
         # Directions cost one simulation per candidate, and are reused with other surrogates. The
         # spectrum of the noise is best estimated from a model with less structure in its residual.
         residual = self.compute_residual(model.fit)
         stream = self.make_rng("library", model.effects)
-        scores = _scored(known.test, residual, against, self.observed_mask, stream)
-        self._take(key, known._replace(scores=scores))
+        scores = _scored(stored_scan.test, residual, against, self.observed_mask, stream)
+        self._take(key, stored_scan._replace(scores=scores))
         return scores
 
-    def _survey(self, models: Sequence[FittedModel], beside: Sequence[FittedModel] = ()) -> None:
+    def _survey(
+        self, models: Sequence[FittedModel], other_kept_models: Sequence[FittedModel] = ()
+    ) -> None:
         """Score the effects that each of the models lacks.
 
         Args:
             models: models to score.
-            beside: further models whose stored results must not be removed.
+            other_kept_models: further models whose stored results must not be removed.
         """
         calls, keys = [], []
         for model in models:
@@ -165,11 +167,14 @@ class ScoredModelSet(ModelSet):
                 self.compute_residual(model.fit),
                 self.make_rng("library", model.effects),
             )
-            former = self.superseded_scans.pop(key, None)
+            previous_scan = self.superseded_scans.pop(key, None)
             # A model that has hardly moved keeps its directions.
-            if former is not None and self._moved(former.at, model.fit) < UNCHANGED_FIT_SIGMAS:
-                scores = _scored(former.test, residual, residual, self.observed_mask, stream)
-                self._take(key, former._replace(scores=scores))
+            if (
+                previous_scan is not None
+                and self._moved(previous_scan.at, model.fit) < UNCHANGED_FIT_SIGMAS
+            ):
+                scores = _scored(previous_scan.test, residual, residual, self.observed_mask, stream)
+                self._take(key, previous_scan._replace(scores=scores))
                 continue
             keys.append(key)
             calls.append(
@@ -183,45 +188,45 @@ class ScoredModelSet(ModelSet):
                 )
             )
         if calls:
-            most = max(len(lacking) for _, lacking, *_ in calls)
-            several = f" beside {len(calls)} models" if len(calls) > 1 else ""
-            self.world.watch.stage(f"testing {most} effects{several}", len(calls))
-        found = {}
-        for number, scanned in self.world.crew.map_unordered(self.world, _scan_model, calls):
-            found[number] = scanned
+            most = max(len(missing_effects) for _, missing_effects, *_ in calls)
+            further_text = f" beside {len(calls)} models" if len(calls) > 1 else ""
+            self.world.watch.stage(f"testing {most} effects{further_text}", len(calls))
+        scans = {}
+        for number, scan in self.world.crew.map_unordered(self.world, _scan_model, calls):
+            scans[number] = scan
             self.world.watch.advance()
         for number, key in enumerate(keys):
-            scores = self.scores_by_effects.get(key, found[number].scores)
+            scores = self.scores_by_effects.get(key, scans[number].scores)
             # Scores that were kept when the directions were removed remain valid.
-            self._take(key, found[number]._replace(scores=scores))
-        self._make_room([*keys, *(frozenset(model.effects) for model in beside)])
+            self._take(key, scans[number]._replace(scores=scores))
+        self._make_room([*keys, *(frozenset(model.effects) for model in other_kept_models)])
 
     def _look(self, model: FittedModel) -> None:
         """Report to the user that a model is scored now, and stop if the search has to end."""
-        about = " + ".join(model.effects) or "the base model"
-        self.world.watch.report_and_check(f"scores of the library about {about}")
+        model_text = " + ".join(model.effects) or "the base model"
+        self.world.watch.report_and_check(f"scores of the library about {model_text}")
 
-    def _make_room(self, asked: Sequence[frozenset[str]]) -> None:
+    def _make_room(self, kept_keys: Sequence[frozenset[str]]) -> None:
         """Remove the oldest stored directions until `DIRECTION_CACHE_BYTES` is not exceeded.
 
-        Those of the base model and of the models `asked` are kept.
+        Those of the base model and of the models `kept_keys` are kept.
         """
-        for kept in (self.superseded_scans, self.cached_scans):
-            for key in [k for k in kept if k and k not in asked]:
-                held = [*self.superseded_scans.items(), *self.cached_scans.items()]
+        for cache in (self.superseded_scans, self.cached_scans):
+            for key in [k for k in cache if k and k not in kept_keys]:
+                cached_entries = [*self.superseded_scans.items(), *self.cached_scans.items()]
                 if (
-                    sum(one.directions.responses.nbytes for k, one in held if k)
+                    sum(scan.directions.responses.nbytes for k, scan in cached_entries if k)
                     <= DIRECTION_CACHE_BYTES
                 ):
                     return
-                del kept[key]
+                del cache[key]
 
-    def _take(self, key: frozenset[str], scanned: ModelScan) -> None:
+    def _take(self, key: frozenset[str], scan: ModelScan) -> None:
         """Store the scan of the model `key` (its effects) as the latest one, with its scores."""
         # Insert the entry again, so that it is the newest one.
         self.cached_scans.pop(key, None)
-        self.cached_scans[key] = scanned
-        self.enter_scores(key, scanned.scores)
+        self.cached_scans[key] = scan
+        self.enter_scores(key, scan.scores)
 
     def enter_scores(self, key: frozenset[str], scores: CandidateScores) -> None:
         """Store the scores about a model.
@@ -236,10 +241,10 @@ class ScoredModelSet(ModelSet):
         if not key and not self.null_gains:
             self.null_gains = dict(zip(scores.effects, scores.null_quantiles.tolist(), strict=True))
 
-    def _moved(self, one: TrajectoryFit, other: TrajectoryFit) -> float:
+    def _moved(self, first: TrajectoryFit, second: TrajectoryFit) -> float:
         """Return by how much two fits differ: RMS over all samples, in units of the noise."""
-        apart = (one.simulated - other.simulated) / self.noise.sigma
-        return float(np.sqrt(np.square(apart[self.observed_mask]).mean()))
+        normalised_difference = (first.simulated - second.simulated) / self.noise.sigma
+        return float(np.sqrt(np.square(normalised_difference[self.observed_mask]).mean()))
 
     def _lacking(self, model: FittedModel) -> list[str]:
         """Return the effects that could be added to a model.
@@ -247,11 +252,11 @@ class ScoredModelSet(ModelSet):
         These are all effects of the library that are neither in the model nor contained in one of
         its effects.
         """
-        held = set(model.effects)
+        included_effects = set(model.effects)
         # An effect and one that it contains have no unique solution together.
         for name in model.effects:
-            held.update(self.world.available_effects[name].contains)
-        return [name for name in self.world.library if name not in held]
+            included_effects.update(self.world.available_effects[name].contains)
+        return [name for name in self.world.library if name not in included_effects]
 
     def refit_extensions(
         self, beam: Iterable[FittedModel], most: int, patient: bool = False
@@ -266,23 +271,25 @@ class ScoredModelSet(ModelSet):
         starts = []
         models = list(beam)
         # A better fit may have discarded the scores of some models.
-        lost = [model for model in models if frozenset(model.effects) not in self.cached_scans]
-        self._survey(lost, beside=models)
+        unscanned_models = [
+            model for model in models if frozenset(model.effects) not in self.cached_scans
+        ]
+        self._survey(unscanned_models, other_kept_models=models)
         for model in models:
             key = frozenset(model.effects)
-            known = self.cached_scans[key]
+            stored_scan = self.cached_scans[key]
             # The model may have been improved since it was put into the beam.
-            newest = self.models[key]
-            further = select_refit_starts(
+            latest_model = self.models[key]
+            extension_starts = select_refit_starts(
                 self.world,
                 self.noise,
-                newest,
-                known.directions,
-                known.scores,
+                latest_model,
+                stored_scan.directions,
+                stored_scan.scores,
                 most,
                 patient,
             )
-            starts += [s for s in further if patient or self._is_new(s, newest)]
+            starts += [s for s in extension_starts if patient or self._is_new(s, latest_model)]
         if not self.world.has_linearisation or patient:
             if starts:
                 self.refit_models(starts, patient=patient)
@@ -291,12 +298,12 @@ class ScoredModelSet(ModelSet):
         # sufficient.
         names = {frozenset(start.effects) for start in starts} | set(self.models)
         parts = {id(start): self._contained(start) & names for start in starts}
-        plain = [start for start in starts if not parts[id(start)]]
-        if plain:
-            self.refit_models(plain)
-        richer = [s for s in starts if parts[id(s)] and not self._explained(parts[id(s)])]
-        if richer:
-            self.refit_models(richer)
+        simple_starts = [start for start in starts if not parts[id(start)]]
+        if simple_starts:
+            self.refit_models(simple_starts)
+        richer_starts = [s for s in starts if parts[id(s)] and not self._explained(parts[id(s)])]
+        if richer_starts:
+            self.refit_models(richer_starts)
 
     def _is_new(self, start: FitStart, model: FittedModel) -> bool:
         """Return whether a fit from this start may find something new.
@@ -305,20 +312,24 @@ class ScoredModelSet(ModelSet):
         from the optimum, it is also the case if the known fit is worse than a model that it
         contains.
         """
-        known = self.models.get(frozenset(start.effects))
-        if known is None:
+        stored_model = self.models.get(frozenset(start.effects))
+        if stored_model is None:
             return True
-        behind = model.likelihood.value - known.likelihood.value
-        return self.world.has_linearisation and behind > NESTED_MODEL_TOLERANCE
+        likelihood_deficit = model.likelihood.value - stored_model.likelihood.value
+        return self.world.has_linearisation and likelihood_deficit > NESTED_MODEL_TOLERANCE
 
     def _contained(self, start: FitStart) -> set[frozenset[str]]:
         """Return the models in which one effect is replaced by a simpler one that it contains.
 
         Each model is the set of its effects.
         """
-        own = frozenset(start.effects)
+        effect_names = frozenset(start.effects)
         effects = self.world.available_effects
-        return {own - {name} | {part} for name in own for part in effects[name].contains}
+        return {
+            effect_names - {name} | {part}
+            for name in effect_names
+            for part in effects[name].contains
+        }
 
     def _explained(self, keys: Iterable[frozenset[str]]) -> bool:
         """Return whether one of the fitted models `keys` (sets of effects) leaves only noise."""
@@ -358,21 +369,23 @@ class ScoredModelSet(ModelSet):
             larger: the larger model.
             gain: gain in twice the log-likelihood.
         """
-        chance = dict(zip(scores.effects, scores.null_quantiles.tolist(), strict=True))
+        null_quantiles = dict(zip(scores.effects, scores.null_quantiles.tolist(), strict=True))
         # Among several effects, the highest null-hypothesis level is used.
-        chances = [chance.get(name, 0.0) for name in larger.effects]
-        lucky = max(chances, default=0.0)
-        excess = np.array([gain - lucky])
+        effect_null_quantiles = [null_quantiles.get(name, 0.0) for name in larger.effects]
+        null_quantile = max(effect_null_quantiles, default=0.0)
+        excess = np.array([gain - null_quantile])
         return estimate_tail_p_value(scores.null_scores, excess)
 
-    def is_complete(self, model: FittedModel, doubt: float) -> bool:
+    def is_complete(self, model: FittedModel, p_value_threshold: float) -> bool:
         """Return whether neither scores nor residual suggest that the model lacks something.
 
         Args:
             model: the model.
-            doubt: p-value threshold of the scores.
+            p_value_threshold: p-value threshold of the scores.
         """
-        return self.score_missing_effects(model).p_value > doubt and self.is_noise_like(model)
+        return self.score_missing_effects(model).p_value > p_value_threshold and self.is_noise_like(
+            model
+        )
 
     def is_noise_like(self, model: FittedModel) -> bool:
         """Return whether the residual of a model may be noise.
@@ -380,12 +393,12 @@ class ScoredModelSet(ModelSet):
         It is at the noise floor, or it is above an estimated floor and AR(1) noise. The floor is
         estimated for white noise, so AR(1) noise may exceed it.
         """
-        left = np.nan_to_num(model.likelihood.sigma, nan=np.inf)
-        loud = left >= NOISE_RATIO_THRESHOLD * self.noise.sigma
-        if not loud.any():
+        residual_sigma = np.nan_to_num(model.likelihood.sigma, nan=np.inf)
+        is_above_noise = residual_sigma >= NOISE_RATIO_THRESHOLD * self.noise.sigma
+        if not is_above_noise.any():
             return True
         # Specified noise is known, so a larger residual is not noise, whatever its spectrum.
-        if (loud & self.stated).any():
+        if (is_above_noise & self.stated).any():
             return False
         # Ljung-Box test, eq. (5) of `bench.diagnosis.evaluation.noise_model`.
         residual = self.compute_residual(model.fit)
@@ -397,31 +410,37 @@ class ScoredModelSet(ModelSet):
 
 def _scan_model(
     world: RunEvaluator,
-    at: TrajectoryFit,
-    lacking: Sequence[str],
+    fit: TrajectoryFit,
+    missing_effects: Sequence[str],
     weights: NoiseModel,
     residual: Array,
-    seen: Mask,
+    observed_mask: Mask,
     stream: np.random.Generator,
 ) -> ModelScan:
     """Score all effects that one model lacks; runs in this process or in a worker.
 
     Args:
         world: the runs.
-        at: the fitted model.
-        lacking: names of the effects that it lacks.
+        fit: the fitted model.
+        missing_effects: names of the effects that it lacks.
         weights: noise that weights the channels.
         residual: (R, T, C) residual of the model.
-        seen: (R, T, C) mask of available samples.
+        observed_mask: (R, T, C) mask of available samples.
         stream: random generator of the surrogates.
     """
-    candidates = compute_directions(world, at, lacking)
-    test = ScoreTest(at, candidates, seen, weights)
-    return ModelScan(at, candidates, test, _scored(test, residual, residual, seen, stream))
+    candidates = compute_directions(world, fit, missing_effects)
+    test = ScoreTest(fit, candidates, observed_mask, weights)
+    return ModelScan(
+        fit, candidates, test, _scored(test, residual, residual, observed_mask, stream)
+    )
 
 
 def _scored(
-    test: ScoreTest, residual: Array, against: Array, seen: Mask, stream: np.random.Generator
+    test: ScoreTest,
+    residual: Array,
+    against: Array,
+    observed_mask: Mask,
+    stream: np.random.Generator,
 ) -> CandidateScores:
     """Return the scores of a residual, with a p-value from surrogate residuals.
 
@@ -431,6 +450,8 @@ def _scored(
     return compute_calibrated_scores(
         test,
         residual,
-        lambda count: draw_surrogates(against, seen, count, stream, left=test.project_out),
+        lambda count: draw_surrogates(
+            against, observed_mask, count, stream, project_out=test.project_out
+        ),
         SURROGATE_COUNT,
     )

@@ -38,17 +38,17 @@ def search_with_subsampling(search: EffectSearch) -> FittedModel:
     Raises:
         SearchStoppedError: the search had to end early.
     """
-    few = thin_runs(search.world)
-    if few is None:
+    thinned_runs = thin_runs(search.world)
+    if thinned_runs is None:
         return search.run()
     try:
-        return _search_subsampled(search, few)
+        return _search_subsampled(search, thinned_runs)
     finally:
-        few.close()
+        thinned_runs.close()
 
 
-def _search_subsampled(search: EffectSearch, few: RunEvaluator) -> FittedModel:
-    """Search on the thinned runs `few`, which is faster, then confirm the result on all samples.
+def _search_subsampled(search: EffectSearch, thinned_runs: RunEvaluator) -> FittedModel:
+    """Search on thinned runs, which is faster, then confirm the result on all samples.
 
     If all samples show more effects than the thinned runs did, the search is repeated on them.
     """
@@ -57,18 +57,18 @@ def _search_subsampled(search: EffectSearch, few: RunEvaluator) -> FittedModel:
     if search.is_complete(search.base_model, MAX_P_VALUE_FIRST_EFFECT):
         return search.run()
     rng = search.make_rng("fewer samples")
-    given = few, search.noise, search.frozen, rng, search.stated
-    sketch = EffectSearch(*given, thorough=search.thorough)
-    sketch.refit_models([search.base_model.fit.make_start()])
+    search_arguments = thinned_runs, search.noise, search.frozen, rng, search.stated
+    subsampled_search = EffectSearch(*search_arguments, thorough=search.thorough)
+    subsampled_search.refit_models([search.base_model.fit.make_start()])
     try:
-        found = refine_best_model(sketch, sketch.run())
+        subsampled_model = refine_best_model(subsampled_search, subsampled_search.run())
     except SearchStoppedError:
-        _adopt_subsampled_models(search, sketch.get_best_so_far())
+        _adopt_subsampled_models(search, subsampled_search.get_best_so_far())
         raise
-    starts = _collect_full_fit_starts(sketch, found)
+    starts = _collect_full_fit_starts(subsampled_search, subsampled_model)
     if starts:
         search.refit_models(starts)
-    model = _select_full_model(search, found)
+    model = _select_full_model(search, subsampled_model)
     if not _is_confirmed_by_all_samples(search, model):
         return search.run()
     search.settled_effects = frozenset(model.effects)
@@ -86,27 +86,35 @@ def _adopt_subsampled_models(search: EffectSearch, model: FittedModel) -> None:
     search.best_supported_model = search.add_fit(fit)
 
 
-def _collect_full_fit_starts(sketch: EffectSearch, found: FittedModel) -> list[FitStart]:
-    """Collect the models on thinned runs (`sketch`) from which fits to all samples start.
+def _collect_full_fit_starts(
+    subsampled_search: EffectSearch, subsampled_model: FittedModel
+) -> list[FitStart]:
+    """Collect the models of the search on thinned runs from which fits to all samples start.
 
     They are the result, models that explain the data nearly as well, models without one of its
     effects, and the best models of a single effect.
     """
-    near = [found, *list_competing_models(sketch, found), *list_submodels(sketch, found)]
-    near += [sketch.remove_effect(found, name) for name in found.effects]
-    near += select_by_size(sketch, 1)[:MAX_SINGLE_EFFECT_REFITS]
-    chosen = {model.effects: model.fit.make_start() for model in near if model.effects}
+    competing_models = [
+        subsampled_model,
+        *list_competing_models(subsampled_search, subsampled_model),
+        *list_submodels(subsampled_search, subsampled_model),
+    ]
+    competing_models += [
+        subsampled_search.remove_effect(subsampled_model, name) for name in subsampled_model.effects
+    ]
+    competing_models += select_by_size(subsampled_search, 1)[:MAX_SINGLE_EFFECT_REFITS]
+    chosen = {model.effects: model.fit.make_start() for model in competing_models if model.effects}
     return list(chosen.values())
 
 
-def _select_full_model(search: EffectSearch, found: FittedModel) -> FittedModel:
+def _select_full_model(search: EffectSearch, subsampled_model: FittedModel) -> FittedModel:
     """Return the fit to all samples of the model that was found.
 
     Near the noise, return the best model of its size, because thinned runs distinguish rivals less
     well.
     """
-    model = search.models[frozenset(found.effects)]
-    best = search.get_best(len(found.effects))
+    model = search.models[frozenset(subsampled_model.effects)]
+    best = search.get_best(len(subsampled_model.effects))
     if best is None or search.compute_excess(model) >= FAR_EXCESS:
         return model
     return best

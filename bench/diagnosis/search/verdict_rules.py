@@ -80,23 +80,26 @@ REQUIRED_QUESTIONS: Collection[str] = frozenset({"structure", "alternatives"})
 """Questions that need not be answered for a cause to be accepted."""
 
 
-def is_motionless(ranges: Array, left: Array, sigma: Array, touched: bool) -> bool:
+def is_motionless(
+    ranges: Array, residual_sigma: Array, sigma: Array, is_model_sensitive: bool
+) -> bool:
     """Return whether a recording shows no motion and the model expects none.
 
     Both are required, because a body that rests where it should fall is a discrepancy.
 
     Args:
         ranges: (C,) maximum minus minimum of each channel.
-        left: (C,) standard deviation of the residual of the base model, in the unit of the channel.
+        residual_sigma: (C,) standard deviation of the residual of the base model, in the unit of
+            the channel.
         sigma: (C,) noise floor in the unit of the channel.
-        touched: whether any base parameter changes the simulated runs.
+        is_model_sensitive: whether any base parameter changes the simulated runs.
     """
-    still = bool(
+    is_at_rest = bool(
         (ranges < MIN_MOTION_SIGMAS * sigma).all()
-        and (left < MAX_RESIDUAL_SIGMAS_AT_REST * sigma).all()
+        and (residual_sigma < MAX_RESIDUAL_SIGMAS_AT_REST * sigma).all()
     )
     # A completely constant recording contains no information, whatever the model expects.
-    return (still and not touched) or not ranges.any()
+    return (is_at_rest and not is_model_sensitive) or not ranges.any()
 
 
 def is_identified(sd: float, low: float, high: float) -> bool:
@@ -113,32 +116,36 @@ def is_identified(sd: float, low: float, high: float) -> bool:
     return sd < MAX_RELATIVE_STANDARD_ERROR * (high - low)
 
 
-def exceeds_noise(excess: float, error: float, stated: bool) -> bool:
+def exceeds_noise(excess: float, error: float, is_noise_stated: bool) -> bool:
     """Return whether the residual of a channel exceeds its noise significantly.
 
     Args:
         excess: RMS residual in units of the noise floor.
         error: relative standard error of this RMS.
-        stated: whether the recording specifies the noise; an estimated floor assumes white noise
-            and may be several times too small.
+        is_noise_stated: whether the recording specifies the noise; an estimated floor assumes white
+            noise and may be several times too small.
     """
     return excess > (
         1.0 + NOISE_TOLERANCE + EXCESS_STANDARD_ERRORS * error
-        if stated
+        if is_noise_stated
         else MAX_AUTOCORRELATED_NOISE_RATIO
     )
 
 
-def get_structure_threshold(stated: bool) -> float:
+def get_structure_threshold(is_noise_stated: bool) -> float:
     """Return the p-value threshold of the lack-of-fit test.
 
     Args:
-        stated: whether the noise of all channels is specified.
+        is_noise_stated: whether the noise of all channels is specified.
     """
-    return STRUCTURE_P_VALUE_THRESHOLD if stated else STRUCTURE_P_VALUE_THRESHOLD_ESTIMATED_NOISE
+    return (
+        STRUCTURE_P_VALUE_THRESHOLD
+        if is_noise_stated
+        else STRUCTURE_P_VALUE_THRESHOLD_ESTIMATED_NOISE
+    )
 
 
-def has_structure(p_value: float, level: float, loud: Sequence[str]) -> bool:
+def has_structure(p_value: float, level: float, channels_above_noise: Sequence[str]) -> bool:
     """Return whether the residual has structure, by the lack-of-fit test or by its size.
 
     Each test misses something: a cause that is not a force may not resemble one, and a small force
@@ -147,9 +154,9 @@ def has_structure(p_value: float, level: float, loud: Sequence[str]) -> bool:
     Args:
         p_value: p-value of the best force of any shape.
         level: threshold of this p-value.
-        loud: names of channels whose residual exceeds their noise.
+        channels_above_noise: names of channels whose residual exceeds their noise.
     """
-    return p_value < level or len(loud) > 0
+    return p_value < level or len(channels_above_noise) > 0
 
 
 def is_unexplained(structure: bool, chance: float) -> bool:
@@ -179,13 +186,13 @@ def improves_held_out(merits: tuple[float, float], excesses: tuple[float, float]
     )
 
 
-def is_indistinguishable(behind: float) -> bool:
+def is_indistinguishable(distance: float) -> bool:
     """Return whether a model is indistinguishable from a better one.
 
     Args:
-        behind: difference in twice the log-likelihood.
+        distance: difference in twice the log-likelihood.
     """
-    return behind < INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
+    return distance < INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
 
 
 def convert_excess_ratio(ratios: Sequence[float]) -> float:
@@ -206,18 +213,18 @@ def convert_excess_ratio(ratios: Sequence[float]) -> float:
     )  # (1)
 
 
-def compute_excess_ratio(excess: float, other: float) -> float:
+def compute_excess_ratio(excess: float, reference_excess: float) -> float:
     """Return the ratio of two excesses, each raised to at least `NEGLIGIBLE_EXCESS`."""
     # For two models at the noise floor, the ratio is random and may be arbitrarily large.
-    return max(excess, NEGLIGIBLE_EXCESS) / max(other, NEGLIGIBLE_EXCESS)
+    return max(excess, NEGLIGIBLE_EXCESS) / max(reference_excess, NEGLIGIBLE_EXCESS)
 
 
-def explains_gap(closed: float) -> bool:
+def explains_gap(gap_closed: float) -> bool:
     """Return whether effects that remove this share of the discrepancy explain it.
 
     Below the threshold they may be real, but the main cause is not in the library.
     """
-    return not closed < MIN_GAP_CLOSED
+    return not gap_closed < MIN_GAP_CLOSED
 
 
 def misses_held_out_gap(before: float, after: float) -> bool:
@@ -230,10 +237,10 @@ def misses_held_out_gap(before: float, after: float) -> bool:
         before: excess of the base model on held-out runs.
         after: excess of the extended model on held-out runs.
     """
-    closed = before - max(after, 0.0)
+    gap_closed = before - max(after, 0.0)
     # The comparison is negated, so that the NaN of a failed simulation counts as missed.
     return not after < UNSEEN_EFFECT_EXCESS or (
-        before > UNSEEN_EFFECT_EXCESS and closed < MIN_GAP_CLOSED * before
+        before > UNSEEN_EFFECT_EXCESS and gap_closed < MIN_GAP_CLOSED * before
     )
 
 
@@ -290,7 +297,9 @@ def verdict_of_numbers(verdict: VerdictName, results: bool) -> VerdictName:
     return "partial" if verdict == "named" and not results else verdict
 
 
-def decide_early_stop_verdict(causes: int, closed: float, not_asked: Sequence[str]) -> VerdictName:
+def decide_early_stop_verdict(
+    causes: int, gap_closed: float, skipped_questions: Sequence[str]
+) -> VerdictName:
     """Return the verdict of a search that ended early, which claims only what was tested.
 
     If a question is open, the verdict is neither adequate nor named. Causes are accepted if they
@@ -299,9 +308,9 @@ def decide_early_stop_verdict(causes: int, closed: float, not_asked: Sequence[st
 
     Args:
         causes: number of causes found.
-        closed: share of the discrepancy on the fitted runs that they remove, if the residual is
+        gap_closed: share of the discrepancy on the fitted runs that they remove, if the residual is
             counted as structure.
-        not_asked: the open questions.
+        skipped_questions: the open questions.
     """
-    stood = all(name in REQUIRED_QUESTIONS for name in not_asked)
-    return "partial" if causes and stood and explains_gap(closed) else "unknown"
+    has_required_answers = all(name in REQUIRED_QUESTIONS for name in skipped_questions)
+    return "partial" if causes and has_required_answers and explains_gap(gap_closed) else "unknown"

@@ -52,8 +52,8 @@ class LaggedSums(NamedTuple):
     def combine(self, phi: float) -> Array:
         """Combine the three sums to the whitened inner products (W a)'(W b) of eq. (1)."""
         square = phi * phi
-        follow = (1.0 + square) * self.whole - phi * self.mixed - square * self.ends
-        result: Array = follow / (1.0 - square)  # (1)
+        scaled_products = (1.0 + square) * self.whole - phi * self.mixed - square * self.ends
+        result: Array = scaled_products / (1.0 - square)  # (1)
         return result
 
 
@@ -89,17 +89,17 @@ class SegmentColumns(NamedTuple):
     edge: Array
 
 
-def count_missing_neighbours(seen: Mask) -> Array:
+def count_missing_neighbours(observed_mask: Mask) -> Array:
     """Count the missing neighbours in time of each available sample: n_t of eq. (1), (R, T, C).
 
     The first and the last sample of a run lack one neighbour each.
     """
-    lacking = np.full(seen.shape, 2.0)
-    lacking[:, 1:] -= seen[:, :-1]
-    lacking[:, :-1] -= seen[:, 1:]
+    missing_counts = np.full(observed_mask.shape, 2.0)
+    missing_counts[:, 1:] -= observed_mask[:, :-1]
+    missing_counts[:, :-1] -= observed_mask[:, 1:]
     # Missing samples count as zero: AR(1) noise restarts after a gap, because earlier noise is not
     # known.
-    return np.where(seen, lacking, 0.0)
+    return np.where(observed_mask, missing_counts, 0.0)
 
 
 def select_run(parts: LaggedSums, run: int) -> LaggedSums:
@@ -108,33 +108,33 @@ def select_run(parts: LaggedSums, run: int) -> LaggedSums:
 
 
 def add_cross_products(
-    parts: LaggedSums, some: SegmentColumns, others: SegmentColumns, place: RunSegment
+    parts: LaggedSums, first: SegmentColumns, second: SegmentColumns, place: RunSegment
 ) -> None:
     """Add the products of all columns of one set with all columns of another.
 
     Args:
         parts: sums to add to, in place.
-        some: columns of the first set.
-        others: columns of the second set.
+        first: columns of the first set.
+        second: columns of the second set.
         place: the section of the run.
     """
-    parts.whole[...] += some.now @ np.swapaxes(others.now, -1, -2)
+    parts.whole[...] += first.now @ np.swapaxes(second.now, -1, -2)
     # Summed over a run, it does not matter to which of the two columns the neighbours belong.
-    parts.mixed[...] += some.now @ np.swapaxes(others.near, -1, -2)
-    parts.ends[...] += (some.edge * place.lacking) @ np.swapaxes(others.edge, -1, -2)
+    parts.mixed[...] += first.now @ np.swapaxes(second.near, -1, -2)
+    parts.ends[...] += (first.edge * place.lacking) @ np.swapaxes(second.edge, -1, -2)
 
 
-def add_self_products(parts: LaggedSums, some: SegmentColumns, place: RunSegment) -> None:
+def add_self_products(parts: LaggedSums, columns: SegmentColumns, place: RunSegment) -> None:
     """Add the products of columns with themselves.
 
     Args:
         parts: sums to add to, in place.
-        some: the columns.
+        columns: the columns.
         place: the section of the run.
     """
-    parts.whole[...] += np.einsum("kn,kn->k", some.now, some.now)
-    parts.mixed[...] += np.einsum("kn,kn->k", some.near, some.now)
-    parts.ends[...] += np.einsum("km,km,m->k", some.edge, some.edge, place.lacking)
+    parts.whole[...] += np.einsum("kn,kn->k", columns.now, columns.now)
+    parts.mixed[...] += np.einsum("kn,kn->k", columns.near, columns.now)
+    parts.ends[...] += np.einsum("km,km,m->k", columns.edge, columns.edge, place.lacking)
 
 
 MIN_RESIDUAL_SHARE = 1e-12
@@ -187,9 +187,9 @@ class WhiteningDesign:
 
     def __init__(
         self,
-        at: TrajectoryFit,
+        fit: TrajectoryFit,
         directions: Array,
-        seen: Mask,
+        observed_mask: Mask,
         sigma: Array,
         blocks: Sequence[Indices],
     ) -> None:
@@ -202,11 +202,11 @@ class WhiteningDesign:
         missing neighbours of each sample, and `_known` caches the projected design of each phi.
         """
         self.blocks = list(blocks)
-        self._own = at.free.size
-        self._jacobian = np.moveaxis(at.jacobian, 3, 0)
+        self._own = fit.free.size
+        self._jacobian = np.moveaxis(fit.jacobian, 3, 0)
         self._directions = np.moveaxis(directions, 3, 0)
-        self._weights = seen / sigma
-        self._lacking = count_missing_neighbours(seen)
+        self._weights = observed_mask / sigma
+        self._lacking = count_missing_neighbours(observed_mask)
         size, runs, *_ = self._jacobian.shape
         count = len(self._directions)
         self._normal = LaggedSums.zeros(runs, size, size)
@@ -224,46 +224,56 @@ class WhiteningDesign:
         for run in range(runs):
             for begin in range(0, length, step):
                 end = min(begin + step, length)
-                without = self._lacking[run, begin:end].ravel()
-                edge = np.flatnonzero(without)
-                yield RunSegment(run, begin, end, edge, without[edge])
+                missing_neighbours = self._lacking[run, begin:end].ravel()
+                edge = np.flatnonzero(missing_neighbours)
+                yield RunSegment(run, begin, end, edge, missing_neighbours[edge])
 
-    def _columns(self, values: Array, place: RunSegment, beside: bool = True) -> SegmentColumns:
+    def _columns(
+        self, values: Array, place: RunSegment, has_neighbours: bool = True
+    ) -> SegmentColumns:
         """Return weighted samples of one section, and the sums of their two neighbours in time.
 
         Args:
             values: (k, R, T, C) columns: derivatives, directions or residuals.
             place: the section.
-            beside: whether neighbours are needed; otherwise they are zero.
+            has_neighbours: whether neighbours are needed; otherwise they are zero.
         """
         run, begin, end = place.run, place.begin, place.end
         rows = len(values)
         # Include one more sample on either side, as a neighbour of the outermost samples.
-        first, last = (max(begin - 1, 0), end + 1) if beside else (begin, end)
-        around = values[:, run, first:last] * self._weights[run, first:last]
-        now = around[:, begin - first : end - first]
-        near = np.zeros_like(now)
-        if beside:
-            former = around[:, : end - first - 1]
-            near[:, now.shape[1] - former.shape[1] :] += former
-            latter = around[:, begin - first + 1 :]
-            near[:, : latter.shape[1]] += latter
+        first, last = (max(begin - 1, 0), end + 1) if has_neighbours else (begin, end)
+        extended_samples = values[:, run, first:last] * self._weights[run, first:last]
+        samples = extended_samples[:, begin - first : end - first]
+        neighbour_sums = np.zeros_like(samples)
+        if has_neighbours:
+            previous_samples = extended_samples[:, : end - first - 1]
+            neighbour_sums[:, samples.shape[1] - previous_samples.shape[1] :] += previous_samples
+            next_samples = extended_samples[:, begin - first + 1 :]
+            neighbour_sums[:, : next_samples.shape[1]] += next_samples
         # The shape is written out, because -1 is ambiguous if there are no rows.
-        size = rows, now.shape[1] * now.shape[2]
-        flat = now.reshape(size)
-        return SegmentColumns(flat, near.reshape(size), flat[:, place.edge])
+        size = rows, samples.shape[1] * samples.shape[2]
+        flat = samples.reshape(size)
+        return SegmentColumns(flat, neighbour_sums.reshape(size), flat[:, place.edge])
 
     def _add(self, place: RunSegment) -> None:
         """Add the products of one section of a run to the sums of eq. (1)."""
-        own = self._columns(self._jacobian, place)
-        some = self._columns(self._directions, place)
-        add_cross_products(select_run(self._normal, place.run), own, own, place)
-        add_cross_products(select_run(self._mixed, place.run), own, some, place)
-        add_self_products(self._powers, some, place)
+        jacobian_columns = self._columns(self._jacobian, place)
+        direction_columns = self._columns(self._directions, place)
+        add_cross_products(
+            select_run(self._normal, place.run), jacobian_columns, jacobian_columns, place
+        )
+        add_cross_products(
+            select_run(self._mixed, place.run), jacobian_columns, direction_columns, place
+        )
+        add_self_products(self._powers, direction_columns, place)
         for block, parts in zip(self.blocks, self._grams, strict=True):
             # The square of a single column is already known.
             if block.shape[1] > 1:
-                members = SegmentColumns(some.now[block], some.near[block], some.edge[block])
+                members = SegmentColumns(
+                    direction_columns.now[block],
+                    direction_columns.near[block],
+                    direction_columns.edge[block],
+                )
                 add_cross_products(parts, members, members, place)
 
     def compute_products(self, *residuals: Array) -> tuple[LaggedSums, LaggedSums, LaggedSums]:
@@ -286,7 +296,7 @@ class WhiteningDesign:
             parts = [self._columns(some, place) for some in residuals]
             left = SegmentColumns(*(np.concatenate(rows) for rows in zip(*parts, strict=True)))
             own = self._columns(self._jacobian, place)
-            some = self._columns(self._directions, place, beside=False)
+            some = self._columns(self._directions, place, has_neighbours=False)
             add_self_products(squares, left, place)
             add_cross_products(select_run(shared, place.run), own, left, place)
             add_cross_products(cross, some, left, place)
@@ -298,27 +308,29 @@ class WhiteningDesign:
         Args:
             residuals: (S, R, T, C) residuals before the fit.
         """
-        known = self.reduce(0.0)
+        reduced_design = self.reduce(0.0)
         q = self._own
         weighted = self._jacobian * self._weights
         shared = np.stack(
             [
-                _flat(own) @ _flat(residuals[:, run] * self._weights[run]).T
-                for run, own in enumerate(np.moveaxis(weighted, 1, 0))
+                _flat(run_jacobian) @ _flat(residuals[:, run] * self._weights[run]).T
+                for run, run_jacobian in enumerate(np.moveaxis(weighted, 1, 0))
             ]
         )
-        by_states, by_own = _project_residuals(known, shared)
+        by_states, by_own = _project_residuals(reduced_design, shared)
         # Back substitution: first coefficients of the parameters, then of the initial states of
         # each run.
-        parameters = known.own @ by_own
-        rest = by_states - known.by_states[:, :q] @ parameters
-        runs, size, _ = known.states.shape
-        states = known.states @ rest.reshape(runs, size, len(residuals))
+        parameters = reduced_design.own @ by_own
+        state_products = by_states - reduced_design.by_states[:, :q] @ parameters
+        runs, size, _ = reduced_design.states.shape
+        states = reduced_design.states @ state_products.reshape(runs, size, len(residuals))
         result = np.empty_like(residuals)
         for run in range(runs):
             coefficients = np.concatenate([parameters, states[run]])
-            followed = coefficients.T @ _flat(self._jacobian[:, run])
-            result[:, run] = residuals[:, run] - followed.reshape(residuals[:, run].shape)
+            explained_residuals = coefficients.T @ _flat(self._jacobian[:, run])
+            result[:, run] = residuals[:, run] - explained_residuals.reshape(
+                residuals[:, run].shape
+            )
         return np.where(self._weights > 0, result, 0.0)
 
     def reduce(self, phi: float) -> _ReducedDesign:
@@ -342,16 +354,18 @@ class WhiteningDesign:
 
         # Eq. (2) for the initial states of each run, then for the parameters.
         states = _matrix_root(normal[:, q:, q:])
-        others = np.concatenate([normal[:, q:, :q], mixed[:, q:]], axis=2)
-        by_states = _project_directions(states, others)
+        other_products = np.concatenate([normal[:, q:, :q], mixed[:, q:]], axis=2)
+        by_states = _project_directions(states, other_products)
         by_parameters, by_directions = by_states[:, :q], by_states[:, q:]
-        left = normal[:, :q, :q].sum(axis=0) - by_parameters.T @ by_parameters
-        own = _matrix_root(left)
-        by_own = own.T @ (mixed[:, :q].sum(axis=0) - by_parameters.T @ by_directions)
+        schur_complement = normal[:, :q, :q].sum(axis=0) - by_parameters.T @ by_parameters
+        parameter_root = _matrix_root(schur_complement)
+        by_own_parameters = parameter_root.T @ (
+            mixed[:, :q].sum(axis=0) - by_parameters.T @ by_directions
+        )
 
         # Only rounding remains of absorbed directions, which would explain residuals at random.
-        taken = np.concatenate([by_directions, by_own])
-        remaining = powers - np.einsum("ak,ak->k", taken, taken)
+        absorbed = np.concatenate([by_directions, by_own_parameters])
+        remaining = powers - np.einsum("ak,ak->k", absorbed, absorbed)
         acting = remaining > MIN_RESIDUAL_SHARE * powers
         remaining = np.where(acting, remaining, 0.0)
         grams = []
@@ -359,13 +373,13 @@ class WhiteningDesign:
             if block.shape[1] == 1:
                 grams.append(remaining[block][:, :, None])
                 continue
-            columns = np.moveaxis(taken[:, block], 0, 2)
+            columns = np.moveaxis(absorbed[:, block], 0, 2)
             gram = parts.combine(phi) - columns @ columns.transpose(0, 2, 1)
             # Rounding makes the two halves differ, and the eigensolver reads only one of them.
             symmetric = (gram + gram.transpose(0, 2, 1)) / 2.0
-            both = acting[block][:, :, None] & acting[block][:, None, :]
-            grams.append(np.where(both, symmetric, 0.0))
-        return _ReducedDesign(states, by_states, own, by_own, grams, acting)
+            is_pair_acting = acting[block][:, :, None] & acting[block][:, None, :]
+            grams.append(np.where(is_pair_acting, symmetric, 0.0))
+        return _ReducedDesign(states, by_states, parameter_root, by_own_parameters, grams, acting)
 
 
 class InnerProducts:
@@ -390,14 +404,20 @@ class InnerProducts:
             Sums of squares (S,) of the residuals, products (n, k, k) of the directions in each
             block, and products of directions with residuals (K, S).
         """
-        known = self._design.reduce(phi)
-        q = len(known.own)
-        by_states, by_own = _project_residuals(known, self._shared.combine(phi))
-        taken = np.concatenate([by_states, by_own])
-        total = self._squares.combine(phi) - np.einsum("as,as->s", taken, taken)
-        others = np.concatenate([known.by_states[:, q:], known.by_own])
-        cross = self._cross.combine(phi) - others.T @ taken
-        return np.maximum(total, 0.0), known.grams, np.where(known.acting[:, None], cross, 0.0)
+        reduced_design = self._design.reduce(phi)
+        q = len(reduced_design.own)
+        by_states, by_own = _project_residuals(reduced_design, self._shared.combine(phi))
+        absorbed = np.concatenate([by_states, by_own])
+        total = self._squares.combine(phi) - np.einsum("as,as->s", absorbed, absorbed)
+        direction_products = np.concatenate(
+            [reduced_design.by_states[:, q:], reduced_design.by_own]
+        )
+        cross = self._cross.combine(phi) - direction_products.T @ absorbed
+        return (
+            np.maximum(total, 0.0),
+            reduced_design.grams,
+            np.where(reduced_design.acting[:, None], cross, 0.0),
+        )
 
 
 def _flat(values: Array) -> Array:
@@ -405,18 +425,18 @@ def _flat(values: Array) -> Array:
     return values.reshape(len(values), -1)
 
 
-def _project_residuals(known: _ReducedDesign, shared: Array) -> tuple[Array, Array]:
+def _project_residuals(reduced_design: _ReducedDesign, shared: Array) -> tuple[Array, Array]:
     """Return L'J'e of eq. (2) for initial states (R s, S) and for parameters (q, S).
 
     Args:
-        known: the whitened design.
+        reduced_design: the whitened design.
         shared: (R, q + s, S) products of the Jacobian with residuals.
     """
-    q = len(known.own)
+    q = len(reduced_design.own)
     # First the initial states of each run, then the parameters.
-    by_states = _project_directions(known.states, shared[:, q:])
-    left = shared[:, :q].sum(axis=0) - known.by_states[:, :q].T @ by_states
-    return by_states, known.own.T @ left
+    by_states = _project_directions(reduced_design.states, shared[:, q:])
+    parameter_products = shared[:, :q].sum(axis=0) - reduced_design.by_states[:, :q].T @ by_states
+    return by_states, reduced_design.own.T @ parameter_products
 
 
 def _project_directions(roots: Array, products: Array) -> Array:

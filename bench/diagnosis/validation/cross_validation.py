@@ -83,10 +83,10 @@ class CrossValidation:
             self.world.watch.stage(f"cross-validation, fold {number + 1} of {len(self._folds)}")
             thetas = self._refitted(fold, fits)
             predicted = HeldOutRuns(fold.left_out, self.noise).fit_initial_states(thetas)
-            for i, one in enumerate(predicted):
-                simulated[i, fold.rows, : one.simulated.shape[1]] = one.simulated
-                states[i, fold.rows] = one.states
-                free[i] += one.freedom
+            for i, prediction in enumerate(predicted):
+                simulated[i, fold.rows, : prediction.simulated.shape[1]] = prediction.simulated
+                states[i, fold.rows] = prediction.states
+                free[i] += prediction.freedom
         return [
             self._measured(*result) for result in zip(simulated, states, free.tolist(), strict=True)
         ]
@@ -113,8 +113,8 @@ class CrossValidation:
         folds = []
         for number in sorted(set(numbers.tolist())):
             rows = np.flatnonzero(numbers == number)
-            others = np.flatnonzero(numbers != number)
-            folds.append(_Fold(rows, others, self._of_runs(others), self._of_runs(rows)))
+            fitted_rows = np.flatnonzero(numbers != number)
+            folds.append(_Fold(rows, fitted_rows, self._of_runs(fitted_rows), self._of_runs(rows)))
         return folds
 
     def _of_runs(self, rows: Indices) -> RunEvaluator:
@@ -146,8 +146,8 @@ class CrossValidation:
         starts = []
         for fit in fits:
             jacobian = fit.jacobian[fold.others, :length, :, : fit.free.size]
-            known = KnownJacobian(fit.free, jacobian)
-            starts.append(FitStart(fit.effects, fit.theta, fit.states[fold.others], known))
+            known_jacobian = KnownJacobian(fit.free, jacobian)
+            starts.append(FitStart(fit.effects, fit.theta, fit.states[fold.others], known_jacobian))
         refits = TrajectoryFitter(fold.fitting, self.noise, frozen).fit_models(starts, MAX_STEPS)
         return self._without_unsupported(fold.fitting, refits)
 
@@ -168,14 +168,14 @@ class CrossValidation:
         lanes = np.stack([fits[i].theta for i, _ in trials])
         for lane, (_, name) in zip(lanes, trials, strict=True):
             lane[world.get_coefficient_indices(name)] = 0.0
-        without = world.simulate(
+        simulated_without = world.simulate(
             np.repeat(lanes, runs, axis=0),
             np.tile(np.arange(runs), len(trials)),
             np.concatenate([fits[i].states for i, _ in trials]),
         ).reshape(len(trials), *world.observed.shape)
-        seen = np.isfinite(world.observed)
-        for (i, name), simulated in zip(trials, without, strict=True):
-            change = ((fits[i].simulated - simulated) / self.noise.sigma)[seen]
+        observed_mask = np.isfinite(world.observed)
+        for (i, name), simulated in zip(trials, simulated_without, strict=True):
+            change = ((fits[i].simulated - simulated) / self.noise.sigma)[observed_mask]
             # If the simulation fails without the effect, the change is NaN and the effect is kept.
             if np.linalg.norm(change) < SHOWN:
                 thetas[i][world.get_coefficient_indices(name)] = 0.0

@@ -89,13 +89,13 @@ def compute_central_jacobian(
 
     # Row j has changed parameter j, so the widths are on the diagonal.
     lower, upper = theta[:, :q, fit.free]
-    moved = np.diagonal(upper - lower)
-    widths = np.concatenate([moved, 2.0 * steps[q:]])
+    parameter_widths = np.diagonal(upper - lower)
+    widths = np.concatenate([parameter_widths, 2.0 * steps[q:]])
     jacobian = np.moveaxis(above - below, 0, -1) / widths
     # A simulation that failed on one side gives no slope.
     jacobian = np.nan_to_num(jacobian, nan=0.0, posinf=0.0, neginf=0.0)
-    own = fit.jacobian[..., q:] if world.has_linearisation else jacobian[..., q:]
-    return replace(fit, jacobian=np.concatenate([jacobian[..., :q], own], axis=3))
+    state_jacobian = fit.jacobian[..., q:] if world.has_linearisation else jacobian[..., q:]
+    return replace(fit, jacobian=np.concatenate([jacobian[..., :q], state_jacobian], axis=3))
 
 
 def get_central_jacobian(models: ModelSet, fit: TrajectoryFit) -> TrajectoryFit:
@@ -105,14 +105,14 @@ def get_central_jacobian(models: ModelSet, fit: TrajectoryFit) -> TrajectoryFit:
         models: Models with the run evaluator, the noise and the cache.
         fit: Fit with a one-sided Jacobian.
     """
-    known = models.derived.get(id(fit))
+    cached_entry = models.derived.get(id(fit))
     # An id can be reused after an object is deleted, so the object itself is compared.
-    if known is None or known[0] is not fit:
-        known = models.derived[id(fit)] = (
+    if cached_entry is None or cached_entry[0] is not fit:
+        cached_entry = models.derived[id(fit)] = (
             fit,
             compute_central_jacobian(models.world, fit, models.noise),
         )
-    return known[1]
+    return cached_entry[1]
 
 
 def _both_sides(fit: TrajectoryFit, steps: Array, bounds: Array) -> tuple[Array, Array]:
@@ -127,9 +127,9 @@ def _both_sides(fit: TrajectoryFit, steps: Array, bounds: Array) -> tuple[Array,
     for side, sign in enumerate((-1.0, 1.0)):
         shifts = sign * steps
         for j, place in enumerate(fit.free):
-            moved = fit.theta[place] + shifts[j]
+            displaced_value = fit.theta[place] + shifts[j]
             # At a bound the step is one-sided, so the actual difference is used as the divisor.
-            theta[side, j, place] = np.clip(moved, *bounds[j])
+            theta[side, j, place] = np.clip(displaced_value, *bounds[j])
         for j, shift in enumerate(shifts[q:]):
             states[side, q + j, :, j] += shift
     return theta, states
@@ -152,34 +152,36 @@ def _bounds_around(world: RunEvaluator, fit: TrajectoryFit) -> Array:
 
 def compute_covariance(models: ModelSet, model: FittedModel) -> Array:
     """Compute the covariance (q, q) of the fitted parameters, (2), with autocorrelated noise."""
-    found = compute_fisher_blocks(models, model)
-    own = found.own.sum(axis=0)
+    fisher_blocks = compute_fisher_blocks(models, model)
+    parameter_curvature = fisher_blocks.own.sum(axis=0)
     # The Schur complement that solves a step of the fit also eliminates the initial states here.
-    left, _ = compute_schur_complement(own, found.cross, found.inner)
-    return invert_scaled(own, left)
+    schur_complement, _ = compute_schur_complement(
+        parameter_curvature, fisher_blocks.cross, fisher_blocks.inner
+    )
+    return invert_scaled(parameter_curvature, schur_complement)
 
 
-def invert_scaled(own: Array, left: Array) -> Array:
+def invert_scaled(parameter_curvature: Array, schur_complement: Array) -> Array:
     """Invert the curvature after elimination of the initial states.
 
     Directions that the data do not identify get a huge variance.
 
     Args:
-        own: (q, q) curvature by the parameters alone, the first sum of (2); it scales the
-            inversion.
-        left: (q, q) curvature after elimination of the initial states.
+        parameter_curvature: (q, q) curvature by the parameters alone, the first sum of (2); it
+            scales the inversion.
+        schur_complement: (q, q) curvature after elimination of the initial states.
     """
     # Parameters of any unit are scaled alike, so that the cut-off below means the same for each.
-    powers = np.diagonal(own)
+    powers = np.diagonal(parameter_curvature)
     scale = np.sqrt(np.maximum(powers, MIN_CURVATURE))
     units = np.outer(scale, scale)
-    scaled = left / units
+    scaled = schur_complement / units
     inverse = np.linalg.pinv(scaled, rcond=1e-13, hermitian=True)
     values, vectors = np.linalg.eigh(scaled)
-    lost = values < 1e-12
+    is_unidentified = values < 1e-12
     # The pseudo-inverse of an unidentified direction is zero, which would look certain.
-    if lost.any():
-        free = vectors[:, lost]
+    if is_unidentified.any():
+        free = vectors[:, is_unidentified]
         inverse = inverse + (free * 1e12) @ free.T
     result: Array = inverse / units  # (2)
     return result
@@ -230,8 +232,8 @@ def compute_fisher_blocks_from_jacobian(
         q: Number of parameters in the Jacobian.
         noise: Noise for whitening.
     """
-    seen = np.isfinite(world.observed)
-    jacobian = whiten(np.where(seen[..., None], jacobian, 0.0), seen, noise)
+    observed_mask = np.isfinite(world.observed)
+    jacobian = whiten(np.where(observed_mask[..., None], jacobian, 0.0), observed_mask, noise)
     runs, *_, size = jacobian.shape
     j = jacobian.reshape(runs, -1, size)
     normal = np.matmul(j.transpose(0, 2, 1), j)
@@ -271,12 +273,12 @@ def compute_intervals(
         low, high = models.world.parameters[place].bounds
         # A value may be far outside its plausible range, and is then the scale itself.
         size = max(high - low, abs(value))
-        known = np.isfinite(sd) and 2.0 * Z95 * sd < MAX_INTERVAL_WIDTH * size
-        reach = Z95 * sd if known else np.nan
+        is_bounded = np.isfinite(sd) and 2.0 * Z95 * sd < MAX_INTERVAL_WIDTH * size
+        half_width = Z95 * sd if is_bounded else np.nan
         result[place] = (
             value,
-            value - reach,
-            value + reach,
+            value - half_width,
+            value + half_width,
         )
     return result
 
@@ -326,8 +328,8 @@ def compute_held_out_gain(
         by_stretches: Resample segments of the runs; two or three runs are too few to resample.
     """
     sums = _sums(world, before, after, channels, by_stretches)
-    whole = sums.sum(axis=0)
-    before_sum, after_sum, count = whole
+    total_sums = sums.sum(axis=0)
+    before_sum, after_sum, count = total_sums
     base = float(np.sqrt(before_sum / count))
     extended = float(np.sqrt(after_sum / count))
     # Whole runs are drawn, because samples of one run depend on each other.
@@ -339,8 +341,8 @@ def compute_held_out_gain(
     # All resamples of a single part are equal, and would look certain.
     if parts > 1:
         low, high = np.quantile(shares, [0.025, 0.975]).tolist()
-    closed = float(_closed(whole[None], floor)[0])
-    return HeldOutGain(base, extended, floor, closed, low, high)
+    gap_closed = float(_closed(total_sums[None], floor)[0])
+    return HeldOutGain(base, extended, floor, gap_closed, low, high)
 
 
 def _sums(
@@ -353,16 +355,16 @@ def _sums(
     rows = []
     for run, part in _parts(world, by_stretches):
         observed = world.observed[run, part][:, channels]
-        seen = np.isfinite(observed)
+        observed_mask = np.isfinite(observed)
         # A part without samples would be a row of zeros with an undefined error.
-        if not seen.any():
+        if not observed_mask.any():
             continue
         row = []
         for simulated in (before, after):
-            there = simulated[run, part][:, channels]
-            error = (observed - there)[seen]
+            simulated_part = simulated[run, part][:, channels]
+            error = (observed - simulated_part)[observed_mask]
             row.append(float(error @ error))
-        row.append(float(seen.sum()))
+        row.append(float(observed_mask.sum()))
         rows.append(row)
     return np.array(rows)
 
@@ -393,9 +395,9 @@ def _closed(sums: Array, floor: float) -> Array:
     extended = np.sqrt(after / counts)
     gap = base - floor
     # A model cannot reduce the error below the noise floor.
-    reached = np.maximum(extended, floor)
+    reached_error = np.maximum(extended, floor)
     with np.errstate(all="ignore"):
-        share = (base - reached) / gap  # (1)
+        share = (base - reached_error) / gap  # (1)
     # A gap below rounding errors would give an arbitrary share, and a resample may have no gap.
     shares = np.where(gap > 1e-3 * floor, share, 0.0)
     return np.clip(shares, MIN_REPORTED_GAIN, 1.0)

@@ -131,24 +131,24 @@ class HeldOutRuns:
         initial states, and the better fit counts.
         """
         guess = self.world.guess
-        begun = [FitStart((), theta, guess) for theta in thetas]
-        followed = self.world.followed is not None
-        fits = self._fitted(begun, FOLLOWED if followed else HORIZON_STAGES)
+        initial_starts = [FitStart((), theta, guess) for theta in thetas]
+        is_filtered = self.world.followed is not None
+        fits = self._fitted(initial_starts, FOLLOWED if is_filtered else HORIZON_STAGES)
         count = max(int(self.seen.sum()), 1)
         # Runs that amplify differences of the initial state need a fit in stages.
-        if followed and not _nearest(fits).cost < FAR * count:
-            fits = _each_nearer(fits, self._fitted(begun, HORIZON_STAGES))
-            followed = False
-        if not followed and self._bends(_nearest(fits)):
-            fits = self._led(begun, fits)
-        nearest = _nearest(fits)
+        if is_filtered and not _nearest(fits).cost < FAR * count:
+            fits = _each_nearer(fits, self._fitted(initial_starts, HORIZON_STAGES))
+            is_filtered = False
+        if not is_filtered and self._bends(_nearest(fits)):
+            fits = self._led(initial_starts, fits)
+        nearest_fit = _nearest(fits)
         # The comparison is negated because the cost of a failed fit may be NaN.
-        limit = REFIT_SQUARES_RATIO * nearest.cost
-        apart = [i for i, fit in enumerate(fits) if not fit.cost < limit]
-        starts = [replace(fits[i].make_start(), states=nearest.states) for i in apart]
+        limit = REFIT_SQUARES_RATIO * nearest_fit.cost
+        far_indices = [i for i, fit in enumerate(fits) if not fit.cost < limit]
+        starts = [replace(fits[i].make_start(), states=nearest_fit.states) for i in far_indices]
         # These initial states are good over the first fraction of the runs already.
-        again = self._fitted(starts, FOLLOWED if followed else HORIZON_STAGES[1:])
-        for i, fit in zip(apart, again, strict=True):
+        refits = self._fitted(starts, FOLLOWED if is_filtered else HORIZON_STAGES[1:])
+        for i, fit in zip(far_indices, refits, strict=True):
             fits[i] = _nearest([fits[i], fit])
         return [self._measured(fit) for fit in fits]
 
@@ -183,12 +183,16 @@ class HeldOutRuns:
             return False
         runs = len(world.guess)
         lanes = np.tile(fit.theta, (runs, 1))
-        begun = world.simulate(lanes, np.arange(runs), world.guess)
-        moved = fit.states - world.guess
+        simulated_from_guess = world.simulate(lanes, np.arange(runs), world.guess)
+        state_changes = fit.states - world.guess
         # A diverging simulation from the guess is infinite or NaN.
         with np.errstate(over="ignore", invalid="ignore"):
-            missed = fit.simulated - begun - np.einsum("rtcs,rs->rtc", fit.jacobian, moved)
-            sizes = (missed / self.noise.sigma)[self.seen]
+            linearisation_error = (
+                fit.simulated
+                - simulated_from_guess
+                - np.einsum("rtcs,rs->rtc", fit.jacobian, state_changes)
+            )
+            sizes = (linearisation_error / self.noise.sigma)[self.seen]
             rms = float(np.sqrt(np.square(sizes).mean()))
         # The comparison is negated because NaN compares as false.
         return not rms < LINEARISATION_ERROR_TOLERANCE
@@ -201,13 +205,13 @@ class HeldOutRuns:
         If that reduces the nearest sum of squares enough, the fits are repeated from the starts
         with derivatives that are computed again before each stage.
         """
-        found = _each_nearer(fits, self._about(fits, HORIZON_STAGES[-1:]))
-        if _nearest(fits).cost - _nearest(found).cost < MIN_SQUARES_DECREASE:
-            return found
-        led = self._fitted(starts, HORIZON_STAGES[:1])
+        continued_fits = _each_nearer(fits, self._about(fits, HORIZON_STAGES[-1:]))
+        if _nearest(fits).cost - _nearest(continued_fits).cost < MIN_SQUARES_DECREASE:
+            return continued_fits
+        staged_fits = self._fitted(starts, HORIZON_STAGES[:1])
         for stage in (*HORIZON_STAGES[1:], HORIZON_STAGES[-1]):
-            led = self._about(led, [stage])
-        return _each_nearer(found, led)
+            staged_fits = self._about(staged_fits, [stage])
+        return _each_nearer(continued_fits, staged_fits)
 
     def _about(
         self, fits: Sequence[TrajectoryFit], stages: Sequence[tuple[float, int]]
@@ -216,8 +220,10 @@ class HeldOutRuns:
         # This import is needed for robots only.
         from bench.diagnosis.fitting.linearised_runs import compute_state_jacobian
 
-        nearest = _nearest(fits)
-        compute_state_jacobian(self.world, nearest.theta, nearest.states, anew=True)
+        nearest_fit = _nearest(fits)
+        compute_state_jacobian(
+            self.world, nearest_fit.theta, nearest_fit.states, is_recomputed=True
+        )
         return self._fitted([fit.make_start() for fit in fits], stages)
 
     def _measured(self, fit: TrajectoryFit) -> HeldOutFit:
@@ -226,8 +232,8 @@ class HeldOutRuns:
         A failed fit has the merit -infinity, so that any other model is preferred.
         """
         if not np.isfinite(fit.cost):
-            nothing = np.full_like(self.world.observed, np.nan)
-            return HeldOutFit(nothing, -np.inf, fit.states)
+            no_prediction = np.full_like(self.world.observed, np.nan)
+            return HeldOutFit(no_prediction, -np.inf, fit.states)
         # Only initial states were fitted here, so only they count as free.
         free = count_identified_states(self.world, fit, self.noise)
         merit = merit_of(self.world.observed, fit.simulated, free)
@@ -242,10 +248,10 @@ def merit_of(observed: Array, simulated: Array, free: float) -> float:
         simulated: (R, T, C) predictions.
         free: Effective number of free initial states.
     """
-    seen = np.isfinite(observed)
-    residual = np.where(seen, observed - simulated, 0.0)
-    price = float(np.log(max(int(seen.sum()), 2)))
-    return maximise_likelihood(residual, seen, free).value - free * price  # (1)
+    observed_mask = np.isfinite(observed)
+    residual = np.where(observed_mask, observed - simulated, 0.0)
+    state_penalty = float(np.log(max(int(observed_mask.sum()), 2)))
+    return maximise_likelihood(residual, observed_mask, free).value - free * state_penalty  # (1)
 
 
 def _nearest(fits: Iterable[TrajectoryFit]) -> TrajectoryFit:
@@ -254,7 +260,7 @@ def _nearest(fits: Iterable[TrajectoryFit]) -> TrajectoryFit:
 
 
 def _each_nearer(
-    fits: Sequence[TrajectoryFit], others: Sequence[TrajectoryFit]
+    fits: Sequence[TrajectoryFit], other_fits: Sequence[TrajectoryFit]
 ) -> list[TrajectoryFit]:
     """Return the better of two fits of each model."""
-    return [_nearest(pair) for pair in zip(fits, others, strict=True)]
+    return [_nearest(pair) for pair in zip(fits, other_fits, strict=True)]

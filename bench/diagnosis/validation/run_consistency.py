@@ -183,67 +183,86 @@ def assess_consistency(models: ModelSet, model: FittedModel) -> tuple[ParameterC
     if not groupings or not model.fit.free.size:
         return ()
     curvatures, gradients = _compute_run_normal_equations(models, model)
-    found = [
-        (by, one) for by in groupings for one in _spreads(world, model, by, curvatures, gradients)
+    consistencies = [
+        (grouping, consistency)
+        for grouping in groupings
+        for consistency in _spreads(world, model, grouping, curvatures, gradients)
     ]
-    level = SIGNIFICANCE_LEVEL / max(len(found), 1)
-    judged = [(by, _assess_parameter(one, level)) for by, one in found]
+    level = SIGNIFICANCE_LEVEL / max(len(consistencies), 1)
+    assessed = [
+        (grouping, _assess_parameter(consistency, level)) for grouping, consistency in consistencies
+    ]
     return tuple(
-        one
-        if one.is_consistent
-        else replace(one, trend_covariate=_find_trend_covariate(world, model, by, one))
-        for by, one in judged
+        consistency
+        if consistency.is_consistent
+        else replace(
+            consistency, trend_covariate=_find_trend_covariate(world, model, grouping, consistency)
+        )
+        for grouping, consistency in assessed
     )
 
 
 def _find_trend_covariate(
-    world: RunEvaluator, model: FittedModel, by: _RunGrouping, one: ParameterConsistency
+    world: RunEvaluator,
+    model: FittedModel,
+    grouping: _RunGrouping,
+    consistency: ParameterConsistency,
 ) -> TrendCovariate | None:
     """Find the covariate, such as load or temperature, with which a parameter changes.
 
     It is the one with a significant linear trend and the smallest scatter about the line. Return
     None if no trend is significant.
     """
-    if by.by not in ("run", "log"):
-        if one.trend is None or one.trend.p_value >= SIGNIFICANCE_LEVEL:
+    if grouping.by not in ("run", "log"):
+        if consistency.trend is None or consistency.trend.p_value >= SIGNIFICANCE_LEVEL:
             return None
-        return TrendCovariate(classify_constant(world, by.by), by.by, one.trend)
-    places = {name: list(runs) for name, runs in zip(by.names, by.runs, strict=True)}
-    tried = []
-    for about in compute_run_covariates(world, model, one.number):
-        values = np.array([about.values[places[part.group]].mean() for part in one.group_estimates])
+        return TrendCovariate(classify_constant(world, grouping.by), grouping.by, consistency.trend)
+    places = {name: list(runs) for name, runs in zip(grouping.names, grouping.runs, strict=True)}
+    trends = []
+    for covariate in compute_run_covariates(world, model, consistency.number):
+        values = np.array(
+            [covariate.values[places[part.group]].mean() for part in consistency.group_estimates]
+        )
         trend = (
-            _fit_trend(one.group_estimates, values)
-            if len(one.group_estimates) >= MIN_GROUPS_FOR_TREND
+            _fit_trend(consistency.group_estimates, values)
+            if len(consistency.group_estimates) >= MIN_GROUPS_FOR_TREND
             else None
         )
         if trend is not None:
-            tried.append((_compute_residual_mean_square(one.group_estimates, values), about, trend))
-    sure = [entry for entry in tried if entry[2].p_value < SIGNIFICANCE_LEVEL / len(tried)]
-    if not sure:
-        return None
-    least, best, trend = min(sure, key=lambda entry: entry[0])
-    # A covariate that fits about as well cannot be distinguished from the best one.
-    also = [
-        about.name
-        for rest, about, _ in sure
-        if about is not best and rest < COVARIATE_TIE_FACTOR * least
+            trends.append(
+                (
+                    _compute_residual_mean_square(consistency.group_estimates, values),
+                    covariate,
+                    trend,
+                )
+            )
+    significant_trends = [
+        entry for entry in trends if entry[2].p_value < SIGNIFICANCE_LEVEL / len(trends)
     ]
-    return TrendCovariate(best.kind, best.name, trend, tuple(also))
+    if not significant_trends:
+        return None
+    lowest_scatter, best, trend = min(significant_trends, key=lambda entry: entry[0])
+    # A covariate that fits about as well cannot be distinguished from the best one.
+    similar_covariates = [
+        covariate.name
+        for residual_scatter, covariate, _ in significant_trends
+        if covariate is not best and residual_scatter < COVARIATE_TIE_FACTOR * lowest_scatter
+    ]
+    return TrendCovariate(best.kind, best.name, trend, tuple(similar_covariates))
 
 
 def _compute_residual_mean_square(parts: Sequence[GroupEstimate], numbers: Array) -> float:
     """Compute the weighted mean square about the line of `_fit_trend`; at least 1 (expectation)."""
     values = np.array([part.value for part in parts])
     weights = np.array([part.error for part in parts]) ** -2.0
-    rest = values - np.polyval(np.polyfit(numbers, values, 1, w=np.sqrt(weights)), numbers)
-    return max(float(weights @ rest**2) / (len(parts) - 2), 1.0)
+    residual = values - np.polyval(np.polyfit(numbers, values, 1, w=np.sqrt(weights)), numbers)
+    return max(float(weights @ residual**2) / (len(parts) - 2), 1.0)
 
 
-def _assess_parameter(one: ParameterConsistency, level: float) -> ParameterConsistency:
+def _assess_parameter(consistency: ParameterConsistency, level: float) -> ParameterConsistency:
     """Mark a parameter as consistent if its scatter is small or not significant at `level`."""
-    slight = one.scatter < MIN_RELEVANT_SCATTER * abs(one.value)
-    return replace(one, is_consistent=slight or one.p_value >= level)
+    is_scatter_small = consistency.scatter < MIN_RELEVANT_SCATTER * abs(consistency.value)
+    return replace(consistency, is_consistent=is_scatter_small or consistency.p_value >= level)
 
 
 def _list_groupings(runs: Sequence[Run]) -> Iterator[_RunGrouping]:
@@ -254,10 +273,18 @@ def _list_groupings(runs: Sequence[Run]) -> Iterator[_RunGrouping]:
         yield _RunGrouping("log", logs, places, tuple(map(float, range(len(logs)))))
     for name in dict.fromkeys(name for run in runs for name in run.constants):
         values = [run.constants.get(name, np.nan) for run in runs]
-        each = sorted(set(values))
-        if len(each) > 1 and np.isfinite(each).all():
-            places = tuple(tuple(i for i, v in enumerate(values) if v == one) for one in each)
-            yield _RunGrouping(name, tuple(f"{one:g}" for one in each), places, tuple(each))
+        unique_values = sorted(set(values))
+        if len(unique_values) > 1 and np.isfinite(unique_values).all():
+            places = tuple(
+                tuple(i for i, v in enumerate(values) if v == unique_value)
+                for unique_value in unique_values
+            )
+            yield _RunGrouping(
+                name,
+                tuple(f"{unique_value:g}" for unique_value in unique_values),
+                places,
+                tuple(unique_values),
+            )
     if len(runs) > 1:
         yield _RunGrouping(
             "run", tuple(run.name for run in runs), tuple((i,) for i in range(len(runs)))
@@ -268,20 +295,26 @@ def _compute_run_normal_equations(models: ModelSet, model: FittedModel) -> tuple
     """Compute the normal equations of each run: H (R, q, q) and g (R, q) of (1)."""
     world, fit = models.world, model.fit
     q = fit.free.size
-    found = compute_fisher_blocks(models, model)
-    residual = whiten(models.compute_residual(fit), models.observed_mask, found.noise)
-    pull = np.einsum("rnk,rn->rk", found.jacobian, residual.reshape(len(residual), -1))
+    fisher_blocks = compute_fisher_blocks(models, model)
+    residual = whiten(models.compute_residual(fit), models.observed_mask, fisher_blocks.noise)
+    pull = np.einsum("rnk,rn->rk", fisher_blocks.jacobian, residual.reshape(len(residual), -1))
     pull[:, q:] += compute_state_prior(world) ** -2.0 * (world.guess - fit.states)
     pull[:, q:] *= ~world.known
-    right = np.concatenate([found.cross.transpose(0, 2, 1), pull[:, q:, None]], 2)
-    solved = np.linalg.solve(found.inner, right)
-    curvatures = found.own - np.matmul(found.cross, solved[..., :-1])
-    gradients = pull[:, :q] - np.matmul(found.cross, solved[..., -1:])[..., 0]  # (1)
+    right_hand_sides = np.concatenate(
+        [fisher_blocks.cross.transpose(0, 2, 1), pull[:, q:, None]], 2
+    )
+    eliminated = np.linalg.solve(fisher_blocks.inner, right_hand_sides)
+    curvatures = fisher_blocks.own - np.matmul(fisher_blocks.cross, eliminated[..., :-1])
+    gradients = pull[:, :q] - np.matmul(fisher_blocks.cross, eliminated[..., -1:])[..., 0]  # (1)
     return curvatures, gradients
 
 
 def _spreads(
-    world: RunEvaluator, model: FittedModel, by: _RunGrouping, curvatures: Array, gradients: Array
+    world: RunEvaluator,
+    model: FittedModel,
+    grouping: _RunGrouping,
+    curvatures: Array,
+    gradients: Array,
 ) -> Iterator[ParameterConsistency]:
     """Test for each parameter whether the groups of runs agree on it.
 
@@ -291,40 +324,40 @@ def _spreads(
     Args:
         world: Run evaluator of the runs.
         model: Joint fit of all runs.
-        by: Groups of runs, for example one for each load.
+        grouping: Groups of runs, for example one for each load.
         curvatures: (R, q, q) H_r of eq. (1), the information of each run on the parameters.
         gradients: (R, q) g_r of eq. (1).
     """
-    joint = _regularised_inverse(curvatures.sum(axis=0))
+    joint_covariance = _regularised_inverse(curvatures.sum(axis=0))
     steps, errors = [], []
-    for runs in by.runs:
-        own = _regularised_inverse(curvatures[list(runs)].sum(axis=0))
-        steps.append(own @ gradients[list(runs)].sum(axis=0))  # (2)
-        errors.append(np.sqrt(np.maximum(np.diagonal(own), 0.0)))
+    for runs in grouping.runs:
+        group_covariance = _regularised_inverse(curvatures[list(runs)].sum(axis=0))
+        steps.append(group_covariance @ gradients[list(runs)].sum(axis=0))  # (2)
+        errors.append(np.sqrt(np.maximum(np.diagonal(group_covariance), 0.0)))
     for column, place in enumerate(model.fit.free.tolist()):
         parameter, value = world.parameters[place], float(model.fit.theta[place])
         low, high = parameter.bounds
         size = max(high - low, abs(value))
         parts, numbers = [], []
-        for group, name in enumerate(by.names):
+        for group, name in enumerate(grouping.names):
             error = float(errors[group][column])
             if error > 0 and 2.0 * Z95 * error < MAX_INTERVAL_WIDTH * size:
                 parts.append(GroupEstimate(name, value + float(steps[group][column]), error))
-                numbers.append(by.numbers[group] if by.numbers else 0.0)
+                numbers.append(grouping.numbers[group] if grouping.numbers else 0.0)
         if len(parts) < 2:
             continue
-        error = float(np.sqrt(max(joint[column, column], 0.0)))
-        scatter, chance = _estimate_heterogeneity(parts)
-        trend = _fit_trend(parts, np.array(numbers)) if by.numbers else None
+        error = float(np.sqrt(max(joint_covariance[column, column], 0.0)))
+        scatter, p_value = _estimate_heterogeneity(parts)
+        trend = _fit_trend(parts, np.array(numbers)) if grouping.numbers else None
         yield ParameterConsistency(
             parameter.name,
             parameter.unit,
-            by.by,
+            grouping.by,
             value,
             error,
             tuple(parts),
             scatter,
-            chance,
+            p_value,
             True,
             trend,
         )
@@ -345,11 +378,11 @@ def _estimate_heterogeneity(parts: Sequence[GroupEstimate]) -> tuple[float, floa
     """
     values = np.array([part.value for part in parts])
     weights = np.array([part.error for part in parts]) ** -2.0
-    mean = float(weights @ values / weights.sum())
-    q = float(weights @ (values - mean) ** 2)  # (3)
+    weighted_mean = float(weights @ values / weights.sum())
+    q = float(weights @ (values - weighted_mean) ** 2)  # (3)
     freedom = len(parts) - 1
-    left = float(weights.sum() - (weights @ weights) / weights.sum())
-    tau = np.sqrt(max(q - freedom, 0.0) / left) if left > 0 else 0.0  # (4)
+    scale = float(weights.sum() - (weights @ weights) / weights.sum())
+    tau = np.sqrt(max(q - freedom, 0.0) / scale) if scale > 0 else 0.0  # (4)
     return float(tau), chi_squared_tail(freedom, q)
 
 
@@ -362,12 +395,12 @@ def _fit_trend(parts: Sequence[GroupEstimate], numbers: Array) -> Trend | None:
         return None
     values = np.array([part.value for part in parts])
     weights = np.array([part.error for part in parts]) ** -2.0
-    apart = numbers - weights @ numbers / weights.sum()
-    power = float(weights @ apart**2)
-    slope = float(weights @ (apart * values)) / power
-    rest = values - weights @ values / weights.sum() - slope * apart
+    centred_numbers = numbers - weights @ numbers / weights.sum()
+    power = float(weights @ centred_numbers**2)
+    slope = float(weights @ (centred_numbers * values)) / power
+    residual = values - weights @ values / weights.sum() - slope * centred_numbers
     freedom = len(parts) - 2
-    ratio = float(weights @ rest**2) / freedom
+    ratio = float(weights @ residual**2) / freedom
     error = float(np.sqrt(max(ratio, 1.0) / power))
     # If the scatter agrees with the errors, these are known; otherwise they are estimated.
     size = abs(slope) / error

@@ -52,11 +52,11 @@ def compute_run_covariates(
         model: Fitted model whose simulated motion is used.
         number: Name of the parameter, ``parameter`` or ``parameter@joint``.
     """
-    everything = [
+    covariates = [
         *_list_non_motion_covariates(world),
         *_compute_motion_covariates(world, model, number),
     ]
-    return [one for one in everything if _varies_between_runs(one.values)]
+    return [covariate for covariate in covariates if _varies_between_runs(covariate.values)]
 
 
 def classify_constant(world: RunEvaluator, name: str) -> CovariateKind:
@@ -110,8 +110,10 @@ def _compute_motion_covariates(
         times = track.scenario.times
         place = simulated[: times.size, column]
         rate = np.gradient(place, times)
-        way = float(rate.sum() / max(np.abs(rate).sum(), 1e-300))
-        rows.append((float(place.std()), float(np.sqrt(np.mean(rate**2))), way, place.mean()))
+        mean_direction = float(rate.sum() / max(np.abs(rate).sum(), 1e-300))
+        rows.append(
+            (float(place.std()), float(np.sqrt(np.mean(rate**2))), mean_direction, place.mean())
+        )
     amplitude, speed, direction, position = np.array(rows).T
     yield RunCovariate("amplitude", "the amplitude", amplitude)
     yield RunCovariate("speed", "the speed", speed)

@@ -74,7 +74,7 @@ def test_what_a_fit_leaves_of_surrogates_remembers_as_much_as_what_it_left_of_th
         seen = everything(residual)
         own.append(autocorrelation(residual, 1))
         naive.append(autocorrelation(left(draw_surrogates(residual, seen, 40, rng)), 1))
-        again = draw_surrogates(residual, seen, 40, rng, left=left)
+        again = draw_surrogates(residual, seen, 40, rng, project_out=left)
         corrected.append(autocorrelation(left(again), 1))
     assert np.mean(corrected) == pytest.approx(np.mean(own), abs=0.015)
     assert np.mean(naive) < np.mean(own) - 0.04, "without it they remember too little"
@@ -89,6 +89,6 @@ def test_white_noise_has_nothing_to_correct():
         asked.append(noises)
         return noises
 
-    like = draw_surrogates(made, everything(made), 5, np.random.default_rng(0), left=left)
+    like = draw_surrogates(made, everything(made), 5, np.random.default_rng(0), project_out=left)
     np.testing.assert_array_equal(like, usual)
     assert not asked

@@ -26,7 +26,7 @@ def test_every_verdict_has_one_sentence_and_is_in_the_form_of_verdict_json():
 def rests(ranges=(5.9, 5.9), left=(2.9, 2.9), touched=False):
     """Evaluate `is_motionless` for ranges and residuals in units of the noise."""
     return verdict_rules.is_motionless(
-        np.array(ranges) * SIGMA, np.array(left) * SIGMA, SIGMA, touched=touched
+        np.array(ranges) * SIGMA, np.array(left) * SIGMA, SIGMA, is_model_sensitive=touched
     )
 
 
@@ -51,13 +51,13 @@ def test_a_parameter_is_fixed_by_an_error_of_less_than_half_its_bounds():
 @pytest.mark.parametrize("error", [0.0, 0.02])
 def test_stated_noise_is_exceeded_by_a_twentieth_and_four_standard_errors(error):
     limit = 1.05 + 4 * error
-    assert not verdict_rules.exceeds_noise(limit - 1e-6, error, stated=True)
-    assert verdict_rules.exceeds_noise(limit + 1e-6, error, stated=True)
+    assert not verdict_rules.exceeds_noise(limit - 1e-6, error, is_noise_stated=True)
+    assert verdict_rules.exceeds_noise(limit + 1e-6, error, is_noise_stated=True)
 
 
 def test_estimated_noise_is_exceeded_sevenfold_whatever_the_error():
-    assert not verdict_rules.exceeds_noise(6.99, 0.0, stated=False)
-    assert verdict_rules.exceeds_noise(7.01, 1.0, stated=False)
+    assert not verdict_rules.exceeds_noise(6.99, 0.0, is_noise_stated=False)
+    assert verdict_rules.exceeds_noise(7.01, 1.0, is_noise_stated=False)
 
 
 @pytest.mark.parametrize(("stated", "chance"), [(True, 1e-3), (False, 1e-4)])
