@@ -102,10 +102,10 @@ class FittedValue:
 
     def to_table(self) -> dict[str, Any]:
         """Return the number as a TOML table, which has no null."""
-        stated: dict[str, Any] = {"value": self.value, "unit": self.unit}
+        table: dict[str, Any] = {"value": self.value, "unit": self.unit}
         if self.low is not None and self.high is not None:
-            stated |= {"low": self.low, "high": self.high}
-        return stated
+            table |= {"low": self.low, "high": self.high}
+        return table
 
 
 @dataclass(frozen=True)
@@ -157,8 +157,8 @@ class ExtendedSimulator:
 
 def make_extended_name(system: str) -> str:
     """Return the name of the extension of a system; special characters are replaced."""
-    plain = re.sub(r"[^A-Za-z0-9_.-]", "_", system)[:MAX_SYSTEM_NAME_LENGTH]
-    return f"{plain if plain[:1].isalpha() else f'robot_{plain}'}_extended"
+    cleaned_name = re.sub(r"[^A-Za-z0-9_.-]", "_", system)[:MAX_SYSTEM_NAME_LENGTH]
+    return f"{cleaned_name if cleaned_name[:1].isalpha() else f'robot_{cleaned_name}'}_extended"
 
 
 def get_robot_reference(kind: type[SystemSimulator]) -> RobotReference | None:
@@ -188,13 +188,13 @@ def format_extended(extended: ExtendedSimulator, folder: Path | None = None) -> 
 
     if extended.robot is None:
         engine = {"engine": extended.engine} if extended.engine else {}
-        of: dict[str, Any] = {"system": extended.system, **engine}
+        base_entries: dict[str, Any] = {"system": extended.system, **engine}
     else:
-        of = extended.robot.to_document(folder)
+        base_entries = extended.robot.to_document(folder)
     document = {
         "format": FORMAT_VERSION,
         "name": extended.name,
-        **of,
+        **base_entries,
         "title": extended.title,
         "observe": list(extended.observe),
         "constants": dict(extended.constants),
@@ -215,8 +215,8 @@ def read_extended(path: Path) -> ExtendedSimulator:
     """
     document = read_toml(path)
     if document.get("format") != FORMAT_VERSION:
-        wanted = f"an extended simulator with format = {FORMAT_VERSION}"
-        raise make_error(path, "", wanted, document.get("format"))
+        expected = f"an extended simulator with format = {FORMAT_VERSION}"
+        raise make_error(path, "", expected, document.get("format"))
     check_known_names(f"key of {path}", document, _KEYS)
     name = _name(path, document.get("name"))
     robot = robot_reference.read_robot_reference(path, document) if "model" in document else None
@@ -253,17 +253,17 @@ def _name(path: Path, value: Any) -> str:
 
 def _observe(path: Path, value: Any) -> list[str]:
     """Check the list of observed channels in the file; it must not be empty."""
-    wanted = "a list of channel names"
-    observe = check_name_list(path, "observe", value, wanted)
+    expected = "a list of channel names"
+    observe = check_name_list(path, "observe", value, expected)
     if not observe:
-        raise make_error(path, "observe", wanted, value)
+        raise make_error(path, "observe", expected, value)
     return list(observe)
 
 
 def _constants(path: Path, value: Any) -> dict[str, float]:
     """Read the known constants in the file, by name."""
-    given = check_table(path, "constants", value)
-    return {name: _real(path, f"constants.{name}", number) for name, number in given.items()}
+    table = check_table(path, "constants", value)
+    return {name: _real(path, f"constants.{name}", number) for name, number in table.items()}
 
 
 def _effects(path: Path, value: Any) -> dict[str, dict[str, FittedValue]]:
@@ -276,33 +276,32 @@ def _effects(path: Path, value: Any) -> dict[str, dict[str, FittedValue]]:
     return coefficients
 
 
-def _numbers(path: Path, where: str, value: Any) -> dict[str, FittedValue]:
+def _numbers(path: Path, key: str, value: Any) -> dict[str, FittedValue]:
     """Read a table of fitted numbers with their units, by name."""
-    given = check_table(path, where, value)
-    return {name: _number(path, f"{where}.{name}", number) for name, number in given.items()}
+    table = check_table(path, key, value)
+    return {name: _number(path, f"{key}.{name}", number) for name, number in table.items()}
 
 
-def _number(path: Path, where: str, value: Any) -> FittedValue:
+def _number(path: Path, key: str, value: Any) -> FittedValue:
     """Read a fitted number with its unit, and its interval where the file states one."""
-    given = check_table(path, where, value, "a table with value and unit")
-    fitted = _real(path, f"{where}.value", given.get("value"))
+    table = check_table(path, key, value, "a table with value and unit")
+    fitted = _real(path, f"{key}.value", table.get("value"))
     low, high = (
-        _real(path, f"{where}.{end}", given[end]) if end in given else None
-        for end in ("low", "high")
+        _real(path, f"{key}.{end}", table[end]) if end in table else None for end in ("low", "high")
     )
-    return FittedValue(fitted, _text(path, "unit", given.get("unit")), low, high)
+    return FittedValue(fitted, _text(path, "unit", table.get("unit")), low, high)
 
 
-def _text(path: Path, where: str, value: Any) -> str:
+def _text(path: Path, key: str, value: Any) -> str:
     """Check that an entry is a text that is not empty."""
-    result = check_text(path, where, value, "a text")
+    result = check_text(path, key, value, "a text")
     if not result:
-        raise make_error(path, where, "a text", value)
+        raise make_error(path, key, "a text", value)
     return result
 
 
-def _real(path: Path, where: str, value: Any) -> float:
-    return check_finite(path, where, value, "a finite number")
+def _real(path: Path, key: str, value: Any) -> float:
+    return check_finite(path, key, value, "a finite number")
 
 
 def make_simulator_class(
@@ -321,14 +320,17 @@ def make_simulator_class(
     """
     check_known_names(f"parameter of system {extended.system}", extended.parameters, _names(kind))
     fitted = extended.parameters
-    own = [_at(p, fitted[p.name]) if p.name in fitted else p for p in kind.parameters]
+    base_parameters = [_at(p, fitted[p.name]) if p.name in fitted else p for p in kind.parameters]
     values = _coefficients(extended, kind)
     # Make one instance, so that wrong settings are refused here; it knows the coefficients' bounds.
     effects, observed = list(extended.effects), list(extended.observe)
-    fresh = kind(extended.constants, observed, effects=effects, **_engine(extended))
-    added = [_at(p, n) for p, n in zip(fresh.parameters[len(own) :], values, strict=True)]
-    fresh.close()
-    return _make_subclass(extended, kind, (*own, *added))
+    extended_simulator = kind(extended.constants, observed, effects=effects, **_engine(extended))
+    added_parameters = [
+        _at(p, n)
+        for p, n in zip(extended_simulator.parameters[len(base_parameters) :], values, strict=True)
+    ]
+    extended_simulator.close()
+    return _make_subclass(extended, kind, (*base_parameters, *added_parameters))
 
 
 def _engine(extended: ExtendedSimulator) -> dict[str, Any]:
@@ -350,9 +352,11 @@ def _make_subclass(
     ) -> None:
         """Create the simulator with the fitted constants and effects of the file."""
         # Engine, sensors and constants may be changed; the effects are fixed.
-        stated = {**extended.constants, **(constants or {})}
-        chosen = {**_engine(extended), **settings}
-        kind.__init__(self, stated, observe or observed, effects=effects, **chosen)
+        stated_constants = {**extended.constants, **(constants or {})}
+        engine_settings = {**_engine(extended), **settings}
+        kind.__init__(
+            self, stated_constants, observe or observed, effects=effects, **engine_settings
+        )
         # A user-defined simulator refuses to set this attribute twice, so bypass the check.
         object.__setattr__(self, "parameters", parameters)
 
@@ -370,8 +374,8 @@ def _make_subclass(
     simulator: type[SystemSimulator] = type(re.sub(r"\W", "_", extended.name), (kind,), body)
     # The base class copies these from the system; replace them by the fitted ones.
     simulator.name = extended.name
-    what = ", ".join(extended.effects) or "nothing added"
-    simulator.says = f"{extended.system} with {what}, fitted to: {extended.title}"
+    additions = ", ".join(extended.effects) or "nothing added"
+    simulator.says = f"{extended.system} with {additions}, fitted to: {extended.title}"
     simulator.parameters = parameters
     return simulator
 
@@ -388,10 +392,10 @@ def check_not_extended(kind: type[SystemSimulator]) -> None:
     """
     if hasattr(kind, "extends"):
         robot: Any = kind
-        of = f"system it extends, {robot.extends}"
+        advice = f"system it extends, {robot.extends}"
         if kind.has_model:
-            of = f"model file it extends, --model {robot.robot.path}"
-        raise InputError(f"simulator {kind.name} is extended already; name the {of}")
+            advice = f"model file it extends, --model {robot.robot.path}"
+        raise InputError(f"simulator {kind.name} is extended already; name the {advice}")
 
 
 def _coefficients(extended: ExtendedSimulator, kind: type[SystemSimulator]) -> list[FittedValue]:
@@ -403,8 +407,8 @@ def _coefficients(extended: ExtendedSimulator, kind: type[SystemSimulator]) -> l
         check_known_names(f"coefficient of effect {name}", numbers, [c.name for c in coefficients])
         parameters = make_effect_parameters(effect, kind.system, extended.observe)
         for parameter, coefficient in zip(parameters, coefficients, strict=True):
-            off = FittedValue(0.0, parameter.unit, None, None)
-            values.append(numbers.get(coefficient.name, off))
+            zero = FittedValue(0.0, parameter.unit, None, None)
+            values.append(numbers.get(coefficient.name, zero))
     return values
 
 
@@ -416,8 +420,8 @@ def _at(parameter: Parameter, number: FittedValue) -> Parameter:
     low, high = parameter.bounds
     # The fitted value may be outside the plausible range; extend the bounds to include it.
     low, high = min(low, number.value), max(high, number.value)
-    inner = (max(low, number.value - reach), min(high, number.value + reach))
-    training = inner if inner[0] < inner[1] else None
+    training_range = (max(low, number.value - reach), min(high, number.value + reach))
+    training = training_range if training_range[0] < training_range[1] else None
     return replace(parameter, nominal=number.value, bounds=(low, high), training=training)
 
 

@@ -106,13 +106,13 @@ def _ask(effect: type[Effect], system: type[OwnSimulatorSystem]) -> None:
     So a missing quantity is reported before a simulation starts.
     """
     # Coefficients and states are zero: only the requested quantities matter, not the result.
-    one = np.ones((1, 1))
+    ones = np.ones((1, 1))
     d = len(system.coordinates)
-    constants = {c.name: c.value * one for c in system.constants}
-    inputs = {c.name: 0.0 * one for c in system.inputs}
+    constants = {c.name: c.value * ones for c in system.constants}
+    inputs = {c.name: 0.0 * ones for c in system.inputs}
     theta = np.array([[p.nominal for p in system.parameters]])
-    nothing = np.zeros((1, d))
-    moment = StateSnapshot(system(), theta, constants, 0 * one, nothing, nothing, inputs)
+    zeros = np.zeros((1, d))
+    moment = StateSnapshot(system(), theta, constants, 0 * ones, zeros, zeros, inputs)
     c = np.zeros((len(effect.coefficients), 1, 1))
     if issubclass(effect, Force):
         effect().force(c, moment)
@@ -158,21 +158,21 @@ class OwnSimulator(SystemSimulator):
         _check(cls)
         forced = {*cls.coordinates, *cls.rates}
         # Other states are appended to the rates, because engines pass two vectors only.
-        others = [name for name in cls.states if name not in forced]
+        free_states = [name for name in cls.states if name not in forced]
         summary = " ".join((cls.__doc__ or cls.says).split("\n\n")[0].split())
         shared = ("name", "parameters", "channels", "constants", "inputs", "states")
-        declared = {
+        attributes = {
             **{name: getattr(cls, name) for name in shared},
             "says": cls.__dict__.get("says") or summary,
             "kind": cls.kind,
             "coordinates": cls.coordinates,
-            "rates": (*cls.rates, *others),
+            "rates": (*cls.rates, *free_states),
             "levels": cls.levels,
             "sensed": tuple(c.name for c in cls.channels),
             "simulator": cls,
         }
         # Each simulator has its own system class: effects query the class, not an instance.
-        system: Any = type(f"{cls.__name__}System", (OwnSimulatorSystem,), declared)
+        system: Any = type(f"{cls.__name__}System", (OwnSimulatorSystem,), attributes)
         cls.system = system
         super().__init_subclass__(**kwargs)
 
@@ -259,8 +259,8 @@ class OwnSimulator(SystemSimulator):
                 f"simulator {self.name} has no setting '{extra[0]}'; there is: time_step"
             )
         if not (is_plausible_number(step) and step > 0):
-            found = truncate_text(str(step))
-            raise InputError(f"time_step must be a positive number of seconds, found {found}")
+            found_text = truncate_text(str(step))
+            raise InputError(f"time_step must be a positive number of seconds, found {found_text}")
         return OwnSimulatorEngine(self, step)
 
     def close(self) -> None:
@@ -291,11 +291,11 @@ def _check(cls: type[OwnSimulator]) -> None:
         )
     for name in (*cls.coordinates, *cls.rates):
         if name not in cls.states:
-            known = ", ".join(cls.states) or "(none)"
-            raise InputError(f"simulator {cls.name}: {name} is not among its states {known}")
-    shown = [c.name for c in cls.channels]
+            state_names = ", ".join(cls.states) or "(none)"
+            raise InputError(f"simulator {cls.name}: {name} is not among its states {state_names}")
+    channel_names = [c.name for c in cls.channels]
     for name in cls.levels:
-        if name not in cls.states or name not in shown:
+        if name not in cls.states or name not in channel_names:
             raise InputError(f"simulator {cls.name}: level {name} must be a state and a channel")
 
 

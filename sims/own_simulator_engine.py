@@ -114,8 +114,8 @@ class OwnSimulatorEngine:
         start = [*lanes.x[lane].tolist(), *lanes.v[lane].tolist()]
         initial = dict(zip(states, start, strict=True))
         # Never pass NaN to a user's model: it may hang or never recover.
-        given = [*theta.values(), *constants.values(), *initial.values()]
-        if not np.isfinite(given).all():
+        arguments = [*theta.values(), *constants.values(), *initial.values()]
+        if not np.isfinite(arguments).all():
             return None
         world.reset(theta, constants, initial)
         forces = _Forces(lanes, lane, world)
@@ -127,7 +127,7 @@ class OwnSimulatorEngine:
         steps[moving] = equalise_steps(steps[moving], lanes.steps_per_sample)
         row = self._row(system)
         t = 0.0
-        moved = False
+        has_moved = False
         rows = [row]
         for i, seconds in enumerate(steps.tolist()):
             if seconds > 0:
@@ -137,29 +137,31 @@ class OwnSimulatorEngine:
                 world.step(inputs, seconds)
                 rims.keep()
                 t = t + seconds
-                moved = True
+                has_moved = True
             # Without a step, the previous row is still valid.
             if (i + 1) % lanes.steps_per_sample == 0:
-                row = self._row(system) if moved else row
-                moved = False
+                row = self._row(system) if has_moved else row
+                has_moved = False
                 rows.append(row)
         return np.array(rows)
 
     def _row(self, system: System) -> list[float]:
         """Return the present reading of each channel of the user's simulator."""
-        seen = self.world.observe()
-        return [observed(self.world, seen, c.name) for c in system.channels]
+        observation = self.world.observe()
+        return [observed(self.world, observation, c.name) for c in system.channels]
 
 
 def _fault(world: SteppableSimulator, error: Exception) -> InputError:
     """Make the error for an exception in the simulator's code, with its line."""
     frames = traceback.extract_tb(error.__traceback__)
     module = sys.modules.get(type(world).__module__)
-    own = [frame for frame in frames if frame.filename == getattr(module, "__file__", None)]
-    frame = (own or list(frames))[-1]
-    what = f"{type(error).__name__}: {error}"
-    at = f"{Path(frame.filename).name}, line {frame.lineno}, in {frame.name}"
-    return InputError(f"simulator {world.name}: {what} ({at})")
+    module_frames = [
+        frame for frame in frames if frame.filename == getattr(module, "__file__", None)
+    ]
+    frame = (module_frames or list(frames))[-1]
+    description = f"{type(error).__name__}: {error}"
+    location = f"{Path(frame.filename).name}, line {frame.lineno}, in {frame.name}"
+    return InputError(f"simulator {world.name}: {description} ({location})")
 
 
 def observed(world: SteppableSimulator, seen: Mapping[str, float], name: str) -> float:
@@ -191,15 +193,15 @@ def observed(world: SteppableSimulator, seen: Mapping[str, float], name: str) ->
         ) from None
 
 
-def _unobserved(world: SteppableSimulator, seen: object, name: str) -> InputError:
+def _unobserved(world: SteppableSimulator, observation: object, name: str) -> InputError:
     """Make the error for a value that `observe` did not return."""
-    if not isinstance(seen, Mapping):
-        found = type(seen).__name__
+    if not isinstance(observation, Mapping):
+        type_name = type(observation).__name__
         return InputError(
-            f"simulator {world.name}: observe(): expected a dictionary, found {found}"
+            f"simulator {world.name}: observe(): expected a dictionary, found {type_name}"
         )
     return InputError(
-        f"simulator {world.name}: observe() gave no '{name}'; it gave: {', '.join(seen)}"
+        f"simulator {world.name}: observe() gave no '{name}'; it gave: {', '.join(observation)}"
     )
 
 
@@ -214,12 +216,12 @@ def inertia_of(world: SteppableSimulator) -> float | Array:
     Raises:
         InputError: `inertia` returned neither.
     """
-    given = world.inertia()
-    if isinstance(given, float):
-        return float(given)
+    inertia = world.inertia()
+    if isinstance(inertia, float):
+        return float(inertia)
     d = len(world.coordinates)
     try:
-        matrix = np.asarray(given, dtype=np.float64)
+        matrix = np.asarray(inertia, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise InputError(f"simulator {world.name}: inertia: expected numbers; {error}") from None
     if not matrix.shape:
@@ -243,21 +245,23 @@ class _LevelLimits:
         """
         self.acting = []
         for effect, c in lanes.effects:
-            own = c[:, lane : lane + 1]
-            if isinstance(effect, Level) and own.any():
-                self.acting.append((effect, own, effect.place or lanes.system.levels[0]))
+            lane_coefficients = c[:, lane : lane + 1]
+            if isinstance(effect, Level) and lane_coefficients.any():
+                self.acting.append(
+                    (effect, lane_coefficients, effect.place or lanes.system.levels[0])
+                )
         self.world = world
 
     def keep(self) -> None:
         """Limit the levels after a step, such as that of a tank which overflows at its rim."""
         if not self.acting:
             return
-        seen = self.world.observe()
+        observation = self.world.observe()
         for effect, c, name in self.acting:
-            level = np.array([[observed(self.world, seen, name)]])
-            kept = float(effect.keep(c, level)[0, 0])
-            if kept != level[0, 0]:
-                self.world.put({name: kept})
+            level = np.array([[observed(self.world, observation, name)]])
+            limited_level = float(effect.keep(c, level)[0, 0])
+            if limited_level != level[0, 0]:
+                self.world.put({name: limited_level})
 
 
 class _Forces:
@@ -269,10 +273,12 @@ class _Forces:
         `_last` holds velocity, forces and length of the previous step, from which (1) estimates
         the simulator's own force; None at the first step.
         """
-        here = [(effect, c[:, lane : lane + 1]) for effect, c in lanes.effects]
-        acting = [(effect, c) for effect, c in here if c.any()]
-        self.forces = [(effect, c) for effect, c in acting if isinstance(effect, Force)]
-        self.frictions = [(effect, c) for effect, c in acting if isinstance(effect, Friction)]
+        lane_effects = [(effect, c[:, lane : lane + 1]) for effect, c in lanes.effects]
+        active_effects = [(effect, c) for effect, c in lane_effects if c.any()]
+        self.forces = [(effect, c) for effect, c in active_effects if isinstance(effect, Force)]
+        self.frictions = [
+            (effect, c) for effect, c in active_effects if isinstance(effect, Friction)
+        ]
         self.any = bool(self.forces or self.frictions)
         self.world = world
         self.system = lanes.system
@@ -288,12 +294,12 @@ class _Forces:
             inputs: Inputs by name.
             seconds: Length of the step, s.
         """
-        seen = self.world.observe()
-        x = self._state(seen, self.world.coordinates)
-        v = self._state(seen, self.world.rates)
-        felt = {name: np.array([[value]]) for name, value in inputs.items()}
-        now = np.array([[t]])
-        moment = StateSnapshot(self.system, self.theta, self.constants, now, x, v, felt)
+        observation = self.world.observe()
+        x = self._state(observation, self.world.coordinates)
+        v = self._state(observation, self.world.rates)
+        applied_inputs = {name: np.array([[value]]) for name, value in inputs.items()}
+        time = np.array([[t]])
+        moment = StateSnapshot(self.system, self.theta, self.constants, time, x, v, applied_inputs)
         force = np.zeros(x.shape[1])
         for effect, c in self.forces:
             force = force + effect.force(c, moment)[0]
@@ -308,19 +314,19 @@ class _Forces:
         """
         inertia = inertia_of(self.world)
         v = moment.v[0]
-        own = np.zeros_like(force)
+        passive_force = np.zeros_like(force)
         if self._last is not None:
-            before, applied, took = self._last
-            own = np.dot(inertia, v - before) / took - applied  # (1)
+            last_velocity, applied, last_seconds = self._last
+            passive_force = np.dot(inertia, v - last_velocity) / last_seconds - applied  # (1)
         limit = sum(float(effect.limit(c, moment)[0, 0]) for effect, c in self.frictions)
-        stop = -(np.dot(inertia, v) / seconds + own + force)  # (2)
+        stop = -(np.dot(inertia, v) / seconds + passive_force + force)  # (2)
         size = float(np.linalg.norm(stop))
         friction: Array = stop if size <= limit else stop * (limit / size)  # (3)
         self._last = v, force + friction, seconds
         return friction
 
-    def _state(self, seen: Mapping[str, float], names: Sequence[str]) -> Array:
-        """Return the named numbers in the observation `seen` as an array (1, D)."""
-        values = [observed(self.world, seen, name) for name in names]
+    def _state(self, observation: Mapping[str, float], names: Sequence[str]) -> Array:
+        """Return the named numbers in the observation `observation` as an array (1, D)."""
+        values = [observed(self.world, observation, name) for name in names]
         state: Array = np.array([values])
         return state

@@ -27,19 +27,19 @@ def make_level_effects(effect: type[Level], system: type[System]) -> tuple[type[
         system: System of a user-defined simulator.
     """
     levels = [channel for channel in system.channels if channel.name in system.levels]
-    made = []
+    effects = []
     for channel in levels:
-        several = len(levels) > 1
+        has_several_levels = len(levels) > 1
         body = {
-            "name": f"{effect.name}@{channel.name}" if several else effect.name,
+            "name": f"{effect.name}@{channel.name}" if has_several_levels else effect.name,
             "of": effect.name,
-            "place": channel.name if several else "",
+            "place": channel.name if has_several_levels else "",
             "coefficients": [_sized(c, channel.unit, channel.scale) for c in effect.coefficients],
             "__module__": __name__,
             "__doc__": effect.__doc__,
         }
-        made.append(type(f"{effect.__name__}At", (effect,), body))
-    return tuple(made)
+        effects.append(type(f"{effect.__name__}At", (effect,), body))
+    return tuple(effects)
 
 
 def _sized(c: Coefficient, unit: str, scale: float) -> Coefficient:
@@ -59,7 +59,7 @@ def find_level_effect(name: str, system: type[System]) -> type[Effect] | None:
         InputError: The effect is not possible on this system or at this place; the message states
             the reason or the possible places.
     """
-    base, at, place = name.partition("@")
+    base, separator, place = name.partition("@")
     try:
         effect = registry.get(base)
     except PartUnavailableError:
@@ -68,13 +68,15 @@ def find_level_effect(name: str, system: type[System]) -> type[Effect] | None:
         return None
     if reason := effect.misses(system):
         raise InputError(f"system {system.name} cannot have effect {name}: {reason}")
-    known = {one.name: one for one in make_level_effects(effect, system)}
-    if name in known:
-        return known[name]
-    places: Sequence[str] = [one.place for one in known.values()]
-    if not at:
-        where = ", ".join(f"{base}@{there}" for there in places)
-        raise InputError(f"effect {base} of simulator {system.name} needs a place: {where}")
+    effects_by_name = {
+        effect_class.name: effect_class for effect_class in make_level_effects(effect, system)
+    }
+    if name in effects_by_name:
+        return effects_by_name[name]
+    places: Sequence[str] = [effect_class.place for effect_class in effects_by_name.values()]
+    if not separator:
+        alternatives = ", ".join(f"{base}@{place_name}" for place_name in places)
+        raise InputError(f"effect {base} of simulator {system.name} needs a place: {alternatives}")
     raise make_unknown_name_error(
         f"place of effect {base} in simulator {system.name}", place, list(system.levels)
     )

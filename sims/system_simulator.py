@@ -83,8 +83,10 @@ class SystemSimulator(Simulator):
             (self._effect(name), _read_coefficients(name, value))
             for name, value in (fixed or {}).items()
         ]
-        named = [effect.name for effect in self.effects]
-        doubled = [name for name in named if name in (fixed or {}) or named.count(name) > 1]
+        effect_names = [effect.name for effect in self.effects]
+        doubled = [
+            name for name in effect_names if name in (fixed or {}) or effect_names.count(name) > 1
+        ]
         if doubled:
             raise InputError(f"effect {doubled[0]} is named twice")
         for effect, values in self.fixed:
@@ -198,27 +200,42 @@ class SystemSimulator(Simulator):
         Returns:
             (L, T, C) observations; NaN after the end of shorter runs and for failed elements.
         """
-        acting = self._acting(theta)
+        active_effects = self._acting(theta)
         runs = group_scenarios(scenarios)
         commands = [self.run_inputs(s) for s in runs.unique_scenarios]
         with np.errstate(all="ignore"):  # batch elements that overflow become NaN
             plan = build_time_grid(
-                runs, commands, _select_effects(acting, (Input, Sensor)), self.engine.largest_step
+                runs,
+                commands,
+                _select_effects(active_effects, (Input, Sensor)),
+                self.engine.largest_step,
             )
             inputs = (
-                compute_applied_inputs(plan, runs, commands, _select_effects(acting, Input))
+                compute_applied_inputs(plan, runs, commands, _select_effects(active_effects, Input))
                 if self.inputs
                 else {}
             )
-            sensors = tuple((effect, c) for effect, c in _select_effects(acting, Sensor) if c.any())
+            sensors = tuple(
+                (effect, c) for effect, c in _select_effects(active_effects, Sensor) if c.any()
+            )
             # A sensor filter needs every step; other sensor effects need the samples only.
             filtered = any(_filters(effect) for effect, _ in sensors)
-            every = 1 if filtered else plan.steps_per_sample
-            own = np.ascontiguousarray(theta[:, : len(self.system.parameters)])
+            steps_per_state = 1 if filtered else plan.steps_per_sample
+            base_theta = np.ascontiguousarray(theta[:, : len(self.system.parameters)])
             constants, x, v = self._known(scenarios, initial)
-            forces = _select_effects(acting, (Force, Friction, Contact, HiddenStateEffect, Level))
+            forces = _select_effects(
+                active_effects, (Force, Friction, Contact, HiddenStateEffect, Level)
+            )
             batch = IntegrationBatch(
-                self._declared, own, constants, x, v, plan.steps, inputs, forces, every
+                self._declared,
+                base_theta,
+                constants,
+                x,
+                v,
+                plan.steps,
+                inputs,
+                forces,
+                steps_per_state,
             )
             clock = np.array([s.times[0] for s in runs.unique_scenarios])[runs.scenario_index, None]
             has_hidden_states = any(isinstance(effect, HiddenStateEffect) for effect, _ in forces)
@@ -243,18 +260,18 @@ class SystemSimulator(Simulator):
 
         Coefficients that the system does not have, or that were not given, are zero.
         """
-        acting = []
+        active_effects = []
         place = len(self.system.parameters)
         for effect in self.effects:
             count = len(effect.on(self.system))
             rows = theta[:, place : place + count].T
-            acting.append((effect, _coefficients(effect, rows)))
+            active_effects.append((effect, _coefficients(effect, rows)))
             place += count
         for effect, values in self.fixed:
             column = np.array(values)[:, None]
             rows = np.repeat(column, len(theta), axis=1)
-            acting.append((effect, _coefficients(effect, rows)))
-        return tuple(acting)
+            active_effects.append((effect, _coefficients(effect, rows)))
+        return tuple(active_effects)
 
     def _known(
         self, scenarios: Sequence[Scenario], initial: Mapping[str, Array]
@@ -338,19 +355,21 @@ def apply_sensor_effects(
         assert isinstance(effect, Sensor)
         # An effect may be active in few of the batch elements; evaluate only these.
         elements = np.flatnonzero(is_active(c))
-        own, begin = c[:, elements], start[elements]
-        nothing = np.zeros_like(begin)
+        coefficients, start_values = c[:, elements], start[elements]
+        zeros = np.zeros_like(start_values)
         first = clock[elements]
-        signal = Signal(values[elements], steps[elements], begin, times[elements], first)
-        values[elements] = effect.read(own, signal)
-        start[elements] = effect.read(own, Signal(begin, nothing, begin, nothing, first))
+        signal = Signal(values[elements], steps[elements], start_values, times[elements], first)
+        values[elements] = effect.read(coefficients, signal)
+        start[elements] = effect.read(
+            coefficients, Signal(start_values, zeros, start_values, zeros, first)
+        )
     return values
 
 
-def _compute_state_times(plan: TimeGrid, every: int) -> Array:
+def _compute_state_times(plan: TimeGrid, steps_per_state: int) -> Array:
     """Return the times (L, R) since the start of the states that the engine stores, s."""
     start = np.zeros((len(plan.ends), 1))
-    return np.concatenate([start, plan.ends[:, every - 1 :: every]], axis=1)
+    return np.concatenate([start, plan.ends[:, steps_per_state - 1 :: steps_per_state]], axis=1)
 
 
 def _select_rows(values: Array, rows: Indices) -> Array:
@@ -378,8 +397,8 @@ def make_effect_parameters(
         name = effect.name if len(coefficients) == 1 else f"{effect.name}.{c.name}"
         low, high = c.range(system.kind)
         unit = c.unit_on(system, observed) or ""
-        off = min(max(0.0, low), high)  # zero, or the nearest value of the range
-        result.append(Parameter(name, unit, off, (low, high), says=effect.says))
+        nominal = min(max(0.0, low), high)  # zero, or the nearest value of the range
+        result.append(Parameter(name, unit, nominal, (low, high), says=effect.says))
     return tuple(result)
 
 
@@ -406,8 +425,8 @@ def _check_effect_types(effects: object, fixed: object) -> None:
     if not isinstance(effects, list | tuple) or not all(map(_is_effect_reference, effects)):
         raise InputError(f"effects: expected a list of names, found {format_value(effects)}")
     if fixed is not None and not isinstance(fixed, Mapping):
-        wanted = "a table of coefficients by effect"
-        raise InputError(f"fixed: expected {wanted}, found {format_value(fixed)}")
+        expected = "a table of coefficients by effect"
+        raise InputError(f"fixed: expected {expected}, found {format_value(fixed)}")
 
 
 def _is_effect_reference(value: object) -> bool:
@@ -420,8 +439,8 @@ def _read_coefficients(name: str, value: Any) -> tuple[float, ...]:
     Raises:
         InputError: a coefficient is not a finite number.
     """
-    several = isinstance(value, list | tuple)
-    values = tuple(value) if several else (value,)
+    is_sequence = isinstance(value, list | tuple)
+    values = tuple(value) if is_sequence else (value,)
     if not all(map(is_plausible_number, values)):
         raise InputError(
             f"effect {name}: expected finite coefficients, found {format_value(value)}"
@@ -439,9 +458,9 @@ def _check_sizes(effect: Effect, system: type[System], values: Sequence[float]) 
         largest = max(map(abs, coefficient.range(system.kind)))
         if abs(value) > MAX_COEFFICIENT_FACTOR * largest:
             unit = coefficient.unit_on(system) or ""
-            wanted = f"within ±{MAX_COEFFICIENT_FACTOR * largest:g} {unit}".rstrip()
+            expected = f"within ±{MAX_COEFFICIENT_FACTOR * largest:g} {unit}".rstrip()
             raise InputError(
-                f"effect {effect.name}: expected {coefficient.name} {wanted}, found {value:g}"
+                f"effect {effect.name}: expected {coefficient.name} {expected}, found {value:g}"
             )
 
 
@@ -452,5 +471,5 @@ def _coefficients(effect: Effect, rows: Array) -> Array:
     return result
 
 
-def _select_effects(acting: ActiveEffects, kind: Any) -> ActiveEffects:
-    return tuple((effect, c) for effect, c in acting if isinstance(effect, kind))
+def _select_effects(active_effects: ActiveEffects, kind: Any) -> ActiveEffects:
+    return tuple((effect, c) for effect, c in active_effects if isinstance(effect, kind))

@@ -101,15 +101,17 @@ def compare(
             "simgap.compare(model='robot.xml', free=['damping@*']); experiments are "
             f"{', '.join(list_experiment_names())}"
         )
-    chosen = build_experiment(experiment, options)
-    if chosen.sweep:
-        raise InputError(f"experiment {chosen.name} sweeps over values: use simgap.sweep")
-    if chosen.experiments:
-        raise InputError(f"experiment {chosen.name} names several: use simgap.sweep")
+    chosen_experiment = build_experiment(experiment, options)
+    if chosen_experiment.sweep:
+        raise InputError(
+            f"experiment {chosen_experiment.name} sweeps over values: use simgap.sweep"
+        )
+    if chosen_experiment.experiments:
+        raise InputError(f"experiment {chosen_experiment.name} names several: use simgap.sweep")
     pool = _connect_to_cluster(options.cluster)
-    (begun,) = begin_studies(chosen, options)
+    (started_study,) = begin_studies(chosen_experiment, options)
     with pdf_figures(options.pdf):
-        return _report_study(begun, begun.run(options.jobs, options.progress, pool))
+        return _report_study(started_study, started_study.run(options.jobs, options.progress, pool))
 
 
 @with_options(StudyOptions)
@@ -132,7 +134,8 @@ def sweep(experiment: ExperimentSource, options: StudyOptions) -> list[Compariso
     studies = begin_studies(build_experiment(experiment, shared), shared)
     with pdf_figures(options.pdf):
         results = [
-            _report_study(begun, begun.run(options.jobs, options.progress)) for begun in studies
+            _report_study(started_study, started_study.run(options.jobs, options.progress))
+            for started_study in studies
         ]
         if len(studies) > 1:
             study.report_jointly(studies[0].folder.parent, _discard_line)
@@ -216,15 +219,15 @@ def resolve_experiment(
     Raises:
         InputError: Neither or both are given.
     """
-    described = [name for name in ("model", "recording", "free") if getattr(options, name)]
+    stated_options = [name for name in ("model", "recording", "free") if getattr(options, name)]
     if experiment is not None:
-        if described:
+        if stated_options:
             raise InputError(
-                f"experiment {experiment} states what it tunes: leave out {', '.join(described)}, "
-                "or leave out the experiment"
+                f"experiment {experiment} states what it tunes: leave out "
+                f"{', '.join(stated_options)}, or leave out the experiment"
             )
         return experiment
-    if not described:
+    if not stated_options:
         raise InputError(
             "expected an experiment (see `simgap list experiments`), or --resume DIR, or a robot: "
             "--model FILE --free A,B"
@@ -265,7 +268,7 @@ def _connect_to_cluster(address: str | None) -> Pool | None:
     return ClusterPool(address)
 
 
-def _report_study(begun: study.Study, outcome: StudyOutcome) -> ComparisonResult:
+def _report_study(started_study: study.Study, outcome: StudyOutcome) -> ComparisonResult:
     """Write the tables and figures of a study that has been run, and return its results.
 
     Raises:
@@ -273,12 +276,14 @@ def _report_study(begun: study.Study, outcome: StudyOutcome) -> ComparisonResult
         KeyboardInterrupt: the user interrupted the runs; finished ones are stored.
     """
     if outcome.skipped:
-        raise InputError(f"{begun.configuration.experiment.name}: skipped: {outcome.skipped}")
-    begun.report(_discard_line)
+        raise InputError(
+            f"{started_study.configuration.experiment.name}: skipped: {outcome.skipped}"
+        )
+    started_study.report(_discard_line)
     if outcome.interrupted:
         # A notebook's cell ends as the user requested; finished runs are stored in the folder.
-        raise KeyboardInterrupt(f"finished runs are stored in {begun.folder}")
-    return ComparisonResult(begun.folder)
+        raise KeyboardInterrupt(f"finished runs are stored in {started_study.folder}")
+    return ComparisonResult(started_study.folder)
 
 
 def _discard_line(_line: str) -> None:
@@ -303,10 +308,10 @@ def _apply_changes(
         experiment = experiment.with_seeds(seeds)
     if labels is None:
         return experiment
-    known = {*registered.names(), *(entry.label for entry in experiment.tuners)}
+    known_labels = {*registered.names(), *(entry.label for entry in experiment.tuners)}
     for label in labels:
-        if label not in known:
-            raise make_unknown_name_error("tuner", label, sorted(known))
+        if label not in known_labels:
+            raise make_unknown_name_error("tuner", label, sorted(known_labels))
     return experiment.with_tuners(labels)
 
 
@@ -323,8 +328,8 @@ def _choose_diagnosers(
             if label not in diagnosers.names():
                 raise make_unknown_name_error("diagnoser", label, diagnosers.names())
         table["diagnosers"] = list(labels)
-    rest = {name: value for name, value in changes.items() if name != "targets"}
-    return experiment.chosen(diagnosis=table, **rest)
+    other_changes = {name: value for name, value in changes.items() if name != "targets"}
+    return experiment.chosen(diagnosis=table, **other_changes)
 
 
 def _get_tuner_label(tuner: str | type[Tuner]) -> str:

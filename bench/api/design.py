@@ -46,8 +46,8 @@ class NextRecording:
         design = self.design
         if design is None:
             return ["no run could be simulated that stays within the limits of joints and commands"]
-        begin = ", ".join(f"{name} = {value:.4g}" for name, value in design.initial.items())
-        lines = [f"record next, {design.times[-1]:.3g} s: {design.says}; begin near {begin}"]
+        initial_text = ", ".join(f"{name} = {value:.4g}" for name, value in design.initial.items())
+        lines = [f"record next, {design.times[-1]:.3g} s: {design.says}; begin near {initial_text}"]
         if design.by == "T":
             return [*lines, *_format_discrimination(design)]
         factor = math.exp(min(design.gain, 50.0))
@@ -99,10 +99,12 @@ def _format_discrimination(design: NextRunDesign) -> list[str]:
         lines.append(f"recorded {repeats} times, it would distinguish it from one more of these")
     if design.settles_all:
         lines.append("all open questions are then answered")
-    others = [group for group in design.groups if len(group) > 1 and design.effect not in group]
+    other_groups = [
+        group for group in design.groups if len(group) > 1 and design.effect not in group
+    ]
     lines += [
         f"if the cause is one of {', '.join(group)}, it does not distinguish these"
-        for group in others
+        for group in other_groups
     ]
     return lines
 

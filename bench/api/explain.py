@@ -80,16 +80,16 @@ def list_sources(
     each: list[Any] = [recording] if single else [*cast(Sequence[RecordingSource], recording)]
     if not each:
         raise InputError(f"recording: expected {_RECORDING}, found an empty list")
-    frames = [one for one in each if isinstance(one, Frame)]
+    frames = [source for source in each if isinstance(source, Frame)]
     sources: list[str | Path | Recording] = []
-    for one in each:
-        if isinstance(one, Frame):
+    for source in each:
+        if isinstance(source, Frame):
             number = f" {len(sources) + 1}" if len(each) > 1 else ""
-            sources.append(recording_of(one, about, f"DataFrame{number}"))
+            sources.append(recording_of(source, about, f"DataFrame{number}"))
         else:
             if not frames:
-                about.refuse_for_files(one)
-            sources.append(one.recording if isinstance(one, SimulatedRecording) else one)
+                about.refuse_for_files(source)
+            sources.append(source.recording if isinstance(source, SimulatedRecording) else source)
     return sources
 
 
@@ -123,23 +123,27 @@ def score(
     Raises:
         InputError: A file cannot be read, or the recording is of another system.
     """
-    about = FrameDescription(units=units, constants=constants, description=description)
+    frame_description = FrameDescription(units=units, constants=constants, description=description)
     if isinstance(recording, Frame):
-        about = _complete_from_model(Path(model), about)
-    (source,) = list_sources(recording, about)
+        frame_description = _complete_from_model(Path(model), frame_description)
+    (source,) = list_sources(recording, frame_description)
     return score_model(Path(model), source, held_out, force)
 
 
-def _complete_from_model(model: Path, about: FrameDescription) -> FrameDescription:
+def _complete_from_model(model: Path, frame_description: FrameDescription) -> FrameDescription:
     """Complete the description of a data frame by the system or robot of a model.
 
     `model` is a robot's model file, or an extended simulator (TOML) that names a robot or a system.
     """
     if model.suffix in MODEL_FILES:
-        return replace(about, model=model)
+        return replace(frame_description, model=model)
     extended = extended_file.read_extended(model)
     robot = extended.robot
     if robot is None:
-        return replace(about, system=extended.system)
-    stated = {"actuators": robot.actuators, "engine": robot.engine}
-    return replace(about, model=robot.path, description={**stated, **(about.description or {})})
+        return replace(frame_description, system=extended.system)
+    robot_settings = {"actuators": robot.actuators, "engine": robot.engine}
+    return replace(
+        frame_description,
+        model=robot.path,
+        description={**robot_settings, **(frame_description.description or {})},
+    )

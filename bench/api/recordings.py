@@ -75,10 +75,10 @@ def read_recording(
     Raises:
         InputError: The recording is malformed; the message is one line.
     """
-    about = FrameDescription(
+    frame_description = FrameDescription(
         system=system, model=model, units=units, constants=constants, description=description
     )
-    (source,) = list_sources(path, about)
+    (source,) = list_sources(path, frame_description)
     return load_recording(source, system, model)[0]
 
 

@@ -69,25 +69,28 @@ def select_training(
     robotic = experiment is not None and load_experiment(experiment).model
     if not plugins and not robotic:
         simulators.get(simulator)
-    chosen = load_experiment(experiment or default_experiment(simulator)).chosen(
+    chosen_experiment = load_experiment(experiment or default_experiment(simulator)).chosen(
         training_budget=budget
     )
-    chosen = chosen.chosen(trusted=trust or chosen.trusted)
-    load_plugins_for_experiment([str(Path(plugin).resolve()) for plugin in plugins], chosen)
-    chosen = complete_robot_experiment(chosen)
-    if not chosen.model:
+    chosen_experiment = chosen_experiment.chosen(trusted=trust or chosen_experiment.trusted)
+    load_plugins_for_experiment(
+        [str(Path(plugin).resolve()) for plugin in plugins], chosen_experiment
+    )
+    chosen_experiment = complete_robot_experiment(chosen_experiment)
+    if not chosen_experiment.model:
         simulators.get(simulator)
-    if chosen.simulator != simulator:
+    if chosen_experiment.simulator != simulator:
         raise InputError(
-            f"experiment {chosen.name}: its simulator is {chosen.simulator}, not {simulator}"
+            f"experiment {chosen_experiment.name}: its simulator is {chosen_experiment.simulator}, "
+            f"not {simulator}"
         )
-    entries = {entry.label: entry for entry in chosen.tuners}
+    entries = {entry.label: entry for entry in chosen_experiment.tuners}
     entry = entries.get(tuner, TunerEntry(tuner, tuner))
     if not tuners.get(entry.tuner).learned:
         raise InputError(f"tuner {entry.label} does not learn: there is nothing to train")
-    if not chosen.trusted:
+    if not chosen_experiment.trusted:
         must_build_isolated(entry)
-    return chosen, entry
+    return chosen_experiment, entry
 
 
 def run_training(
@@ -109,13 +112,13 @@ def run_training(
     Raises:
         TrainingBudgetTooSmallError: The training budget is too small.
     """
-    lesson = TrainingRequest(entry, seed)
+    request = TrainingRequest(entry, seed)
     if not experiment.trusted:
-        lesson = TrainingRequest(
+        request = TrainingRequest(
             entry, seed, make_tuner_spec(entry), (str(get_weights_folder().resolve()),)
         )
     try:
-        return train_or_load(experiment, lesson, watch, again)
+        return train_or_load(experiment, request, watch, again)
     except RunEndedError as ended:
         # The error from the isolated process arrives as text: its name and its message.
         name, _, message = "".join(ended.reason.strip().splitlines()[-1:]).partition(": ")

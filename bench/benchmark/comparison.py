@@ -133,10 +133,10 @@ class Comparison:
         if not (self.folder / SEGMENTS_FOLDER).exists():
             results.run_sink.statuses = self._finished_statuses(ids)
             return
-        planned = read_plan(self.folder)
+        planned_ids = read_plan(self.folder)
         journal = RunJournal(self.folder)
         try:
-            if planned is not None and planned != ids:
+            if planned_ids is not None and planned_ids != ids:
                 raise InputError(
                     f"{self.folder / SEGMENTS_FOLDER / PLAN_FILE}: its plan is not the one that "
                     "its configuration gives; start a new comparison"
@@ -146,7 +146,7 @@ class Comparison:
             journal.close()
             raise
         # The process was killed before it wrote the plan, so there are no runs to compare with it.
-        if planned is None:
+        if planned_ids is None:
             write_plan(self.folder, ids)
         results.run_sink = journal
 
@@ -278,12 +278,12 @@ class Comparison:
             InputError: the folder is damaged.
         """
         configuration = self.configuration
-        ends = tuple(self._list_run_ends())
+        run_ends = tuple(self._list_run_ends())
         return StudyProgress(
             configuration.experiment.name,
             "runs finished",
             configuration.fingerprint,
-            ends,
+            run_ends,
             self._under_way,
         )
 
@@ -296,17 +296,17 @@ class Comparison:
         """
         if not self._under_way:
             return [_find_run_end(status.run, status) for status in self._list_finished_statuses()]
-        planned, experiment = read_plan(self.folder), self.configuration.experiment
-        if planned is not None:
+        planned_ids, experiment = read_plan(self.folder), self.configuration.experiment
+        if planned_ids is not None:
             path = self.folder / SEGMENTS_FOLDER / PLAN_FILE
-            check_plan(planned, experiment, path, PLAN_REMEDY)
+            check_plan(planned_ids, experiment, path, PLAN_REMEDY)
         statuses_by_run: dict[str, RunStatus] = {}
         for path, statuses_by_index in read_statuses_by_file(self.folder):
-            check_segment_statuses(path, statuses_by_index, experiment, planned, SEGMENT_REMEDY)
+            check_segment_statuses(path, statuses_by_index, experiment, planned_ids, SEGMENT_REMEDY)
             statuses_by_run |= {status.run: status for status in statuses_by_index.values()}
         return [
             _find_run_end(name, statuses_by_run.get(name))
-            for name in (statuses_by_run if planned is None else planned)
+            for name in (statuses_by_run if planned_ids is None else planned_ids)
         ]
 
     @property
@@ -314,11 +314,11 @@ class Comparison:
         """Whether the comparison is unfinished: its journal is deleted when all is written."""
         return (self.folder / SEGMENTS_FOLDER).exists()
 
-    def report(self, say: PrintLine) -> int:
+    def report(self, print_line: PrintLine) -> int:
         """Write tables and figures of the stored runs, and print the results.
 
         Args:
-            say: callback that prints one line.
+            print_line: callback that prints one line.
 
         Returns:
             Number of failed runs.
@@ -331,9 +331,9 @@ class Comparison:
 
         results = self.results
         problem = results.problem if results else TuningProblem(self.configuration.experiment)
-        failed = write_report(self.folder, problem, say)
+        failed = write_report(self.folder, problem, print_line)
         for line in results.notes.lines() if results else ():
-            say(line)
+            print_line(line)
         return failed
 
 

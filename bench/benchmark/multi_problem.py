@@ -80,47 +80,47 @@ class MultiProblemResult(NamedTuple):
 
 
 def compare_across_problems(
-    folders: Sequence[Path], out: Path, say: Callable[[str], None]
+    folders: Sequence[Path], out: Path, print_line: Callable[[str], None]
 ) -> MultiProblemResult:
     """Compute joint statistics of several comparisons, and write tables, figures and a page.
 
     Args:
         folders: result folders of the comparisons.
         out: folder to write to.
-        say: callback that prints one line.
+        print_line: callback that prints one line.
 
     Raises:
         InputError: a folder is not that of a comparison, or they share no tuners.
     """
-    together = load_comparisons(folders)
+    collection = load_comparisons(folders)
     out.mkdir(parents=True, exist_ok=True)
     files = []
-    frames = together.build_tables()
+    frames = collection.build_tables()
     for name, frame in frames.items():
         files.append(out / f"{name}.csv")
         write_atomically(files[-1], frame.to_csv(index=False))
-    means = together.mean_ranks.mean().sort_values().round(2)
-    count = len(together.mean_ranks)
-    say(f"mean rank over {count} problems (1 is best)\n{means.to_string()}")
-    if not together.has_enough_problems:
-        say(
+    mean_ranks = collection.mean_ranks.mean().sort_values().round(2)
+    count = len(collection.mean_ranks)
+    print_line(f"mean rank over {count} problems (1 is best)\n{mean_ranks.to_string()}")
+    if not collection.has_enough_problems:
+        print_line(
             f"no critical-difference diagram: it needs {MIN_PROBLEMS_FOR_RANKS} problems and "
             f"{_MIN_TUNERS_FRIEDMAN} tuners"
         )
     pictures = {
-        name: render_all_formats(figure) for name, figure in together.build_figures().items()
+        name: render_all_formats(figure) for name, figure in collection.build_figures().items()
     }
     for name, picture in pictures.items():
-        drawn = write_figure_files(out / "figures" / name, picture.png, picture.pdf)
-        say(f"figure  {drawn[0]}")
-        files += drawn
+        figure_files = write_figure_files(out / "figures" / name, picture.png, picture.pdf)
+        print_line(f"figure  {figure_files[0]}")
+        files += figure_files
     files.append(out / REPORT_FILE)
     write_atomically(
         files[-1],
-        render_multi_problem_page(together.build_page_data(frames, pictures, folders, out)),
+        render_multi_problem_page(collection.build_page_data(frames, pictures, folders, out)),
     )
-    say(f"report  {files[-1]}")
-    return MultiProblemResult(together, files)
+    print_line(f"report  {files[-1]}")
+    return MultiProblemResult(collection, files)
 
 
 def load_comparisons(folders: Sequence[Path]) -> ComparisonCollection:
@@ -135,8 +135,8 @@ def load_comparisons(folders: Sequence[Path]) -> ComparisonCollection:
         if stored.runs.empty:
             raise InputError(f"{folder}: holds no runs")
         parts.append(LoadedComparison(compute_statistics(stored), stored.experiment))
-    first, *others = (part.statistics.curves.list_tuners() for part in parts)
-    tuners = [t for t in first if all(t in other for other in others)]
+    first_labels, *other_labels = (part.statistics.curves.list_tuners() for part in parts)
+    tuners = [t for t in first_labels if all(t in labels for labels in other_labels)]
     if not tuners:
         raise InputError(f"{', '.join(map(str, folders))}: have no tuner in common")
     return ComparisonCollection(parts, tuners)
@@ -254,14 +254,14 @@ class ComparisonCollection:
 
     def build_figures(self) -> dict[str, Figure]:
         """Draw runtime-distribution, and critical-difference if `has_enough_problems`."""
-        drawn = {"runtime-distribution": self._draw_joint_figure()}
+        figures = {"runtime-distribution": self._draw_joint_figure()}
         if self.has_enough_problems:
             friedman, p_values = self.rank_tests
-            drawn["critical-difference"] = draw_critical_difference_figure(
+            figures["critical-difference"] = draw_critical_difference_figure(
                 self.mean_ranks, p_values, friedman
             )
         return {
-            name: add_trust_note(figure, self.has_trusted_runs) for name, figure in drawn.items()
+            name: add_trust_note(figure, self.has_trusted_runs) for name, figure in figures.items()
         }
 
     def _draw_joint_figure(self) -> Figure:
@@ -277,8 +277,8 @@ class ComparisonCollection:
             tuners=tuple(TunerEntry(t, t) for t in self.tuners),
         )
         style = TunerStyles(experiment, order)
-        looks = [(name, style.get_mark_style(name)) for name in style.order]
-        panel, table = make_runtime_panel(looks, self._compute_runtime_distributions())
+        mark_styles = [(name, style.get_mark_style(name)) for name in style.order]
+        panel, table = make_runtime_panel(mark_styles, self._compute_runtime_distributions())
         figure, axes = draw_chart([panel], {panel.table: table})
         caption = "Mean over problems, each with equal weight."
         finish_figure(figure, axes, style, experiment, caption)

@@ -25,7 +25,7 @@ def draw_with_references(
     folder: Path,
     references: Sequence[ReferenceResult],
     out: Path,
-    say: Callable[[str], None],
+    print_line: Callable[[str], None],
     before: str = "",
 ) -> list[dict[str, Any]]:
     """Draw a comparison's figures again with references behind them, as separate files.
@@ -34,7 +34,7 @@ def draw_with_references(
         folder: folder of the comparison.
         references: reference results to draw.
         out: folder in whose subfolder ``figures`` the files are written.
-        say: callback that prints one line; it gets differences of the references, and files.
+        print_line: callback that prints one line; it gets differences of the references, and files.
         before: prefix of the file names.
 
     Returns:
@@ -53,13 +53,13 @@ def draw_with_references(
     finally:
         problem.close()
     for reference in references:
-        say(f"behind  {reference.provenance_text}")
+        print_line(f"behind  {reference.provenance_text}")
         for line in reference.find_mismatches(stored.experiment):
-            say(f"differs {line}")
+            print_line(f"differs {line}")
     files = []
     for name in comparison_figures.list_figure_names(stored):
         if name in OVERLAYABLE_FIGURES:
             figure = comparison_figures.draw_figure(stored, labels, name, behind=references)
             files += write_figure(figure, out / "figures" / f"{before}{FIGURE_FILES[name]}-behind")
-            say(f"figure  {files[-2]}")
+            print_line(f"figure  {files[-2]}")
     return [reference.to_document(stored.experiment, files) for reference in references]

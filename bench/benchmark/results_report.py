@@ -76,13 +76,13 @@ _SHOWN = (3, 10)
 
 
 @numeric_warnings_silenced()
-def write_report(folder: Path, problem: TuningProblem, say: Callable[[str], None]) -> int:
+def write_report(folder: Path, problem: TuningProblem, print_line: Callable[[str], None]) -> int:
     """Write tables, figures and the report page of a comparison, and print a summary.
 
     Args:
         folder: result folder of the comparison.
         problem: tuning problem of the comparison.
-        say: callback that prints one line.
+        print_line: callback that prints one line.
 
     Returns:
         Number of failed runs.
@@ -92,17 +92,17 @@ def write_report(folder: Path, problem: TuningProblem, say: Callable[[str], None
     """
     stored = read_comparison(folder, REQUIRED_RUN_COLUMNS)
     if stored.runs.empty:
-        say(f"no run was made; {folder}/status.csv says why")
+        print_line(f"no run was made; {folder}/status.csv says why")
         return 0
     labels, statistics = make_axis_labels(problem), compute_statistics(stored)
-    made = build_tables(stored, statistics)
-    for name, frame in made.items():
+    tables = build_tables(stored, statistics)
+    for name, frame in tables.items():
         write_atomically(folder / f"{name}.csv", frame.to_csv(index=False))
     pictures = _render_figures(stored, labels, statistics)
     figures = _write_figures(folder, pictures)
     results = ComparisonReportData(
         ComparisonView(stored, labels, statistics),
-        made,
+        tables,
         pictures,
         read_environment(folder),
         str(folder),
@@ -111,24 +111,24 @@ def write_report(folder: Path, problem: TuningProblem, say: Callable[[str], None
     )
     write_atomically(folder / REPORT_FILE, render_page(results))
 
-    lines = made["table"]
+    lines = tables["table"]
     for text in _describe_best_tuners(results.view):
-        say(text)
+        print_line(text)
     for text in _format_median_errors(lines, labels, statistics):
-        say(text)
+        print_line(text)
     for text in _list_limitations(stored.experiment):
-        say(text)
-    if redrawn := redraws_text(results):
-        say(f"\n{redrawn}")
+        print_line(text)
+    if redraw_note := redraws_text(results):
+        print_line(f"\n{redraw_note}")
     failed = stored.statuses[stored.statuses["status"].isin(FAILED_OR_SKIPPED_STATUSES)]
     for text in format_failures(failed):
-        say(text)
-    say("\n" + _format_run_seconds(lines, statistics))
-    say(f"\ntable   {folder / 'table.csv'}")
-    say(f"more    {folder}/{', '.join(f'{name}.csv' for name in made if name != 'table')}")
+        print_line(text)
+    print_line("\n" + _format_run_seconds(lines, statistics))
+    print_line(f"\ntable   {folder / 'table.csv'}")
+    print_line(f"more    {folder}/{', '.join(f'{name}.csv' for name in tables if name != 'table')}")
     for figure in figures:
-        say(f"figure  {figure}")
-    say(f"report  {folder / REPORT_FILE}")
+        print_line(f"figure  {figure}")
+    print_line(f"report  {folder / REPORT_FILE}")
     # A tuner that cannot be used here does not count as a failure of the comparison.
     return int((failed["status"] != "skipped").sum())
 
@@ -234,33 +234,37 @@ def _describe_best_tuners(view: ComparisonView) -> list[str]:
     statistics, texts = view.statistics, []
     label = view.format_metric_label(view.shown_metric)
     for kind in view.ranges:
-        where = f"{headline.WHERE[kind]}, {headline.targets_text(statistics, kind)}"
-        lines = [f"\nbest tuners, {where} ({label}; {headline.floor_text(statistics)})"]
-        for one in headline.standings(statistics, kind):
-            lines += _format_standing(one)
+        range_text = f"{headline.WHERE[kind]}, {headline.targets_text(statistics, kind)}"
+        lines = [f"\nbest tuners, {range_text} ({label}; {headline.floor_text(statistics)})"]
+        for standing in headline.standings(statistics, kind):
+            lines += _format_standing(standing)
         lines += [headline.failed_runs(statistics, kind)]
         lines += [headline.too_few(statistics, kind) or headline.how_decided(statistics, kind)]
         texts.append("\n".join(line for line in lines if line))
     return texts
 
 
-def _format_standing(one: headline.Standing) -> list[str]:
+def _format_standing(standing: headline.Standing) -> list[str]:
     """Format the lines of one number of simulations; verdicts without tuners are left out."""
-    best = f"{', '.join(one.best)} ({one.error})" if one.best else "none: every run failed"
+    best = (
+        f"{', '.join(standing.best)} ({standing.error})"
+        if standing.best
+        else "none: every run failed"
+    )
     parts = {
         "best": best,
-        "worse": ", ".join(one.worse),
-        "not decided": ", ".join(one.undecided),
-        "all runs failed": ", ".join(one.failed),
+        "worse": ", ".join(standing.worse),
+        "not decided": ", ".join(standing.undecided),
+        "all runs failed": ", ".join(standing.failed),
     }
     lines = [
         textwrap.fill(
-            f"{what}: {names}", _WIDTH, initial_indent=" " * 12, subsequent_indent=" " * 14
+            f"{verdict}: {names}", _WIDTH, initial_indent=" " * 12, subsequent_indent=" " * 14
         )
-        for what, names in parts.items()
+        for verdict, names in parts.items()
         if names
     ]
-    lines[0] = f"  after {one.simulations}".ljust(12) + lines[0].lstrip()
+    lines[0] = f"  after {standing.simulations}".ljust(12) + lines[0].lstrip()
     return lines
 
 
@@ -271,8 +275,8 @@ def _format_median_errors(
     texts = []
     for kind in lines["range"][lines["range"] != ""].unique():
         texts.append("\n" + _format_error_table(lines, kind, labels, statistics))
-        if more := _format_direction_errors(lines, kind, labels.channel, statistics):
-            texts.append("\n" + more)
+        if direction_table := _format_direction_errors(lines, kind, labels.channel, statistics):
+            texts.append("\n" + direction_table)
     return texts
 
 
@@ -280,26 +284,28 @@ def _format_error_table(
     lines: pd.DataFrame, kind: str, labels: AxisLabels, statistics: ComparisonStatistics
 ) -> str:
     """Format the median errors of one range as a table for the terminal."""
-    present = set(lines["metric"])
+    metrics = set(lines["metric"])
     if kind == "real":
-        held_out = "heldout_error" in present
-        metric, what = ("heldout_error", "held-out") if held_out else ("obs_error", "fitted")
-        title = f"median {what} RMSE of {labels.channel} after N simulations"
+        held_out = "heldout_error" in metrics
+        metric, error_kind = ("heldout_error", "held-out") if held_out else ("obs_error", "fitted")
+        title = f"median {error_kind} RMSE of {labels.channel} after N simulations"
     else:
-        metric = "param_abs_error" if "param_abs_error" in present else "param_error"
-        what = labels.parameter or "the parameters [training widths]"
-        where = "in the training range" if kind == "in" else "anywhere in the bounds"
-        title = f"median absolute error of {what} after N simulations, targets {where}"
+        metric = "param_abs_error" if "param_abs_error" in metrics else "param_error"
+        error_kind = labels.parameter or "the parameters [training widths]"
+        range_text = "in the training range" if kind == "in" else "anywhere in the bounds"
+        title = f"median absolute error of {error_kind} after N simulations, targets {range_text}"
     medians = build_summary(lines, metric, kind, statistics.order_in(kind))
-    fits = lines.drop_duplicates("tuner").set_index("tuner")["fit_simulations"]
-    medians["trained on"] = [f"{fits[t]:.0f}" if fits[t] else "-" for t in medians.index]
+    training_simulations = lines.drop_duplicates("tuner").set_index("tuner")["fit_simulations"]
+    medians["trained on"] = [
+        f"{training_simulations[t]:.0f}" if training_simulations[t] else "-" for t in medians.index
+    ]
     return f"{title}\n{_format_frame(medians.rename(index=statistics.labelled))}"
 
 
 def _format_frame(frame: pd.DataFrame) -> str:
     """Format numbers with two digits, without names of rows and columns."""
-    bare = frame.rename_axis(index=None, columns=None)
-    return bare.to_string(float_format=lambda value: f"{value:.2g}")
+    unnamed_frame = frame.rename_axis(index=None, columns=None)
+    return unnamed_frame.to_string(float_format=lambda value: f"{value:.2g}")
 
 
 def _format_direction_errors(
@@ -314,8 +320,8 @@ def _format_direction_errors(
     if kind == "real" or part.empty:
         return ""
     budget = part["simulations"].max()
-    shown = [k for k in (*_SHOWN, budget) if k <= budget]
-    part = part[part["simulations"].isin(shown)]
+    shown_counts = [k for k in (*_SHOWN, budget) if k <= budget]
+    part = part[part["simulations"].isin(shown_counts)]
     part = part.assign(column=part["metric"].map(titles) + " " + part["simulations"].astype(str))
     order = [f"{t} {k}" for t in titles.values() for k in sorted(part["simulations"].unique())]
     medians = part.pivot(index="tuner", columns="column", values="median")
@@ -368,8 +374,8 @@ def format_failures(failed: pd.DataFrame) -> list[str]:
         for tuner, runs, status, reason in lines
     ]
     refused = [reason.endswith(ISOLATED) for reason in failed["reason"].astype(str)]
-    isolated = list(dict.fromkeys(failed["tuner"][refused].astype(str)))
-    note = [f"{', '.join(isolated)}: {ISOLATED}"] if isolated else []
+    isolated_tuners = list(dict.fromkeys(failed["tuner"][refused].astype(str)))
+    note = [f"{', '.join(isolated_tuners)}: {ISOLATED}"] if isolated_tuners else []
     return ["", "failures", *laid_out, *note]
 
 

@@ -157,9 +157,9 @@ def make_success_panel(lines: pd.DataFrame) -> tuple[Panel, pd.DataFrame]:
     counts = lines.groupby("ball")["shots"].agg(["min", "max"]).astype(int)
     names = []
     for ball in balls:
-        ends = dict.fromkeys(counts.loc[ball].tolist())
-        names.append(f"{ball}\nn={'–'.join(map(str, ends))}")
-    across = Axis("ball; n shots of each method", names=tuple(names))
-    up = Axis("share of shots through the hoop", scales=("linear",), ends=(-0.03, 1.03))
-    panel = Panel("Hits by ball", "success", "place", series, across, up)
+        shot_counts = dict.fromkeys(counts.loc[ball].tolist())
+        names.append(f"{ball}\nn={'–'.join(map(str, shot_counts))}")
+    x_axis = Axis("ball; n shots of each method", names=tuple(names))
+    y_axis = Axis("share of shots through the hoop", scales=("linear",), ends=(-0.03, 1.03))
+    panel = Panel("Hits by ball", "success", "place", series, x_axis, y_axis)
     return panel, lines.assign(place=lines["ball"].map(places))

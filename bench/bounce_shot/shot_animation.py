@@ -61,9 +61,9 @@ class _Moving(NamedTuple):
         Args:
             sample: index of the sample.
         """
-        now = min(sample, self.end - 1)
-        self.line.set_data(self.path[: now + 1, 0], self.path[: now + 1, 2])
-        self.ball.set_data(self.path[now : now + 1, 0], self.path[now : now + 1, 2])
+        index = min(sample, self.end - 1)
+        self.line.set_data(self.path[: index + 1, 0], self.path[: index + 1, 2])
+        self.ball.set_data(self.path[index : index + 1, 0], self.path[index : index + 1, 2])
 
 
 class _Filmed(NamedTuple):
@@ -180,8 +180,8 @@ def _draw_film_panel(axis: Any, film: FilmFrames) -> _Filmed:
     """
     picture = axis.imshow(film.pictures[0])
     (track,) = axis.plot([], [], color=BLUE, linewidth=0.7)
-    look = {"markersize": 9, "markerfacecolor": "none", "markeredgecolor": VERMILION}
-    (ring,) = axis.plot([], [], "o", **look)
+    marker_style = {"markersize": 9, "markerfacecolor": "none", "markeredgecolor": VERMILION}
+    (ring,) = axis.plot([], [], "o", **marker_style)
     axis.set_title("one drop,\nfilmed and tracked", fontsize=9)
     axis.set(xticks=[], yticks=[])
     return _Filmed(picture, track, ring)

@@ -83,21 +83,21 @@ def read_shot_config(experiment: Experiment) -> ShotConfig:
     return settings
 
 
-def _convert_value(source: str, where: str, value: Any, declared: Any) -> Any:
+def _convert_value(source: str, key: str, value: Any, declared: Any) -> Any:
     """Convert a value to the type of its field; numbers must not be negative.
 
     Raises:
         InputError: the value has a wrong type or range.
     """
     if declared == tuple[str, ...]:
-        return check_name_list(source, where, value)
+        return check_name_list(source, key, value)
     if declared == Range:
-        low, high = check_number_pair(source, where, value)
+        low, high = check_number_pair(source, key, value)
         if not 0 <= low <= high:  # equal ends define a constant
-            raise make_error(source, where, "0 <= low <= high", value)
+            raise make_error(source, key, "0 <= low <= high", value)
         return low, high
     expected = "a number of at least 0"
-    size = check_number(source, where, value, expected)
+    size = check_number(source, key, value, expected)
     if size < 0:
-        raise make_error(source, where, expected, value)
+        raise make_error(source, key, expected, value)
     return size

@@ -62,11 +62,11 @@ def execute_shot(setup: ShotSetup, settings: ShotConfig, model: TunedModel) -> S
     times = np.arange(round(MAX_SHOT_SECONDS * SAMPLING_RATE_HZ) + 1) / SAMPLING_RATE_HZ
     # Without a plan, the shot is a miss.
     if not math.isfinite(model.height):
-        nothing = np.full((times.size, 3), np.nan)
-        return ShotResult(False, float("nan"), float("nan"), times, nothing, nothing)
+        no_path = np.full((times.size, 3), np.nan)
+        return ShotResult(False, float("nan"), float("nan"), times, no_path, no_path)
     heights = np.array([model.height])
     constants = get_planning_constants(settings, setup.ball.radius)
-    planned = simulate_flights(
+    planned_path = simulate_flights(
         make_planning_simulator(model),
         get_planning_theta(model),
         setup.scene,
@@ -87,11 +87,11 @@ def execute_shot(setup: ShotSetup, settings: ShotConfig, model: TunedModel) -> S
     is_hit = math.hypot(miss_distance, y) < setup.scene.hoop_radius
     # Beyond the hoop's plane, nothing was planned.
     last = min(
-        _find_descent_index(planned, setup.scene.hoop_z),
+        _find_descent_index(planned_path, setup.scene.hoop_z),
         _find_descent_index(flown, setup.scene.hoop_z),
     )
-    error = float(np.linalg.norm(planned - flown, axis=1)[: last + 1].mean())
-    return ShotResult(is_hit, miss_distance, error, times, planned, flown)
+    error = float(np.linalg.norm(planned_path - flown, axis=1)[: last + 1].mean())
+    return ShotResult(is_hit, miss_distance, error, times, planned_path, flown)
 
 
 def _find_descent_index(path: Array, height: float) -> int:
@@ -109,8 +109,8 @@ def _find_descent_index(path: Array, height: float) -> int:
     """
     z = path[:, 2]
     # Before its bounce, the ball falls through the same heights.
-    risen = np.logical_or.accumulate(z[1:] > z[:-1])
-    down = np.flatnonzero(risen & (z[:-1] > height) & (z[1:] <= height))
+    has_risen = np.logical_or.accumulate(z[1:] > z[:-1])
+    down = np.flatnonzero(has_risen & (z[:-1] > height) & (z[1:] <= height))
     return int(down[0]) if down.size else len(z) - 1
 
 

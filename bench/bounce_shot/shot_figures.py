@@ -79,9 +79,9 @@ def draw_figures(
         "success": draw_success_figure(experiment, lines),
         "off": draw_miss_figure(settings, rows),
     }
-    chosen = select_example_shots(setups, stored, rows)
-    if chosen:
-        figures["shots"] = draw_shots_figure(settings, chosen, stored)
+    example_shots = select_example_shots(setups, stored, rows)
+    if example_shots:
+        figures["shots"] = draw_shots_figure(settings, example_shots, stored)
     return {
         name: render_all_formats(add_trust_note(figure, experiment.trusted))
         for name, figure in figures.items()
@@ -133,10 +133,10 @@ def _draw_legend(figure: Figure, methods: Sequence[str]) -> None:
     """Draw the legend of the groups that occur, below the figure."""
     from matplotlib.lines import Line2D
 
-    present = {get_method_group(method) for method in methods}
+    present_groups = {get_method_group(method) for method in methods}
     handles = []
     for group, (colour, marker) in _GROUPS.items():
-        if group in present:
+        if group in present_groups:
             handles.append(Line2D([], [], color=colour, marker=marker, label=_WORDS[group]))
     columns = len(handles)
     figure.legend(
@@ -153,26 +153,28 @@ def draw_miss_figure(settings: ShotConfig, rows: pd.DataFrame) -> Figure:
     """
     methods = list(rows["method"].unique())
     figure, axes = make_panel_grid(1, 2, (11.5, 1.6 + 0.42 * len(methods)), sharey=True)
-    left, right = axes[0]
+    miss_axis, error_axis = axes[0]
     for place, method in enumerate(methods):
         part = rows[rows["method"] == method]
         colour, _ = _GROUPS[get_method_group(method)]
-        _draw_box_plot(left, 100 * part["off"].dropna().to_numpy(), place, colour)
-        _draw_box_plot(right, 100 * part["prediction_error"].dropna().to_numpy(), place, colour)
+        _draw_box_plot(miss_axis, 100 * part["off"].dropna().to_numpy(), place, colour)
+        _draw_box_plot(
+            error_axis, 100 * part["prediction_error"].dropna().to_numpy(), place, colour
+        )
     radius = 100 * settings.hoop_radius
-    left.axvspan(-radius, radius, color=BLACK, alpha=0.08, linewidth=0)
-    left.axvline(0, color=CAPTION_GREY, linewidth=0.8)
-    left.set_xlabel(
+    miss_axis.axvspan(-radius, radius, color=BLACK, alpha=0.08, linewidth=0)
+    miss_axis.axvline(0, color=CAPTION_GREY, linewidth=0.8)
+    miss_axis.set_xlabel(
         "where shots met the hoop's plane, from its centre [cm]\n"
         f"grey: the hoop; beyond {_MAX_SHOWN_RADII} of its radii not shown"
     )
-    left.set_xlim(-_MAX_SHOWN_RADII * radius, _MAX_SHOWN_RADII * radius)
-    right.set_xlabel("mean distance between planned and flown path [cm]")
-    right.set_xscale("log")
-    right.set_xticks([1, 2, 5, 10, 20, 50], ["1", "2", "5", "10", "20", "50"])
-    right.minorticks_off()
-    _label_methods(left, methods)
-    for axis in (left, right):
+    miss_axis.set_xlim(-_MAX_SHOWN_RADII * radius, _MAX_SHOWN_RADII * radius)
+    error_axis.set_xlabel("mean distance between planned and flown path [cm]")
+    error_axis.set_xscale("log")
+    error_axis.set_xticks([1, 2, 5, 10, 20, 50], ["1", "2", "5", "10", "20", "50"])
+    error_axis.minorticks_off()
+    _label_methods(miss_axis, methods)
+    for axis in (miss_axis, error_axis):
         axis.grid(visible=True, axis="x", which="both", linewidth=0.3, alpha=0.5)
         axis.spines[["top", "right"]].set_visible(False)
     _draw_legend(figure, methods)
@@ -233,14 +235,22 @@ def select_example_shots(
         m for m in (UNTUNED_METHOD, reference_method, EXPLAIN_METHOD) if (rows["method"] == m).any()
     ]
     # Only shots with a result of all shown methods can be compared.
-    wide = rows.pivot(index="shot", columns="method", values="off")[methods_shown].abs().dropna()
-    if wide.empty:
+    miss_by_method = (
+        rows.pivot(index="shot", columns="method", values="off")[methods_shown].abs().dropna()
+    )
+    if miss_by_method.empty:
         return []
-    missed = rows[(rows["method"] == UNTUNED_METHOD) & (rows["hit"].astype(float) == 0)]["shot"]
-    missed_by_untuned = wide[wide.index.isin(missed)]
-    missed_by_untuned = wide if missed_by_untuned.empty else missed_by_untuned
-    typical = (missed_by_untuned[reference_method] - wide[reference_method].median()).abs().idxmin()
-    worst = wide[reference_method].idxmax()
+    missed_shots = rows[(rows["method"] == UNTUNED_METHOD) & (rows["hit"].astype(float) == 0)][
+        "shot"
+    ]
+    missed_by_untuned = miss_by_method[miss_by_method.index.isin(missed_shots)]
+    missed_by_untuned = miss_by_method if missed_by_untuned.empty else missed_by_untuned
+    typical = (
+        (missed_by_untuned[reference_method] - miss_by_method[reference_method].median())
+        .abs()
+        .idxmin()
+    )
+    worst = miss_by_method[reference_method].idxmax()
     return [
         (by_name[str(name)], methods_shown)
         for name in dict.fromkeys((typical, worst))
@@ -274,9 +284,9 @@ def execute_example(
         stored: stored results by name of the shot.
     """
     models = {model["method"]: TunedModel(**model) for model in stored[setup.name]["models"]}
-    throws = {method: execute_shot(setup, settings, models[method]) for method in methods}
-    top = max(float(np.nanmax(t.flown[:, 2])) for t in throws.values()) + 0.1
-    return ExampleShot(models, throws, top)
+    shot_results = {method: execute_shot(setup, settings, models[method]) for method in methods}
+    top = max(float(np.nanmax(t.flown[:, 2])) for t in shot_results.values()) + 0.1
+    return ExampleShot(models, shot_results, top)
 
 
 def draw_shots_figure(
@@ -354,7 +364,7 @@ def find_path_end(path: Array, scene: ShotGeometry) -> int:
     """
     z = path[:, 2]
     # Before the bounce, the ball falls through the same heights.
-    risen = np.concatenate([[False], np.logical_or.accumulate(z[1:] > z[:-1])])
+    has_risen = np.concatenate([[False], np.logical_or.accumulate(z[1:] > z[:-1])])
     falling = np.concatenate([[0], np.diff(z)]) < 0
-    below = np.flatnonzero(risen & (z < scene.hoop_z - _BELOW) & falling)
-    return int(below[0]) if below.size else len(z)
+    indices_below = np.flatnonzero(has_risen & (z < scene.hoop_z - _BELOW) & falling)
+    return int(indices_below[0]) if indices_below.size else len(z)

@@ -68,13 +68,13 @@ def compute_hoop_crossings(path: Array, scene: ShotGeometry) -> Array:
     with np.errstate(invalid="ignore"):
         rises = z[:, 1:] > z[:, :-1]
         falls = z[:, 1:] < z[:, :-1]
-        risen = np.logical_or.accumulate(rises, axis=1)
-        fallen = np.logical_or.accumulate(risen & falls, axis=1)
+        has_risen = np.logical_or.accumulate(rises, axis=1)
+        fallen = np.logical_or.accumulate(has_risen & falls, axis=1)
         rises_again = np.logical_or.accumulate(fallen & rises, axis=1)
         # Downward only: a ball that crosses upwards has not scored.
-        above = z[:, :-1] > scene.hoop_z
-        below = z[:, 1:] <= scene.hoop_z
-        down = risen & ~rises_again & above & below
+        is_above = z[:, :-1] > scene.hoop_z
+        is_below = z[:, 1:] <= scene.hoop_z
+        down = has_risen & ~rises_again & is_above & is_below
     first = np.argmax(down, axis=1)
     rows = np.arange(len(z))
     high = z[rows, first]

@@ -39,15 +39,15 @@ def render_page(
     page.add_table("shots", rows, 6)
     page.add_table(success_panel.table, success)
     over = lines[lines["ball"] == ALL_BALLS].sort_values("rate", ascending=False, kind="stable")
-    best, *others = over.to_dict("records")
+    best, *other_rows = over.to_dict("records")
     return page.render(
         _TEMPLATE,
         experiment=experiment,
         folder=folder,
         ALL_BALLS=ALL_BALLS,
         best=best,
-        has_others=bool(others),
-        similar=[row["method"] for row in others if row["high"] >= best["low"]],
+        has_others=bool(other_rows),
+        similar=[row["method"] for row in other_rows if row["high"] >= best["low"]],
         success_panel=success_panel,
         figure=partial(PrintedFigure.from_files, pictures),
     )

@@ -90,8 +90,8 @@ class ShotInputs:
     def list_files(self) -> tuple[Path, ...]:
         """List the files that another machine needs."""
         plugins = {Path(tuned.file) for tuned in self.tuned.values() if tuned.file}
-        described = self.recording.with_suffix(".toml")
-        return self.recording, described, *self.weights.values(), *sorted(plugins)
+        description_file = self.recording.with_suffix(".toml")
+        return self.recording, description_file, *self.weights.values(), *sorted(plugins)
 
     def relocate(self, paths: Mapping[Path, Path]) -> ShotInputs:
         """Return a copy for another machine, where the files have other paths."""
@@ -119,12 +119,12 @@ def tune_and_plan(
         _tune_model(experiment, settings, entry, inputs, recording, {})
         for entry in experiment.tuners
     ]
-    explained, acting = _explain_drop(inputs.recording)
+    explained, active_effects = _explain_drop(inputs.recording)
     models.append(explained)
     # If explain failed, there is no extended simulator to tune.
     if explained.status == "done":
         extended_models = [
-            _tune_model(experiment, settings, entry, inputs, recording, acting)
+            _tune_model(experiment, settings, entry, inputs, recording, active_effects)
             for entry in experiment.tuners
         ]
         models += [
@@ -175,8 +175,8 @@ def _tune_model(
             if label in settings.rows
             else _make_observed_runs(recording, experiment)
         )
-        nothing = ObservedRuns((), np.empty((0, observed_runs.observed.shape[1])))
-        target = BlindedTarget(inputs.name, "real", start, observed_runs, nothing)
+        no_runs = ObservedRuns((), np.empty((0, observed_runs.observed.shape[1])))
+        target = BlindedTarget(inputs.name, "real", start, observed_runs, no_runs)
         request = RunRequest(
             label,
             entry,
@@ -235,8 +235,10 @@ def _make_observed_runs(recording: Recording, experiment: Experiment) -> Observe
     )
     first = {"z": float(visible_heights[0]), "vz": -speed, **scenario.initial}
     initial = {**first, "z": first["z"] + shift}
-    moved = Scenario(scenario.times, initial, {}, {**scenario.constants, "radius": radius})
-    return ObservedRuns((moved,), z[:, None])
+    shifted_scenario = Scenario(
+        scenario.times, initial, {}, {**scenario.constants, "radius": radius}
+    )
+    return ObservedRuns((shifted_scenario,), z[:, None])
 
 
 def _get_run_constants(recording: Recording) -> dict[str, float]:

@@ -69,12 +69,12 @@ class ReportableShotStudy(Protocol):
         """Reasons why tuners cannot be used here, by label."""
 
 
-def write_report(study: ReportableShotStudy, say: Callable[[str], None]) -> int:
+def write_report(study: ReportableShotStudy, print_line: Callable[[str], None]) -> int:
     """Write tables, figures and HTML report from the shots that exist.
 
     Args:
         study: the study to report.
-        say: prints a line.
+        print_line: prints a line.
 
     Returns:
         Number of methods and shots that crashed or exceeded their time.
@@ -85,7 +85,7 @@ def write_report(study: ReportableShotStudy, say: Callable[[str], None]) -> int:
         if (shot := read_shot(folder, setup)) is not None:
             stored[setup.name] = shot
     if not stored:
-        say("no shot was made")
+        print_line("no shot was made")
         return 0
     rows = pd.DataFrame([row for shot in stored.values() for row in shot["rows"]])
     for name in _NUMBERS:
@@ -112,30 +112,30 @@ def write_report(study: ReportableShotStudy, say: Callable[[str], None]) -> int:
     journal = folder / SEGMENTS_FOLDER
     if journal.is_dir() and not any(journal.iterdir()):
         journal.rmdir()
-    say("\n" + format_result_table(lines))
+    print_line("\n" + format_result_table(lines))
     failed = rows[rows["status"].isin(NO_SHOT_STATUSES)]
-    _say_faults(failed, study.skipped_tuners, say)
-    say(f"\ntable   {folder / 'table.csv'}\nshots   {folder / 'shots.csv'}")
+    _say_faults(failed, study.skipped_tuners, print_line)
+    print_line(f"\ntable   {folder / 'table.csv'}\nshots   {folder / 'shots.csv'}")
     for figure in figures:
-        say(f"figure  {figure}")
-    say(f"report  {folder / REPORT_FILE}")
+        print_line(f"figure  {figure}")
+    print_line(f"report  {folder / REPORT_FILE}")
     return int(failed["status"].isin(_FAILED).sum())
 
 
 def _say_faults(
-    failed: pd.DataFrame, skipped: Mapping[str, str], say: Callable[[str], None]
+    failed: pd.DataFrame, skipped: Mapping[str, str], print_line: Callable[[str], None]
 ) -> None:
     """Print why tuners were skipped, and each failure of a method with its count and one reason.
 
     Args:
         failed: rows of shots.csv whose method failed or found no plan.
         skipped: reasons why tuners cannot be used here, by label.
-        say: prints a line.
+        print_line: prints a line.
     """
     for label, reason in skipped.items():
-        say(f"skipped {label}: {reason}")
+        print_line(f"skipped {label}: {reason}")
     for (method, status), part in failed.groupby(["method", "status"]):
-        say(f"{status}: {method} in {len(part)} shots; {part['reason'].iloc[0]}")
+        print_line(f"{status}: {method} in {len(part)} shots; {part['reason'].iloc[0]}")
 
 
 def _build_status_rows(rows: pd.DataFrame, skipped: Mapping[str, str]) -> pd.DataFrame:

@@ -155,9 +155,9 @@ class BounceShotStudy:
         if pool is not None or jobs:
             check_classes_importable(self.experiment)
         try:
-            left = list_missing_shots(self.folder, self.shots)
-            if left:
-                _ShotStages(self, left, progress or no_progress).run(jobs, pool)
+            missing_shots = list_missing_shots(self.folder, self.shots)
+            if missing_shots:
+                _ShotStages(self, missing_shots, progress or no_progress).run(jobs, pool)
         except KeyboardInterrupt:  # the kinds of balls alternate, so a partial result covers all
             return self._finish_study(interrupted=True)
         except PoolLostError as error:
@@ -173,12 +173,12 @@ class BounceShotStudy:
             **why: reason for which the run ended early (``interrupted``, ``stopped`` or
                 ``skipped``); empty if it did not.
         """
-        left = list_missing_shots(self.folder, self.shots)
-        if not left and not why:
+        missing_shots = list_missing_shots(self.folder, self.shots)
+        if not missing_shots and not why:
             experiment = self.configuration.experiment
             reveal_salt(self.folder, read_salt(self.folder, experiment))
             self.configuration = read_configuration(self.folder)
-        return StudyOutcome(len(self.shots) - len(left), len(self.shots), **why)
+        return StudyOutcome(len(self.shots) - len(missing_shots), len(self.shots), **why)
 
     def close(self) -> None:
         """Close the study; it holds no open files."""
@@ -191,20 +191,20 @@ class BounceShotStudy:
         """
         check_shots(self.folder, self.shots)
         missing = {setup.name for setup in list_missing_shots(self.folder, self.shots)}
-        ends = tuple(
+        run_ends = tuple(
             RunEnd(setup.name, setup.ball.name, MISSING_STATUS if setup.name in missing else "made")
             for setup in self.shots
         )
         configuration = self.configuration
         return StudyProgress(
-            configuration.experiment.name, "shots made", configuration.fingerprint, ends
+            configuration.experiment.name, "shots made", configuration.fingerprint, run_ends
         )
 
-    def report(self, say: PrintLine) -> int:
+    def report(self, print_line: PrintLine) -> int:
         """Write tables, figures and HTML report, and print a summary.
 
         Args:
-            say: prints a line.
+            print_line: prints a line.
 
         Returns:
             Number of failures of methods.
@@ -214,7 +214,7 @@ class BounceShotStudy:
         """
         from bench.bounce_shot.shot_report import write_report
 
-        return write_report(self, say)
+        return write_report(self, print_line)
 
 
 class _ShotStages:
@@ -241,7 +241,7 @@ class _ShotStages:
         if not self._experiment.trusted:
             self._tuned = {entry.label: make_tuner_spec(entry) for entry in self._experiment.tuners}
         self._hidden = tuple(str(place.resolve()) for place in (study.folder, get_weights_folder()))
-        self._paths = [study.folder / RECORDINGS_FOLDER / f"{one.name}.csv" for one in left]
+        self._paths = [study.folder / RECORDINGS_FOLDER / f"{shot.name}.csv" for shot in left]
 
     def run(self, jobs: int, pool: Pool | None) -> None:
         """Record the drops, train tuners, tune and plan, and execute the shots.
@@ -294,24 +294,24 @@ class _ShotStages:
         Raises:
             Exception: a training failed; an untrained tuner must not be used as a trained one.
         """
-        learned = [e for e in self._experiment.tuners if tuners.get(e.tuner).learned]
+        learned_entries = [e for e in self._experiment.tuners if tuners.get(e.tuner).learned]
         experiments = [
             shot_planning.make_tuning_experiment(self._experiment, self._settings, entry)
-            for entry in learned
+            for entry in learned_entries
         ]
         calls: list[Call] = [
             (
                 train_or_load,
                 (experiment, TrainingRequest(entry, 0, self._tuned.get(entry.label), self._hidden)),
             )
-            for experiment, entry in zip(experiments, learned, strict=True)
+            for experiment, entry in zip(experiments, learned_entries, strict=True)
         ]
         step = self._progress("training", len(calls))
         weights = {}
         for index, training in workers.iterate_results(calls, math.inf):
             if not isinstance(training, TrainingResult):
                 raise training
-            weights[learned[index].label] = training.path
+            weights[learned_entries[index].label] = training.path
             step()
         return weights
 
@@ -370,7 +370,7 @@ def _make_failed_models(
     """
     if isinstance(error, TimeoutError):
         status = "timeout"
-    nothing = partial(
+    make_failed_model = partial(
         shot_planning.TunedModel,
         effects={},
         simulations=0,
@@ -385,4 +385,4 @@ def _make_failed_models(
         shot_planning.EXPLAIN_METHOD,
         *(label + shot_planning.EXPLAIN_SUFFIX for label in labels),
     ]
-    return [vars(nothing(method=method, restitution=math.nan)) for method in methods]
+    return [vars(make_failed_model(method=method, restitution=math.nan)) for method in methods]

@@ -156,8 +156,8 @@ class _Flight:
         gap = self.gap(*position)
         rate = velocity[0] * self._normal[0] + velocity[2] * self._normal[1]
         # Look two steps ahead: a step of flight must not penetrate the ground.
-        near = gap <= 0.0 or (rate < 0.0 and gap < -2.0 * _FLIGHT * rate)
-        self._model.opt.timestep = _IMPACT if near else _FLIGHT
+        is_near_impact = gap <= 0.0 or (rate < 0.0 and gap < -2.0 * _FLIGHT * rate)
+        self._model.opt.timestep = _IMPACT if is_near_impact else _FLIGHT
         if gap > 0.0:
             self._touches = False
         # Set the damping once per impact, at its initial speed: restitution refers to the whole
@@ -199,10 +199,10 @@ class _Flight:
         ]
         torque = 0.0
         if self._data.ncon and self._friction > 0.0:
-            rub = self._compute_friction(vx, vz, wy)
-            force[0] += rub * self._normal[1]
-            force[2] -= rub * self._normal[0]
-            torque = -rub * self._ball.radius
+            friction = self._compute_friction(vx, vz, wy)
+            force[0] += friction * self._normal[1]
+            force[2] -= friction * self._normal[0]
+            torque = -friction * self._ball.radius
         self._data.xfrc_applied[1] = (*force, 0.0, torque, 0.0)
 
     def _compute_friction(self, vx: float, vz: float, spin: float) -> float:
@@ -219,8 +219,8 @@ class _Flight:
         slip = vx * self._normal[1] - vz * self._normal[0] - spin * self._ball.radius
         k = self._ball.inertia_ratio
         stops = self._ball.mass * k / (1.0 + k) * abs(slip) / self._model.opt.timestep
-        held = self._friction * float(self._data.efc_force[0])
-        return -math.copysign(min(stops, held), slip)  # (5)
+        friction_limit = self._friction * float(self._data.efc_force[0])
+        return -math.copysign(min(stops, friction_limit), slip)  # (5)
 
 
 def _render_mjcf(ball: BallKind, ground: InclinedGround) -> str:

@@ -30,7 +30,7 @@ def build_catalogue(parser: argparse.ArgumentParser) -> JsonDocument:
     """Build the whole catalogue from the parser of the command line."""
     return {
         "commands": list_commands(parser),
-        **{name: make() for name, make in CATALOGUE_SECTIONS.items()},
+        **{name: list_section() for name, list_section in CATALOGUE_SECTIONS.items()},
     }
 
 
@@ -58,13 +58,13 @@ def list_commands(parser: argparse.ArgumentParser) -> list[JsonDocument]:
 def _describe_option(action: argparse.Action) -> JsonDocument:
     """Describe an argument or option of a command by plain values, for `simgap list commands`."""
     default = None if action.default in ([], "") else action.default
-    read = getattr(action.type, "__name__", "")
+    type_name = getattr(action.type, "__name__", "")
     flag = _TYPES.get(type(action).__name__)
     return {
         "name": action.dest,
         "flags": list(action.option_strings),
         "metavar": action.metavar or action.dest.upper(),
-        "type": flag or _TYPES.get(read, "text"),
+        "type": flag or _TYPES.get(type_name, "text"),
         "choices": list(action.choices) if action.choices else None,
         "default": default,
         "required": action.required,
@@ -195,16 +195,16 @@ def list_experiments() -> list[JsonDocument]:
     from bench.benchmark.problem import experiment
     from bench.benchmark.problem.availability import availability
 
-    shown = []
+    documents = []
     for name in experiment.list_experiment_names():
         each = experiment.load_experiment(name)
-        lacks = availability(each)
-        shown.append(
+        missing = availability(each)
+        documents.append(
             {
                 "name": each.name,
                 "says": each.says,
-                "skipped": lacks.skipped or None,
-                "needs": lacks.data_set.command if lacks.data_set else None,
+                "skipped": missing.skipped or None,
+                "needs": missing.data_set.command if missing.data_set else None,
                 "title": each.title,
                 "tags": list(each.tags),
                 "simulator": each.simulator,
@@ -213,10 +213,10 @@ def list_experiments() -> list[JsonDocument]:
                 "targets": each.targets,
                 "budget": each.budget,
                 "tuners": [asdict(entry)["label"] for entry in each.tuners],
-                "tuners_skipped": dict(lacks.tuners),
+                "tuners_skipped": dict(missing.tuners),
             }
         )
-    return shown
+    return documents
 
 
 def list_references() -> list[JsonDocument]:

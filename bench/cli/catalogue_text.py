@@ -24,8 +24,8 @@ def format_documents(what: str, documents: list[JsonDocument]) -> list[str]:
         what: Name of the section.
         documents: Documents of its entries.
     """
-    lay = _LAID_OUT.get(what, _format_plain_entry)
-    return [line for document in documents for line in lay(document)]
+    format_entry = _LAID_OUT.get(what, _format_plain_entry)
+    return [line for document in documents for line in format_entry(document)]
 
 
 def _format_plain_entry(each: JsonDocument) -> list[str]:
@@ -40,15 +40,15 @@ def _format_sentence(each: JsonDocument) -> str:
 
 def _format_experiment(each: JsonDocument) -> list[str]:
     """Format an experiment: what is missing on this machine, its description, its tags."""
-    lacks = []
+    missing = []
     if each["skipped"]:
-        lacks.append(f"skipped: {each['skipped']}")
+        missing.append(f"skipped: {each['skipped']}")
     if each["needs"]:
-        lacks.append(f"needs `{each['needs']}`")
+        missing.append(f"needs `{each['needs']}`")
     if each["tuners_skipped"] and not each["skipped"]:
         reasons = "; ".join(sorted(set(each["tuners_skipped"].values())))
-        lacks.append(f"without {', '.join(each['tuners_skipped'])}: {reasons}")
-    words = f"{'; '.join(lacks)}. {each['says']}" if lacks else each["says"]
+        missing.append(f"without {', '.join(each['tuners_skipped'])}: {reasons}")
+    words = f"{'; '.join(missing)}. {each['says']}" if missing else each["says"]
     return [f"{each['name']:22} {words} [{', '.join(each['tags'])}]"]
 
 
@@ -60,10 +60,10 @@ def _format_system(each: JsonDocument) -> list[str]:
     for p in each["parameters"]:
         low, high = p["bounds"]
         training = p["training"]
-        inner = f", training {training[0]:g} to {training[1]:g}" if training else ""
+        training_text = f", training {training[0]:g} to {training[1]:g}" if training else ""
         result.append(
-            f"  parameter {p['name']:18} {p['unit']:12} {low:g} to {high:g}{inner}; nominal "
-            f"{p['nominal']:g}  {p['says']}"
+            f"  parameter {p['name']:18} {p['unit']:12} {low:g} to {high:g}{training_text}; "
+            f"nominal {p['nominal']:g}  {p['says']}"
         )
     result += [
         f"  constant  {c['name']:18} {c['unit']:12} {c['value']:g}  {c['says']}"
@@ -74,8 +74,8 @@ def _format_system(each: JsonDocument) -> list[str]:
     return result + _format_channels("channel", each["channels"])
 
 
-def _format_channels(what: str, channels: list[JsonDocument]) -> list[str]:
-    return [f"  {what:9} {c['name']:18} {c['unit']:12} {c['says']}".rstrip() for c in channels]
+def _format_channels(role: str, channels: list[JsonDocument]) -> list[str]:
+    return [f"  {role:9} {c['name']:18} {c['unit']:12} {c['says']}".rstrip() for c in channels]
 
 
 def _format_effect(each: JsonDocument) -> list[str]:
@@ -84,15 +84,17 @@ def _format_effect(each: JsonDocument) -> list[str]:
         return [f"{each['name']}: {_format_sentence(each)}"]
     result = [f"{each['name']} ({each['hook']}): {each['says']}"]
     for c in each["coefficients"]:
-        for on in c["on"]:
-            spread = f"{on['low']:g} to {on['high']:g}"
-            result.append(f"  {c['name']:14} {on['kind']:7} {on['unit']:18} {spread}")
+        for application in c["on"]:
+            spread = f"{application['low']:g} to {application['high']:g}"
+            result.append(
+                f"  {c['name']:14} {application['kind']:7} {application['unit']:18} {spread}"
+            )
     return result
 
 
 def _format_reference(each: JsonDocument) -> list[str]:
-    what = f"{each['says']} [simgap {each['simgap']}, {each['started'][:10]}, "
-    return [f"{each['name']:26} {what}{each['targets']} targets, budget {each['budget']}]"]
+    description = f"{each['says']} [simgap {each['simgap']}, {each['started'][:10]}, "
+    return [f"{each['name']:26} {description}{each['targets']} targets, budget {each['budget']}]"]
 
 
 _LAID_OUT: dict[str, Callable[[JsonDocument], list[str]]] = {

@@ -12,12 +12,12 @@ class InterruptHandler:
     """Context in which the first Ctrl-C requests a stop, and the second one interrupts as usual.
 
     Args:
-        say: Prints what the first Ctrl-C does; a line on stderr if None.
+        print_line: Prints what the first Ctrl-C does; a line on stderr if None.
     """
 
-    def __init__(self, say: Callable[[str], None] | None = None) -> None:
+    def __init__(self, print_line: Callable[[str], None] | None = None) -> None:
         self._asked = False
-        self._say = say or _print_line
+        self._say = print_line or _print_line
 
     def is_stop_requested(self) -> bool:
         """Return whether a stop has been requested."""

@@ -85,16 +85,17 @@ def parse_coefficients(texts: Sequence[str]) -> dict[str, list[float]]:
 
 def parse_noise(texts: Sequence[str]) -> dict[str, float]:
     """Parse NAME=S texts, and at most one plain S for all channels that are not named."""
-    plain = [text for text in texts if "=" not in text]
-    if len(plain) > 1:
+    unnamed_texts = [text for text in texts if "=" not in text]
+    if len(unnamed_texts) > 1:
         raise InputError(
-            f"--noise {' '.join(plain)}: expected one number for all channels, or NAME=VALUE"
+            f"--noise {' '.join(unnamed_texts)}: expected one number for all channels, or "
+            "NAME=VALUE"
         )
-    named = parse_key_numbers("--noise", [text for text in texts if "=" in text])
+    named_values = parse_key_numbers("--noise", [text for text in texts if "=" in text])
     return (
-        {ALL_CHANNELS: parse_number("--noise", "every channel", plain[0]), **named}
-        if plain
-        else named
+        {ALL_CHANNELS: parse_number("--noise", "every channel", unnamed_texts[0]), **named_values}
+        if unnamed_texts
+        else named_values
     )
 
 

@@ -213,8 +213,8 @@ class _Parser(argparse.ArgumentParser):
 
         from sims.core.value_limits import truncate_text
 
-        near = get_close_matches(name[:_LONGEST_NAME], list(known), cutoff=0.5)
-        hint = f"; did you mean {', '.join(near)}?" if near else ""
+        similar_names = get_close_matches(name[:_LONGEST_NAME], list(known), cutoff=0.5)
+        hint = f"; did you mean {', '.join(similar_names)}?" if similar_names else ""
         self.error(f"unknown {kind} '{truncate_text(name)}'{hint}")
 
 
@@ -290,12 +290,12 @@ def _parse_command_line(words: Sequence[str]) -> argparse.Namespace:
         _UsageError: The command or an option is unknown, or a value is wrong.
     """
     names = [command.name for command in COMMANDS]
-    chosen = words[0] if words and not words[0].startswith("-") else None
-    parser = build_parser(chosen)
-    if chosen is not None and chosen not in names:
-        parser.refuse_unknown("command", chosen, names)
-    options, unknown = parser.parse_known_args(words)
-    for word in unknown:
+    command_name = words[0] if words and not words[0].startswith("-") else None
+    parser = build_parser(command_name)
+    if command_name is not None and command_name not in names:
+        parser.refuse_unknown("command", command_name, names)
+    options, unknown_words = parser.parse_known_args(words)
+    for word in unknown_words:
         command = options.command_parser
         if word.startswith("-"):
             name = word.partition("=")[0]

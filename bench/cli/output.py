@@ -1,7 +1,7 @@
 """Print the results of commands, as text or with ``--json`` as one JSON document.
 
-A command is a function of its options and of `say`, which prints one line of text at once. It
-returns an `CommandResult`, which contains the same information as JSON. One of the two printers
+A command is a function of its options and of `print_line`, which prints one line of text at once.
+It returns a `CommandResult`, which contains the same information as JSON. One of the two printers
 here prints either the one or the other; so every command has ``--json``, and errors have one form.
 """
 
@@ -130,9 +130,9 @@ def format_json(document: JsonDocument) -> str:
 def to_json_value(value: Any) -> Any:
     """Convert a value to JSON types: paths to text, tuples to lists, NaN and infinity to None."""
     if isinstance(value, Mapping):
-        return {str(key): to_json_value(inner) for key, inner in value.items()}
+        return {str(key): to_json_value(item) for key, item in value.items()}
     if isinstance(value, tuple | list | set | frozenset):
-        return [to_json_value(inner) for inner in value]
+        return [to_json_value(item) for item in value]
     if isinstance(value, PurePath):
         return str(value)
     # NumPy numbers and arrays have this method.
@@ -160,14 +160,14 @@ def _redirect_stdout_to_stderr() -> Iterator[None]:
         if descriptor is None:
             yield
             return
-        kept = os.dup(descriptor)
+        saved_descriptor = os.dup(descriptor)
         try:
             os.dup2(2, descriptor)
             yield
         finally:
             _flush_c()
-            os.dup2(kept, descriptor)
-            os.close(kept)
+            os.dup2(saved_descriptor, descriptor)
+            os.close(saved_descriptor)
 
 
 def _flush_c() -> None:

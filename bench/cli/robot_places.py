@@ -35,7 +35,7 @@ def format_places(model: Path) -> Iterator[str]:
 def list_places(model: Path) -> JsonDocument:
     """Build the JSON document of the places of a model file."""
     kind = cast(type[RobotSimulator], make_robot_simulator(model))
-    acting = list_effects_by_place_kind(kind.system)
+    effects_by_kind = list_effects_by_place_kind(kind.system)
     return {
         "model": model,
         "about": list(format_robot_summary(kind)),
@@ -60,7 +60,7 @@ def list_places(model: Path) -> JsonDocument:
         ],
         "inputs": [{"name": c.name, "unit": c.unit} for c in kind.inputs],
         "channels": [{"name": c.name, "unit": c.unit, "says": c.says} for c in kind.channels],
-        "effects": acting,
+        "effects": effects_by_kind,
         "free": list(kind.system.list_mujoco_words()),
     }
 
@@ -81,22 +81,22 @@ def _format_actuators(kind: type[RobotSimulator]) -> Iterator[str]:
         yield f"  {'actuator':9} {a.name:24} {a.kind} on {a.joint or 'no joint'}{limits}"
 
 
-def _format_range(ends: tuple[float, float], unit: str) -> str:
-    return f", {ends[0]:.4g} to {ends[1]:.4g} {unit}"
+def _format_range(limits: tuple[float, float], unit: str) -> str:
+    return f", {limits[0]:.4g} to {limits[1]:.4g} {unit}"
 
 
 def _format_effects_by_place(system: type[RobotSystem]) -> Iterator[str]:
     """Yield a line for each kind of place with the effects that can act there."""
-    for kind, named in list_effects_by_place_kind(system).items():
-        at = "of the world" if kind == "world" else f"at a {kind}, as {named[0]}@NAME or @*"
-        yield f"  effects {at.replace('a actuator', 'an actuator')}: {', '.join(named)}"
+    for kind, names in list_effects_by_place_kind(system).items():
+        location = "of the world" if kind == "world" else f"at a {kind}, as {names[0]}@NAME or @*"
+        yield f"  effects {location.replace('a actuator', 'an actuator')}: {', '.join(names)}"
 
 
 def list_effects_by_place_kind(system: type[RobotSystem]) -> dict[str, list[str]]:
     """Return the names of effects that can act on a robot, by the kind of their places."""
-    found: dict[str, list[str]] = {}
+    names_by_kind: dict[str, list[str]] = {}
     for name in effects.list_names():
         effect = effects.get_effect(name)
         if system.placed(effect):
-            found.setdefault(effect.at, []).append(name)
-    return found
+            names_by_kind.setdefault(effect.at, []).append(name)
+    return names_by_kind

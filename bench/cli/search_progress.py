@@ -95,8 +95,8 @@ class SearchProgress:
         """
         if self._estimate is None or not self._is_searching:
             return None
-        since = self._clock() - self._estimated_at
-        return max(self._estimate - since, OVERDUE * since)
+        estimate_age = self._clock() - self._estimated_at
+        return max(self._estimate - estimate_age, OVERDUE * estimate_age)
 
     def finish(self, name: str) -> None:
         """End the search and begin a stage that follows it, such as drawing figures."""
@@ -113,13 +113,13 @@ class SearchProgress:
             full: Character of the bar for the part that is done.
         """
         # Rounded down: a full bar means that everything is done.
-        done = int(BAR_WIDTH * self._share)
+        filled_width = int(BAR_WIDTH * self._share)
         percent, bar = f"{100 * self._share:3.0f}% ", ""
         if not self._is_searching:
             # The share refers to the search, which may have ended early.
             percent = ""
         elif empty:
-            bar = f"|{full * done}{empty * (BAR_WIDTH - done)}| "
+            bar = f"|{full * filled_width}{empty * (BAR_WIDTH - filled_width)}| "
         long = self._join_parts(
             self._format_times(), self._format_stage(), self._format_best_so_far()
         )
@@ -157,22 +157,22 @@ class SearchProgress:
         if not self._is_searching:
             return elapsed
         if self._budget is not None:
-            left = self._budget - self.elapsed()
-            said = (
-                f"at most {clock_text(left)} left"
-                if left > 0
+            remaining_seconds = self._budget - self.elapsed()
+            remaining_text = (
+                f"at most {clock_text(remaining_seconds)} left"
+                if remaining_seconds > 0
                 else "budget used up, finishing this step"
             )
-            return f"{elapsed}, {said}"
+            return f"{elapsed}, {remaining_text}"
         remaining = self.remaining()
         return elapsed if remaining is None else f"{elapsed}, about {clock_text(remaining)} left"
 
 
 def clock_text(seconds: float) -> str:
     """Return a duration as ``0:07`` or ``1:02:03``."""
-    minutes, rest = divmod(round(max(seconds, 0.0)), 60)
+    minutes, seconds_part = divmod(round(max(seconds, 0.0)), 60)
     hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"
+    return f"{hours}:{minutes:02}:{seconds_part:02}" if hours else f"{minutes}:{seconds_part:02}"
 
 
 class ProgressDisplay(SearchProgress):
@@ -294,14 +294,14 @@ class ProgressDisplay(SearchProgress):
         """Show the state, unless that was done less than an interval ago."""
         if self._silent or self._busy or not self._name:
             return
-        now = self._clock()
-        if self._shown_at is not None and now - self._shown_at < self._interval:
+        current_time = self._clock()
+        if self._shown_at is not None and current_time - self._shown_at < self._interval:
             return
         with self._block_timer_writes():
             if self._hints and self.elapsed() >= HINT_AFTER and self._is_searching:
                 self._hints = False
                 self._waiting.append(HINT)
-            self._shown_at = now
+            self._shown_at = current_time
             if self._live:
                 self._draw_lines()
             else:
@@ -332,11 +332,11 @@ class ProgressDisplay(SearchProgress):
 
         columns = _get_terminal_width(self._stream) - 1
         lines = list(self.lines(*_choose_bar_characters(self._stream)))
-        line = next((one for one in lines if disp_len(one) <= columns), lines[-1])
+        line = next((candidate for candidate in lines if disp_len(candidate) <= columns), lines[-1])
         line = disp_trim(line, columns)
         # A terminal echoes ^C at the end of the line, so two more characters are overwritten.
-        rest = min(disp_len(self._shown) + 2, columns) - disp_len(line)
-        self._stream.write("\r" + line + " " * max(rest, 0) + "\b" * max(rest, 0))
+        padding = min(disp_len(self._shown) + 2, columns) - disp_len(line)
+        self._stream.write("\r" + line + " " * max(padding, 0) + "\b" * max(padding, 0))
         self._stream.flush()
         self._shown = line
 

@@ -29,39 +29,39 @@ def add_options(
 
     texts = read_option_texts(options)
     # Inherited options are listed last.
-    for declared in sorted(fields(options), key=lambda each: each.name not in vars(options)):
-        kind = str(declared.type).removesuffix(" | None")
-        metadata = {"in_command": True, **declared.metadata}
+    for option in sorted(fields(options), key=lambda each: each.name not in vars(options)):
+        kind = str(option.type).removesuffix(" | None")
+        metadata = {"in_command": True, **option.metadata}
         if kind not in _PARSERS or not metadata["in_command"]:
             continue
         parse, metavar = _PARSERS[kind]
-        flags = metadata.get("flags") or [f"--{declared.name.replace('_', '-')}"]
-        text = texts[declared.name].rstrip(".").replace("`", "").replace("%", "%%")
+        flags = metadata.get("flags") or [f"--{option.name.replace('_', '-')}"]
+        text = texts[option.name].rstrip(".").replace("`", "").replace("%", "%%")
         settings: dict[str, Any] = {"help": text[0].lower() + text[1:]}
         if kind == "bool":
             settings["action"] = "store_true"
         elif kind == "Files":
             settings |= {"action": "append", "default": [], "type": parse, "metavar": metavar}
         else:
-            default = None if declared.default == () else declared.default
+            default = None if option.default == () else option.default
             if default not in (None, "") and "(default" not in text:
-                shown = f"{default:g}" if kind == "float" else default
-                settings["help"] += f" (default: {shown})"
+                default_text = f"{default:g}" if kind == "float" else default
+                settings["help"] += f" (default: {default_text})"
             settings |= {"type": parse, "default": default}
             settings |= {"choices": metadata.get("choices")} if metadata.get("choices") else {}
             settings |= {"metavar": metadata.get("metavar") or metavar}
-        parser.add_argument(*flags, **{**settings, **changed.get(declared.name, {})})
+        parser.add_argument(*flags, **{**settings, **changed.get(option.name, {})})
 
 
 def collect_options(values: argparse.Namespace, options: type) -> dict[str, Any]:
     """Return the values of a dataclass's options on the command line, as keyword arguments."""
-    given = {}
-    for declared in fields(options):
-        flags = declared.metadata.get("flags") or [declared.name]
+    arguments = {}
+    for option in fields(options):
+        flags = option.metadata.get("flags") or [option.name]
         value = getattr(values, flags[0].strip("-").replace("-", "_"), None)
         if value not in (None, ""):
-            given[declared.name] = value
-    return given
+            arguments[option.name] = value
+    return arguments
 
 
 def add_recordings_argument(parser: argparse.ArgumentParser, text: str) -> None:
@@ -150,8 +150,8 @@ def parse_non_negative_int(text: str) -> int:
     return _parse_whole_number(text, 0)
 
 
-def _parse_whole_number(text: str, least: int) -> int:
-    """Parse a whole number from `least` to MAX_INTEGER, for argparse.
+def _parse_whole_number(text: str, minimum: int) -> int:
+    """Parse a whole number from `minimum` to MAX_INTEGER, for argparse.
 
     Raises:
         argparse.ArgumentTypeError: the text is not such a number.
@@ -161,12 +161,12 @@ def _parse_whole_number(text: str, least: int) -> int:
     try:
         value = int(text)
     except ValueError:
-        value = least - 1
-    if not least <= value <= MAX_INTEGER:
-        wanted = f"a whole number of at least {least}"
+        value = minimum - 1
+    if not minimum <= value <= MAX_INTEGER:
+        expected = f"a whole number of at least {minimum}"
         if value > MAX_INTEGER:
-            wanted = f"{wanted} and at most {MAX_INTEGER:.0e}"
-        raise argparse.ArgumentTypeError(f"expected {wanted}, found '{truncate_text(text)}'")
+            expected = f"{expected} and at most {MAX_INTEGER:.0e}"
+        raise argparse.ArgumentTypeError(f"expected {expected}, found '{truncate_text(text)}'")
     return value
 
 
@@ -191,9 +191,9 @@ def parse_path(text: str) -> Path:
         pass
     # The path is too long, contains circular links, or is not accessible.
     except (OSError, ValueError) as error:
-        why = getattr(error, "strerror", None) or error
+        reason = getattr(error, "strerror", None) or error
         raise argparse.ArgumentTypeError(
-            f"expected a path, found '{truncate_text(text)}' ({why})"
+            f"expected a path, found '{truncate_text(text)}' ({reason})"
         ) from None
     return Path(text)
 

@@ -29,8 +29,8 @@ def summarise_study(study: Study) -> JsonDocument:
 
 def list_result_files(folder: Path) -> list[Path]:
     """List the files of a result folder and its figures, without the data of single runs."""
-    inside = [*folder.glob("*"), *(folder / _FIGURES_FOLDER).glob("*")]
-    return sorted(path for path in inside if path.is_file() and not path.name.startswith("."))
+    paths = [*folder.glob("*"), *(folder / _FIGURES_FOLDER).glob("*")]
+    return sorted(path for path in paths if path.is_file() and not path.name.startswith("."))
 
 
 def summarise_results(table: Path) -> list[JsonDocument]:

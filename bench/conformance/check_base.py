@@ -71,14 +71,14 @@ def check_global_random_state(look: str) -> Iterator[None]:
     # Large primes as seeds: a method that seeds with 0 or 42 certainly changes the state.
     random.seed(82_589_933)
     np.random.seed(30_402_457)  # noqa: NPY002
-    before = _get_random_states()
+    states_before = _get_random_states()
     try:
         yield
-        after = _get_random_states()
+        states_after = _get_random_states()
     finally:
         random.setstate(python)
         np.random.set_state(legacy)  # noqa: NPY002
-    touched = [name for name in before if before[name] != after[name]]
+    touched = [name for name in states_before if states_before[name] != states_after[name]]
     check(not touched, "global random state left alone", f"changed: {', '.join(touched)}", look)
 
 

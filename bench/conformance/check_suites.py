@@ -59,10 +59,10 @@ def failed_need(check: Check, failed: Collection[Check]) -> Check | None:
     Returns:
         The failed check, or None.
     """
-    for needed in NEEDS.get(check, ()):
-        if needed in failed:
-            return needed
-        if (root := failed_need(needed, failed)) is not None:
+    for needed_check in NEEDS.get(check, ()):
+        if needed_check in failed:
+            return needed_check
+        if (root := failed_need(needed_check, failed)) is not None:
             return root
     return None
 
@@ -101,11 +101,15 @@ def parametrize(*subjects: type) -> pytest.MarkDecorator:
 
     cases = []
     for subject in subjects:
-        known = getattr(subject, "known_failures", {})
+        known_failures = getattr(subject, "known_failures", {})
         failed: set[Check] = set()
         for check in get_suite(subject):
             name = check.__name__
-            marks = [pytest.mark.xfail(reason=known[name], strict=True)] if name in known else []
+            marks = (
+                [pytest.mark.xfail(reason=known_failures[name], strict=True)]
+                if name in known_failures
+                else []
+            )
             title = f"{subject.__name__}-{name.removeprefix('check_')}"
             cases.append(pytest.param(_bind_check(check, subject, failed), id=title, marks=marks))
     return pytest.mark.parametrize("check", cases)
@@ -124,8 +128,8 @@ def _bind_check(check: Check, subject: type, failed: set[Check]) -> Callable[[],
         """Run the check as a pytest test; skip it if an earlier check that it needs has failed."""
         import pytest
 
-        if (needed := failed_need(check, failed)) is not None:
-            pytest.skip(f"not tested: needs '{title_of(needed)}'")
+        if (failed_check := failed_need(check, failed)) is not None:
+            pytest.skip(f"not tested: needs '{title_of(failed_check)}'")
         try:
             outcome = check(subject)
         except Exception:

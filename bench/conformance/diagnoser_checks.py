@@ -87,12 +87,12 @@ def _open_case(
         budget: maximum number of simulations.
         missing: whether the recording has gaps.
     """
-    made = _get_recording(hidden)
+    simulated = _get_recording(hidden)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "recording.csv"
-        made.write(path)
+        simulated.write(path)
         path.with_suffix(".truth.toml").unlink()
-        simulator = type(made.simulator)
+        simulator = type(simulated.simulator)
         assert issubclass(simulator, SystemSimulator)
         recording = read_recording(path, simulator)
         if missing:
@@ -145,10 +145,12 @@ def _train_diagnoser(kind: type[Diagnoser]) -> tuple[dict[str, Array], int]:
     library = effects.list_effects_for(simulator.system)
     SIMULATION_COUNTER.reset(TRAINING_BUDGET)
     try:
-        lesson = DiagnoserTrainingTask(
+        training_task = DiagnoserTrainingTask(
             simulator, library, np.random.default_rng(5), TRAINING_BUDGET
         )
-        return {n: np.asarray(a) for n, a in kind().train(lesson).items()}, SIMULATION_COUNTER.used
+        return {
+            n: np.asarray(a) for n, a in kind().train(training_task).items()
+        }, SIMULATION_COUNTER.used
     finally:
         SIMULATION_COUNTER.reset()
 
@@ -173,7 +175,7 @@ class _Run(NamedTuple):
 def _diagnose_cached(kind: type[Diagnoser], hidden: bool = True, turn: int = 0) -> _Run:  # noqa: ARG001
     """Run a diagnoser; the result is cached for several checks, once for each value of `turn`."""
     with _open_case(kind, hidden) as case:
-        before, touched = _copy_case_bytes(case), ""
+        files_before, touched = _copy_case_bytes(case), ""
         answers: list[Answer] = []
         try:
             with check_global_random_state(f"case.rng in {kind.__name__}.diagnose"):
@@ -186,7 +188,7 @@ def _diagnose_cached(kind: type[Diagnoser], hidden: bool = True, turn: int = 0) 
         (answer,) = answers
         names = {name for group in list_named_sets(answer) for name in group}
         foreign = tuple(sorted(names - set(case.library)))
-        return _Run(answer, foreign, _copy_case_bytes(case) != before, touched)
+        return _Run(answer, foreign, _copy_case_bytes(case) != files_before, touched)
 
 
 def _run_diagnoser(kind: type[Diagnoser], case: DiagnosisCase) -> Answer:
@@ -199,8 +201,8 @@ def _run_diagnoser(kind: type[Diagnoser], case: DiagnosisCase) -> Answer:
     try:
         return Answer.of(answer)
     except InputError as error:
-        look = f"{kind.__name__}.diagnose"
-        raise CheckError(f"expected an answer; found {error}; see {look}") from None
+        location = f"{kind.__name__}.diagnose"
+        raise CheckError(f"expected an answer; found {error}; see {location}") from None
 
 
 def _copy_case_bytes(case: DiagnosisCase) -> list[bytes]:
@@ -223,16 +225,18 @@ def check_answers(kind: type[Diagnoser]) -> None:
 
 def check_names_what_there_is(kind: type[Diagnoser]) -> None:
     """Check that named effects are observable in the recording, and occur once in a set."""
-    run, look = _diagnose_cached(kind), f"{kind.__name__}.diagnose"
-    check(not run.foreign, "names of case.library", run.foreign, look)
-    double = [names for names in list_named_sets(run.answer) if len(set(names)) < len(names)]
-    check(not double, "each effect once in a set", double, look)
+    run, location = _diagnose_cached(kind), f"{kind.__name__}.diagnose"
+    check(not run.foreign, "names of case.library", run.foreign, location)
+    sets_with_repeats = [
+        names for names in list_named_sets(run.answer) if len(set(names)) < len(names)
+    ]
+    check(not sets_with_repeats, "each effect once in a set", sets_with_repeats, location)
 
 
 def check_same_answer_again(kind: type[Diagnoser]) -> None:
     """Check that the same random seed gives the same answer."""
-    first, again = (_diagnose_cached(kind, turn=turn).answer.document() for turn in (0, 1))
-    check(first == again, "the same answer again", again, f"case.rng in {kind.__name__}")
+    first, second = (_diagnose_cached(kind, turn=turn).answer.document() for turn in (0, 1))
+    check(first == second, "the same answer again", second, f"case.rng in {kind.__name__}")
 
 
 def check_leaves_the_recording_alone(kind: type[Diagnoser]) -> None:
@@ -255,11 +259,11 @@ def check_keeps_to_its_budget(kind: type[Diagnoser]) -> None:
             _run_diagnoser(kind, case)
         except SimulationBudgetExceededError:
             return
-        used = case.used
+        used_simulations = case.used
     check(
-        used <= TINY_SIMULATION_BUDGET,
+        used_simulations <= TINY_SIMULATION_BUDGET,
         f"at most {TINY_SIMULATION_BUDGET} simulations",
-        used,
+        used_simulations,
         f"{kind.__name__}.diagnose",
     )
 
@@ -274,11 +278,11 @@ def check_learns_within_its_budget(kind: type[Diagnoser]) -> NotApplicable | Non
     """Check that the training stays within its budget and results in numeric arrays."""
     if not kind.learned:
         return NotApplicable("it does not learn")
-    arrays, used = _train_diagnoser(kind)
+    arrays, used_simulations = _train_diagnoser(kind)
     check(
-        used <= TRAINING_BUDGET,
+        used_simulations <= TRAINING_BUDGET,
         f"at most {TRAINING_BUDGET} simulations",
-        used,
+        used_simulations,
         f"{kind.__name__}.train",
     )
     try:

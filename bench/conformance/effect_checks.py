@@ -72,9 +72,9 @@ def _make_simulator_with_effect(
     Raises:
         CheckError: another effect has the same name.
     """
-    known = effects.list_names()
-    if effect.name not in known or effects.get_effect(effect.name) is not effect:
-        if effect.name in known:
+    registered_names = effects.list_names()
+    if effect.name not in registered_names or effects.get_effect(effect.name) is not effect:
+        if effect.name in registered_names:
             raise CheckError(
                 f"expected a name of its own; found {effect.name}; see {effect.__name__}.name"
             )
@@ -106,10 +106,10 @@ def _make_parameters(simulator: SystemSimulator, share: float) -> Array:
     `share` (0 to 1) of its plausible range.
     """
     # The coefficients of the effect follow the parameters of the system.
-    own = len(simulator.system.parameters)
-    values = [p.nominal for p in simulator.parameters[:own]]
+    base_count = len(simulator.system.parameters)
+    values = [p.nominal for p in simulator.parameters[:base_count]]
     values += [
-        p.bounds[0] + share * (p.bounds[1] - p.bounds[0]) for p in simulator.parameters[own:]
+        p.bounds[0] + share * (p.bounds[1] - p.bounds[0]) for p in simulator.parameters[base_count:]
     ]
     return np.array([values])
 
@@ -120,20 +120,24 @@ def check_declaration_is_complete(effect: type[Effect]) -> None:
     It needs a name, a description and a source, and for each coefficient a unit and a range on at
     least one kind of system.
     """
-    look = effect.__name__
-    check(bool(_NAME.match(effect.name)), "a name family.form in lower case", effect.name, look)
+    location = effect.__name__
+    check(bool(_NAME.match(effect.name)), "a name family.form in lower case", effect.name, location)
     check(
         bool(effect.says) and bool(effect.source),
         "a sentence and a source",
         (effect.says, effect.source),
-        look,
+        location,
     )
-    check(bool(effect.coefficients), "at least one coefficient", "none", look)
+    check(bool(effect.coefficients), "at least one coefficient", "none", location)
     for c in effect.coefficients:
         for unit, (low, high) in zip(c.units, c.plausible, strict=True):
-            check(unit is None or low < high, f"a plausible range for {c.name}", (low, high), look)
-    hosted = any(True for _ in _find_supporting_systems(effect)) or bool(list_effect_places(effect))
-    check(hosted, "a registered system or a robot that can have it", "none", look)
+            check(
+                unit is None or low < high, f"a plausible range for {c.name}", (low, high), location
+            )
+    has_host = any(True for _ in _find_supporting_systems(effect)) or bool(
+        list_effect_places(effect)
+    )
+    check(has_host, "a registered system or a robot that can have it", "none", location)
 
 
 def check_contribution_is_nothing_at_zero(effect: type[Effect]) -> NotApplicable | None:
@@ -144,18 +148,18 @@ def check_contribution_is_nothing_at_zero(effect: type[Effect]) -> NotApplicable
     """
     hosts = list(_find_supporting_systems(effect))
     for host in hosts:
-        system, acting = host.system(), effect()
+        system, active_effect = host.system(), effect()
         c = np.zeros((len(effect.coefficients), 2, 1))
-        same = all(
-            is_bitwise_equal(given, nothing)
-            for given, nothing in _compute_contributions(acting, c, host, system)
+        is_same = all(
+            is_bitwise_equal(contribution, inactive)
+            for contribution, inactive in _compute_contributions(active_effect, c, host, system)
         )
-        check(same, f"no contribution on {host.name} at zero", "one", effect.__name__)
+        check(is_same, f"no contribution on {host.name} at zero", "one", effect.__name__)
     return None if hosts else NO_SUPPORTING_SYSTEM
 
 
 def _compute_contributions(
-    acting: Effect, c: Array, host: type[SystemSimulator], system: System
+    active_effect: Effect, c: Array, host: type[SystemSimulator], system: System
 ) -> list[tuple[Array, Array]]:
     """Return pairs of the hook's result and the expected result of an inactive effect.
 
@@ -169,25 +173,26 @@ def _compute_contributions(
     times = np.cumsum(np.full((2, 3), 0.1), axis=1)
     signal = Signal(values, np.full((2, 3), 0.1), np.array([[0.7], [0.2]]), times)
     # Adding zero turns -0.0, the result of a product with zero, into 0.0.
-    if isinstance(acting, Force):
-        return [(acting.force(c, moment) + 0.0, np.zeros_like(moment.x))]
-    if isinstance(acting, Friction):
-        return [(acting.limit(c, moment) + np.zeros((2, 1)), np.zeros((2, 1)))]
-    if isinstance(acting, Contact):
+    if isinstance(active_effect, Force):
+        return [(active_effect.force(c, moment) + 0.0, np.zeros_like(moment.x))]
+    if isinstance(active_effect, Friction):
+        return [(active_effect.limit(c, moment) + np.zeros((2, 1)), np.zeros((2, 1)))]
+    if isinstance(active_effect, Contact):
         return [
-            (acting.restitution(c, e, speed), e),
-            (acting.friction(c) + np.zeros((2, 1)), np.zeros((2, 1))),
+            (active_effect.restitution(c, e, speed), e),
+            (active_effect.friction(c) + np.zeros((2, 1)), np.zeros((2, 1))),
         ]
-    if isinstance(acting, Input):
-        return [(acting.times(c, times), times), (acting.feel(c, signal), values)]
-    if isinstance(acting, HiddenStateEffect):
+    if isinstance(active_effect, Input):
+        return [(active_effect.times(c, times), times), (active_effect.feel(c, signal), values)]
+    if isinstance(active_effect, HiddenStateEffect):
         return []  # engines do not call it if its first coefficient is zero
-    if isinstance(acting, Sensor):
-        return [(acting.times(c, times), times), (acting.read(c, signal), values)]
-    if isinstance(acting, Level):
-        return [(acting.keep(c, e), e)]
+    if isinstance(active_effect, Sensor):
+        return [(active_effect.times(c, times), times), (active_effect.read(c, signal), values)]
+    if isinstance(active_effect, Level):
+        return [(active_effect.keep(c, e), e)]
     raise CheckError(
-        f"expected one of the hook classes; found {type(acting).__mro__}; see sims.core.effect"
+        f"expected one of the hook classes; found {type(active_effect).__mro__}; see "
+        "sims.core.effect"
     )
 
 
@@ -221,21 +226,23 @@ def check_it_shows_and_stays_finite(effect: type[Effect]) -> NotApplicable | Non
     """
     hosts = list(_find_supporting_systems(effect))
     for host in hosts:
-        simulator, plain, scenario = (
+        simulator, base_simulator, scenario = (
             _make_simulator_with_effect(host, effect),
             host(engine=_choose_engine(host)),
             _make_scenario(host.system),
         )
         thetas = np.concatenate([_make_parameters(simulator, share) for share in (0.05, 0.3, 0.7)])
         observations = simulator.simulate(thetas, scenario)
-        look = f"{effect.__name__} on {host.name}"
-        check(bool(np.isfinite(observations[-1]).all()), "finite observations", "others", look)
-        before = plain.simulate(thetas[:1, : len(host.system.parameters)], scenario)
+        location = f"{effect.__name__} on {host.name}"
+        check(bool(np.isfinite(observations[-1]).all()), "finite observations", "others", location)
+        base_observations = base_simulator.simulate(
+            thetas[:1, : len(host.system.parameters)], scenario
+        )
         check(
-            bool((observations != before).any()),
+            bool((observations != base_observations).any()),
             "a change inside the plausible range",
             "none",
-            look,
+            location,
         )
     return None if hosts else NO_SUPPORTING_SYSTEM
 
@@ -246,10 +253,12 @@ def check_lanes_are_independent(effect: type[Effect]) -> NotApplicable | None:
     for host in hosts:
         simulator, scenario = _make_simulator_with_effect(host, effect), _make_scenario(host.system)
         lanes = np.concatenate([_make_parameters(simulator, share) for share in (0.2, 0.5, 0.9)])
-        together = simulator.simulate(lanes, scenario)
-        alone = np.concatenate([simulator.simulate(lane[None], scenario) for lane in lanes])
+        batch_result = simulator.simulate(lanes, scenario)
+        single_results = np.concatenate(
+            [simulator.simulate(lane[None], scenario) for lane in lanes]
+        )
         check(
-            is_bitwise_equal(together, alone),
+            is_bitwise_equal(batch_result, single_results),
             "the same bits alone and among others",
             "others",
             effect.__name__,
@@ -264,8 +273,8 @@ def check_impossible_hosts_are_refused(effect: type[Effect]) -> NotApplicable | 
         try:
             _make_simulator_with_effect(host, effect)
         except InputError as error:
-            named = effect.name in str(error)
-            check(named, "a message that names the effect", error, effect.__name__)
+            is_named = effect.name in str(error)
+            check(is_named, "a message that names the effect", error, effect.__name__)
             continue
         raise CheckError(
             f"expected {host.name} to refuse it; found that it did not; see {effect.__name__}.needs"

@@ -30,10 +30,10 @@ def check_same_run_when_sealed(kind: type[Tuner]) -> NotApplicable | None:
     tuned = _make_tuner_spec(kind)
     if tuned is None:
         return NotApplicable("its class is in no plugin file and no installed package")
-    here = run_tuner(make_trained_tuner(kind, 2), 2, _BUDGET, _SEED)
+    local_trace = run_tuner(make_trained_tuner(kind, 2), 2, _BUDGET, _SEED)
     state = make_trained_tuner(kind, 2).state() if kind.learned else None
     task, _ = make_task(2, _BUDGET)
-    look = f"{kind.__name__}: what needs files, the network or processes; docs/sealing.md"
+    location = f"{kind.__name__}: what needs files, the network or processes; docs/sealing.md"
     try:
         with start_isolated_tuner(tuned, _SEED, "run", state=state) as tuner:
             words = np.array([_SEED], dtype=np.uint32)
@@ -43,16 +43,21 @@ def check_same_run_when_sealed(kind: type[Tuner]) -> NotApplicable | None:
             )
     except (RunEndedError, KilledExternallyError) as error:
         last_line = str(error).strip().splitlines()[-1:]
-        check(False, "a run in a process of its own", last_line, look)
+        check(False, "a run in a process of its own", last_line, location)
         raise
-    ended = (
+    end_text = (
         sandboxed_trace.reason.strip().splitlines()[-1:]
-        if sandboxed_trace.status != here.status
+        if sandboxed_trace.status != local_trace.status
         else ""
     )
-    check(sandboxed_trace.status == here.status, f"the end {here.status} when sealed", ended, look)
-    same = np.array_equal(sandboxed_trace.proposals, here.proposals)
-    check(same, "the same run when sealed", "another one", look)
+    check(
+        sandboxed_trace.status == local_trace.status,
+        f"the end {local_trace.status} when sealed",
+        end_text,
+        location,
+    )
+    is_same = np.array_equal(sandboxed_trace.proposals, local_trace.proposals)
+    check(is_same, "the same run when sealed", "another one", location)
     return None
 
 
@@ -65,9 +70,9 @@ def _make_tuner_spec(kind: type[Tuner]) -> TunerSpec | None:
     if kind.__module__.startswith("simgap_plugin_"):
         return TunerSpec(kind.name, "", file, {}, find_preloadable_packages(file))
     # A class of a script or a test is in a file that an isolated process cannot read.
-    own = file.startswith(str(PROJECT_ROOT / "methods")) or "site-packages" in file
+    is_importable = file.startswith(str(PROJECT_ROOT / "methods")) or "site-packages" in file
     return (
         TunerSpec(kind.name, kind.__module__, "", {}, find_preloadable_packages(file))
-        if own
+        if is_importable
         else None
     )

@@ -43,38 +43,42 @@ def check_hooks_have_the_declared_shapes(kind: type[Simulator]) -> NotApplicable
     `observe` must return a number for every channel, coordinate, rate and level. `inertia` must
     return a number or a positive definite matrix (D, D). `apply_force` must accept (D,).
     """
-    own = _as_own_simulator(kind)
-    if own is None:
+    user_class = _as_own_simulator(kind)
+    if user_class is None:
         return _NOT_OWN
-    forced = own.apply_force is not OwnSimulator.apply_force
-    heavy = own.inertia is not OwnSimulator.inertia
+    forced = user_class.apply_force is not OwnSimulator.apply_force
+    heavy = user_class.inertia is not OwnSimulator.inertia
     hook = "apply_force" if forced else "inertia"
     if forced or heavy:
-        what = f"the attributes coordinates and rates beside {hook}"
-        check(bool(own.coordinates), what, "none", own.__name__)
-    simulator = own()
+        expected = f"the attributes coordinates and rates beside {hook}"
+        check(bool(user_class.coordinates), expected, "none", user_class.__name__)
+    simulator = user_class()
     names = [c.name for c in simulator.channels]
     _start_run(simulator)
     try:
         for _ in range(2):
             observation = simulator.observe()
-            for name in dict.fromkeys([*names, *own.coordinates, *own.rates, *own.levels]):
+            for name in dict.fromkeys(
+                [*names, *user_class.coordinates, *user_class.rates, *user_class.levels]
+            ):
                 observed(simulator, observation, name)
             if heavy:
-                _check_inertia(own, inertia_of(simulator))
+                _check_inertia(user_class, inertia_of(simulator))
             if forced:
-                simulator.apply_force(np.zeros(len(own.coordinates)))
+                simulator.apply_force(np.zeros(len(user_class.coordinates)))
             _make_step(simulator)
     except InputError as error:
-        message = str(error).removeprefix(f"simulator {own.name}: ")
-        wanted, _, found = message.partition(", found ")
-        raise CheckError(f"{wanted}; found {found or 'it is not'}; see {own.__name__}") from None
+        message = str(error).removeprefix(f"simulator {user_class.name}: ")
+        expected_text, _, found_text = message.partition(", found ")
+        raise CheckError(
+            f"{expected_text}; found {found_text or 'it is not'}; see {user_class.__name__}"
+        ) from None
     finally:
         simulator.close()
     return None
 
 
-def _check_inertia(kind: type[OwnSimulator], given: float | Array) -> None:
+def _check_inertia(kind: type[OwnSimulator], value: float | Array) -> None:
     """Check that an inertia is a positive number, or a symmetric positive definite matrix (D, D).
 
     D is the number of coordinates. Any other inertia would give accelerations without meaning.
@@ -82,29 +86,31 @@ def _check_inertia(kind: type[OwnSimulator], given: float | Array) -> None:
     Raises:
         CheckError: it is not.
     """
-    inertia = np.atleast_2d(given)
-    sound = bool(np.isfinite(inertia).all()) and np.allclose(inertia, inertia.T)
-    sound = sound and bool(np.linalg.eigvalsh(inertia).min() > 0)
-    wanted = "inertia: expected a positive number, or a symmetric positive definite matrix"
-    if not sound:
-        raise CheckError(f"{wanted}; found {inertia.tolist()}; see {kind.__name__}.inertia")
+    inertia = np.atleast_2d(value)
+    is_valid = bool(np.isfinite(inertia).all()) and np.allclose(inertia, inertia.T)
+    is_valid = is_valid and bool(np.linalg.eigvalsh(inertia).min() > 0)
+    expected = "inertia: expected a positive number, or a symmetric positive definite matrix"
+    if not is_valid:
+        raise CheckError(f"{expected}; found {inertia.tolist()}; see {kind.__name__}.inertia")
 
 
 def check_step_goes_on_by_its_seconds(kind: type[Simulator]) -> NotApplicable | None:
     """Check that twice as many steps of half the length lead to about the same state."""
-    own = _as_own_simulator(kind)
-    if own is None:
+    user_class = _as_own_simulator(kind)
+    if user_class is None:
         return _NOT_OWN
-    simulator = own()
-    whole, half = (_compute_scaled_change(simulator, own.time_step / n, _FEW * n) for n in (1, 2))
+    simulator = user_class()
+    full_change, half_change = (
+        _compute_scaled_change(simulator, user_class.time_step / n, _FEW * n) for n in (1, 2)
+    )
     simulator.close()
-    moved = np.abs(whole) > _ROUNDING
-    if not moved.any():
+    has_moved = np.abs(full_change) > _ROUNDING
+    if not has_moved.any():
         return NotApplicable("nothing moves")
-    ratio = float(np.min(np.abs(half[moved] / whole[moved])))
-    what = f"{2 * _FEW} steps of time_step / 2 to lead as far as {_FEW} of time_step"
-    look = f"{own.__name__}.step: the engine must step by `seconds`"
-    check(ratio < _FARTHER, what, f"{ratio:.2g} times as far", look)
+    ratio = float(np.min(np.abs(half_change[has_moved] / full_change[has_moved])))
+    expected = f"{2 * _FEW} steps of time_step / 2 to lead as far as {_FEW} of time_step"
+    location = f"{user_class.__name__}.step: the engine must step by `seconds`"
+    check(ratio < _FARTHER, expected, f"{ratio:.2g} times as far", location)
     return None
 
 
@@ -127,14 +133,16 @@ def _compute_scaled_change(simulator: OwnSimulator, seconds: float, steps: int) 
     inputs = {c.name: c.scale for c in simulator.inputs}
 
     def observation() -> Array:
-        now = simulator.observe()
-        return np.array([observed(simulator, now, c.name) / c.scale for c in simulator.channels])
+        readings = simulator.observe()
+        return np.array(
+            [observed(simulator, readings, c.name) / c.scale for c in simulator.channels]
+        )
 
     _start_run(simulator)
-    before = observation()
+    initial = observation()
     for _ in range(steps):
         simulator.step(inputs, seconds)
-    return observation() - before
+    return observation() - initial
 
 
 def check_forces_act(kind: type[Simulator]) -> NotApplicable | None:
@@ -142,35 +150,35 @@ def check_forces_act(kind: type[Simulator]) -> NotApplicable | None:
 
     It must not act in the next run.
     """
-    own = _as_own_simulator(kind)
-    if own is None:
+    user_class = _as_own_simulator(kind)
+    if user_class is None:
         return _NOT_OWN
-    if own.apply_force is OwnSimulator.apply_force:
+    if user_class.apply_force is OwnSimulator.apply_force:
         return NotApplicable("it takes no forces (it has no method apply_force)")
-    simulator, look = own(), f"{own.__name__}.apply_force"
-    still = _simulate_motion(simulator, None)
-    for place, name in enumerate(own.coordinates):
-        moved = still
+    simulator, location = user_class(), f"{user_class.__name__}.apply_force"
+    unforced = _simulate_motion(simulator, None)
+    for place, name in enumerate(user_class.coordinates):
+        forced = unforced
         size = 1.0
-        while is_bitwise_equal(still, moved) and size <= _LARGEST:
-            force = np.zeros(len(own.coordinates))
+        while is_bitwise_equal(unforced, forced) and size <= _LARGEST:
+            force = np.zeros(len(user_class.coordinates))
             force[place] = size
-            moved = _simulate_motion(simulator, force)
+            forced = _simulate_motion(simulator, force)
             size *= 10.0
-        found = f"the same motion with forces up to {_LARGEST:g}"
+        found_text = f"the same motion with forces up to {_LARGEST:g}"
         check(
-            not is_bitwise_equal(still, moved),
+            not is_bitwise_equal(unforced, forced),
             f"a force along {name} to change the motion",
-            found,
-            look,
+            found_text,
+            location,
         )
-        again = is_bitwise_equal(still, _simulate_motion(simulator, None))
-        reset = f"{own.__name__}.reset: it must take away a force that was applied"
-        check(again, "the same run after one with forces", "another", reset)
-        velocity = np.abs(moved - still)[:, len(own.coordinates) + place]
+        is_restored = is_bitwise_equal(unforced, _simulate_motion(simulator, None))
+        reset = f"{user_class.__name__}.reset: it must take away a force that was applied"
+        check(is_restored, "the same run after one with forces", "another", reset)
+        velocity = np.abs(forced - unforced)[:, len(user_class.coordinates) + place]
         grown = 0.0 < velocity[1] * _GROWN < velocity[_LATER]
-        what = f"a force along {name} to act in the next step alone"
-        check(not grown, what, "that it acts in later steps too", look)
+        expected = f"a force along {name} to act in the next step alone"
+        check(not grown, expected, "that it acts in later steps too", location)
     simulator.close()
     return None
 
@@ -191,20 +199,22 @@ def _simulate_motion(simulator: OwnSimulator, force: Array | None) -> Array:
 
 def check_levels_can_be_set(kind: type[Simulator]) -> NotApplicable | None:
     """Check that `put` sets a level, which `observe` returns, and leaves other levels unchanged."""
-    own = _as_own_simulator(kind)
-    if own is None:
+    user_class = _as_own_simulator(kind)
+    if user_class is None:
         return _NOT_OWN
-    if own.put is OwnSimulator.put or not own.levels:
+    if user_class.put is OwnSimulator.put or not user_class.levels:
         return NotApplicable("its levels cannot be set (it has no method put)")
-    simulator, look = own(), f"{own.__name__}.put"
-    for name in own.levels:
+    simulator, location = user_class(), f"{user_class.__name__}.put"
+    for name in user_class.levels:
         _start_run(simulator)
         _make_step(simulator)
-        before = {level: float(simulator.observe()[level]) for level in own.levels}
-        wanted = {**before, name: 0.9 * before[name] + 0.01}
-        simulator.put({name: wanted[name]})
-        found = {level: float(simulator.observe()[level]) for level in own.levels}
-        same = np.allclose(list(found.values()), list(wanted.values()), rtol=1e-9, atol=1e-12)
-        check(same, f"levels {wanted} after put({name})", found, look)
+        levels_before = {level: float(simulator.observe()[level]) for level in user_class.levels}
+        expected_levels = {**levels_before, name: 0.9 * levels_before[name] + 0.01}
+        simulator.put({name: expected_levels[name]})
+        found_levels = {level: float(simulator.observe()[level]) for level in user_class.levels}
+        is_same = np.allclose(
+            list(found_levels.values()), list(expected_levels.values()), rtol=1e-9, atol=1e-12
+        )
+        check(is_same, f"levels {expected_levels} after put({name})", found_levels, location)
     simulator.close()
     return None

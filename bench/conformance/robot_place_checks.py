@@ -37,13 +37,17 @@ def check_places_are_declared(effect: type[Effect]) -> NotApplicable | None:
     """
     classes = list_effect_places(effect)
     for effect_class in classes:
-        look = f"{effect.__name__} at {effect_class.place or 'the world'}"
-        named = f"{effect.name}@{effect_class.place}" if effect_class.place else effect.name
-        check(effect_class.name == named, f"name {named}", effect_class.name, look)
+        location = f"{effect.__name__} at {effect_class.place or 'the world'}"
+        expected_name = f"{effect.name}@{effect_class.place}" if effect_class.place else effect.name
+        check(
+            effect_class.name == expected_name, f"name {expected_name}", effect_class.name, location
+        )
         for c in effect_class.coefficients:
-            finite = all(np.isfinite(ends).all() and ends[0] < ends[1] for ends in c.plausible)
-            check(finite, f"a finite range for {c.name}", c.plausible, look)
-            check(all(c.units), f"a unit for {c.name} ('1' for a number)", c.units, look)
+            finite = all(
+                np.isfinite(limits).all() and limits[0] < limits[1] for limits in c.plausible
+            )
+            check(finite, f"a finite range for {c.name}", c.plausible, location)
+            check(all(c.units), f"a unit for {c.name} ('1' for a number)", c.units, location)
     if not classes:
         return NO_PLACE
     places = [effect_class.place for effect_class in classes if effect_class.place]
@@ -61,8 +65,8 @@ def _check_place_refusal(effect: type[Effect], places: Sequence[str]) -> None:
     try:
         make_arm_simulator(effect).system.effect(f"{effect.name}@nowhere")
     except InputError as error:
-        listed = all(place in str(error) for place in places)
-        check(listed, f"a message that lists {', '.join(places)}", error, effect.__name__)
+        is_listed = all(place in str(error) for place in places)
+        check(is_listed, f"a message that lists {', '.join(places)}", error, effect.__name__)
         return
     raise CheckError(f"expected place nowhere to be refused; found it is not; see {effect.name}")
 
@@ -76,23 +80,25 @@ def check_nothing_at_zero_at_a_place(effect: type[Effect]) -> NotApplicable | No
     classes = list_effect_places(effect)
     kind = make_arm_simulator(effect)
     for effect_class in classes:
-        look = f"{effect.__name__} at {effect_class.place or 'the world'}"
+        location = f"{effect.__name__} at {effect_class.place or 'the world'}"
         c = np.zeros((len(effect_class.coefficients), 2, 1))
-        for part, own in effect_class().parts(c):
-            none = _acts_on(part, own, kind) == ()
-            check(none, "no contribution at zero", "one", look)
+        for part, coefficients in effect_class().parts(c):
+            none = _acts_on(part, coefficients, kind) == ()
+            check(none, "no contribution at zero", "one", location)
         lanes = np.concatenate(
             [_make_coefficients(effect_class, 0.0), _make_coefficients(effect_class, 0.7)]
         )
         observations = kind(observe=OBSERVED_CHANNELS, effects=[effect_class]).simulate(
             lanes, make_scenario()
         )
-        plain = kind(observe=OBSERVED_CHANNELS).simulate(np.empty((1, 0)), make_scenario())
+        base_observations = kind(observe=OBSERVED_CHANNELS).simulate(
+            np.empty((1, 0)), make_scenario()
+        )
         check(
-            is_bitwise_equal(observations[:1] + 0.0, plain + 0.0),
+            is_bitwise_equal(observations[:1] + 0.0, base_observations + 0.0),
             "the plain motion at zero",
             "other",
-            look,
+            location,
         )
     return None if classes else NO_PLACE
 
@@ -106,35 +112,45 @@ def check_it_acts_at_its_place_alone(effect: type[Effect]) -> NotApplicable | No
     kind = make_arm_simulator(effect)
     touched = {}
     for effect_class in classes:
-        look = f"{effect.__name__} at {effect_class.place or 'the world'}"
+        location = f"{effect.__name__} at {effect_class.place or 'the world'}"
         thetas = np.concatenate(
             [_make_coefficients(effect_class, share) for share in (0.05, *_SHARES)]
         )
         observations = kind(observe=OBSERVED_CHANNELS, effects=[effect_class]).simulate(
             thetas, make_scenario()
         )
-        plain = kind(observe=OBSERVED_CHANNELS).simulate(np.empty((1, 0)), make_scenario())
+        base_observations = kind(observe=OBSERVED_CHANNELS).simulate(
+            np.empty((1, 0)), make_scenario()
+        )
         # Only the last element is tested: at the low end of its range, a force may destabilise a
         # joint.
-        check(bool(np.isfinite(observations[-1]).all()), "finite observations", "others", look)
+        check(bool(np.isfinite(observations[-1]).all()), "finite observations", "others", location)
         is_observable = effect_class.signal in ("", *OBSERVED_CHANNELS) or not issubclass(
             effect_class, Sensor
         )
         check(
-            bool((observations != plain).any()) == is_observable,
+            bool((observations != base_observations).any()) == is_observable,
             "a change where it is seen",
             "none",
-            look,
+            location,
         )
         if issubclass(effect_class, Sensor) and effect_class.signal in OBSERVED_CHANNELS:
-            others = [i for i, name in enumerate(OBSERVED_CHANNELS) if name != effect_class.signal]
-            same = bool((observations[:, :, others] == plain[:, :, others]).all())
-            check(same, "other channels left alone", "changes", look)
-        for part, own in effect_class().parts(np.ones((len(effect_class.coefficients), 2, 1))):
-            touched[part.name] = _acts_on(part, own, kind)
-    are_disjoint = len({ends for ends in touched.values() if ends}) == sum(
-        map(bool, touched.values())
-    )
+            other_channels = [
+                i for i, name in enumerate(OBSERVED_CHANNELS) if name != effect_class.signal
+            ]
+            is_same = bool(
+                (
+                    observations[:, :, other_channels] == base_observations[:, :, other_channels]
+                ).all()
+            )
+            check(is_same, "other channels left alone", "changes", location)
+        for part, coefficients in effect_class().parts(
+            np.ones((len(effect_class.coefficients), 2, 1))
+        ):
+            touched[part.name] = _acts_on(part, coefficients, kind)
+    are_disjoint = len(
+        {changed_fields for changed_fields in touched.values() if changed_fields}
+    ) == sum(map(bool, touched.values()))
     check(are_disjoint, "each place to be touched by one alone", touched, effect.__name__)
     return None if classes else NO_PLACE
 
@@ -147,22 +163,22 @@ def check_family_is_the_sum_of_its_members(effect: type[Effect]) -> NotApplicabl
         for effect_class in list_effect_places(effect)
         if hasattr(effect_class, "members")
     ]
-    for whole in families:
-        members = [type(member) for member in whole.members]
-        effect_class = kind(observe=OBSERVED_CHANNELS, effects=[whole])
-        several = kind(observe=OBSERVED_CHANNELS, effects=members)
+    for family in families:
+        members = [type(member) for member in family.members]
+        effect_class = kind(observe=OBSERVED_CHANNELS, effects=[family])
+        members_simulator = kind(observe=OBSERVED_CHANNELS, effects=members)
         # A family with one coefficient applies it at every place.
-        shared = len(effect_class.parameters) < len(several.parameters)
-        theta = _make_coefficients(whole, 0.3)
+        shared = len(effect_class.parameters) < len(members_simulator.parameters)
+        theta = _make_coefficients(family, 0.3)
         each = np.tile(theta, len(members)) if shared else theta
         check(
             is_bitwise_equal(
                 effect_class.simulate(theta, make_scenario()),
-                several.simulate(each, make_scenario()),
+                members_simulator.simulate(each, make_scenario()),
             ),
             "the motion of all members together",
             "another",
-            whole.name,
+            family.name,
         )
     return None if families else NotApplicable("it has no family")
 
@@ -176,29 +192,29 @@ def check_lanes_of_a_robot_are_independent(effect: type[Effect]) -> NotApplicabl
     classes = list_effect_places(effect)
     simulator = make_arm_simulator(effect)(observe=OBSERVED_CHANNELS, effects=classes)
     rows = [np.zeros((1, len(simulator.parameters)))]
-    begin = 0
+    start = 0
     for effect_class in classes:
-        end = begin + len(effect_class.coefficients)
+        end = start + len(effect_class.coefficients)
         for share in _SHARES:
             row = rows[0].copy()
-            row[:, begin:end] = _make_coefficients(effect_class, share)
+            row[:, start:end] = _make_coefficients(effect_class, share)
             rows.append(row)
-        begin = end
+        start = end
     lanes = np.concatenate(rows)
-    together = simulator.simulate(lanes, make_scenario())
-    alone = np.concatenate([simulator.simulate(row, make_scenario()) for row in rows])
-    turned = simulator.simulate(lanes[::-1], make_scenario())[::-1]
-    same = is_bitwise_equal(together, alone) and is_bitwise_equal(
-        together, np.ascontiguousarray(turned)
+    batch_result = simulator.simulate(lanes, make_scenario())
+    single_results = np.concatenate([simulator.simulate(row, make_scenario()) for row in rows])
+    reversed_result = simulator.simulate(lanes[::-1], make_scenario())[::-1]
+    is_same = is_bitwise_equal(batch_result, single_results) and is_bitwise_equal(
+        batch_result, np.ascontiguousarray(reversed_result)
     )
-    check(same, "the same bits alone, among others and in any order", "others", effect.__name__)
+    check(is_same, "the same bits alone, among others and in any order", "others", effect.__name__)
     return None if classes else NO_PLACE
 
 
 def _make_coefficients(effect: type[Effect], share: float) -> Array:
     """Return coefficients (1, K) at a fraction of their plausible ranges; all zero for 0."""
-    ends = np.array([c.plausible[0] for c in effect.coefficients])
-    theta: Array = ends[:, 0] + share * (ends[:, 1] - ends[:, 0])
+    limits = np.array([c.plausible[0] for c in effect.coefficients])
+    theta: Array = limits[:, 0] + share * (limits[:, 1] - limits[:, 0])
     return theta[None] * (share != 0.0)
 
 
@@ -243,12 +259,12 @@ def _find_changed_fields(effect: Effect, c: Array, kind: type) -> tuple[object, 
     fields, changes = {}, []
     for name in native.fields:
         owner, _, field = name.rpartition(".")
-        stated = getattr(robot.compiled.opt if owner else robot.compiled, field)
-        fields[name] = np.repeat(np.array(stated)[None], 2, axis=0)
-    before = {name: values.copy() for name, values in fields.items()}
+        field_value = getattr(robot.compiled.opt if owner else robot.compiled, field)
+        fields[name] = np.repeat(np.array(field_value)[None], 2, axis=0)
+    values_before = {name: values.copy() for name, values in fields.items()}
     native.write(fields, robot, effect.place, c[:, :, 0])
     for name, values in fields.items():
-        places = np.nonzero(values != before[name])[1]
+        places = np.nonzero(values != values_before[name])[1]
         changes += [(name, int(place)) for place in np.unique(places)]
     # Fields indexed by place must change at one place; fields of the world are indexed by axis.
     if effect.place and len({place for _, place in changes}) > 1:
@@ -268,9 +284,9 @@ def _put_in_series(effect: HiddenStateEffect, c: Array, kind: type) -> tuple[obj
         name: np.repeat(np.array(getattr(model, name))[None], 2, 0)
         for name in series_joints.USED_FIELDS
     }
-    before = {name: values.copy() for name, values in fields.items()}
+    values_before = {name: values.copy() for name, values in fields.items()}
     series_joints.write_series_effects(fields, robot, ((effect, c),))
-    changed = [name for name, values in fields.items() if (values != before[name]).any()]
+    changed = [name for name, values in fields.items() if (values != values_before[name]).any()]
     return tuple((name, effect.place) for name in changed)
 
 

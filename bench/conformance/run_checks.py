@@ -101,18 +101,20 @@ def run_check(kind: str, name: str, place: int) -> str:
         Description of the failure, or an empty text.
     """
     check, subject = SUITES[kind][place], _get_subject(kind, name)
-    known = getattr(subject, "known_failures", {}).get(check.__name__)
+    known_failure = getattr(subject, "known_failures", {}).get(check.__name__)
     try:
         outcome = check(subject)
     except CheckError as error:
-        return f"{_EXPECTED_FAILURE_PREFIX}{known}" if known else str(error)
+        return f"{_EXPECTED_FAILURE_PREFIX}{known_failure}" if known_failure else str(error)
     except InputError as error:
         return str(error)
     except Exception as error:
         location = _describe_raise_location(error)
         return f"expected no exception; found {type(error).__name__}: {error}; {location}"
-    if known:
-        return f"expected to fail ({known}); found that it passes; see {name}.known_failures"
+    if known_failure:
+        return (
+            f"expected to fail ({known_failure}); found that it passes; see {name}.known_failures"
+        )
     return f"{_NOT_APPLICABLE_PREFIX}{outcome.reason}" if outcome else ""
 
 
@@ -121,18 +123,18 @@ def _describe_raise_location(error: Exception) -> str:
     frames = traceback.extract_tb(error.__traceback__)
     packages = Path(__file__).parents[2]
     folders = [str(packages / name) for name in ("bench", "methods", "sims")]
-    own = [frame for frame in frames if not frame.filename.startswith(tuple(folders))]
-    frame = (own or list(frames))[-1]
+    subject_frames = [frame for frame in frames if not frame.filename.startswith(tuple(folders))]
+    frame = (subject_frames or list(frames))[-1]
     return f"see {Path(frame.filename).name}, line {frame.lineno}, in {frame.name}"
 
 
-def run_suite(name: str, plugins: Sequence[str], say: Callable[[str], None]) -> SuiteResult:
+def run_suite(name: str, plugins: Sequence[str], print_line: Callable[[str], None]) -> SuiteResult:
     """Run all checks and print the result of each.
 
     Args:
         name: registered name of a tuner, simulator, effect or diagnoser.
         plugins: plugin files, which are already loaded in this process.
-        say: prints a line.
+        print_line: prints a line.
 
     Raises:
         InputError: the name does not exist, or the subject cannot be used here.
@@ -142,19 +144,23 @@ def run_suite(name: str, plugins: Sequence[str], say: Callable[[str], None]) -> 
     lines = {}
     for check, line in _run_all_checks(kind, name, plugins):
         lines[title_of(check)] = line
-        below = f"\n        {line.removeprefix(_EXPECTED_FAILURE_PREFIX)}" if line else ""
-        say(f"{_get_outcome_label(line)}  {title_of(check)}{below}")
+        error_text = f"\n        {line.removeprefix(_EXPECTED_FAILURE_PREFIX)}" if line else ""
+        print_line(f"{_get_outcome_label(line)}  {title_of(check)}{error_text}")
     checked = SuiteResult(name, kind, f"{subject.__module__}.{subject.__qualname__}", lines)
-    say(f"{kind} {name} ({checked.qualified}): {_summarise_checks(checked)}")
+    print_line(f"{kind} {name} ({checked.qualified}): {_summarise_checks(checked)}")
     return checked
 
 
 def _summarise_checks(checked: SuiteResult) -> str:
     """Summarise how many checks failed and how many were not run."""
     outcomes = [_get_outcome(line) for line in checked.lines.values()]
-    idle = {what: outcomes.count(what) for what in ("not tested", "not applicable")}
-    checked_count, failed = len(outcomes) - sum(idle.values()), outcomes.count("failed")
-    other_counts = "".join(f", {count} {what}" for what, count in idle.items() if count)
+    unrun_counts = {
+        outcome: outcomes.count(outcome) for outcome in ("not tested", "not applicable")
+    }
+    checked_count, failed = len(outcomes) - sum(unrun_counts.values()), outcomes.count("failed")
+    other_counts = "".join(
+        f", {count} {outcome}" for outcome, count in unrun_counts.items() if count
+    )
     if failed:
         return f"{failed} of {checked_count} checks failed{other_counts}"
     return f"all {checked_count} checks passed{other_counts}"
@@ -162,16 +168,16 @@ def _summarise_checks(checked: SuiteResult) -> str:
 
 def _get_outcome(line: str) -> str:
     """Return the outcome that a check's line stands for; an empty line is a passed check."""
-    for begin, outcome in _OUTCOMES.items():
-        if line.startswith(begin):
+    for prefix, outcome in _OUTCOMES.items():
+        if line.startswith(prefix):
             return outcome
     return "failed" if line else "passed"
 
 
 def _get_outcome_label(line: str) -> str:
     """Return the label printed before a check's title; an empty line is a passed check."""
-    for begin, mark in _MARKS.items():
-        if line.startswith(begin):
+    for prefix, mark in _MARKS.items():
+        if line.startswith(prefix):
             return mark
     return "FAILED" if line else "ok    "
 
@@ -182,14 +188,14 @@ def _run_all_checks(kind: str, name: str, plugins: Sequence[str]) -> Iterator[tu
     After two checks that were killed or whose process died, no more checks are run.
     """
     failed: list[Check] = []
-    lost = 0
+    lost_workers = 0
     with LocalPool(1) as pool:
         pool.load_plugins([Plugin(path) for path in plugins])
         for place, check in enumerate(SUITES[kind]):
-            needed = failed_need(check, failed)
-            if needed is not None:
-                line = f"{_LEFT_OUT}needs '{title_of(needed)}'"
-            elif lost == 2 or (lost and check in _MULTIPROCESS_CHECKS):
+            failed_check = failed_need(check, failed)
+            if failed_check is not None:
+                line = f"{_LEFT_OUT}needs '{title_of(failed_check)}'"
+            elif lost_workers == 2 or (lost_workers and check in _MULTIPROCESS_CHECKS):
                 line = f"{_LEFT_OUT}the process of other checks died, or had to be killed"
             elif check in _MULTIPROCESS_CHECKS:
                 # This check runs the subject in this process too; earlier checks have shown that
@@ -199,7 +205,7 @@ def _run_all_checks(kind: str, name: str, plugins: Sequence[str]) -> Iterator[tu
                 ((_, end),) = pool.iterate_results(
                     [(run_check, (kind, name, place))], CALL_TIMEOUT_SECONDS
                 )
-                lost += isinstance(end, Exception) and not isinstance(end, InputError)
+                lost_workers += isinstance(end, Exception) and not isinstance(end, InputError)
                 line = _format_check_end(end)
             if _get_outcome(line) == "failed":
                 failed.append(check)

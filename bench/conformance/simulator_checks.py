@@ -56,48 +56,51 @@ def _list_named_parts(kind: type[Simulator]) -> list[Parameter | Channel | Const
 
 def check_declaration_is_complete(kind: type[Simulator]) -> None:
     """Check that the declaration has valid names and a description, and no duplicates."""
-    look = kind.__name__
+    location = kind.__name__
     check(
         bool(kind.parameters and kind.channels and kind.says),
         "parameters, channels and a sentence",
         "none",
-        look,
+        location,
     )
     groups: tuple[tuple[Parameter | Channel | Constant, ...], ...]
     groups = (kind.parameters, kind.channels, kind.constants, kind.inputs)
     for group in groups:
-        names = [thing.name for thing in group]
-        check(len(set(names)) == len(names), "different names", names, look)
-    for thing in _list_named_parts(kind):
+        names = [part.name for part in group]
+        check(len(set(names)) == len(names), "different names", names, location)
+    for part in _list_named_parts(kind):
         # The names of a robot are those of its model file and may contain any character.
-        plain = kind.has_model or bool(_NAME.match(thing.name))
-        check(plain, "a name in lower case", thing.name, look)
+        is_plain_name = kind.has_model or bool(_NAME.match(part.name))
+        check(is_plain_name, "a name in lower case", part.name, location)
 
 
 def check_units_are_known(kind: type[Simulator]) -> None:
     """Check that every parameter, channel, constant and input has a unit that can be converted."""
-    for thing in _list_named_parts(kind):
+    for part in _list_named_parts(kind):
         check(
-            is_unit(thing.unit),
-            f"a unit for {thing.name} (such as m/s, rad, N*m; '1' for a number)",
-            repr(thing.unit),
+            is_unit(part.unit),
+            f"a unit for {part.name} (such as m/s, rad, N*m; '1' for a number)",
+            repr(part.unit),
             kind.__name__,
         )
 
 
 def check_observations_have_the_declared_shape(kind: type[Simulator]) -> None:
     """Check that observations are (n, T, C) and finite, for several n and T."""
-    simulator, look = kind(), f"{kind.__name__}.simulate"
+    simulator, location = kind(), f"{kind.__name__}.simulate"
     for n, samples in ((1, 2), (3, 40), (1, 1)):
         observations = simulator.simulate(_draw_points(simulator, n), _make_scenario(kind, samples))
         shape = (n, samples, len(simulator.channels))
         check(
-            observations.shape == shape, f"observations of shape {shape}", observations.shape, look
+            observations.shape == shape,
+            f"observations of shape {shape}",
+            observations.shape,
+            location,
         )
         for place, channel in enumerate(simulator.channels):
-            bad = observations[:, :, place][~np.isfinite(observations[:, :, place])]
-            what = f"finite values of {channel.name} for parameters inside the bounds"
-            check(not bad.size, what, bad[:1], look)
+            invalid_values = observations[:, :, place][~np.isfinite(observations[:, :, place])]
+            expected = f"finite values of {channel.name} for parameters inside the bounds"
+            check(not invalid_values.size, expected, invalid_values[:1], location)
     simulator.close()
 
 
@@ -107,11 +110,11 @@ def check_same_proposal_gives_the_same_bits(kind: type[Simulator]) -> None:
     It must not depend on earlier simulations, in this simulator or another, nor on other parameter
     vectors of the same call.
     """
-    simulator, other = kind(), kind()
+    simulator, new_simulator = kind(), kind()
     points = _draw_points(simulator, 6)
     # Nonzero inputs, because their lasting effects, such as heat, would not be visible otherwise.
-    run, longer = _make_scenario(kind, size=1.0), _make_scenario(kind, 300, 50.0, size=3.0)
-    together = simulator.simulate(points.copy(), run)
+    run, longer_run = _make_scenario(kind, size=1.0), _make_scenario(kind, 300, 50.0, size=3.0)
+    batch_result = simulator.simulate(points.copy(), run)
 
     def compare(observations: Array, after: str) -> None:
         """Raise an error unless observations equal those of the first call bit for bit.
@@ -120,48 +123,52 @@ def check_same_proposal_gives_the_same_bits(kind: type[Simulator]) -> None:
             observations: (n, T, C) observations of the same points and scenario.
             after: what was different in this call, for the message.
         """
-        if not is_bitwise_equal(together, observations):
-            what = f"{kind.__name__}.reset" if hasattr(kind, "reset") else kind.__name__
-            difference = _describe_first_difference(kind, together, observations)
+        if not is_bitwise_equal(batch_result, observations):
+            location = f"{kind.__name__}.reset" if hasattr(kind, "reset") else kind.__name__
+            difference = _describe_first_difference(kind, batch_result, observations)
             raise CheckError(
-                f"expected the same numbers {after}; found {difference}; see {what}: it must set "
-                "everything that a run has changed"
+                f"expected the same numbers {after}; found {difference}; see {location}: it must "
+                "set everything that a run has changed"
             )
 
-    simulator.simulate(_draw_points(simulator, 2, seed=9), longer)
+    simulator.simulate(_draw_points(simulator, 2, seed=9), longer_run)
     compare(simulator.simulate(points.copy(), run), "after a run with other inputs")
-    alone = [simulator.simulate(point[None].copy(), run) for point in points[::-1]]
-    compare(np.concatenate(alone[::-1]), "one by one as all together")
-    compare(other.simulate(points.copy(), run), "in a new simulator")
+    single_results = [simulator.simulate(point[None].copy(), run) for point in points[::-1]]
+    compare(np.concatenate(single_results[::-1]), "one by one as all together")
+    compare(new_simulator.simulate(points.copy(), run), "in a new simulator")
     simulator.close()
     compare(simulator.simulate(points.copy(), run), "after close()")
     simulator.close()
-    other.close()
+    new_simulator.close()
 
 
 def _describe_first_difference(kind: type[Simulator], expected: Array, observations: Array) -> str:
     """Describe where two observations (n, T, C) first differ in time."""
     if expected.shape != observations.shape:
         return f"shape {observations.shape} in place of {expected.shape}"
-    differs = (expected != observations) & ~(np.isnan(expected) & np.isnan(observations))
-    if not differs.any():
+    is_different = (expected != observations) & ~(np.isnan(expected) & np.isnan(observations))
+    if not is_different.any():
         return "zeros of another sign"
-    lane, sample, channel = min(np.argwhere(differs).tolist(), key=lambda at: at[1])
-    before, after = expected[lane, sample, channel], observations[lane, sample, channel]
+    lane, sample, channel = min(np.argwhere(is_different).tolist(), key=lambda index: index[1])
+    expected_value, found_value = (
+        expected[lane, sample, channel],
+        observations[lane, sample, channel],
+    )
     # All digits are shown if the values differ only by rounding.
-    digits = 6 if f"{before:.6g}" != f"{after:.6g}" else 17
+    digits = 6 if f"{expected_value:.6g}" != f"{found_value:.6g}" else 17
     name = kind.channels[channel].name
-    return f"{name} = {after:.{digits}g} in place of {before:.{digits}g} at sample {sample}"
+    found, wanted = f"{found_value:.{digits}g}", f"{expected_value:.{digits}g}"
+    return f"{name} = {found} in place of {wanted} at sample {sample}"
 
 
 def check_arguments_are_not_changed(kind: type[Simulator]) -> None:
     """Check that the simulator does not change `theta` and the scenario."""
     simulator, scenario = kind(), _make_scenario(kind)
     points = _draw_points(simulator, 3)
-    before, times = points.copy(), scenario.times.copy()
+    points_before, times = points.copy(), scenario.times.copy()
     simulator.simulate(points, scenario)
     check(
-        is_bitwise_equal(before, points) and is_bitwise_equal(times, scenario.times),
+        is_bitwise_equal(points_before, points) and is_bitwise_equal(times, scenario.times),
         "arguments as they were",
         "changed ones",
         kind.__name__,
@@ -171,18 +178,18 @@ def check_arguments_are_not_changed(kind: type[Simulator]) -> None:
 
 def check_parameters_that_are_not_numbers_spoil_only_their_lane(kind: type[Simulator]) -> None:
     """Check that a NaN parameter makes its own batch element NaN, and no other."""
-    simulator, look = kind(), f"{kind.__name__}.simulate"
+    simulator, location = kind(), f"{kind.__name__}.simulate"
     points = _draw_points(simulator, 3)
-    clean = simulator.simulate(points, _make_scenario(kind))
+    expected_observations = simulator.simulate(points, _make_scenario(kind))
     # The middle element has neighbours on both sides.
     points[1] = np.nan
     observations = simulator.simulate(points, _make_scenario(kind))
-    check(bool(np.isnan(observations[1]).all()), "a lane of NaN", observations[1][:2], look)
+    check(bool(np.isnan(observations[1]).all()), "a lane of NaN", observations[1][:2], location)
     check(
-        is_bitwise_equal(clean[[0, 2]], observations[[0, 2]]),
+        is_bitwise_equal(expected_observations[[0, 2]], observations[[0, 2]]),
         "neighbours as they were",
         "others",
-        look,
+        location,
     )
     simulator.close()
 
@@ -220,11 +227,11 @@ def check_initial_states_show(kind: type[Simulator]) -> NotApplicable | None:
     run = _make_scenario(kind, 600, size=1.0)
     observations = simulator.simulate(theta, run)
     for name, value in kind.states.items():
-        other = value + _MOVED * max(abs(value), scales.get(name, 1.0))
-        moved = Scenario(run.times, {name: other}, run.inputs)
+        changed_value = value + _MOVED * max(abs(value), scales.get(name, 1.0))
+        changed_scenario = Scenario(run.times, {name: changed_value}, run.inputs)
         check(
-            not np.array_equal(observations, simulator.simulate(theta, moved)),
-            f"initial state {name} = {other:g} in place of {value:g} to change something",
+            not np.array_equal(observations, simulator.simulate(theta, changed_scenario)),
+            f"initial state {name} = {changed_value:g} in place of {value:g} to change something",
             "the same observation",
             f"{kind.__name__}.reset" if hasattr(kind, "reset") else kind.__name__,
         )
@@ -265,22 +272,25 @@ def check_unknown_names_are_refused(kind: type[Simulator]) -> None:
 
 def check_chosen_channels_are_the_same_columns(kind: type[Simulator]) -> NotApplicable | None:
     """Check that `observe` selects and orders columns without changing their values."""
-    everything = kind()
-    names = [c.name for c in everything.channels][::-1]
+    full_simulator = kind()
+    names = [c.name for c in full_simulator.channels][::-1]
     if len(names) == 1:
-        everything.close()
+        full_simulator.close()
         return NotApplicable("it has one channel")
-    chosen = kind(observe=names)
-    points = _draw_points(everything, 2)
-    same = is_bitwise_equal(
-        np.ascontiguousarray(everything.simulate(points, _make_scenario(kind))[:, :, ::-1]),
-        np.ascontiguousarray(chosen.simulate(points, _make_scenario(kind))),
+    reordered_simulator = kind(observe=names)
+    points = _draw_points(full_simulator, 2)
+    is_same = is_bitwise_equal(
+        np.ascontiguousarray(full_simulator.simulate(points, _make_scenario(kind))[:, :, ::-1]),
+        np.ascontiguousarray(reordered_simulator.simulate(points, _make_scenario(kind))),
     )
     check(
-        same, "the same columns in the order asked for", "others", f"{kind.__name__}: self.columns"
+        is_same,
+        "the same columns in the order asked for",
+        "others",
+        f"{kind.__name__}: self.columns",
     )
-    everything.close()
-    chosen.close()
+    full_simulator.close()
+    reordered_simulator.close()
     return None
 
 

@@ -35,9 +35,14 @@ from sims.core.simulator import Array
 _NAME = re.compile(r"[a-z][a-z0-9_-]*$")
 
 
-def _check_run_completed(kind: type[Tuner], trace: RunTrace, when: str) -> None:
-    outcome, look = f"{trace.status}: {trace.reason}", f"{kind.__name__}.tune"
-    check(trace.status in ("done", "converged"), f"a run that ends well {when}", outcome, look)
+def _check_run_completed(kind: type[Tuner], trace: RunTrace, condition: str) -> None:
+    outcome, location = f"{trace.status}: {trace.reason}", f"{kind.__name__}.tune"
+    check(
+        trace.status in ("done", "converged"),
+        f"a run that ends well {condition}",
+        outcome,
+        location,
+    )
 
 
 def check_api_is_complete(kind: type[Tuner]) -> None:
@@ -46,13 +51,13 @@ def check_api_is_complete(kind: type[Tuner]) -> None:
     It needs a valid name, default options, a generator `tune` and, if it is trained, `fit`, `state`
     and `restore`.
     """
-    look = kind.__name__
-    check(bool(_NAME.match(kind.name)), "a name in lower case", repr(kind.name), f"{look}.name")
+    location = kind.__name__
+    check(bool(_NAME.match(kind.name)), "a name in lower case", repr(kind.name), f"{location}.name")
     try:
         tuner = kind()
     except TypeError as error:
         raise CheckError(
-            f"expected a default for every option; found {error}; see {look}.__init__"
+            f"expected a default for every option; found {error}; see {location}.__init__"
         ) from None
     # The returned object is tested: a `tune` that returns a list would only fail in the harness's
     # loop.
@@ -61,7 +66,7 @@ def check_api_is_complete(kind: type[Tuner]) -> None:
         inspect.isgenerator(steps),
         "a generator (with a yield)",
         type(steps).__name__,
-        f"{look}.tune",
+        f"{location}.tune",
     )
     if tuner.learned:
         missing = [
@@ -73,7 +78,7 @@ def check_api_is_complete(kind: type[Tuner]) -> None:
             not missing,
             "fit, state and restore of a learned tuner",
             f"no {', '.join(missing)}",
-            look,
+            location,
         )
 
 
@@ -98,9 +103,11 @@ def check_budget_is_exact(kind: type[Tuner]) -> None:
         trace = run_tuner(tuner, 2, budget)
         _check_run_completed(kind, trace, f"with budget {budget}")
         # Fewer simulations are correct if the tuner gives a reason.
-        used = len(trace.losses)
-        exact = used == budget or (trace.status == "converged" and used < budget)
-        check(exact, f"{budget} simulations", used, f"{kind.__name__}.tune")
+        used_simulations = len(trace.losses)
+        is_exact = used_simulations == budget or (
+            trace.status == "converged" and used_simulations < budget
+        )
+        check(is_exact, f"{budget} simulations", used_simulations, f"{kind.__name__}.tune")
 
 
 def check_arguments_are_not_changed(kind: type[Tuner]) -> None:
@@ -145,7 +152,7 @@ def check_proposals_stay_in_the_unit_cube(kind: type[Tuner]) -> None:
 
     The harness would clip others without informing the tuner.
     """
-    asked: list[Array] = []
+    proposals: list[Array] = []
 
     # A wrapper around the tuner, because the harness's loop clips what it records.
     class Watched(Tuner):
@@ -158,7 +165,9 @@ def check_proposals_stay_in_the_unit_cube(kind: type[Tuner]) -> None:
                     points, recommended = (
                         proposal if isinstance(proposal, Proposal) else (proposal, None)
                     )
-                    asked.extend(np.atleast_2d(p) for p in (points, recommended) if p is not None)
+                    proposals.extend(
+                        np.atleast_2d(p) for p in (points, recommended) if p is not None
+                    )
                     proposal = steps.send((yield proposal))
             except StopIteration as stop:
                 return str(stop.value)
@@ -166,8 +175,8 @@ def check_proposals_stay_in_the_unit_cube(kind: type[Tuner]) -> None:
                 steps.close()
 
     run_tuner(Watched(), 2, 30)
-    given = np.concatenate(asked)
-    outside = given[~((given >= 0.0) & (given <= 1.0)).all(axis=1)]
+    all_points = np.concatenate(proposals)
+    outside = all_points[~((all_points >= 0.0) & (all_points <= 1.0)).all(axis=1)]
     check(not len(outside), "points inside the unit cube", outside[:1], f"{kind.__name__}.tune")
 
 
@@ -185,23 +194,23 @@ def check_same_seed_gives_the_same_run(kind: type[Tuner]) -> None:
         second = run_tuner(tuner, 2, 25, seed=3)
     finally:
         np.random.set_state(saved)  # noqa: NPY002
-    same = is_bitwise_equal(first.proposals, second.proposals) and is_bitwise_equal(
+    is_same = is_bitwise_equal(first.proposals, second.proposals) and is_bitwise_equal(
         first.recommendations, second.recommendations
     )
-    check(same, "the same run for the same seed", "another", f"{kind.__name__}.tune: use rng")
+    check(is_same, "the same run for the same seed", "another", f"{kind.__name__}.tune: use rng")
 
 
 def check_runs_do_not_touch_each_other(kind: type[Tuner]) -> None:
     """Check that a run on a used instance equals one on a fresh instance."""
-    used = make_trained_tuner(kind, 2)
-    run_tuner(used, 2, 15, seed=1)
-    again, fresh = (
-        run_tuner(used, 2, 15, seed=2),
+    used_tuner = make_trained_tuner(kind, 2)
+    run_tuner(used_tuner, 2, 15, seed=1)
+    reused, fresh_trace = (
+        run_tuner(used_tuner, 2, 15, seed=2),
         run_tuner(make_trained_tuner(kind, 2), 2, 15, seed=2),
     )
-    same = is_bitwise_equal(again.proposals, fresh.proposals)
+    is_same = is_bitwise_equal(reused.proposals, fresh_trace.proposals)
     check(
-        same,
+        is_same,
         "nothing kept from run to run",
         "a different run",
         f"what {kind.__name__}.tune keeps in self",
@@ -220,11 +229,11 @@ def check_stochastic_is_declared(kind: type[Tuner]) -> NotApplicable | None:
     if kind.stochastic:
         return NotApplicable("it says that it uses chance")
     tuner = make_trained_tuner(kind, 2)
-    same = is_bitwise_equal(
+    is_same = is_bitwise_equal(
         run_tuner(tuner, 2, 15, seed=1).proposals, run_tuner(tuner, 2, 15, seed=2).proposals
     )
-    look = f"{kind.__name__}.stochastic"
-    check(same, "stochastic = True", "another run with another seed", look)
+    location = f"{kind.__name__}.stochastic"
+    check(is_same, "stochastic = True", "another run with another seed", location)
     return None
 
 
@@ -235,7 +244,7 @@ def check_failed_simulations_are_survived(kind: type[Tuner]) -> None:
     """
     tuner = make_trained_tuner(kind, 2)
     # Methods start from the first simulation; if all fail, nothing can be fitted.
-    for fails, when in (
+    for fails, condition in (
         (lambda k: k == 1, "when the first simulation fails"),
         (lambda k: k % 3 == 0, "when every third simulation fails"),
         (lambda _: True, "when every simulation fails"),
@@ -243,7 +252,7 @@ def check_failed_simulations_are_survived(kind: type[Tuner]) -> None:
         trace = run_tuner(tuner, 2, 15, fails=fails)
         # A run without a finite loss has the status `diverged`, however the tuner ends it.
         if trace.status != "diverged" or np.isfinite(trace.losses).any():
-            _check_run_completed(kind, trace, when)
+            _check_run_completed(kind, trace, condition)
 
 
 def check_easy_problem_is_improved(kind: type[Tuner]) -> None:
@@ -253,13 +262,13 @@ def check_easy_problem_is_improved(kind: type[Tuner]) -> None:
     """
     trace = run_tuner(make_trained_tuner(kind, 2), 2, 60)
     task, truth = make_task(2, 60)
-    before, after = (
+    initial_error, final_error = (
         np.abs(point - truth).mean() for point in (task.start, trace.recommendations[-1])
     )
     check(
-        after < before / 2,
-        f"an error below half of the start's, {before / 2:.3g}",
-        f"{after:.3g}",
+        final_error < initial_error / 2,
+        f"an error below half of the start's, {initial_error / 2:.3g}",
+        f"{final_error:.3g}",
         kind.__name__,
     )
 
@@ -278,20 +287,21 @@ def check_beats_random_search(kind: type[Tuner]) -> None:
 
     tuner, chance = make_trained_tuner(kind, 2), _RandomSearchBaseline()
     logs: list[Array] = []
-    for look in _SEQUENTIAL_TEST_TARGETS:
+    for target_count in _SEQUENTIAL_TEST_TARGETS:
         logs += [
-            _compute_final_log_errors((tuner, chance), target) for target in range(len(logs), look)
+            _compute_final_log_errors((tuner, chance), target)
+            for target in range(len(logs), target_count)
         ]
         tuner_logs, random = np.array(logs).T
-        differ = (tuner_logs != random).any()  # the test is undefined without a difference
-        p = float(wilcoxon(tuner_logs, random, alternative="less").pvalue) if differ else 1.0
+        is_different = (tuner_logs != random).any()  # the test is undefined without a difference
+        p = float(wilcoxon(tuner_logs, random, alternative="less").pvalue) if is_different else 1.0
         # Bonferroni correction: three looks at 5 % in total.
         if p < 0.05 / len(_SEQUENTIAL_TEST_TARGETS):
             return
     medians = [f"{np.exp(np.median(logs)):.2g}" for logs in (tuner_logs, random)]
-    found = f"p = {p:.2g}, median error {' against '.join(medians)}"
+    found_text = f"p = {p:.2g}, median error {' against '.join(medians)}"
     expected = f"errors below random search's (p < {0.05 / len(_SEQUENTIAL_TEST_TARGETS):.2g})"
-    raise CheckError(f"expected {expected}; found {found}; see {kind.__name__}.tune")
+    raise CheckError(f"expected {expected}; found {found_text}; see {kind.__name__}.tune")
 
 
 def _compute_final_log_errors(subjects: tuple[Tuner, ...], target: int) -> Array:
@@ -337,19 +347,21 @@ def compute_run_digests(
 
 def check_same_run_in_other_processes(kind: type[Tuner]) -> None:
     """Check that runs agree bit for bit here, in another process, and in 1 and 4 workers."""
-    look = f"{kind.__name__}: what depends on the process, e.g. hash(), the clock, threads"
+    location = f"{kind.__name__}: what depends on the process, e.g. hash(), the clock, threads"
     seeds = (0, 1, 2, 3)
-    here = compute_run_digests(kind, seeds)
+    local_digests = compute_run_digests(kind, seeds)
     # One worker trains by itself, four get the state trained here; all must agree with this
     # process.
-    for workers, learned in ((1, None), (4, TRAINED_TUNERS.get((kind, 2)))):
+    for workers, trained_tuner in ((1, None), (4, TRAINED_TUNERS.get((kind, 2)))):
         other_outcomes = call_in_processes(
-            compute_run_digests, [(kind, (seed,), learned) for seed in seeds], workers, kind
+            compute_run_digests, [(kind, (seed,), trained_tuner) for seed in seeds], workers, kind
         )
-        ended = [str(digest) for digest in other_outcomes if isinstance(digest, Exception)]
-        check(not ended, f"runs that end in {workers} worker(s)", ended[:1], look)
-        same = [digest for (digest,) in other_outcomes] == here
-        check(same, f"the same runs in {workers} worker(s) as in this process", "others", look)
+        failures = [str(digest) for digest in other_outcomes if isinstance(digest, Exception)]
+        check(not failures, f"runs that end in {workers} worker(s)", failures[:1], location)
+        is_same = [digest for (digest,) in other_outcomes] == local_digests
+        check(
+            is_same, f"the same runs in {workers} worker(s) as in this process", "others", location
+        )
 
 
 def check_what_was_learned_can_be_stored(kind: type[Tuner]) -> NotApplicable | None:
@@ -359,16 +371,18 @@ def check_what_was_learned_can_be_stored(kind: type[Tuner]) -> NotApplicable | N
     """
     if not kind.learned:
         return NotApplicable("it does not learn")
-    tuner, other = make_trained_tuner(kind, 2), kind()
+    tuner, restored_tuner = make_trained_tuner(kind, 2), kind()
     state = tuner.state()
-    plain = all(isinstance(a, np.ndarray) and a.dtype.kind in "fiu" for a in state.values())
-    found = {name: type(array) for name, array in state.items()}
-    check(bool(state) and plain, "plain numeric arrays", found, f"{kind.__name__}.state")
+    is_numeric = all(isinstance(a, np.ndarray) and a.dtype.kind in "fiu" for a in state.values())
+    array_types = {name: type(array) for name, array in state.items()}
+    check(bool(state) and is_numeric, "plain numeric arrays", array_types, f"{kind.__name__}.state")
     # A run is compared and not only the arrays, because scales and settings may be stored
     # elsewhere.
-    other.restore(state)
-    same = is_bitwise_equal(run_tuner(tuner, 2, 5).proposals, run_tuner(other, 2, 5).proposals)
-    check(same, "the same run after restore", "another one", f"{kind.__name__}.restore")
+    restored_tuner.restore(state)
+    is_same = is_bitwise_equal(
+        run_tuner(tuner, 2, 5).proposals, run_tuner(restored_tuner, 2, 5).proposals
+    )
+    check(is_same, "the same run after restore", "another one", f"{kind.__name__}.restore")
     # Weights of another version or another tuner must not be accepted.
     try:
         kind().restore({"weights": np.zeros(3)})

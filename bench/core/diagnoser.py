@@ -180,15 +180,15 @@ class DiagnosisCase:
         fixed = {name: list(c) for name, c in (effects or {}).items()}
         constants = {**self.recording.constants, **run.constants}
         engine = None if self.kind.own_engine else "batch"
-        made = self.kind(constants, recorded, engine=engine, fixed=fixed)
-        given = parameters or {}
-        theta = [given.get(p.name, p.nominal) for p in made.parameters]
-        begin = {**self.kind.states, **run.initial, **(initial or {})}
-        scenario = Scenario(run.times, begin, dict(run.inputs))
+        simulator = self.kind(constants, recorded, engine=engine, fixed=fixed)
+        values = parameters or {}
+        theta = [values.get(p.name, p.nominal) for p in simulator.parameters]
+        initial_states = {**self.kind.states, **run.initial, **(initial or {})}
+        scenario = Scenario(run.times, initial_states, dict(run.inputs))
         try:
-            observed = made.simulate(np.array([theta]), scenario)[0]
+            observed = simulator.simulate(np.array([theta]), scenario)[0]
         finally:
-            made.close()
+            simulator.close()
         return dict(zip(recorded, observed.T, strict=True))
 
 
@@ -264,76 +264,76 @@ def list_named_sets(answer: Answer) -> list[tuple[str, ...]]:
     return [(cause.effect, *cause.alternatives) for cause in answer.causes]
 
 
-def _convert_cause(given: object) -> NamedCause:
+def _convert_cause(cause: object) -> NamedCause:
     """Convert one cause of a diagnoser's answer to a `NamedCause`.
 
-    `given` is the name of an effect, or a mapping with the key ``effect`` and optionally
+    `cause` is the name of an effect, or a mapping with the key ``effect`` and optionally
     ``alternatives``, ``coefficients`` and ``p_value``. It may come from a plugin, so it can be
     anything.
 
     Raises:
         InputError: it has another form, which the message states.
     """
-    if isinstance(given, str):
-        given = {"effect": given}
-    if not isinstance(given, Mapping) or not isinstance(given.get("effect"), str):
-        raise InputError(f"causes: expected effects' names, found {given!r:.80}")
-    others = _check_list("alternatives", given.get("alternatives") or [], _MAX_ALTERNATIVES)
-    if not all(isinstance(name, str) for name in others):
-        raise InputError(f"alternatives: expected effects' names, found {others!r:.80}")
+    if isinstance(cause, str):
+        cause = {"effect": cause}
+    if not isinstance(cause, Mapping) or not isinstance(cause.get("effect"), str):
+        raise InputError(f"causes: expected effects' names, found {cause!r:.80}")
+    alternatives = _check_list("alternatives", cause.get("alternatives") or [], _MAX_ALTERNATIVES)
+    if not all(isinstance(name, str) for name in alternatives):
+        raise InputError(f"alternatives: expected effects' names, found {alternatives!r:.80}")
     return NamedCause(
-        given["effect"],
-        tuple(others),
-        _read_intervals("coefficients", given.get("coefficients") or {}),
-        _convert_p_value(given.get("p_value")),
+        cause["effect"],
+        tuple(alternatives),
+        _read_intervals("coefficients", cause.get("coefficients") or {}),
+        _convert_p_value(cause.get("p_value")),
     )
 
 
-def _check_list(what: str, given: object, most: int) -> list[Any]:
-    if not isinstance(given, list | tuple) or len(given) > most:
-        raise InputError(f"{what}: expected a list of up to {most}, found {given!r:.80}")
-    return list(given)
+def _check_list(key: str, values: object, max_count: int) -> list[Any]:
+    if not isinstance(values, list | tuple) or len(values) > max_count:
+        raise InputError(f"{key}: expected a list of up to {max_count}, found {values!r:.80}")
+    return list(values)
 
 
-def _convert_p_value(given: object) -> float | None:
+def _convert_p_value(p_value: object) -> float | None:
     """Convert a p-value of a diagnoser's answer; None stays None (no p-value given).
 
     Raises:
         InputError: it is not a number from 0 to 1; NaN is refused too.
     """
-    if given is None:
+    if p_value is None:
         return None
-    value = float(given) if isinstance(given, int | float | np.floating) else math.nan
+    value = float(p_value) if isinstance(p_value, int | float | np.floating) else math.nan
     if not 0.0 <= value <= 1.0:
-        raise InputError(f"p_value: expected a number from 0 to 1, found {given!r:.80}")
+        raise InputError(f"p_value: expected a number from 0 to 1, found {p_value!r:.80}")
     return value
 
 
-def _read_intervals(what: str, given: object) -> dict[str, tuple[float | None, float | None]]:
-    if not isinstance(given, Mapping):
-        raise InputError(f"{what}: expected intervals by name, found {given!r:.80}")
-    return {str(name): _convert_interval(what, value) for name, value in given.items()}
+def _read_intervals(key: str, intervals: object) -> dict[str, tuple[float | None, float | None]]:
+    if not isinstance(intervals, Mapping):
+        raise InputError(f"{key}: expected intervals by name, found {intervals!r:.80}")
+    return {str(name): _convert_interval(key, value) for name, value in intervals.items()}
 
 
-def _convert_interval(what: str, given: object) -> tuple[float | None, float | None]:
+def _convert_interval(key: str, interval: object) -> tuple[float | None, float | None]:
     """Convert a confidence interval of a diagnoser's answer to (low, high).
 
-    `given` is a pair, or a mapping with the keys ``low`` and ``high``. An end that is missing or
-    infinite becomes None: the interval is open on this side. `what` names the value in errors.
+    `interval` is a pair, or a mapping with the keys ``low`` and ``high``. An end that is missing or
+    infinite becomes None: the interval is open on this side. `key` names the value in errors.
     """
-    if isinstance(given, Mapping):
-        given = (given.get("low"), given.get("high"))
-    ends = _check_list(what, given, 2)
-    if len(ends) != 2:
-        raise InputError(f"{what}: expected (low, high), found {given!r:.80}")
+    if isinstance(interval, Mapping):
+        interval = (interval.get("low"), interval.get("high"))
+    limits = _check_list(key, interval, 2)
+    if len(limits) != 2:
+        raise InputError(f"{key}: expected (low, high), found {interval!r:.80}")
     low, high = (
         float(end) if isinstance(end, int | float | np.floating) and math.isfinite(end) else None
-        for end in ends
+        for end in limits
     )
     return low, high
 
 
 def _convert_intervals(
-    given: Mapping[str, tuple[float | None, float | None]],
+    intervals: Mapping[str, tuple[float | None, float | None]],
 ) -> dict[str, dict[str, float | None]]:
-    return {name: {"low": low, "high": high} for name, (low, high) in given.items()}
+    return {name: {"low": low, "high": high} for name, (low, high) in intervals.items()}

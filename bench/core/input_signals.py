@@ -70,8 +70,8 @@ def _compute_random_steps(
     """
     place = np.floor(t / seconds + _EDGE_TOLERANCE_SHARE).astype(int)
     levels: Array = rng.uniform(-amplitude, amplitude, size=place[-1] + 1)
-    held: Array = levels[place]
-    return held
+    held_levels: Array = levels[place]
+    return held_levels
 
 
 def _compute_chirp(
@@ -105,8 +105,8 @@ def _compute_multisine(
     # It starts at zero, because a sudden start would make the largest error of a servo at t = 0.
     rise = np.minimum(t * low / _RAMP_UP_SHARE, 1.0)
     largest = float(np.abs(rise * total).max())
-    faded: Array = amplitude * rise * total / max(largest, 1e-12)
-    return faded
+    signal: Array = amplitude * rise * total / max(largest, 1e-12)
+    return signal
 
 
 _FORMS: dict[str, tuple[Callable[..., Array], str]] = {
@@ -142,10 +142,10 @@ def evaluate_signal(text: str, times: Array, rng: np.random.Generator) -> Array:
     Raises:
         InputError: there is no such form, or its numbers are not valid.
     """
-    first, *others = text.split(" + ")
-    result = _compute_signal(first.strip(), times, rng)
-    for other in others:
-        result = result + _compute_signal(other.strip(), times, rng)
+    first_term, *further_terms = text.split(" + ")
+    result = _compute_signal(first_term.strip(), times, rng)
+    for term in further_terms:
+        result = result + _compute_signal(term.strip(), times, rng)
     return result
 
 
@@ -157,24 +157,24 @@ def _compute_signal(text: str, times: Array, rng: np.random.Generator) -> Array:
     Raises:
         InputError: the text is not a known form with valid numbers.
     """
-    name, *given = text.split(":")
-    if not given:
-        name, given = "constant", [text]
+    name, *arguments = text.split(":")
+    if not arguments:
+        name, arguments = "constant", [text]
     if name not in _FORMS:
         raise make_unknown_name_error("signal", name, list(_FORMS))
-    make, form = _FORMS[name]
+    compute_form, form = _FORMS[name]
     try:
-        numbers = [float(number) for number in given]
+        numbers = [float(number) for number in arguments]
     except ValueError:
         numbers = []
     complete = len(numbers) == len(form.split(":")) and np.isfinite(numbers).all()
     # All numbers except the first are frequencies or durations.
     if not complete or min([1.0, *numbers[1:]]) <= 0:
-        wanted = f"{name}:{form} with numbers, all but the first > 0"
-        raise InputError(f"signal '{truncate_text(text)}': expected {wanted}")
+        expected = f"{name}:{form} with numbers, all but the first > 0"
+        raise InputError(f"signal '{truncate_text(text)}': expected {expected}")
     span = float(times[-1])
-    changes = [span / n if make is _compute_random_steps else span * n for n in numbers[1:]]
+    changes = [span / n if compute_form is _compute_random_steps else span * n for n in numbers[1:]]
     if max(map(abs, numbers)) > MAX_NUMBER or max([0.0, *changes]) > _MOST_CHANGES:
-        wanted = f"numbers within {MAX_NUMBER:g}, and at most {_MOST_CHANGES:g} periods or levels"
-        raise InputError(f"signal '{truncate_text(text)}': expected {wanted} in its {span:g} s")
-    return make(times, rng, *numbers)
+        expected = f"numbers within {MAX_NUMBER:g}, and at most {_MOST_CHANGES:g} periods or levels"
+        raise InputError(f"signal '{truncate_text(text)}': expected {expected} in its {span:g} s")
+    return compute_form(times, rng, *numbers)

@@ -70,15 +70,15 @@ def takes_options(
 
     def decorate(function: Callable[[Options], Result]) -> Callable[P, Result]:
         """Return the function that takes the fields of the options dataclass as its arguments."""
-        signature, called = inspect.signature(options), name or function.__name__
+        signature, function_name = inspect.signature(options), name or function.__name__
 
         @wraps(function)
         def call(*args: P.args, **kwargs: P.kwargs) -> Result:
-            given = bind_checked(called, signature, get_hints(options), args, kwargs)
-            make: Callable[..., Options] = options
-            return function(make(**given.arguments))
+            bound = bind_checked(function_name, signature, get_hints(options), args, kwargs)
+            make_options: Callable[..., Options] = options
+            return function(make_options(**bound.arguments))
 
-        call.__name__ = called
+        call.__name__ = function_name
         _set_signature(call, options, signature)
         return call
 
@@ -105,16 +105,18 @@ def with_options(
         """
         source, _ = inspect.signature(function).parameters.values()
         fields = inspect.signature(options).parameters.values()
-        named = [parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY) for parameter in fields]
-        signature = inspect.Signature([source, *named])
+        keyword_parameters = [
+            parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY) for parameter in fields
+        ]
+        signature = inspect.Signature([source, *keyword_parameters])
 
         @wraps(function)
         def call(*args: Any, **kwargs: Any) -> Result:
             """Check the arguments, collect them in the options dataclass, and call the function."""
             hints = {**get_hints(options), source.name: get_hints(function)[source.name]}
-            given = bind_checked(function.__name__, signature, hints, args, kwargs).arguments
-            make: Callable[..., Options] = options
-            return function(given.pop(source.name, source.default), make(**given))
+            arguments = bind_checked(function.__name__, signature, hints, args, kwargs).arguments
+            make_options: Callable[..., Options] = options
+            return function(arguments.pop(source.name, source.default), make_options(**arguments))
 
         _set_signature(call, options, signature)
         return call

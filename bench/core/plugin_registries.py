@@ -84,22 +84,24 @@ def load_plugins(paths: str | Path | Iterable[str | Path]) -> None:
         InputError: a file is missing, does not run, or defines no such part; nothing of this file
             is registered then.
     """
-    given = [paths] if isinstance(paths, str | Path) or not isinstance(paths, Iterable) else paths
+    paths_to_load = (
+        [paths] if isinstance(paths, str | Path) or not isinstance(paths, Iterable) else paths
+    )
     files = []
-    for path in given:
+    for path in paths_to_load:
         if not isinstance(path, str | Path):
             raise InputError(f"plugins: expected a path or a list of paths, found {path!r:.80}")
         files.append(Path(path).resolve())
     for path in sorted(files, key=lambda file: file.suffix == ".toml"):
         if any(path in registry.paths() for registry in REGISTRIES):
             continue
-        before = [registry.snapshot() for registry in REGISTRIES]
+        snapshots = [registry.snapshot() for registry in REGISTRIES]
         try:
             _load_plugin_file(path)
         except InputError:
             # A partly registered plugin would count as loaded, and its error would not be reported
             # again.
-            for registry, snapshot in zip(REGISTRIES, before, strict=True):
+            for registry, snapshot in zip(REGISTRIES, snapshots, strict=True):
                 registry.restore(snapshot)
             raise
 
@@ -126,7 +128,7 @@ def _load_plugin_file(path: Path) -> None:
 
 def _find_plugin_classes(module: ModuleType) -> list[tuple[Registry[Any], type]]:
     """Return the non-abstract classes that the module defines, each with its registry."""
-    own = [
+    module_classes = [
         value
         for value in vars(module).values()
         # Imported classes belong to other modules.
@@ -134,7 +136,7 @@ def _find_plugin_classes(module: ModuleType) -> list[tuple[Registry[Any], type]]
     ]
     return [
         (registry, part)
-        for part in own
+        for part in module_classes
         if not inspect.isabstract(part)
         for registry in REGISTRIES
         if registry.accepts(part)

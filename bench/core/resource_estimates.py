@@ -76,12 +76,12 @@ class ResourceNeed:
 
         The needs are memory, disk, number of files, time steps of one simulation, and total time.
         """
-        for wanted, there, unit in (
+        for required, available, unit in (
             (self.memory, machine.memory, "of memory"),
             (self.disk, machine.disk, "of free disk"),
         ):
-            if wanted > there:
-                return f"{format_bytes(wanted)} {unit}, where there are {format_bytes(there)}"
+            if required > available:
+                return f"{format_bytes(required)} {unit}, where there are {format_bytes(available)}"
         if self.files > machine.files:
             return f"{self.files:.3g} files, where there is room for {machine.files:.3g}"
         if self.steps > MAX_STEPS_PER_SIMULATION:
@@ -90,8 +90,8 @@ class ResourceNeed:
                 f"where {MAX_STEPS_PER_SIMULATION:g} take hours"
             )
         if self.seconds > MAX_TOTAL_SECONDS:
-            most = _format_long_duration(MAX_TOTAL_SECONDS)
-            return f"{_format_long_duration(self.seconds)}, where {most} are the most"
+            longest_text = _format_long_duration(MAX_TOTAL_SECONDS)
+            return f"{_format_long_duration(self.seconds)}, where {longest_text} are the most"
         return ""
 
 
@@ -109,8 +109,8 @@ def check_feasible(
     Raises:
         InputError: the work needs more than is available.
     """
-    if not force and (what := need.find_excess(machine)):
-        raise InputError(f"{who}: {need.made} would need {what}; {need.change}, {FORCE_HINT}")
+    if not force and (excess := need.find_excess(machine)):
+        raise InputError(f"{who}: {need.made} would need {excess}; {need.change}, {FORCE_HINT}")
 
 
 def get_machine_resources(folder: Path | None = None) -> MachineResources:

@@ -119,9 +119,9 @@ def search_folders(kind: str) -> Iterator[Path]:
 
     They are the one in the environment variable, if it is set, and the user's.
     """
-    given = os.environ.get(FOLDER_VARIABLES[kind])
-    if given:
-        yield Path(given)
+    stated_folder = os.environ.get(FOLDER_VARIABLES[kind])
+    if stated_folder:
+        yield Path(stated_folder)
     yield user_folder()
 
 
@@ -168,8 +168,8 @@ def providing(kind: str, path: str) -> DataSet | None:
         path: path of the file, with the name of the data set as its folder.
     """
     folder, _, file = path.replace("\\", "/").rpartition("/")
-    found = _read_catalogue().get(folder)
-    return found if found and found.kind == kind and file in found.provides else None
+    data_set = _read_catalogue().get(folder)
+    return data_set if data_set and data_set.kind == kind and file in data_set.provides else None
 
 
 @cache
@@ -186,14 +186,14 @@ def _make_data_set(name: str, table: dict[str, object]) -> DataSet:
         name: name of the table and of the data set.
         table: keys and values; those of `DataSet`, with ``files`` as a list of tables.
     """
-    given: dict[str, object] = dict(table)
-    files = given.pop("files")
-    provides = given.pop("provides")
+    fields: dict[str, object] = dict(table)
+    files = fields.pop("files")
+    provides = fields.pop("provides")
     assert isinstance(files, list)
     assert isinstance(provides, list)
     return DataSet(
         name=name,
         files=tuple(SourceFile(**file) for file in files),
         provides=tuple(provides),
-        **given,  # type: ignore[arg-type]  # keys of the package's own file
+        **fields,  # type: ignore[arg-type]  # keys of the package's own file
     )

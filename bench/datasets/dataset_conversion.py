@@ -83,14 +83,16 @@ def _join_pieces(name: str, content: bytes) -> np.ndarray[tuple[int, int], np.dt
     try:
         arrays = loadmat(io.BytesIO(content))  # type: ignore[arg-type]  # the stubs know no streams
         pieces = [piece for key in ("Y_id", "Y_vad") for piece in arrays[key].ravel()]
-        joined = np.concatenate([np.asarray(piece, float) for piece in pieces], axis=1)
+        joined_samples = np.concatenate([np.asarray(piece, float) for piece in pieces], axis=1)
     except Exception as error:  # the reader raises various errors for a damaged file
-        what = f"{type(error).__name__}: {error}"
-        wanted = "a MATLAB file with cell arrays Y_id and Y_vad of (2, T) numbers"
-        raise InputError(f"{name}: expected {wanted} ({what})") from None
-    if joined.shape[0] != 2:
-        raise InputError(f"{name}: expected 2 rows in Y_id and Y_vad, found {joined.shape[0]}")
-    return joined
+        reason = f"{type(error).__name__}: {error}"
+        expected = "a MATLAB file with cell arrays Y_id and Y_vad of (2, T) numbers"
+        raise InputError(f"{name}: expected {expected} ({reason})") from None
+    if joined_samples.shape[0] != 2:
+        raise InputError(
+            f"{name}: expected 2 rows in Y_id and Y_vad, found {joined_samples.shape[0]}"
+        )
+    return joined_samples
 
 
 CONVERSIONS: Mapping[str, Conversion] = {"free_swing": free_swing}

@@ -59,8 +59,8 @@ def download(
     }
     written: dict[str, Content] = dict(contents)
     if data_set.conversion:
-        kept = {"LICENSE": contents["LICENSE"]}
-        written = {**CONVERSIONS[data_set.conversion](contents), **kept}
+        licence = {"LICENSE": contents["LICENSE"]}
+        written = {**CONVERSIONS[data_set.conversion](contents), **licence}
     written["SOURCE.txt"] = _format_provenance(data_set)
     _write_folder(target, written)
     return target
@@ -115,14 +115,16 @@ def _read_file(
     for path in (folder / file.path, folder / Path(file.path).name, folder / file.name):
         if path.is_file():
             try:
-                with path.open("rb") as opened:
-                    content = opened.read(file.bytes + 1)
+                with path.open("rb") as stream:
+                    content = stream.read(file.bytes + 1)
             except OSError as error:
                 raise InputError(f"{path}: cannot be read ({error.strerror})") from None
             advance(len(content))
             return str(path), content
-    where = f"commit {data_set.commit[:7]} of {data_set.repository}"
-    raise InputError(f"{folder}: expected {file.path} of {where}, or the file alone; found neither")
+    origin = f"commit {data_set.commit[:7]} of {data_set.repository}"
+    raise InputError(
+        f"{folder}: expected {file.path} of {origin}, or the file alone; found neither"
+    )
 
 
 def _download_content(url: str, data_set: DataSet, file: SourceFile, advance: Advance) -> bytes:
@@ -151,35 +153,37 @@ def _download_content(url: str, data_set: DataSet, file: SourceFile, advance: Ad
                 content += block
                 advance(len(block))
     except urllib.error.HTTPError as error:
-        answered = f"the server answers {error.code} {error.reason}"
-        raise InputError(f"{url}: {answered}; {remedy}") from None
+        response_text = f"the server answers {error.code} {error.reason}"
+        raise InputError(f"{url}: {response_text}; {remedy}") from None
     except (OSError, ValueError, http.client.HTTPException) as error:
-        why = getattr(error, "reason", None) or error
-        raise InputError(f"{url}: cannot be downloaded ({why}); {remedy}") from None
+        reason = getattr(error, "reason", None) or error
+        raise InputError(f"{url}: cannot be downloaded ({reason}); {remedy}") from None
     return content
 
 
-def _check_content(file: SourceFile, where: str, content: bytes) -> bytes:
+def _check_content(file: SourceFile, location: str, content: bytes) -> bytes:
     """Return the content of a file if it is the published one.
 
     Args:
         file: File with its published size and SHA-256.
-        where: Path or address from which it was fetched, for messages.
+        location: Path or address from which it was fetched, for messages.
         content: Content of the file.
 
     Raises:
         InputError: Size or SHA-256 differ.
     """
-    found = len(content)
-    if found > file.bytes:
-        raise InputError(f"{where}: expected {file.bytes} bytes, found more; nothing is written")
-    if found < file.bytes:
-        wanted = f"expected {file.bytes} bytes, found {found}"
-        raise InputError(f"{where}: {wanted}: incomplete; download it again; nothing is written")
+    size = len(content)
+    if size > file.bytes:
+        raise InputError(f"{location}: expected {file.bytes} bytes, found more; nothing is written")
+    if size < file.bytes:
+        mismatch = f"expected {file.bytes} bytes, found {size}"
+        raise InputError(
+            f"{location}: {mismatch}: incomplete; download it again; nothing is written"
+        )
     digest = hashlib.sha256(content).hexdigest()
     if digest != file.sha256:
-        wanted = f"expected SHA-256 {file.sha256}, found {digest}"
-        raise InputError(f"{where}: {wanted}: not the published file; nothing is written")
+        mismatch = f"expected SHA-256 {file.sha256}, found {digest}"
+        raise InputError(f"{location}: {mismatch}: not the published file; nothing is written")
     return content
 
 

@@ -30,7 +30,7 @@ def build_answer_rows(answered: AnswersByCase, diagnosers: Sequence[str]) -> pd.
     return pd.DataFrame(rows)
 
 
-def _iterate_rows(diagnoser: str, answered: AnswersByCase) -> Iterator[dict[str, Any]]:
+def _iterate_rows(diagnoser: str, answers: AnswersByCase) -> Iterator[dict[str, Any]]:
     """Yield the result rows of one diagnoser, ordered by the name of the case.
 
     A case is left out if it was not drawn (its stored document has no hidden effects) or if this
@@ -38,14 +38,14 @@ def _iterate_rows(diagnoser: str, answered: AnswersByCase) -> Iterator[dict[str,
 
     Args:
         diagnoser: name of the diagnoser.
-        answered: stored answers by name of the case.
+        answers: stored answers by name of the case.
     """
-    for question, one in sorted(answered.items()):
+    for question, answer in sorted(answers.items()):
         # The case could not be drawn, or its worker was lost before it was drawn.
-        if "effects" not in one["item"] or diagnoser not in one["rows"]:
+        if "effects" not in answer["item"] or diagnoser not in answer["rows"]:
             continue
         yield build_answer_row(
-            question, BenchmarkCase.from_json(one["item"]), one["rows"][diagnoser]
+            question, BenchmarkCase.from_json(answer["item"]), answer["rows"][diagnoser]
         )
 
 
@@ -69,17 +69,17 @@ def build_answer_row(
     """
     answer = given["answer"]
     mark = grade_answer(item, answer)
-    held = [holds for holds in mark.covered.values() if holds is not None]
+    covered = [is_covered for is_covered in mark.covered.values() if is_covered is not None]
     causes = answer["causes"] if answer else []
-    about = {name: getattr(item, name) for name in CASE_COLUMNS}
-    about[RUN_SECONDS_COLUMN] = about.pop("seconds")
+    case_columns = {name: getattr(item, name) for name in CASE_COLUMNS}
+    case_columns[RUN_SECONDS_COLUMN] = case_columns.pop("seconds")
     return {
         "question": question,
         "diagnoser": given["diagnoser"],
         "kind": item.kind,
         "system": item.system,
         "hidden": " + ".join(item.effects),
-        **about,
+        **case_columns,
         "channels": " ".join(item.channels),
         "status": given["status"],
         "reason": (given["reason"].strip().splitlines() or [""])[-1][:200],
@@ -93,8 +93,8 @@ def build_answer_row(
         "found_class": mark.is_correct_up_to_equivalence,
         "alarm": answer is None or answer["verdict"] != "adequate",
         "p_value": answer["p_value"] if answer else None,
-        "intervals": len(held),
-        "holding": sum(held),
+        "intervals": len(covered),
+        "holding": sum(covered),
         "simulations": given["simulations"],
         "seconds": given["seconds"],
         "processor_seconds": given["processor_seconds"],

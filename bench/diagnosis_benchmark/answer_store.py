@@ -76,35 +76,35 @@ def read_answers(folder: Path) -> AnswersByCase:
     Returns:
         By case name, ``item`` (the case) and ``rows`` by diagnoser.
     """
-    answered: AnswersByCase = {}
+    answers: AnswersByCase = {}
     path = folder / ANSWERS_FILE
     if not path.exists():
-        return answered
+        return answers
     with path.open(encoding="utf-8") as file:
         for line in file:
             try:
-                one = json.loads(line)
+                document = json.loads(line)
             except ValueError:
                 continue  # incomplete line of a killed process
-            _add_line(answered, one)
-    return answered
+            _add_line(answers, document)
+    return answers
 
 
-def _add_line(answered: AnswersByCase, one: Mapping[str, Any]) -> None:
+def _add_line(answers: AnswersByCase, document: Mapping[str, Any]) -> None:
     """Add one line of the file of the answers to the answers in memory.
 
     A case has several lines if diagnosers were asked in different sessions. The newest line
     replaces the case, and the rows of its own diagnosers only.
 
     Args:
-        answered: answers by name of the case; changed in place.
-        one: document of the line: name of the case (``question``), case (``item``), and list of
-            ``rows``.
+        answers: answers by name of the case; changed in place.
+        document: document of the line: name of the case (``question``), case (``item``), and list
+            of ``rows``.
     """
-    held = answered.setdefault(one["question"], {"item": one["item"], "rows": {}})
-    held["item"] = one["item"]
-    for row in one["rows"]:
-        held["rows"][row["diagnoser"]] = row
+    stored = answers.setdefault(document["question"], {"item": document["item"], "rows": {}})
+    stored["item"] = document["item"]
+    for row in document["rows"]:
+        stored["rows"][row["diagnoser"]] = row
 
 
 def _lock_file(file: IO[str]) -> None:

@@ -75,10 +75,10 @@ class BenchmarkConfig:
         return tuple(
             CaseRequest(
                 **check_entries(
-                    "experiment", "diagnosis.questions", one, get_type_hints_of(CaseRequest)
+                    "experiment", "diagnosis.questions", table, get_type_hints_of(CaseRequest)
                 )
             )
-            for one in self.questions
+            for table in self.questions
         )
 
 
@@ -88,31 +88,36 @@ def read_config(experiment: Experiment) -> BenchmarkConfig:
     Raises:
         InputError: a key or value is not allowed.
     """
-    who = f"experiment {experiment.name}"
-    given = check_entries(
-        who, "diagnosis", dict(experiment.diagnosis), get_type_hints_of(BenchmarkConfig)
+    subject = f"experiment {experiment.name}"
+    entries = check_entries(
+        subject, "diagnosis", dict(experiment.diagnosis), get_type_hints_of(BenchmarkConfig)
     )
-    settings = BenchmarkConfig(**given)
+    settings = BenchmarkConfig(**entries)
     if not settings.diagnosers:
-        raise make_error(who, "diagnosis.diagnosers", "one or more names", "none")
+        raise make_error(subject, "diagnosis.diagnosers", "one or more names", "none")
     if not settings.questions:
-        raise make_error(who, "diagnosis.questions", "one or more tables", "none")
+        raise make_error(subject, "diagnosis.questions", "one or more tables", "none")
     if len(set(settings.diagnosers)) < len(settings.diagnosers):
-        raise make_error(who, "diagnosis.diagnosers", "each once", list(settings.diagnosers))
+        raise make_error(subject, "diagnosis.diagnosers", "each once", list(settings.diagnosers))
     if settings.sample < 0 or settings.seed < 0:
-        raise InputError(f"{who}: diagnosis: expected seed and sample of at least 0")
-    for one in settings.case_requests:
-        check_known_names("kind", [one.kind], CASE_KINDS)
-        check_known_names("system", one.systems, ALL_SYSTEMS)
-        check_known_names("noise", one.noises, NOISE_KINDS)
-        if not 1 <= one.count <= _MAX_CASES:
-            raise make_error(who, "diagnosis.questions.count", f"1 to {_MAX_CASES}", one.count)
-        if not all(0.0 < size <= MAX_EFFECT_SIZE for size in one.sizes):
+        raise InputError(f"{subject}: diagnosis: expected seed and sample of at least 0")
+    for request in settings.case_requests:
+        check_known_names("kind", [request.kind], CASE_KINDS)
+        check_known_names("system", request.systems, ALL_SYSTEMS)
+        check_known_names("noise", request.noises, NOISE_KINDS)
+        if not 1 <= request.count <= _MAX_CASES:
             raise make_error(
-                who, "diagnosis.questions.sizes", f"above 0, up to {MAX_EFFECT_SIZE:g}", one.sizes
+                subject, "diagnosis.questions.count", f"1 to {_MAX_CASES}", request.count
             )
-        if not all(10 <= rate <= 1000 for rate in one.rates):
-            raise make_error(who, "diagnosis.questions.rates", "10 to 1000 Hz", one.rates)
-        if not all(2 <= runs <= 6 for runs in one.runs):
-            raise make_error(who, "diagnosis.questions.runs", "2 to 6", one.runs)
+        if not all(0.0 < size <= MAX_EFFECT_SIZE for size in request.sizes):
+            raise make_error(
+                subject,
+                "diagnosis.questions.sizes",
+                f"above 0, up to {MAX_EFFECT_SIZE:g}",
+                request.sizes,
+            )
+        if not all(10 <= rate <= 1000 for rate in request.rates):
+            raise make_error(subject, "diagnosis.questions.rates", "10 to 1000 Hz", request.rates)
+        if not all(2 <= runs <= 6 for runs in request.runs):
+            raise make_error(subject, "diagnosis.questions.runs", "2 to 6", request.runs)
     return settings

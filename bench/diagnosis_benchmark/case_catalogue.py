@@ -67,8 +67,8 @@ def draw_case(
     Returns:
         The case, or None if the hidden cause is not observable.
     """
-    by = machines.draw_case if system in machines.MACHINE_NAMES else case_sampling.draw_case
-    return by(kind, system, seed, effect, size, asked)
+    draw = machines.draw_case if system in machines.MACHINE_NAMES else case_sampling.draw_case
+    return draw(kind, system, seed, effect, size, asked)
 
 
 def list_hideable_effects(system: str) -> list[str]:
@@ -104,8 +104,8 @@ def list_coefficient_names(system: str, name: str) -> list[str]:
     effect = library.get_effect(name.partition("@")[0])
     if system == "arm2":
         return [coefficient.name for coefficient in effect.coefficients]
-    of = Servo.system if system == "servo" else SIMULATORS[system].system
-    return [coefficient.name for coefficient in effect.on(of)]
+    system_model = Servo.system if system == "servo" else SIMULATORS[system].system
+    return [coefficient.name for coefficient in effect.on(system_model)]
 
 
 def render_recording(item: BenchmarkCase) -> RecordingFiles:
@@ -122,6 +122,8 @@ def render_recording(item: BenchmarkCase) -> RecordingFiles:
         else:
             path = case_sampling.write_case(item, folder, truth=False)
         description = path.with_suffix(".toml")
-        others = [one for one in sorted(Path(folder).iterdir()) if one not in (path, description)]
-        beside = {one.name: one.read_text("utf-8") for one in others}
-        return RecordingFiles(path.read_text("utf-8"), description.read_text("utf-8"), beside)
+        other_files = [
+            file for file in sorted(Path(folder).iterdir()) if file not in (path, description)
+        ]
+        other_texts = {file.name: file.read_text("utf-8") for file in other_files}
+        return RecordingFiles(path.read_text("utf-8"), description.read_text("utf-8"), other_texts)

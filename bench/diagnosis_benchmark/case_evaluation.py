@@ -102,36 +102,40 @@ def evaluate_case(
         JSON document with the name of the case (``question``), the case with its true causes
         (``item``, {} if the sensors cannot show the cause), and one row per diagnoser (``rows``).
     """
-    asked = CaseSpec.from_json(question)
+    case_spec = CaseSpec.from_json(question)
     item = (
-        asked.draw_case(seed, salt)
+        case_spec.draw_case(seed, salt)
         if known is None
         else BenchmarkCase.from_json(known)
         if known
         else None
     )
     if item is None:
-        return {"question": asked.name, "item": {}, "rows": []}
+        return {"question": case_spec.name, "item": {}, "rows": []}
     written = render_recording(item)
     rows = []
-    for one in examined:
-        given = {
-            "wanted": {"name": one.code.name, "module": one.code.module, "file": one.code.file},
+    for diagnoser in examined:
+        request = {
+            "wanted": {
+                "name": diagnoser.code.name,
+                "module": diagnoser.code.module,
+                "file": diagnoser.code.file,
+            },
             "table": written.table,
             "description": written.description,
             "beside": written.beside,
             "system": item.system,
             "budget": limits.simulations,
             "seconds": limits.seconds,
-            "seed": make_seed_words("diagnosis", one.label, asked.name).tolist(),
+            "seed": make_seed_words("diagnosis", diagnoser.label, case_spec.name).tolist(),
         }
-        rows.append(_evaluate_case(one, given, asked.name, limits, hidden))
-    return {"question": asked.name, "item": item.to_json(), "rows": rows}
+        rows.append(_evaluate_case(diagnoser, request, case_spec.name, limits, hidden))
+    return {"question": case_spec.name, "item": item.to_json(), "rows": rows}
 
 
 def _evaluate_case(
-    one: EvaluatedDiagnoser,
-    given: dict[str, Any],
+    diagnoser: EvaluatedDiagnoser,
+    request: dict[str, Any],
     question: str,
     limits: AnswerLimits,
     hidden: tuple[str, ...],
@@ -139,8 +143,8 @@ def _evaluate_case(
     """Run one diagnoser on a case and return its row, with the reason if it gave no answer.
 
     Args:
-        one: the diagnoser.
-        given: request of the diagnoser, with the texts of the recording; it does not contain the
+        diagnoser: the diagnoser.
+        request: request of the diagnoser, with the texts of the recording; it does not contain the
             truth.
         question: name of the case.
         limits: limits of the answer.
@@ -149,22 +153,26 @@ def _evaluate_case(
     Returns:
         The row as it is stored: status (done, skipped, or how the process ended), answer and costs.
     """
-    row: dict[str, Any] = {"question": question, "diagnoser": one.label, "trusted": one.trusted}
-    learned = _load_trained_arrays(one.learned.get(given["system"]))
-    begun = perf_counter()
+    row: dict[str, Any] = {
+        "question": question,
+        "diagnoser": diagnoser.label,
+        "trusted": diagnoser.trusted,
+    }
+    trained_arrays = _load_trained_arrays(diagnoser.learned.get(request["system"]))
+    started_at = perf_counter()
     try:
-        if one.trusted:
-            said = _diagnose_in_process(given, learned)
+        if diagnoser.trusted:
+            answer = _diagnose_in_process(request, trained_arrays)
         else:
-            said = retry_if_killed(
-                lambda: _diagnose_isolated(one.code, given, learned, limits, hidden)
+            answer = retry_if_killed(
+                lambda: _diagnose_isolated(diagnoser.code, request, trained_arrays, limits, hidden)
             )
-        skipped = said.pop("skipped", "")
-        end = {"status": "skipped" if skipped else "done", "reason": skipped, **said}
+        skipped = answer.pop("skipped", "")
+        outcome = {"status": "skipped" if skipped else "done", "reason": skipped, **answer}
     except RunEndedError as ended:
-        end = {"status": ended.status, "reason": _format_failure_reason(ended.reason)}
-    nothing = {"answer": None, "simulations": 0, "processor_seconds": None, "seconds": None}
-    return {**row, **nothing, "seconds": perf_counter() - begun, **end}
+        outcome = {"status": ended.status, "reason": _format_failure_reason(ended.reason)}
+    empty_answer = {"answer": None, "simulations": 0, "processor_seconds": None, "seconds": None}
+    return {**row, **empty_answer, "seconds": perf_counter() - started_at, **outcome}
 
 
 def _format_failure_reason(text: str) -> str:
@@ -181,7 +189,9 @@ def _format_failure_reason(text: str) -> str:
     )
 
 
-def _diagnose_in_process(given: dict[str, Any], learned: Mapping[str, Array]) -> dict[str, Any]:
+def _diagnose_in_process(
+    request: dict[str, Any], trained_arrays: Mapping[str, Array]
+) -> dict[str, Any]:
     """Run a trusted diagnoser in this process.
 
     Raises:
@@ -189,7 +199,7 @@ def _diagnose_in_process(given: dict[str, Any], learned: Mapping[str, Array]) ->
     """
     with tempfile.TemporaryDirectory() as folder:
         try:
-            return diagnoser_process.diagnose_case(given, Path(folder), learned)
+            return diagnoser_process.diagnose_case(request, Path(folder), trained_arrays)
         except Exception:
             traceback.print_exc()
             raise RunEndedError("crashed", traceback.format_exc()) from None
@@ -197,8 +207,8 @@ def _diagnose_in_process(given: dict[str, Any], learned: Mapping[str, Array]) ->
 
 def _diagnose_isolated(
     code: TunerSpec,
-    given: dict[str, Any],
-    learned: Mapping[str, Array],
+    request: dict[str, Any],
+    trained_arrays: Mapping[str, Array],
     limits: AnswerLimits,
     hidden: tuple[str, ...],
 ) -> dict[str, Any]:
@@ -209,42 +219,42 @@ def _diagnose_isolated(
 
     Args:
         code: where the code of the diagnoser is.
-        given: request with the texts of the recording.
-        learned: trained arrays; empty if the diagnoser needs no training.
+        request: request with the texts of the recording.
+        trained_arrays: trained arrays; empty if the diagnoser needs no training.
         limits: limits of the answer.
         hidden: folders that the diagnoser may not read.
 
     Raises:
         RunEndedError: the diagnoser failed.
     """
-    robots = ("mujoco",) if given["beside"] else ()
+    robots = ("mujoco",) if request["beside"] else ()
     child = _start_process(code, limits.memory, hidden, robots)
     try:
-        if learned:
+        if trained_arrays:
             deadline = perf_counter() + START_TIMEOUT_SECONDS
-            child.send(b"L", *pack_arrays(learned), deadline=deadline)
+            child.send(b"L", *pack_arrays(trained_arrays), deadline=deadline)
             child.receive(deadline=deadline)
-        begun = perf_counter()
-        deadline = begun + limits.seconds
-        child.send(b"Q", json.dumps(given).encode(), deadline=deadline)
+        started_at = perf_counter()
+        deadline = started_at + limits.seconds
+        child.send(b"Q", json.dumps(request).encode(), deadline=deadline)
         message = child.receive(_MAX_ANSWER_BYTES, deadline)
-        seconds = perf_counter() - begun
+        seconds = perf_counter() - started_at
         try:
             if message.kind != b"A":
                 raise ProtocolError("it gave no answer")
-            said = _validate_answer(message.to_document(_MAX_ANSWER_BYTES), limits)
+            answer = _validate_answer(message.to_document(_MAX_ANSWER_BYTES), limits)
         except (ProtocolError, InputError, KeyError, TypeError, ValueError) as error:
             raise child.fail_with_protocol_error(f"{error}"[:500]) from None
-        return {**said, "seconds": seconds}
+        return {**answer, "seconds": seconds}
     finally:
         child.end()
 
 
-def _validate_answer(said: Any, limits: AnswerLimits) -> dict[str, Any]:
+def _validate_answer(message: Any, limits: AnswerLimits) -> dict[str, Any]:
     """Validate the message of an isolated diagnoser, which may be malicious.
 
     Args:
-        said: document that the process of the diagnoser sent.
+        message: document that the process of the diagnoser sent.
         limits: limits of the answer, which the reported costs cannot exceed.
 
     Returns:
@@ -254,18 +264,18 @@ def _validate_answer(said: Any, limits: AnswerLimits) -> dict[str, Any]:
     Raises:
         ProtocolError: the reported costs are impossible.
     """
-    simulations, seconds = int(said["simulations"]), float(said["processor_seconds"])
+    simulations, seconds = int(message["simulations"]), float(message["processor_seconds"])
     if not 0 <= simulations <= limits.simulations or not 0 <= seconds < 1e9:
         raise ProtocolError("it said what it cannot have used")
-    if skipped := str(said.get("skipped", ""))[:_REASON]:
-        nothing = {"answer": None, "simulations": 0, "processor_seconds": 0.0}
-        return {**nothing, "skipped": skipped}
-    answer = Answer.of(said["answer"]).document()
+    if skipped := str(message.get("skipped", ""))[:_REASON]:
+        empty_answer = {"answer": None, "simulations": 0, "processor_seconds": 0.0}
+        return {**empty_answer, "skipped": skipped}
+    answer = Answer.of(message["answer"]).document()
     return {"answer": answer, "simulations": simulations, "processor_seconds": seconds}
 
 
 def _start_process(
-    code: TunerSpec, memory: int, hidden: tuple[str, ...], more: tuple[str, ...] = ()
+    code: TunerSpec, memory: int, hidden: tuple[str, ...], extra_modules: tuple[str, ...] = ()
 ) -> IsolatedProcess:
     """Start the isolated process of a diagnoser from the fork server, and wait until it is ready.
 
@@ -273,16 +283,21 @@ def _start_process(
         code: where the code of the diagnoser is.
         memory: maximum memory, MiB; 0 for no limit.
         hidden: folders that the process must not read.
-        more: further modules that the fork server loads first, such as MuJoCo for robots.
+        extra_modules: further modules that the fork server loads first, such as MuJoCo for robots.
     """
-    own = code.module.startswith("bench.")
+    is_builtin = code.module.startswith("bench.")
     child = get_fork_server().start_process(
         "bench.diagnosis_benchmark.diagnoser_process:serve_requests",
         [code.file] if code.file else [],
         memory,
         hidden,
         # MuJoCo starts a process while it is imported, which an isolated diagnoser must not do.
-        [PRELOAD_MODULE, *more, *code.modules, *([code.module] if own and not code.file else [])],
+        [
+            PRELOAD_MODULE,
+            *extra_modules,
+            *code.modules,
+            *([code.module] if is_builtin and not code.file else []),
+        ],
     )
     try:
         child.wait_until_ready()
@@ -318,22 +333,22 @@ def train_isolated(
     Raises:
         RunEndedError: the training failed.
     """
-    begun = perf_counter()
+    started_at = perf_counter()
     if trusted:
-        arrays, used = diagnoser_process.train_diagnoser(lesson)
-        return dict(arrays), used, perf_counter() - begun
+        arrays, used_simulations = diagnoser_process.train_diagnoser(lesson)
+        return dict(arrays), used_simulations, perf_counter() - started_at
     child = _start_process(code, 0, hidden)
     try:
-        deadline = begun + seconds
+        deadline = started_at + seconds
         child.send(b"F", json.dumps(lesson).encode(), deadline=deadline)
         message = child.receive(MAX_STATE_BYTES, deadline)
         try:
             if message.kind != b"L":
                 raise ProtocolError("it learned nothing")
-            learned = unpack_arrays(message.body)
-            used = int(learned.pop("simulations")[0])
+            trained_arrays = unpack_arrays(message.body)
+            used_simulations = int(trained_arrays.pop("simulations")[0])
         except (ProtocolError, KeyError, ValueError) as error:
             raise child.fail_with_protocol_error(f"{error}") from None
-        return learned, used, perf_counter() - begun
+        return trained_arrays, used_simulations, perf_counter() - started_at
     finally:
         child.end()

@@ -114,23 +114,23 @@ def build_case_set(settings: BenchmarkConfig) -> list[CaseSpec]:
     """
     numbers: dict[tuple[Any, ...], int] = {}
     questions = []
-    for asked in settings.case_requests:
-        for kind, system, effect, size, circumstances in _iterate_combinations(asked):
+    for request in settings.case_requests:
+        for kind, system, effect, size, circumstances in _iterate_combinations(request):
             key = kind, system, effect, size, circumstances
             # Sizes are not part of the key, so cases of two sizes have different seeds.
-            for _ in range(asked.count):
+            for _ in range(request.count):
                 group = kind, system, effect
                 numbers[group] = numbers.get(group, -1) + 1
                 questions.append(CaseSpec(*key, index=numbers[group]))
     if not settings.sample or settings.sample >= len(questions):
         return questions
     rng = make_rng("diagnosis", "sample", settings.seed)
-    chosen = rng.choice(len(questions), settings.sample, replace=False)
-    return [questions[i] for i in sorted(chosen.tolist())]
+    chosen_indices = rng.choice(len(questions), settings.sample, replace=False)
+    return [questions[i] for i in sorted(chosen_indices.tolist())]
 
 
 def _iterate_combinations(
-    asked: CaseRequest,
+    request: CaseRequest,
 ) -> Iterator[tuple[str, str, str | None, float | None, RequestedConditions]]:
     """Yield every combination of the values that one table of the experiment lists.
 
@@ -138,42 +138,46 @@ def _iterate_combinations(
     all that can be hidden.
 
     Args:
-        asked: the table.
+        request: the table.
 
     Yields:
         Kind, system, effect, size, and recording conditions.
     """
-    for system in asked.systems:
-        effects = _list_hidden_effects(asked, system)
+    for system in request.systems:
+        effects = _list_hidden_effects(request, system)
         combinations = product(
             effects,
-            asked.sizes or (None,),
-            asked.rates or (None,),
-            asked.runs or (None,),
-            asked.noises or (None,),
+            request.sizes or (None,),
+            request.rates or (None,),
+            request.runs or (None,),
+            request.noises or (None,),
         )
         for effect, size, rate, runs, noise in combinations:
-            yield asked.kind, system, effect, size, RequestedConditions(rate, runs, noise)
+            yield request.kind, system, effect, size, RequestedConditions(rate, runs, noise)
 
 
-def _list_hidden_effects(asked: CaseRequest, system: str) -> list[str | None]:
+def _list_hidden_effects(request: CaseRequest, system: str) -> list[str | None]:
     """List the effects that cases of one system hide; None stands for an effect that is drawn.
 
     Raises:
         InputError: an effect is unknown, or effects are named for clean or double cases.
     """
-    if asked.kind in ("clean", "double"):
-        if asked.effects:
-            raise InputError(f"diagnosis.questions: of {asked.kind} questions no effects are named")
+    if request.kind in ("clean", "double"):
+        if request.effects:
+            raise InputError(
+                f"diagnosis.questions: of {request.kind} questions no effects are named"
+            )
         return [None]
-    foreign = asked.kind == "foreign"
-    there = list_unmodelled_causes(system) if foreign else list_hideable_effects(system)
-    every = (
+    foreign = request.kind == "foreign"
+    available_effects = list_unmodelled_causes(system) if foreign else list_hideable_effects(system)
+    known_effects = (
         {n for s in ALL_SYSTEMS for n in list_unmodelled_causes(s)}
         if foreign
         else set(library.registry.names())
     )
-    for name in asked.effects:
-        if name not in every:
-            raise make_unknown_name_error("foreign cause" if foreign else "effect", name, there)
-    return [name for name in there if not asked.effects or name in asked.effects]
+    for name in request.effects:
+        if name not in known_effects:
+            raise make_unknown_name_error(
+                "foreign cause" if foreign else "effect", name, available_effects
+            )
+    return [name for name in available_effects if not request.effects or name in request.effects]

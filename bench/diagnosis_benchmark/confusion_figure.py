@@ -31,31 +31,36 @@ def draw_confusion_matrices(rows: pd.DataFrame, order: Sequence[str], title: str
         order: names of the diagnosers.
         title: title of the figure.
     """
-    asked = select_graded_answers(rows[rows["kind"] != "double"])
-    asked = asked.assign(family=_list_hidden_families(asked), answer=_list_answer_families(asked))
-    hidden = sorted(set(asked["family"]), key=lambda name: (name in _LAST, name))
-    said = [name for name in hidden if name not in _LAST]
-    said += sorted(set(asked["answer"]) - {*said, *_FAMILY_LABELS})
-    said += [name for name in _FAMILY_LABELS if (asked["answer"] == name).any()]
-    across = min(_PANELS_PER_ROW, len(order))
-    down = -(-len(order) // across)
-    size = 1.6 + across * max(2.2, 0.16 * len(said)), 1.4 + down * max(1.4, 0.17 * len(hidden))
-    figure, axes = style.make_panel_grid(down, across, size, sharex=True, sharey=True)
+    graded_rows = select_graded_answers(rows[rows["kind"] != "double"])
+    graded_rows = graded_rows.assign(
+        family=_list_hidden_families(graded_rows), answer=_list_answer_families(graded_rows)
+    )
+    hidden = sorted(set(graded_rows["family"]), key=lambda name: (name in _LAST, name))
+    answer_labels = [name for name in hidden if name not in _LAST]
+    answer_labels += sorted(set(graded_rows["answer"]) - {*answer_labels, *_FAMILY_LABELS})
+    answer_labels += [name for name in _FAMILY_LABELS if (graded_rows["answer"] == name).any()]
+    column_count = min(_PANELS_PER_ROW, len(order))
+    row_count = -(-len(order) // column_count)
+    size = (
+        1.6 + column_count * max(2.2, 0.16 * len(answer_labels)),
+        1.4 + row_count * max(1.4, 0.17 * len(hidden)),
+    )
+    figure, axes = style.make_panel_grid(row_count, column_count, size, sharex=True, sharey=True)
     for place, axis in enumerate(axes.flat):
         if place >= len(order):
             axis.set_axis_off()
             continue
-        own = asked[asked["diagnoser"] == order[place]]
-        counts = pd.crosstab(own["family"], own["answer"]).reindex(
-            index=hidden, columns=said, fill_value=0
+        diagnoser_rows = graded_rows[graded_rows["diagnoser"] == order[place]]
+        counts = pd.crosstab(diagnoser_rows["family"], diagnoser_rows["answer"]).reindex(
+            index=hidden, columns=answer_labels, fill_value=0
         )
         _draw_confusion_matrix(axis, counts, order[place])
     figure.suptitle(title, fontsize=11)
     figure.supylabel("hidden", fontsize=9)
-    many = asked.drop_duplicates("question")
+    cases = graded_rows.drop_duplicates("question")
     style.add_caption(
         figure,
-        f"{len(many)} recordings with nothing hidden, one effect of at least one noise or a "
+        f"{len(cases)} recordings with nothing hidden, one effect of at least one noise or a "
         "foreign cause. Per cent of a row. Black frames: right. A cause that is found alone or in "
         "a set of at most two counts as its family, else the leading name does.",
         letters=16,
@@ -87,10 +92,10 @@ def _list_answer_families(rows: pd.DataFrame) -> list[str]:
     Args:
         rows: one row per answer.
     """
-    good = is_correct(rows)
+    correct = is_correct(rows)
     return [
         _get_answer_family(row, is_right)
-        for row, is_right in zip(rows.to_dict("records"), good, strict=True)
+        for row, is_right in zip(rows.to_dict("records"), correct, strict=True)
     ]
 
 
@@ -112,10 +117,12 @@ def _get_answer_family(row: dict[Any, Any], is_right: bool) -> str:
         return str(row["hidden"]).partition(".")[0]
     if row["verdict"] in ("unknown", "unidentifiable") or (is_right and row["kind"] == "foreign"):
         return "unknown"
-    named = str(row["named"] or "")
-    if not named:
+    named_effects = str(row["named"] or "")
+    if not named_effects:
         return "unknown"
-    return "several" if " + " in named else named.partition("|")[0].partition(".")[0]
+    return (
+        "several" if " + " in named_effects else named_effects.partition("|")[0].partition(".")[0]
+    )
 
 
 def _draw_confusion_matrix(axis: Axes, counts: pd.DataFrame, name: str) -> None:
@@ -131,13 +138,13 @@ def _draw_confusion_matrix(axis: Axes, counts: pd.DataFrame, name: str) -> None:
     totals = counts.sum(axis=1).to_numpy()
     shares = 100.0 * counts.to_numpy() / np.maximum(totals, 1)[:, None]
     axis.imshow(shares, cmap="Greys", vmin=0, vmax=100, aspect="auto")
-    said = list(counts.columns)
+    answer_labels = list(counts.columns)
     for i, family in enumerate(counts.index):
         for right_answer in _RIGHT.get(family, (family,)):
-            if right_answer in said:
-                at = said.index(right_answer) - 0.5, i - 0.5
+            if right_answer in answer_labels:
+                corner = answer_labels.index(right_answer) - 0.5, i - 0.5
                 axis.add_patch(
-                    Rectangle(at, 1, 1, fill=False, edgecolor=style.NEUTRAL_MARK, linewidth=1.0)
+                    Rectangle(corner, 1, 1, fill=False, edgecolor=style.NEUTRAL_MARK, linewidth=1.0)
                 )
         for j, share in enumerate(shares[i]):
             if share >= _MIN_LABELLED_PERCENT:
@@ -145,7 +152,7 @@ def _draw_confusion_matrix(axis: Axes, counts: pd.DataFrame, name: str) -> None:
                 ink = "white" if share > 55 else style.NEUTRAL_MARK
                 axis.text(j, i, f"{share:.0f}", ha="center", va="center", fontsize=5.5, color=ink)
     axis.set_title(name, fontsize=9)
-    axis.set_xticks(range(len(said)), said, rotation=90, fontsize=6.5)
+    axis.set_xticks(range(len(answer_labels)), answer_labels, rotation=90, fontsize=6.5)
     labels = [f"{family} {n}" for family, n in zip(counts.index, totals, strict=True)]
     axis.set_yticks(range(len(labels)), labels, fontsize=6.5)
     axis.spines[:].set_visible(False)

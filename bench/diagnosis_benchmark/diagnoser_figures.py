@@ -58,10 +58,10 @@ def draw_leaderboard(table: pd.DataFrame, order: Sequence[str], title: str) -> F
     figure, axes = style.make_panel_grid(1, 1, (7.6, 4.8))
     axis: Axes = axes[0][0]
     alarms = index_by_diagnoser(table, "false alarms")
-    named = index_by_diagnoser(table, PRIMARY_METRIC)
+    named_shares = index_by_diagnoser(table, PRIMARY_METRIC)
     for name in order:
-        x, y = alarms[name], named[name]
-        shown = {**get_line_style(name, order), "linestyle": "none"}
+        x, y = alarms[name], named_shares[name]
+        line_style = {**get_line_style(name, order), "linestyle": "none"}
         axis.errorbar(
             100 * x["share"],
             100 * y["share"],
@@ -71,7 +71,7 @@ def draw_leaderboard(table: pd.DataFrame, order: Sequence[str], title: str) -> F
             linewidth=1.0,
             elinewidth=1.0,
             capsize=2.5,
-            **shown,
+            **line_style,
         )
     axis.axvline(
         100 * TARGET_FALSE_ALARM_RATE,
@@ -89,12 +89,14 @@ def draw_leaderboard(table: pd.DataFrame, order: Sequence[str], title: str) -> F
     style.style_axis(axis)
     axis.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False, fontsize=9)
     figure.suptitle(title, fontsize=11)
-    clean, asked = (max(int(v["of"]) for v in part.values()) for part in (alarms, named))
+    clean_count, single_count = (
+        max(int(v["of"]) for v in part.values()) for part in (alarms, named_shares)
+    )
     style.add_caption(
         figure,
-        f"{clean} recordings with nothing hidden, {asked} with one effect of at least one noise. "
-        "Named: alone or in a set of at most two, equivalent effects being one. Bars: 95 % "
-        "(Clopper-Pearson, Wilson). Dashes: 1 % of false alarms.",
+        f"{clean_count} recordings with nothing hidden, {single_count} with one effect of at least "
+        "one noise. Named: alone or in a set of at most two, equivalent effects being one. Bars: "
+        "95 % (Clopper-Pearson, Wilson). Dashes: 1 % of false alarms.",
         letters=16,
     )
     return figure
@@ -109,7 +111,7 @@ def draw_power(frame: pd.DataFrame, order: Sequence[str], title: str) -> Figure:
         title: title of the figure.
     """
     figure, axes = style.make_panel_grid(1, 2, (9.6, 4.4), sharey=True)
-    for axis, metric, says in zip(
+    for axis, metric, metric_title in zip(
         axes[0],
         ("named", "seen"),
         ("named (set of at most two)", "something is seen"),
@@ -117,12 +119,14 @@ def draw_power(frame: pd.DataFrame, order: Sequence[str], title: str) -> Figure:
     ):
         part = frame[frame["metric"] == metric]
         for place, name in enumerate(order):
-            own = part[part["diagnoser"] == name].sort_values("size")
-            if own.empty:
+            diagnoser_rows = part[part["diagnoser"] == name].sort_values("size")
+            if diagnoser_rows.empty:
                 continue
             # Shifted sideways, so that the error bars of the diagnosers do not overlap.
-            x = own["size"].to_numpy() * (1 + 0.025 * (place - (len(order) - 1) / 2))
-            y, low, high = (100 * own[key].to_numpy() for key in ("share", "low", "high"))
+            x = diagnoser_rows["size"].to_numpy() * (1 + 0.025 * (place - (len(order) - 1) / 2))
+            y, low, high = (
+                100 * diagnoser_rows[key].to_numpy() for key in ("share", "low", "high")
+            )
             axis.errorbar(
                 x,
                 y,
@@ -139,19 +143,19 @@ def draw_power(frame: pd.DataFrame, order: Sequence[str], title: str) -> Figure:
         axis.minorticks_off()
         axis.set_ylim(-3, 103)
         axis.set_xlabel("size of the hidden effect [noises]")
-        axis.set_title(says, fontsize=10)
+        axis.set_title(metric_title, fontsize=10)
         style.style_axis(axis)
     axes[0][0].set_ylabel("share of recordings [%]")
     axes[0][1].legend(loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False, fontsize=9)
     figure.suptitle(title, fontsize=11)
     counts = frame[(frame["metric"] == "named") & (frame["diagnoser"] == order[0])]
-    said = ", ".join(
+    case_counts = ", ".join(
         f"{int(n)} at {s:g}" for s, n in counts.sort_values("size")[["size", "of"]].to_numpy()
     )
     style.add_caption(
         figure,
-        f"Recordings with one hidden effect: {said} noises. Bars: 95 % (Wilson). Who alarms always "
-        "sees everything: see false alarms.",
+        f"Recordings with one hidden effect: {case_counts} noises. Bars: 95 % (Wilson). Who alarms "
+        "always sees everything: see false alarms.",
         letters=16,
     )
     return figure
@@ -168,9 +172,9 @@ def draw_outcomes(rows: pd.DataFrame, order: Sequence[str], title: str) -> Figur
     figure, axes = style.make_panel_grid(1, 1, (8.6, 0.5 * len(order) + 2.2))
     axis: Axes = axes[0][0]
     places = np.arange(len(order))[::-1]
-    left = np.zeros(len(order))
+    bar_starts = np.zeros(len(order))
     total = max(int((rows["diagnoser"] == name).sum()) for name in order)
-    for outcome, colour, says in OUTCOME_STYLES:
+    for outcome, colour, label in OUTCOME_STYLES:
         counts = [
             int(((rows["diagnoser"] == name) & (rows["outcome"] == outcome)).sum())
             for name in order
@@ -181,18 +185,18 @@ def draw_outcomes(rows: pd.DataFrame, order: Sequence[str], title: str) -> Figur
         axis.barh(
             places,
             widths,
-            left=left,
+            left=bar_starts,
             color=colour,
             edgecolor=style.NEUTRAL_MARK,
             linewidth=0.5,
-            label=says,
+            label=label,
         )
-        for place, width, begin, count in zip(places, widths, left, counts, strict=True):
+        for place, width, bar_start, count in zip(places, widths, bar_starts, counts, strict=True):
             # A narrower part has no room for its number.
             if width > 4:
                 dark = colour in (style.BLACK, style.BLUE, style.VERMILION)
                 axis.text(
-                    begin + width / 2,
+                    bar_start + width / 2,
                     place,
                     str(count),
                     ha="center",
@@ -200,7 +204,7 @@ def draw_outcomes(rows: pd.DataFrame, order: Sequence[str], title: str) -> Figur
                     fontsize=8,
                     color="white" if dark else style.NEUTRAL_MARK,
                 )
-        left += widths
+        bar_starts += widths
     axis.set_yticks(places, order)
     axis.set_xlim(0, 100)
     axis.set_xlabel("recordings with one hidden effect of at least one noise [%]")
@@ -228,10 +232,10 @@ def draw_p_value_calibration(frame: pd.DataFrame, order: Sequence[str], title: s
     axis.plot(levels, levels, color=style.CAPTION_GREY, linewidth=0.9, linestyle=(0, (2, 2)))
     names = [name for name in order if (frame["diagnoser"] == name).any()]
     for place, name in enumerate(names):
-        own = frame[frame["diagnoser"] == name].sort_values("level")
-        y, low, high = (own[key].to_numpy() for key in ("share", "low", "high"))
+        diagnoser_rows = frame[frame["diagnoser"] == name].sort_values("level")
+        y, low, high = (diagnoser_rows[key].to_numpy() for key in ("share", "low", "high"))
         axis.errorbar(
-            own["level"].to_numpy() * (1 + 0.03 * (place - (len(names) - 1) / 2)),
+            diagnoser_rows["level"].to_numpy() * (1 + 0.03 * (place - (len(names) - 1) / 2)),
             y,
             yerr=np.maximum([y - low, high - y], 0.0),
             linewidth=1.3,
@@ -249,11 +253,11 @@ def draw_p_value_calibration(frame: pd.DataFrame, order: Sequence[str], title: s
     style.style_axis(axis)
     axis.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False, fontsize=9)
     figure.suptitle(title, fontsize=11)
-    asked = int(frame["of"].max())
+    case_count = int(frame["of"].max())
     style.add_caption(
         figure,
-        f"Up to {asked} recordings with nothing hidden. Dashes: a p value that is one. Below: too "
-        "careful; above: it alarms too often. Bars: 95 % (Clopper-Pearson).",
+        f"Up to {case_count} recordings with nothing hidden. Dashes: a p value that is one. Below: "
+        "too careful; above: it alarms too often. Bars: 95 % (Clopper-Pearson).",
         letters=16,
     )
     return figure
@@ -269,8 +273,8 @@ def draw_cost(costs: pd.DataFrame, table: pd.DataFrame, order: Sequence[str], ti
         title: title of the figure.
     """
     figure, axes = style.make_panel_grid(1, 2, (9.6, 4.2), sharey=True)
-    named = index_by_diagnoser(table, PRIMARY_METRIC)
-    held = index_by_diagnoser(costs)
+    named_shares = index_by_diagnoser(table, PRIMARY_METRIC)
+    costs_by_diagnoser = index_by_diagnoser(costs)
     for axis, column, unit in zip(
         axes[0],
         ("simulations", "processor_seconds"),
@@ -278,8 +282,11 @@ def draw_cost(costs: pd.DataFrame, table: pd.DataFrame, order: Sequence[str], ti
         strict=True,
     ):
         for name in order:
-            y = named[name]
-            middle, high = (float(held[name][f"{column}_{what}"]) for what in ("median", "p95"))
+            y = named_shares[name]
+            middle, high = (
+                float(costs_by_diagnoser[name][f"{column}_{quantity}"])
+                for quantity in ("median", "p95")
+            )
             if not middle > 0:
                 continue
             axis.errorbar(
@@ -299,16 +306,16 @@ def draw_cost(costs: pd.DataFrame, table: pd.DataFrame, order: Sequence[str], ti
     axes[0][0].set_ylabel("single causes named [%]")
     axes[0][1].legend(loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False, fontsize=9)
     figure.suptitle(title, fontsize=11)
-    learned = {n: int(held[n]["training_simulations"]) for n in order}
-    said = "; ".join(
+    training_simulations = {n: int(costs_by_diagnoser[n]["training_simulations"]) for n in order}
+    training_text = "; ".join(
         f"{name} has learned from {count:,} simulations before".replace(",", " ")
-        for name, count in learned.items()
+        for name, count in training_simulations.items()
         if count
     )
     style.add_caption(
         figure,
         "Marks: median; bars to the right: 95 % of the answers; up and down: 95 % (Wilson). "
-        + (f"{said}." if said else ""),
+        + (f"{training_text}." if training_text else ""),
         letters=16,
     )
     return figure

@@ -60,30 +60,32 @@ def serve_requests(channel: MessageChannel, reach: AccessPolicy, held: list[str]
         held: sent in the first message of this process.
     """
     channel.send_document(b"R", held)
-    learned: Mapping[str, Array] = {}
+    trained_arrays: Mapping[str, Array] = {}
     with suppress(PeerClosedError):
         while True:
             message = channel.receive(_LIMIT)
             try:
                 match message.kind:
                     case b"L":
-                        learned = unpack_arrays(message.body)
+                        trained_arrays = unpack_arrays(message.body)
                         channel.send(b"K")
                     case b"Q":
                         question = message.to_document(_DOCUMENT)
                         channel.send_document(
-                            b"A", diagnose_case(question, Path(reach.folder), learned)
+                            b"A", diagnose_case(question, Path(reach.folder), trained_arrays)
                         )
                     case b"F":
-                        arrays, used = train_diagnoser(message.to_document(_DOCUMENT))
-                        channel.send(b"L", *pack_arrays({**arrays, _USED: np.array([used])}))
+                        arrays, used_simulations = train_diagnoser(message.to_document(_DOCUMENT))
+                        channel.send(
+                            b"L", *pack_arrays({**arrays, _USED: np.array([used_simulations])})
+                        )
             except PeerClosedError:
                 return
             except BaseException:
-                said = traceback.format_exc().encode("utf-8", "replace")
+                error_text = traceback.format_exc().encode("utf-8", "replace")
                 # BaseException includes SystemExit: the diagnoser caused it. Of a long text, only
                 # the end is sent.
-                channel.send(b"D", said[-MAX_TEXT_BYTES // 2 :])
+                channel.send(b"D", error_text[-MAX_TEXT_BYTES // 2 :])
 
 
 _USED = "simulations"
@@ -150,13 +152,20 @@ def diagnose_case(
         learned,
     )
     SIMULATION_COUNTER.reset(case.budget)
-    begun = time.process_time()
+    started_at = time.process_time()
     try:
         answer = Answer.of(diagnoser.diagnose(case))
     finally:
-        used, spent = SIMULATION_COUNTER.used, time.process_time() - begun
+        used_simulations, processor_seconds = (
+            SIMULATION_COUNTER.used,
+            time.process_time() - started_at,
+        )
         SIMULATION_COUNTER.reset()
-    return {"answer": answer.document(), "simulations": used, "processor_seconds": spent}
+    return {
+        "answer": answer.document(),
+        "simulations": used_simulations,
+        "processor_seconds": processor_seconds,
+    }
 
 
 def train_diagnoser(lesson: Mapping[str, Any]) -> tuple[Mapping[str, Array], int]:

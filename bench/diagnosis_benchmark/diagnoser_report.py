@@ -58,28 +58,28 @@ class ReportableDiagnosisStudy(Protocol):
         """Diagnosers that cannot be used here, with the reason."""
 
 
-def write_report(study: ReportableDiagnosisStudy, say: Callable[[str], None]) -> int:
+def write_report(study: ReportableDiagnosisStudy, print_line: Callable[[str], None]) -> int:
     """Write tables, figures and HTML report from the answers that exist.
 
     Only cases that every diagnoser has answered are reported.
 
     Args:
         study: the study to report.
-        say: prints one line.
+        print_line: prints one line.
 
     Returns:
         Number of failed answers.
     """
     for name, reason in study.skipped_diagnosers.items():
-        say(f"skipped: {name}: {reason}")
+        print_line(f"skipped: {name}: {reason}")
     order = study.usable_diagnosers
-    whole = build_answer_rows(study.answers, order)
-    if whole.empty:
-        say("no answers yet")
+    all_rows = build_answer_rows(study.answers, order)
+    if all_rows.empty:
+        print_line("no answers yet")
         return 0
-    rows = select_fully_answered_cases(whole, order)
+    rows = select_fully_answered_cases(all_rows, order)
     if rows.empty:
-        say("no question has been put to every diagnoser yet")
+        print_line("no question has been put to every diagnoser yet")
         return 0
     training = read_training_costs(study.folder)
     write_atomically(study.folder / ANSWERS_TABLE_FILE, format_csv(rows))
@@ -91,7 +91,7 @@ def write_report(study: ReportableDiagnosisStudy, say: Callable[[str], None]) ->
     pictures = draw_figures(study.configuration.experiment, rows, tables, order)
     for name, picture in pictures.items():
         write_figure_files(study.folder / "figures" / name, picture.png, picture.pdf)
-    shown = DiagnoserReportData(
+    report_data = DiagnoserReportData(
         study.configuration.experiment,
         str(study.folder),
         order,
@@ -103,25 +103,28 @@ def write_report(study: ReportableDiagnosisStudy, say: Callable[[str], None]) ->
         len(study.cases),
         left_out,
     )
-    write_atomically(study.folder / REPORT_FILE, render_page(shown))
+    write_atomically(study.folder / REPORT_FILE, render_page(report_data))
     for line in format_summary(tables, order):
-        say(line)
+        print_line(line)
     for name, reason, count in summarise_unsupported(left_out):
-        say(f"{name} does not support {count} of the questions: {reason}")
-    asked, planned = rows["question"].nunique(), len(study.cases)
-    hopeless = sum(not one["item"] for one in study.answers.values())
-    say(f"{asked} questions of {planned}; of {hopeless} the sensors cannot show what is hidden")
-    say(
+        print_line(f"{name} does not support {count} of the questions: {reason}")
+    answered_count, planned_count = rows["question"].nunique(), len(study.cases)
+    undetectable_count = sum(not answer["item"] for answer in study.answers.values())
+    print_line(
+        f"{answered_count} questions of {planned_count}; of {undetectable_count} the sensors "
+        "cannot show what is hidden"
+    )
+    print_line(
         f"written: {study.folder}/ with {ANSWERS_TABLE_FILE}, "
         f"{', '.join(f'{n}.csv' for n in tables)}"
     )
-    say(f"figures: {', '.join(f'{name}.png' for name in sorted(pictures))}")
-    say(f"report: {study.folder / REPORT_FILE}")
+    print_line(f"figures: {', '.join(f'{name}.png' for name in sorted(pictures))}")
+    print_line(f"report: {study.folder / REPORT_FILE}")
     failed = rows[rows["status"] != "done"]
     for _, row in failed.head(_MAX_LISTED_FAILURES).iterrows():
-        say(f"{row['status']}: {row['diagnoser']} on {row['question']}: {row['reason']}")
+        print_line(f"{row['status']}: {row['diagnoser']} on {row['question']}: {row['reason']}")
     if len(failed) > _MAX_LISTED_FAILURES:
-        say(f"({len(failed)} answers failed; see {ANSWERS_TABLE_FILE})")
+        print_line(f"({len(failed)} answers failed; see {ANSWERS_TABLE_FILE})")
     return len(failed)
 
 
@@ -156,26 +159,28 @@ def draw_figures(
         Figures by name.
     """
     title = experiment.title or experiment.name
-    made = {}
+    figures = {}
     counted = (
-        index_by_diagnoser(tables["table"], what) for what in ("false alarms", "named, alone")
+        index_by_diagnoser(tables["table"], metric) for metric in ("false alarms", "named, alone")
     )
     if all(any(line["of"] for line in lines.values()) for lines in counted):
-        made["board"] = diagnoser_figures.draw_leaderboard(tables["table"], order, title)
-        made["outcomes"] = diagnoser_figures.draw_outcomes(
+        figures["board"] = diagnoser_figures.draw_leaderboard(tables["table"], order, title)
+        figures["outcomes"] = diagnoser_figures.draw_outcomes(
             select_single_effects(rows), order, title
         )
-        made["confusion"] = draw_confusion_matrices(rows, order, title)
-        made["cost"] = diagnoser_figures.draw_cost(tables["costs"], tables["table"], order, title)
+        figures["confusion"] = draw_confusion_matrices(rows, order, title)
+        figures["cost"] = diagnoser_figures.draw_cost(
+            tables["costs"], tables["table"], order, title
+        )
     if not tables["power"].empty:
-        made["power"] = diagnoser_figures.draw_power(tables["power"], order, title)
+        figures["power"] = diagnoser_figures.draw_power(tables["power"], order, title)
     if not tables["calibration"].empty:
-        made["calibration"] = diagnoser_figures.draw_p_value_calibration(
+        figures["calibration"] = diagnoser_figures.draw_p_value_calibration(
             tables["calibration"], order, title
         )
     return {
         name: render_all_formats(add_trust_note(figure, experiment.trusted))
-        for name, figure in made.items()
+        for name, figure in figures.items()
     }
 
 
@@ -197,16 +202,16 @@ def format_summary(tables: Mapping[str, pd.DataFrame], order: Sequence[str]) -> 
         ("pairs: both named", "both of two"),
         ("foreign causes: unknown or partial", "foreign"),
     )
-    held = {metric: index_by_diagnoser(tables["table"], metric) for metric, _ in columns}
+    rows_by_metric = {metric: index_by_diagnoser(tables["table"], metric) for metric, _ in columns}
     costs = index_by_diagnoser(tables["costs"])
-    head = ["diagnoser", *(says for _, says in columns), "simulations", "seconds"]
+    head = ["diagnoser", *(title for _, title in columns), "simulations", "seconds"]
     lines = [head]
     for name in order:
         cells = [name]
         for metric, _ in columns:
-            line = held[metric][name]
-            ends = f"{100 * line['low']:.0f}-{100 * line['high']:.0f}"
-            cells.append(f"{100 * line['share']:.0f} % ({ends})" if line["of"] else "-")
+            line = rows_by_metric[metric][name]
+            interval = f"{100 * line['low']:.0f}-{100 * line['high']:.0f}"
+            cells.append(f"{100 * line['share']:.0f} % ({interval})" if line["of"] else "-")
         cost = costs[name]
         cells += [f"{cost['simulations_median']:.0f}", f"{cost['processor_seconds_median']:.2f}"]
         lines.append(cells)

@@ -124,14 +124,16 @@ class DiagnosisStudy:
             plugins: further plugin files.
         """
         study = cls(folder)
-        held = study.configuration
-        given = {str(Path(p).resolve()) for p in plugins}
-        study.plugins = held.plugins + sorted(given - set(held.plugins))
-        load_plugins_for_experiment(study.plugins, held.experiment)
+        configuration = study.configuration
+        stated_paths = {str(Path(p).resolve()) for p in plugins}
+        study.plugins = configuration.plugins + sorted(stated_paths - set(configuration.plugins))
+        load_plugins_for_experiment(study.plugins, configuration.experiment)
         for name in study.config.diagnosers:
-            _register_stub(name, held.experiment.trusted)
+            _register_stub(name, configuration.experiment.trusted)
         check_unchanged(
-            folder, held.fingerprint, _compute_fingerprint(held.experiment, study.plugins)
+            folder,
+            configuration.fingerprint,
+            _compute_fingerprint(configuration.experiment, study.plugins),
         )
         return study
 
@@ -151,9 +153,9 @@ class DiagnosisStudy:
         reasons = {}
         # A diagnoser of a plugin is registered only where the plugin was loaded. Reading the folder
         # does not require the plugin, so an unregistered name is no reason to skip.
-        known = set(diagnosers.names())
+        known_names = set(diagnosers.names())
         for name in self.config.diagnosers:
-            if name not in known:
+            if name not in known_names:
                 continue
             try:
                 diagnosers.get(name)
@@ -197,12 +199,12 @@ class DiagnosisStudy:
                 it did
                 not.
         """
-        ends = self.status().ends
-        missing = sum(end.status == MISSING_STATUS for end in ends)
+        run_ends = self.status().ends
+        missing = sum(end.status == MISSING_STATUS for end in run_ends)
         if not missing and not why:
             reveal_salt(self.folder, kept_salt(self.folder, self.configuration.experiment))
             self.configuration = read_configuration(self.folder)
-        return StudyOutcome(len(ends) - missing, len(ends), **why)
+        return StudyOutcome(len(run_ends) - missing, len(run_ends), **why)
 
     def close(self) -> None:
         """Close the answer file and release its lock."""
@@ -221,37 +223,37 @@ class DiagnosisStudy:
         Cases whose hidden cause the sensors cannot show count as done, because nothing is asked
         then.
         """
-        held = self.answers
-        ends = []
+        answers = self.answers
+        run_ends = []
         for question in self.cases:
-            one = held.get(question.name)
+            answer = answers.get(question.name)
             for name in self.config.diagnosers:
                 label = f"{question.name} {name}"
                 if name in self.skipped_diagnosers:
-                    ends.append(RunEnd(label, name, "skipped", self.skipped_diagnosers[name]))
-                elif one is not None and not one["item"]:
-                    ends.append(RunEnd(label, name, "done", "the sensors cannot show it"))
-                elif one is None or name not in one["rows"]:
-                    ends.append(RunEnd(label, name, MISSING_STATUS))
+                    run_ends.append(RunEnd(label, name, "skipped", self.skipped_diagnosers[name]))
+                elif answer is not None and not answer["item"]:
+                    run_ends.append(RunEnd(label, name, "done", "the sensors cannot show it"))
+                elif answer is None or name not in answer["rows"]:
+                    run_ends.append(RunEnd(label, name, MISSING_STATUS))
                 else:
-                    row = one["rows"][name]
-                    ends.append(RunEnd(label, name, row["status"], row["reason"]))
+                    row = answer["rows"][name]
+                    run_ends.append(RunEnd(label, name, row["status"], row["reason"]))
         configured = self.configuration
         name = configured.experiment.name
-        return StudyProgress(name, "answers given", configured.fingerprint, tuple(ends))
+        return StudyProgress(name, "answers given", configured.fingerprint, tuple(run_ends))
 
-    def report(self, say: PrintLine) -> int:
+    def report(self, print_line: PrintLine) -> int:
         """Write tables, figures and HTML report, and print a summary.
 
         Args:
-            say: prints one line.
+            print_line: prints one line.
 
         Returns:
             Number of failed answers.
         """
         from bench.diagnosis_benchmark.diagnoser_report import write_report
 
-        return write_report(self, say)
+        return write_report(self, print_line)
 
 
 class _EvaluationRun:
@@ -295,9 +297,9 @@ class _EvaluationRun:
         # same user.
         trusted = self._experiment.trusted
         with nullcontext() if trusted else not_dumpable(), pool or make_pool(jobs) as workers:
-            examined, taught = self._train_diagnosers(workers)
-            write_training_costs(self._study.folder, taught)
-            self._evaluate_open_cases(workers, open_questions, examined)
+            evaluated, training_costs = self._train_diagnosers(workers)
+            write_training_costs(self._study.folder, training_costs)
+            self._evaluate_open_cases(workers, open_questions, evaluated)
 
     def _shuffle_cases(self) -> list[CaseSpec]:
         """Return the cases in a fixed random order, so that a partial result is a fair sample."""
@@ -311,10 +313,10 @@ class _EvaluationRun:
         The list is empty if the sensors cannot show the hidden cause: such a case has an empty
         document.
         """
-        one = self._kept.answered.get(question.name)
-        if one is not None and not one["item"]:
+        answer = self._kept.answered.get(question.name)
+        if answer is not None and not answer["item"]:
             return []
-        rows = one["rows"] if one else {}
+        rows = answer["rows"] if answer else {}
         return [name for name in self._study.usable_diagnosers if name not in rows]
 
     def _train_diagnosers(
@@ -333,11 +335,11 @@ class _EvaluationRun:
         """
         trusted = self._experiment.trusted
         # The model file of a robot is not known before its case, so no diagnoser can train for it.
-        wanted = {question.system for question in self._study.cases}
-        systems = sorted(wanted & set(simulators.names()))
+        required_systems = {question.system for question in self._study.cases}
+        systems = sorted(required_systems & set(simulators.names()))
         codes = {name: make_diagnoser_spec(name) for name in self._study.usable_diagnosers}
-        learned = [name for name in codes if diagnosers.get(name).learned]
-        pairs = [(name, system) for name in learned for system in systems]
+        learned_names = [name for name in codes if diagnosers.get(name).learned]
+        pairs = [(name, system) for name in learned_names for system in systems]
         budget = self._experiment.training_budget
         calls: list[Call] = [
             (
@@ -355,25 +357,27 @@ class _EvaluationRun:
             for name, system in pairs
         ]
         files: dict[str, dict[str, Path]] = {name: {} for name in codes}
-        taught = []
+        training_costs = []
         step = self._progress("training", len(calls)) if calls else None
         for place, result in workers.iterate_results(calls, math.inf) if calls else ():
             name, system = pairs[place]
             if isinstance(result, TrainedDiagnoser):
                 files[name][system] = result.path
-                taught.append(TrainingCost(name, system, result.simulations, result.seconds))
+                training_costs.append(
+                    TrainingCost(name, system, result.simulations, result.seconds)
+                )
             elif isinstance(result, RunEndedError | TimeoutError):
                 # An untrained diagnoser is evaluated all the same; its answer states what it lacks.
-                taught.append(TrainingCost(name, system, 0, 0.0, str(result)))
+                training_costs.append(TrainingCost(name, system, 0, 0.0, str(result)))
             else:
                 raise result
             if step:
                 step()
-        examined = {n: EvaluatedDiagnoser(n, code, files[n], trusted) for n, code in codes.items()}
-        return examined, taught
+        evaluated = {n: EvaluatedDiagnoser(n, code, files[n], trusted) for n, code in codes.items()}
+        return evaluated, training_costs
 
     def _evaluate_open_cases(
-        self, workers: Pool, questions: Sequence[CaseSpec], examined: dict[str, EvaluatedDiagnoser]
+        self, workers: Pool, questions: Sequence[CaseSpec], evaluated: dict[str, EvaluatedDiagnoser]
     ) -> None:
         """Let the workers evaluate the open cases, and store the answers of each finished case.
 
@@ -383,21 +387,27 @@ class _EvaluationRun:
         Args:
             workers: pool of worker processes.
             questions: cases with missing answers.
-            examined: diagnosers by name; each case is put only to those that have not answered it.
+            evaluated: diagnosers by name; each case is put only to those that have not answered it.
         """
         calls: list[Call] = []
         for question in questions:
-            one = self._kept.answered.get(question.name)
-            asked = [examined[name] for name in self._list_unanswered(question)]
-            known = one["item"] if one else None
-            given = (question.to_json(), self._study.config.seed, self._salt, known, asked)
-            calls.append((evaluate_case, (*given, self._limits, self._hidden)))
+            answer = self._kept.answered.get(question.name)
+            diagnosers_to_run = [evaluated[name] for name in self._list_unanswered(question)]
+            known_item = answer["item"] if answer else None
+            case_args = (
+                question.to_json(),
+                self._study.config.seed,
+                self._salt,
+                known_item,
+                diagnosers_to_run,
+            )
+            calls.append((evaluate_case, (*case_args, self._limits, self._hidden)))
         step = self._progress("asking", len(calls))
-        longest = _CASE_DRAW_SECONDS + len(examined) * (self._limits.seconds + _CASE_DRAW_SECONDS)
+        longest = _CASE_DRAW_SECONDS + len(evaluated) * (self._limits.seconds + _CASE_DRAW_SECONDS)
         for place, result in workers.iterate_results(calls, longest):
             if isinstance(result, BaseException):
                 result = _make_failed_answers(
-                    questions[place], [one.label for one in calls[place][1][4]], result
+                    questions[place], [answer.label for answer in calls[place][1][4]], result
                 )
             self._kept.append(result)
             step()
@@ -440,12 +450,14 @@ def make_diagnoser_spec(name: str) -> TunerSpec:
     kind, place = diagnosers.get(name), diagnosers.place(name)
     module = getattr(kind, "module", "") or kind.__module__
     file = str(place) if place else ""
-    own = importlib.util.find_spec(module) if module.startswith("bench.") else None
+    module_spec = importlib.util.find_spec(module) if module.startswith("bench.") else None
     # Without preloading, packages that a diagnoser imports would be imported again for each answer.
-    ahead = (
-        find_preloadable_packages(file or (own.origin or "" if own else "")) if file or own else ()
+    preloaded = (
+        find_preloadable_packages(file or (module_spec.origin or "" if module_spec else ""))
+        if file or module_spec
+        else ()
     )
-    return TunerSpec(name, module, file, {}, ahead)
+    return TunerSpec(name, module, file, {}, preloaded)
 
 
 def _refuse_unreachable(names: Sequence[str]) -> None:
@@ -455,9 +467,9 @@ def _refuse_unreachable(names: Sequence[str]) -> None:
         InputError: a diagnoser is a class of a script or notebook.
     """
     for name in names:
-        added = diagnosers.snapshot().get(name)
-        if added is not None and added.path is None:
-            raise unreachable("diagnoser", name, added.part)
+        registered = diagnosers.snapshot().get(name)
+        if registered is not None and registered.path is None:
+            raise unreachable("diagnoser", name, registered.part)
 
 
 def _register_stub(name: str, trusted: bool) -> None:
@@ -482,8 +494,8 @@ def _register_stub(name: str, trusted: bool) -> None:
         kind = diagnosers.get(name)
     except PartUnavailableError:
         return
-    added = diagnosers.snapshot().get(name)
-    if not trusted and added is not None:
+    registered = diagnosers.snapshot().get(name)
+    if not trusted and registered is not None:
         raise InputError(
             f"diagnoser {name}: class {kind.__qualname__} is in this process, where the truths "
             "are: put it into a plugin file, or trust the diagnosers (--trust)"

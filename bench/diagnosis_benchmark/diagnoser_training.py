@@ -85,25 +85,25 @@ def train_or_load(
         length=20,
     )
     path = get_weights_folder() / CACHE_SUBFOLDER / f"{code.name}-{system}-{key}.npz"
-    told = path.with_suffix(".json")
-    if (cost := _read_training_cost(told)) is not None and zipfile.is_zipfile(path):
+    cost_file = path.with_suffix(".json")
+    if (cost := _read_training_cost(cost_file)) is not None and zipfile.is_zipfile(path):
         return TrainedDiagnoser(path, *cost, found=True)
-    lesson: dict[str, Any] = {
+    training_request: dict[str, Any] = {
         "wanted": {"name": code.name, "module": code.module, "file": code.file},
         "system": system,
         "budget": budget,
         "seed": make_seed_words("diagnosis", "lesson", code.name, system).tolist(),
     }
-    arrays, used, spent = retry_if_killed(
-        lambda: train_isolated(code, lesson, seconds, hidden, trusted)
+    arrays, used_simulations, spent_seconds = retry_if_killed(
+        lambda: train_isolated(code, training_request, seconds, hidden, trusted)
     )
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_replacement(path, keep_ending=True) as partial:
-        named: dict[str, Any] = dict(arrays)
-        np.savez_compressed(partial, **named)
-    with atomic_replacement(told) as partial:
-        partial.write_text(json.dumps([used, spent]), encoding="utf-8")
-    return TrainedDiagnoser(path, used, spent, found=False)
+        named_arrays: dict[str, Any] = dict(arrays)
+        np.savez_compressed(partial, **named_arrays)
+    with atomic_replacement(cost_file) as partial:
+        partial.write_text(json.dumps([used_simulations, spent_seconds]), encoding="utf-8")
+    return TrainedDiagnoser(path, used_simulations, spent_seconds, found=False)
 
 
 def _read_training_cost(path: Path) -> tuple[int, float] | None:
@@ -117,7 +117,7 @@ def _read_training_cost(path: Path) -> tuple[int, float] | None:
         diagnoser is trained again.
     """
     try:
-        used, seconds = json.loads(path.read_text(encoding="utf-8"))
-        return int(used), float(seconds)
+        used_simulations, seconds = json.loads(path.read_text(encoding="utf-8"))
+        return int(used_simulations), float(seconds)
     except (OSError, ValueError, TypeError):
         return None

@@ -85,8 +85,8 @@ def grade_answer(item: BenchmarkCase, verdict: Mapping[str, Any] | None) -> Grad
         if outcome in ("right", "set") and item.kind != "foreign"
         else {}
     )
-    named = " + ".join("|".join(names) for names in sets)
-    return Grade(outcome, set_size, class_size, named, covered)
+    named_effects = " + ".join("|".join(names) for names in sets)
+    return Grade(outcome, set_size, class_size, named_effects, covered)
 
 
 def list_named_sets(verdict: Mapping[str, Any]) -> NamedSets:
@@ -159,14 +159,14 @@ def _grade_library(
 
 
 def _match_sets_to_effects(
-    effects: Iterable[str], sets: NamedSets, holds: CoverageCheck
+    effects: Iterable[str], sets: NamedSets, is_in_set: CoverageCheck
 ) -> dict[str, int]:
     """Assign effects to sets, each set to at most one effect.
 
     Args:
         effects: the hidden effects, at most two.
         sets: the named sets.
-        holds: returns whether a set contains an effect.
+        is_in_set: returns whether a set contains an effect.
 
     Returns:
         Index of the set of each effect, for the assignment with the most effects.
@@ -174,16 +174,16 @@ def _match_sets_to_effects(
     best: dict[str, int] = {}
     for order in (list(effects), list(effects)[::-1]):
         for reverse in (False, True):
-            found: dict[str, int] = {}
+            matches: dict[str, int] = {}
             for effect in order:
                 places = [
                     i
                     for i, names in enumerate(sets)
-                    if holds(effect, names) and i not in found.values()
+                    if is_in_set(effect, names) and i not in matches.values()
                 ]
                 if places:
-                    found[effect] = places[-1 if reverse else 0]
-            best = max(best, found, key=len)
+                    matches[effect] = places[-1 if reverse else 0]
+            best = max(best, matches, key=len)
     return best
 
 
@@ -192,8 +192,8 @@ def _count_classes(names: Sequence[str], equivalents: EquivalentEffects) -> int:
 
     The family of an effect (``effect@*``) is not counted if the set contains one of its places.
     """
-    placed = {name.partition("@")[0] for name in names if not name.endswith("@*")}
-    counted = [n for n in names if not n.endswith("@*") or n.partition("@")[0] not in placed]
+    at_places = {name.partition("@")[0] for name in names if not name.endswith("@*")}
+    counted = [n for n in names if not n.endswith("@*") or n.partition("@")[0] not in at_places]
     return len({min(equivalents(name)) for name in counted})
 
 
@@ -211,18 +211,20 @@ def _count_covered_intervals(
         By parameter or coefficient, whether the 95 % interval contains the true value; see
         `Grade`. It is empty if a leading cause is wrong.
     """
-    truth, said = dict(item.parameters), dict(verdict["parameters"])
-    led = {names[0] for names in sets}
+    truth, intervals = dict(item.parameters), dict(verdict["parameters"])
+    leading_causes = {names[0] for names in sets}
     for cause in verdict["causes"]:
         if cause["effect"] in item.effects:
             names = list_coefficient_names(item.system, cause["effect"])
             for name, value in zip(names, item.effects[cause["effect"]], strict=False):
                 truth[f"{cause['effect']}.{name}"] = value
-                said[f"{cause['effect']}.{name}"] = cause["coefficients"].get(name)
-    if not set(item.effects) <= led:
+                intervals[f"{cause['effect']}.{name}"] = cause["coefficients"].get(name)
+    if not set(item.effects) <= leading_causes:
         return {}  # parameters fitted together with a wrong cause are not comparable
     return {
-        name: _contains_value(said[name], value) for name, value in truth.items() if said.get(name)
+        name: _contains_value(intervals[name], value)
+        for name, value in truth.items()
+        if intervals.get(name)
     }
 
 

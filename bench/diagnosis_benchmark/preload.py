@@ -37,15 +37,17 @@ def _warm_up_search(system: str) -> None:
     Args:
         system: name of the system.
     """
-    wish = SimulationSpec(
+    specification = SimulationSpec(
         system=system, noise={"*": _NOISE_SIGMA}, runs=2, seconds=0.5, rate=50.0, engine="batch"
     )
-    made = simulate_recording(wish)
-    kind = type(made.simulator)
+    simulated = simulate_recording(specification)
+    kind = type(simulated.simulator)
     assert issubclass(kind, SystemSimulator)
-    with closing(RunEvaluator(kind, made.recording, made.recording.training(), "batch")) as world:
+    with closing(
+        RunEvaluator(kind, simulated.recording, simulated.recording.training(), "batch")
+    ) as world:
         noise = NoiseModel(
-            compute_noise_floor(world, made.recording).sigma, np.zeros(len(world.channels))
+            compute_noise_floor(world, simulated.recording).sigma, np.zeros(len(world.channels))
         )
         compute_directions(world, fit_base_model(world, noise).fit, world.library)
 

@@ -70,13 +70,13 @@ def compute_share(hits: int, of: int, exact: bool = False) -> TableRow:
     if not of:
         return {"count": 0, "of": 0, "share": np.nan, "low": np.nan, "high": np.nan}
     interval = binomtest(hits, of).proportion_ci(0.95, method="exact" if exact else "wilson")
-    ends = {"low": float(interval.low), "high": float(interval.high)}
-    return {"count": hits, "of": of, "share": hits / of, **ends}
+    limits = {"low": float(interval.low), "high": float(interval.high)}
+    return {"count": hits, "of": of, "share": hits / of, **limits}
 
 
-def _share_of(successes: pd.Series[bool], exact: bool = False) -> TableRow:
+def _share_of(successes: pd.Series[bool], is_exact: bool = False) -> TableRow:
     """Compute the fraction of successes with its 95 % interval; see `compute_share`."""
-    return compute_share(int(successes.sum()), len(successes), exact)
+    return compute_share(int(successes.sum()), len(successes), is_exact)
 
 
 def select_single_effects(rows: pd.DataFrame) -> pd.DataFrame:
@@ -156,80 +156,82 @@ def _build_diagnoser_table(
     return pd.DataFrame(lines)
 
 
-def _list_metrics(own: pd.DataFrame) -> Iterator[TableRow]:
+def _list_metrics(diagnoser_rows: pd.DataFrame) -> Iterator[TableRow]:
     """Yield the lines of table.csv for one diagnoser: the fraction of each metric."""
     for metric in METRICS:
-        successes = metric.predicate(metric.select(own))
+        successes = metric.predicate(metric.select(diagnoser_rows))
         yield {"metric": metric.name, **_share_of(successes, metric.is_exact)}
-    intervals = compute_share(int(own["holding"].sum()), int(own["intervals"].sum()))
+    intervals = compute_share(
+        int(diagnoser_rows["holding"].sum()), int(diagnoser_rows["intervals"].sum())
+    )
     yield {"metric": "95 % intervals that hold", **intervals}
 
 
-def _list_groups(own: pd.DataFrame) -> Iterator[TableRow]:
+def _list_groups(diagnoser_rows: pd.DataFrame) -> Iterator[TableRow]:
     """Yield the lines of groups.csv for one diagnoser: metrics by system, noise, rate and so on.
 
     Args:
-        own: rows of the diagnoser.
+        diagnoser_rows: rows of the diagnoser.
 
     Yields:
         Metric, column that defines the groups (``by``), its value in this group, and the fraction.
     """
     for metric, columns in GROUPED_METRICS:
         for column in columns:
-            for value, part in metric.select(own).groupby(column):
+            for value, part in metric.select(diagnoser_rows).groupby(column):
                 place = {"metric": metric.name, "by": column, "value": str(value)}
                 yield {**place, **_share_of(metric.predicate(part), metric.is_exact)}
 
 
-def _list_power(own: pd.DataFrame) -> Iterator[TableRow]:
+def _list_power(diagnoser_rows: pd.DataFrame) -> Iterator[TableRow]:
     """Yield the lines of power.csv: fractions of single effects named and detected, by their size.
 
     All sizes are counted, also those that are too small to be graded.
 
     Args:
-        own: rows of one diagnoser.
+        diagnoser_rows: rows of one diagnoser.
     """
-    for size, part in own[own["kind"] == "single"].groupby("size"):
+    for size, part in diagnoser_rows[diagnoser_rows["kind"] == "single"].groupby("size"):
         for metric, successes in (("named", _is_named(part)), ("seen", _is_alarm(part))):
             yield {"size": size, "metric": metric, **_share_of(successes)}
 
 
-def _list_calibration(own: pd.DataFrame) -> Iterator[TableRow]:
+def _list_calibration(diagnoser_rows: pd.DataFrame) -> Iterator[TableRow]:
     """List the fraction of clean recordings whose p-value is at most a level.
 
     For a calibrated p-value this fraction equals the level.
     """
-    p_values = pd.to_numeric(select_clean(own)["p_value"]).dropna()
+    p_values = pd.to_numeric(select_clean(diagnoser_rows)["p_value"]).dropna()
     for level in P_VALUE_LEVELS if len(p_values) else ():
-        yield {"level": level, **_share_of(p_values <= level, exact=True)}
+        yield {"level": level, **_share_of(p_values <= level, is_exact=True)}
 
 
-def _list_set_sizes(own: pd.DataFrame) -> Iterator[TableRow]:
+def _list_set_sizes(diagnoser_rows: pd.DataFrame) -> Iterator[TableRow]:
     """Yield the lines of sets.csv: answers about single effects by the size of their largest set.
 
     The fraction is that of the answers whose sets contain the true cause. Large sets contain it
     more easily but tell less.
 
     Args:
-        own: rows of one diagnoser.
+        diagnoser_rows: rows of one diagnoser.
     """
-    answered = select_single_effects(own)
+    single_rows = select_single_effects(diagnoser_rows)
     for label, (low, high) in SET_SIZE_BINS.items():
-        part = answered[answered["largest_set"].between(low, high)]
+        part = single_rows[single_rows["largest_set"].between(low, high)]
         yield {"largest_set": label, **_share_of(_is_in_any_set(part))}
 
 
-def _list_costs(own: pd.DataFrame) -> Iterator[TableRow]:
+def _list_costs(diagnoser_rows: pd.DataFrame) -> Iterator[TableRow]:
     """Yield the line of costs.csv for one diagnoser: medians and 95 % quantiles.
 
     Args:
-        own: rows of the diagnoser. Only finished answers count; the costs are simulations,
-            processor time and elapsed time, s.
+        diagnoser_rows: rows of the diagnoser. Only finished answers count; the costs are
+            simulations, processor time and elapsed time, s.
     """
-    done = own[own["status"] == "done"]
-    line: TableRow = {"answers": len(done)}
+    finished_rows = diagnoser_rows[diagnoser_rows["status"] == "done"]
+    line: TableRow = {"answers": len(finished_rows)}
     for column in ("simulations", "processor_seconds", "seconds"):
-        values = pd.to_numeric(done[column]).dropna().to_numpy(dtype=float)
+        values = pd.to_numeric(finished_rows[column]).dropna().to_numpy(dtype=float)
         for name, quantile in (("median", 0.5), ("p95", 0.95)):
             line[f"{column}_{name}"] = np.quantile(values, quantile) if values.size else np.nan
     yield line
@@ -245,29 +247,33 @@ def build_confusion_table(rows: pd.DataFrame, order: Sequence[str]) -> pd.DataFr
         rows: one row per answer.
         order: names of the diagnosers.
     """
-    asked = rows[(rows["kind"] != "double") & rows["diagnoser"].isin(order)].copy()
-    asked["hidden"] = asked["hidden"].where(asked["kind"] == "single", "(" + asked["kind"] + ")")
-    answers = zip(asked["verdict"].astype(str), asked["named"].astype(str), strict=True)
-    asked["said"] = [_get_confusion_column(verdict, named) for verdict, named in answers]
-    counted = asked.groupby(["diagnoser", "hidden", "said"]).size()
+    graded_rows = rows[(rows["kind"] != "double") & rows["diagnoser"].isin(order)].copy()
+    graded_rows["hidden"] = graded_rows["hidden"].where(
+        graded_rows["kind"] == "single", "(" + graded_rows["kind"] + ")"
+    )
+    answers = zip(graded_rows["verdict"].astype(str), graded_rows["named"].astype(str), strict=True)
+    graded_rows["said"] = [
+        _get_confusion_column(verdict, named_effects) for verdict, named_effects in answers
+    ]
+    counted = graded_rows.groupby(["diagnoser", "hidden", "said"]).size()
     counts: pd.DataFrame = counted.rename("count").reset_index()
     return counts
 
 
-def _get_confusion_column(verdict: str, named: str) -> str:
+def _get_confusion_column(verdict: str, named_effects: str) -> str:
     """Return the column of confusion.csv for an answer.
 
     Args:
         verdict: verdict of the answer; empty without an answer.
-        named: named causes, separated by " + ", alternatives separated by bars.
+        named_effects: named causes, separated by " + ", alternatives separated by bars.
 
     Returns:
         Leading name of the only cause, ``(several)`` for several causes, or the verdict in brackets
         if no cause is named.
     """
-    if verdict in ("", "adequate", "unknown", "unidentifiable") or not named:
+    if verdict in ("", "adequate", "unknown", "unidentifiable") or not named_effects:
         return f"({verdict or 'nothing'})"
-    return "(several)" if " + " in named else named.partition("|")[0]
+    return "(several)" if " + " in named_effects else named_effects.partition("|")[0]
 
 
 def build_pair_table(rows: pd.DataFrame, order: Sequence[str]) -> pd.DataFrame:
@@ -284,16 +290,18 @@ def build_pair_table(rows: pd.DataFrame, order: Sequence[str]) -> pd.DataFrame:
     lines = []
     for metric in PAIR_METRICS:
         part = metric.select(rows)
-        wide = part.assign(right=metric.predicate(part)).pivot(
+        results_by_diagnoser = part.assign(right=metric.predicate(part)).pivot(
             index="question", columns="diagnoser", values="right"
         )
-        others = [name for name in order if name != REFERENCE_DIAGNOSER and name in wide]
-        for name in others if REFERENCE_DIAGNOSER in wide else ():
-            both = wide[[REFERENCE_DIAGNOSER, name]].dropna().astype(bool)
-            ours = int((both[REFERENCE_DIAGNOSER] & ~both[name]).sum())
-            theirs = int((~both[REFERENCE_DIAGNOSER] & both[name]).sum())
-            p_value = compute_mcnemar_p_value(ours, theirs)
-            lines.append((metric.name, name, len(both), ours, theirs, p_value))
+        other_names = [
+            name for name in order if name != REFERENCE_DIAGNOSER and name in results_by_diagnoser
+        ]
+        for name in other_names if REFERENCE_DIAGNOSER in results_by_diagnoser else ():
+            paired_results = results_by_diagnoser[[REFERENCE_DIAGNOSER, name]].dropna().astype(bool)
+            only_simgap = int((paired_results[REFERENCE_DIAGNOSER] & ~paired_results[name]).sum())
+            only_other = int((~paired_results[REFERENCE_DIAGNOSER] & paired_results[name]).sum())
+            p_value = compute_mcnemar_p_value(only_simgap, only_other)
+            lines.append((metric.name, name, len(paired_results), only_simgap, only_other, p_value))
     frame = pd.DataFrame(lines, columns=columns)
     frame["p_holm"] = frame.groupby("metric")["p_value"].transform(
         lambda p_values: correct_holm(p_values.to_numpy())
@@ -351,7 +359,11 @@ def build_all_tables(
     costs = _build_diagnoser_table(rows, order, _list_costs)
     for column, kind in (("simulations", int), ("seconds", float)):
         costs[f"training_{column}"] = [
-            sum(kind(lesson[column]) for lesson in training if lesson["diagnoser"] == name)
+            sum(
+                kind(training_cost[column])
+                for training_cost in training
+                if training_cost["diagnoser"] == name
+            )
             for name in order
         ]
     calibration = _build_diagnoser_table(rows, order, _list_calibration)

@@ -132,7 +132,9 @@ def build_leaderboard(table: pd.DataFrame) -> pd.DataFrame:
     Returns:
         Fractions; the diagnoser with the highest primary metric comes first.
     """
-    wide = table.pivot(index="diagnoser", columns="metric", values="share")
-    wide = wide[list(dict.fromkeys(table["metric"]))]
-    named: pd.DataFrame = wide.sort_values(PRIMARY_METRIC, ascending=False, kind="stable")
-    return named.rename_axis(columns=None).reset_index()
+    shares_by_metric = table.pivot(index="diagnoser", columns="metric", values="share")
+    shares_by_metric = shares_by_metric[list(dict.fromkeys(table["metric"]))]
+    sorted_shares: pd.DataFrame = shares_by_metric.sort_values(
+        PRIMARY_METRIC, ascending=False, kind="stable"
+    )
+    return sorted_shares.rename_axis(columns=None).reset_index()

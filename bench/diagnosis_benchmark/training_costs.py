@@ -39,7 +39,7 @@ def write_training_costs(folder: Path, taught: Iterable[TrainingCost]) -> None:
         folder: result folder.
         taught: training costs, one per diagnoser and system.
     """
-    rows = [one._asdict() for one in taught]
+    rows = [cost._asdict() for cost in taught]
     if not rows:
         return
     text = io.StringIO()

@@ -39,10 +39,10 @@ def is_correct(rows: pd.DataFrame) -> pd.Series[bool]:
         "clean": ~rows["alarm"].astype(bool),
         "foreign": rows["outcome"] == "right",
     }
-    good = rows["found_class"].astype(bool)
-    for kind, judged in by_kind.items():
-        good = good.where(rows["kind"] != kind, judged)
-    return good & (rows["status"] == "done")
+    is_right = rows["found_class"].astype(bool)
+    for kind, is_right_for_kind in by_kind.items():
+        is_right = is_right.where(rows["kind"] != kind, is_right_for_kind)
+    return is_right & (rows["status"] == "done")
 
 
 def select_graded_answers(rows: pd.DataFrame) -> pd.DataFrame:
@@ -59,12 +59,18 @@ def build_failure_table(rows: pd.DataFrame, order: Sequence[str]) -> pd.DataFram
         rows: one row per answer.
         order: names of the diagnosers.
     """
-    asked = select_graded_answers(rows)
-    asked = asked.assign(right=is_correct(asked))
-    good = asked[asked["right"]].groupby("question")["diagnoser"].agg(list).to_dict()
-    wrong = asked[~asked["right"]].copy()
-    by = [[name for name in order if name in good.get(q, ())] for q in wrong["question"]]
-    wrong["right_by"] = [" ".join(names) or "nobody" for names in by]
-    wrong["place"] = wrong["diagnoser"].map({name: i for i, name in enumerate(order)})
-    chosen: pd.DataFrame = wrong.sort_values(["place", "kind", "question"])[list(FAILURE_COLUMNS)]
-    return chosen.reset_index(drop=True)
+    graded_rows = select_graded_answers(rows)
+    graded_rows = graded_rows.assign(right=is_correct(graded_rows))
+    correct_names = (
+        graded_rows[graded_rows["right"]].groupby("question")["diagnoser"].agg(list).to_dict()
+    )
+    wrong_rows = graded_rows[~graded_rows["right"]].copy()
+    correct_by_case = [
+        [name for name in order if name in correct_names.get(q, ())] for q in wrong_rows["question"]
+    ]
+    wrong_rows["right_by"] = [" ".join(names) or "nobody" for names in correct_by_case]
+    wrong_rows["place"] = wrong_rows["diagnoser"].map({name: i for i, name in enumerate(order)})
+    failure_table: pd.DataFrame = wrong_rows.sort_values(["place", "kind", "question"])[
+        list(FAILURE_COLUMNS)
+    ]
+    return failure_table.reset_index(drop=True)

@@ -52,7 +52,7 @@ def draw_loss_figure(title: str, rows: Sequence[LossRow]) -> Figure:
         for seed in seeds:
             values = np.array([row[2:] for row in rows if row[:2] == (seed, stage)])
             # The legend lists the lines of the first seed only.
-            _draw_losses(axis, values.T, named=seed == seeds[0])
+            _draw_losses(axis, values.T, has_labels=seed == seeds[0])
         axis.set(
             title=_STAGES.get(stage, stage),
             xlabel="epoch (pass over the training data)",
@@ -66,11 +66,11 @@ def draw_loss_figure(title: str, rows: Sequence[LossRow]) -> Figure:
     return figure
 
 
-def _draw_losses(axis: Axes, values: Array, named: bool) -> None:
+def _draw_losses(axis: Axes, values: Array, has_labels: bool) -> None:
     """Draw one training; `values` are (3, epochs): epoch, training loss, held-out loss."""
     epochs, training, held_out = values
     for losses, line, colour, name in (
         (training, "-", BLUE, "training"),
         (held_out, "--", ORANGE, "held out"),
     ):
-        axis.plot(epochs, losses, line, color=colour, lw=1.2, label=name if named else None)
+        axis.plot(epochs, losses, line, color=colour, lw=1.2, label=name if has_labels else None)

@@ -37,12 +37,12 @@ _failed: set[str] = set()
 
 def list_gl_backends() -> tuple[str, ...]:
     """List the OpenGL backends to try, by MuJoCo's names; none if the user has disabled it."""
-    chosen = os.environ.get("MUJOCO_GL", "").lower()
-    if chosen in ("disable", "disabled", "off", "false", "0"):
+    chosen_backend = os.environ.get("MUJOCO_GL", "").lower()
+    if chosen_backend in ("disable", "disabled", "off", "false", "0"):
         return ()
     # On other platforms MuJoCo's default needs no window.
     usual = ("egl", "osmesa") if sys.platform.startswith("linux") else ("",)
-    return (chosen, *usual) if chosen in ("egl", "osmesa") else usual
+    return (chosen_backend, *usual) if chosen_backend in ("egl", "osmesa") else usual
 
 
 def render_robot(model: Any, positions: Array, view: Projection) -> Image | None:
@@ -165,8 +165,8 @@ def convert_to_grey(colours: Array, shape: NDArray[np.bool_]) -> Image:
 
 def _hide_floors(mujoco: Any, model: Any) -> None:
     """Hide floors, which would fill the image."""
-    endless = (int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_HFIELD))
+    floor_types = (int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_HFIELD))
     for g in range(model.ngeom):
-        if int(model.geom_type[g]) in endless:
+        if int(model.geom_type[g]) in floor_types:
             model.geom_matid[g] = -1
             model.geom_rgba[g, 3] = 0.0

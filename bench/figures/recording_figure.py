@@ -75,21 +75,21 @@ def draw_recording_figure(recording: Recording, kind: type[Simulator]) -> Figure
         kind: Simulator class of its system, which declares names and units.
     """
     signals = list_recorded_signals(recording, kind)
-    placed = _place_runs(recording.runs)
-    width = float(np.clip(3 + 0.8 * len(placed), 9, 16))
+    placed_runs = _place_runs(recording.runs)
+    width = float(np.clip(3 + 0.8 * len(placed_runs), 9, 16))
     figure, axes = make_panel_grid(len(signals), 1, (width, 1.2 + 2.0 * len(signals)), sharex=True)
-    for axis, (channel, what) in zip(axes[:, 0], signals, strict=True):
+    for axis, (channel, role) in zip(axes[:, 0], signals, strict=True):
         unit = "" if channel.unit == "1" else f" [{_format_unit(channel.unit)}]"
-        axis.set_ylabel(f"{channel.name}{unit}\n({what})")
-        for part in placed:
+        axis.set_ylabel(f"{channel.name}{unit}\n({role})")
+        for part in placed_runs:
             values = part.run.channels.get(channel.name)
             _draw_signal(axis, part, part.run.inputs[channel.name] if values is None else values)
     panels = list(axes[:, 0])
-    _style_panels(panels, placed)
-    _draw_run_names(panels[0], placed)
-    _draw_title(panels[0], recording, placed)
+    _style_panels(panels, placed_runs)
+    _draw_run_names(panels[0], placed_runs)
+    _draw_title(panels[0], recording, placed_runs)
     figure.legend(
-        handles=_make_mark_legend(recording, placed),
+        handles=_make_mark_legend(recording, placed_runs),
         loc="outside lower center",
         ncols=3,
         fontsize=8,
@@ -105,13 +105,13 @@ def _format_unit(unit: str) -> str:
 def _place_runs(runs: Sequence[Run]) -> list[_PlacedRun]:
     """Place runs end to end with small gaps; of too many runs, use evenly spaced ones."""
     if len(runs) > _MOST_RUNS:
-        chosen = np.linspace(0, len(runs) - 1, _MOST_RUNS).round().astype(int)
-        runs = [runs[i] for i in chosen]
+        chosen_indices = np.linspace(0, len(runs) - 1, _MOST_RUNS).round().astype(int)
+        runs = [runs[i] for i in chosen_indices]
     # The more runs, the smaller the gaps between them.
     lengths = [float(run.times[-1] - run.times[0]) for run in runs]
-    apart = _RUN_GAP_SHARE * sum(lengths) / max(1.0, len(runs) ** 0.5)
-    begins = np.concatenate([[0.0], np.cumsum(np.array(lengths) + apart)[:-1]])
-    return [_PlacedRun(run, float(begin)) for run, begin in zip(runs, begins, strict=True)]
+    gap = _RUN_GAP_SHARE * sum(lengths) / max(1.0, len(runs) ** 0.5)
+    starts = np.concatenate([[0.0], np.cumsum(np.array(lengths) + gap)[:-1]])
+    return [_PlacedRun(run, float(start)) for run, start in zip(runs, starts, strict=True)]
 
 
 def _draw_signal(axis: Axes, part: _PlacedRun, values: Array) -> None:
@@ -131,8 +131,8 @@ def _draw_signal(axis: Axes, part: _PlacedRun, values: Array) -> None:
     axis.plot(t, y, color=colour, linewidth=0.9, marker=marker, markersize=3, linestyle="-")
     if missing.any():
         foot = np.full(missing.sum(), 0.02)
-        across = axis.get_xaxis_transform()
-        axis.plot(times[missing], foot, "|", color="black", markersize=5, transform=across)
+        transform = axis.get_xaxis_transform()
+        axis.plot(times[missing], foot, "|", color="black", markersize=5, transform=transform)
 
 
 def _reduce_points(times: Array, values: Array) -> tuple[Array, Array]:
@@ -143,19 +143,19 @@ def _reduce_points(times: Array, values: Array) -> tuple[Array, Array]:
     if values.size <= _MOST_POINTS:
         return times, values
     size = -(-values.size // (_MOST_POINTS // 2))
-    keep = set()
-    for begin in range(0, values.size, size):
-        stretch = values[begin : begin + size]
+    kept_indices = set()
+    for start in range(0, values.size, size):
+        stretch = values[start : start + size]
         if np.isfinite(stretch).any():
-            keep |= {begin + int(np.nanargmin(stretch)), begin + int(np.nanargmax(stretch))}
+            kept_indices |= {start + int(np.nanargmin(stretch)), start + int(np.nanargmax(stretch))}
         else:
             # One missing sample keeps the gap open.
-            keep.add(begin)
-    rows = np.array(sorted(keep))
+            kept_indices.add(start)
+    rows = np.array(sorted(kept_indices))
     return times[rows], values[rows]
 
 
-def _style_panels(axes: Sequence[Axes], placed: Sequence[_PlacedRun]) -> None:
+def _style_panels(axes: Sequence[Axes], placed_runs: Sequence[_PlacedRun]) -> None:
     """Style the panels, and mark with dotted lines where each run after the first begins.
 
     `axes` has the panels from top to bottom; the last one gets the label of the time axis.
@@ -164,14 +164,14 @@ def _style_panels(axes: Sequence[Axes], placed: Sequence[_PlacedRun]) -> None:
         axis.grid(visible=True, axis="y", linewidth=0.4, alpha=0.5)
         axis.spines[["top", "right"]].set_visible(False)
         axis.margins(x=0.01)
-        for part in placed[1:]:
+        for part in placed_runs[1:]:
             axis.axvline(part.begin, color=RUN_SEPARATOR_GREY, linewidth=0.5, linestyle=":")
     axes[-1].set_xlabel("time, runs end to end [s]; above: their names")
 
 
-def _draw_run_names(axis: Axes, placed: Sequence[_PlacedRun]) -> None:
+def _draw_run_names(axis: Axes, placed_runs: Sequence[_PlacedRun]) -> None:
     """Write the name of each run above the first panel, in the middle of the run."""
-    for part in placed:
+    for part in placed_runs:
         middle = float(part.times[[0, -1]].mean())
         axis.annotate(
             part.run.name,
@@ -181,25 +181,25 @@ def _draw_run_names(axis: Axes, placed: Sequence[_PlacedRun]) -> None:
             textcoords="offset points",
             ha="center",
             va="bottom",
-            fontsize=8 if len(placed) <= 20 else 6,
+            fontsize=8 if len(placed_runs) <= 20 else 6,
             annotation_clip=False,
         )
 
 
-def _draw_title(axis: Axes, recording: Recording, placed: Sequence[_PlacedRun]) -> None:
+def _draw_title(axis: Axes, recording: Recording, placed_runs: Sequence[_PlacedRun]) -> None:
     total = len(recording.runs)
-    selection = f", {len(placed)} of {total} runs" if len(placed) < total else ""
+    selection = f", {len(placed_runs)} of {total} runs" if len(placed_runs) < total else ""
     axis.set_title(f"{recording.title}{selection}", fontsize=11, pad=16)
 
 
-def _make_mark_legend(recording: Recording, placed: Sequence[_PlacedRun]) -> list[Line2D]:
+def _make_mark_legend(recording: Recording, placed_runs: Sequence[_PlacedRun]) -> list[Line2D]:
     """Make the legend entries for the marks that are present."""
     from matplotlib.lines import Line2D
 
     marks = [Line2D([], [], color=_FITTING, label="for fitting")]
     if recording.held_out():
         marks.append(Line2D([], [], color=_HELD_OUT, label="held out (grey ground)"))
-    if any(np.isnan(values).any() for part in placed for values in part.run.channels.values()):
+    if any(np.isnan(values).any() for part in placed_runs for values in part.run.channels.values()):
         gap = Line2D([], [], color="black", marker="|", linestyle="", label="missing sample")
         marks.append(gap)
     return marks

@@ -103,22 +103,22 @@ def draw_robot_figure(
     data = make_posed_data(robot, dict(positions))
     projection = choose_projection(robot, data)
     labels = _make_labels(robot, data, projection, marks)
-    sides = _divide_labels(labels)
-    columns = [_compute_column_width(side) for side in sides]
+    label_columns = _divide_labels(labels)
+    columns = [_compute_column_width(side) for side in label_columns]
     scale = MAX_SIDE_INCHES / max(projection.width, projection.height)
-    needed = max(_compute_column_height(side) for side in sides)
+    label_height = max(_compute_column_height(side) for side in label_columns)
     width, height = scale * projection.width, scale * projection.height
-    tall = max(height, needed)
+    tall = max(height, label_height)
     spare = max(0.0, least - sum(columns) - width) / 2
     columns = [column + spare for column in columns]
     size = (columns[0] + width + columns[1], tall + SCALE_BAR_HEIGHT_INCHES + 0.15)
     figure, axes = make_panel_grid(1, 1, size, layout=None)
     axis = axes[0, 0]
-    below = (SCALE_BAR_HEIGHT_INCHES + (tall - height) / 2) / size[1]
-    axis.set_position((columns[0] / size[0], below, width / size[0], height / size[1]))
+    bottom_margin = (SCALE_BAR_HEIGHT_INCHES + (tall - height) / 2) / size[1]
+    axis.set_position((columns[0] / size[0], bottom_margin, width / size[0], height / size[1]))
     axis.set_axis_off()
-    across, up = projection.width / 2, projection.height / 2
-    axis.set(xlim=(-across, across), ylim=(-up, up))
+    half_width, half_height = projection.width / 2, projection.height / 2
+    axis.set(xlim=(-half_width, half_width), ylim=(-half_height, half_height))
     axis.set_autoscale_on(False)
 
     image = (
@@ -127,20 +127,32 @@ def draw_robot_figure(
     if image is None:
         draw_skeleton(axis, robot, data, projection)
     else:
-        axis.imshow(image, extent=(-across, across, -up, up), zorder=0, aspect="auto")
+        axis.imshow(
+            image,
+            extent=(-half_width, half_width, -half_height, half_height),
+            zorder=0,
+            aspect="auto",
+        )
         # Shapes may be missing between joints, if their meshes are absent or were never drawn.
-        for ends in compute_link_segments(robot, data):
+        for segment in compute_link_segments(robot, data):
             axis.plot(
-                *projection.project(np.stack(ends)).T, color=CAPTION_GREY, linewidth=0.7, zorder=3
+                *projection.project(np.stack(segment)).T,
+                color=CAPTION_GREY,
+                linewidth=0.7,
+                zorder=3,
             )
         dots = projection.project(np.array([data.xanchor[j.id] for j in robot.joints]))
         axis.plot(*dots.T, "o", color=NEUTRAL_MARK, markersize=3.5, zorder=4)
     _draw_place_rings(axis, robot, data, projection, marks)
-    for side, ((left, right), begin) in enumerate(
+    for side, ((is_left, is_right), offset) in enumerate(
         zip(((1, 0), (0, 1)), (-0.12, 0.12), strict=True)
     ):
         _draw_label_column(
-            axis, sides[side], left * -across + right * across + begin / scale, scale, tall
+            axis,
+            label_columns[side],
+            is_left * -half_width + is_right * half_width + offset / scale,
+            scale,
+            tall,
         )
     _draw_scale_bar(axis, projection, scale, tall)
     return figure
@@ -166,8 +178,8 @@ def compute_joint_positions(
     for joint in robot.joints:
         point = projection.project(data.xanchor[joint.id][None])[0]
         pixels = axis.transData.transform(point)
-        across, up = (pixels / figure.bbox.size).tolist()
-        joint_positions.append((joint.name, across, 1.0 - up))
+        x_share, y_share = (pixels / figure.bbox.size).tolist()
+        joint_positions.append((joint.name, x_share, 1.0 - y_share))
     return joint_positions
 
 
@@ -213,18 +225,18 @@ def _divide_labels(labels: Sequence[_Label]) -> tuple[list[_Label], list[_Label]
 
     Each label is on the side of its place, as long as there is space.
     """
-    across = sorted(labels, key=lambda label: (label.point[0], -label.point[1]))
-    count = sum(label.point[0] < 0 for label in across)
+    ordered_labels = sorted(labels, key=lambda label: (label.point[0], -label.point[1]))
+    count = sum(label.point[0] < 0 for label in ordered_labels)
     # A column is not longer than the drawing, unless both columns are.
-    while count and _compute_column_height(across[:count]) > max(
-        MAX_SIDE_INCHES, _compute_column_height(across[count:])
+    while count and _compute_column_height(ordered_labels[:count]) > max(
+        MAX_SIDE_INCHES, _compute_column_height(ordered_labels[count:])
     ):
         count -= 1
-    while count < len(across) and _compute_column_height(across[count:]) > max(
-        MAX_SIDE_INCHES, _compute_column_height(across[:count])
+    while count < len(ordered_labels) and _compute_column_height(ordered_labels[count:]) > max(
+        MAX_SIDE_INCHES, _compute_column_height(ordered_labels[:count])
     ):
         count += 1
-    return _sort_downwards(across[:count]), _sort_downwards(across[count:])
+    return _sort_downwards(ordered_labels[:count]), _sort_downwards(ordered_labels[count:])
 
 
 def _compute_column_height(labels: Sequence[_Label]) -> float:
@@ -276,8 +288,8 @@ def _draw_label_column(
     `scale` is in inches per metre, `tall` is the height of the column in inches.
     """
     sizes = [label.height / scale for label in labels]
-    half = tall / scale / 2
-    middles = arrange_labels([label.point[1] for label in labels], sizes, -half, half)
+    half_height = tall / scale / 2
+    middles = arrange_labels([label.point[1] for label in labels], sizes, -half_height, half_height)
     for label, y in zip(labels, middles.tolist(), strict=True):
         colour = "black" if label.marked else CAPTION_GREY
         axis.annotate(
@@ -315,11 +327,11 @@ def _draw_place_rings(
         if place is None:
             continue
         shape, size = _SIZES.get(kind, _SIZES["joint"])
-        across, up = projection.project(place[None])[0].tolist()
+        x, y = projection.project(place[None])[0].tolist()
         # Markers cannot be dashed, so a ring is a scatter plot of one point.
         axis.scatter(
-            across,
-            up,
+            x,
+            y,
             s=size**2,
             marker=shape,
             facecolors="none",
@@ -337,10 +349,10 @@ def _draw_scale_bar(axis: Axes, projection: Projection, scale: float, tall: floa
     `scale` is in inches per metre, `tall` the height of the drawing in inches.
     """
     length = round_down_length(0.3 * projection.width)
-    left = -projection.width / 2
+    left_edge = -projection.width / 2
     y = -tall / scale / 2 - 0.2 / scale
     axis.plot(
-        [left, left + length],
+        [left_edge, left_edge + length],
         [y, y],
         color=NEUTRAL_MARK,
         linewidth=2.2,
@@ -348,7 +360,7 @@ def _draw_scale_bar(axis: Axes, projection: Projection, scale: float, tall: floa
         clip_on=False,
     )
     axis.text(
-        left + length / 2, y - 0.06 / scale, f"{length:g} m", ha="center", va="top", fontsize=8
+        left_edge + length / 2, y - 0.06 / scale, f"{length:g} m", ha="center", va="top", fontsize=8
     )
 
 

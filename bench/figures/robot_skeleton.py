@@ -30,8 +30,8 @@ def draw_skeleton(axis: Axes, robot: RobotModel, data: Any, view: Projection) ->
         data: MuJoCo data at the pose.
         view: Camera view.
     """
-    for begin, end in compute_link_segments(robot, data):
-        line = view.project(np.stack([begin, end]))
+    for start, end in compute_link_segments(robot, data):
+        line = view.project(np.stack([start, end]))
         axis.plot(
             *line.T,
             color=CHANCE_LEVEL_GREY,
@@ -71,8 +71,8 @@ def compute_link_segments(robot: RobotModel, data: Any) -> list[tuple[Array, Arr
             )
     for body in range(1, model.nbody):
         if int(model.body_weldid[body]) and body not in parents:
-            begin = _find_link_start(model, data, body)
-            segments.append((begin, _find_link_end(model, data, body, begin)))
+            start = _find_link_start(model, data, body)
+            segments.append((start, _find_link_end(model, data, body, start)))
     return segments
 
 
@@ -82,22 +82,22 @@ def _find_link_start(model: Any, data: Any, body: int) -> Array:
     return np.array(data.xanchor[first] if first >= 0 else data.xpos[body])
 
 
-def _find_link_end(model: Any, data: Any, body: int, begin: Array) -> Array:
+def _find_link_end(model: Any, data: Any, body: int, start: Array) -> Array:
     """Return (3,) the end of a body without child bodies.
 
     It is the point of its shapes that is furthest from the joint; without shapes, the joint
     mirrored at the centre of mass.
     """
-    points = [2 * data.xipos[body] - begin]
+    points = [2 * data.xipos[body] - start]
     for g in range(model.ngeom):
         if int(model.geom_bodyid[g]) != body:
             continue
         turn = data.geom_xmat[g].reshape(3, 3)
         middle = data.geom_xpos[g] + turn @ model.geom_aabb[g, :3]
-        sides = turn * model.geom_aabb[g, 3:]
-        points += [*(middle + sides.T), *(middle - sides.T)]
+        half_extents = turn * model.geom_aabb[g, 3:]
+        points += [*(middle + half_extents.T), *(middle - half_extents.T)]
     shapes = points[1:] or points
-    return np.array(max(shapes, key=lambda p: round(float(np.linalg.norm(p - begin)), 9)))
+    return np.array(max(shapes, key=lambda p: round(float(np.linalg.norm(p - start)), 9)))
 
 
 def _find_base_points(robot: RobotModel, data: Any) -> list[Array]:
@@ -126,13 +126,15 @@ def _draw_joint(axis: Axes, joint: Joint, data: Any, view: Projection) -> None:
     anchor = data.xanchor[joint.id]
     x, y = view.project(anchor[None])[0]
     if joint.has_one_coordinate:
-        along = view.axes[:2] @ data.xaxis[joint.id]
+        projected_axis = view.axes[:2] @ data.xaxis[joint.id]
         # An axis that points at the viewer has no direction to draw.
-        if float(np.linalg.norm(along)) > MIN_VISIBLE_AXIS_SHARE:
-            reach = JOINT_AXIS_LENGTH_SHARE * max(view.width, view.height) * along
+        if float(np.linalg.norm(projected_axis)) > MIN_VISIBLE_AXIS_SHARE:
+            reach = JOINT_AXIS_LENGTH_SHARE * max(view.width, view.height) * projected_axis
             middle = np.array([x, y])
-            ends = np.stack([middle - reach, middle + reach])
-            axis.plot(*ends.T, color=NEUTRAL_MARK, linewidth=1.3, linestyle=(0, (3, 1.2)), zorder=3)
+            end_points = np.stack([middle - reach, middle + reach])
+            axis.plot(
+                *end_points.T, color=NEUTRAL_MARK, linewidth=1.3, linestyle=(0, (3, 1.2)), zorder=3
+            )
     shape = "s" if joint.kind == "slide" else "o"
     axis.plot(
         x,

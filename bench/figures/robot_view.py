@@ -104,13 +104,16 @@ def choose_projection(robot: RobotModel, data: Any) -> Projection:
     """
     azimuth, elevation = _choose_view_angles(robot, data)
     axes = _compute_camera_axes(azimuth, elevation)
-    moving, still = compute_bounding_points(robot.compiled, data)
-    points = np.concatenate([data.xanchor, moving, _find_end_points(robot.compiled, data)]) @ axes.T
+    moving_points, static_points = compute_bounding_points(robot.compiled, data)
+    points = (
+        np.concatenate([data.xanchor, moving_points, _find_end_points(robot.compiled, data)])
+        @ axes.T
+    )
     low, high = points.min(axis=0), points.max(axis=0)
-    if len(still):
+    if len(static_points):
         # A floor or a long rail would make the robot too small.
         margin = STATIC_CONTEXT_SHARE * float(np.linalg.norm(high - low))
-        clipped = np.clip(still @ axes.T, low - margin, high + margin)
+        clipped = np.clip(static_points @ axes.T, low - margin, high + margin)
         low = np.minimum(low, clipped.min(axis=0))
         high = np.maximum(high, clipped.max(axis=0))
     width, height = np.maximum((high - low)[:2], MIN_VIEW_METRES) * (1 + 2 * MARGIN_SHARE)
@@ -123,8 +126,11 @@ def _find_end_points(model: Any, data: Any) -> Array:
 
     The end is the body's joint mirrored at its centre of mass.
     """
-    bare = set(range(1, model.nbody)) - {*model.geom_bodyid.tolist(), *model.body_parentid.tolist()}
-    jointed = [body for body in sorted(bare) if int(model.body_jntadr[body]) >= 0]
+    shapeless_bodies = set(range(1, model.nbody)) - {
+        *model.geom_bodyid.tolist(),
+        *model.body_parentid.tolist(),
+    }
+    jointed = [body for body in sorted(shapeless_bodies) if int(model.body_jntadr[body]) >= 0]
     tips: Array = 2 * data.xipos[jointed] - data.xanchor[model.body_jntadr[jointed]]
     return tips
 
@@ -167,9 +173,9 @@ def _find_motion_plane_normal(robot: RobotModel, data: Any) -> Array | None:
     if not hinges:
         return None
     normal: Array = np.array(hinges[0])
-    turned = [float(np.linalg.norm(np.cross(normal, axis))) for axis in hinges]
-    pushed = [abs(float(normal @ axis)) for axis in slides]
-    return normal if max(turned + pushed) < PARALLEL_SINE_TOLERANCE else None
+    hinge_sines = [float(np.linalg.norm(np.cross(normal, axis))) for axis in hinges]
+    slide_cosines = [abs(float(normal @ axis)) for axis in slides]
+    return normal if max(hinge_sines + slide_cosines) < PARALLEL_SINE_TOLERANCE else None
 
 
 def compute_bounding_points(model: Any, data: Any) -> tuple[Array, Array]:
@@ -186,12 +192,12 @@ def compute_bounding_points(model: Any, data: Any) -> tuple[Array, Array]:
     """
     import mujoco
 
-    endless = (int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_HFIELD))
+    floor_types = (int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_HFIELD))
     corners = np.array(list(product((-1, 1), repeat=3)))
     parts: tuple[list[Array], list[Array]] = ([data.xipos[:0]], [data.xipos[:0]])
     shaped = set()
     for g in range(model.ngeom):
-        if int(model.geom_type[g]) in endless:
+        if int(model.geom_type[g]) in floor_types:
             continue
         body = int(model.geom_bodyid[g])
         shaped.add(body)
@@ -201,8 +207,8 @@ def compute_bounding_points(model: Any, data: Any) -> tuple[Array, Array]:
     for body in range(1, model.nbody):
         if body not in shaped:
             parts[_is_static_body(model, body)].append(data.xipos[body][None])
-    moving, still = (np.concatenate(part) for part in parts)
-    return moving, still
+    moving_points, static_points = (np.concatenate(part) for part in parts)
+    return moving_points, static_points
 
 
 def _is_static_body(model: Any, body: int) -> bool:
@@ -241,11 +247,11 @@ def _place_of_channel(robot: RobotModel, data: Any, name: str) -> Array | None:
     """
     import mujoco
 
-    kind, _, rest = name.partition(".")
+    kind, _, place_name = name.partition(".")
     if kind != "s":
-        return locate_place(robot, data, "joint", rest)
+        return locate_place(robot, data, "joint", place_name)
     model = robot.compiled
-    row = next((s for s in robot.sensors if s.name == rest), None)
+    row = next((s for s in robot.sensors if s.name == place_name), None)
     if row is None:
         return None
     sensor = int(np.searchsorted(model.sensor_adr, row.address, side="right")) - 1

@@ -237,9 +237,13 @@ class TunerStyles:
             tuner: Label of the tuner.
         """
         # Tuners that the user does not have get the following indices.
-        others = [each for each in reference.tuners if each not in self._places]
-        taken = 1 + max(self._places.values(), default=-1)
-        i = self._places[tuner] if tuner in self._places else taken + others.index(tuner)
+        further_tuners = [each for each in reference.tuners if each not in self._places]
+        first_free = 1 + max(self._places.values(), default=-1)
+        i = (
+            self._places[tuner]
+            if tuner in self._places
+            else first_free + further_tuners.index(tuner)
+        )
         return {
             "color": REFERENCE_GREYS[self.behind.index(reference)],
             "marker": _get_marker(i),
@@ -271,8 +275,8 @@ def style_of(
             curves coincide in them.
     """
     notes = [statistics.notes, statistics.coinciding(shown)]
-    joined = {t: "\n".join(n[t] for n in notes if t in n) for t in {*notes[0], *notes[1]}}
-    return TunerStyles(experiment, statistics.order, behind, joined)
+    joined_notes = {t: "\n".join(n[t] for n in notes if t in n) for t in {*notes[0], *notes[1]}}
+    return TunerStyles(experiment, statistics.order, behind, joined_notes)
 
 
 def make_panel_grid(
@@ -340,18 +344,18 @@ def finish_figure(
     # A panel may lack a tuner that another panel has; of several handles the first panel's is used.
     for axis in reversed(axes):
         handles |= dict(zip(*reversed(axis.get_legend_handles_labels()), strict=True))
-    listed = [
+    legend_entries = [
         (handles[label], "\n".join(filter(None, [label, style.notes.get(label)])))
         for label in style.order
         if label in handles
     ]
     for reference in style.behind:
-        listed += _make_reference_entries(axes, style, reference)
+        legend_entries += _make_reference_entries(axes, style, reference)
         caption += _format_reference_caption(reference, style.experiment)
-    size = 9.0 if len(listed) <= _ROWS else 7.0
+    size = 9.0 if len(legend_entries) <= _ROWS else 7.0
     figure.legend(
-        [handle for handle, _ in listed],
-        [label for _, label in listed],
+        [handle for handle, _ in legend_entries],
+        [label for _, label in legend_entries],
         loc="outside right upper",
         title=heading,
         fontsize=size,

@@ -30,7 +30,9 @@ def break_name(name: str, longest: int) -> str:
             lines.append("")
         lines[-1] += part
     # A part may be too long even for a line of its own.
-    return "\n".join(piece for line in lines for piece in textwrap.wrap(line, longest))
+    return "\n".join(
+        wrapped_line for line in lines for wrapped_line in textwrap.wrap(line, longest)
+    )
 
 
 def brief(name: str, most: int) -> str:

@@ -48,13 +48,13 @@ def draw_track_figure(track: BallTrack, heights: BallHeights, part: slice, title
         title: Title above the figure.
     """
     figure, axes = make_panel_grid(1, 3, (13, 4.3), gridspec_kw={"width_ratios": (1, 1.2, 1.2)})
-    scene, above, below = axes[0]
+    scene, height_axis, radius_axis = axes[0]
     _draw_scene(scene, track)
-    _draw_over_time(above, track, part, heights.z, "height of the centre z [m]")
-    _draw_over_time(below, track, part, track.radius, "radius [px]")
-    above.axhline(heights.radius, color="black", linewidth=0.6, linestyle=":")
-    above.set_title("dotted: ball on the ground", fontsize=9)
-    below.set_title("grey: recorded; marks at the foot: no ball seen", fontsize=9)
+    _draw_over_time(height_axis, track, part, heights.z, "height of the centre z [m]")
+    _draw_over_time(radius_axis, track, part, track.radius, "radius [px]")
+    height_axis.axhline(heights.radius, color="black", linewidth=0.6, linestyle=":")
+    height_axis.set_title("dotted: ball on the ground", fontsize=9)
+    radius_axis.set_title("grey: recorded; marks at the foot: no ball seen", fontsize=9)
     visible_count, frames = int(np.isfinite(track.u).sum()), len(track.times)
     # A film's name must not be read as mathematics.
     figure.suptitle(f"{title}\n{visible_count} of {frames} frames", parse_math=False, fontsize=10)
@@ -82,12 +82,12 @@ def _draw_over_time(axis: Axes, track: BallTrack, part: slice, values: Array, la
     `part` selects the recorded frames, which have a grey background. The marks are at 2 % of the
     height of the panel.
     """
-    times, gone = track.times, ~np.isfinite(track.u)
+    times, is_missing = track.times, ~np.isfinite(track.u)
     axis.axvspan(times[part][0], times[part][-1], color=RECORDED_PART_GREY, linewidth=0)
     axis.plot(times, values, ".-", color=_SEEN, markersize=3, linewidth=0.7)
-    foot = np.full(gone.sum(), 0.02)
-    across = axis.get_xaxis_transform()
-    axis.plot(times[gone], foot, "|", color=_MISSING, markersize=7, transform=across)
+    foot = np.full(is_missing.sum(), 0.02)
+    transform = axis.get_xaxis_transform()
+    axis.plot(times[is_missing], foot, "|", color=_MISSING, markersize=7, transform=transform)
     axis.set(xlabel="time [s]", ylabel=label)
     axis.spines[["top", "right"]].set_visible(False)
 

@@ -195,14 +195,14 @@ def _fit_free_flights(times: Array, q: Array) -> list[_Flight]:
     arcs = []
     for a, b in pairwise([0, *lowest, last]):
         # The frame of the bounce itself belongs to no flight.
-        inside = visible_frames[a + (a > 0) : b - (b < last) + 1]
-        if len(inside) < _MIN_FLIGHT_FRAMES or np.ptp(q[inside]) < _MIN_FLIGHT_EXTENT:
+        flight_frames = visible_frames[a + (a > 0) : b - (b < last) + 1]
+        if len(flight_frames) < _MIN_FLIGHT_FRAMES or np.ptp(q[flight_frames]) < _MIN_FLIGHT_EXTENT:
             continue
-        t = times[inside]
-        curve, squared_residuals, *_ = np.polyfit(t, q[inside], 2, full=True)
+        t = times[flight_frames]
+        curve, squared_residuals, *_ = np.polyfit(t, q[flight_frames], 2, full=True)
         scatter = float(np.sqrt(squared_residuals[0] / len(t))) if len(squared_residuals) else 0.0
         # A motion that is not a parabola is not a flight, but a hand, a roll or another ball.
-        if scatter < 0.05 * np.ptp(q[inside]) + 0.02:
+        if scatter < 0.05 * np.ptp(q[flight_frames]) + 0.02:
             # The variance of a parabola's curvature goes as 1 / (n T^4), for n samples in T.
             arcs.append(_Flight(curve, t[0], t[-1], len(t) * float(t[-1] - t[0]) ** 4))
     return arcs
@@ -224,12 +224,12 @@ def _estimate_ground_position(track: BallTrack, q: Array, arcs: list[_Flight]) -
     It is where two successive flights meet, or the lowest position if there is only one flight.
     """
     crossings = []
-    for before, after in pairwise(arcs):
-        roots = np.roots(before.curve - after.curve)
+    for earlier_arc, later_arc in pairwise(arcs):
+        roots = np.roots(earlier_arc.curve - later_arc.curve)
         # Two parabolas have up to two intersections: the bounce, and one outside both flights.
-        begin, end = before.end - _MEETING, after.begin + _MEETING
-        real = [r.real for r in roots if abs(r.imag) < 1e-9 and begin < r.real < end]
-        crossings += [float(np.polyval(before.curve, r)) for r in real[:1]]
+        begin, end = earlier_arc.end - _MEETING, later_arc.begin + _MEETING
+        real_roots = [r.real for r in roots if abs(r.imag) < 1e-9 and begin < r.real < end]
+        crossings += [float(np.polyval(earlier_arc.curve, r)) for r in real_roots[:1]]
     if crossings:
         return float(np.median(crossings))
     # Without two flights, use the lowest position, but ignore frames with tracking errors.
@@ -251,11 +251,11 @@ def estimate_height_noise(times: Array, z: Array) -> float:
     """
     squares, freedom = 0.0, 0
     for arc in _fit_free_flights(times, -z):
-        inside = (times >= arc.begin) & (times <= arc.end) & np.isfinite(z)
-        t = times[inside] - arc.begin
+        is_in_flight = (times >= arc.begin) & (times <= arc.end) & np.isfinite(z)
+        t = times[is_in_flight] - arc.begin
         if len(t) > _MIN_FLIGHT_FRAMES:
-            cubic = np.polyfit(t, z[inside], 3)
-            squares += float(np.sum((z[inside] - np.polyval(cubic, t)) ** 2))
+            cubic = np.polyfit(t, z[is_in_flight], 3)
+            squares += float(np.sum((z[is_in_flight] - np.polyval(cubic, t)) ** 2))
             # Four coefficients are fitted.
             freedom += len(t) - 4
     return float(np.sqrt(squares / freedom)) if freedom else float("nan")

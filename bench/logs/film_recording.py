@@ -49,25 +49,29 @@ def write_film(
     runs = {r.name: r for r in data.runs}
     if run is not None and run not in runs:
         raise make_unknown_name_error(f"run in {recording}", run, list(runs))
-    chosen = runs[run] if run is not None else data.runs[0]
-    if "z" not in chosen.channels:
-        raise InputError(f"{recording}: expected the channel z, found {', '.join(chosen.channels)}")
+    chosen_run = runs[run] if run is not None else data.runs[0]
+    if "z" not in chosen_run.channels:
+        raise InputError(
+            f"{recording}: expected the channel z, found {', '.join(chosen_run.channels)}"
+        )
     # A drop recorded by its height alone falls straight down at the origin.
-    zero = np.zeros(chosen.times.size)
-    positions = np.stack([chosen.channels.get(name, zero) for name in ("x", "y", "z")], axis=1)
+    zero = np.zeros(chosen_run.times.size)
+    positions = np.stack([chosen_run.channels.get(name, zero) for name in ("x", "y", "z")], axis=1)
     if not np.isfinite(positions).all():
         missing = "has missing samples; a film shows the ball in every frame"
-        raise InputError(f"{recording}: run {chosen.name}: {missing}")
+        raise InputError(f"{recording}: run {chosen_run.name}: {missing}")
     check_film_size(recording, len(positions), pixels, force)
-    radius = {**data.constants, **chosen.constants}.get("radius", _get_default_constant("radius"))
+    radius = {**data.constants, **chosen_run.constants}.get(
+        "radius", _get_default_constant("radius")
+    )
     rng = make_rng("film", seed)
-    camera, look = PinholeCamera.draw_published(rng, pixels), SceneAppearance.draw(rng)
-    stage = BallScene(camera, look, radius, rng)
+    camera, appearance = PinholeCamera.draw_published(rng, pixels), SceneAppearance.draw(rng)
+    stage = BallScene(camera, appearance, radius, rng)
     filmed = FilmDescription(camera, radius, float(positions[0, 0]), float(positions[0, 1]))
     # The camera is published with the film, so that exact heights follow from the images.
     description = {get_camera_file_path(out): format_camera_file(filmed)}
-    write_video(out, stage.render_frames(positions), chosen.times, look.crf, description)
-    return len(positions), float(chosen.times[-1] - chosen.times[0])
+    write_video(out, stage.render_frames(positions), chosen_run.times, appearance.crf, description)
+    return len(positions), float(chosen_run.times[-1] - chosen_run.times[0])
 
 
 def _get_default_constant(name: str) -> float:

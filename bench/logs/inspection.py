@@ -179,16 +179,16 @@ def _format_use(run: Run) -> str:
 
 def _run_row(run: Run) -> tuple[str, ...]:
     """Format the statistics of a run as a table row; sampling intervals are in milliseconds."""
-    facts = compute_run_statistics(run)
+    statistics = compute_run_statistics(run)
     return (
-        facts.name,
+        statistics.name,
         _format_use(run),
-        str(facts.samples),
-        f"{facts.seconds:.4g}",
-        f"{facts.rate:.4g}",
-        *(f"{1e3 * t:.4g}" for t in (facts.shortest, facts.median, facts.longest)),
-        str(facts.gaps),
-        str(facts.missing),
+        str(statistics.samples),
+        f"{statistics.seconds:.4g}",
+        f"{statistics.rate:.4g}",
+        *(f"{1e3 * t:.4g}" for t in (statistics.shortest, statistics.median, statistics.longest)),
+        str(statistics.gaps),
+        str(statistics.missing),
     )
 
 
@@ -199,18 +199,18 @@ def _iterate_signal_rows(recording: Recording, kind: type[Simulator]) -> Iterato
     stated; steps are quantisation steps.
     """
     for channel, role in list_recorded_signals(recording, kind):
-        facts = compute_signal_statistics(recording, channel, role)
+        statistics = compute_signal_statistics(recording, channel, role)
         not_stated = "-" if role == "channel" else ""
         yield (
-            facts.name,
+            statistics.name,
             role,
-            facts.unit,
-            f"{facts.low:.4g}",
-            f"{facts.high:.4g}",
-            f"{facts.missing:.1%}" if facts.missing else "0",
-            not_stated if facts.stated is None else f"{facts.stated:.3g}",
-            f"{facts.estimated:.3g}" if np.isfinite(facts.estimated) else "",
-            f"in steps of {facts.step:.3g}" if facts.step else "",
+            statistics.unit,
+            f"{statistics.low:.4g}",
+            f"{statistics.high:.4g}",
+            f"{statistics.missing:.1%}" if statistics.missing else "0",
+            not_stated if statistics.stated is None else f"{statistics.stated:.3g}",
+            f"{statistics.estimated:.3g}" if np.isfinite(statistics.estimated) else "",
+            f"in steps of {statistics.step:.3g}" if statistics.step else "",
         )
 
 

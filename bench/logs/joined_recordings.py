@@ -78,7 +78,7 @@ def load_joined(
         for run in recording.runs
     ]
     other_count = len(loaded) - 1
-    joined = replace(
+    joined_recording = replace(
         first,
         title=f"{first.title or first.path.stem} and {other_count} more "
         f"log{'s' * (other_count > 1)}",
@@ -87,7 +87,7 @@ def load_joined(
         runs=tuple(runs),
         notes=tuple(note for recording in recordings for note in recording.notes),
     )
-    return (split_held_out(joined, folds=True) if folds else joined), kind
+    return (split_held_out(joined_recording, folds=True) if folds else joined_recording), kind
 
 
 def _get_constant(key: str, recording: Recording, run: Run, usual: dict[str, float]) -> float:
@@ -131,10 +131,10 @@ def make_log_names(paths: Sequence[Path]) -> list[str]:
     stems = [path.stem for path in paths]
     if len(set(stems)) == len(stems):
         return stems
-    longer = [f"{path.parent.name}/{path.stem}" for path in paths]
-    if len(set(longer)) == len(longer):
-        return longer
-    return [f"{number}/{name}" for number, name in enumerate(longer, start=1)]
+    qualified_names = [f"{path.parent.name}/{path.stem}" for path in paths]
+    if len(set(qualified_names)) == len(qualified_names):
+        return qualified_names
+    return [f"{number}/{name}" for number, name in enumerate(qualified_names, start=1)]
 
 
 def _compute_rms_noise(recordings: Sequence[Recording]) -> dict[str, float]:

@@ -67,8 +67,8 @@ def _list_included_files(model: Path) -> list[Path]:
     """Return a model file and the files that it includes, searched in the folder of the model."""
     files, visited_count = [model], 0
     while visited_count < len(files):
-        inner = files[visited_count]
-        names = _INCLUDE.findall(inner.read_bytes()) if inner.is_file() else []
+        visited_file = files[visited_count]
+        names = _INCLUDE.findall(visited_file.read_bytes()) if visited_file.is_file() else []
         included_files = [model.parent / name.decode(errors="replace") for name in names]
         files += [file for file in dict.fromkeys(included_files) if file not in files]
         visited_count += 1

@@ -61,9 +61,9 @@ def format_log_warnings(recording: Recording, kind: type[Simulator]) -> Iterator
 def _list_missing_signals(recording: Recording, robot: RobotModel) -> Iterator[str]:
     """Yield a line for the commands and one for the joint positions missing in the log."""
     run = recording.runs[0]
-    silent = [f"u.{a.name}" for a in robot.actuators if f"u.{a.name}" not in run.inputs]
-    if silent:
-        yield f"not in the log, and taken for zero: {', '.join(silent)}"
+    missing_commands = [f"u.{a.name}" for a in robot.actuators if f"u.{a.name}" not in run.inputs]
+    if missing_commands:
+        yield f"not in the log, and taken for zero: {', '.join(missing_commands)}"
     joints = [joint.name for joint in robot.joints if joint.has_one_coordinate]
     unseen = [name for name in joints if f"q.{name}" not in run.channels]
     if unseen:
@@ -110,10 +110,10 @@ def _format_exceeded_range(
             runs.append(run.name)
             min_value, max_value = min(min_value, lowest), max(max_value, highest)
     if runs:
-        named = ", ".join(dict.fromkeys(runs[:MAX_NAMED_RUNS])) + (
+        run_names = ", ".join(dict.fromkeys(runs[:MAX_NAMED_RUNS])) + (
             " ..." if len(runs) > MAX_NAMED_RUNS else ""
         )
         states = f"{model} states {low:.4g} to {high:.4g}"
         yield f"{name} goes from {min_value:.4g} to {max_value:.4g} {unit}".rstrip() + (
-            f" in runs {named}, and {states}: another unit, sign or zero?"
+            f" in runs {run_names}, and {states}: another unit, sign or zero?"
         )

@@ -166,6 +166,6 @@ def _compute_command_changes(run: Run) -> Array:
     for values in run.inputs.values():
         spread = float(np.ptp(values))
         if spread > 0:
-            added = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(values)))]) / spread
-            total += added - added[lead_places]
+            cumulative_change = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(values)))]) / spread
+            total += cumulative_change - cumulative_change[lead_places]
     return total

@@ -437,12 +437,15 @@ def _make_noise_table(
     `stated` is one value for all channels, or a value for each. Channels that are not named have
     none.
     """
-    named = stated if isinstance(stated, Mapping) else {ALL_CHANNELS: stated}
+    stated_by_name = stated if isinstance(stated, Mapping) else {ALL_CHANNELS: stated}
     check_known_names(
-        "recorded channel", [name for name in named if name != ALL_CHANNELS], channels
+        "recorded channel", [name for name in stated_by_name if name != ALL_CHANNELS], channels
     )
-    default = named.get(ALL_CHANNELS, 0.0)
-    values = {name: _check_number("noise of", name, named.get(name, default)) for name in channels}
+    default = stated_by_name.get(ALL_CHANNELS, 0.0)
+    values = {
+        name: _check_number("noise of", name, stated_by_name.get(name, default))
+        for name in channels
+    }
     for name, value in values.items():
         if value < 0:
             raise InputError(f"noise of {name} = {value:g}: expected at least 0")

@@ -62,11 +62,13 @@ def write_calibration_recording(experiment: Experiment, salt: str, path: Path) -
         scene = targets.draw_scenario(
             experiment, streams.get_held_out_stream(number), initial, inputs
         )
-        clean = problem.world.simulate(theta, scene)[0]
+        noise_free = problem.world.simulate(theta, scene)[0]
         rng = TargetStreams(salt, experiment.name, "calibration", 1 + number).get_stream("noise")
-        noisy = clean + problem.noise * rng.standard_normal(clean.shape)
+        measured = noise_free + problem.noise * rng.standard_normal(noise_free.shape)
         runs.append(
-            _run(problem, number, scene, noisy, number >= calibration.runs - calibration.held_out)
+            _run(
+                problem, number, scene, measured, number >= calibration.runs - calibration.held_out
+            )
         )
     kind = type(problem.simulator)
     model = None
@@ -146,8 +148,10 @@ def list_coefficients(extended: ExtendedSimulator, kind: type[Simulator]) -> dic
         raise InputError(f"simulator {kind.name} takes no effects, and cannot be extended")
     coefficients = {}
     for name, numbers in extended.effects.items():
-        declared = library.find_effect(name, kind.system).on(kind.system)
-        coefficients[name] = [numbers[c.name].value if c.name in numbers else 0.0 for c in declared]
+        declared_effect = library.find_effect(name, kind.system).on(kind.system)
+        coefficients[name] = [
+            numbers[c.name].value if c.name in numbers else 0.0 for c in declared_effect
+        ]
     return coefficients
 
 
@@ -169,8 +173,8 @@ def make_extended_experiment(experiment: Experiment, effects: dict[str, list[flo
     settings = dict(experiment.settings)
     # An effect that is tuned stays tuned, although explain fitted its coefficients too.
     tuned = {*settings.get("effects", ()), *(p for p in experiment.parameters)}
-    added = {name: values for name, values in effects.items() if name not in tuned}
-    settings["fixed"] = {**settings.get("fixed", {}), **added}
+    fixed_effects = {name: values for name, values in effects.items() if name not in tuned}
+    settings["fixed"] = {**settings.get("fixed", {}), **fixed_effects}
     return _part(experiment, EXTENDED, settings)
 
 

@@ -206,9 +206,9 @@ def _find_most_biased(lines: pd.DataFrame) -> str:
     Args:
         lines: rows of the score table of one study, with the metric "bias".
     """
-    before = lines[lines["model"] == "plain"]
-    reference = before[before["tuner"] == _REFERENCE]
-    sizes = (reference if len(reference) else before).groupby("parameter", sort=False)["mean"]
+    plain_lines = lines[lines["model"] == "plain"]
+    reference = plain_lines[plain_lines["tuner"] == _REFERENCE]
+    sizes = (reference if len(reference) else plain_lines).groupby("parameter", sort=False)["mean"]
     largest = sizes.mean().abs().fillna(0.0)
     return [str(name) for name in largest.index][int(largest.to_numpy().argmax())]
 
@@ -226,8 +226,12 @@ def _slope(panel: Axes, study: StudyResult, ranks: pd.DataFrame) -> None:
     """
     style_axis(panel)
     style = TunerStyles(study.experiment, list(ranks.sort_values("plain", kind="stable")["tuner"]))
-    for tuner, before, after in zip(ranks["tuner"], ranks["plain"], ranks["extended"], strict=True):
-        panel.plot([0, 1], [before, after], markersize=5, **style.get_plot_style(str(tuner)))
+    for tuner, plain_rank, extended_rank in zip(
+        ranks["tuner"], ranks["plain"], ranks["extended"], strict=True
+    ):
+        panel.plot(
+            [0, 1], [plain_rank, extended_rank], markersize=5, **style.get_plot_style(str(tuner))
+        )
     panel.set_xticks([0, 1], ["as it is", "extended"], fontsize=8)
     panel.set_xlim(-0.25, 1.25)
 
@@ -241,8 +245,8 @@ def _lacks(study: StudyResult) -> str:
 def _targets(systems: Sequence[StudyResult]) -> str:
     """Format the number of targets of all studies, as one number or a range."""
     counts = sorted({len(study.targets()) for study in systems})
-    many = " to ".join(str(count) for count in dict.fromkeys((counts[0], counts[-1])))
-    return f"{many} targets"
+    count_text = " to ".join(str(count) for count in dict.fromkeys((counts[0], counts[-1])))
+    return f"{count_text} targets"
 
 
 def _finished(figure: Figure, panel: Axes, heading: str, caption: str) -> Figure:

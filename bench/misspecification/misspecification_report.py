@@ -36,48 +36,48 @@ class ReportableMisspecificationStudy(Protocol):
     configuration: FolderConfiguration
 
 
-def write_report(study: ReportableMisspecificationStudy, say: PrintLine) -> int:
+def write_report(study: ReportableMisspecificationStudy, print_line: PrintLine) -> int:
     """Write tables and figures of a study, and print a summary.
 
     Args:
         study: the study.
-        say: prints a line.
+        print_line: prints a line.
 
     Returns:
         Number of failed runs.
     """
     folder, experiment = study.folder, study.configuration.experiment
-    failed = _comparisons(folder, say)
+    failed = _comparisons(folder, print_line)
     scores = (
         misspecification_scores.load_scores(folder, experiment)
         if has_both_comparisons(folder)
         else None
     )
     if scores is None or not scores.targets():
-        say(f"{experiment.name}: no target has been met in both simulators yet")
+        print_line(f"{experiment.name}: no target has been met in both simulators yet")
         return failed
-    _written(folder, [scores], say, is_joint=False)
+    _written(folder, [scores], print_line, is_joint=False)
     return failed
 
 
-def write_joint_report(folder: Path, parts: Sequence[Path], say: PrintLine) -> None:
+def write_joint_report(folder: Path, parts: Sequence[Path], print_line: PrintLine) -> None:
     """Write tables and figures of several studies together, and print a summary.
 
     Args:
         folder: folder that contains the studies.
         parts: folders of the studies.
-        say: prints a line.
+        print_line: prints a line.
     """
-    there = [part for part in parts if has_both_comparisons(part)]
+    complete_parts = [part for part in parts if has_both_comparisons(part)]
     outcomes = [
         misspecification_scores.load_scores(part, read_configuration(part).experiment)
-        for part in there
+        for part in complete_parts
     ]
-    outcomes = [one for one in outcomes if one.targets()]
+    outcomes = [outcome for outcome in outcomes if outcome.targets()]
     if len(outcomes) < 2:
         return
-    say(f"\ntogether, {len(outcomes)} systems")
-    _written(folder, outcomes, say, is_joint=True)
+    print_line(f"\ntogether, {len(outcomes)} systems")
+    _written(folder, outcomes, print_line, is_joint=True)
 
 
 def has_both_comparisons(folder: Path) -> bool:
@@ -85,7 +85,7 @@ def has_both_comparisons(folder: Path) -> bool:
     return all((folder / model / "runs.parquet").is_file() for model in MODEL_LABELS)
 
 
-def _comparisons(folder: Path, say: PrintLine) -> int:
+def _comparisons(folder: Path, print_line: PrintLine) -> int:
     """Write the tables of the comparisons that exist.
 
     Returns:
@@ -100,7 +100,7 @@ def _comparisons(folder: Path, say: PrintLine) -> int:
             write_atomically(folder / model / f"{name}.csv", frame.to_csv(index=False))
         failures = stored.statuses[stored.statuses["status"].isin(FAILED_OR_SKIPPED_STATUSES)]
         for text in format_failures(failures):
-            say(text)
+            print_line(text)
         failed += int((failures["status"] != "skipped").sum())
     return failed
 
@@ -108,7 +108,7 @@ def _comparisons(folder: Path, say: PrintLine) -> int:
 def _written(
     folder: Path,
     outcomes: Sequence[misspecification_scores.StudyScores],
-    say: PrintLine,
+    print_line: PrintLine,
     is_joint: bool,
 ) -> None:
     """Write tables and figures of one study, or of all together, and print a summary.
@@ -116,15 +116,19 @@ def _written(
     Args:
         folder: folder to write to.
         outcomes: scores of each study.
-        say: prints a line.
+        print_line: prints a line.
         is_joint: whether several studies are reported together.
     """
     experiment: Experiment = outcomes[0].experiment
     frames = {
-        "table": pd.concat([misspecification_scores.build_score_table(one) for one in outcomes]),
-        "ranks": pd.concat([misspecification_scores.build_rank_table(one) for one in outcomes]),
+        "table": pd.concat(
+            [misspecification_scores.build_score_table(outcome) for outcome in outcomes]
+        ),
+        "ranks": pd.concat(
+            [misspecification_scores.build_rank_table(outcome) for outcome in outcomes]
+        ),
         "ranking": pd.concat(
-            [misspecification_scores.build_rank_agreement_table(one) for one in outcomes]
+            [misspecification_scores.build_rank_agreement_table(outcome) for outcome in outcomes]
         ),
     }
     for name, frame in frames.items():
@@ -132,7 +136,7 @@ def _written(
             folder / f"{name}.csv", add_trust_column(frame, experiment).to_csv(index=False)
         )
     for text in _said(folder, outcomes, frames, is_joint):
-        say(text)
+        print_line(text)
     drawn_figures = {
         "bias": figures.draw_bias_figure(outcomes, frames["table"]),
         "prediction": figures.draw_prediction_figure(outcomes, frames["table"]),
@@ -142,7 +146,7 @@ def _written(
         path = write_figure(add_trust_note(figure, experiment.trusted), folder / "figures" / name)[
             0
         ]
-        say(f"figure  {path}")
+        print_line(f"figure  {path}")
 
 
 def _said(
@@ -207,14 +211,16 @@ def _table(scores: misspecification_scores.StudyScores, lines: pd.DataFrame) -> 
     study_lines = study_lines.assign(
         column=study_lines["metric"].map(heads) + " " + study_lines["model"]
     )
-    wide = study_lines.pivot(index="tuner", columns="column", values="mean")
+    errors_by_column = study_lines.pivot(index="tuner", columns="column", values="mean")
     order = [f"{head} {model}" for head in heads.values() for model in MODEL_LABELS]
-    wide = wide[order].sort_values(order[-1]).rename_axis(index=None, columns=None)
+    errors_by_column = (
+        errors_by_column[order].sort_values(order[-1]).rename_axis(index=None, columns=None)
+    )
     title = (
         f"mean error of the parameters [{misspecification_scores.TRAINING_WIDTHS_UNIT}] "
         f"and RMSE of unseen runs [{scores.unit}]"
     )
-    return f"{title}\n{wide.to_string(float_format=lambda value: f'{value:.2g}')}"
+    return f"{title}\n{errors_by_column.to_string(float_format=lambda value: f'{value:.2g}')}"
 
 
 def _tau(row: pd.Series) -> str:
@@ -226,11 +232,13 @@ def _tau(row: pd.Series) -> str:
     Args:
         row: row of the table of rank agreement.
     """
-    what = "parameters" if row["metric"] == misspecification_scores.PARAMETERS else "prediction"
+    metric_name = (
+        "parameters" if row["metric"] == misspecification_scores.PARAMETERS else "prediction"
+    )
     return (
-        f"ranking by {what}: Kendall's tau {row['tau']:.2f} ({row['low']:.2f} to {row['high']:.2f})"
-        f" between the simulators, {row['tau_of_halves']:.2f} between halves of the targets in the"
-        f" plain one; p of no change {row['p_value']:.2g}"
+        f"ranking by {metric_name}: Kendall's tau {row['tau']:.2f} ({row['low']:.2f} to "
+        f"{row['high']:.2f}) between the simulators, {row['tau_of_halves']:.2f} between halves of "
+        f"the targets in the plain one; p of no change {row['p_value']:.2g}"
     )
 
 
@@ -242,8 +250,8 @@ def _together(ranked: pd.DataFrame, metric: str) -> str:
         metric: one of `misspecification_scores.RANKED_METRICS`.
     """
     joint = misspecification_scores.compute_joint_ranks(ranked, metric)
-    means = pd.DataFrame({model: joint.ranked[model].mean() for model in MODEL_LABELS})
-    means = means.sort_values(EXTENDED).rename_axis(index=None)
+    mean_ranks = pd.DataFrame({model: joint.ranked[model].mean() for model in MODEL_LABELS})
+    mean_ranks = mean_ranks.sort_values(EXTENDED).rename_axis(index=None)
     quantity = "parameters" if metric == misspecification_scores.PARAMETERS else "prediction"
     head = f"mean rank over {len(joint.ranked[PLAIN])} systems by {quantity}, tau {joint.tau:.2f}"
     tests = "; ".join(
@@ -251,4 +259,4 @@ def _together(ranked: pd.DataFrame, metric: str) -> str:
         f"{joint.distinct_tuner_pairs[model]} pairs apart (Nemenyi)"
         for model in MODEL_LABELS
     )
-    return f"{head}\n{means.to_string(float_format=lambda value: f'{value:.1f}')}\n{tests}"
+    return f"{head}\n{mean_ranks.to_string(float_format=lambda value: f'{value:.1f}')}\n{tests}"

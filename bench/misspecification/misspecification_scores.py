@@ -95,8 +95,8 @@ class StudyScores:
 
     def tuners(self) -> list[str]:
         """List the labels of the tuners with results in both simulators, as in the experiment."""
-        ran = set(self.errors["tuner"])
-        return [e.label for e in self.experiment.tuners if e.label in ran]
+        finished_tuners = set(self.errors["tuner"])
+        return [e.label for e in self.experiment.tuners if e.label in finished_tuners]
 
     def build_metric_matrix(
         self, model: str, metric: str, tuners: Sequence[str], targets: Sequence[str]
@@ -152,10 +152,12 @@ def _whole(errors: pd.DataFrame) -> pd.DataFrame:
     """
     seed_counts = errors.groupby(["model", "tuner"])["runs"].transform("max")
     # A tuner that was skipped in one simulator is excluded from both.
-    used = set.intersection(*(set(part["tuner"]) for _, part in errors.groupby("model")))
-    complete = errors[(errors["runs"] == seed_counts) & errors["tuner"].isin(used)]
-    met = complete.groupby("target").size()
-    complete_targets = set(met[met == len(MODEL_LABELS) * len(used)].index)
+    common_tuners = set.intersection(*(set(part["tuner"]) for _, part in errors.groupby("model")))
+    complete = errors[(errors["runs"] == seed_counts) & errors["tuner"].isin(common_tuners)]
+    runs_per_target = complete.groupby("target").size()
+    complete_targets = set(
+        runs_per_target[runs_per_target == len(MODEL_LABELS) * len(common_tuners)].index
+    )
     return complete[complete["target"].isin(complete_targets)].reset_index(drop=True)
 
 
@@ -175,8 +177,8 @@ def _last(folder: Path, model: str, parameters: Sequence[Parameter], widths: Arr
     rows = RunRowTable(stored.runs, stored.statuses, stored.experiment.budget)
     frame = rows.keys[["tuner", "target"]].copy()
     for parameter, width in zip(parameters, widths, strict=True):
-        named = (f"recommendation_{parameter.name}", f"true_{parameter.name}")
-        recommended, true = (rows.build_curves(column).values[:, -1] for column in named)
+        column_names = (f"recommendation_{parameter.name}", f"true_{parameter.name}")
+        recommended, true = (rows.build_curves(column).values[:, -1] for column in column_names)
         frame[parameter.name] = np.where(rows.failed, np.nan, (recommended - true) / width)
     names = [parameter.name for parameter in parameters]
     frame[PARAMETERS] = frame[names].abs().mean(axis=1, skipna=False)
@@ -185,10 +187,12 @@ def _last(folder: Path, model: str, parameters: Sequence[Parameter], widths: Arr
     frame[PREDICTION] = np.where(rows.failed, np.nan, rows.build_curves(PREDICTION).values[:, -1])
     frame["runs"], frame["failures"] = 1, rows.failed.astype(int)
     sums = {"runs": "sum", "failures": "sum"}
-    means = {c: "mean" for c in frame.columns if c not in ("tuner", "target", *sums)}
-    grouped = frame.groupby(["tuner", "target"], sort=False, as_index=False).agg({**means, **sums})
+    mean_columns = {c: "mean" for c in frame.columns if c not in ("tuner", "target", *sums)}
+    grouped = frame.groupby(["tuner", "target"], sort=False, as_index=False).agg(
+        {**mean_columns, **sums}
+    )
     # A target with a failed seed counts as failed, because its other seeds are the easier ones.
-    grouped.loc[grouped["failures"] > 0, list(means)] = np.nan
+    grouped.loc[grouped["failures"] > 0, list(mean_columns)] = np.nan
     grouped.insert(0, "model", model)
     return grouped
 
@@ -261,11 +265,13 @@ def build_rank_agreement_table(scores: StudyScores) -> pd.DataFrame:
     tuners, targets = scores.tuners(), scores.targets()
     lines = []
     for metric in RANKED_METRICS:
-        plain, extended = (
+        base_errors, extended_errors = (
             scores.build_metric_matrix(model, metric, tuners, targets) for model in MODEL_LABELS
         )
-        agreement = compute_rank_agreement(plain, extended, scores.experiment.name, metric)
-        friedman = [_friedman(errors) for errors in (plain, extended)]
+        agreement = compute_rank_agreement(
+            base_errors, extended_errors, scores.experiment.name, metric
+        )
+        friedman = [_friedman(errors) for errors in (base_errors, extended_errors)]
         numbers = (
             agreement.tau,
             agreement.low,
@@ -329,16 +335,16 @@ def compute_joint_ranks(ranked: pd.DataFrame, metric: str) -> JointRanks:
         metric: name of the metric.
     """
     part = ranked[ranked["metric"] == metric]
-    tables, friedman, apart = {}, {}, {}
+    tables, friedman, significant_pairs = {}, {}, {}
     for model in MODEL_LABELS:
-        wide = part.pivot(index="experiment", columns="tuner", values=model)
-        wide = wide[list(dict.fromkeys(part["tuner"]))].dropna(axis="columns")
-        tables[model] = wide.rank(axis=1)
-        friedman[model], apart[model] = float("nan"), 0
-        if len(wide) >= MIN_PROBLEMS_FOR_RANKS and wide.shape[1] >= 3:
+        errors_by_tuner = part.pivot(index="experiment", columns="tuner", values=model)
+        errors_by_tuner = errors_by_tuner[list(dict.fromkeys(part["tuner"]))].dropna(axis="columns")
+        tables[model] = errors_by_tuner.rank(axis=1)
+        friedman[model], significant_pairs[model] = float("nan"), 0
+        if len(errors_by_tuner) >= MIN_PROBLEMS_FOR_RANKS and errors_by_tuner.shape[1] >= 3:
             friedman[model], p_values = compute_nemenyi_p_values(tables[model])
             upper = np.triu(p_values.to_numpy(), k=1)
-            apart[model] = int(((upper > 0) & (upper < 0.05)).sum())
+            significant_pairs[model] = int(((upper > 0) & (upper < 0.05)).sum())
     tuners = [t for t in tables[PLAIN] if t in tables[EXTENDED]]
-    means = [tables[model][tuners].mean().to_numpy() for model in MODEL_LABELS]
-    return JointRanks(tables, compute_kendall_tau(*means), friedman, apart)
+    mean_ranks = [tables[model][tuners].mean().to_numpy() for model in MODEL_LABELS]
+    return JointRanks(tables, compute_kendall_tau(*mean_ranks), friedman, significant_pairs)

@@ -115,7 +115,7 @@ class MisspecificationStudy:
         """
         from bench.benchmark.runner.experiment_runner import no_progress
 
-        finished = planned = 0
+        finished_count = planned_count = 0
         try:
             self._extend(jobs, progress or no_progress)
         except KeyboardInterrupt:
@@ -124,13 +124,16 @@ class MisspecificationStudy:
         for model in MODEL_LABELS:
             comparison = self._comparison(model, jobs)
             outcome = comparison.run(jobs, progress, pool)
-            finished, planned = finished + outcome.finished, planned + outcome.planned
+            finished_count, planned_count = (
+                finished_count + outcome.finished,
+                planned_count + outcome.planned,
+            )
             if not outcome.is_complete:
                 # The comparison that has not started has the same number of runs.
                 not_started = outcome.planned if model == PLAIN else 0
                 return StudyOutcome(
-                    finished,
-                    planned + not_started,
+                    finished_count,
+                    planned_count + not_started,
                     outcome.interrupted,
                     outcome.stopped,
                     outcome.skipped,
@@ -140,7 +143,7 @@ class MisspecificationStudy:
         segments = self.folder / SEGMENTS_FOLDER
         if segments.is_dir() and not any(segments.iterdir()):
             segments.rmdir()
-        return StudyOutcome(finished, planned)
+        return StudyOutcome(finished_count, planned_count)
 
     def _planned(self) -> int:
         """Return the number of runs in each simulator: all seeds, times targets and ranges."""
@@ -198,8 +201,8 @@ class MisspecificationStudy:
         if comparison.results is not None:
             # The folder of the other simulator contains the same truths, so it must be inaccessible
             # too.
-            everything = (str(self.folder.resolve()), *comparison.results.hidden_paths)
-            comparison.results.hidden_paths = everything
+            hidden_paths = (str(self.folder.resolve()), *comparison.results.hidden_paths)
+            comparison.results.hidden_paths = hidden_paths
         return comparison
 
     def get_experiment(self, model: str) -> Experiment:
@@ -230,30 +233,30 @@ class MisspecificationStudy:
             InputError: the study is damaged.
         """
         configuration = self.configuration
-        ends: list[RunEnd] = []
+        run_ends: list[RunEnd] = []
         under_way = (self.folder / SEGMENTS_FOLDER).exists()
         for model in MODEL_LABELS:
             if not (self.folder / model / CONFIGURATION_FILE).is_file():
-                ends += [
+                run_ends += [
                     RunEnd(f"{model} {i}", model, MISSING_STATUS) for i in range(self._planned())
                 ]
                 continue
             progress = Comparison(self.folder / model).status()
             under_way = under_way or progress.under_way
-            ends += [
+            run_ends += [
                 RunEnd(f"{model} {e.name}", f"{model} {e.group}", e.status, e.reason)
                 for e in progress.ends
             ]
         name = configuration.experiment.name
         return StudyProgress(
-            name, "runs finished", configuration.fingerprint, tuple(ends), under_way
+            name, "runs finished", configuration.fingerprint, tuple(run_ends), under_way
         )
 
-    def report(self, say: PrintLine) -> int:
+    def report(self, print_line: PrintLine) -> int:
         """Write tables and figures, and print a summary.
 
         Args:
-            say: prints a line.
+            print_line: prints a line.
 
         Returns:
             Number of failed runs.
@@ -263,4 +266,4 @@ class MisspecificationStudy:
         """
         from bench.misspecification.misspecification_report import write_report
 
-        return write_report(self, say)
+        return write_report(self, print_line)

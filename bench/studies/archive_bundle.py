@@ -104,7 +104,7 @@ def write_bundle(
     else:
         files |= _list_recording_files(recordings)
         command = _format_explain_command(folder)
-    about = {
+    metadata = {
         "format": _FORMAT,
         "kind": kind,
         "name": name,
@@ -113,7 +113,7 @@ def write_bundle(
         "command": command,
     }
     archive = out or Path(f"{name}.zip")
-    write_archive(archive, name, files, about)
+    write_archive(archive, name, files, metadata)
     return BundleResult(archive, kind, len(files), command, tuple(left_out))
 
 
@@ -238,26 +238,26 @@ class ArchiveVerification(NamedTuple):
     @property
     def is_consistent(self) -> bool:
         """Whether there is no verification failure."""
-        sound = not self.doubts and all(each.is_consistent for each in self.comparisons)
-        return sound and not (self.explanation and self.explanation.doubts)
+        has_no_doubts = not self.doubts and all(each.is_consistent for each in self.comparisons)
+        return has_no_doubts and not (self.explanation and self.explanation.doubts)
 
     def to_document(self) -> dict[str, Any]:
         """Convert to a JSON document."""
-        compared = [each.to_document() for each in self.comparisons]
+        comparisons = [each.to_document() for each in self.comparisons]
         explanation = self.explanation.to_document() if self.explanation else None
         archive = {**self.archive, "doubts": [doubt._asdict() for doubt in self.doubts]}
-        parts = {"archive": archive, "comparisons": compared, "explanation": explanation}
+        parts = {"archive": archive, "comparisons": comparisons, "explanation": explanation}
         return {"follows": self.is_consistent, **parts}
 
 
 def verify_archive(
-    archive: Path, say: PrintLine, plugins: Sequence[str] = (), every: bool = False
+    archive: Path, print_line: PrintLine, plugins: Sequence[str] = (), every: bool = False
 ) -> ArchiveVerification:
     """Verify that an archive matches its manifest, and verify the results in it.
 
     Args:
         archive: archive written by `write_bundle`, possibly elsewhere.
-        say: prints a line.
+        print_line: prints a line.
         plugins: plugin files to load; those that the archive names or contains are never run.
         every: whether to repeat every simulation instead of a sample.
 
@@ -265,25 +265,30 @@ def verify_archive(
         InputError: the file is not such an archive, or is unsafe to unpack.
     """
     with unpack_archive(archive) as unpacked:
-        about = _describe_archive(archive, unpacked)
-        count, size = about["files"], about["bytes"]
-        say(f"{archive}: {about['kind']} of simgap {about['simgap']}, {count} files, {size} bytes")
+        description = _describe_archive(archive, unpacked)
+        count, size = description["files"], description["bytes"]
+        print_line(
+            f"{archive}: {description['kind']} of simgap {description['simgap']}, {count} files, "
+            f"{size} bytes"
+        )
         doubts = [VerificationFailure(fault.file, 0, fault.says) for fault in unpacked.faults]
         if doubts:
-            _format_result(doubts, archive, say)
-            return ArchiveVerification(about, doubts, [], None)
-        say(f"{MANIFEST_FILE}: every file is there and has its SHA-256, and there is no other")
-        if about["kind"] == "explanation":
-            explained = _verify_extended_model(unpacked.folder, say)
-            _format_result(explained.doubts, archive, say)
-            return ArchiveVerification(about, [], [], explained)
-        compared = [
-            verify_comparison(part, say, plugins, every, own_plugins=False)._replace(
+            _format_result(doubts, archive, print_line)
+            return ArchiveVerification(description, doubts, [], None)
+        print_line(
+            f"{MANIFEST_FILE}: every file is there and has its SHA-256, and there is no other"
+        )
+        if description["kind"] == "explanation":
+            explained = _verify_extended_model(unpacked.folder, print_line)
+            _format_result(explained.doubts, archive, print_line)
+            return ArchiveVerification(description, [], [], explained)
+        verifications = [
+            verify_comparison(part, print_line, plugins, every, own_plugins=False)._replace(
                 folder=archive / part.relative_to(unpacked.folder.parent)
             )
             for part in _list_comparison_folders(unpacked.folder)
         ]
-        return ArchiveVerification(about, [], compared, None)
+        return ArchiveVerification(description, [], verifications, None)
 
 
 def _describe_archive(archive: Path, unpacked: UnpackedArchive) -> dict[str, Any]:
@@ -299,29 +304,31 @@ def _describe_archive(archive: Path, unpacked: UnpackedArchive) -> dict[str, Any
     }
 
 
-def _format_result(doubts: Sequence[VerificationFailure], where: Path, say: PrintLine) -> None:
+def _format_result(
+    doubts: Sequence[VerificationFailure], folder: Path, print_line: PrintLine
+) -> None:
     """Print the doubts (numbers that do not follow from others), at most 20 of them."""
     for doubt in doubts[:20]:
-        say(f"DOES NOT FOLLOW  {where}/{doubt}")
+        print_line(f"DOES NOT FOLLOW  {folder}/{doubt}")
     if len(doubts) > 20:
-        say(f"and {len(doubts) - 20} more")
+        print_line(f"and {len(doubts) - 20} more")
 
 
-def verify_explanation(folder: Path, say: PrintLine) -> ExplanationVerification:
+def verify_explanation(folder: Path, print_line: PrintLine) -> ExplanationVerification:
     """Verify that the files of an explanation are valid and consistent.
 
     If the folder contains the recording, the held-out error is computed again.
 
     Args:
         folder: folder of the explanation.
-        say: prints a line.
+        print_line: prints a line.
     """
-    verification = _verify_extended_model(folder, say)
-    _format_result(verification.doubts, folder, say)
+    verification = _verify_extended_model(folder, print_line)
+    _format_result(verification.doubts, folder, print_line)
     return verification
 
 
-def _verify_extended_model(folder: Path, say: PrintLine) -> ExplanationVerification:
+def _verify_extended_model(folder: Path, print_line: PrintLine) -> ExplanationVerification:
     """Check that the verdict and the extended model of an explanation agree.
 
     The verdict must follow its schema, the extended model must load and have the same numbers, and
@@ -331,13 +338,13 @@ def _verify_extended_model(folder: Path, say: PrintLine) -> ExplanationVerificat
 
     Args:
         folder: folder of the explanation.
-        say: prints one line of text.
+        print_line: prints one line of text.
     """
     verification = ExplanationVerification([], [], [])
 
     def note(line: str) -> None:
         verification.checked.append(line)
-        say(line)
+        print_line(line)
 
     verdict = _read_verdict(folder, verification)
     if verdict is None:
@@ -350,7 +357,7 @@ def _verify_extended_model(folder: Path, say: PrintLine) -> ExplanationVerificat
         # The hash of a robot's model file is known; its absence here is no verification failure.
         if "model" in text and "no such file" in text:
             verification.unchecked.append(f"{EXTENDED_MODEL_FILE}: {text}")
-            say(f"not checked: {verification.unchecked[-1]}")
+            print_line(f"not checked: {verification.unchecked[-1]}")
         else:
             verification.doubts.append(VerificationFailure(EXTENDED_MODEL_FILE, 0, text))
         return verification
@@ -360,9 +367,11 @@ def _verify_extended_model(folder: Path, say: PrintLine) -> ExplanationVerificat
         note(f"{VERDICT_FILE} and {EXTENDED_MODEL_FILE} have the same numbers")
     _score_extended_model(folder, verdict, verification, note)
     for line in verification.unchecked:
-        say(f"not checked: {line}")
+        print_line(f"not checked: {line}")
     if not verification.doubts:
-        say("all of it follows" if not verification.unchecked else "what could be checked follows")
+        print_line(
+            "all of it follows" if not verification.unchecked else "what could be checked follows"
+        )
     return verification
 
 
@@ -384,23 +393,25 @@ def _find_differing_numbers(
 ) -> Iterator[VerificationFailure]:
     """Yield numbers of the verdict that are missing or different in the extended simulator."""
     for name, number in verdict.parameters.items():
-        other = extended.parameters.get(name)
-        if other is not None and not math.isclose(number.value, other.value, rel_tol=1e-9):
+        model_value = extended.parameters.get(name)
+        if model_value is not None and not math.isclose(
+            number.value, model_value.value, rel_tol=1e-9
+        ):
             yield VerificationFailure(
                 VERDICT_FILE,
                 0,
-                f"{name}: {number.value:.9g}, in {EXTENDED_MODEL_FILE} {other.value:.9g}",
+                f"{name}: {number.value:.9g}, in {EXTENDED_MODEL_FILE} {model_value.value:.9g}",
             )
     for cause in verdict.causes:
-        known: Mapping[str, Any] = extended.effects.get(cause.effect, {})
+        coefficients: Mapping[str, Any] = extended.effects.get(cause.effect, {})
         for name, number in cause.coefficients.items():
-            value = known[name].value if name in known else math.nan
+            value = coefficients[name].value if name in coefficients else math.nan
             if not math.isclose(number.value, value, rel_tol=1e-9):
-                what = f"{cause.effect} {name}"
+                label = f"{cause.effect} {name}"
                 yield VerificationFailure(
                     VERDICT_FILE,
                     0,
-                    f"{what}: {number.value:.9g}, in {EXTENDED_MODEL_FILE} {value:.9g}",
+                    f"{label}: {number.value:.9g}, in {EXTENDED_MODEL_FILE} {value:.9g}",
                 )
 
 
@@ -409,24 +420,26 @@ def _score_extended_model(
 ) -> None:
     """Repeat the held-out error of the extended simulator, if the folder has the recording."""
     environment = read_environment(folder)
-    stated = verdict.heldout.rmse_extended if verdict.heldout else None
+    stated_error = verdict.heldout.rmse_extended if verdict.heldout else None
     tables = sorted((folder / _RECORDINGS_FOLDER).glob("*.csv"))
-    if stated is None:
+    if stated_error is None:
         verification.unchecked.append("held-out error: the verdict states none")
         return
     if len(tables) != 1:
-        where = f"{len(tables)} recordings are" if tables else "the recording is not"
+        location = f"{len(tables)} recordings are" if tables else "the recording is not"
         verification.unchecked.append(
-            f"held-out error: {where} in it (simgap bundle --with LOG.csv)"
+            f"held-out error: {location} in it (simgap bundle --with LOG.csv)"
         )
         return
     hashes = {each["file"]: each["sha256"] for each in environment.get("recordings", [])}
     for path in (tables[0], tables[0].with_suffix(".toml")):
         if path.name in hashes and path.is_file() and compute_sha256(path) != hashes[path.name]:
-            wrong = f"expected the recording that was explained, SHA-256 {hashes[path.name][:12]}"
+            expected = (
+                f"expected the recording that was explained, SHA-256 {hashes[path.name][:12]}"
+            )
             verification.doubts.append(
                 VerificationFailure(
-                    f"{_RECORDINGS_FOLDER}/{path.name}", 0, f"{wrong}; found another"
+                    f"{_RECORDINGS_FOLDER}/{path.name}", 0, f"{expected}; found another"
                 )
             )
             return
@@ -445,8 +458,10 @@ def _score_extended_model(
         if errors_in_unit
         else math.nan
     )
-    if not math.isclose(stated, repeated_error, rel_tol=_ERROR_TOLERANCE):
-        what = f"rmse_extended on held-out runs: {stated:.6g}, scored again {repeated_error:.6g}"
-        verification.doubts.append(VerificationFailure(VERDICT_FILE, 0, what))
+    if not math.isclose(stated_error, repeated_error, rel_tol=_ERROR_TOLERANCE):
+        difference = (
+            f"rmse_extended on held-out runs: {stated_error:.6g}, scored again {repeated_error:.6g}"
+        )
+        verification.doubts.append(VerificationFailure(VERDICT_FILE, 0, difference))
         return
     note(f"{VERDICT_FILE}: rmse_extended on held-out runs comes out again: {repeated_error:.6g}")

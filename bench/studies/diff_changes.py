@@ -29,19 +29,19 @@ def find_changes(a: Mapping[str, Any], b: Mapping[str, Any]) -> list[dict[str, A
     ]
 
 
-def _flatten_table(value: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:
+def _flatten_table(value: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
     """Yield the values of nested tables, each with its path such as ``noise.q``.
 
-    `before` is the path of the table with its final dot. A tuple becomes a list, so that it equals
+    `prefix` is the path of the table with its final dot. A tuple becomes a list, so that it equals
     the list read from a file.
     """
-    for key, inner in value.items():
-        if isinstance(inner, Mapping):
-            yield from _flatten_table(inner, f"{before}{key}.")
-        elif isinstance(inner, list | tuple):
-            yield f"{before}{key}", list(inner)
+    for key, item in value.items():
+        if isinstance(item, Mapping):
+            yield from _flatten_table(item, f"{prefix}{key}.")
+        elif isinstance(item, list | tuple):
+            yield f"{prefix}{key}", list(item)
         else:
-            yield f"{before}{key}", inner
+            yield f"{prefix}{key}", item
 
 
 def select_relevant_environment(environment: Mapping[str, Any]) -> dict[str, Any]:

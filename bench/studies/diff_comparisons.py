@@ -73,9 +73,9 @@ class ComparisonSide:
         part = self.curves.select(range=kind, tuner=tuner)
         last = k >= part.values.shape[1] - 1
         errors = part.values[:, k]
-        lost = np.isnan(errors) | (part.failed & last)
+        is_failed = np.isnan(errors) | (part.failed & last)
         index = pd.MultiIndex.from_frame(part.keys[["target", "seed"]])
-        return pd.Series(np.where(lost, np.inf, errors), index=index)
+        return pd.Series(np.where(is_failed, np.inf, errors), index=index)
 
 
 def load_side(folder: Path, metric: str | None = None) -> ComparisonSide:
@@ -160,8 +160,10 @@ class ComparisonDiff:
         for kind in dict.fromkeys(self.a.curves.keys["range"]):
             if kind not in ranges:
                 continue
-            mine, other = (s.curves.select(range=str(kind)).list_tuners() for s in (self.a, self.b))
-            for tuner in (t for t in mine if t in other):
+            tuners_a, tuners_b = (
+                s.curves.select(range=str(kind)).list_tuners() for s in (self.a, self.b)
+            )
+            for tuner in (t for t in tuners_a if t in tuners_b):
                 for k in checkpoints:
                     yield self._compare_errors(str(kind), tuner, k)
 
@@ -174,10 +176,10 @@ class ComparisonDiff:
         """
         a, b = (side.index_errors(kind, tuner, k) for side in (self.a, self.b))
         shared = self.shared_targets
-        both = [key for key in a.index if key in b.index and key[0] in shared]
-        paired = bool(both)
+        common_keys = [key for key in a.index if key in b.index and key[0] in shared]
+        paired = bool(common_keys)
         if paired:
-            a, b = a[both], b[both]
+            a, b = a[common_keys], b[common_keys]
         by_target = [each.groupby(level="target").mean() for each in (a, b)]
         first, second = (
             compute_log_errors(np.asarray(each, dtype=np.float64)) for each in by_target
@@ -209,14 +211,16 @@ class ComparisonDiff:
         if list(a.columns) != list(b.columns):
             return set()
         names = [name for name in a.index if name in b.index]
-        same = np.isclose(
+        is_close = np.isclose(
             a.loc[names].to_numpy(dtype=float),
             b.loc[names].to_numpy(dtype=float),
             rtol=1e-9,
             atol=0.0,
             equal_nan=True,
         )
-        return {name for name, alike in zip(names, same.all(axis=1), strict=True) if alike}
+        return {
+            name for name, is_equal in zip(names, is_close.all(axis=1), strict=True) if is_equal
+        }
 
     @cached_property
     def statuses(self) -> list[dict[str, Any]]:
@@ -235,10 +239,10 @@ class ComparisonDiff:
     @cached_property
     def unshared_tuners(self) -> dict[str, list[str]]:
         """Tuners that only one of the comparisons has."""
-        mine, other = (s.curves.list_tuners() for s in (self.a, self.b))
+        tuners_a, tuners_b = (s.curves.list_tuners() for s in (self.a, self.b))
         return {
-            "a": [t for t in mine if t not in other],
-            "b": [t for t in other if t not in mine],
+            "a": [t for t in tuners_a if t not in tuners_b],
+            "b": [t for t in tuners_b if t not in tuners_a],
         }
 
     @property
@@ -251,8 +255,8 @@ class ComparisonDiff:
     @property
     def is_worse(self) -> bool:
         """Whether an error has grown significantly, or the fraction of failed runs has grown."""
-        found = self._select_significant_errors()
-        grown = bool(len(found) and (found["ratio"] > 1).any())
+        significant_errors = self._select_significant_errors()
+        grown = bool(len(significant_errors) and (significant_errors["ratio"] > 1).any())
         return grown or any(b > a for a, b in self._compute_failure_shares())
 
     def _select_significant_errors(self) -> pd.DataFrame:
@@ -266,11 +270,11 @@ class ComparisonDiff:
         frames = [s.stored.statuses for s in (self.a, self.b)]
         for tuner in self.a.curves.list_tuners():
             if tuner not in self.unshared_tuners["a"]:
-                mine = [
+                failure_shares = [
                     f.loc[f["tuner"] == tuner, "status"].isin(FAILED_OR_SKIPPED_STATUSES).mean()
                     for f in frames
                 ]
-                yield float(mine[0]), float(mine[1])
+                yield float(failure_shares[0]), float(failure_shares[1])
 
     def _format_status_changes(self) -> Iterator[str]:
         """Yield changed status counts as text lines.
@@ -290,21 +294,22 @@ class ComparisonDiff:
     def notes(self) -> list[str]:
         """Notes on limitations of the comparison."""
         notes = []
-        found = self.errors
-        if not len(found):
+        error_table = self.errors
+        if not len(error_table):
             return ["no range and tuner is in both"]
-        if not found["paired"].any():
+        if not error_table["paired"].any():
             notes.append("no target is in both (each salt draws its own): not paired")
-        elif not found["paired"].all():
+        elif not error_table["paired"].all():
             notes.append("some lines are not paired: their targets are not in both")
-        least = min(
+        min_p_value = min(
             _compute_min_attainable_p_value(n, p)
-            for n, p in zip(found["targets"], found["paired"], strict=True)
+            for n, p in zip(error_table["targets"], error_table["paired"], strict=True)
         )
-        if least * len(found) > FAMILYWISE_ERROR_RATE:
+        if min_p_value * len(error_table) > FAMILYWISE_ERROR_RATE:
             notes.append(
-                f"no difference could be significant: with {found['targets'].max()} targets a "
-                f"p-value is at least {least:.2g}, and {len(found)} lines are compared"
+                f"no difference could be significant: with {error_table['targets'].max()} targets "
+                f"a p-value is at least {min_p_value:.2g}, and {len(error_table)} lines are "
+                "compared"
             )
         return notes
 
@@ -312,7 +317,7 @@ class ComparisonDiff:
         """Convert to a JSON document."""
         experiments = [s.stored.experiment for s in (self.a, self.b)]
         environments = [read_environment(s.folder) for s in (self.a, self.b)]
-        sides = [
+        side_documents = [
             describe_side(s.folder, e.name, environment)
             for s, e, environment in zip((self.a, self.b), experiments, environments, strict=True)
         ]
@@ -320,8 +325,8 @@ class ComparisonDiff:
             "kind": "comparison",
             "changed": self.has_changed,
             "worse": self.is_worse,
-            "a": sides[0],
-            "b": sides[1],
+            "a": side_documents[0],
+            "b": side_documents[1],
             "errors": self.errors.to_dict("records"),
             "statuses": self.statuses,
             "only": self.unshared_tuners,
@@ -338,8 +343,8 @@ class ComparisonDiff:
         rows = [head]
         lines: list[dict[str, Any]] = document["errors"]
         last = max((each["simulations"] for each in lines), default=0)
-        shown = [each for each in lines if each["significant"] or each["simulations"] == last]
-        for each in shown:
+        listed = [each for each in lines if each["significant"] or each["simulations"] == last]
+        for each in listed:
             mark = "" if not each["significant"] else "WORSE" if each["ratio"] > 1 else "better"
             rows.append(
                 (
@@ -355,16 +360,17 @@ class ComparisonDiff:
                 )
             )
         yield from format_columns(rows)
-        if len(lines) > len(shown):
-            yield f"({len(lines) - len(shown)} more lines differ by chance at most; --json has all)"
+        if len(lines) > len(listed):
+            count = len(lines) - len(listed)
+            yield f"({count} more lines differ by chance at most; --json has all)"
         yield from self._format_status_changes()
         for name, tuners in self.unshared_tuners.items():
             if tuners:
                 yield f"in {name} alone: {', '.join(tuners)}"
-        for what in ("configuration", "environment"):
-            if document[what]:
-                yield f"{what}, a -> b"
-                yield from format_changes(document[what])
+        for section in ("configuration", "environment"):
+            if document[section]:
+                yield f"{section}, a -> b"
+                yield from format_changes(document[section])
         yield from (f"note: {note}" for note in self.notes)
         yield "something has changed" if self.has_changed else "nothing has changed significantly"
 

@@ -64,14 +64,14 @@ class ExplanationSide:
     @property
     def settings(self) -> dict[str, Any]:
         """System, settings, recordings, versions and machine of the explanation."""
-        made = self.environment
-        recordings = {each["file"]: each["sha256"] for each in made.get("recordings", [])}
-        asked = {"system": self.verdict.system, "engine": self.verdict.engine}
+        environment = self.environment
+        recordings = {each["file"]: each["sha256"] for each in environment.get("recordings", [])}
+        base_settings = {"system": self.verdict.system, "engine": self.verdict.engine}
         return {
-            **asked,
-            "settings": made.get("settings", {}),
+            **base_settings,
+            "settings": environment.get("settings", {}),
             "recordings": recordings,
-            **select_relevant_environment(made),
+            **select_relevant_environment(environment),
         }
 
     def classify_effect(self, effect: str) -> str:
@@ -92,14 +92,14 @@ def load_side(folder: Path) -> ExplanationSide:
     path = folder / VERDICT
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
-        wrong = find_violations(document, "verdict")
-        verdict = Verdict.from_document(document) if not wrong else None
+        violations = find_violations(document, "verdict")
+        verdict = Verdict.from_document(document) if not violations else None
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
     except (ValueError, KeyError, TypeError, RecursionError) as error:
-        wrong, verdict = [get_first_line(error)], None
+        violations, verdict = [get_first_line(error)], None
     if verdict is None:
-        raise InputError(f"{path}: expected a verdict of simgap explain; {wrong[0]}")
+        raise InputError(f"{path}: expected a verdict of simgap explain; {violations[0]}")
     title = str(read_toml(folder / EXTENDED).get("title", ""))
     return ExplanationSide(folder, verdict, title, read_environment(folder))
 
@@ -119,7 +119,7 @@ class ExplanationDiff:
     @cached_property
     def causes(self) -> list[dict[str, Any]]:
         """All effects that either explanation names, with their roles in both."""
-        named = [
+        effect_names = [
             effect
             for each in (self.a, self.b)
             for cause in each.verdict.causes
@@ -131,7 +131,7 @@ class ExplanationDiff:
                 "in_a": self.a.classify_effect(effect),
                 "in_b": self.b.classify_effect(effect),
             }
-            for effect in dict.fromkeys(named)
+            for effect in dict.fromkeys(effect_names)
         ]
 
     @cached_property
@@ -143,9 +143,9 @@ class ExplanationDiff:
         parameters = _pair_coefficients(self.a.verdict.parameters, self.b.verdict.parameters)
         rows = [*coefficients, *parameters]
         p = np.array([_compute_p_value(row) for row in rows])
-        there = np.isfinite(p)
+        is_known = np.isfinite(p)
         corrected = np.full(len(p), np.nan)
-        corrected[there] = correct_holm(p[there])
+        corrected[is_known] = correct_holm(p[is_known])
         for row, value in zip(rows, corrected, strict=True):
             row["significant"] = bool(value < FAMILYWISE_ERROR_RATE) if np.isfinite(value) else None
         return coefficients, parameters
@@ -153,10 +153,12 @@ class ExplanationDiff:
     @property
     def has_changed(self) -> bool:
         """Whether verdict or causes differ, or a number differs significantly."""
-        other = self.a.verdict.verdict != self.b.verdict.verdict
-        moved = any(row["significant"] for rows in self.numbers for row in rows)
-        causes = any("cause" in pair and len(set(pair)) > 1 for pair in self._list_cause_places())
-        return other or moved or causes
+        has_other_verdict = self.a.verdict.verdict != self.b.verdict.verdict
+        has_other_numbers = any(row["significant"] for rows in self.numbers for row in rows)
+        has_other_causes = any(
+            "cause" in pair and len(set(pair)) > 1 for pair in self._list_cause_places()
+        )
+        return has_other_verdict or has_other_numbers or has_other_causes
 
     def _list_cause_places(self) -> list[tuple[str, str]]:
         return [(each["in_a"], each["in_b"]) for each in self.causes]
@@ -172,9 +174,9 @@ class ExplanationDiff:
 
     def _list_held_out_errors(self) -> list[dict[str, Any]]:
         """List errors on held-out runs and the closed gap of both explanations; None if missing."""
-        sides = [each.verdict.heldout for each in (self.a, self.b)]
+        errors = [each.verdict.heldout for each in (self.a, self.b)]
         return [
-            {"name": name, "a": getattr(sides[0], name, None), "b": getattr(sides[1], name, None)}
+            {"name": name, "a": getattr(errors[0], name, None), "b": getattr(errors[1], name, None)}
             for name in _HELD_OUT
         ]
 
@@ -213,14 +215,14 @@ class ExplanationDiff:
     def to_document(self) -> dict[str, Any]:
         """Convert to a JSON document."""
         coefficients, parameters = self.numbers
-        sides = [
+        side_documents = [
             describe_side(each.folder, each.title, each.environment) for each in (self.a, self.b)
         ]
         return {
             "kind": "explanation",
             "changed": self.has_changed,
-            "a": sides[0],
-            "b": sides[1],
+            "a": side_documents[0],
+            "b": side_documents[1],
             "verdict": {"a": self.a.verdict.verdict, "b": self.b.verdict.verdict},
             "causes": self.causes,
             "coefficients": coefficients,
@@ -235,12 +237,13 @@ class ExplanationDiff:
         """Format the differences as text lines."""
         document = self.to_document()
         words = document["verdict"]
-        same = words["a"] == words["b"]
-        yield f"verdict: {words['a']}" + ("" if same else f" -> {words['b']}")
+        is_same = words["a"] == words["b"]
+        yield f"verdict: {words['a']}" + ("" if is_same else f" -> {words['b']}")
         for cause in self.causes:
-            here, there = cause["in_a"], cause["in_b"]
-            places = f"{here} in both" if here == there else f"{here} -> {there}"
-            yield f"{'cause' if 'cause' in (here, there) else '     '} {cause['effect']}: {places}"
+            role_a, role_b = cause["in_a"], cause["in_b"]
+            places = f"{role_a} in both" if role_a == role_b else f"{role_a} -> {role_b}"
+            label = "cause" if "cause" in (role_a, role_b) else "     "
+            yield f"{label} {cause['effect']}: {places}"
         rows = [("number", "unit", "", "a", "95 %", "b", "95 %")]
         for row in (*document["coefficients"], *document["parameters"]):
             mark = "MOVED" if row["significant"] else ""
@@ -295,9 +298,9 @@ def _pair_coefficients(
     rows = []
     for name in dict.fromkeys([*a, *b]):
         first, second = a.get(name), b.get(name)
-        either = first or second
-        assert either is not None
-        row: dict[str, Any] = {"name": name, "unit": either.unit}
+        number = first or second
+        assert number is not None
+        row: dict[str, Any] = {"name": name, "unit": number.unit}
         for mark, each in (("a", first), ("b", second)):
             row |= {
                 mark: each.value if each else None,
@@ -310,8 +313,8 @@ def _pair_coefficients(
 
 def _compute_p_value(row: Mapping[str, Any]) -> float:
     """Compute the p-value of no difference; NaN if an interval is open or a number is missing."""
-    ends = [row[key] for key in ("low_a", "high_a", "low_b", "high_b", "a", "b")]
-    if any(end is None for end in ends):
+    limits = [row[key] for key in ("low_a", "high_a", "low_b", "high_b", "a", "b")]
+    if any(end is None for end in limits):
         return math.nan
     errors = [(row[f"high_{m}"] - row[f"low_{m}"]) / (2 * _Z95) for m in ("a", "b")]
     spread = math.hypot(*errors)

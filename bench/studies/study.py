@@ -95,7 +95,7 @@ class Study(Protocol):
         """Return what the folder contains, and what is missing."""
         ...
 
-    def report(self, say: PrintLine) -> int:
+    def report(self, print_line: PrintLine) -> int:
         """Write tables and figures, print the results, and return the number of failures."""
         ...
 
@@ -135,19 +135,19 @@ def begin_studies(
     if salt is None and not experiment.salt and not experiment.experiments:
         salt = generate_salt()
     parent = choose_free_folder(experiment, folder)
-    begun: list[Study] = []
+    studies: list[Study] = []
     try:
         # All are planned before the first is run, so that an error in the last one shows at once.
         for part in experiments:
-            begun.append(begin(part, parent / part.name))
+            studies.append(begin(part, parent / part.name))
     except BaseException:
-        for study in begun:
+        for study in studies:
             study.close()
             shutil.rmtree(study.folder, ignore_errors=True)
         if parent.is_dir() and not any(parent.iterdir()):
             parent.rmdir()
         raise
-    return begun
+    return studies
 
 
 def list_study_folders(folder: Path) -> list[Path]:
@@ -158,23 +158,23 @@ def list_study_folders(folder: Path) -> list[Path]:
     return subfolders or [folder]
 
 
-def report_jointly(folder: Path, say: PrintLine) -> None:
+def report_jointly(folder: Path, print_line: PrintLine) -> None:
     """Write and print the joint results of the studies in a folder, if their kind has any.
 
     Args:
         folder: folder that was given to `begin_studies`.
-        say: callback that prints one line.
+        print_line: callback that prints one line.
     """
     parts = list_study_folders(folder)
     experiments = [read_configuration(part).experiment for part in parts]
     if len(parts) > 1 and all(experiment.calibration for experiment in experiments):
         from bench.misspecification.misspecification_report import write_joint_report
 
-        write_joint_report(folder, parts, say)
+        write_joint_report(folder, parts, print_line)
     if experiments and all(experiment.suite for experiment in experiments):
         from bench.studies.suite.suite_report import report_suite
 
-        report_suite(folder, say)
+        report_suite(folder, print_line)
 
 
 def resume_study(folder: Path, plugins: Sequence[str] = ()) -> Study:

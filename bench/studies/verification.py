@@ -87,7 +87,7 @@ class VerificationResult(NamedTuple):
 @numeric_warnings_silenced()
 def verify_comparison(
     folder: Path,
-    say: PrintLine,
+    print_line: PrintLine,
     plugins: Sequence[str] = (),
     every: bool = False,
     own_plugins: bool = True,
@@ -96,7 +96,7 @@ def verify_comparison(
 
     Args:
         folder: folder of the comparison.
-        say: prints a line.
+        print_line: prints a line.
         plugins: plugin files in addition to those that the comparison names.
         every: whether to repeat every simulation instead of a sample.
         own_plugins: whether to run the plugin files that the comparison names; False for a
@@ -118,13 +118,13 @@ def verify_comparison(
 
     def note(line: str) -> None:
         checks.append(line)
-        say(line)
+        print_line(line)
 
     # The salt in experiment.toml was already checked against its hash when the file was read.
     stored = read_checked_comparison(folder)
     note(_describe_salt(experiment))
-    named = configuration.plugins if own_plugins else []
-    files = [*named, *(str(Path(plugin).resolve()) for plugin in plugins)]
+    own_files = configuration.plugins if own_plugins else []
+    files = [*own_files, *(str(Path(plugin).resolve()) for plugin in plugins)]
     load_plugins_for_experiment(list(dict.fromkeys(files)), experiment)
     problem = TuningProblem(experiment)
     try:
@@ -133,11 +133,11 @@ def verify_comparison(
         problem.close()
     doubts += _verify_tables(folder, stored, note)
     for doubt in doubts[:20]:
-        say(f"DOES NOT FOLLOW  {folder}/{doubt}")
+        print_line(f"DOES NOT FOLLOW  {folder}/{doubt}")
     if len(doubts) > 20:
-        say(f"and {len(doubts) - 20} more")
+        print_line(f"and {len(doubts) - 20} more")
     if not doubts:
-        say("all of it follows")
+        print_line("all of it follows")
     return VerificationResult(folder, tuple(checks), tuple(doubts))
 
 
@@ -155,12 +155,12 @@ def _describe_salt(experiment: Experiment) -> str:
 
 
 def _verify_runs_table(
-    stored: StoredComparison, problem: TuningProblem, say: PrintLine, every: bool
+    stored: StoredComparison, problem: TuningProblem, print_line: PrintLine, is_every_row: bool
 ) -> list[VerificationFailure]:
     """Verify runs.parquet, and return the failures.
 
     The targets are drawn again from the salt. Errors are computed from them in all rows; losses are
-    simulated again in a selection of rows, or in all with `every`.
+    simulated again in a selection of rows, or in all with `is_every_row`.
     """
     targets = {target.blinded.name: target for target in problem.draw_targets()}
     runs = stored.runs
@@ -175,11 +175,13 @@ def _verify_runs_table(
         return doubts
     for name, rows in runs.groupby("target", sort=False):
         doubts += _verify_errors(problem, targets[str(name)], rows)
-    say(f"runs.parquet: {len(targets)} targets drawn again, {len(runs)} rows compared with them")
-    shown = _select_rows(runs, MAX_RESIMULATED_ROWS if not every else len(runs))
-    for name, rows in shown.groupby("target", sort=False):
+    print_line(
+        f"runs.parquet: {len(targets)} targets drawn again, {len(runs)} rows compared with them"
+    )
+    checked_rows = _select_rows(runs, MAX_RESIMULATED_ROWS if not is_every_row else len(runs))
+    for name, rows in checked_rows.groupby("target", sort=False):
         doubts += _verify_losses(problem, targets[str(name)], rows)
-    say(f"runs.parquet: {len(shown)} of {len(runs)} rows simulated again")
+    print_line(f"runs.parquet: {len(checked_rows)} of {len(runs)} rows simulated again")
     doubts += [
         VerificationFailure(
             "runs.parquet", int(row) + 1, f"trusted: expected {problem.experiment.trusted}"
@@ -235,14 +237,14 @@ def _verify_losses(
         ("heldout_error", target.blinded.held_out),
     ):
         # A run that ended before its first result has no error.
-        there = rows[column].notna().to_numpy()
-        if side.scenarios and there.any():
+        has_value = rows[column].notna().to_numpy()
+        if side.scenarios and has_value.any():
             rmse = ProposalEvaluator(problem, side).compute_rmse(
-                recommended[:0], recommended[there]
+                recommended[:0], recommended[has_value]
             )
             typical = _SIMULATION_TOLERANCE * float(problem.scale[channel])
             yield from _find_first_difference(
-                rows[there], column, rmse[:, channel], _SIMULATION_TOLERANCE, typical
+                rows[has_value], column, rmse[:, channel], _SIMULATION_TOLERANCE, typical
             )
 
 
@@ -283,12 +285,12 @@ def _select_rows(runs: pd.DataFrame, max_count: int) -> pd.DataFrame:
 
 
 def _verify_tables(
-    folder: Path, stored: StoredComparison, say: PrintLine
+    folder: Path, stored: StoredComparison, print_line: PrintLine
 ) -> list[VerificationFailure]:
     """Verify that table.csv follows from the rows, and return the failures."""
     path = folder / "table.csv"
     if not path.exists():
-        say("table.csv: none; simgap plot writes it")
+        print_line("table.csv: none; simgap plot writes it")
         return []
     stored_table = pd.read_csv(path, keep_default_na=True)
     expected = build_tables(stored)["table"]
@@ -325,5 +327,5 @@ def _verify_tables(
             place = int(np.argmin(is_equal))
             message = f"{column}: expected {a[place]}, found {b[place]}"
             failures.append(VerificationFailure(path.name, int(lines[place]) + 2, message))
-    say(f"table.csv: {len(stored_table)} rows made again from runs.parquet")
+    print_line(f"table.csv: {len(stored_table)} rows made again from runs.parquet")
     return failures

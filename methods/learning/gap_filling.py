@@ -59,12 +59,12 @@ def fill_gaps(channel: Array, simulated: Array) -> Array:
     y = _scale_like(channel, channel[is_present])
     table = np.stack([np.ones_like(x), x, -x * y], axis=1)[is_present]
     a, b, c = _fit_camera_line(table, y[is_present])
-    below = 1 + c * x
+    denominator = 1 + c * x
     # A change of sign would put a part of the run behind the camera.
-    if not (below > _MIN_DENOMINATOR).all():
+    if not (denominator > _MIN_DENOMINATOR).all():
         return channel
-    mapped = (a + b * x) / below  # (1)
-    unscaled = mapped * float(channel[is_present].std()) + float(channel[is_present].mean())
+    scaled_values = (a + b * x) / denominator  # (1)
+    unscaled = scaled_values * float(channel[is_present].std()) + float(channel[is_present].mean())
     result: Array = np.where(is_present, channel, unscaled)
     return result
 
@@ -88,9 +88,9 @@ def _fit_camera_line(table: Array, values: Array) -> Array:
     return numbers
 
 
-def _scale_like(values: Array, some: Array) -> Array:
-    """Return values in standard deviations from the mean, both computed from `some` of them."""
-    spread = float(some.std())
+def _scale_like(values: Array, reference: Array) -> Array:
+    """Return values in standard deviations of `reference` from the mean of `reference`."""
+    spread = float(reference.std())
     divisor = spread if spread > 0 else 1.0
-    result: Array = (values - float(some.mean())) / divisor
+    result: Array = (values - float(reference.mean())) / divisor
     return result

@@ -97,8 +97,8 @@ class GaussianProcess:
         Returns:
             Correlations (n, m) and derivatives (n, m).
         """
-        chosen = self.hyper if hyper is None else hyper
-        lengths = chosen[:-1]
+        hyperparameters = self.hyper if hyper is None else hyper
+        lengths = hyperparameters[:-1]
         scaled = squares @ np.exp(-2.0 * lengths)
         if self.settings.kernel == "rbf":
             k = np.exp(-0.5 * scaled)  # (4.9)
@@ -186,9 +186,9 @@ class GaussianProcess:
         from scipy.linalg import solve_triangular
 
         to_known = (points[:, None] - self.points) ** 2
-        among = (points[:, None] - points) ** 2
+        squared_distances = (points[:, None] - points) ** 2
         cross, _ = self._compute_correlation(to_known)
-        prior, _ = self._compute_correlation(among)
+        prior, _ = self._compute_correlation(squared_distances)
         explained = solve_triangular(self._lower, cross.T, lower=True)
         spread = _compute_cholesky_factor(prior - explained.T @ explained, 1e-10)  # (2.26)
         noise = rng.standard_normal((draws, len(points)))

@@ -100,24 +100,26 @@ def train_history_transformer(
 
     with deterministic_training(), torch.enable_grad():
         generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
-        named = get_weight_shapes(material.shown.shape[-1], material.parameters.shape[-1], design)
-        w = _draw_initial_weights(named, generator)
+        shapes_by_name = get_weight_shapes(
+            material.shown.shape[-1], material.parameters.shape[-1], design
+        )
+        w = _draw_initial_weights(shapes_by_name, generator)
         _minimise_loss(w, material, drawn, design, rng, watched)
         return {name: v.detach().numpy().astype(np.float64) for name, v in w.items()}
 
 
 def _draw_initial_weights(
-    named: dict[str, tuple[int, ...]], generator: torch.Generator
+    shapes_by_name: dict[str, tuple[int, ...]], generator: torch.Generator
 ) -> dict[str, Any]:
     """Draw initial weights uniform in +- gain / sqrt(inputs); biases are zero.
 
-    `named` has the shape of each array. Layers whose output is added to another value (names that
-    begin with one of `_SUMMED`) get a smaller gain.
+    `shapes_by_name` has the shape of each array. Layers whose output is added to another value
+    (names that begin with one of `_SUMMED`) get a smaller gain.
     """
     import torch
 
     w: dict[str, Any] = {}
-    for name, shape in named.items():
+    for name, shape in shapes_by_name.items():
         gain = _SPREAD if name.endswith("weight") else 0.0
         if name.startswith(_SUMMED):
             gain *= _SMALL
@@ -130,21 +132,21 @@ def _draw_initial_weights(
 def _minimise_loss(
     w: dict[str, Any],
     material: TrainingHistories,
-    drawn: Callable[[np.random.Generator], HistoryIndices],
+    draw_histories: Callable[[np.random.Generator], HistoryIndices],
     design: HistoryTransformerDesign,
     rng: np.random.Generator,
-    watched: HistoryValidationMonitor | None,
+    monitor: HistoryValidationMonitor | None,
 ) -> None:
     """Minimise the loss with Adam; the weights are changed in place.
 
     The learning rate falls to zero along half a cosine. `w` are the weights, `material` the
-    training simulations, and `drawn` draws the histories of one batch. `watched` gets the losses on
-    training and held-out data after each epoch; None for none.
+    training simulations, and `draw_histories` draws the histories of one batch. `monitor` gets the
+    losses on training and held-out data after each epoch; None for none.
     """
     import torch
 
     parts = material.to_tensors()
-    apart = watched and watched.material.to_tensors()
+    watched_parts = monitor and monitor.material.to_tensors()
     # torch's weight_decay is the gradient of half of it times the squared norm.
     decay = 2.0 * design.weight_decay
     optimiser: Any = torch.optim.Adam(list(w.values()), design.rate, weight_decay=decay, fused=True)
@@ -157,41 +159,41 @@ def _minimise_loss(
         for first in range(0, len(order), design.batch):
             batch = order[first : first + design.batch]
             optimiser.zero_grad()
-            error = _compute_loss(w, design, [part[batch] for part in parts], drawn(rng))
+            error = _compute_loss(w, design, [part[batch] for part in parts], draw_histories(rng))
             error.backward()
             optimiser.step()
             losses.append(error.detach())
-        if watched and apart:
+        if monitor and watched_parts:
             # A separate random stream keeps the training independent of the evaluation.
-            chosen = drawn(np.random.default_rng(0))
+            histories = draw_histories(np.random.default_rng(0))
             with torch.no_grad():
-                held_out = float(_compute_loss(w, design, apart, chosen))
+                held_out = float(_compute_loss(w, design, watched_parts, histories))
                 training = float(torch.stack(losses).mean())
-            watched.epoch(epoch + 1, design.epochs, training, held_out)
+            monitor.epoch(epoch + 1, design.epochs, training, held_out)
 
 
 def _compute_loss(
-    w: dict[str, Any], design: HistoryTransformerDesign, parts: list[Any], chosen: HistoryIndices
+    w: dict[str, Any], design: HistoryTransformerDesign, parts: list[Any], histories: HistoryIndices
 ) -> Any:
     """Compute the mean squared error of the proposals: loss (1), or (2) if published.
 
     (1) compares each proposal with the target's parameters, relative to the distance of the
     simulation before; (2) compares it with the next point of the history. `parts` are input rows
-    without and with noise, and parameters, of one batch of scenarios; `chosen` are the indices of
-    the simulations that form each history and of its target.
+    without and with noise, and parameters, of one batch of scenarios; `histories` are the indices
+    of the simulations that form each history and of its target.
     """
     import torch
 
-    shown, target, parameters = parts
-    seen = (shown @ w["seen.weight"])[:, chosen.tried]
-    aim = (target @ w["seen.weight"])[:, chosen.targets]
-    tried = parameters[:, chosen.tried]
-    truth = parameters[:, chosen.targets][:, :, None]
-    out = predict_proposals(torch, w, design, aim, seen, tried)
+    simulations, target, parameters = parts
+    tokens = (simulations @ w["seen.weight"])[:, histories.tried]
+    aim = (target @ w["seen.weight"])[:, histories.targets]
+    proposed = parameters[:, histories.tried]
+    truth = parameters[:, histories.targets][:, :, None]
+    proposals = predict_proposals(torch, w, design, aim, tokens, proposed)
     if design.published:
-        return ((out[:, :, 1:-1] - tried[:, :, 1:]) ** 2).mean()  # (2)
-    squares = ((out - truth) ** 2).sum(dim=-1)
+        return ((proposals[:, :, 1:-1] - proposed[:, :, 1:]) ** 2).mean()  # (2)
+    squares = ((proposals - truth) ** 2).sum(dim=-1)
     # Small distances matter in the last steps of tuning, so they must have enough weight.
-    distances = ((tried - truth) ** 2).sum(dim=-1) + design.relative**2
+    distances = ((proposed - truth) ** 2).sum(dim=-1) + design.relative**2
     parts = [squares[:, :, :1], squares[:, :, 1:] / distances * _TAMED]
     return torch.cat(parts, dim=2).mean()  # (1)

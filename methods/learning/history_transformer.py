@@ -82,13 +82,13 @@ def get_weight_shapes(
     layers["guess"] = width, dim
     layers["next"] = width, dim if design.published else dim * (d + 1)
     # The projection has no bias, because a bias would cancel in every difference.
-    named: dict[str, tuple[int, ...]] = {"seen.weight": (inputs, d)}
+    shapes_by_name: dict[str, tuple[int, ...]] = {"seen.weight": (inputs, d)}
     for layer, (fan_in, fan_out) in layers.items():
-        named[f"{layer}.weight"] = fan_in, fan_out
-        named[f"{layer}.bias"] = (fan_out,)
+        shapes_by_name[f"{layer}.weight"] = fan_in, fan_out
+        shapes_by_name[f"{layer}.bias"] = (fan_out,)
     for block in range(design.blocks):
-        named[f"lag{block}.bias"] = (design.window + 1,)
-    return named
+        shapes_by_name[f"lag{block}.bias"] = (design.window + 1,)
+    return shapes_by_name
 
 
 def predict_proposals(
@@ -114,14 +114,22 @@ def predict_proposals(
     Returns:
         (..., k + 1, dim) proposals, in half widths from the middle.
     """
-    here = target[..., None, :]
-    far = shown - here
-    size = xp.sqrt((far**2).mean(axis=-1, keepdims=True) + _STILL**2)
-    unit = far / size  # (1)
-    known = [unit, xp.log(size + _SIGMA_ZERO), tried, xp.broadcast_to(here, far.shape)]
-    tokens = xp.concatenate([*known, *_compute_step_features(xp, far, tried)], axis=-1)  # (3)
+    target_row = target[..., None, :]
+    differences = shown - target_row
+    size = xp.sqrt((differences**2).mean(axis=-1, keepdims=True) + _STILL**2)
+    unit = differences / size  # (1)
+    base_features = [
+        unit,
+        xp.log(size + _SIGMA_ZERO),
+        tried,
+        xp.broadcast_to(target_row, differences.shape),
+    ]
+    tokens = xp.concatenate(
+        [*base_features, *_compute_step_features(xp, differences, tried)], axis=-1
+    )  # (3)
     h = xp.concatenate(
-        [_apply_linear_layer(w, "first", here), _apply_linear_layer(w, "token", tokens)], axis=-2
+        [_apply_linear_layer(w, "first", target_row), _apply_linear_layer(w, "token", tokens)],
+        axis=-2,
     )
     for block in range(design.blocks):
         h = h + _compute_causal_attention(xp, w, block, h)  # (4)
@@ -129,29 +137,29 @@ def predict_proposals(
             w, f"outer{block}", _compute_swish(xp, _apply_linear_layer(w, f"inner{block}", h))
         )
     guess = _apply_linear_layer(w, "guess", h[..., :1, :])
-    following = _apply_linear_layer(w, "next", h[..., 1:, :])
+    next_proposals = _apply_linear_layer(w, "next", h[..., 1:, :])
     if not design.published:
-        gain = following.reshape(*tried.shape, unit.shape[-1] + 1)
-        along = (gain[..., :-1] * unit[..., None, :]).sum(axis=-1)
-        following = tried + size * (along + gain[..., -1])  # (5)
-    return xp.concatenate([guess, following], axis=-2)
+        gain = next_proposals.reshape(*tried.shape, unit.shape[-1] + 1)
+        direction_sum = (gain[..., :-1] * unit[..., None, :]).sum(axis=-1)
+        next_proposals = tried + size * (direction_sum + gain[..., -1])  # (5)
+    return xp.concatenate([guess, next_proposals], axis=-2)
 
 
-def _compute_step_features(xp: Any, far: Any, tried: Any) -> tuple[Any, Any]:
+def _compute_step_features(xp: Any, differences: Any, proposed: Any) -> tuple[Any, Any]:
     """Compute the direction of each step, and the slope (2): change of the difference per length.
 
     Both are zero for the first simulation, which has no step before it. `xp` is numpy or torch,
-    `far` the projected differences d of (1) and `tried` the points e, both with one row per
-    simulation. The slope is returned as arsinh, because it can be very large.
+    `differences` the projected differences d of (1) and `proposed` the points e, both with one row
+    per simulation. The slope is returned as arsinh, because it can be very large.
     """
-    step = tried[..., 1:, :] - tried[..., :-1, :]
+    step = proposed[..., 1:, :] - proposed[..., :-1, :]
     length = xp.sqrt((step**2).sum(axis=-1, keepdims=True) + _STILL**2)
-    slope = (far[..., 1:, :] - far[..., :-1, :]) / length  # (2)
+    slope = (differences[..., 1:, :] - differences[..., :-1, :]) / length  # (2)
 
     def begun(like: Any, rest: Any) -> Any:
         return xp.concatenate([xp.zeros_like(like[..., :1, :]), rest], axis=-2)
 
-    return begun(tried, step / length), begun(far, xp.arcsinh(slope))
+    return begun(proposed, step / length), begun(differences, xp.arcsinh(slope))
 
 
 def _compute_causal_attention(xp: Any, w: dict[str, Any], block: int, h: Any) -> Any:
@@ -162,8 +170,8 @@ def _compute_causal_attention(xp: Any, w: dict[str, Any], block: int, h: Any) ->
     tokens.
     """
     count, width = h.shape[-2:]
-    heard = _apply_linear_layer(w, f"heard{block}", h)
-    query, key = heard[..., :width], heard[..., width : 2 * width]
+    projections = _apply_linear_layer(w, f"heard{block}", h)
+    query, key = projections[..., :width], projections[..., width : 2 * width]
     lag = np.arange(count)[:, None] - np.arange(count)
     later = xp.asarray(np.where(lag < 0, _CAUSAL_MASK_OFFSET, 0.0).astype(np.float32))
     score = query @ key.swapaxes(-1, -2) / width**0.5 + w[f"lag{block}.bias"][np.maximum(lag, 0)]
@@ -171,7 +179,7 @@ def _compute_causal_attention(xp: Any, w: dict[str, Any], block: int, h: Any) ->
     # The largest score is subtracted, so that the exponentials do not overflow.
     share = xp.exp(score - xp.amax(score, -1)[..., None])
     share = share / share.sum(axis=-1, keepdims=True)
-    return _apply_linear_layer(w, f"mixed{block}", share @ heard[..., 2 * width :])
+    return _apply_linear_layer(w, f"mixed{block}", share @ projections[..., 2 * width :])
 
 
 def _apply_linear_layer(w: dict[str, Any], layer: str, x: Any) -> Any:

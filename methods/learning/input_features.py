@@ -60,8 +60,8 @@ class FeatureConfig:
         """
         if self.channels is None:
             return observations
-        most = observations.shape[-1] - 1
-        first, last = (min(channel, most) for channel in self.channels)
+        last_channel = observations.shape[-1] - 1
+        first, last = (min(channel, last_channel) for channel in self.channels)
         return observations[..., first : last + 1]
 
 
@@ -94,20 +94,22 @@ class InputFeatures:
                 reading,
                 make_raw_features(data.flattened_observations, data.lengths, reading.points),
             )
-        told = None
+        scenario_features = None
         if reading.use_scenario_features:
-            told = ScenarioFeatures.fit(data.scenes, data.observations, data.lengths)
+            scenario_features = ScenarioFeatures.fit(data.scenes, data.observations, data.lengths)
         # If inputs vary, samples have another meaning in each scenario, so only responses are used.
-        driven = told is not None and told.has_varying_inputs
-        most = 0 if driven else reading.inputs
-        seen = make_weighted_features(data, reading.points, most, reading.strictness)
-        return cls(reading, seen, told)
+        driven = scenario_features is not None and scenario_features.has_varying_inputs
+        input_count = 0 if driven else reading.inputs
+        observation_features = make_weighted_features(
+            data, reading.points, input_count, reading.strictness
+        )
+        return cls(reading, observation_features, scenario_features)
 
     @property
     def feature_count(self) -> int:
         """Length of an input row."""
-        told = 0 if self.told is None else self.told.centre.size
-        return self.seen.chosen.size + told
+        scenario_size = 0 if self.told is None else self.told.centre.size
+        return self.seen.chosen.size + scenario_size
 
     def __call__(
         self,
@@ -176,24 +178,36 @@ class InputFeatures:
         Raises:
             ValueError: arrays are missing or have other shapes, or numbers that are not finite.
         """
-        rest = {name: np.array(array, dtype=np.float64) for name, array in state.items()}
+        remaining_arrays = {
+            name: np.array(array, dtype=np.float64) for name, array in state.items()
+        }
         names = [f"inputs.{name}" for name in _OBSERVATION_FEATURE_ARRAYS]
-        if any(name.startswith("told.") for name in rest):
+        if any(name.startswith("told.") for name in remaining_arrays):
             names += [f"told.{name}" for name in _SCENARIO_FEATURE_ARRAYS]
         # The shape of one array of each part determines the shapes of the others.
-        sizes = {part: rest.get(f"{part}.centre", _NONE).shape for part in ("inputs", "told")}
+        sizes = {
+            part: remaining_arrays.get(f"{part}.centre", _NONE).shape for part in ("inputs", "told")
+        }
         for name in names:
             shape = () if name == "told.initial" else sizes[name.partition(".")[0]]
-            if name not in rest:
+            if name not in remaining_arrays:
                 raise ValueError(f"expected array {name}, found {sorted(state)[:4]}")
-            array = rest[name]
+            array = remaining_arrays[name]
             if array.shape != shape or len(shape) > 1 or not np.isfinite(array).all():
                 raise ValueError(
                     f"array {name}: expected finite numbers of shape {shape}, found {array.shape}"
                 )
         if not sizes["inputs"][0] + sum(sizes["told"]):
             raise ValueError("expected a network that reads something, found one without inputs")
-        chosen, centre, gain, *own = (rest.pop(name) for name in names)
-        seen = ObservationFeatures(reading.points, reading.raw, chosen, centre, gain)
-        told = ScenarioFeatures(own[0], own[1], int(own[2])) if own else None
-        return cls(reading, seen, told), rest
+        chosen_numbers, centre, gain, *scenario_arrays = (
+            remaining_arrays.pop(name) for name in names
+        )
+        observation_features = ObservationFeatures(
+            reading.points, reading.raw, chosen_numbers, centre, gain
+        )
+        scenario_features = (
+            ScenarioFeatures(scenario_arrays[0], scenario_arrays[1], int(scenario_arrays[2]))
+            if scenario_arrays
+            else None
+        )
+        return cls(reading, observation_features, scenario_features), remaining_arrays

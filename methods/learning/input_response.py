@@ -62,38 +62,38 @@ def compute_response_coefficients(
         if length < _LEAST:
             continue
         # Resampling to the run's own length fills missing samples and changes nothing else.
-        whole = resample_runs(observations[:, run], (length,), length)
-        series = np.nan_to_num(whole).transpose(0, 2, 1)
+        resampled = resample_runs(observations[:, run], (length,), length)
+        series = np.nan_to_num(resampled).transpose(0, 2, 1)
         coefficients.append(_compute_run_response(series, inputs[run]))
     return np.concatenate(coefficients, axis=1)
 
 
 def _compute_run_response(series: Array, inputs: Array) -> Array:
     """Compute the coefficients (n, C * R) of one run from series (n, T, C) and inputs (T, U)."""
-    half = max(3, series.shape[1] // (2 * _BUMPS_PER_RUN))
-    width = half + 1
-    s = np.arange(-half, half + 1) / (half + 1.0)
-    inside = 1 - s**2
-    bump = inside**4  # (3)
+    half_width = max(3, series.shape[1] // (2 * _BUMPS_PER_RUN))
+    bump_width = half_width + 1
+    s = np.arange(-half_width, half_width + 1) / (half_width + 1.0)
+    parabola = 1 - s**2
+    bump = parabola**4  # (3)
     # Derivatives w' and w'' of the bump, per sample.
-    slope = -8 * s * inside**3 / width
-    bend = (48 * s**2 * inside**2 - 8 * inside**3) / width**2
-    stride = max(1, half // 4)
+    slope = -8 * s * parabola**3 / bump_width
+    bend = (48 * s**2 * parabola**2 - 8 * parabola**3) / bump_width**2
+    stride = max(1, half_width // 4)
 
     def integral(signal: Array, kernel: Array) -> Array:
         windows = sliding_window_view(signal, len(s), axis=1)[:, ::stride]
         return np.asarray(windows @ kernel, dtype=np.float64)
 
     # An input is constant until the next sample, so around a sample it is the mean of two values.
-    earlier = np.concatenate([inputs[:1], inputs[:-1]])
-    held = (inputs + earlier) / 2.0
-    driven = np.broadcast_to(held, (len(series), *inputs.shape))
+    earlier_inputs = np.concatenate([inputs[:1], inputs[:-1]])
+    held_inputs = (inputs + earlier_inputs) / 2.0
+    driven = np.broadcast_to(held_inputs, (len(series), *inputs.shape))
     constant = np.ones_like(driven[..., :1])
     # All terms of (1) except the last one, which needs the derivative w'.
-    plain = np.concatenate(
+    signals = np.concatenate(
         [constant, series, series**3, _compute_smoothed_velocity_signs(series), driven], axis=2
     )
-    regressors = np.concatenate([integral(plain, bump), -integral(series, slope)], axis=2)  # (2)
+    regressors = np.concatenate([integral(signals, bump), -integral(series, slope)], axis=2)  # (2)
     accelerations = integral(series, bend)  # (2)
     return _fit_ridge_regression(regressors, accelerations).reshape(len(series), -1)
 
@@ -118,9 +118,9 @@ def _fit_ridge_regression(regressors: Array, values: Array) -> Array:
     # Scaled to mean square 1, so that the ridge has the same effect on every regressor.
     size = np.sqrt((regressors**2).mean(axis=1, keepdims=True)) + _ZERO
     scaled = regressors / size
-    across = scaled.transpose(0, 2, 1)
+    transposed = scaled.transpose(0, 2, 1)
     count = scaled.shape[1]
     ridge = _RIDGE * np.eye(scaled.shape[2])
-    normal = across @ scaled / count + ridge
-    coefficients = np.linalg.solve(normal, across @ values / count)
+    normal = transposed @ scaled / count + ridge
+    coefficients = np.linalg.solve(normal, transposed @ values / count)
     return np.asarray(coefficients / size.transpose(0, 2, 1), dtype=np.float64)

@@ -76,8 +76,10 @@ class NoiseMatchedNetworks(Generic[Learner]):
             learn: function that trains a network.
         """
         spread = data.flattened_observations.std(axis=(0, 1))
-        own = estimate_noise_sigma(data.flattened_observations, data.lengths).max(axis=0)
-        limit = _CLEAN_ROUGHNESS_FACTOR * own + reading.noise / _NOISE_SHARE_THRESHOLD * spread
+        data_noise = estimate_noise_sigma(data.flattened_observations, data.lengths).max(axis=0)
+        limit = (
+            _CLEAN_ROUGHNESS_FACTOR * data_noise + reading.noise / _NOISE_SHARE_THRESHOLD * spread
+        )
 
         def noisy() -> Learner:
             noise = reading.noise * spread
@@ -88,13 +90,13 @@ class NoiseMatchedNetworks(Generic[Learner]):
         if reading.noise and not reading.clean:
             network = noisy()
             return cls(network, network, limit)
-        clean = learn("clean", data, None)
-        return cls(clean, noisy() if reading.noise else clean, limit)
+        clean_network = learn("clean", data, None)
+        return cls(clean_network, noisy() if reading.noise else clean_network, limit)
 
     def select_for(self, task: Task) -> Learner:
         """Return the network for a target, chosen by the target's roughness."""
-        rough = estimate_noise_sigma(task.observed[None], task.lengths)[0]
-        return self.noisy if (rough > self.limit).any() else self.clean
+        roughness = estimate_noise_sigma(task.observed[None], task.lengths)[0]
+        return self.noisy if (roughness > self.limit).any() else self.clean
 
     def to_arrays(self) -> dict[str, Array]:
         """Return everything as plain arrays by name."""
@@ -122,24 +124,25 @@ class NoiseMatchedNetworks(Generic[Learner]):
         """
         parts: dict[str, dict[str, Array]] = {"clean": {}, "noisy": {}, "limit": {}}
         for name, array in state.items():
-            part, _, rest = name.partition(".")
+            part, _, array_name = name.partition(".")
             if part not in parts:
                 raise ValueError(f"expected arrays of {sorted(parts)}, found {name}")
-            parts[part][rest] = array
+            parts[part][array_name] = array
         limit = np.array(parts["limit"].get("", np.nan), dtype=np.float64)
         if limit.ndim != 1 or not np.isfinite(limit).all():
             raise ValueError(
                 "array limit: expected finite numbers of shape (channels,), "
                 f"found shape {limit.shape}"
             )
-        two = bool(reading.noise) and reading.clean
-        if two != bool(parts["noisy"]):
+        has_two_networks = bool(reading.noise) and reading.clean
+        if has_two_networks != bool(parts["noisy"]):
             raise ValueError(
-                f"expected {'two networks' if two else 'one network'}, found another number of them"
+                f"expected {'two networks' if has_two_networks else 'one network'}, found another "
+                "number of them"
             )
-        clean = restore(parts["clean"])
-        noisy = restore(parts["noisy"]) if two else clean
-        return cls(clean, noisy, limit)
+        clean_network = restore(parts["clean"])
+        noisy_network = restore(parts["noisy"]) if has_two_networks else clean_network
+        return cls(clean_network, noisy_network, limit)
 
 
 def add_noise_to_held_out(apart: TrainingData, noise: Array | None) -> TrainingData:

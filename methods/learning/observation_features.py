@@ -63,39 +63,39 @@ def resample_runs(observations: Array, lengths: tuple[int, ...], points: int) ->
         raise ValueError(
             f"runs of {lengths} samples add up to {sum(lengths)}, the observation has {samples}"
         )
-    out = np.empty((n, len(lengths), channels, points))
+    resampled = np.empty((n, len(lengths), channels, points))
     first = 0
     for run, length in enumerate(lengths):
         series = observations[:, first : first + length].transpose(0, 2, 1)
         first += length
         # Interpolation at the samples would return them; most runs need no interpolation.
         if length == points and not np.isnan(series).any():
-            out[:, run] = series
+            resampled[:, run] = series
             continue
         samples = np.arange(length)
-        at = np.linspace(0, length - 1, points)
+        positions = np.linspace(0, length - 1, points)
         for i in range(n):
             for c in range(channels):
-                out[i, run, c] = _interpolate_channel(at, samples, series[i, c])
-    return out.reshape(n, len(lengths) * channels, points)
+                resampled[i, run, c] = _interpolate_channel(positions, samples, series[i, c])
+    return resampled.reshape(n, len(lengths) * channels, points)
 
 
-def _interpolate_channel(at: Array, samples: NDArray[np.intp], values: Array) -> Array:
+def _interpolate_channel(positions: Array, samples: NDArray[np.intp], values: Array) -> Array:
     """Interpolate linearly between available samples of one channel of one run.
 
     Args:
-        at: (points,) sample indices at which values are computed; they need not be whole.
+        positions: (points,) sample indices at which values are computed; they need not be whole.
         samples: (T,) indices of the samples.
         values: (T,) samples; NaN for missing ones.
 
     Returns:
         (points,) values; NaN if all samples are missing.
     """
-    there = ~np.isnan(values)
-    if not there.any():
-        return np.full(len(at), np.nan)
-    between: Array = np.interp(at, samples[there], values[there])
-    return between
+    is_available = ~np.isnan(values)
+    if not is_available.any():
+        return np.full(len(positions), np.nan)
+    interpolated: Array = np.interp(positions, samples[is_available], values[is_available])
+    return interpolated
 
 
 def compute_descriptors(series: Array) -> Array:
@@ -134,26 +134,26 @@ def estimate_noise_sigma(observations: Array, lengths: tuple[int, ...]) -> Array
         (n, C) noise in SI units: for each channel the largest one of all runs, 0 if no run has four
         successive samples.
     """
-    out = np.zeros((observations.shape[0], observations.shape[2]))
+    sigmas = np.zeros((observations.shape[0], observations.shape[2]))
     for run in np.split(observations, np.cumsum(lengths)[:-1], axis=1):
         # Third differences of a parabola are zero, so those of smooth motion are small.
         thirds = np.abs(np.diff(run, n=3, axis=1))
         count = min(_PARTS, max(1, thirds.shape[1] // _LEAST_PART))
         parts = np.array_split(thirds, count, axis=1)
-        for i, c in np.ndindex(out.shape):
-            calmest = _compute_min_part_median([part[i, :, c] for part in parts])
-            noise = calmest / (_NORMAL * _THIRD)
-            out[i, c] = max(float(out[i, c]), noise)
-    return out
+        for i, c in np.ndindex(sigmas.shape):
+            min_median = _compute_min_part_median([part[i, :, c] for part in parts])
+            noise = min_median / (_NORMAL * _THIRD)
+            sigmas[i, c] = max(float(sigmas[i, c]), noise)
+    return sigmas
 
 
 def _compute_min_part_median(parts: list[Array]) -> float:
     """Return the smallest median of the parts, without NaN; 0 if there are no values."""
     medians = []
     for part in parts:
-        there = part[~np.isnan(part)]
-        if there.size:
-            medians.append(float(np.median(there)))
+        available_values = part[~np.isnan(part)]
+        if available_values.size:
+            medians.append(float(np.median(available_values)))
     return min(medians, default=0.0)
 
 
@@ -188,25 +188,25 @@ class ObservationFeatures:
         if not self.chosen.size:
             return np.empty((len(observations), 0))
         rows = _compute_feature_rows(observations, lengths, self.points, self.plain)
-        chosen = self.chosen.astype(np.intp)
-        if chosen.max() >= rows.shape[1]:
+        chosen_numbers = self.chosen.astype(np.intp)
+        if chosen_numbers.max() >= rows.shape[1]:
             raise ValueError(
-                f"the network reads number {chosen.max()} of an observation, "
+                f"the network reads number {chosen_numbers.max()} of an observation, "
                 f"this one gives {rows.shape[1]}; "
                 "train on observations of the same runs and channels"
             )
-        centred = rows[:, chosen] - self.centre
+        centred = rows[:, chosen_numbers] - self.centre
         scaled = centred * self.gain
         # A series without any sample is replaced by its mean.
         return np.nan_to_num(scaled)
 
 
 def _compute_feature_rows(
-    observations: Array, lengths: tuple[int, ...], points: int, plain: bool
+    observations: Array, lengths: tuple[int, ...], points: int, is_raw: bool
 ) -> Array:
     """Compute all candidate numbers (n, D) of observations (n, T, C)."""
     series = resample_runs(observations, lengths, points)
-    return series.reshape(len(series), -1) if plain else compute_descriptors(series)
+    return series.reshape(len(series), -1) if is_raw else compute_descriptors(series)
 
 
 def make_raw_features(
@@ -219,9 +219,9 @@ def make_raw_features(
         lengths: number of samples of each run.
         points: number of points to which each run is resampled.
     """
-    size = _compute_feature_rows(observations[:1], lengths, points, plain=True).shape[1]
-    every = np.arange(size, dtype=np.float64)
-    return ObservationFeatures(points, True, every, np.zeros(size), np.ones(size))
+    size = _compute_feature_rows(observations[:1], lengths, points, is_raw=True).shape[1]
+    indices = np.arange(size, dtype=np.float64)
+    return ObservationFeatures(points, True, indices, np.zeros(size), np.ones(size))
 
 
 def make_weighted_features(
@@ -245,38 +245,40 @@ def make_weighted_features(
     Returns:
         The inputs; their mean square over the training data is 1.
     """
-    rows = _compute_feature_rows(data.flattened_observations, data.lengths, points, plain=False)
+    rows = _compute_feature_rows(data.flattened_observations, data.lengths, points, is_raw=False)
     grouped = rows.reshape(*data.parameters.shape[:2], -1)
-    spread, explained, left = _compute_sensitivities(data.parameters, grouped)
+    spread, explained, unexplained = _compute_sensitivities(data.parameters, grouped)
     deviation = rows.std(axis=0)
-    between = grouped.mean(axis=1).std(axis=0)
+    scenario_spread = grouped.mean(axis=1).std(axis=0)
     floor = _EXACT * max(float(deviation.max()), _ZERO)
-    faith = explained / (explained + strictness * left + floor)  # (2)
-    best = faith.max(axis=1, keepdims=True)
-    share = faith / np.where(best > 0, best, 1.0)
-    following = np.max(share**2, axis=0)  # (3)
-    context = (between / (between + strictness * spread + floor)) ** 2  # (4)
+    reliability = explained / (explained + strictness * unexplained + floor)  # (2)
+    best = reliability.max(axis=1, keepdims=True)
+    share = reliability / np.where(best > 0, best, 1.0)
+    parameter_weight = np.max(share**2, axis=0)  # (3)
+    context = (scenario_spread / (scenario_spread + strictness * spread + floor)) ** 2  # (4)
     # A stable sort chooses the same numbers on every machine if weights are equal.
-    order = np.argsort(-np.maximum(following, context), kind="stable")
-    chosen = np.sort(order[:most])
-    by_parameters = _compute_weight_per_deviation(following[chosen], spread[chosen])
-    by_context = _compute_weight_per_deviation(context[chosen], deviation[chosen])
+    order = np.argsort(-np.maximum(parameter_weight, context), kind="stable")
+    chosen_numbers = np.sort(order[:most])
+    by_parameters = _compute_weight_per_deviation(
+        parameter_weight[chosen_numbers], spread[chosen_numbers]
+    )
+    by_context = _compute_weight_per_deviation(context[chosen_numbers], deviation[chosen_numbers])
     gain = np.maximum(by_parameters, by_context)
     # The network's initial weights and learning rate assume inputs of mean square 1.
-    size = np.sqrt(np.mean((gain * deviation[chosen]) ** 2)) if most else 1.0
+    size = np.sqrt(np.mean((gain * deviation[chosen_numbers]) ** 2)) if most else 1.0
     return ObservationFeatures(
         points,
         False,
-        chosen.astype(np.float64),
-        rows[:, chosen].mean(axis=0),
+        chosen_numbers.astype(np.float64),
+        rows[:, chosen_numbers].mean(axis=0),
         gain / size if size > 0 else gain,
     )
 
 
 def _compute_weight_per_deviation(weight: Array, deviation: Array) -> Array:
     """Return the weight per unit of deviation, limited for small deviations."""
-    least = _LEAST_DEVIATION * deviation.max(initial=0.0)
-    scaled: Array = weight / (deviation + least + _ZERO)
+    min_deviation = _LEAST_DEVIATION * deviation.max(initial=0.0)
+    scaled: Array = weight / (deviation + min_deviation + _ZERO)
     return scaled
 
 
@@ -293,17 +295,17 @@ def _compute_sensitivities(parameters: Array, rows: Array) -> tuple[Array, Array
     # A fit with 1 + dim free numbers leaves this share of the variance of pure noise.
     free = max(each - 1 - dim, 1) / each
     total = np.zeros(count)
-    rest = np.zeros(count)
+    residual_variance = np.zeros(count)
     explained = np.zeros((dim, count))
     for delta, values in zip(offsets, rows, strict=True):
         centred = values - values.mean(axis=0)
         slopes = np.linalg.lstsq(delta, centred, rcond=None)[0]  # (1)
         left_over = centred - delta @ slopes
         total += np.mean(centred**2, axis=0)
-        rest += np.mean(left_over**2, axis=0) / free
+        residual_variance += np.mean(left_over**2, axis=0) / free
         explained += np.mean(delta**2, axis=0)[:, None] * slopes**2
     return (
         np.sqrt(total / scenarios),
         np.sqrt(explained / scenarios),
-        np.sqrt(rest / scenarios),
+        np.sqrt(residual_variance / scenarios),
     )

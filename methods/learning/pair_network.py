@@ -110,11 +110,11 @@ def get_weight_shapes(inputs: tuple[int, int], width: int, dim: int) -> dict[str
         (2 * width, width),
         (width, dim),
     )
-    named: dict[str, tuple[int, ...]] = {}
+    shapes_by_name: dict[str, tuple[int, ...]] = {}
     for layer, (fan_in, fan_out) in zip(LAYER_NAMES, sizes, strict=True):
-        named[f"{layer}.weight"] = fan_in, fan_out
-        named[f"{layer}.bias"] = (fan_out,)
-    return named
+        shapes_by_name[f"{layer}.weight"] = fan_in, fan_out
+        shapes_by_name[f"{layer}.bias"] = (fan_out,)
+    return shapes_by_name
 
 
 def estimate_difference(
@@ -145,10 +145,10 @@ def estimate_difference(
 
         Eq. (1): both branches are concatenated, then follow one hidden and one linear layer.
         """
-        both = np.concatenate([branch(a, "proposed"), branch(b, "target")], axis=-1)
-        hidden = branch(both, "joined")
-        out: Array = hidden @ w["output.weight"] + w["output.bias"]  # (1)
-        return np.tanh(out) if design.bounded else out
+        branches = np.concatenate([branch(a, "proposed"), branch(b, "target")], axis=-1)
+        hidden = branch(branches, "joined")
+        output: Array = hidden @ w["output.weight"] + w["output.bias"]  # (1)
+        return np.tanh(output) if design.bounded else output
 
     if design.antisymmetric:
         return (joined(proposed, target) - joined(target, proposed)) / 2.0  # (2)
@@ -254,8 +254,8 @@ def _convert_to_tensors(rows: PairInputs, parameters: Array) -> tuple[Any, Any, 
         return torch.as_tensor(array, dtype=torch.float32)
 
     proposed = tensor(rows.proposed)
-    same = rows.target is rows.proposed
-    target = proposed if same else tensor(rows.target)
+    is_shared = rows.target is rows.proposed
+    target = proposed if is_shared else tensor(rows.target)
     return proposed, target, tensor(parameters)
 
 
@@ -281,13 +281,14 @@ def _draw_initial_weights(
 
 
 def _make_loss(
-    design: PairNetworkDesign, w: dict[str, Any], alone: bool
+    design: PairNetworkDesign, w: dict[str, Any], is_target_only: bool
 ) -> Callable[[Any, Any, Any], Any]:
     """Return a function that computes the loss (3) without the penalty on the weights.
 
     The function's arguments are the input rows of the proposed side (n, m, D) and of the target's
     side (n, m, E), and the parameters (n, m, dim), for n scenarios of m simulations. `w` are the
-    weights as tensors. `alone` is True for a network that sees the target only (direct regression).
+    weights as tensors. `is_target_only` is True for a network that sees the target only (direct
+    regression).
     """
     import torch
     from torch.nn.functional import softplus
@@ -300,8 +301,8 @@ def _make_loss(
 
     def joined(a: Any, b: Any) -> Any:
         hidden = branch(torch.cat([a, b], dim=-1), "joined")
-        out = hidden @ w["output.weight"] + w["output.bias"]  # (1)
-        return torch.tanh(out) if design.bounded else out
+        output = hidden @ w["output.weight"] + w["output.bias"]  # (1)
+        return torch.tanh(output) if design.bounded else output
 
     def objective(x: Any, seen: Any, y: Any) -> Any:
         """Compute the mean squared error of the estimated parameter differences; see `_make_loss`.
@@ -315,18 +316,18 @@ def _make_loss(
             y: (n, m, dim) parameters.
         """
         b = branch(seen, "target")
-        if alone:
+        if is_target_only:
             # A proposed input of zero leaves the branch's bias.
-            silent = unit(w["proposed.bias"]).expand_as(b)
-            error = joined(silent, b) - y
+            zero_branch = unit(w["proposed.bias"]).expand_as(b)
+            error = joined(zero_branch, b) - y
             return (error**2).sum(dim=-1).mean()
         # Half of the ordered pairs is enough, because the network is antisymmetric.
-        one, other = torch.triu_indices(x.shape[1], x.shape[1], offset=1)
+        first, second = torch.triu_indices(x.shape[1], x.shape[1], offset=1)
         a = branch(x, "proposed")
-        h = joined(a[:, one], b[:, other])
+        h = joined(a[:, first], b[:, second])
         if design.antisymmetric:
-            h = (h - joined(a[:, other], b[:, one])) / 2.0  # (2)
-        difference = y[:, other] - y[:, one]
+            h = (h - joined(a[:, second], b[:, first])) / 2.0  # (2)
+        difference = y[:, second] - y[:, first]
         squares = ((h - difference) ** 2).sum(dim=-1)
         if design.relative:
             # Small differences matter in the last steps of tuning, so they must have enough weight.
@@ -343,19 +344,19 @@ def _run_optimiser(
     data: tuple[Any, Any, Any],
     design: PairNetworkDesign,
     generator: torch.Generator,
-    watched: PairValidationMonitor | None,
+    monitor: PairValidationMonitor | None,
 ) -> None:
     """Minimise the loss (3) by gradient descent; the weights are changed in place.
 
     The method is Adam with a learning rate that falls along half a cosine, or as published plain
     gradient descent with a rate that falls exponentially. `data` are the tensors of
-    `_convert_to_tensors`. `watched` gets the losses on training and held-out data after each epoch;
+    `_convert_to_tensors`. `monitor` gets the losses on training and held-out data after each epoch;
     None for none.
     """
     import torch
 
-    x, seen, y = data
-    held_out = watched and _convert_to_tensors(watched.rows, watched.parameters)
+    x, target_rows, y = data
+    held_out = monitor and _convert_to_tensors(monitor.rows, monitor.parameters)
     kind = torch.optim.Adam if design.adam else torch.optim.SGD
     optimiser: Any = kind(weights, lr=design.rate)
     for epoch in range(design.epochs):
@@ -369,14 +370,14 @@ def _run_optimiser(
         for first in range(0, len(x), design.batch):
             batch = order[first : first + design.batch]
             optimiser.zero_grad()
-            error = loss(x[batch], seen[batch], y[batch])
+            error = loss(x[batch], target_rows[batch], y[batch])
             # The penalty is in the loss and not torch's option, so that it is Eq. 1 for Adam too.
             penalty = design.weight_decay * sum((v**2).sum() for v in weights)
             (error + penalty).backward()
             optimiser.step()
             losses.append(error.detach())
-        if watched and held_out:
+        if monitor and held_out:
             with torch.no_grad():
                 training_loss = float(torch.stack(losses).mean())
                 held_out_loss = float(loss(*held_out))
-            watched.epoch(epoch + 1, design.epochs, training_loss, held_out_loss)
+            monitor.epoch(epoch + 1, design.epochs, training_loss, held_out_loss)

@@ -82,18 +82,20 @@ class TrainedPairNetwork:
             alone: as in `pair_network.train`.
             look: monitor of the training; None for none.
         """
-        read = InputFeatures.fit(data, reading)
+        features = InputFeatures.fit(data, reading)
         proposed = (
-            InputFeatures.fit(data.without_noise, reading.proposed) if reading.proposed else read
+            InputFeatures.fit(data.without_noise, reading.proposed)
+            if reading.proposed
+            else features
         )
-        watched = None
+        validation_monitor = None
         if look is not None:
             held_out = look.held_out
-            rows = _compute_input_rows(proposed, read, held_out)
-            watched = PairValidationMonitor(rows, held_out.parameters, look.epoch)
-        rows = _compute_input_rows(proposed, read, data)
-        weights = train_pair_network(rows, data.parameters, design, rng, alone, watched)
-        return cls(design, read, weights, proposed)
+            rows = _compute_input_rows(proposed, features, held_out)
+            validation_monitor = PairValidationMonitor(rows, held_out.parameters, look.epoch)
+        rows = _compute_input_rows(proposed, features, data)
+        weights = train_pair_network(rows, data.parameters, design, rng, alone, validation_monitor)
+        return cls(design, features, weights, proposed)
 
     def predict_difference(self, proposed: Array, target: Array) -> Array:
         """Compute h(proposed, target) of input rows; see `pair_network.estimate`.
@@ -109,12 +111,12 @@ class TrainedPairNetwork:
 
         The result is NaN if the simulation failed.
         """
-        alike = self.proposed is self.read
+        is_shared = self.proposed is self.read
         # Samples missing in the target are hidden in the simulation too, so that the true
         # parameters give the target's own row.
-        hidden = np.isnan(task.observed) if alike else None
+        hidden = np.isnan(task.observed) if is_shared else None
         row = None
-        if alike:
+        if is_shared:
             # The target's row is equal for all simulations, unless a simulation fills its gaps.
             row = self.read(task.observed[None], task.lengths, task.scene, hidden)[0]
 
@@ -129,8 +131,8 @@ class TrainedPairNetwork:
             proposed = self.proposed(observations, task.lengths, task.scene, hidden)[0]
             target = row
             if target is None:
-                whole = _fill_target_gaps(task, observations[0], self)
-                target = self.read(whole[None], task.lengths, task.scene)[0]
+                filled_target = _fill_target_gaps(task, observations[0], self)
+                target = self.read(filled_target[None], task.lengths, task.scene)[0]
             return self.predict_difference(proposed, target)
 
         return difference
@@ -141,10 +143,10 @@ class TrainedPairNetwork:
         if self.proposed is self.read:
             return state
         # The arrays of both sides have the same names.
-        own = {
+        arrays = {
             _PROPOSED_SIDE_PREFIX + name: array for name, array in self.proposed.to_arrays().items()
         }
-        return own | state
+        return arrays | state
 
     @classmethod
     def from_arrays(
@@ -160,18 +162,22 @@ class TrainedPairNetwork:
         Raises:
             ValueError: arrays have other names or shapes, or numbers that are not finite.
         """
-        own: dict[str, Array] = {}
+        proposed_arrays: dict[str, Array] = {}
         common: dict[str, Array] = {}
         for name, array in state.items():
-            part = own if name.startswith(_PROPOSED_SIDE_PREFIX) else common
+            part = proposed_arrays if name.startswith(_PROPOSED_SIDE_PREFIX) else common
             part[name.removeprefix(_PROPOSED_SIDE_PREFIX)] = array
-        read, arrays = InputFeatures.from_arrays(common, reading)
-        proposed = InputFeatures.from_arrays(own, reading.proposed)[0] if reading.proposed else read
+        features, arrays = InputFeatures.from_arrays(common, reading)
+        proposed = (
+            InputFeatures.from_arrays(proposed_arrays, reading.proposed)[0]
+            if reading.proposed
+            else features
+        )
         dim = arrays.get("output.bias", np.empty(0)).size
         expected = get_weight_shapes(
-            (proposed.feature_count, read.feature_count), design.width, dim
+            (proposed.feature_count, features.feature_count), design.width, dim
         )
-        return cls(design, read, check_shapes(arrays, expected), proposed)
+        return cls(design, features, check_shapes(arrays, expected), proposed)
 
 
 def _compute_input_rows(
@@ -179,26 +185,26 @@ def _compute_input_rows(
 ) -> PairInputs:
     """Compute input rows of both sides; separate inputs of the proposed side have no noise."""
     rows = target.compute_rows(data)
-    own = rows if proposed is target else proposed.compute_rows(data.without_noise)
-    return PairInputs(own, rows)
+    proposed_rows = rows if proposed is target else proposed.compute_rows(data.without_noise)
+    return PairInputs(proposed_rows, rows)
 
 
-def _fill_target_gaps(task: Task, shown: Array, network: TrainedPairNetwork) -> Array:
+def _fill_target_gaps(task: Task, simulated: Array, network: TrainedPairNetwork) -> Array:
     """Fill the gaps of the target (T, C) from a simulation (T, C), run by run.
 
     This is done only if one channel is compared.
     """
-    sensor = network.proposed.reading.select_channels(shown)
-    whole = task.observed.copy()
+    sensor = network.proposed.reading.select_channels(simulated)
+    filled = task.observed.copy()
     # With several channels of the simulation, the one that belongs to the sensor is not known.
     if sensor.shape[-1] != 1:
-        return whole
-    ends = np.cumsum(task.lengths)
-    for first, end in zip(ends - task.lengths, ends, strict=True):
+        return filled
+    run_ends = np.cumsum(task.lengths)
+    for first, end in zip(run_ends - task.lengths, run_ends, strict=True):
         # Slices of the copy are filled in place.
-        for channel in network.read.reading.select_channels(whole[first:end]).T:
+        for channel in network.read.reading.select_channels(filled[first:end]).T:
             channel[:] = fill_gaps(channel, sensor[first:end, 0])
-    return whole
+    return filled
 
 
 class PairTuner(Tuner):
@@ -240,14 +246,16 @@ class PairTuner(Tuner):
         """
         scenarios, each = self.choose_training_layout(simulator.dim)
         data = generate_training_data(simulator, rng, budget, scenarios, each)
-        watch = self.watch
-        apart = None
-        if watch is not None:
-            ground = watch.ground
+        callback = self.watch
+        held_out_data = None
+        if callback is not None:
+            ground = callback.ground
             # Separate simulations and a separate random stream do not affect the training.
             stream = np.random.default_rng(0)
-            apart = generate_training_data(ground, stream, ground.budget, scenarios, max(each, 2))
-        self.train_on(data, rng, apart)
+            held_out_data = generate_training_data(
+                ground, stream, ground.budget, scenarios, max(each, 2)
+            )
+        self.train_on(data, rng, held_out_data)
 
     def train_on(
         self, data: TrainingData, rng: np.random.Generator, apart: TrainingData | None = None
@@ -257,9 +265,9 @@ class PairTuner(Tuner):
         Args:
             data: training data.
             rng: random generator.
-            apart: held-out data for the losses that `watch` gets; None for none.
+            apart: held-out data for the losses that `callback` gets; None for none.
         """
-        watch = self.watch
+        callback = self.watch
 
         def fitted(stage: str, shown: TrainingData, noise: Array | None) -> TrainedPairNetwork:
             """Train the network for one noise level; called by `NoiseMatchedNetworks.train`.
@@ -269,10 +277,10 @@ class PairTuner(Tuner):
                 shown: simulations to train on, with noise.
                 noise: noise that is also added to the held-out simulations; None for none.
             """
-            look = None
-            if watch is not None and apart is not None:
-                look = TrainingMonitor(
-                    add_noise_to_held_out(apart, noise), partial(watch.epoch, stage)
+            monitor = None
+            if callback is not None and apart is not None:
+                monitor = TrainingMonitor(
+                    add_noise_to_held_out(apart, noise), partial(callback.epoch, stage)
                 )
             return TrainedPairNetwork.train(
                 self.make_network_design(),
@@ -280,7 +288,7 @@ class PairTuner(Tuner):
                 rng,
                 self.make_feature_config(),
                 self.is_single_input,
-                look,
+                monitor,
             )
 
         self._fitted = NoiseMatchedNetworks.train(data, rng, self.make_feature_config(), fitted)

@@ -76,8 +76,8 @@ class PosteriorRounds:
         """
         self._centre = residuals.mean(axis=0)
         _, singular, directions = np.linalg.svd(residuals - self._centre, full_matrices=False)
-        kept = max(int((singular[:_MAX_COMPONENTS] > 1e-9 * singular[0]).sum()), 1)
-        self._components = directions[:kept].T
+        component_count = max(int((singular[:_MAX_COMPONENTS] > 1e-9 * singular[0]).sum()), 1)
+        self._components = directions[:component_count].T
         spread = ((residuals - self._centre) @ self._components).std(axis=0)
         self._widths = np.where(spread > 0, spread, 1.0)
 
@@ -117,5 +117,5 @@ class PosteriorRounds:
         self._posterior = self._trainer.build_posterior().set_default_x(target)
         draws = self._posterior.sample((max(count, _POSTERIOR_DRAWS),)).numpy().astype(np.float64)
         self.mean = draws.mean(axis=0)
-        chosen: Array = np.clip(draws[:count], 0.0, 1.0)
-        return chosen
+        drawn_points: Array = np.clip(draws[:count], 0.0, 1.0)
+        return drawn_points

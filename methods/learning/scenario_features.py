@@ -116,9 +116,9 @@ class ScenarioFeatures:
                 f"this one gives {numbers.shape[1]}; "
                 "train on scenarios with the same inputs and channels"
             )
-        says = self.spread > 0
+        is_varying = self.spread > 0
         # A number that was constant in training gets no weight.
-        scale = np.where(says, 1.0 / np.where(says, self.spread, 1.0), 0.0)
+        scale = np.where(is_varying, 1.0 / np.where(is_varying, self.spread, 1.0), 0.0)
         # arcsinh is the identity near zero and logarithmic far out, so outliers do not saturate
         # units.
         return np.asarray(np.arcsinh((numbers - self.centre) * scale), dtype=np.float64)

@@ -36,9 +36,9 @@ def draw_binary_search(simulator: TrainingSimulator, rng: np.random.Generator, c
     points = [target, source]
     while len(points) < count:
         last = points[-1]
-        below = last < target
-        lower = np.where(below, last, lower)  # (1)
-        upper = np.where(below, upper, last)
+        is_below = last < target
+        lower = np.where(is_below, last, lower)  # (1)
+        upper = np.where(is_below, upper, last)
         share = rng.beta(_CENTRED, _CENTRED, size=last.size)
         points.append(lower + share * (upper - lower))  # (2)
     return np.array(points[:count])
@@ -64,11 +64,11 @@ def make_shuffled_histories(rng: np.random.Generator, count: int, window: int) -
         count: number of simulations.
         window: length of a history.
     """
-    tried = np.empty((count, window), dtype=np.intp)
+    histories = np.empty((count, window), dtype=np.intp)
     for target in range(count):
-        others = rng.permutation(np.delete(np.arange(count), target))
-        tried[target] = others[:window]
-    return HistoryIndices(np.arange(count), tried)
+        other_simulations = rng.permutation(np.delete(np.arange(count), target))
+        histories[target] = other_simulations[:window]
+    return HistoryIndices(np.arange(count), histories)
 
 
 def make_ordered_histories(count: int, window: int) -> HistoryIndices:
@@ -78,5 +78,7 @@ def make_ordered_histories(count: int, window: int) -> HistoryIndices:
         count: number of simulations.
         window: length of a history.
     """
-    starts = np.arange(1, count - window + 1)
-    return HistoryIndices(np.zeros(len(starts), dtype=np.intp), starts[:, None] + np.arange(window))
+    first_indices = np.arange(1, count - window + 1)
+    return HistoryIndices(
+        np.zeros(len(first_indices), dtype=np.intp), first_indices[:, None] + np.arange(window)
+    )

@@ -97,7 +97,7 @@ class DirectRegressor(PairTuner):
         network = self.get_trained_network().select_for(task)
         target = network.read(task.observed[None], task.lengths, task.scene)[0]
         # The proposed input is zero, so the difference is the parameters themselves.
-        nothing = np.zeros_like(target)
-        guess = np.clip(network.predict_difference(nothing, target), 0.0, 1.0)
+        zero_input = np.zeros_like(target)
+        guess = np.clip(network.predict_difference(zero_input, target), 0.0, 1.0)
         yield Proposal(guess, recommend=guess)
         return "it estimates once"

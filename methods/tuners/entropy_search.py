@@ -143,19 +143,19 @@ class EntropySearch(Tuner):
         The latter have distances of all orders of magnitude.
         """
         dim = len(best)
-        wide = generate_quasi_random_points(self.everywhere, rng.uniform(size=dim))
+        spread_points = generate_quasi_random_points(self.everywhere, rng.uniform(size=dim))
         distances = np.linalg.norm(process.points - best, axis=1)
         # Distances range from a tenth of the distance to the nearest neighbour to half the cube.
         nearest = np.min(distances, where=distances > 0.0, initial=0.5)
-        finest = max(0.1 * nearest, 1e-9)
-        exponents = rng.uniform(np.log(finest), np.log(0.5), size=(self.nearby, 1))
+        min_scale = max(0.1 * nearest, 1e-9)
+        exponents = rng.uniform(np.log(min_scale), np.log(0.5), size=(self.nearby, 1))
         # The expected length is the same in any number of dimensions.
         scales = np.exp(exponents) / np.sqrt(dim)
-        expected = wide[process.predict(wide).argmin()]
-        even = np.arange(self.nearby)[:, None] % 2 == 0
-        centres = np.where(even, best, expected)
-        near = centres + scales * rng.standard_normal((self.nearby, dim))
-        return np.vstack([best, wide, np.clip(near, 0.0, 1.0)])
+        expected = spread_points[process.predict(spread_points).argmin()]
+        is_even = np.arange(self.nearby)[:, None] % 2 == 0
+        centres = np.where(is_even, best, expected)
+        near_points = centres + scales * rng.standard_normal((self.nearby, dim))
+        return np.vstack([best, spread_points, np.clip(near_points, 0.0, 1.0)])
 
 
 def compute_minimiser_probability(
@@ -177,9 +177,9 @@ def compute_minimiser_probability(
 
 def compute_entropy_terms(p: Array) -> Array:
     """Compute -P log P, and -1 if P = 0, so that such a candidate is chosen last."""
-    possible = p > 0.0
-    logarithms = np.log(np.where(possible, p, 1.0))
-    return np.where(possible, -p * logarithms, -1.0)
+    is_positive = p > 0.0
+    logarithms = np.log(np.where(is_positive, p, 1.0))
+    return np.where(is_positive, -p * logarithms, -1.0)
 
 
 def replace_failed_losses(losses: Array) -> Array:

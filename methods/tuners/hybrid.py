@@ -69,7 +69,7 @@ class TuneNetLeastSquares(TuneNet):
         """Take network steps, then fit by least squares from there, then from new starts."""
         finish = LeastSquares(reproduced=_ROUNDING_LOSS)
         run = EvaluationHistory(task, _ROUNDING_LOSS)
-        enough = run.enough / _ROUNDING_LOSS * finish.reproduced
+        loss_tolerance = run.enough / _ROUNDING_LOSS * finish.reproduced
         trusted = yield from self._take_network_steps(run, task)
         # Without any successful simulation, the middle of the training range is the start.
         if not np.isfinite(run.losses).any():
@@ -81,10 +81,10 @@ class TuneNetLeastSquares(TuneNet):
             model = yield from self._build_linear_model(run, finish)
             model.trusted = trusted
             yield from fit.fit_from_model(run, model)
-            if min(run.losses) <= enough:
+            if min(run.losses) <= loss_tolerance:
                 break
             trusted = False
-        while min(run.losses) > enough:
+        while min(run.losses) > loss_tolerance:
             yield from finish.fit_from_point(run, run.find_untried_point(rng))
         return "the simulation reproduces the target"
 
@@ -132,20 +132,20 @@ class TuneNetLeastSquares(TuneNet):
         point = run.tried[best]
         residual = run.residuals[best]
         steps = np.array(run.tried) - point
-        chosen, basis = self._choose_secants(steps, finite, finish.smallest_difference)
-        directions = steps[chosen]
-        changes = [run.residuals[i] - residual for i in chosen]
+        chosen_steps, basis = self._choose_secants(steps, finite, finish.smallest_difference)
+        directions = steps[chosen_steps]
+        changes = [run.residuals[i] - residual for i in chosen_steps]
         missing = _compute_orthogonal_complement(basis, len(point))
         if len(missing):
             # Differences have the length of the secants, so that all columns have similar accuracy.
-            size = float(np.abs(directions).max()) if chosen else finish.difference
+            size = float(np.abs(directions).max()) if chosen_steps else finish.difference
             size = min(max(size, finish.smallest_difference), finish.difference)
             inward = np.where(missing @ (0.5 - point) < 0.0, -size, size)
-            moved = np.clip(point + missing * inward[:, None], 0.0, 1.0)
-            residuals = yield from run.simulate(moved)
-            whole = ~np.isnan(residuals).any(axis=1)
-            directions = np.concatenate([directions, (moved - point)[whole]])
-            changes += list(residuals[whole] - residual)
+            probe_points = np.clip(point + missing * inward[:, None], 0.0, 1.0)
+            residuals = yield from run.simulate(probe_points)
+            is_complete = ~np.isnan(residuals).any(axis=1)
+            directions = np.concatenate([directions, (probe_points - point)[is_complete]])
+            changes += list(residuals[is_complete] - residual)
         # If no simulation nearby succeeded, the model predicts no decrease.
         if not changes:
             return LinearModel(point, residual, np.zeros((len(residual), len(point))))
@@ -172,7 +172,7 @@ class TuneNetLeastSquares(TuneNet):
         usable &= lengths >= smallest
         nearest = np.argsort((steps**2).sum(axis=1), kind="stable")
         basis: list[Array] = []
-        chosen: list[int] = []
+        chosen_steps: list[int] = []
         # The nearest points come first; each step is orthogonalised by Gram-Schmidt.
         for i in nearest[usable[nearest]]:
             step = steps[i]
@@ -181,8 +181,8 @@ class TuneNetLeastSquares(TuneNet):
             length = np.linalg.norm(orthogonal_part)
             if length > _MIN_ORTHOGONAL_SHARE * np.linalg.norm(step):
                 basis.append(orthogonal_part / length)
-                chosen.append(int(i))
-        return chosen, basis
+                chosen_steps.append(int(i))
+        return chosen_steps, basis
 
 
 def _compute_orthogonal_complement(basis: list[Array], dim: int) -> Array:

@@ -86,15 +86,15 @@ class TrainedHistoryNetwork:
             tried: points (dim,) of the simulations so far.
         """
         window = self.design.window
-        half = (self.training_range[1] - self.training_range[0]) / 2.0
+        half_widths = (self.training_range[1] - self.training_range[0]) / 2.0
         middle = self.training_range.mean(axis=0)
-        seen = np.array(shown[-window:]).reshape(-1, target.size)
-        points = np.array(tried[-window:]).reshape(-1, half.size)
-        out = predict_proposals(
-            np, self.weights, self.design, target, seen, (points - middle) / half
+        simulations = np.array(shown[-window:]).reshape(-1, target.size)
+        points = np.array(tried[-window:]).reshape(-1, half_widths.size)
+        proposals = predict_proposals(
+            np, self.weights, self.design, target, simulations, (points - middle) / half_widths
         )
-        following: Array = np.clip(middle + half * out[-1], 0.0, 1.0)
-        return following
+        next_point: Array = np.clip(middle + half_widths * proposals[-1], 0.0, 1.0)
+        return next_point
 
     def to_arrays(self) -> dict[str, Array]:
         """Return everything as plain arrays by name."""
@@ -114,11 +114,11 @@ class TrainedHistoryNetwork:
         Raises:
             ValueError: arrays have other names or shapes, or numbers that are not finite.
         """
-        read, arrays = InputFeatures.from_arrays(state, reading)
+        features, arrays = InputFeatures.from_arrays(state, reading)
         dim = arrays.get("guess.bias", np.empty(0)).size
-        expected = get_weight_shapes(read.feature_count, dim, design) | {_BOX: (2, dim)}
+        expected = get_weight_shapes(features.feature_count, dim, design) | {_BOX: (2, dim)}
         weights = check_shapes(arrays, expected)
-        return cls(design, read, weights, weights.pop(_BOX))
+        return cls(design, features, weights, weights.pop(_BOX))
 
 
 @dataclass(eq=False)
@@ -207,13 +207,13 @@ class InContextTransformer(Tuner):
         data = generate_training_data(
             simulator, rng, budget, self.scenarios, each, draw_binary_search
         )
-        watch = self.watch
-        apart = None
-        if watch is not None:
-            ground = watch.ground
+        callback = self.watch
+        held_out_data = None
+        if callback is not None:
+            ground = callback.ground
             # Separate simulations and a separate random stream do not affect the training.
             stream = np.random.default_rng(0)
-            apart = generate_training_data(
+            held_out_data = generate_training_data(
                 ground, stream, ground.budget, self.scenarios, each, draw_binary_search
             )
         box = np.array(simulator.training, dtype=np.float64)
@@ -226,17 +226,19 @@ class InContextTransformer(Tuner):
                 shown: simulations to train on, with noise.
                 noise: noise that is also added to the held-out simulations; None for none.
             """
-            read = InputFeatures.fit(shown, self.make_feature_config())
-            watched = None
-            if watch is not None and apart is not None:
-                material = _build_training_histories(read, add_noise_to_held_out(apart, noise), box)
-                watched = HistoryValidationMonitor(material, partial(watch.epoch, stage))
+            features = InputFeatures.fit(shown, self.make_feature_config())
+            monitor = None
+            if callback is not None and held_out_data is not None:
+                material = _build_training_histories(
+                    features, add_noise_to_held_out(held_out_data, noise), box
+                )
+                monitor = HistoryValidationMonitor(material, partial(callback.epoch, stage))
             design = self.make_network_design()
-            material = _build_training_histories(read, shown, box)
+            material = _build_training_histories(features, shown, box)
             weights = train_history_transformer(
-                material, partial(self._draw_histories, each), design, rng, watched
+                material, partial(self._draw_histories, each), design, rng, monitor
             )
-            return TrainedHistoryNetwork(design, read, weights, box)
+            return TrainedHistoryNetwork(design, features, weights, box)
 
         self._prepared = NoiseMatchedNetworks.train(data, rng, self.make_feature_config(), learned)
 
@@ -285,9 +287,11 @@ class InContextTransformer(Tuner):
         missing = np.isnan(task.observed)
         row = network.input_features(task.observed[None], task.lengths, task.scene, missing)
         target = network.apply_weights(row)[0]
-        shown: list[Array] = []
-        tried: list[Array] = []
-        guess = task.start if self.published else network.propose_next(target, shown, tried)
+        simulations: list[Array] = []
+        proposals: list[Array] = []
+        guess = (
+            task.start if self.published else network.propose_next(target, simulations, proposals)
+        )
         while True:
             evaluation = yield Proposal(guess, recommend=guess)
             point = evaluation.proposals[0]
@@ -295,30 +299,32 @@ class InContextTransformer(Tuner):
                 row = network.input_features(
                     evaluation.observations, task.lengths, task.scene, missing
                 )
-                shown.append(network.apply_weights(row)[0])
-                tried.append(point)
-                guess = network.propose_next(target, shown, tried)
+                simulations.append(network.apply_weights(row)[0])
+                proposals.append(point)
+                guess = network.propose_next(target, simulations, proposals)
                 if np.abs(guess - point).max() <= MIN_STEP:
                     return "the proposal no longer changes"
             else:
                 # Half the distance to the last successful point, or to the middle of the training
                 # range.
-                refuge = tried[-1] if tried else task.training.mean(axis=0)
+                refuge = proposals[-1] if proposals else task.training.mean(axis=0)
                 guess = (point + refuge) / 2.0
 
 
 def _build_training_histories(
-    read: InputFeatures, data: TrainingData, box: Array
+    features: InputFeatures, data: TrainingData, box: Array
 ) -> TrainingHistories:
     """Build the training data: simulations without noise, targets with the sensor's noise.
 
     `box` (2, dim) are the corners of the training range; parameters are scaled to half widths from
     its middle, as in the network's input.
     """
-    half = (box[1] - box[0]) / 2.0
-    parameters = (data.parameters - box.mean(axis=0)) / half
-    target = read.compute_rows(data)
-    shown = (
-        target if data.noise_free_observations is None else read.compute_rows(data.without_noise)
+    half_widths = (box[1] - box[0]) / 2.0
+    parameters = (data.parameters - box.mean(axis=0)) / half_widths
+    target = features.compute_rows(data)
+    simulations = (
+        target
+        if data.noise_free_observations is None
+        else features.compute_rows(data.without_noise)
     )
-    return TrainingHistories(shown, target, parameters)
+    return TrainingHistories(simulations, target, parameters)

@@ -136,10 +136,10 @@ class LeastSquares(Tuner):
             model: linear model at the starting point.
         """
         for share in self.horizons:
-            chosen = run.select_samples(share)
+            is_selected = run.select_samples(share)
             # Before the first impact the samples may not depend on the parameters.
-            if share >= 1.0 or model.is_sensitive(chosen):
-                model = yield from self._run_levenberg_marquardt(run, model, chosen)
+            if share >= 1.0 or model.is_sensitive(is_selected):
+                model = yield from self._run_levenberg_marquardt(run, model, is_selected)
             if run.finished:
                 return
 
@@ -152,59 +152,62 @@ class LeastSquares(Tuner):
         """
         h = min(max(longest, self.smallest_difference), self.difference)
         steps = np.where(point + h > 1.0, -h, h)
-        moved = yield from run.simulate(point + np.diag(steps))
-        failed = np.isnan(moved).any(axis=1)
+        probe_residuals = yield from run.simulate(point + np.diag(steps))
+        failed = np.isnan(probe_residuals).any(axis=1)
         if failed.any():
             steps[failed] *= -1.0
-            moved[failed] = yield from run.simulate(point + np.diag(steps)[failed])
-        slopes = (moved - residual) / steps[:, None]
+            probe_residuals[failed] = yield from run.simulate(point + np.diag(steps)[failed])
+        slopes = (probe_residuals - residual) / steps[:, None]
         # If both sides fail, the column stays zero.
         return LinearModel(point, residual, np.nan_to_num(slopes).T)
 
     def _run_levenberg_marquardt(
-        self, run: EvaluationHistory, model: LinearModel, chosen: Mask
+        self, run: EvaluationHistory, model: LinearModel, is_selected: Mask
     ) -> SimulationGenerator[LinearModel]:
         """Run Levenberg-Marquardt on the chosen samples until convergence or lack of progress.
 
         It starts from the point of the linear model (point, residual, Jacobian). After each step
         the Jacobian gets Broyden's update; it is computed again by finite differences when it is
-        outdated. `chosen` masks the residuals, for example to a short horizon at first, since a
-        long simulation can have many local minima.
+        outdated. `is_selected` masks the residuals, for example to a short horizon at first, since
+        a long simulation can have many local minima.
         """
-        worthwhile = _FINAL_CONVERGENCE_SHARE if chosen.all() else _HORIZON_CONVERGENCE_SHARE
+        worthwhile = _FINAL_CONVERGENCE_SHARE if is_selected.all() else _HORIZON_CONVERGENCE_SHARE
         damping = _Damping(self.damping)
         stalled = 0
         failed = 0
         while stalled < self.patience:
-            before = model.compute_error(chosen)
-            step, promised = model.compute_step(chosen, damping.mu)
-            if np.abs(step).max() < self.step_tolerance or promised <= worthwhile * before:
+            error_before = model.compute_error(is_selected)
+            step, predicted_decrease = model.compute_step(is_selected, damping.mu)
+            if (
+                np.abs(step).max() < self.step_tolerance
+                or predicted_decrease <= worthwhile * error_before
+            ):
                 break
             proposal = model.point + step
             # On a short horizon, or after a wrong prediction, a step is too uncertain to be
             # recommended.
-            trusted = self.ahead and model.trusted and chosen.all()
-            hopeful = proposal if trusted else None
-            (residual,) = yield from run.simulate(proposal[None], hopeful)
+            trusted = self.ahead and model.trusted and is_selected.all()
+            expected_proposal = proposal if trusted else None
+            (residual,) = yield from run.simulate(proposal[None], expected_proposal)
             # The error is NaN if the simulation failed, and then `better` is False.
-            after = float(residual[chosen] @ residual[chosen])
-            better = after < before
+            error_after = float(residual[is_selected] @ residual[is_selected])
+            is_better = error_after < error_before
             # A step that increased the error still gives information about the slope along it.
-            if np.isfinite(after):
+            if np.isfinite(error_after):
                 model.apply_broyden_update(step, residual)
-            if better:
+            if is_better:
                 model.point = proposal
                 model.residual = residual
-            decrease = before - after
-            model.trusted = decrease > _MIN_TRUST_RATIO * promised
-            damping.adapt(decrease / promised)  # (2)
-            failed = 0 if better else failed + 1
-            stalled = 0 if after < (1.0 - self.progress) * before else stalled + 1
+            decrease = error_before - error_after
+            model.trusted = decrease > _MIN_TRUST_RATIO * predicted_decrease
+            damping.adapt(decrease / predicted_decrease)  # (2)
+            failed = 0 if is_better else failed + 1
+            stalled = 0 if error_after < (1.0 - self.progress) * error_before else stalled + 1
             if run.finished:
                 break
             # With one parameter the secant is the slope; with several the secants may be outdated.
             stale = failed == 2 and len(step) > 1
-            if stale or (better and not self.secant):
+            if stale or (is_better and not self.secant):
                 longest = float(np.abs(step).max())
                 model = yield from self._compute_differences(
                     run, model.point, model.residual, longest
@@ -262,8 +265,8 @@ class LinearModel:
 
         Their sensitivity is compared with that of all samples.
         """
-        here = (self.jacobian[chosen] ** 2).mean()
-        return bool(here > _MIN_RELATIVE_SENSITIVITY * (self.jacobian**2).mean())
+        mean_square = (self.jacobian[chosen] ** 2).mean()
+        return bool(mean_square > _MIN_RELATIVE_SENSITIVITY * (self.jacobian**2).mean())
 
     def compute_step(self, chosen: Mask, mu: float) -> tuple[Array, float]:
         """Compute Marquardt's step (1) from the model's point, clipped to the unit cube.
@@ -279,9 +282,9 @@ class LinearModel:
         jacobian = self.jacobian[chosen]
         gradient = jacobian.T @ r
         # A parameter at a bound that would leave the cube stays at the bound.
-        below = (self.point <= 0.0) & (gradient > 0.0)
-        above = (self.point >= 1.0) & (gradient < 0.0)
-        free = ~(below | above)
+        is_at_lower_bound = (self.point <= 0.0) & (gradient > 0.0)
+        is_at_upper_bound = (self.point >= 1.0) & (gradient < 0.0)
+        free = ~(is_at_lower_bound | is_at_upper_bound)
         scale = np.sqrt((jacobian**2).sum(0))
         scale = np.maximum(scale, _MIN_DAMPING_SENSITIVITY * scale.max())
         # (1) is solved as a least-squares problem, which does not square the condition number of J.
@@ -301,8 +304,8 @@ class LinearModel:
             step: (dim,) step from the point.
             residual: (samples,) residual after the step.
         """
-        missed = residual - self.residual - self.jacobian @ step
-        self.jacobian = self.jacobian + np.outer(missed, step / (step @ step))  # (4)
+        prediction_error = residual - self.residual - self.jacobian @ step
+        self.jacobian = self.jacobian + np.outer(prediction_error, step / (step @ step))  # (4)
 
 
 @dataclass
@@ -369,5 +372,5 @@ class EvaluationHistory:
         dim = self.task.dim
         candidates = rng.uniform(size=(_CANDIDATES * dim, dim))
         squares = [((candidates - point) ** 2).sum(1) for point in self.tried]
-        farthest: Array = candidates[np.min(squares, axis=0).argmax()]
-        return farthest
+        farthest_point: Array = candidates[np.min(squares, axis=0).argmax()]
+        return farthest_point

@@ -147,8 +147,8 @@ class NeuralPosteriorEstimation(Tuner):
             ValueError: arrays have other names or shapes, or numbers that are not finite.
         """
         flow = {name: array for name, array in state.items() if name.startswith("flow.")}
-        others = {name: array for name, array in state.items() if name not in flow}
-        features, foreign = InputFeatures.from_arrays(others, self._make_feature_config())
+        feature_arrays = {name: array for name, array in state.items() if name not in flow}
+        features, foreign = InputFeatures.from_arrays(feature_arrays, self._make_feature_config())
         not_finite = [name for name, array in flow.items() if not np.isfinite(array).all()]
         if foreign or not_finite:
             name = [*foreign, *not_finite][0]

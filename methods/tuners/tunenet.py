@@ -242,8 +242,8 @@ class BroydenSearch:
         """
         square = step @ step
         if square > 0.0:
-            missed = change - self._slope @ step
-            self._slope = self._slope + np.outer(missed, step) / square
+            prediction_error = change - self._slope @ step
+            self._slope = self._slope + np.outer(prediction_error, step) / square
 
     def _compute_step(self, residual: Array) -> Array:
         """Compute Broyden's step from the best point, at most twice as long as Algorithm 1's.
@@ -276,12 +276,12 @@ class BroydenSearch:
         elif residual[0] < 0.0:
             self._high = min(self._high, point[0])
         # Inaccurate estimates may contradict each other; then there is no interval.
-        known = np.isfinite([self._low, self._high]).all() and self._low < self._high
-        if self._setbacks and known and not self._low < guess[0] < self._high:
-            far = 1.0
+        has_bracket = np.isfinite([self._low, self._high]).all() and self._low < self._high
+        if self._setbacks and has_bracket and not self._low < guess[0] < self._high:
+            max_step = 1.0
             if self._residual is not None:
-                far = _MAX_BISECTION_STEP_RATIO * float(np.abs(self._residual).max())
+                max_step = _MAX_BISECTION_STEP_RATIO * float(np.abs(self._residual).max())
             halfway = np.array([(self._low + self._high) / 2.0])
-            inside: Array = np.clip(halfway, self.best - far, self.best + far)
-            return inside
+            limited_guess: Array = np.clip(halfway, self.best - max_step, self.best + max_step)
+            return limited_guess
         return guess

@@ -161,25 +161,27 @@ class TuRBO(Tuner):
 
             model = _fit_gaussian_process(points, -(values - values.mean()) / scale)
             scales = model.covar_module.base_kernel.lengthscale.detach().numpy()
-            sides = np.asarray(scales).ravel()
+            side_lengths = np.asarray(scales).ravel()
             # (1)
-            sides = length * sides / np.exp(np.log(sides).mean())
-            candidates = self._draw_candidates(points[values.argmin()], sides, rng)
+            side_lengths = length * side_lengths / np.exp(np.log(side_lengths).mean())
+            candidates = self._draw_candidates(points[values.argmin()], side_lengths, rng)
             with torch.no_grad():
-                chosen = MaxPosteriorSampling(model=model, replacement=False)(
+                sampled_point = MaxPosteriorSampling(model=model, replacement=False)(
                     torch.from_numpy(candidates)
                 )
-            best: Array = np.clip(chosen.numpy()[0].astype(np.float64), 0.0, 1.0)
+            best: Array = np.clip(sampled_point.numpy()[0].astype(np.float64), 0.0, 1.0)
         return best
 
-    def _draw_candidates(self, centre: Array, sides: Array, rng: np.random.Generator) -> Array:
+    def _draw_candidates(
+        self, centre: Array, side_lengths: Array, rng: np.random.Generator
+    ) -> Array:
         """Draw points in the box around `centre`.
 
         In many dimensions each one differs from the centre in about 20 coordinates.
         """
         dim = len(centre)
-        low = np.clip(centre - sides / 2.0, 0.0, 1.0)
-        high = np.clip(centre + sides / 2.0, 0.0, 1.0)
+        low = np.clip(centre - side_lengths / 2.0, 0.0, 1.0)
+        high = np.clip(centre + side_lengths / 2.0, 0.0, 1.0)
         spread = low + (high - low) * _draw_sobol_points(rng, self.candidates, dim)
         is_perturbed = rng.uniform(size=spread.shape) <= min(_MAX_PERTURBED_COORDINATES / dim, 1.0)
         # At least one coordinate is changed, because the centre has already been simulated.

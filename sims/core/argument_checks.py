@@ -139,7 +139,7 @@ def get_hints(annotated: Hashable) -> dict[str, Any]:
 
 
 def _bind_arguments(
-    called: str,
+    function_name: str,
     signature: inspect.Signature,
     hints: Mapping[str, Any],
     args: Sequence[object],
@@ -153,19 +153,23 @@ def _bind_arguments(
     names = [name for name in signature.parameters if name != "self"]
     for name in kwargs:
         if name not in names:
-            raise make_unknown_name_error(f"argument of {called}", name, names)
+            raise make_unknown_name_error(f"argument of {function_name}", name, names)
     try:
         return signature.bind(*args, **kwargs)
     except TypeError as error:
         for name, parameter in signature.parameters.items():
             required = parameter.default is parameter.empty
             if required and "missing" in str(error) and f"'{name}'" in str(error):
-                wanted = _describe_type(hints[name])
-                raise InputError(f"{called}: expected {name}, {wanted}; found none") from None
-        most = sum(p.kind is not p.KEYWORD_ONLY for p in signature.parameters.values())
-        plural = "s" * (most != 1)
-        found = f"expected at most {most} argument{plural} without a name, found {len(args)}"
-        raise InputError(f"{called}: {found}; name the others, as {names[-1]}=...") from None
+                expected = _describe_type(hints[name])
+                raise InputError(
+                    f"{function_name}: expected {name}, {expected}; found none"
+                ) from None
+        max_count = sum(p.kind is not p.KEYWORD_ONLY for p in signature.parameters.values())
+        plural = "s" * (max_count != 1)
+        problem = f"expected at most {max_count} argument{plural} without a name, found {len(args)}"
+        raise InputError(
+            f"{function_name}: {problem}; name the others, as {names[-1]}=..."
+        ) from None
 
 
 def _convert_value(place: str, value: Any, hint: Any) -> Any:
@@ -199,9 +203,9 @@ _NO_MATCH = object()
 
 def _convert_annotated(place: str, value: Any, hint: Any) -> Any:
     """Convert a value annotated with `Expected`, whose words replace the default ones."""
-    inner, expected = get_args(hint)[:2]
+    annotated_type, expected = get_args(hint)[:2]
     try:
-        converted = _convert_value(place, value, inner)
+        converted = _convert_value(place, value, annotated_type)
     except _MismatchError as error:
         if error.place != place:
             raise
@@ -230,12 +234,12 @@ def _convert_to_union(place: str, value: Any, hint: Any) -> Any:
     raise _MismatchError(place, _describe_type(hint), value)
 
 
-def _convert_to_type(value: Any, hint: Any, inner: tuple[Any, ...]) -> Any:
+def _convert_to_type(value: Any, hint: Any, arguments: tuple[Any, ...]) -> Any:
     """Convert a value to a single type; `_NO_MATCH` if it does not match."""
     if hint is NoneType:
         return None if value is None else _NO_MATCH
     if get_origin(hint) is type:
-        return value if inspect.isclass(value) and issubclass(value, inner[0]) else _NO_MATCH
+        return value if inspect.isclass(value) and issubclass(value, arguments[0]) else _NO_MATCH
     if hint is bool:
         is_bool = isinstance(value, bool | np.bool_) or (isinstance(value, int) and value in (0, 1))
         return bool(value) if is_bool else _NO_MATCH
@@ -298,11 +302,11 @@ def _convert_to_dict(place: str, value: Any, hint: Any) -> Any:
 
 def _convert_to_tuple(place: str, value: Any, hint: Any) -> Any:
     """Convert a value to a tuple of the annotated length."""
-    inner = get_args(hint)
-    if not isinstance(value, list | tuple | np.ndarray) or len(value) != len(inner):
+    entry_types = get_args(hint)
+    if not isinstance(value, list | tuple | np.ndarray) or len(value) != len(entry_types):
         return _NO_MATCH
     return tuple(
-        _convert_value(place, entry, kind) for entry, kind in zip(value, inner, strict=True)
+        _convert_value(place, entry, kind) for entry, kind in zip(value, entry_types, strict=True)
     )
 
 
@@ -335,21 +339,21 @@ def _describe_type(hint: Any) -> str:
 
     The words follow "expected" in a message, for example "a list (a number each)".
     """
-    origin, inner = get_origin(hint), get_args(hint)
+    origin, arguments = get_origin(hint), get_args(hint)
     if origin is Annotated:
-        return str(inner[1].words)
+        return str(arguments[1].words)
     if origin in (Union, UnionType):
         # Text is accepted for a path, too.
-        implied = {NoneType, str} if Path in inner else {NoneType}
+        implied_types = {NoneType, str} if Path in arguments else {NoneType}
         return " or ".join(
-            dict.fromkeys(_describe_type(kind) for kind in inner if kind not in implied)
+            dict.fromkeys(_describe_type(kind) for kind in arguments if kind not in implied_types)
         )
     if origin is Sequence:
-        return f"a list ({_describe_type(inner[0])} each)"
-    if origin is Mapping and inner[1] is not Any:
-        return f"a dict ({_describe_type(inner[1])} for each name)"
+        return f"a list ({_describe_type(arguments[0])} each)"
+    if origin is Mapping and arguments[1] is not Any:
+        return f"a dict ({_describe_type(arguments[1])} for each name)"
     if origin is type:
-        return f"a subclass of {inner[0].__name__}"
+        return f"a subclass of {arguments[0].__name__}"
     kind = origin or hint
     return _TYPE_DESCRIPTIONS.get(kind) or f"a {kind.__name__}"
 

@@ -41,8 +41,8 @@ def require_file(path: Path, wanted: str = "") -> None:
             return
         exists = path.exists()
     except (OSError, ValueError) as error:  # too long, or with a null character
-        why = getattr(error, "strerror", None) or error
-        raise InputError(f"{truncate_text(str(path))}: not a path ({why})") from None
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"{truncate_text(str(path))}: not a path ({reason})") from None
     if exists:
         raise InputError(f"{path}: not a file{expected}")
     raise InputError(f"{path}: no such file{expected}{_format_similar_names(path)}")
@@ -57,8 +57,8 @@ def _format_similar_names(path: Path) -> str:
     except OSError:
         return "" if path.parent.is_dir() else f"; there is no folder '{path.parent}'"
     stems = {entry.stem: entry.name for entry in entries if entry.suffix == path.suffix}
-    near = [stems[stem] for stem in get_close_matches(path.stem, stems, n=3)]
-    return f"; did you mean {' or '.join(near)}?" if near else ""
+    similar_files = [stems[stem] for stem in get_close_matches(path.stem, stems, n=3)]
+    return f"; did you mean {' or '.join(similar_files)}?" if similar_files else ""
 
 
 def write_atomically(path: Path, content: Content) -> None:

@@ -203,28 +203,28 @@ class Effect(metaclass=EffectType):
     @classmethod
     def misses(cls, system: System | type[System]) -> str:
         """Return why the system cannot have this effect; empty if it can."""
-        declared = system if isinstance(system, type) else type(system)
+        system_class = system if isinstance(system, type) else type(system)
         heavy = any(c.name == "gravity" for c in system.constants)
-        says_push = declared.push is not System.push
+        says_push = system_class.push is not System.push
         in_space = len(system.coordinates) == 3
-        lacks = {
+        reasons = {
             "": "",
             "input": "" if system.inputs else "it has no input",
             "ground": "" if system.bounces else "it meets no ground",
             # A bouncing body flies freely: dry friction and springs would act against nothing.
             "guide": "it flies freely" if system.bounces else "",
             "joint": "" if _is_joint(system) else "it is not one joint alone",
-            "servo": "" if declared.servo else "it has no servo that follows a set point",
+            "servo": "" if system_class.servo else "it has no servo that follows a set point",
             "gravity": "" if heavy else "it states no gravity",
             "push": "" if says_push else "it does not say what horizontal acceleration does",
             "space": "" if in_space else "it does not move in three dimensions",
             "model": ""
-            if declared.has_model
+            if system_class.has_model
             else "it has no model file whose numbers may be wrong",
-            "level": "" if declared.levels else "it names no level that could spill over",
+            "level": "" if system_class.levels else "it names no level that could spill over",
         }[cls.needs]
         undefined = "" if cls.on(system) else f"it is not defined for a {system.kind} system"
-        return lacks or undefined or system.refuses(cls)
+        return reasons or undefined or system.refuses(cls)
 
     @classmethod
     def on(cls, system: System | type[System]) -> tuple[Coefficient, ...]:

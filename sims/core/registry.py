@@ -126,8 +126,8 @@ class Registry(Generic[T]):
             part = self.get(name)
         except PartUnavailableError as error:
             return f"skipped: {error.reason}"
-        says = getattr(part, "says", "") or (inspect.getdoc(part) or "").split("\n\n")[0]
-        return " ".join(says.split())
+        description = getattr(part, "says", "") or (inspect.getdoc(part) or "").split("\n\n")[0]
+        return " ".join(description.split())
 
     def accepts(self, part: object) -> bool:
         """Return whether an object is a class of this registry's kind."""
@@ -147,18 +147,18 @@ class Registry(Generic[T]):
             InputError: The class is of another kind, or its name is taken or not usable in tables,
                 files and command lines.
         """
-        where = f"plugin {path}: " if path else ""
+        source = f"plugin {path}: " if path else ""
         if not self.accepts(part) or inspect.isabstract(part):
-            wanted = f"a complete subclass of {self.base.__name__}"
-            raise InputError(f"{where}{self.kind}: expected {wanted}, found {part!r:.80}")
-        name = _name_of(part, where)
+            expected = f"a complete subclass of {self.base.__name__}"
+            raise InputError(f"{source}{self.kind}: expected {expected}, found {part!r:.80}")
+        name = _name_of(part, source)
         if self._is_registered(name, part):
             return part
         # The loaded class replaces the stub of the same file.
         if name in self._announced and self._announced[name].path == path:
             del self._announced[name]
         if name in self.names() and not self._may_replace(name, part, path):
-            raise InputError(f"{where}{self.kind} '{name}' exists already; give it another name")
+            raise InputError(f"{source}{self.kind} '{name}' exists already; give it another name")
         self._added[name] = AddedPart(part, path)
         return part
 
@@ -173,12 +173,12 @@ class Registry(Generic[T]):
         Raises:
             InputError: The name is taken or not usable.
         """
-        where = f"plugin {path}: " if path else ""
-        name = _name_of(part, where)
-        other = self._announced.get(name) or self._added.get(name)
-        taken = other is not None and other.path != path
-        if taken or (path is not None and name in self._entry_points):
-            raise InputError(f"{where}{self.kind} '{name}' exists already; give it another name")
+        source = f"plugin {path}: " if path else ""
+        name = _name_of(part, source)
+        existing = self._announced.get(name) or self._added.get(name)
+        is_taken = existing is not None and existing.path != path
+        if is_taken or (path is not None and name in self._entry_points):
+            raise InputError(f"{source}{self.kind} '{name}' exists already; give it another name")
         self._announced[name] = AddedPart(part, path)
 
     def entry(self, name: str) -> str | None:
@@ -187,8 +187,8 @@ class Registry(Generic[T]):
 
     def place(self, name: str) -> Path | None:
         """Return the plugin file of a loaded part or stub; None if it is not from a file."""
-        added = self._added.get(name) or self._announced.get(name)
-        return added.path if added else None
+        registered = self._added.get(name) or self._announced.get(name)
+        return registered.path if registered else None
 
     def _is_registered(self, name: str, part: type[T]) -> bool:
         """Return whether this class is registered under the name."""
@@ -212,7 +212,9 @@ class Registry(Generic[T]):
 
     def paths(self) -> set[Path]:
         """Return the plugin files of all loaded parts."""
-        return {added.path for added in self._added.values() if added.path is not None}
+        return {
+            registered.path for registered in self._added.values() if registered.path is not None
+        }
 
     def snapshot(self) -> Mapping[str, AddedPart[T]]:
         """Return the parts added at run time by name, for `restore`."""
@@ -228,14 +230,14 @@ def _get_qualified_name(part: type) -> tuple[str, str]:
     return part.__module__, part.__qualname__
 
 
-def _name_of(part: type, where: str) -> str:
+def _name_of(part: type, source: str) -> str:
     """Check the declaration of a class, and return its name.
 
     A name is part of commands and files, so it must be plain.
 
     Args:
         part: Class to register.
-        where: Beginning of the message.
+        source: Beginning of the message.
 
     Raises:
         InputError: The class has no name, or one that is not usable.
@@ -243,9 +245,9 @@ def _name_of(part: type, where: str) -> str:
     name = getattr(part, "name", None)
     if not (isinstance(name, str) and _NAME.match(name)):
         raise InputError(
-            f"{where}class {part.__name__}: expected name = 'plain_name', found {name!r:.80}"
+            f"{source}class {part.__name__}: expected name = 'plain_name', found {name!r:.80}"
         )
     requires = getattr(part, "requires", ())
     if not (isinstance(requires, tuple | list) and all(isinstance(r, str) for r in requires)):
-        raise InputError(f"{where}class {part.__name__}: expected requires = ('package', ...)")
+        raise InputError(f"{source}class {part.__name__}: expected requires = ('package', ...)")
     return name

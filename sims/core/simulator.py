@@ -60,11 +60,13 @@ def make_unknown_name_error(kind: str, name: str, known: Sequence[str]) -> Input
         name: Unknown name.
         known: Known names.
     """
-    near = similar(str(name), known)
-    listed = (
-        "" if near and len(known) > MAX_LISTED_NAMES else f"; there are: {', '.join(sorted(known))}"
+    suggestion = similar(str(name), known)
+    name_list = (
+        ""
+        if suggestion and len(known) > MAX_LISTED_NAMES
+        else f"; there are: {', '.join(sorted(known))}"
     )
-    return InputError(f"unknown {kind} '{truncate_text(str(name))}'{listed}{near}")
+    return InputError(f"unknown {kind} '{truncate_text(str(name))}'{name_list}{suggestion}")
 
 
 def similar(name: str, known: Iterable[str]) -> str:
@@ -80,12 +82,12 @@ def similar(name: str, known: Iterable[str]) -> str:
     from difflib import get_close_matches
 
     # Ignore case and accept prefixes: users write Pendulum for pendulum, or a family for a member.
-    names = {one.lower(): one for one in known}
-    wanted = name.lower()[:MAX_QUOTED_NAME_LENGTH]
-    similar = [key for key in names if len(wanted) >= 3 and key.startswith(wanted)]
-    similar = similar or get_close_matches(wanted, names, cutoff=_ALIKE)
-    near = [names[key] for key in similar[:3]]
-    return f"; did you mean {' or '.join(near)}?" if near else ""
+    names = {known_name.lower(): known_name for known_name in known}
+    lower_name = name.lower()[:MAX_QUOTED_NAME_LENGTH]
+    similar = [key for key in names if len(lower_name) >= 3 and key.startswith(lower_name)]
+    similar = similar or get_close_matches(lower_name, names, cutoff=_ALIKE)
+    similar_names = [names[key] for key in similar[:3]]
+    return f"; did you mean {' or '.join(similar_names)}?" if similar_names else ""
 
 
 def make_read_only(values: ArrayLike) -> Array:
@@ -248,10 +250,10 @@ class Scenario:
                     f"input '{name}' has shape {signal.shape}, the scenario has {times.size}"
                     " samples"
                 )
-        before = {
+        histories = {
             name: make_read_only(signal) for name, signal in self.before.items() if signal.size
         }
-        for name, (stamps, _) in before.items():
+        for name, (stamps, _) in histories.items():
             if not (np.diff(stamps, append=0.0) > 0).all():
                 raise InputError(
                     f"input '{name}' before the run: its instants must be negative and increasing"
@@ -263,7 +265,7 @@ class Scenario:
                     f"{times.size}"
                 )
         # Fields of a frozen dataclass can only be set in this way.
-        object.__setattr__(self, "before", before)
+        object.__setattr__(self, "before", histories)
         object.__setattr__(self, "times", times)
         object.__setattr__(self, "inputs", inputs)
         object.__setattr__(self, "initial", {k: float(v) for k, v in self.initial.items()})
@@ -377,16 +379,16 @@ class Simulator(ABC):
         defaults = {c.name: c.value for c in self.constants}
         self.constant_values = self._check_constants(defaults, constants or {})
         names = [c.name for c in self.channels]
-        chosen = names if observe is None else list(observe)
-        for name in chosen:
+        chosen_names = names if observe is None else list(observe)
+        for name in chosen_names:
             if name not in names:
                 raise make_unknown_name_error(f"channel of simulator {self.name}", name, names)
-        if not chosen or len(set(chosen)) < len(chosen):
+        if not chosen_names or len(set(chosen_names)) < len(chosen_names):
             raise InputError(
                 f"simulator {self.name}: observe needs one or more different channels, found"
-                f" {truncate_text(str(chosen))}"
+                f" {truncate_text(str(chosen_names))}"
             )
-        self.columns = [names.index(name) for name in chosen]
+        self.columns = [names.index(name) for name in chosen_names]
         self.channels = tuple(self.channels[i] for i in self.columns)
 
     @abstractmethod
@@ -421,56 +423,56 @@ class Simulator(ABC):
 
     def run_inputs(self, scenario: Scenario) -> dict[str, Array]:
         """Return the input signals of one run, each (T,); missing inputs are zero."""
-        known = {c.name: np.zeros(scenario.times.size) for c in self.inputs}
-        return self._check_values("input", known, scenario.inputs)
+        default_signals = {c.name: np.zeros(scenario.times.size) for c in self.inputs}
+        return self._check_values("input", default_signals, scenario.inputs)
 
     def _check_constants(
-        self, known: Mapping[str, float], given: Mapping[str, float]
+        self, defaults: Mapping[str, float], given_values: Mapping[str, float]
     ) -> dict[str, float]:
         """Return the constants with their given values, after checking their limits.
 
         Args:
-            known: default values of all constants.
-            given: values that differ, from the user or a scenario.
+            defaults: default values of all constants.
+            given_values: values that differ, from the user or a scenario.
 
         Raises:
             InputError: a constant is unknown, not finite, or outside its limits.
         """
-        values = self._check_values("constant", known, given)
+        values = self._check_values("constant", defaults, given_values)
         for c in self.constants:
             value = values[c.name]
             if c.positive and value <= 0:
-                wanted = "be > 0"
+                condition = "be > 0"
             elif not c.limits[0] <= value <= c.limits[1]:
-                wanted = f"lie in {c.wanted(value)}"
+                condition = f"lie in {c.wanted(value)}"
             else:
                 continue
-            who = f"constant '{c.name}' of simulator {self.name}"
-            raise InputError(f"{who} must {wanted}, found {value}")
+            subject = f"constant '{c.name}' of simulator {self.name}"
+            raise InputError(f"{subject} must {condition}, found {value}")
         return values
 
     def _check_values(
-        self, kind: str, known: Mapping[str, Any], given: Mapping[str, Any]
+        self, kind: str, defaults: Mapping[str, Any], given_values: Mapping[str, Any]
     ) -> dict[str, Any]:
         """Return known values, replaced by the given ones.
 
         Args:
             kind: word for these values in messages: constant, initial state or input.
-            known: default values by name.
-            given: values that replace them.
+            defaults: default values by name.
+            given_values: values that replace them.
 
         Raises:
             InputError: a name is unknown, or a value is not finite.
         """
-        for name, value in given.items():
-            if name not in known:
+        for name, value in given_values.items():
+            if name not in defaults:
                 raise make_unknown_name_error(
-                    f"{kind} of simulator {self.name}", name, list(known) or ["none"]
+                    f"{kind} of simulator {self.name}", name, list(defaults) or ["none"]
                 )
             if not np.isfinite(value).all():
-                who = f"{kind} '{name}' of simulator {self.name}"
-                raise InputError(f"{who} must be finite, found {truncate_text(str(value))}")
-        return {**known, **given}
+                subject = f"{kind} '{name}' of simulator {self.name}"
+                raise InputError(f"{subject} must be finite, found {truncate_text(str(value))}")
+        return {**defaults, **given_values}
 
 
 def apply_parameter_changes(
@@ -489,13 +491,15 @@ def apply_parameter_changes(
         InputError: A parameter or attribute is unknown, or a value is not possible.
     """
     names = [p.name for p in parameters]
-    allowed = ("nominal", "bounds", "training", "log")
+    allowed_attributes = ("nominal", "bounds", "training", "log")
     for name, change in changes.items():
         if name not in names:
             raise make_unknown_name_error("parameter", name, names)
         for attribute in change:
-            if attribute not in allowed:
-                raise make_unknown_name_error(f"attribute of parameter {name}", attribute, allowed)
+            if attribute not in allowed_attributes:
+                raise make_unknown_name_error(
+                    f"attribute of parameter {name}", attribute, allowed_attributes
+                )
     pairs = ("bounds", "training")  # given as lists in an experiment's file
     result = []
     for p in parameters:
@@ -505,7 +509,9 @@ def apply_parameter_changes(
         # Parameters that are positive by nature, such as masses, must stay positive.
         low, lowest = p.bounds[0], changed.bounds[0]
         if low >= 0 and (lowest < 0 or (low > 0 and lowest == 0)):
-            wanted = "more than 0" if low > 0 else "at least 0"
-            raise InputError(f"parameter {p.name}: bounds must be {wanted}, found {changed.bounds}")
+            condition = "more than 0" if low > 0 else "at least 0"
+            raise InputError(
+                f"parameter {p.name}: bounds must be {condition}, found {changed.bounds}"
+            )
         result.append(changed)
     return tuple(result)

@@ -119,8 +119,8 @@ class StateSnapshot:
             shift: (L, 1) shift of the set point.
         """
         name = self.system.servo
-        moved = replace(self, inputs={**self.inputs, name: self.inputs[name] + shift})
-        difference: Array = self.system.drive(moved) - self.system.drive(self)
+        shifted_moment = replace(self, inputs={**self.inputs, name: self.inputs[name] + shift})
+        difference: Array = self.system.drive(shifted_moment) - self.system.drive(self)
         return difference
 
     @property

@@ -57,8 +57,8 @@ def toml_key(name: str) -> str:
 
     It is quoted if it contains characters other than ASCII letters, digits, ``_`` and ``-``.
     """
-    bare = name.replace("_", "").replace("-", "")
-    return name if bare.isascii() and bare.isalnum() else toml_text(name)
+    characters = name.replace("_", "").replace("-", "")
+    return name if characters.isascii() and characters.isalnum() else toml_text(name)
 
 
 def read_toml(path: Path) -> dict[str, Any]:
@@ -72,8 +72,8 @@ def read_toml(path: Path) -> dict[str, Any]:
         # Editors on Windows begin a file with a byte order mark.
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
-        what = f"{error.reason} at byte {error.start}"
-        raise InputError(f"{path}: expected UTF-8 text ({what})") from None
+        reason = f"{error.reason} at byte {error.start}"
+        raise InputError(f"{path}: expected UTF-8 text ({reason})") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
     try:
@@ -136,8 +136,8 @@ def check_type(source: Source, where: str, value: Any, wanted: type, words: str 
     """
     kinds = _WIDER.get(wanted, (wanted,))
     # In Python, booleans are integers.
-    mistaken = isinstance(value, bool) and wanted is not bool
-    if mistaken or not isinstance(value, kinds):
+    is_wrong_bool = isinstance(value, bool) and wanted is not bool
+    if is_wrong_bool or not isinstance(value, kinds):
         raise make_error(source, where, words or _WORDS[wanted], value)
     size: Any = value
     if wanted is int and not -MAX_INTEGER <= size <= MAX_INTEGER:  # TOML integers are unbounded
@@ -169,10 +169,10 @@ def check_text(
         words: Description of the expected value; the default one if empty.
         most: Maximum number of characters.
     """
-    read = str(check_type(source, where, value, str, words))
-    if len(read) > most:
-        raise make_error(source, where, f"at most {most} characters, not {len(read)}", value)
-    return read
+    text = str(check_type(source, where, value, str, words))
+    if len(text) > most:
+        raise make_error(source, where, f"at most {most} characters, not {len(text)}", value)
+    return text
 
 
 def check_name_list(
@@ -280,18 +280,18 @@ def check_annotation(source: Source, where: str, value: Any, declared: Any) -> A
     Raises:
         InputError: The value does not match.
     """
-    origin, inner = get_origin(declared), get_args(declared)
+    origin, arguments = get_origin(declared), get_args(declared)
     if declared is Any:
         return value  # checked where it is used, for example settings by a simulator
     if origin in (Union, UnionType):
-        return check_annotation(source, where, value, _choose_union_member(value, inner))
+        return check_annotation(source, where, value, _choose_union_member(value, arguments))
     if declared == Range:  # before other tuples, which may have any length
         return check_range(source, where, value)
     if origin is tuple:
         items = check_type(source, where, value, list)
-        return tuple(check_annotation(source, where, item, inner[0]) for item in items)
+        return tuple(check_annotation(source, where, item, arguments[0]) for item in items)
     if origin is not None:
-        return _check_table(source, where, value, inner[1])
+        return _check_table(source, where, value, arguments[1])
     if isinstance(declared, type) and is_dataclass(declared):
         return declared(**check_entries(source, where, value, get_type_hints_of(declared)))
     if is_typeddict(declared):
@@ -301,11 +301,11 @@ def check_annotation(source: Source, where: str, value: Any, declared: Any) -> A
     return check_type(source, where, value, declared)
 
 
-def _check_table(source: Source, where: str, value: Any, declared: Any) -> dict[str, Any]:
+def _check_table(source: Source, key_path: str, value: Any, declared: Any) -> dict[str, Any]:
     """Check a table with arbitrary names whose entries are all of one type."""
     result = {}
-    for key, item in check_table(source, where, value).items():
-        result[key] = check_annotation(source, f"{where}.{key}", item, declared)
+    for key, item in check_table(source, key_path, value).items():
+        result[key] = check_annotation(source, f"{key_path}.{key}", item, declared)
     return result
 
 
@@ -324,15 +324,15 @@ def check_entries(
     Raises:
         InputError: A name is unknown, or an entry has a wrong type.
     """
-    given = check_table(source, where, value)
+    table = check_table(source, where, value)
     # Check names first: an error about the type of an unknown key would be confusing.
-    check_known_names(kind or f"entry of [{where}] in {source}", given, hints)
+    check_known_names(kind or f"entry of [{where}] in {source}", table, hints)
     result = {}
-    for key, item in given.items():
+    for key, item in table.items():
         place = f"{where}.{key}" if where else key
-        read = check_annotation(source, place, item, hints[key])
+        checked_item = check_annotation(source, place, item, hints[key])
         # Keep integers, because hashes of runs and trained weights depend on what is written.
-        result[key] = item if hints[key] is float else read
+        result[key] = item if hints[key] is float else checked_item
     return result
 
 
@@ -342,9 +342,9 @@ def get_type_hints_of(kind: type) -> dict[str, Any]:
     return get_type_hints(kind)
 
 
-def _choose_union_member(value: Any, among: Sequence[Any]) -> Any:
+def _choose_union_member(value: Any, members: Sequence[Any]) -> Any:
     """Return the type of a union to check a value against: a tuple for a list, else the first."""
     # TOML has no null: entries that may be None are left out.
-    kinds = [kind for kind in among if kind is not NoneType]
+    kinds = [kind for kind in members if kind is not NoneType]
     lists = [kind for kind in kinds if get_origin(kind) is tuple]
     return lists[0] if lists and isinstance(value, list | tuple) else kinds[0]

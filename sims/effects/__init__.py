@@ -24,8 +24,8 @@ def list_effects_for(system: type[System]) -> dict[str, type[Effect]]:
             PartUnavailableError
         ):  # the list of effects shows the reason; explain works without it
             continue
-        for placed in system.placed(effect):
-            usable[placed.name] = placed
+        for placed_effect in system.placed(effect):
+            usable[placed_effect.name] = placed_effect
     return usable
 
 

@@ -52,10 +52,10 @@ def apply_recursion(decay: Array, gained: Array, start: Array) -> Array:
     """
     # rows are contiguous in memory, and the additions become the result
     result = np.ascontiguousarray(gained.T)
-    kept = np.ascontiguousarray(decay.T)
+    decay_rows = np.ascontiguousarray(decay.T)
     state: Array = start[:, 0]
     # step by step: a closed form would divide by products of decays, which underflow
-    for row, share in zip(result, kept, strict=True):
+    for row, share in zip(result, decay_rows, strict=True):
         row += share * state
         state = row
     return result.T

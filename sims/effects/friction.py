@@ -157,8 +157,8 @@ class DirectionalLoadFriction(Friction):
             c: (K, L, 1) coefficients.
             moment: state snapshot of L batch elements.
         """
-        drive, against = moment.sides
-        return np.abs(np.maximum(c[0], 0.0) * drive + np.maximum(c[1], 0.0) * against)  # (4)
+        drive, external_load = moment.sides
+        return np.abs(np.maximum(c[0], 0.0) * drive + np.maximum(c[1], 0.0) * external_load)  # (4)
 
 
 class QuadraticLoadFriction(Friction):
@@ -218,8 +218,10 @@ class WarmingFriction(Friction):
             c: (K, L, 1) coefficients.
             moment: state snapshot of L batch elements.
         """
-        left = np.exp(-moment.t / np.maximum(c[2], _SMALLEST))
-        return (np.maximum(c[0], 0.0) + np.maximum(c[1], 0.0) * moment.speed) * left  # (7)
+        remaining_share = np.exp(-moment.t / np.maximum(c[2], _SMALLEST))
+        return (
+            np.maximum(c[0], 0.0) + np.maximum(c[1], 0.0) * moment.speed
+        ) * remaining_share  # (7)
 
 
 class DirectionalViscousFriction(Force):
@@ -239,18 +241,18 @@ class DirectionalViscousFriction(Force):
             c: (K, L, 1) coefficients.
             moment: state snapshot of L batch elements.
         """
-        ahead, back = np.maximum(moment.v, 0.0), np.minimum(moment.v, 0.0)
-        return -c[0] * ahead - c[1] * back  # (8)
+        forward_velocity, backward_velocity = np.maximum(moment.v, 0.0), np.minimum(moment.v, 0.0)
+        return -c[0] * forward_velocity - c[1] * backward_velocity  # (8)
 
 
-def _limit_to_opposing(drive: Array, against: Array) -> Array:
+def _limit_to_opposing(drive: Array, external_load: Array) -> Array:
     """Return the smaller of two opposing forces (L, 1); zero where they do not oppose."""
-    low, high = np.minimum(drive, against), np.maximum(drive, against)
+    low, high = np.minimum(drive, external_load), np.maximum(drive, external_load)
     return np.maximum(low, 0.0) - np.minimum(high, 0.0)
 
 
 def _compute_stribeck_factor(speed: Array, scale: Array) -> Array:
     """Return exp(-(v / scale)^2) (L, 1), the share of Stribeck's extra friction (2) at a speed."""
     ratio = speed / np.maximum(scale, _SMALLEST)
-    left: Array = np.exp(-np.square(ratio))
-    return left
+    factor: Array = np.exp(-np.square(ratio))
+    return factor

@@ -96,15 +96,15 @@ class PayloadMass(ModelValueEffect):
 
         At a place, the plausible positions are those within the link.
         """
-        ends = np.array([c.plausible[0] for c in self.coefficients])
-        middle = ends.mean(axis=1)
-        middle[0] = _SMALL_MASS * ends[0, 1]
-        moved = [k for k, c in enumerate(self.coefficients) if k and c.least != c.most]
-        middle[[k for k in range(1, len(middle)) if k not in moved]] = 0.0
+        limits = np.array([c.plausible[0] for c in self.coefficients])
+        middle = limits.mean(axis=1)
+        middle[0] = _SMALL_MASS * limits[0, 1]
+        observable_axes = [k for k, c in enumerate(self.coefficients) if k and c.least != c.most]
+        middle[[k for k in range(1, len(middle)) if k not in observable_axes]] = 0.0
         points = [middle]
-        for k in moved:
+        for k in observable_axes:
             point = middle.copy()
-            point[k] = 0.5 * (ends[k].mean() + ends[k, 1])
+            point[k] = 0.5 * (limits[k].mean() + limits[k, 1])
             points.append(point)
         return points
 

@@ -163,10 +163,10 @@ class InputDeadBand(Input):
             c: (K, L, 1) coefficients.
             signal: signal (L, S) over the steps.
         """
-        half = np.abs(c[0])
+        half_width = np.abs(c[0])
         # the excess, not the whole value: the applied input is continuous at the border
-        beyond = signal.values - np.clip(signal.values, -half, half)  # (5)
-        return np.where(c[0] > 0, beyond, signal.values)
+        excess = signal.values - np.clip(signal.values, -half_width, half_width)  # (5)
+        return np.where(c[0] > 0, excess, signal.values)
 
 
 class InputSaturation(Input):
@@ -207,8 +207,8 @@ class InputBacklash(Input):
             c: (K, L, 1) coefficients.
             signal: signal (L, S) over the steps.
         """
-        played = _apply_play(signal, c[0] / 2)
-        return np.where(c[0] > 0, played, signal.values)
+        load_side_input = _apply_play(signal, c[0] / 2)
+        return np.where(c[0] > 0, load_side_input, signal.values)
 
 
 class InputPower(Input):
@@ -229,8 +229,8 @@ class InputPower(Input):
             signal: signal (L, S) over the steps.
         """
         size = np.abs(signal.values)
-        bent = np.sign(signal.values) * size ** np.maximum(1.0 + c[1], _LEAST)
-        return (1.0 + c[0]) * np.where(c[1] != 0, bent, signal.values)  # (8)
+        power = np.sign(signal.values) * size ** np.maximum(1.0 + c[1], _LEAST)
+        return (1.0 + c[0]) * np.where(c[1] != 0, power, signal.values)  # (8)
 
 
 class InputRateLimit(Input):
@@ -258,9 +258,9 @@ def _apply_lag(signal: Signal, lag: Array) -> Array:
     # the command is constant over a step, so (2) of sims.effects.first_order_lag gives the value at
     # its end
     decay, mean = compute_lag_response(signal.steps, lag)
-    ends = apply_recursion(decay, (1.0 - decay) * signal.values, signal.start)
+    step_end_values = apply_recursion(decay, (1.0 - decay) * signal.values, signal.start)
     # engines hold the input over a step: the mean transfers the same momentum as the lagged input
-    return signal.values + (shift_by_one_step(ends, signal.start) - signal.values) * mean
+    return signal.values + (shift_by_one_step(step_end_values, signal.start) - signal.values) * mean
 
 
 def _apply_play(signal: Signal, half: Array) -> Array:
@@ -270,11 +270,11 @@ def _apply_play(signal: Signal, half: Array) -> Array:
     high = np.ascontiguousarray((signal.values + half).T)
     # the position within the backlash is not recorded: the centre favours neither direction
     state: Array = signal.start[:, 0]
-    for below, above in zip(low, high, strict=True):
+    for lower_limit, upper_limit in zip(low, high, strict=True):
         # (7), in place and without the overhead of np.clip: the array of lower bounds becomes the
         # result
-        np.maximum(state, below, out=below)
-        state = np.minimum(below, above, out=below)
+        np.maximum(state, lower_limit, out=lower_limit)
+        state = np.minimum(lower_limit, upper_limit, out=lower_limit)
     return low.T
 
 
@@ -283,19 +283,21 @@ def _apply_rate_limit(signal: Signal, limit: Array) -> Array:
 
     `limit` (L, 1) is the largest rate, infinite for no limit.
     """
-    wanted = np.ascontiguousarray(signal.values.T)
+    commands = np.ascontiguousarray(signal.values.T)
     # An infinite limit times a step of zero length counts as zero.
     reach = np.where(signal.steps > 0, limit * np.where(signal.steps > 0, signal.steps, 1.0), 0.0).T
-    back = -reach
-    moved = np.empty_like(wanted)
-    ends = np.empty_like(wanted)
+    min_changes = -reach
+    changes = np.empty_like(commands)
+    step_end_values = np.empty_like(commands)
     state: Array = signal.start[:, 0]
-    for row, up, down, move, end in zip(wanted, reach, back, moved, ends, strict=True):
-        np.subtract(row, state, out=move)
-        np.minimum(move, up, out=move)
-        np.maximum(move, down, out=move)
-        state = np.add(state, move, out=end)
+    for row, max_change, min_change, change, step_end_value in zip(
+        commands, reach, min_changes, changes, step_end_values, strict=True
+    ):
+        np.subtract(row, state, out=change)
+        np.minimum(change, max_change, out=change)
+        np.maximum(change, min_change, out=change)
+        state = np.add(state, change, out=step_end_value)
     # It rises until it reaches the command, and is constant for the rest of the step.
-    rising = np.abs(moved) / np.where(reach > 0, reach, np.inf)
-    means = ends - 0.5 * rising * moved
-    return np.where(np.isfinite(reach), means, wanted).T
+    rising = np.abs(changes) / np.where(reach > 0, reach, np.inf)
+    mean_values = step_end_values - 0.5 * rising * changes
+    return np.where(np.isfinite(reach), mean_values, commands).T

@@ -56,8 +56,8 @@ class SupplySag(Force):
             moment: state snapshot of L batch elements.
         """
         drive, _ = moment.sides
-        lost = np.maximum(c[0], 0.0) * moment.drawn
-        return moment.along_primary(-drive * lost / (1.0 + lost))  # (1), (2)
+        relative_drop = np.maximum(c[0], 0.0) * moment.drawn
+        return moment.along_primary(-drive * relative_drop / (1.0 + relative_drop))  # (1), (2)
 
 
 class SupplyBrakingLoss(Force):
@@ -79,5 +79,5 @@ class SupplyBrakingLoss(Force):
             moment: state snapshot of L batch elements.
         """
         drive, _ = moment.sides
-        against = np.where(drive * moment.primary_rate < 0.0, drive, 0.0)
-        return moment.along_primary(-np.clip(c[0], 0.0, 1.0) * against)  # (3)
+        braking_force = np.where(drive * moment.primary_rate < 0.0, drive, 0.0)
+        return moment.along_primary(-np.clip(c[0], 0.0, 1.0) * braking_force)  # (3)

@@ -222,10 +222,10 @@ class ClockSkew(Sensor):
         return t * (1.0 + c[0])  # (6)
 
 
-def _smooth_step(instant: Array, now: Array) -> Array:
-    """Return the progress (L, S) of the slip at stamps `now`: 0 before, 1 after, (8) between."""
-    apart = np.maximum(np.diff(now, axis=1, prepend=now[:, :1]), _SHORTEST)
-    share: Array = np.clip((now - instant) / apart + 0.5, 0.0, 1.0)
+def _smooth_step(instant: Array, times: Array) -> Array:
+    """Return the progress (L, S) of the slip at stamps `times`: 0 before, 1 after, (8) between."""
+    intervals = np.maximum(np.diff(times, axis=1, prepend=times[:, :1]), _SHORTEST)
+    share: Array = np.clip((times - instant) / intervals + 0.5, 0.0, 1.0)
     return share
 
 
@@ -237,5 +237,5 @@ def _apply_lag(signal: Signal, lag: Array) -> Array:
     decay, mean = compute_lag_response(signal.steps, lag)
     old = shift_by_one_step(signal.values, signal.start)
     # (4) of sims.effects.first_order_lag without its first term, which is the recursion
-    gained = signal.values - decay * old - mean * (signal.values - old)
-    return apply_recursion(decay, gained, signal.start)
+    increments = signal.values - decay * old - mean * (signal.values - old)
+    return apply_recursion(decay, increments, signal.start)

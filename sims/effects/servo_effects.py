@@ -100,53 +100,56 @@ class ServoMotionProfile(Input):
         return np.where(limit > 0, _apply_acceleration_limit(signal, limit[:, 0]), signal.values)
 
 
-def _apply_acceleration_limit(signal: Signal, most: Array) -> Array:
+def _apply_acceleration_limit(signal: Signal, max_acceleration: Array) -> Array:
     """Return the set point limited in acceleration (3), as means (L, S) over each step.
 
-    `most` (L,) is the limit c of the acceleration, in units of the set point per s^2.
+    `max_acceleration` (L,) is the limit c of the acceleration, in units of the set point per s^2.
 
     The speed w at the end of a step is chosen such that the remaining distance is sufficient for
     stopping: w h / 2 if one more step of length h is enough, w^2 / (2 c) if it takes longer.
     """
-    wanted, steps = np.ascontiguousarray(signal.values.T), np.ascontiguousarray(signal.steps.T)
-    means = np.empty_like(wanted)
-    gains = most * steps
+    commands, steps = np.ascontiguousarray(signal.values.T), np.ascontiguousarray(signal.steps.T)
+    means = np.empty_like(commands)
+    gains = max_acceleration * steps
     inverses = np.divide(1.0, steps, out=np.zeros_like(steps), where=steps > 0)
-    rows = zip(wanted, steps, gains, 0.5 * gains, 0.25 * gains**2, inverses, means, strict=True)
-    place, speed = signal.start[:, 0].copy(), np.zeros(wanted.shape[1])
+    rows = zip(commands, steps, gains, 0.5 * gains, 0.25 * gains**2, inverses, means, strict=True)
+    place, speed = signal.start[:, 0].copy(), np.zeros(commands.shape[1])
     # The loop has thousands of steps of a few elements: everything possible is computed before it.
-    for row, h, gain, half, square, inverse, mean in rows:
-        apart = row - place
-        way = np.copysign(1.0, apart)
-        left, now = np.abs(apart), way * speed
-        braked = h * now
-        short = inverse * (left - 0.5 * braked)
-        root = np.maximum(square + most * (2.0 * left - braked), 0.0)
-        long = np.maximum(np.sqrt(root) - half, gain)
-        least = np.maximum(np.minimum(short, long), now - gain)
-        next_speed = way * np.minimum(least, now + gain)
-        both = 0.5 * h * (speed + next_speed)
-        np.add(place, (both + 0.5 * h * speed) / 3.0, out=mean)
-        place = place + both
+    for row, h, gain, half_gain, square, inverse, mean in rows:
+        deviation = row - place
+        direction = np.copysign(1.0, deviation)
+        remaining, directed_speed = np.abs(deviation), direction * speed
+        braking_distance = h * directed_speed
+        short = inverse * (remaining - 0.5 * braking_distance)
+        root = np.maximum(square + max_acceleration * (2.0 * remaining - braking_distance), 0.0)
+        long = np.maximum(np.sqrt(root) - half_gain, gain)
+        limited_speed = np.maximum(np.minimum(short, long), directed_speed - gain)
+        next_speed = direction * np.minimum(limited_speed, directed_speed + gain)
+        travel = 0.5 * h * (speed + next_speed)
+        np.add(place, (travel + 0.5 * h * speed) / 3.0, out=mean)
+        place = place + travel
         speed = next_speed
     return means.T
 
 
-def _average_earlier_signal(signal: Signal, late: Array) -> Array:
-    """Return means (L, S) over each step of the signal `late` (L, 1) seconds earlier.
+def _average_earlier_signal(signal: Signal, delay: Array) -> Array:
+    """Return means (L, S) over each step of the signal `delay` (L, 1) seconds earlier.
 
     Before the run, the signal has its initial value.
     """
-    ends = signal.times
-    begins = ends - signal.steps
-    gained = np.cumsum(signal.values * signal.steps, axis=1)
+    step_ends = signal.times
+    step_starts = step_ends - signal.steps
+    cumulative_integral = np.cumsum(signal.values * signal.steps, axis=1)
     result = signal.values.copy()
-    for lane in np.flatnonzero(late[:, 0] > 0):
+    for lane in np.flatnonzero(delay[:, 0] > 0):
         # integral of the signal, beginning long before the run
-        knots = np.concatenate([[begins[lane, 0] - 1.0, begins[lane, 0]], ends[lane]])
-        whole = np.concatenate([[-signal.start[lane, 0], 0.0], gained[lane]])
+        knots = np.concatenate(
+            [[step_starts[lane, 0] - 1.0, step_starts[lane, 0]], step_ends[lane]]
+        )
+        integral = np.concatenate([[-signal.start[lane, 0], 0.0], cumulative_integral[lane]])
         first, last = (
-            _integrate_signal(knots, whole, t[lane] - late[lane]) for t in (begins, ends)
+            _integrate_signal(knots, integral, t[lane] - delay[lane])
+            for t in (step_starts, step_ends)
         )
         steps = signal.steps[lane]
         long = steps > 0
@@ -154,8 +157,8 @@ def _average_earlier_signal(signal: Signal, late: Array) -> Array:
     return result
 
 
-def _integrate_signal(knots: Array, whole: Array, t: Array) -> Array:
+def _integrate_signal(knots: Array, integral: Array, t: Array) -> Array:
     """Return the integral at times t, extrapolated linearly before the first knot."""
-    inside: Array = np.interp(t, knots, whole)
-    slope = (whole[1] - whole[0]) / (knots[1] - knots[0])
-    return inside + slope * np.minimum(t - knots[0], 0.0)
+    interpolated: Array = np.interp(t, knots, integral)
+    slope = (integral[1] - integral[0]) / (knots[1] - knots[0])
+    return interpolated + slope * np.minimum(t - knots[0], 0.0)

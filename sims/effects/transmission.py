@@ -110,11 +110,13 @@ class DrivenLoad(HiddenStateEffect):
 
     def element(self, c: Array) -> SeriesElement:
         """Return the series element: a spring with damper for a compliance, else backlash."""
-        numbers = {one.name: values for one, values in zip(self.between, c, strict=True)}
+        numbers = {
+            coefficient.name: values for coefficient, values in zip(self.between, c, strict=True)
+        }
         none = np.zeros_like(c[0])
-        gives = numbers.get("compliance", none)
+        compliance = numbers.get("compliance", none)
         # A compliance of zero is off; it adds no spring to a batch in which others are on.
-        stiffness = np.where(gives > 0, 1.0 / np.maximum(gives, _LEAST), 0.0)
+        stiffness = np.where(compliance > 0, 1.0 / np.maximum(compliance, _LEAST), 0.0)
         gap = np.maximum(numbers.get("gap", none), 0.0)
         return SeriesElement(stiffness, numbers.get("damping", none), gap, numbers["rotor"])
 
@@ -125,10 +127,10 @@ class DrivenLoad(HiddenStateEffect):
             c: (K, L, 1) coefficients.
             moment: state snapshot of L batch elements.
         """
-        away = self.compute_static_deflection(
+        deflection = self.compute_static_deflection(
             c, _compute_gravity_acceleration(moment, moment.primary)
         )
-        return HiddenState(moment.primary + away, moment.v[:, :1])
+        return HiddenState(moment.primary + deflection, moment.v[:, :1])
 
     def act(self, c: Array, moment: StateSnapshot, state: HiddenState) -> tuple[Array, Array]:
         """Return the force (L, D) on the drive side and the acceleration (L, 1) of the load.
@@ -140,10 +142,10 @@ class DrivenLoad(HiddenStateEffect):
         """
         pull, share = self.compute_coupling_force(c, moment, state), self.behind(c)
         # The load carries its share of the weight.
-        near = (
+        reaction_force = (
             -share * moment.inertia * (pull + _compute_gravity_acceleration(moment, moment.primary))
         )  # (1)
-        return moment.along_primary(near), pull + _compute_gravity_acceleration(
+        return moment.along_primary(reaction_force), pull + _compute_gravity_acceleration(
             moment, state.x
         )  # (2)
 
@@ -222,17 +224,17 @@ class JointBacklash(DrivenLoad):
             moment: state snapshot of L batch elements.
             state: position and velocity of the load.
         """
-        apart = moment.primary - state.x
-        beyond = apart - np.clip(apart, -0.5 * c[0], 0.5 * c[0])
-        pressed = np.abs(beyond) / (np.abs(beyond) + CONTACT_DAMPING_DEPTH * c[0])
-        push = CONTACT_FREQUENCY * beyond + 4.0 * pressed * (moment.v[:, :1] - state.v)
+        gap = moment.primary - state.x
+        indentation = gap - np.clip(gap, -0.5 * c[0], 0.5 * c[0])
+        pressed = np.abs(indentation) / (np.abs(indentation) + CONTACT_DAMPING_DEPTH * c[0])
+        push = CONTACT_FREQUENCY * indentation + 4.0 * pressed * (moment.v[:, :1] - state.v)
         pull = (1.0 - self.behind(c)) * CONTACT_FREQUENCY * push  # (4)
-        return np.where(beyond > 0, np.maximum(pull, 0.0), np.minimum(pull, 0.0))
+        return np.where(indentation > 0, np.maximum(pull, 0.0), np.minimum(pull, 0.0))
 
 
 def _compute_gravity_acceleration(moment: StateSnapshot, y: Array) -> Array:
     """Return the acceleration (L, 1) by gravity alone at positions y (L, 1)."""
-    there = replace(moment, x=moment.along_primary(y))
-    weight = moment.system.weight(there)[:, moment.system.primary, None]
+    moment_at_y = replace(moment, x=moment.along_primary(y))
+    weight = moment.system.weight(moment_at_y)[:, moment.system.primary, None]
     fall: Array = weight / moment.inertia
     return fall

@@ -72,10 +72,10 @@ def make_engine(name: str, system: type[System], settings: Mapping[str, Any]) ->
     # An engine's settings are the keyword-only arguments of its factory, so that they are declared
     # once.
     parameters = inspect.signature(module.make_engine).parameters
-    known = [key for key, p in parameters.items() if p.kind is p.KEYWORD_ONLY]
+    setting_names = [key for key, p in parameters.items() if p.kind is p.KEYWORD_ONLY]
     for setting in settings:
-        if setting not in known:
-            raise make_unknown_name_error(f"setting of engine {name}", setting, known)
+        if setting not in setting_names:
+            raise make_unknown_name_error(f"setting of engine {name}", setting, setting_names)
     engine: Engine = module.make_engine(system, **settings)
     if reason := engine.find_unsupported_reason(system):
         raise InputError(f"engine {name} cannot simulate system {system.name}: {reason}")

@@ -51,7 +51,7 @@ def join_trajectories(
         return motion
     count, dim = batch.x.shape
     records = batch.steps.shape[1] // batch.steps_per_sample + 1
-    joined = np.empty((3, count, records, dim))
+    joined_states = np.empty((3, count, records, dim))
     for i, motion in parts:
-        joined[:, i] = motion.x, motion.v, motion.a
-    return Trajectories(*joined)
+        joined_states[:, i] = motion.x, motion.v, motion.a
+    return Trajectories(*joined_states)

@@ -42,9 +42,9 @@ class AugmentedSystem(System):
     @classmethod
     def get_base_snapshot(cls, moment: StateSnapshot) -> StateSnapshot:
         """Return the state of the original system, without hidden coordinates."""
-        own = len(cls.base_system.coordinates)
+        base_size = len(cls.base_system.coordinates)
         theta = moment.theta[:, : len(cls.base_system.parameters)]
-        x, v = moment.x[:, :own], moment.v[:, :own]
+        x, v = moment.x[:, :base_size], moment.v[:, :base_size]
         return replace(moment, system=cls.base_system, theta=theta, x=x, v=v)
 
     @classmethod
@@ -85,15 +85,15 @@ class AugmentedSystem(System):
         The engine divides forces by the inertia. So the force on a hidden state is the
         inertia times its rate, which gives the rate as its acceleration.
         """
-        plain = self.get_base_snapshot(moment)
-        own = len(self.base_system.coordinates)
-        total = self.base_system.force(plain)
+        base_moment = self.get_base_snapshot(moment)
+        base_size = len(self.base_system.coordinates)
+        total = self.base_system.force(base_moment)
         inertia = self.mass(moment.theta, moment.constants)
         rates = []
         for k, c in enumerate(self.split_coefficients(moment.theta)):
-            place = slice(own + k, own + k + 1)
+            place = slice(base_size + k, base_size + k + 1)
             state = HiddenState(moment.x[:, place], moment.v[:, place])
-            force, rate = self.effects[k].act(c, plain, state)
+            force, rate = self.effects[k].act(c, base_moment, state)
             total = total + force
             rates.append(inertia * rate)
         return np.concatenate([total, *rates], axis=1)
@@ -109,8 +109,10 @@ class AugmentedSystem(System):
             a: (L, S, D) accelerations.
             constants: constants by name.
         """
-        own = len(self.base_system.coordinates)
-        return self.base_system.observe(x[:, :, :own], v[:, :, :own], a[:, :, :own], constants)
+        base_size = len(self.base_system.coordinates)
+        return self.base_system.observe(
+            x[:, :, :base_size], v[:, :, :base_size], a[:, :, :base_size], constants
+        )
 
 
 class _BaseForce(Force):
@@ -156,21 +158,21 @@ def integrate_with_hidden_states(engine: Engine, batch: IntegrationBatch) -> Tra
     hidden = [(e, c) for e, c in batch.effects if isinstance(e, HiddenStateEffect)]
     if not hidden:
         return engine.integrate(batch)
-    others = tuple((e, c) for e, c in batch.effects if not isinstance(e, HiddenStateEffect))
+    other_effects = tuple((e, c) for e, c in batch.effects if not isinstance(e, HiddenStateEffect))
     active = np.array([c[0, :, 0] > 0 for _, c in hidden])
     # Most calls have no hidden-state effects; they must not become slower.
     if not active.any():
-        return engine.integrate(replace(batch, effects=others))
+        return engine.integrate(replace(batch, effects=other_effects))
     motions = []
     numbers = (1 << np.arange(len(hidden))) @ active
     for number in sorted(set(numbers.tolist())):
         members = np.flatnonzero(numbers == number)
-        acting = [pair for k, pair in enumerate(hidden) if number >> k & 1]
-        part = slice_batch(replace(batch, effects=others), members)
-        effects = [(e, c[:, members]) for e, c in acting]
-        motion = engine.integrate(_augment_batch(part, effects) if acting else part)
-        own = batch.x.shape[1]
-        parts = (values[:, :, :own] for values in (motion.x, motion.v, motion.a))
+        active_effects = [pair for k, pair in enumerate(hidden) if number >> k & 1]
+        part = slice_batch(replace(batch, effects=other_effects), members)
+        effects = [(e, c[:, members]) for e, c in active_effects]
+        motion = engine.integrate(_augment_batch(part, effects) if active_effects else part)
+        base_size = batch.x.shape[1]
+        parts = (values[:, :, :base_size] for values in (motion.x, motion.v, motion.a))
         motions.append((members, Trajectories(*parts)))
     return join_trajectories(motions, batch)
 
@@ -187,8 +189,10 @@ def _augment_batch(
     system = make_augmented_system(type(batch.system), kinds)()
     inputs = {name: values[:, :1] for name, values in batch.inputs.items()}
     start = np.zeros((len(batch.x), 1))
-    at = StateSnapshot(batch.system, batch.theta, batch.constants, start, batch.x, batch.v, inputs)
-    states = [effect.begin(c, at) for effect, c in effects]
+    initial_moment = StateSnapshot(
+        batch.system, batch.theta, batch.constants, start, batch.x, batch.v, inputs
+    )
+    states = [effect.begin(c, initial_moment) for effect, c in effects]
     return replace(
         batch,
         system=system,
@@ -210,7 +214,7 @@ def make_augmented_system(
         effects: effect classes with a hidden state.
     """
     names = [effect.name for effect in effects]
-    declared: dict[str, Any] = {
+    attributes: dict[str, Any] = {
         "base_system": system(),
         "effects": tuple(effect() for effect in effects),
         "name": f"{system.name} with {' and '.join(names)}",
@@ -229,7 +233,7 @@ def make_augmented_system(
         "fastest": max(effect.fastest for effect in effects),
         "guided": len(system.coordinates),
     }
-    return type("EnlargedSystem", (AugmentedSystem,), declared)
+    return type("EnlargedSystem", (AugmentedSystem,), attributes)
 
 
 @cache
@@ -238,8 +242,8 @@ def _wrap_effect(effect: type[Effect]) -> type[Effect]:
     if not issubclass(effect, (Force, Friction)):
         return effect
     base = _BaseForce if issubclass(effect, Force) else _BaseFriction
-    declared = {"name": effect.name, "coefficients": effect.coefficients, "inner": effect()}
-    return type("PlainEffect", (base,), {**declared, "says": effect.says})
+    attributes = {"name": effect.name, "coefficients": effect.coefficients, "inner": effect()}
+    return type("PlainEffect", (base,), {**attributes, "says": effect.says})
 
 
 def _get_base_snapshot(moment: StateSnapshot) -> StateSnapshot:
@@ -255,5 +259,5 @@ def pad_force(force: Array, moment: StateSnapshot) -> Array:
         force: (L, d) force on the system's own coordinates.
         moment: state snapshot with hidden coordinates.
     """
-    nothing = np.zeros_like(moment.x[:, force.shape[1] :])
-    return np.concatenate([force, nothing], axis=1)
+    zeros = np.zeros_like(moment.x[:, force.shape[1] :])
+    return np.concatenate([force, zeros], axis=1)

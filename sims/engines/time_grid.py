@@ -101,12 +101,18 @@ def group_scenarios(scenarios: Sequence[Scenario], by_initial: bool = False) -> 
     groups = []
     for scenario in objects:
         signals = sorted(scenario.inputs.items())
-        earlier = tuple((name, u.tobytes()) for name, u in sorted(scenario.before.items()))
-        interpretation = tuple(sorted(scenario.linear)), scenario.offset, earlier
+        input_histories = tuple((name, u.tobytes()) for name, u in sorted(scenario.before.items()))
+        interpretation = tuple(sorted(scenario.linear)), scenario.offset, input_histories
         initial_states = tuple(sorted(scenario.initial.items())) if by_initial else ()
         signals_content = ((name, u.tobytes()) for name, u in signals)
-        off = tuple((name, mask.tobytes()) for name, mask in sorted(scenario.off.items()))
-        content = scenario.times.tobytes(), interpretation, initial_states, off, *signals_content
+        off_masks = tuple((name, mask.tobytes()) for name, mask in sorted(scenario.off.items()))
+        content = (
+            scenario.times.tobytes(),
+            interpretation,
+            initial_states,
+            off_masks,
+            *signals_content,
+        )
         group = by_content.setdefault(content, len(distinct))
         if group == len(distinct):
             distinct.append(scenario)
@@ -147,11 +153,11 @@ def build_time_grid(
         # Runs with the same sample times share one row and everything computed from it.
         if (instants == instants[:1]).all():
             instants = instants[:1]
-        steps, ends, every, rows = _divide_intervals(instants, largest_step)
+        steps, step_ends, steps_per_sample, rows = _divide_intervals(instants, largest_step)
         return TimeGrid(
             runs.expand_rows(steps),
-            runs.expand_rows(ends),
-            every,
+            runs.expand_rows(step_ends),
+            steps_per_sample,
             runs.expand_rows(rows),
             has_uniform_steps=True,
         )
@@ -167,11 +173,11 @@ def build_time_grid(
     event_times = np.clip(event_times, 0.0, instants[:, -1:])
     order = np.argsort(event_times, axis=1, kind="stable")
     event_times = np.take_along_axis(event_times, order, axis=1)
-    steps, ends, every, rows = _divide_intervals(event_times, largest_step)
+    steps, step_ends, steps_per_sample, rows = _divide_intervals(event_times, largest_step)
     # Rows in the original order of the marks, of which the first are samples.
     sample_rows = np.empty_like(rows)
     np.put_along_axis(sample_rows, order, rows, axis=1)
-    return TimeGrid(steps, ends, every, sample_rows[:, :samples])
+    return TimeGrid(steps, step_ends, steps_per_sample, sample_rows[:, :samples])
 
 
 def _find_change_times(
@@ -217,13 +223,13 @@ def _divide_intervals(instants: Array, largest_step: float) -> tuple[Array, Arra
     """
     elements, samples = instants.shape
     start = np.zeros((elements, 1))
-    before = np.concatenate([start, instants[:, :-1]], axis=1)
-    intervals = instants - before
+    interval_starts = np.concatenate([start, instants[:, :-1]], axis=1)
+    intervals = instants - interval_starts
     # Tolerate rounding where an interval is an integer number of steps.
     parts = np.ceil(intervals / largest_step - _ROUNDING).astype(np.intp)
     parts = np.where(intervals > 0, np.maximum(parts, 1), 0)
-    every = int(np.bincount(parts[parts > 0]).argmax()) if parts.any() else 1
-    blocks = -(-parts // every)
+    steps_per_block = int(np.bincount(parts[parts > 0]).argmax()) if parts.any() else 1
+    blocks = -(-parts // steps_per_block)
     rows = np.cumsum(blocks, axis=1)
     size = max(int(rows[:, -1].max()), 1)
     # Arrays with one entry per block: its interval, its number in the batch element, and the
@@ -235,17 +241,19 @@ def _divide_intervals(instants: Array, largest_step: float) -> tuple[Array, Arra
     block = np.arange(interval.size) - first_blocks[element]
     blocks_before = (rows - blocks).ravel()[interval]
     in_interval = (block - blocks_before)[:, None]
-    number = in_interval * every + np.arange(every)
+    number = in_interval * steps_per_block + np.arange(steps_per_block)
     count = parts.ravel()[interval, None]
     length = intervals.ravel()[interval, None] / count
-    steps = np.zeros((elements, size, every))
-    ends = np.repeat(instants[:, -1], size * every).reshape(elements, size, every)
+    steps = np.zeros((elements, size, steps_per_block))
+    step_ends = np.repeat(instants[:, -1], size * steps_per_block).reshape(
+        elements, size, steps_per_block
+    )
     steps[element, block] = np.where(number < count, length, 0.0)
     # The last step of an interval ends exactly at the given time.
-    inside = before.ravel()[interval, None] + (number + 1) * length
+    inner_times = interval_starts.ravel()[interval, None] + (number + 1) * length
     instant = instants.ravel()[interval, None]
-    ends[element, block] = np.where(number + 1 < count, inside, instant)
-    return steps.reshape(elements, -1), ends.reshape(elements, -1), every, rows
+    step_ends[element, block] = np.where(number + 1 < count, inner_times, instant)
+    return steps.reshape(elements, -1), step_ends.reshape(elements, -1), steps_per_block, rows
 
 
 def _sample_times(scenario: Scenario) -> Array:
@@ -264,8 +272,8 @@ def _get_history_times(scenario: Scenario, name: str) -> Array:
     """Return the times (K,) of an input's known history before the run, s."""
     if name not in scenario.before:
         return np.empty(0)
-    earlier: Array = scenario.before[name][0] + scenario.offset
-    return earlier
+    history_times: Array = scenario.before[name][0] + scenario.offset
+    return history_times
 
 
 def _get_command_values(scenario: Scenario, name: str, values: Array) -> Array:
@@ -283,8 +291,8 @@ def _get_command_values(scenario: Scenario, name: str, values: Array) -> Array:
 
 def _pad_with_last(values: Array, size: int) -> Array:
     """Repeat the last of `values` up to the given size."""
-    more = np.full(size - values.size, values[-1])
-    return np.concatenate([values, more])
+    padding = np.full(size - values.size, values[-1])
+    return np.concatenate([values, padding])
 
 
 def compute_applied_inputs(
@@ -306,40 +314,48 @@ def compute_applied_inputs(
         Applied inputs (L, S) by name.
     """
     effects = tuple((effect, c, is_active(c)) for effect, c in acting if c.any())
-    begin, end, steps = _step_begins(plan.ends), plan.ends, plan.steps
-    first, *others = commands[0]
+    starts, end, steps = _step_begins(plan.ends), plan.ends, plan.steps
+    first, *other_names = commands[0]
     applied = {}
-    for name in others if effects else (first, *others):
-        applied[name] = _average_command(runs, name, commands, begin, end, plan.has_uniform_steps)
+    for name in other_names if effects else (first, *other_names):
+        applied[name] = _average_command(runs, name, commands, starts, end, plan.has_uniform_steps)
     if not effects:
         return applied
     lead = _build_lead_in_steps(
         runs, first, max(float(steps.max(initial=0.0)), MAX_LEAD_IN_STEP_SECONDS)
     )
     if lead[0].size:
-        parts = zip(lead, (begin, end, steps), strict=True)
-        begin, end, steps = (np.hstack([before[runs.scenario_index], now]) for before, now in parts)
-    ends = end
+        parts = zip(lead, (starts, end, steps), strict=True)
+        starts, end, steps = (
+            np.hstack([lead_part[runs.scenario_index], run_part]) for lead_part, run_part in parts
+        )
+    step_ends = end
     # Backwards from the plant to the command: map the times through the effects.
-    for effect, c, on in reversed(effects):
+    for effect, c, is_acting in reversed(effects):
         assert isinstance(effect, Input)
         # Most effects do not shift time; skip them.
         if not _shifts_time(effect):
             continue
-        begin = np.where(on, effect.times(c, begin), begin)
-        end = np.where(on, effect.times(c, end), end)
+        starts = np.where(is_acting, effect.times(c, starts), starts)
+        end = np.where(is_acting, effect.times(c, end), end)
     # Forwards with the values.
-    means = _average_command(runs, first, commands, begin, end, plan.has_uniform_steps)
-    for effect, c, on in effects:
+    means = _average_command(runs, first, commands, starts, end, plan.has_uniform_steps)
+    for effect, c, is_acting in effects:
         if isinstance(effect, Input) and effect.between:
-            other = _average_command(
-                runs, first, commands, begin, end, plan.has_uniform_steps, other=True
+            other_means = _average_command(
+                runs,
+                first,
+                commands,
+                starts,
+                end,
+                plan.has_uniform_steps,
+                is_other_interpolation=True,
             )
-            means = np.where(on, means + c[0] * (other - means), means)
+            means = np.where(is_acting, means + c[0] * (other_means - means), means)
     pairs = zip(runs.unique_scenarios, commands, strict=True)
     beginnings = np.array([_get_command_values(s, first, u[first])[0] for s, u in pairs])
     result = _apply_input_effects(
-        effects, steps, ends, means, beginnings[runs.scenario_index, None]
+        effects, steps, step_ends, means, beginnings[runs.scenario_index, None]
     )
     return {first: result[:, lead[0].shape[1] :], **applied}
 
@@ -362,14 +378,14 @@ def _build_lead_in_steps(
     event_times = [np.append(row[row < 0], 0.0) for row in event_times]
     size = max(row.size for row in event_times)
     if size == 1:
-        nothing = np.empty((len(event_times), 0))
-        return nothing, nothing, nothing
+        no_steps = np.empty((len(event_times), 0))
+        return no_steps, no_steps, no_steps
     first = np.array([[row[0]] for row in event_times])
-    steps, ends, _, _ = _divide_intervals(
+    steps, step_ends, _, _ = _divide_intervals(
         np.stack([_pad_with_last(row, size) for row in event_times]) - first, largest
     )
-    ends = ends + first
-    return np.hstack([first, ends[:, :-1]]), ends, steps
+    step_ends = step_ends + first
+    return np.hstack([first, step_ends[:, :-1]]), step_ends, steps
 
 
 def _apply_input_effects(
@@ -395,25 +411,25 @@ def _apply_input_effects(
     last_steps = _find_last_nonzero_step(steps)
     values = np.take_along_axis(means, last_steps, axis=1)
     start = start.copy()
-    for effect, c, on in effects:
+    for effect, c, is_acting in effects:
         assert isinstance(effect, Input)
         # An effect may be active in few of the batch elements; evaluate only these.
-        elements = np.flatnonzero(on)
-        own, begin = c[:, elements], start[elements]
-        nothing = np.zeros_like(begin)
+        elements = np.flatnonzero(is_acting)
+        coefficients, begin = c[:, elements], start[elements]
+        zeros = np.zeros_like(begin)
         signal = Signal(values[elements], steps[elements], begin, ends[elements])
-        result = effect.feel(own, signal)
+        result = effect.feel(coefficients, signal)
         values[elements] = np.take_along_axis(result, last_steps[elements], axis=1)
-        start[elements] = effect.feel(own, Signal(begin, nothing, begin, nothing))
+        start[elements] = effect.feel(coefficients, Signal(begin, zeros, begin, zeros))
     return values
 
 
 def _step_begins(ends: Array) -> Array:
     """Return the beginnings (L, S) of steps from their ends; memory is shared as in `ends`."""
-    own = ends[:1] if ends.strides[0] == 0 else ends
-    start = np.zeros((len(own), 1))
-    begin = np.concatenate([start, own[:, :-1]], axis=1)
-    return np.broadcast_to(begin, ends.shape)
+    distinct_ends = ends[:1] if ends.strides[0] == 0 else ends
+    start = np.zeros((len(distinct_ends), 1))
+    starts = np.concatenate([start, distinct_ends[:, :-1]], axis=1)
+    return np.broadcast_to(starts, ends.shape)
 
 
 def _find_last_nonzero_step(steps: Array) -> Indices:
@@ -421,8 +437,8 @@ def _find_last_nonzero_step(steps: Array) -> Indices:
 
     The input does not change while a batch element waits.
     """
-    own = np.arange(steps.shape[1])
-    last_steps = np.where(steps > 0, own, 0)
+    step_numbers = np.arange(steps.shape[1])
+    last_steps = np.where(steps > 0, step_numbers, 0)
     last: Indices = np.maximum.accumulate(last_steps, axis=1)
     return last
 
@@ -431,10 +447,10 @@ def _average_command(
     runs: ScenarioGroups,
     name: str,
     commands: Commands,
-    begin: Array,
+    starts: Array,
     end: Array,
     has_uniform_steps: bool,
-    other: bool = False,
+    is_other_interpolation: bool = False,
 ) -> Array:
     """Return the mean of each batch element's signal over each step.
 
@@ -442,17 +458,18 @@ def _average_command(
         runs: Scenarios of the batch elements.
         name: Name of the input.
         commands: Inputs of each distinct scenario.
-        begin: (L, S) beginnings of the steps, s.
+        starts: (L, S) beginnings of the steps, s.
         end: (L, S) ends of the steps, s.
         has_uniform_steps: Whether batch elements with the same scenario have the same steps, so
             that only the first of them is evaluated.
-        other: Whether to interpolate held signals linearly, and to hold linear ones.
+        is_other_interpolation: Whether to interpolate held signals linearly, and to hold linear
+            ones.
 
     Returns:
         Means (L, S).
     """
-    count = len(commands) if has_uniform_steps else len(begin)
-    result = np.empty((count, begin.shape[1]))
+    count = len(commands) if has_uniform_steps else len(starts)
+    result = np.empty((count, starts.shape[1]))
     # Process all batch elements with the same scenario in one call.
     by_run = np.argsort(runs.scenario_index, kind="stable")
     borders = np.flatnonzero(np.diff(runs.scenario_index[by_run])) + 1
@@ -460,7 +477,9 @@ def _average_command(
         run = runs.scenario_index[elements[0]]
         scenario = runs.unique_scenarios[run]
         average_signal = (
-            _average_linear_signal if (name in scenario.linear) != other else _average_held_signal
+            _average_linear_signal
+            if (name in scenario.linear) != is_other_interpolation
+            else _average_held_signal
         )
         target_rows, source_rows = (
             (slice(run, run + 1), elements[:1]) if has_uniform_steps else (elements, elements)
@@ -469,20 +488,22 @@ def _average_command(
             [_get_history_times(scenario, name), _get_command_times(scenario)]
         )
         signal = _get_command_values(scenario, name, commands[run][name])
-        result[target_rows] = average_signal(instants, signal, begin[source_rows], end[source_rows])
+        result[target_rows] = average_signal(
+            instants, signal, starts[source_rows], end[source_rows]
+        )
     return runs.expand_rows(result) if has_uniform_steps else result
 
 
-def _average_held_signal(times: Array, values: Array, begin: Array, end: Array) -> Array:
+def _average_held_signal(times: Array, values: Array, starts: Array, end: Array) -> Array:
     """Return the means of a held signal over intervals; its value where an interval has no length.
 
     Args:
         times: (T,) times from which the values hold, s.
         values: (T,) values.
-        begin: Beginnings of the intervals, s.
+        starts: Beginnings of the intervals, s.
         end: Ends of the intervals, s.
     """
-    index = np.searchsorted(times, begin, side="right") - 1
+    index = np.searchsorted(times, starts, side="right") - 1
     index = np.clip(index, 0, times.size - 1)
     value: Array = values[index]
     last = np.searchsorted(times, end, side="left") - 1
@@ -490,9 +511,9 @@ def _average_held_signal(times: Array, values: Array, begin: Array, end: Array) 
     # Equation (1) only where the command changes within the interval; elsewhere its value is exact.
     crossing = last > index
     if crossing.any():
-        held = values[:-1] * np.diff(times)
-        area = np.concatenate([[0.0], np.cumsum(held)])
-        a = begin[crossing]
+        areas = values[:-1] * np.diff(times)
+        area = np.concatenate([[0.0], np.cumsum(areas)])
+        a = starts[crossing]
         b = end[crossing]
         integral = _compute_held_integral(times, values, area, b) - _compute_held_integral(
             times, values, area, a
@@ -501,7 +522,7 @@ def _average_held_signal(times: Array, values: Array, begin: Array, end: Array) 
     return value
 
 
-def _average_linear_signal(times: Array, values: Array, begin: Array, end: Array) -> Array:
+def _average_linear_signal(times: Array, values: Array, starts: Array, end: Array) -> Array:
     """Return the means of a linearly interpolated signal over intervals.
 
     The signal is constant before the first and after the last sample.
@@ -509,17 +530,17 @@ def _average_linear_signal(times: Array, values: Array, begin: Array, end: Array
     Args:
         times: (T,) sample times, s.
         values: (T,) values.
-        begin: Beginnings of the intervals, s.
+        starts: Beginnings of the intervals, s.
         end: Ends of the intervals, s.
     """
     halves = 0.5 * (values[:-1] + values[1:]) * np.diff(times)
     area = np.concatenate([[0.0], np.cumsum(halves)])
-    value = np.interp(0.5 * (begin + end), times, values)
+    value = np.interp(0.5 * (starts + end), times, values)
     # The mean over a part of one linear segment is its middle value; over several segments, (1).
-    first = np.searchsorted(times, begin, side="right")
+    first = np.searchsorted(times, starts, side="right")
     crossing = np.searchsorted(times, end, side="left") > first
     if crossing.any():
-        a, b = begin[crossing], end[crossing]
+        a, b = starts[crossing], end[crossing]
         integral = _compute_linear_integral(times, values, area, b) - _compute_linear_integral(
             times, values, area, a
         )

@@ -226,7 +226,7 @@ def _collect_texts(tables: Any, word: str) -> list[str]:
     if not isinstance(tables, dict):
         return []
     texts = [tables[word]] if isinstance(tables.get(word), str) else []
-    return texts + [name for inner in tables.values() for name in _collect_texts(inner, word)]
+    return texts + [name for table in tables.values() for name in _collect_texts(table, word)]
 
 
 def read_logs(
@@ -359,8 +359,8 @@ class _FolderLogs:
             stamps = rows_of[log.path].stamps
             cells = np.full(times.size, np.nan)
             places = np.searchsorted(times, stamps - SAME_INSTANT_SECONDS)
-            inside = (places < times.size) & (stamps >= times[0] - SAME_INSTANT_SECONDS)
-            cells[places[inside]] = values[inside]
+            is_in_run = (places < times.size) & (stamps >= times[0] - SAME_INSTANT_SECONDS)
+            cells[places[is_in_run]] = values[is_in_run]
             columns[channel] = make_read_only(cells)
         for name in (*self._inputs, *self._extra):
             columns[name] = make_read_only(

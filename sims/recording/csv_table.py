@@ -218,9 +218,9 @@ class Table:
         except ValueError:
             values = np.array([float(c) if _NUMBER.fullmatch(c) else math.nan for c in cells])
         suspects: Iterable[int] = np.flatnonzero(~np.isfinite(values)).tolist()
-        joined = "".join(cells)
+        joined_cells = "".join(cells)
         # float() also accepts 1_000 and digits of other scripts.
-        if "_" in joined or not joined.isascii():
+        if "_" in joined_cells or not joined_cells.isascii():
             suspects = range(len(cells))
         for i in suspects:
             if cells[i].strip() or name not in self.gaps:

@@ -56,8 +56,8 @@ def read_csv_fast(
         cells = table[name]
         values = cells.to_numpy()
         # An empty cell is NaN and allowed in a gap; NaN or inf written as text is not.
-        allowed = cells.null_count if name in gaps else 0
-        if np.count_nonzero(~np.isfinite(values)) != allowed:
+        allowed_gaps = cells.null_count if name in gaps else 0
+        if np.count_nonzero(~np.isfinite(values)) != allowed_gaps:
             return None
         columns[name] = values
     runs = table["run"].combine_chunks().dictionary_encode()

@@ -134,9 +134,11 @@ class Run:
         Returns:
             (2, K) times relative to the sample (s, negative) and values.
         """
-        earlier = self.before.get(name, np.empty((2, 0)))
-        stamps = np.concatenate([earlier[0] + self.times[0], self.times[:row]]) - self.times[row]
-        samples = np.stack([stamps, np.concatenate([earlier[1], self.inputs[name][:row]])])
+        earlier_samples = self.before.get(name, np.empty((2, 0)))
+        stamps = (
+            np.concatenate([earlier_samples[0] + self.times[0], self.times[:row]]) - self.times[row]
+        )
+        samples = np.stack([stamps, np.concatenate([earlier_samples[1], self.inputs[name][:row]])])
         return samples[:, stamps >= -self.memory]
 
 

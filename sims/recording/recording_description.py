@@ -373,10 +373,10 @@ def check_run_names(path: Path, marked: Iterable[str], there: Iterable[str]) -> 
 
 
 def _check_known_names(
-    path: Path, table_name: str, entry_names: Iterable[str], allowed: Iterable[str]
+    path: Path, table_name: str, entry_names: Iterable[str], allowed_names: Iterable[str]
 ) -> None:
     check_known_names(
-        f"entry {f'in [{table_name}] ' if table_name else ''}of {path}", entry_names, allowed
+        f"entry {f'in [{table_name}] ' if table_name else ''}of {path}", entry_names, allowed_names
     )
 
 
@@ -445,8 +445,8 @@ def dotted(given: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
     """
     result: dict[str, Any] = {}
     for name, value in given.items():
-        inside = isinstance(value, dict) and name not in names
-        if inside and any(known_name.startswith(f"{name}.") for known_name in names):
+        is_nested = isinstance(value, dict) and name not in names
+        if is_nested and any(known_name.startswith(f"{name}.") for known_name in names):
             flat_entries = {f"{name}.{key}": entry for key, entry in value.items()}
             result.update(dotted(flat_entries, names))
         else:
@@ -470,7 +470,7 @@ def _read_column(path: Path, kind: str, name: str, value: Any, unit: str) -> _Co
     location, usual = f"{kind} {name}", f'unit = "{unit}"'
     table = check_table(path, location, value, f"a table with {usual}")
     # Noise of an input is not allowed, because simulations cannot use it.
-    allowed = (
+    allowed_keys = (
         "unit",
         "scale",
         "offset",
@@ -479,7 +479,7 @@ def _read_column(path: Path, kind: str, name: str, value: Any, unit: str) -> _Co
         "file",
         *(("noise", "unwrap") if kind == "channel" else ("hold",)),
     )
-    _check_known_names(path, f"{kind}s.{name}", table, allowed)
+    _check_known_names(path, f"{kind}s.{name}", table, allowed_keys)
     # The unit is required: a log in degrees without a unit would be read as radians.
     stated_unit = check_text(
         path, location, table.get("unit"), f"{usual} or one that converts to it"
@@ -579,19 +579,22 @@ def _read_run(path: Path, name: str, value: Any, declared: DeclaredSignals) -> R
     """Check the table of one run: its constants, its initial state, and whether it is held out."""
     location = f"runs.{name}"
     table = check_table(path, location, value)
-    allowed = [c.name for c in declared.constants]
+    constant_names = [c.name for c in declared.constants]
     _check_known_names(
-        path, location, table, ("constants", "initial", "held_out", "folder", "file", *allowed)
+        path,
+        location,
+        table,
+        ("constants", "initial", "held_out", "folder", "file", *constant_names),
     )
     held_out = table.get("held_out")
     if held_out is not None:
         check_type(path, f"{location}.held_out", held_out, bool, "true or false")
     # The constants of a run may be in a table of their own or among its other entries.
     constants = _read_constants(path, f"{location}.constants", table.get("constants", {}), declared)
-    direct = {key: number for key, number in table.items() if key in allowed}
-    for repeated_name in constants.keys() & direct.keys():
+    direct_constants = {key: number for key, number in table.items() if key in constant_names}
+    for repeated_name in constants.keys() & direct_constants.keys():
         raise InputError(f"{path}: {location}: constant {repeated_name} stands twice")
-    constants |= _read_constants(path, location, direct, declared)
+    constants |= _read_constants(path, location, direct_constants, declared)
     _check_constants_possible(path, location, constants, declared)
     states = [*declared.states, *getattr(_get_system(declared), "activations", ())]
     initial = _read_numbers(path, f"{location}.initial", table.get("initial", {}), states)
@@ -604,10 +607,12 @@ def _read_constants(
     return _read_numbers(path, key, value, [c.name for c in declared.constants])
 
 
-def _read_numbers(path: Path, key: str, value: Any, allowed: Collection[str]) -> dict[str, float]:
+def _read_numbers(
+    path: Path, key: str, value: Any, allowed_names: Collection[str]
+) -> dict[str, float]:
     """Check a table of finite numbers, whose names must be among the allowed ones."""
-    entries = dotted(check_table(path, key, value), allowed)
-    _check_known_names(path, key, entries, allowed)
+    entries = dotted(check_table(path, key, value), allowed_names)
+    _check_known_names(path, key, entries, allowed_names)
     return {name: check_finite(path, f"{key}.{name}", number) for name, number in entries.items()}
 
 

@@ -127,14 +127,14 @@ def described(
         else:
             raise _make_unassigned_column_error(path, name, declared)
 
-    noted = frame.attrs.get("units", {})
-    noted = noted if isinstance(noted, Mapping) else {}
-    _state_unit(time, stamps, units, noted)
+    noted_units = frame.attrs.get("units", {})
+    noted_units = noted_units if isinstance(noted_units, Mapping) else {}
+    _state_unit(time, stamps, units, noted_units)
     missing = {}
     for name, table in (*channels.items(), *inputs.items(), *extra.items()):
         # Entries that are not tables are refused when the description is checked.
         column = _list_signal_columns(name, table)[0]
-        if isinstance(table, dict) and not _state_unit(table, column, units, noted):
+        if isinstance(table, dict) and not _state_unit(table, column, units, noted_units):
             missing[column] = usual.get(name, "1")
     if missing:
         raise InputError(
@@ -152,13 +152,13 @@ def _list_signal_columns(name: str, table: Any) -> list[str]:
 
 
 def _state_unit(
-    table: dict[str, Any], column: str, units: Mapping[str, str], noted: Mapping[str, Any]
+    table: dict[str, Any], column: str, units: Mapping[str, str], noted_units: Mapping[str, Any]
 ) -> bool:
     """Write the unit of a column into its table, and return whether a unit is known."""
     if column in units:
         table["unit"] = units[column]
-    elif "unit" not in table and column in noted:
-        table["unit"] = noted[column]
+    elif "unit" not in table and column in noted_units:
+        table["unit"] = noted_units[column]
     return "unit" in table
 
 

@@ -100,13 +100,15 @@ def _is_simple_unit(unit: str) -> bool:
     A simple unit consists of names and 1, joined by * / or spaces, each with at most one small
     power.
     """
-    place, before = 0, "operator"
+    place, previous_token = 0, "operator"
     while place < len(unit):
         token = _TOKEN.match(unit, place)
-        if token is None or (token.lastgroup == "power" and before in ("power", "operator")):
+        if token is None or (
+            token.lastgroup == "power" and previous_token in ("power", "operator")
+        ):
             return False
-        place, before = token.end(), str(token.lastgroup)
-    return before != "operator"
+        place, previous_token = token.end(), str(token.lastgroup)
+    return previous_token != "operator"
 
 
 @lru_cache(maxsize=1)

@@ -118,17 +118,17 @@ class ShotSystem(System):
     def weight(self, moment: StateSnapshot) -> Array:
         """Return gravity in the incline's frame (L, 3), m/s^2."""
         angle = moment.constants["incline_angle"]
-        across = np.zeros_like(angle)
-        down: Array = np.concatenate([np.sin(angle), across, -np.cos(angle)], axis=1)
+        zeros = np.zeros_like(angle)
+        down: Array = np.concatenate([np.sin(angle), zeros, -np.cos(angle)], axis=1)
         return moment.gravity * down  # (1)
 
     def push(self, moment: StateSnapshot, axis: Literal["x", "y"]) -> Array:
         """Return a horizontal unit vector along `axis` in the incline's frame (L, 3)."""
         angle = moment.constants["incline_angle"]
-        nothing = np.zeros_like(angle)
+        zeros = np.zeros_like(angle)
         if axis == "y":
-            return np.concatenate([nothing, nothing + 1.0, nothing], axis=1)
-        return np.concatenate([np.cos(angle), nothing, np.sin(angle)], axis=1)
+            return np.concatenate([zeros, zeros + 1.0, zeros], axis=1)
+        return np.concatenate([np.cos(angle), zeros, np.sin(angle)], axis=1)
 
     def observe(
         self, x: Array, v: Array, a: Array, constants: Mapping[str, Array]
@@ -136,13 +136,13 @@ class ShotSystem(System):
         """Return the position of the centre in the world frame by channel."""
         cos = np.cos(constants["incline_angle"])
         sin = np.sin(constants["incline_angle"])
-        along = x[:, :, 0]
-        away = x[:, :, 2]
+        tangential = x[:, :, 0]
+        normal = x[:, :, 2]
         height = constants["radius"] / cos + constants["drop_height"]
         return {
-            "x": along * cos + away * sin,  # (3)
+            "x": tangential * cos + normal * sin,  # (3)
             "y": x[:, :, 1],
-            "z": height - along * sin + away * cos,  # (4)
+            "z": height - tangential * sin + normal * cos,  # (4)
         }
 
     def floor(self, constants: Mapping[str, Array]) -> Array:

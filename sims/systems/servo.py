@@ -168,8 +168,8 @@ class ServoSystem(System):
         k = moment.constants
         kt = moment.theta[:, _KT]
         error = moment.inputs["goal"] - moment.x
-        wanted = k["kp"] * k["error_gain"] * error
-        duty = np.minimum(np.maximum(wanted, -1.0), 1.0)  # (2)
+        unlimited_duty = k["kp"] * k["error_gain"] * error
+        duty = np.minimum(np.maximum(unlimited_duty, -1.0), 1.0)  # (2)
         voltage = duty * k["voltage"] - kt * moment.v
         torque = kt * voltage / moment.theta[:, _RESISTANCE]  # (3)
         return np.where(moment.inputs["torque_enable"] > 0.5, torque, 0.0)

@@ -44,9 +44,11 @@ def render_model_file(numbers: Mapping[str, float]) -> RenderedModelFile:
         least=repr(-stall),
         most=repr(stall),
     )
-    said = (
+    assumptions = (
         "damping is the motor's own voltage, kt^2/R, of a driven motor: with torque_enable 0 there "
         "is none",
         "forcerange is the stall torque at this supply",
     )
-    return RenderedModelFile(text, "joint", "motor", {"q": "q.joint", "goal": "u.motor"}, said)
+    return RenderedModelFile(
+        text, "joint", "motor", {"q": "q.joint", "goal": "u.motor"}, assumptions
+    )

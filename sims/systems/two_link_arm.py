@@ -53,12 +53,14 @@ def _make_link_parameters(
     nominal: float,
     bounds: tuple[float, float],
     training: tuple[float, float],
-    says: str,
+    description: str,
 ) -> tuple[Parameter, Parameter]:
     """Return a parameter of each of the two links, with the link's number in its name."""
 
     def of(link: int) -> Parameter:
-        return Parameter(f"{name}{link}", unit, nominal, bounds, training, says=f"{says} {link}")
+        return Parameter(
+            f"{name}{link}", unit, nominal, bounds, training, says=f"{description} {link}"
+        )
 
     return of(1), of(2)
 
@@ -72,20 +74,27 @@ class TwoLinkArm(OwnSimulator):
     kind = "rotary"
     time_step = 1 / 250
     parameters = (
-        *_make_link_parameters("mass", "kg", 1.0, (0.2, 3.0), (0.5, 1.5), says="mass of link"),
+        *_make_link_parameters(
+            "mass", "kg", 1.0, (0.2, 3.0), (0.5, 1.5), description="mass of link"
+        ),
         *_make_link_parameters(
             "centre",
             "m",
             0.2,
             (0.05, 0.35),
             (0.12, 0.28),
-            says="from the joint to the centre of mass of link",
+            description="from the joint to the centre of mass of link",
         ),
         *_make_link_parameters(
-            "damping", "N*m*s/rad", 0.1, (0.0, 0.5), (0.0, 0.2), says="viscous damping of joint"
+            "damping",
+            "N*m*s/rad",
+            0.1,
+            (0.0, 0.5),
+            (0.0, 0.2),
+            description="viscous damping of joint",
         ),
         *_make_link_parameters(
-            "friction", "N*m", 0.1, (0.0, 0.5), (0.0, 0.2), says="dry friction of joint"
+            "friction", "N*m", 0.1, (0.0, 0.5), (0.0, 0.2), description="dry friction of joint"
         ),
     )
     constants = (
@@ -175,10 +184,10 @@ class TwoLinkArm(OwnSimulator):
     def step(self, inputs: Mapping[str, float], seconds: float) -> None:
         """One step of Heun's method, or several short ones where dry friction changes sides."""
         torques = (inputs["u1"], inputs["u2"])
-        before = (self._q, self._v)
+        state_before = (self._q, self._v)
         # Friction's side is fixed within a step of Bullet's; where it changes, steps must be short.
         if self._heun(torques, seconds):
-            self._q, self._v = before
+            self._q, self._v = state_before
             for _ in range(_FRICTION_SUBSTEPS):
                 self._heun(torques, seconds / _FRICTION_SUBSTEPS)
 
@@ -242,8 +251,8 @@ class TwoLinkArm(OwnSimulator):
         return self._state(self._arm, 0)[1], self._state(self._arm, 1)[1]
 
 
-def _turns(before: float, middle: float, after: float) -> bool:
+def _turns(rate_before: float, middle: float, rate_after: float) -> bool:
     """Whether a joint that moved has come to rest or turned round, from its rates in rad/s."""
-    if abs(before) <= _REST_SPEED:
+    if abs(rate_before) <= _REST_SPEED:
         return False
-    return min(middle * before, after * before) < _REST_SPEED * abs(before)
+    return min(middle * rate_before, rate_after * rate_before) < _REST_SPEED * abs(rate_before)

@@ -65,10 +65,10 @@ def survey_frames(frames: Iterable[tuple[float, RgbImage]]) -> FrameSurvey:
         InputError: The size of the picture changes.
     """
     times = []
-    moved = []
+    motions = []
     cuts = []
     size = 0, 0
-    before = None
+    previous_frame = None
     for number, (time, picture) in enumerate(frames):
         if number and picture.shape[1::-1] != size:
             expected = f"{size[0]} x {size[1]} px as before"
@@ -78,8 +78,8 @@ def survey_frames(frames: Iterable[tuple[float, RgbImage]]) -> FrameSurvey:
         share = height * width / _PIXELS
         skip = max(1, int(share**0.5))
         coarse = picture[::skip, ::skip].astype(np.int16)
-        earlier = coarse if before is None else before
-        change = np.abs(coarse - earlier).max(axis=2)
+        reference_frame = coarse if previous_frame is None else previous_frame
+        change = np.abs(coarse - reference_frame).max(axis=2)
         if np.mean(change > _STEP) > _CUT:
             cuts.append(number)
             # The whole picture has changed, and no ball has moved.
@@ -87,10 +87,10 @@ def survey_frames(frames: Iterable[tuple[float, RgbImage]]) -> FrameSurvey:
         times.append(time)
         # Ignore small changes: noise would make a static picture look busy.
         usual = np.median(change)
-        beyond = change - 2 * usual - _GRAIN
-        moved.append(float(np.maximum(beyond, 0).mean()))
-        before = coarse
-    return FrameSurvey(np.array(times), np.array(moved), tuple(cuts), size)
+        excess = change - 2 * usual - _GRAIN
+        motions.append(float(np.maximum(excess, 0).mean()))
+        previous_frame = coarse
+    return FrameSurvey(np.array(times), np.array(motions), tuple(cuts), size)
 
 
 def select_frames(moved: Array, most: int = MAX_BACKGROUND_FRAMES) -> list[int]:
@@ -108,20 +108,20 @@ def select_frames(moved: Array, most: int = MAX_BACKGROUND_FRAMES) -> list[int]:
     """
     count = len(moved)
     # A small value for each frame, so that a film without motion has marks, too.
-    least = 1e-3 * moved.sum() / max(1, count)
-    way = np.cumsum(moved + least + 1e-12)
-    marks = np.linspace(way[0], way[-1], min(most, count))
-    places = np.searchsorted(way, marks - 1e-12).clip(0, count - 1)
+    min_motion = 1e-3 * moved.sum() / max(1, count)
+    path_length = np.cumsum(moved + min_motion + 1e-12)
+    marks = np.linspace(path_length[0], path_length[-1], min(most, count))
+    places = np.searchsorted(path_length, marks - 1e-12).clip(0, count - 1)
     return sorted(set(places.tolist()))
 
 
 def compute_median_background(pictures: list[RgbImage]) -> RgbImage:
     """Return the pixelwise median of pictures."""
     stack = np.stack(pictures)
-    half = len(stack) // 2
+    half_count = len(stack) // 2
     # A partition finds the middle without sorting, and keeps integer grey levels.
-    stack.partition(half, axis=0)
-    result: RgbImage = stack[half].copy()
+    stack.partition(half_count, axis=0)
+    result: RgbImage = stack[half_count].copy()
     return result
 
 
@@ -141,21 +141,21 @@ def compute_masked_background(
     """
     height, width = before.shape[:2]
     rows, columns = np.mgrid[:height, :width]
-    nowhere = np.zeros((len(pictures), height, width), bool)
-    hidden = nowhere if shaded is None else shaded.copy()
-    for mask, there in zip(hidden, balls, strict=True):
-        for u, v, radius in there:
-            far = np.hypot(columns - u, rows - v)
-            mask |= far < _NEAR * radius + _EDGE
+    empty_masks = np.zeros((len(pictures), height, width), bool)
+    hidden = empty_masks if shaded is None else shaded.copy()
+    for mask, circles in zip(hidden, balls, strict=True):
+        for u, v, radius in circles:
+            distances = np.hypot(columns - u, rows - v)
+            mask |= distances < _NEAR * radius + _EDGE
     # Elsewhere the median is kept: pixels that are never hidden, or hidden in all pictures.
-    ever = hidden.any(axis=0) & ~hidden.all(axis=0)
-    colours = np.stack(pictures)[:, ever].astype(np.float32)
-    values = np.where(hidden[:, ever, None], np.nan, colours)
+    is_partly_hidden = hidden.any(axis=0) & ~hidden.all(axis=0)
+    colours = np.stack(pictures)[:, is_partly_hidden].astype(np.float32)
+    values = np.where(hidden[:, is_partly_hidden, None], np.nan, colours)
     result = before.copy()
-    if ever.any():
+    if is_partly_hidden.any():
         middle = _compute_nan_median(values)
         # Add half a grey level, because the conversion to integers truncates.
-        result[ever] = (middle + 0.5).astype(np.uint8)
+        result[is_partly_hidden] = (middle + 0.5).astype(np.uint8)
     return result
 
 
@@ -181,8 +181,8 @@ def estimate_camera_noise(pictures: list[RgbImage], background: RgbImage) -> flo
         Standard deviation in grey levels of the worst colour.
     """
     # A few pictures suffice, because each has many pixels.
-    every = max(1, len(pictures) // 8)
-    worst = [_compute_largest_difference(picture, background) for picture in pictures[::every]]
+    stride = max(1, len(pictures) // 8)
+    worst = [_compute_largest_difference(picture, background) for picture in pictures[::stride]]
     return float(_NORMAL * np.median(np.stack(worst)) / _WORST)
 
 
@@ -190,6 +190,6 @@ def _compute_largest_difference(picture: RgbImage, background: RgbImage) -> NDAr
     """Return the largest difference over the colours (height, width)."""
     # Unsigned integers would wrap around.
     signed = picture.astype(np.int16)
-    apart = np.abs(signed - background)
-    result: NDArray[np.int16] = apart.max(axis=2)
+    differences = np.abs(signed - background)
+    result: NDArray[np.int16] = differences.max(axis=2)
     return result

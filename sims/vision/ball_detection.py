@@ -98,12 +98,12 @@ class BallDetection(NamedTuple):
         for _ in range(_TURNS):
             away_u = self.edges[:, 0] - u
             away_v = self.edges[:, 1] - v
-            far = np.maximum(np.hypot(away_u, away_v), 1e-9)
-            rest = far - radius
+            distances = np.maximum(np.hypot(away_u, away_v), 1e-9)
+            residual = distances - radius
             # Geman-McClure weights: points off the circle hardly count.
-            weights = 1 / (1 + (rest / _TUKEY_WIDTH_KNOWN_RADIUS) ** 2) ** 2
+            weights = 1 / (1 + (residual / _TUKEY_WIDTH_KNOWN_RADIUS) ** 2) ** 2
             # Equation (2) of sims.vision.circle_fit without dR
-            rows = np.stack([away_u / far, away_v / far, rest])
+            rows = np.stack([away_u / distances, away_v / distances, residual])
             normal = (rows * weights) @ rows.T
             (a, b, p), (_, c, q), _ = normal.tolist()
             area = a * c - b * b
@@ -173,22 +173,24 @@ class BallDetector:
         contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
         lengths = [(len(c), i) for i, c in enumerate(contours) if len(c) > 3]
         large = sorted(lengths, reverse=True)[:_MOST_SPOTS]
-        seen = []
+        detections = []
         for _, i in large:
             spot = self._measure_object(contours[i], (brightness, difference), shade)
             if spot is not None:
-                seen.append(self._add_colour(spot, picture))
-        return seen if ghosts else [spot for spot in seen if not spot.is_ghost]
+                detections.append(self._add_colour(spot, picture))
+        return detections if ghosts else [spot for spot in detections if not spot.is_ghost]
 
     def _add_colour(self, spot: BallDetection, picture: RgbImage) -> BallDetection:
         """Add to a detection its colour, its contrast, and whether it is a background artefact."""
-        here = _compute_centre_colour(picture, spot)
-        behind = _compute_centre_colour(self.background, spot)
-        out = _compute_surrounding_colour(picture, spot)
+        centre_colour = _compute_centre_colour(picture, spot)
+        background_colour = _compute_centre_colour(self.background, spot)
+        surrounding_colour = _compute_surrounding_colour(picture, spot)
         out_behind = _compute_surrounding_colour(self.background, spot)
-        contrast = float(np.abs(here - behind).max())
-        ghost = self._is_ghost((here, out), (behind, out_behind))
-        return spot._replace(colour=tuple(here.tolist()), contrast=contrast, is_ghost=ghost)
+        contrast = float(np.abs(centre_colour - background_colour).max())
+        ghost = self._is_ghost((centre_colour, surrounding_colour), (background_colour, out_behind))
+        return spot._replace(
+            colour=tuple(centre_colour.tolist()), contrast=contrast, is_ghost=ghost
+        )
 
     def find_missing_shadow(self, picture: RgbImage) -> Mask:
         """Find where the background image has a shadow that the picture lacks, as a mask.
@@ -200,43 +202,45 @@ class BallDetector:
         mask = (self._compute_largest_difference(picture) > self.level).astype(np.uint8)
         lighter = (self._compute_brightness_ratio(picture, mask) > 1).astype(np.uint8)
         count, parts, sizes, _ = cv2.connectedComponentsWithStats(lighter)
-        gone = np.zeros(mask.shape, bool)
+        missing_shadow = np.zeros(mask.shape, bool)
         # Component 0 is the area between the others.
         for part in range(1, count):
             if sizes[part, cv2.CC_STAT_AREA] < _LEAST_AREA:
                 continue
-            inside = (parts == part).astype(np.uint8)
+            part_mask = (parts == part).astype(np.uint8)
             # Leave out one pixel between inside and ring, which is half one and half the other.
-            near = cv2.dilate(inside, np.ones((3, 3), np.uint8))
-            wide = cv2.dilate(near, np.ones((5, 5), np.uint8))
-            ring = (wide > 0) & (near == 0) & (mask == 0)
+            grown_mask = cv2.dilate(part_mask, np.ones((3, 3), np.uint8))
+            outer_mask = cv2.dilate(grown_mask, np.ones((5, 5), np.uint8))
+            ring = (outer_mask > 0) & (grown_mask == 0) & (mask == 0)
             if not ring.any():
                 continue
-            within = inside > 0
-            shown = _compute_median_colours(picture, within, ring)
-            hidden = _compute_median_colours(self.background, within, ring)
+            is_inside = part_mask > 0
+            picture_colours = _compute_median_colours(picture, is_inside, ring)
+            background_colours = _compute_median_colours(self.background, is_inside, ring)
             # A pale ball is lighter, too, but it stands out in the picture.
-            if self._is_ghost(shown, hidden):
-                gone |= within
-        return gone
+            if self._is_ghost(picture_colours, background_colours):
+                missing_shadow |= is_inside
+        return missing_shadow
 
-    def _is_ghost(self, here: tuple[Array, Array], behind: tuple[Array, Array]) -> bool:
+    def _is_ghost(
+        self, picture_colours: tuple[Array, Array], background_colours: tuple[Array, Array]
+    ) -> bool:
         """Return whether an object is in the background image and not in the picture.
 
         Args:
-            here: Colours inside and around the object in the picture.
-            behind: Colours there in the background image.
+            picture_colours: Colours inside and around the object in the picture.
+            background_colours: Colours there in the background image.
         """
-        stands_out = float(np.abs(here[0] - here[1]).max())
-        stood_out = float(np.abs(behind[0] - behind[1]).max())
+        stands_out = float(np.abs(picture_colours[0] - picture_colours[1]).max())
+        stood_out = float(np.abs(background_colours[0] - background_colours[1]).max())
         return stood_out > stands_out + self.level / 2
 
     def _compute_largest_difference(self, picture: RgbImage) -> NDArray[np.uint8]:
         """Return the largest difference from the background over the colours (height, width)."""
         cv2 = import_package("cv2")
-        apart = cv2.absdiff(picture, self.background)
-        red_green = cv2.max(apart[..., 0], apart[..., 1])
-        result: NDArray[np.uint8] = cv2.max(red_green, apart[..., 2])
+        differences = cv2.absdiff(picture, self.background)
+        red_green = cv2.max(differences[..., 0], differences[..., 1])
+        result: NDArray[np.uint8] = cv2.max(red_green, differences[..., 2])
         return result
 
     def _compute_brightness_ratio(self, picture: RgbImage, mask: NDArray[np.uint8]) -> GreyLevels:
@@ -246,18 +250,18 @@ class BallDetector:
         """
         result = np.zeros(mask.shape, np.float32)
         rows, columns = np.nonzero(mask)
-        there = picture[rows, columns].astype(np.float32)
-        plain = self._plain[rows, columns]
+        colours = picture[rows, columns].astype(np.float32)
+        background_colours = self._plain[rows, columns]
         # Least squares over the three colours.
-        product = (there * plain).sum(axis=1)
+        product = (colours * background_colours).sum(axis=1)
         factor = product / self._square[rows, columns]
-        apart = np.abs(there - factor[:, None] * plain).max(axis=1)
-        rest = apart / np.maximum(factor, 1)
+        deviations = np.abs(colours - factor[:, None] * background_colours).max(axis=1)
+        relative_deviations = deviations / np.maximum(factor, 1)
         # A missing shadow is judged by the inverse factor.
-        even = np.minimum(factor, 1 / np.maximum(factor, 1e-3))
+        symmetric_factor = np.minimum(factor, 1 / np.maximum(factor, 1e-3))
         darkest, lightest = _SHADOW_FACTOR_RANGE
-        shade = (even > darkest) & (even < lightest)
-        shade &= rest < max(_UNEVEN, 3 * self.sigma)
+        shade = (symmetric_factor > darkest) & (symmetric_factor < lightest)
+        shade &= relative_deviations < max(_UNEVEN, 3 * self.sigma)
         result[rows, columns] = np.where(shade, factor, 0)
         return result
 
@@ -285,9 +289,9 @@ class BallDetector:
         if int(filled.sum()) < _LEAST_AREA:
             return None
         # The largest inscribed disc is the ball, even if a shadow is connected to it.
-        inside = cv2.distanceTransform(filled, cv2.DIST_L2, 5)
-        row, column = np.unravel_index(int(inside.argmax()), inside.shape)
-        radius = max(float(inside[row, column]), 1.0)
+        distance_map = cv2.distanceTransform(filled, cv2.DIST_L2, 5)
+        row, column = np.unravel_index(int(distance_map.argmax()), distance_map.shape)
+        radius = max(float(distance_map[row, column]), 1.0)
         u = left + float(column) - 1
         v = top + float(row) - 1
         # Use a window around it in which shadow counts as background unless the region encloses it.
@@ -327,39 +331,39 @@ class BallDetector:
         """
         u, v, radius = start
         on_it = np.empty(0, bool)
-        rest = np.empty(0)
+        residuals = np.empty(0)
         edges = None
         for _ in range(_ROUNDS):
             edges = self._locate_edges(windows, u, v, radius)
             if edges is None:
                 return None
             fitted = circle_fit.fit_circle(edges, (u, v, None))
-            enough = (
+            has_enough_points = (
                 fitted is not None
                 and circle_fit.find_inliers(fitted).sum() >= _GOOD_RAY_AGREEMENT * _RAYS
             )
-            if not enough:
+            if not has_enough_points:
                 from_an_arc = circle_fit.fit_circle(edges, circle_fit.fit_arc(edges))
                 fitted = circle_fit.select_better_fit(fitted, from_an_arc)
             if fitted is None:
                 return None
-            before = u, v, radius
-            found, rest = fitted
-            moved = max(abs(new - old) for new, old in zip(found, before, strict=True))
-            u, v, radius = found
+            previous_circle = u, v, radius
+            circle, residuals = fitted
+            change = max(abs(new - old) for new, old in zip(circle, previous_circle, strict=True))
+            u, v, radius = circle
             on_it = circle_fit.find_inliers(fitted)
-            if moved < _STILL:
+            if change < _STILL:
                 break
         agree = float(on_it.sum()) / _RAYS
         height, width = windows.shape[1:]
         # A centre outside the window belongs to an arc of a large object.
-        within = -0.5 <= u <= width - 0.5
-        within &= -0.5 <= v <= height - 0.5
-        if edges is None or agree < _MIN_RAY_AGREEMENT or not within:
+        is_within = -0.5 <= u <= width - 0.5
+        is_within &= -0.5 <= v <= height - 0.5
+        if edges is None or agree < _MIN_RAY_AGREEMENT or not is_within:
             return None
-        scatter = float(np.sqrt(np.mean(rest[on_it] ** 2)))
-        whole = edges + np.array([u0, v0])
-        return BallDetection(u + u0, v + v0, radius, agree, scatter, whole)
+        scatter = float(np.sqrt(np.mean(residuals[on_it] ** 2)))
+        picture_edges = edges + np.array([u0, v0])
+        return BallDetection(u + u0, v + v0, radius, agree, scatter, picture_edges)
 
     def _locate_edges(self, windows: GreyLevels, u: float, v: float, radius: float) -> Array | None:
         """Locate the points (n, 2) where the difference falls to half along rays from (u, v).
@@ -377,46 +381,46 @@ class BallDetector:
         Returns:
             Edge points in the window; None if there are too few.
         """
-        begin = max(0.0, 0.7 * radius - 2)
-        steps = np.arange(begin, 1.5 * radius + 2, _FINE, dtype=np.float32)
+        start = max(0.0, 0.7 * radius - 2)
+        steps = np.arange(start, 1.5 * radius + 2, _FINE, dtype=np.float32)
         cos, sin = _compute_ray_directions()
         along_u = (u + cos * steps).astype(np.float32)
         along_v = (v + sin * steps).astype(np.float32)
         profiles = [_interpolate_window(window, along_u, along_v) for window in windows]
         # Last pixels inside the edge, except those affected by blur.
-        inner = steps > min(0.5 * radius, radius - 3.5)
-        inner &= steps < max(0.7 * radius, radius - 1.3)
-        half_way = int(inner.sum()) // 2
+        is_inner = steps > min(0.5 * radius, radius - 3.5)
+        is_inner &= steps < max(0.7 * radius, radius - 1.3)
+        median_index = int(is_inner.sum()) // 2
         levels = []
         for profile in profiles:
-            ranked = np.partition(profile[:, inner], half_way, axis=1)
-            levels.append(ranked[:, half_way])
+            ranked = np.partition(profile[:, is_inner], median_index, axis=1)
+            levels.append(ranked[:, median_index])
         brightness, worst = levels
-        bright = brightness > 1.5 * self.level
-        bright &= brightness > 0.7 * worst
-        values = np.where(bright[:, None], *profiles)
-        half = 0.5 * np.where(bright, brightness, worst)
-        crossed = half[:, None]
-        below = values[:, 1:] < crossed
-        below &= values[:, :-1] >= crossed
+        is_bright = brightness > 1.5 * self.level
+        is_bright &= brightness > 0.7 * worst
+        values = np.where(is_bright[:, None], *profiles)
+        half_level = 0.5 * np.where(is_bright, brightness, worst)
+        crossed = half_level[:, None]
+        is_crossing = values[:, 1:] < crossed
+        is_crossing &= values[:, :-1] >= crossed
         # A dark patch further inside is not an edge.
-        below[:, : int(np.flatnonzero(inner)[0])] = False
+        is_crossing[:, : int(np.flatnonzero(is_inner)[0])] = False
         # Take the first of several crossings.
-        k = below.argmax(axis=1)
+        k = is_crossing.argmax(axis=1)
         lines = np.arange(_RAYS)
         a = values[lines, k]
         b = values[lines, k + 1]
-        has = below.any(axis=1) & (half > 0.4 * self.level)
+        has_edge = is_crossing.any(axis=1) & (half_level > 0.4 * self.level)
         # A fall to the value for outside is the end of the picture, not of the ball.
-        has &= b > 0.5 * _OUTSIDE
-        if has.sum() < 0.5 * _RAYS:
+        has_edge &= b > 0.5 * _OUTSIDE
+        if has_edge.sum() < 0.5 * _RAYS:
             return None
         # Interpolate linearly between the two samples.
         drop = np.maximum(a - b, 1e-6)
-        share = (a - half)[has] / drop[has]
-        out = steps[k[has]] + _FINE * share
-        edge_u = u + cos[has, 0] * out
-        edge_v = v + sin[has, 0] * out
+        share = (a - half_level)[has_edge] / drop[has_edge]
+        edge_distances = steps[k[has_edge]] + _FINE * share
+        edge_u = u + cos[has_edge, 0] * edge_distances
+        edge_v = v + sin[has_edge, 0] * edge_distances
         return np.stack([edge_u, edge_v], axis=1).astype(np.float64)
 
     def _measure_small_ball(
@@ -431,10 +435,10 @@ class BallDetector:
         """Measure a ball of a few pixels: centroid of the difference, and radius from its sum."""
         height, width = window.shape
         rows, columns = np.mgrid[:height, :width]
-        near = np.hypot(columns - u, rows - v) <= radius + 2.5
-        weights = np.where(near & (window > 0.4 * self.level), window, 0.0)
+        is_near = np.hypot(columns - u, rows - v) <= radius + 2.5
+        weights = np.where(is_near & (window > 0.4 * self.level), window, 0.0)
         total = float(weights.sum())
-        peak = float(np.percentile(window[near], 90))
+        peak = float(np.percentile(window[is_near], 90))
         if total <= 0 or peak < self.level:
             return None
         # A partly covered pixel differs in proportion: sums measure areas.
@@ -448,11 +452,13 @@ class BallDetector:
         return BallDetection(u, v, equal, _MIN_RAY_AGREEMENT, 0.2)
 
 
-def _compute_median_colours(picture: RgbImage, inside: Mask, around: Mask) -> tuple[Array, Array]:
+def _compute_median_colours(
+    picture: RgbImage, object_mask: Mask, surroundings: Mask
+) -> tuple[Array, Array]:
     """Return the median colours (3,) of two parts of a picture."""
-    within: Array = np.median(picture[inside], axis=0)
-    outside: Array = np.median(picture[around], axis=0)
-    return within, outside
+    inside_colour: Array = np.median(picture[object_mask], axis=0)
+    outside_colour: Array = np.median(picture[surroundings], axis=0)
+    return inside_colour, outside_colour
 
 
 def _compute_centre_colour(picture: RgbImage, spot: BallDetection) -> Array:
@@ -467,15 +473,15 @@ def _compute_surrounding_colour(picture: RgbImage, spot: BallDetection) -> Array
     """Return the median colour (3,) on a circle around a detection, in grey levels."""
     cos, sin = _compute_ray_directions()
     height, width = picture.shape[:2]
-    away = _AROUND * spot.radius
-    half = _RAYS // 2
-    rows = (spot.v + away * sin[:, 0] + 0.5).astype(np.intp)
-    columns = (spot.u + away * cos[:, 0] + 0.5).astype(np.intp)
+    circle_radius = _AROUND * spot.radius
+    median_index = _RAYS // 2
+    rows = (spot.v + circle_radius * sin[:, 0] + 0.5).astype(np.intp)
+    columns = (spot.u + circle_radius * cos[:, 0] + 0.5).astype(np.intp)
     # Beyond the border, the outermost pixels are repeated.
     rows = rows.clip(0, height - 1)
     columns = columns.clip(0, width - 1)
-    ranked = np.partition(picture[rows, columns], half, axis=0)
-    colour: Array = ranked[half].astype(np.float64)
+    ranked = np.partition(picture[rows, columns], median_index, axis=0)
+    colour: Array = ranked[median_index].astype(np.float64)
     return colour
 
 

@@ -72,9 +72,9 @@ class BallScene:
         ground = self._create_body(p.GEOM_BOX, look.ground, halfExtents=extents)
         self._move_body(ground, (0, 0, -_THICKNESS))
         width, height = camera.size
-        everything = 0, 0, width, height
+        full_window = 0, 0, width, height
         self._rays = self._compute_view_directions()
-        picture, covered = self._render_body(everything, 1, ground)
+        picture, covered = self._render_body(full_window, 1, ground)
         # Frames are rendered without the ground, because it does not change.
         p.removeBody(ground, physicsClientId=self._client)
         self._still = self._render_background(picture, covered)
@@ -143,18 +143,18 @@ class BallScene:
         """
         # A ray meets the ground at height 0.
         with np.errstate(divide="ignore"):
-            far = -self.camera.position[2] / self._rays[..., 2]
+            ground_distance = -self.camera.position[2] / self._rays[..., 2]
         # Without the second condition, rays above the horizon would meet the ground behind the
         # camera.
-        meets = (covered[..., 0] > 0.5) & (far > 0)
-        along = np.where(meets, far, 0.0)
-        points = self.camera.position + along[..., None] * self._rays
+        is_ground = (covered[..., 0] > 0.5) & (ground_distance > 0)
+        ray_lengths = np.where(is_ground, ground_distance, 0.0)
+        points = self.camera.position + ray_lengths[..., None] * self._rays
         self._points = points.astype(np.float32)
-        self._open = meets
-        bright = self.look.compute_ground_brightness(points[..., 0], points[..., 1])
-        ground = picture * bright[..., None]
+        self._open = is_ground
+        brightness = self.look.compute_ground_brightness(points[..., 0], points[..., 1])
+        ground = picture * brightness[..., None]
         sky = 255 * np.array(self.look.sky)
-        return np.where(meets[..., None], ground, sky).astype(np.float32)
+        return np.where(is_ground[..., None], ground, sky).astype(np.float32)
 
     def _cast_shadow(self, picture: ColourArray, position: Array) -> None:
         """Darken the ground in the ball's shadow; the sun's disc softens its edge."""
@@ -178,11 +178,11 @@ class BallScene:
             return
         left, top, right, bottom = window
         place = np.s_[top:bottom, left:right]
-        away = self._points[place] - foot.astype(np.float32)
+        offsets = self._points[place] - foot.astype(np.float32)
         # Distance from that line by Pythagoras; rounding may make the square negative.
-        along = away @ light.astype(np.float32)
-        far = (away * away).sum(axis=-1)
-        squares = far - along * along
+        light_components = offsets @ light.astype(np.float32)
+        squared_distances = (offsets * offsets).sum(axis=-1)
+        squares = squared_distances - light_components * light_components
         distance = np.sqrt(np.maximum(squares, 0))
         soft = _SHARPEST * self.radius + _SUN * travel
         depth = (self.radius + soft - distance) / (2 * soft)
@@ -192,16 +192,16 @@ class BallScene:
 
     def _draw_ball(self, picture: ColourArray, position: Array) -> None:
         """Blend the ball into the picture, weighted by its coverage of each pixel."""
-        centre, (longer, _) = self.camera.project_sphere(position, self.radius)
-        reach = longer + _MARGIN
+        centre, (semi_major_axis, _) = self.camera.project_sphere(position, self.radius)
+        reach = semi_major_axis + _MARGIN
         if not np.isfinite(reach):
             return
-        around = np.array([centre - reach, centre + reach])
-        window = _find_window(around, self.camera.size)
+        corners = np.array([centre - reach, centre + reach])
+        window = _find_window(corners, self.camera.size)
         if window is None:
             return
         self._move_body(self._ball, position)
-        fine = 3 if longer < _SMALL else 2
+        fine = 3 if semi_major_axis < _SMALL else 2
         ball, covered = self._render_body(window, fine, self._ball)
         left, top, right, bottom = window
         place = np.s_[top:bottom, left:right]
@@ -226,7 +226,7 @@ class BallScene:
         width = right - left
         height = bottom - top
         # size of a pixel on the near plane in metres
-        at = _NEAR / camera.focal
+        pixel_size = _NEAR / camera.focal
         # The renderer counts pixels from their corner: shift by half a fine pixel, measured on
         # spheres.
         shift = 0.5 / fine
@@ -237,10 +237,10 @@ class BallScene:
         lower_edge = bottom - 0.5 - v
         upper_edge = top - 0.5 - v
         projection = p.computeProjectionMatrix(
-            at * left_edge,
-            at * right_edge,
-            -at * lower_edge,
-            -at * upper_edge,
+            pixel_size * left_edge,
+            pixel_size * right_edge,
+            -pixel_size * lower_edge,
+            -pixel_size * upper_edge,
             _NEAR,
             _FAR,
         )
@@ -257,10 +257,10 @@ class BallScene:
         )
         # Average the fine pixels of each pixel; only colours of the body itself count.
         grouped = height, fine, width, fine
-        there = np.reshape(bodies, (*grouped, 1)) == body
-        share = there.mean(axis=(1, 3), dtype=np.float32)
+        is_body = np.reshape(bodies, (*grouped, 1)) == body
+        share = is_body.mean(axis=(1, 3), dtype=np.float32)
         colour = np.reshape(colours, (*grouped, 4))[..., :3]
-        sums = np.where(there, colour, 0).sum(axis=(1, 3), dtype=np.float32)
+        sums = np.where(is_body, colour, 0).sum(axis=(1, 3), dtype=np.float32)
         count = np.maximum(share * fine**2, 1)
         return sums / count, share
 

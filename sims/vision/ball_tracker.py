@@ -86,8 +86,8 @@ def track_ball(frames: Iterable[tuple[float, RgbImage]]) -> BallTrack:
     notes: list[str] = []
     first, end = _find_longest_shot(survey, notes)
     numbers = [first + k for k in background_model.select_frames(survey.moved[first:end])]
-    wanted = set(numbers)
-    pictures = [picture for number, (_, picture) in enumerate(frames) if number in wanted]
+    wanted_frames = set(numbers)
+    pictures = [picture for number, (_, picture) in enumerate(frames) if number in wanted_frames]
     finder = _make_detector(pictures)
     spots = []
     for number, (_, picture) in enumerate(frames):
@@ -96,13 +96,13 @@ def track_ball(frames: Iterable[tuple[float, RgbImage]]) -> BallTrack:
     paths = link_detections(spots)
     if not paths:
         raise InputError(_format_no_ball_message(end - first, sum(map(bool, spots))))
-    path, others = merge_continuations(paths)
+    path, other_paths = merge_continuations(paths)
     # An object that hardly moves may be a ball, but its fall cannot be measured.
     if len(path.frames) < _LEAST_FRAMES or path.travel < path.radius:
         raise InputError(_format_no_ball_message(end - first, len(path.frames)))
-    _note_other_objects(path, others, notes)
-    shown = {n - first: p for n, p in zip(numbers, pictures, strict=True)}
-    return _make_track(survey.times[first:end], path, survey.size, notes, finder, shown)
+    _note_other_objects(path, other_paths, notes)
+    sample_pictures = {n - first: p for n, p in zip(numbers, pictures, strict=True)}
+    return _make_track(survey.times[first:end], path, survey.size, notes, finder, sample_pictures)
 
 
 class _FrameCache:
@@ -122,29 +122,33 @@ class _FrameCache:
             yield from self._kept
             return
         frames = []
-        held = 0
+        stored_bytes = 0
         for time, picture in self._source:
-            held += picture.nbytes
-            if held <= _HELD:
+            stored_bytes += picture.nbytes
+            if stored_bytes <= _HELD:
                 frames.append((time, picture))
             else:
                 # Too many frames: release those cached so far at once.
                 frames.clear()
             yield time, picture
-        if held <= _HELD:
+        if stored_bytes <= _HELD:
             self._kept = frames
 
 
-def _format_no_ball_message(frames: int, some: int) -> str:
+def _format_no_ball_message(frames: int, frames_with_objects: int) -> str:
     """Format the message that no ball was found.
 
     Args:
         frames: Number of frames.
-        some: Number of frames with a round object.
+        frames_with_objects: Number of frames with a round object.
     """
-    seen = f"something round in {some} of {frames} frames, but nothing" if some else "nothing"
+    observation = (
+        f"something round in {frames_with_objects} of {frames} frames, but nothing"
+        if frames_with_objects
+        else "nothing"
+    )
     return (
-        f"no ball found: {seen} that moves and stays round; "
+        f"no ball found: {observation} that moves and stays round; "
         "film with a fixed camera and a ball unlike its background"
     )
 
@@ -154,7 +158,7 @@ def _find_longest_shot(survey: background_model.FrameSurvey, notes: list[str]) -
     shots = survey.list_shots()
     first, end = max(shots, key=lambda shot: shot[1] - shot[0])
     if len(shots) > 1:
-        cuts = ", ".join(f"{survey.times[cut]:.2f} s" for cut in survey.cuts[:5])
+        cuts = ", ".join(f"{survey.times[cut_frame]:.2f} s" for cut_frame in survey.cuts[:5])
         span = f"{survey.times[first]:.2f} to {survey.times[end - 1]:.2f} s"
         notes.append(
             f"the film is cut or the camera moves (at {cuts}); "
@@ -173,32 +177,36 @@ def _make_detector(pictures: list[RgbImage]) -> BallDetector:
     It treats shadows in the way with which more round objects are found: as shadow, or as part
     of the ball.
     """
-    plain = background_model.compute_median_background(pictures)
-    every = max(1, len(pictures) // _FEW)
+    background = background_model.compute_median_background(pictures)
+    stride = max(1, len(pictures) // _FEW)
     # Two passes: objects hidden by the first background are detected with the second.
     for _ in range(2):
-        sigma = background_model.estimate_camera_noise(pictures, plain)
-        careful = BallDetector(plain, sigma, shadows=True)
-        careless = BallDetector(plain, sigma, shadows=False)
-        by_careful = [careful.detect(p, ghosts=True) for p in pictures[::every]]
-        by_careless = [careless.detect(p, ghosts=True) for p in pictures[::every]]
+        sigma = background_model.estimate_camera_noise(pictures, background)
+        shadow_detector = BallDetector(background, sigma, shadows=True)
+        plain_detector = BallDetector(background, sigma, shadows=False)
+        shadow_detections = [shadow_detector.detect(p, ghosts=True) for p in pictures[::stride]]
+        plain_detections = [plain_detector.detect(p, ghosts=True) for p in pictures[::stride]]
         # A ball of the ground's hue would be removed as shadow; then shadows must be tolerated.
-        if _compute_roundness(by_careful) >= _SHADOWS * _compute_roundness(by_careless):
-            best, known = careful, by_careful
+        if _compute_roundness(shadow_detections) >= _SHADOWS * _compute_roundness(plain_detections):
+            best, known_detections = shadow_detector, shadow_detections
         else:
-            best, known = careless, by_careless
-        found = []
+            best, known_detections = plain_detector, plain_detections
+        detections = []
         for i, picture in enumerate(pictures):
-            if i % every == 0:
-                found.append(known[i // every])
+            if i % stride == 0:
+                detections.append(known_detections[i // stride])
             else:
-                found.append(best.detect(picture, ghosts=True))
-        hiding = _list_hiding_circles(found)
-        shaded = None
+                detections.append(best.detect(picture, ghosts=True))
+        hiding = _list_hiding_circles(detections)
+        shadow_masks = None
         if best.shadows:
-            shaded = _find_shadows([best.find_missing_shadow(picture) for picture in pictures])
-        plain = background_model.compute_masked_background(pictures, hiding, plain, shaded)
-    return BallDetector(plain, sigma, best.shadows)
+            shadow_masks = _find_shadows(
+                [best.find_missing_shadow(picture) for picture in pictures]
+            )
+        background = background_model.compute_masked_background(
+            pictures, hiding, background, shadow_masks
+        )
+    return BallDetector(background, sigma, best.shadows)
 
 
 def _compute_roundness(pictures: list[list[BallDetection]]) -> float:
@@ -209,7 +217,7 @@ def _compute_roundness(pictures: list[list[BallDetection]]) -> float:
     )
 
 
-def _list_hiding_circles(found: list[list[BallDetection]]) -> list[list[Circle]]:
+def _list_hiding_circles(detections: list[list[BallDetection]]) -> list[list[Circle]]:
     """Return the circles that hide the background in each picture.
 
     A ball that rests for most of the film, or its shadow, is part of the median. Pictures without
@@ -217,17 +225,19 @@ def _list_hiding_circles(found: list[list[BallDetection]]) -> list[list[Circle]]
     """
     balls: list[list[Circle]] = []
     ghosts: list[list[Circle]] = []
-    for spots in found:
+    for spots in detections:
         balls.append([(s.u, s.v, s.radius) for s in spots if not s.is_ghost])
         ghosts.append([(s.u, s.v, s.radius) for s in spots if s.is_ghost])
-    for one in [ghost for there in ghosts for ghost in there]:
-        lacking = [any(_is_same_object(one, other) for other in there) for there in ghosts]
+    for ghost_circle in [ghost for circles in ghosts for ghost in circles]:
+        missing_flags = [
+            any(_is_same_object(ghost_circle, circle) for circle in circles) for circles in ghosts
+        ]
         # One or two frames may miss it by mistake.
-        if sum(lacking) < _FEWEST:
+        if sum(missing_flags) < _FEWEST:
             continue
-        for there, lacks in zip(balls, lacking, strict=True):
-            if not lacks:
-                there.append(one)
+        for circles, is_missing in zip(balls, missing_flags, strict=True):
+            if not is_missing:
+                circles.append(ghost_circle)
     return balls
 
 
@@ -247,23 +257,25 @@ def _is_same_object(a: Circle, b: Circle) -> bool:
 
     Their centres may differ by 0.3 radii and half a pixel, and their radii by a factor of 1.4.
     """
-    apart = abs(a[0] - b[0]) + abs(a[1] - b[1])
-    return apart < 0.3 * b[2] + 0.5 and 0.7 < a[2] / b[2] < 1.4
+    distance = abs(a[0] - b[0]) + abs(a[1] - b[1])
+    return distance < 0.3 * b[2] + 0.5 and 0.7 < a[2] / b[2] < 1.4
 
 
-def _note_other_objects(path: TrackedPath, others: Sequence[TrackedPath], notes: list[str]) -> None:
+def _note_other_objects(
+    path: TrackedPath, other_paths: Sequence[TrackedPath], notes: list[str]
+) -> None:
     """Add a note if a second object of similar size moves at the same time as the ball.
 
     It must appear in at least 8 frames and a quarter of the ball's frames, and travel more than its
     diameter. The user then knows that the tracker may have chosen the wrong object.
     """
     frames = set(path.frames)
-    for other in others:
-        shared = len(frames & set(other.frames))
+    for other_path in other_paths:
+        shared = len(frames & set(other_path.frames))
         # A brief, small or resting object is not a second ball.
-        beside = shared >= max(8, 0.25 * len(path.frames))
-        moves = other.travel > 2 * other.radius
-        if beside and moves and 0.4 < other.radius / path.radius < 2.5:
+        is_simultaneous = shared >= max(8, 0.25 * len(path.frames))
+        is_moving = other_path.travel > 2 * other_path.radius
+        if is_simultaneous and is_moving and 0.4 < other_path.radius / path.radius < 2.5:
             notes.append(
                 f"a second ball, or its shadow, moves in {shared} of the same frames; "
                 "the clearer one is tracked"
@@ -296,10 +308,10 @@ def _make_track(
         if not misfit:
             columns[:, frame] = spot.u, spot.v, spot.radius
     u, v, radius = columns
-    gone = int(np.isnan(u).sum())
-    if gone:
+    missing_count = int(np.isnan(u).sum())
+    if missing_count:
         notes.append(
-            f"{gone} of {len(times)} frames show no ball that could be measured; "
+            f"{missing_count} of {len(times)} frames show no ball that could be measured; "
             "their cells are empty"
         )
     noise = np.nan
@@ -340,23 +352,23 @@ def _refine_with_smooth_radius(
     spread = np.maximum(np.ptp(places, axis=0), 1.0)
     # position along the path's main direction, about -1 to 1
     axes = np.linalg.svd(offsets, full_matrices=False)[2]
-    along = offsets @ axes[0] / spread.max()
-    basis = np.stack([np.ones_like(along), along], axis=1)
+    path_position = offsets @ axes[0] / spread.max()
+    basis = np.stack([np.ones_like(path_position), path_position], axis=1)
     radius = np.array([s.radius for s in spots])
     weights = np.ones_like(radius)
     line = np.zeros(2)
     for _ in range(_ROUNDS):
         weighed = basis * weights[:, None]
         line = np.linalg.lstsq(weighed, radius * weights, rcond=None)[0]
-        rest = np.abs(radius - basis @ line)
+        deviations = np.abs(radius - basis @ line)
         # Weights with heavy tails: measurements of other objects must not affect the trend.
-        width = max(float(np.median(rest)), _SURE)
-        weights = 1 / (1 + (rest / width) ** 2)
+        width = max(float(np.median(deviations)), _SURE)
+        weights = 1 / (1 + (deviations / width) ** 2)
     fitted = np.maximum(basis @ line, 0.5)
-    allowed = np.maximum(_MISFIT * fitted, 1.0)
-    wrong = np.abs(radius - fitted) > allowed
+    tolerance = np.maximum(_MISFIT * fitted, 1.0)
+    is_wrong = np.abs(radius - fitted) > tolerance
     steady = [s.refit_with_radius(float(r)) for s, r in zip(spots, fitted, strict=True)]
-    return steady, wrong.tolist()
+    return steady, is_wrong.tolist()
 
 
 def estimate_roughness(values: Array) -> float:
@@ -376,14 +388,14 @@ def estimate_roughness(values: Array) -> float:
     windows = sliding_window_view(values, _WINDOW)
     windows = windows[np.isfinite(windows).all(axis=1)]
     # At rest the same pixels give the same error again and again, which is no scatter.
-    there = values[np.isfinite(values)]
-    travel = max(float(np.ptp(there)), 1e-12)
+    finite_values = values[np.isfinite(values)]
+    travel = max(float(np.ptp(finite_values)), 1e-12)
     windows = windows[np.ptp(windows, axis=1) > 1e-3 * travel * _WINDOW]
     if not len(windows):
         return float("nan")
     # A cubic has four coefficients, which reduces the degrees of freedom by four.
     cubic = np.vander(np.linspace(-1, 1, _WINDOW), 4)
     basis = np.linalg.qr(cubic)[0]
-    rest = windows - windows @ basis @ basis.T
-    squares = (rest**2).sum(axis=1)
+    residuals = windows - windows @ basis @ basis.T
+    squares = (residuals**2).sum(axis=1)
     return float(np.sqrt(np.median(squares) / (_WINDOW - 4)))

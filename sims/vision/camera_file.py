@@ -74,14 +74,14 @@ def _read_section(
     path: Path, section: str, meta: Mapping[str, Any], counts: Mapping[str, int]
 ) -> dict[str, Any]:
     """Read all entries of a section, each a number or a tuple of the required length."""
-    given = check_table(path, section, meta.get(section))
-    check_known_names(f"entry in [{section}] of {path}", given, counts)
+    table = check_table(path, section, meta.get(section))
+    check_known_names(f"entry in [{section}] of {path}", table, counts)
     values: dict[str, Any] = {}
     for name, count in counts.items():
-        where, value = f"{section}.{name}", given.get(name)
+        key, value = f"{section}.{name}", table.get(name)
         if count == 1:
-            values[name] = check_finite(path, where, value)
+            values[name] = check_finite(path, key, value)
         else:
-            row = check_number_list(path, where, value, count)
-            values[name] = tuple(check_finite(path, where, entry) for entry in row)
+            row = check_number_list(path, key, value, count)
+            values[name] = tuple(check_finite(path, key, entry) for entry in row)
     return values

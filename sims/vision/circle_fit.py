@@ -68,16 +68,16 @@ def fit_circle(points: Array, start: tuple[float, float, float | None] | None) -
     for _ in range(_MAX_ITERATIONS):
         away_u = x - u
         away_v = y - v
-        far = np.hypot(away_u, away_v)
+        distances = np.hypot(away_u, away_v)
         if radius is None:
-            radius = _compute_median(far)
-        rest = far - radius  # (1)
-        width = _TUKEY * max(_NORMAL * _compute_median(np.abs(rest)), _FINEST)
-        weights = np.maximum(1 - (rest / width) ** 2, 0.0) ** 2  # (3)
-        np.maximum(far, 1e-9, out=far)
-        rows[0] = away_u / far
-        rows[1] = away_v / far
-        rows[3] = rest
+            radius = _compute_median(distances)
+        residuals = distances - radius  # (1)
+        width = _TUKEY * max(_NORMAL * _compute_median(np.abs(residuals)), _FINEST)
+        weights = np.maximum(1 - (residuals / width) ** 2, 0.0) ** 2  # (3)
+        np.maximum(distances, 1e-9, out=distances)
+        rows[0] = away_u / distances
+        rows[1] = away_v / distances
+        rows[3] = residuals
         step = _solve_gauss_newton_step((rows * weights) @ rows.T)
         if step is None:
             return None
@@ -117,9 +117,9 @@ def _solve_gauss_newton_step(normal: Array) -> tuple[float, float, float] | None
 
 def find_inliers(fitted: CircleFit) -> NDArray[np.bool_]:
     """Return which points are on the circle, within 0.7 pixels or 10 % of its radius, (n,)."""
-    (_, _, radius), rest = fitted
+    (_, _, radius), residuals = fitted
     tolerance = max(0.7, 0.1 * radius)
-    result: NDArray[np.bool_] = np.abs(rest) < tolerance
+    result: NDArray[np.bool_] = np.abs(residuals) < tolerance
     return result
 
 
@@ -152,29 +152,29 @@ def fit_arc(points: Array) -> Circle | None:
         The circle; None if an arc does not determine one.
     """
     count = len(points)
-    begins = np.arange(0, count, _ARC_STRIDE)
-    along = np.arange(count // 2 + 1)
-    numbers = (begins[:, None] + along) % count
+    arc_starts = np.arange(0, count, _ARC_STRIDE)
+    arc_offsets = np.arange(count // 2 + 1)
+    numbers = (arc_starts[:, None] + arc_offsets) % count
     # Relative to the mean, because the squares in (4) lose digits far from the origin.
     middle = points.mean(axis=0)
     arcs = points[numbers] - middle
     table = np.concatenate([arcs, np.ones((*numbers.shape, 1))], axis=2)
-    turned = table.transpose(0, 2, 1)
-    normal = turned @ table
+    transposed = table.transpose(0, 2, 1)
+    normal = transposed @ table
     if (np.abs(np.linalg.det(normal)) < _SINGULAR).any():
         return None
     squares = (arcs**2).sum(axis=2)[..., None]
-    solution = np.linalg.solve(normal, turned @ squares)  # (4)
-    doubled_u, doubled_v, rest = solution[..., 0].T
+    solution = np.linalg.solve(normal, transposed @ squares)  # (4)
+    doubled_u, doubled_v, constant = solution[..., 0].T
     u = doubled_u / 2
     v = doubled_v / 2
-    radius = np.sqrt(np.maximum(rest + u**2 + v**2, 0.0))
+    radius = np.sqrt(np.maximum(constant + u**2 + v**2, 0.0))
     x, y = (points - middle).T
-    far = np.hypot(x - u[:, None], y - v[:, None])
-    away = far - radius[:, None]
+    distances = np.hypot(x - u[:, None], y - v[:, None])
+    deviations = distances - radius[:, None]
     # Half the tolerance of `find_inliers`: points graze the circle of a wrong arc.
     tolerance = np.maximum(0.35, 0.05 * radius)
-    agree = np.abs(away) < tolerance[:, None]
+    agree = np.abs(deviations) < tolerance[:, None]
     best = int(agree.sum(axis=1).argmax())
     return (
         float(u[best] + middle[0]),

@@ -108,15 +108,17 @@ class FilmedBall(Simulator):
         camera = _make_camera(constants)
         radius = constants["radius"]
         if self._tracked:
-            tracks = [_track_film(camera, radius, way, scenario.times) for way in places]
+            tracks = [
+                _track_film(camera, radius, positions, scenario.times) for positions in places
+            ]
             rows = np.array(tracks).reshape(places.shape[:2])  # also where there are no lanes
             heights = np.full_like(rows, np.nan)
         else:
             middles, _ = camera.project_sphere(places, radius)
             heights = places[..., 2]
             rows = middles[..., 1]
-        seen = np.stack([heights, rows], axis=2)
-        result: Array = seen[:, :, self.columns]
+        observations = np.stack([heights, rows], axis=2)
+        result: Array = observations[:, :, self.columns]
         return result
 
     def close(self) -> None:
@@ -160,12 +162,12 @@ def _track_film(camera: PinholeCamera, radius: float, places: Array, times: Arra
     ]
     digest = hashlib.sha256(np.array(numbers).tobytes()).digest()
     rng = np.random.default_rng(np.frombuffer(digest, dtype=np.uint32))
-    look = SceneAppearance.draw(rng)
-    stage = BallScene(camera, look, radius, rng)
+    appearance = SceneAppearance.draw(rng)
+    stage = BallScene(camera, appearance, radius, rng)
     try:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "film.mp4"
-            write_video(path, stage.render_frames(places), times, look.crf)
+            write_video(path, stage.render_frames(places), times, appearance.crf)
             measured = track_ball(VideoFile(path))
     except InputError:  # no ball to be seen: nothing was measured
         return rows

@@ -143,8 +143,8 @@ class PinholeCamera:
 
     def to_camera_frame(self, points: ArrayLike) -> Array:
         """Transform world points (..., 3) to the camera's frame (..., 3), m: right, down, depth."""
-        away = np.asarray(points, dtype=np.float64) - self.position
-        result: Array = away @ self.axes.T  # (1)
+        offsets = np.asarray(points, dtype=np.float64) - self.position
+        result: Array = offsets @ self.axes.T  # (1)
         return result
 
     def compute_depth(self, points: ArrayLike) -> Array:
@@ -160,11 +160,11 @@ class PinholeCamera:
 
         Pixels may be outside the picture; they are NaN for points behind the camera.
         """
-        seen = self.to_camera_frame(points)
-        depth = seen[..., 2:]
+        camera_points = self.to_camera_frame(points)
+        depth = camera_points[..., 2:]
         # Points behind the camera would appear mirrored about the principal point.
         depth = np.where(depth > 0, depth, np.nan)
-        result: Array = self.principal_point + self.focal * seen[..., :2] / depth  # (2)
+        result: Array = self.principal_point + self.focal * camera_points[..., :2] / depth  # (2)
         return result
 
     def project_sphere(self, points: ArrayLike, radius: float) -> tuple[Array, Array]:
@@ -181,29 +181,29 @@ class PinholeCamera:
             Centre (..., 2) and semi-axes (..., 2) of the ellipse in pixels, the longer axis first;
             NaN where the sphere is not wholly in front of the camera.
         """
-        seen = self.to_camera_frame(points)
-        sideways = seen[..., :2]
-        depth = seen[..., 2]
-        far = np.linalg.norm(seen, axis=-1)
-        aside = np.hypot(sideways[..., 0], sideways[..., 1])
+        camera_points = self.to_camera_frame(points)
+        sideways = camera_points[..., :2]
+        depth = camera_points[..., 2]
+        distances = np.linalg.norm(camera_points, axis=-1)
+        lateral_distance = np.hypot(sideways[..., 0], sideways[..., 1])
         with np.errstate(invalid="ignore", divide="ignore"):
-            half = np.arcsin(radius / far)  # (4)
-            tilt = np.arctan2(aside, depth)
+            half_angle = np.arcsin(radius / distances)  # (4)
+            tilt = np.arctan2(lateral_distance, depth)
             # The section is no ellipse if the cone reaches the plane of the camera.
-            tilt = np.where(tilt + half < math.pi / 2, tilt, np.nan)
-            near_end = np.tan(tilt - half)
-            far_end = np.tan(tilt + half)
-            away = (near_end + far_end) / 2  # (5)
-            lean = away * np.sin(tilt) + np.cos(tilt)
-            ratio = lean / np.cos(half)
-            across = ratio**2 - away**2 - 1  # (6), b^2
+            tilt = np.where(tilt + half_angle < math.pi / 2, tilt, np.nan)
+            near_end = np.tan(tilt - half_angle)
+            far_end = np.tan(tilt + half_angle)
+            centre_radius = (near_end + far_end) / 2  # (5)
+            lean = centre_radius * np.sin(tilt) + np.cos(tilt)
+            ratio = lean / np.cos(half_angle)
+            squared_semi_axis = ratio**2 - centre_radius**2 - 1  # (6), b^2
             # In the middle of the picture the direction is arbitrary.
-            divisor = np.where(aside > 0, aside, 1.0)
+            divisor = np.where(lateral_distance > 0, lateral_distance, 1.0)
             direction = sideways / divisor[..., None]
-        centre = self.principal_point + self.focal * away[..., None] * direction
-        longer = (far_end - near_end) / 2  # (5)
-        shorter = np.sqrt(across)
-        return centre, self.focal * np.stack([longer, shorter], axis=-1)
+        centre = self.principal_point + self.focal * centre_radius[..., None] * direction
+        semi_major_axis = (far_end - near_end) / 2  # (5)
+        semi_minor_axis = np.sqrt(squared_semi_axis)
+        return centre, self.focal * np.stack([semi_major_axis, semi_minor_axis], axis=-1)
 
     def compute_apparent_radius(self, points: ArrayLike, radius: float) -> Array:
         """Return the radius (...) in pixels of the circle with the area of the sphere's outline.
@@ -240,18 +240,18 @@ class PinholeCamera:
         """
         pixels = np.asarray(centres, dtype=np.float64)
         base = self.to_camera_frame((x, y, 0.0))
-        up = self.axes[:, 2]
+        vertical = self.axes[:, 2]
         shift: Array = np.zeros_like(pixels)
         z: Array = np.full(pixels.shape[:-1], np.nan)
         for _ in range(_REFINEMENTS):
             ratio = (pixels - shift - self.principal_point) / self.focal
             constant = base[:2] - ratio * base[2]
-            slope = up[:2] - ratio * up[2]
-            along = (constant * slope).sum(axis=-1)
+            slope = vertical[:2] - ratio * vertical[2]
+            constant_product = (constant * slope).sum(axis=-1)
             square = (slope * slope).sum(axis=-1)
-            z = -along / square  # (7)
-            everywhere = np.ones_like(z)
-            points = np.stack([x * everywhere, y * everywhere, z], axis=-1)
+            z = -constant_product / square  # (7)
+            ones = np.ones_like(z)
+            points = np.stack([x * ones, y * ones, z], axis=-1)
             centre, _ = self.project_sphere(points, radius)
             shift = centre - self.project(points)
         return z

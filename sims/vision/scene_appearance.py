@@ -55,12 +55,12 @@ class SceneAppearance:
         """
         # The order of the draws must not change, because it determines the result of a seed.
         azimuth = rng.uniform(0, 2 * np.pi)
-        above = rng.uniform(_LOWEST, _HIGHEST)
-        flat = np.cos(above)
+        elevation = rng.uniform(_LOWEST, _HIGHEST)
+        flat = np.cos(elevation)
         light = [
             flat * np.cos(azimuth),
             flat * np.sin(azimuth),
-            np.sin(above),
+            np.sin(elevation),
         ]
         ground = _draw_colour(rng, saturation=(0.0, 0.4), value=(0.3, 0.85))
         ball = _draw_colour(rng, saturation=(0.0, 1.0), value=_BALL_VALUE)
@@ -72,9 +72,9 @@ class SceneAppearance:
         length = rng.uniform(0.5, 6.0, _WAVES)
         phase = rng.uniform(0, turn, _WAVES)
         amplitude = rng.uniform(0.0, 0.04, _WAVES)
-        across = length * np.cos(bearing)
-        along = length * np.sin(bearing)
-        waves = np.stack([across, along, phase, amplitude], axis=1)
+        wave_x = length * np.cos(bearing)
+        wave_y = length * np.sin(bearing)
+        waves = np.stack([wave_x, wave_y, phase, amplitude], axis=1)
         return cls(
             make_read_only(light),
             ball,
@@ -93,10 +93,10 @@ class SceneAppearance:
             x: Positions, any shape.
             y: Positions, of the shape of `x`.
         """
-        bright = np.ones_like(x)
+        brightness = np.ones_like(x)
         for kx, ky, phase, amplitude in self.waves:
-            bright += amplitude * np.sin(kx * x + ky * y + phase)
-        return bright
+            brightness += amplitude * np.sin(kx * x + ky * y + phase)
+        return brightness
 
 
 def _draw_colour(

@@ -34,10 +34,10 @@ def make_sphere_mesh(divisions: int = _FACES) -> tuple[Array, tuple[int, ...]]:
         (-1, -golden, 0),
         (1, -golden, 0),
     ]
-    turned = [(c, a, b) for a, b, c in corners]
-    turned_again = [(c, a, b) for a, b, c in turned]
+    rotated = [(c, a, b) for a, b, c in corners]
+    rotated_twice = [(c, a, b) for a, b, c in rotated]
     size = np.hypot(1, golden)
-    points = [np.array(p) / size for p in (*corners, *turned, *turned_again)]
+    points = [np.array(p) / size for p in (*corners, *rotated, *rotated_twice)]
     faces = [_orient_outward(points, face) for face in _find_triangles(points)]
     for _ in range(divisions):
         faces = _subdivide_faces(points, faces)
@@ -77,9 +77,9 @@ def _subdivide_faces(
         # Two faces share an edge and its midpoint.
         edge = min(i, j), max(i, j)
         if edge not in numbers:
-            between = points[i] + points[j]
+            midpoint = points[i] + points[j]
             numbers[edge] = len(points)
-            points.append(between / np.linalg.norm(between))
+            points.append(midpoint / np.linalg.norm(midpoint))
         return numbers[edge]
 
     result = []

@@ -74,15 +74,15 @@ class TrackedPath:
         # A single detection has no direction.
         if len(self.spots) < 2:
             return u, v, 4 * last.radius + 10
-        before = self.spots[-2]
+        previous = self.spots[-2]
         gap = self.frames[-1] - self.frames[-2]
-        du = (u - before.u) / gap
-        dv = (v - before.v) / gap
-        wait = frame - self.frames[-1]
+        du = (u - previous.u) / gap
+        dv = (v - previous.v) / gap
+        frame_gap = frame - self.frames[-1]
         # Twice the distance covered: an object that reverses is that far from its prediction.
         speed = float(np.hypot(du, dv))
-        reach = 2 * speed * wait + last.radius + 2
-        return u + du * wait, v + dv * wait, reach
+        reach = 2 * speed * frame_gap + last.radius + 2
+        return u + du * frame_gap, v + dv * frame_gap, reach
 
     def compute_distance(self, frame: int, spot: BallDetection) -> float:
         """Return the distance of a detection from this path as a fraction of the allowed one.
@@ -96,14 +96,14 @@ class TrackedPath:
             spot: Detection in that frame.
         """
         u, v, reach = self.predict(frame)
-        off = float(np.hypot(spot.u - u, spot.v - v)) / reach
-        if off > 1:
+        position_distance = float(np.hypot(spot.u - u, spot.v - v)) / reach
+        if position_distance > 1:
             return np.inf
         low, high = _RADIUS_RATIO_RANGE
         if not low < spot.radius / self.spots[-1].radius < high:
             return np.inf
-        unlike = self.compute_colour_distance(spot.colour, spot.contrast)
-        return off + unlike if unlike <= 1 else np.inf
+        colour_distance = self.compute_colour_distance(spot.colour, spot.contrast)
+        return position_distance + colour_distance if colour_distance <= 1 else np.inf
 
     def compute_colour_distance(self, colour: Sequence[float], contrast: float) -> float:
         """Return the difference of a colour from that of the path as a fraction of the tolerance.
@@ -116,13 +116,13 @@ class TrackedPath:
         """
         # The smaller the ball, the more of it is mixed with the background.
         tinge = _COLOUR_TOLERANCE * (1.0 + _CHROMA_BLUR_PIXELS / self.spots[-1].radius)
-        allowed = max(
+        tolerance = max(
             tinge,
             _CONTRAST_TOLERANCE_SHARE * contrast,
             _CONTRAST_TOLERANCE_SHARE * self.contrast,
         )
-        apart = np.abs(self.mean_colour - colour)
-        return float(apart.max()) / allowed
+        differences = np.abs(self.mean_colour - colour)
+        return float(differences.max()) / tolerance
 
     @property
     def contrast(self) -> float:
@@ -160,30 +160,34 @@ def link_detections(pictures: Sequence[Sequence[BallDetection]]) -> list[Tracked
     Args:
         pictures: Detections in each frame.
     """
-    done: list[TrackedPath] = []
-    live: list[TrackedPath] = []
+    finished_paths: list[TrackedPath] = []
+    active_paths: list[TrackedPath] = []
     for frame, spots in enumerate(pictures):
-        done += [path for path in live if frame - path.frames[-1] > _MAX_MISSED_FRAMES]
-        live = [path for path in live if frame - path.frames[-1] <= _MAX_MISSED_FRAMES]
-        taken = _extend_paths(live, frame, spots)
+        finished_paths += [
+            path for path in active_paths if frame - path.frames[-1] > _MAX_MISSED_FRAMES
+        ]
+        active_paths = [
+            path for path in active_paths if frame - path.frames[-1] <= _MAX_MISSED_FRAMES
+        ]
+        used_detections = _extend_paths(active_paths, frame, spots)
         # Each remaining detection begins a new path.
         for k, spot in enumerate(spots):
-            if k not in taken:
+            if k not in used_detections:
                 path = TrackedPath()
                 path.append(frame, spot)
-                live.append(path)
-    paths = [path for path in done + live if len(path.frames) >= _LEAST]
+                active_paths.append(path)
+    paths = [path for path in finished_paths + active_paths if len(path.frames) >= _LEAST]
     # Objects that do not move come last, regardless of their evidence.
     return sorted(paths, key=lambda path: -path.evidence * (path.travel > path.radius))
 
 
 def _extend_paths(
-    live: Sequence[TrackedPath], frame: int, spots: Sequence[BallDetection]
+    active_paths: Sequence[TrackedPath], frame: int, spots: Sequence[BallDetection]
 ) -> set[int]:
     """Append each detection in a frame to the path that it fits best, nearest pairs first.
 
     Args:
-        live: Paths that may continue.
+        active_paths: Paths that may continue.
         frame: Number of the frame.
         spots: Detections in that frame.
 
@@ -191,21 +195,21 @@ def _extend_paths(
         Numbers of the detections that were appended.
     """
     pairs = []
-    for i, path in enumerate(live):
+    for i, path in enumerate(active_paths):
         for k, spot in enumerate(spots):
             distance = path.compute_distance(frame, spot)
             if np.isfinite(distance):
                 pairs.append((distance, i, k))
     paths: set[int] = set()
-    taken: set[int] = set()
+    used_detections: set[int] = set()
     # Nearest pairs first: a path gets one detection, and a detection one path.
     for _, i, k in sorted(pairs):
-        if i in paths or k in taken:
+        if i in paths or k in used_detections:
             continue
         paths.add(i)
-        taken.add(k)
-        live[i].append(frame, spots[k])
-    return taken
+        used_detections.add(k)
+        active_paths[i].append(frame, spots[k])
+    return used_detections
 
 
 def merge_continuations(paths: Sequence[TrackedPath]) -> tuple[TrackedPath, list[TrackedPath]]:
@@ -218,28 +222,28 @@ def merge_continuations(paths: Sequence[TrackedPath]) -> tuple[TrackedPath, list
         The merged path, and the other paths.
     """
     main = paths[0]
-    others = []
+    other_paths = []
     frames = list(main.frames)
     spots = list(main.spots)
     low, high = _RADIUS_RATIO_RANGE
     for path in paths[1:]:
         # A ball is in one place: a detection in the same frame is another object.
-        apart = not set(path.frames) & set(frames)
-        alike = low < path.radius / main.radius < high
-        alike &= main.compute_colour_distance(path.mean_colour.tolist(), path.contrast) <= 1
-        aside = _compute_median_distance(main.places, path.places)
-        if apart and alike and aside < _MAX_CONTINUATION_DISTANCE * main.radius:
+        is_disjoint = not set(path.frames) & set(frames)
+        is_similar = low < path.radius / main.radius < high
+        is_similar &= main.compute_colour_distance(path.mean_colour.tolist(), path.contrast) <= 1
+        line_distance = _compute_median_distance(main.places, path.places)
+        if is_disjoint and is_similar and line_distance < _MAX_CONTINUATION_DISTANCE * main.radius:
             frames += path.frames
             spots += path.spots
         else:
-            others.append(path)
+            other_paths.append(path)
     order = np.argsort(frames).tolist()
-    whole = TrackedPath(
+    merged_path = TrackedPath(
         [frames[i] for i in order],
         [spots[i] for i in order],
         main.mean_colour,
     )
-    return whole, others
+    return merged_path, other_paths
 
 
 def _compute_median_distance(line: Array, points: Array) -> float:
@@ -252,5 +256,5 @@ def _compute_median_distance(line: Array, points: Array) -> float:
     middle = line.mean(axis=0)
     # The last axis is perpendicular to the line: along it, the points differ least.
     _, _, axes = np.linalg.svd(line - middle, full_matrices=False)
-    across = (points - middle) @ axes[-1]
-    return float(np.median(np.abs(across)))
+    distances = (points - middle) @ axes[-1]
+    return float(np.median(np.abs(distances)))

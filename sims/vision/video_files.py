@@ -83,13 +83,13 @@ def _encode_frames(path: Path, frames: Iterable[RgbImage], times: Array, crf: in
         stream.thread_count = 1
         # Reproducible output on every processor: with x264's fast code paths alone, the file
         # differs occasionally.
-        exact = {"x264-params": "cpu-independent=1"}
+        exact_options = {"x264-params": "cpu-independent=1"}
         stream.options = {
             "crf": str(crf),
             "preset": "veryfast",
             # No B-frames, so that frames are stored in the order of their times.
             "bf": "0",
-            **exact,
+            **exact_options,
         }
         stream.codec_context.time_base = Fraction(1, _TICKS)
         converter = av.video.reformatter.VideoReformatter()
@@ -129,8 +129,8 @@ class VideoFile:
         """Check the frame rate, and that the file can be opened as a video."""
         require_file(path)
         if fps is not None and not _FRAMES[0] <= fps <= _FRAMES[1]:
-            wanted = f"more than 0, from {_FRAMES[0]:g} to {_FRAMES[1]:g}"
-            raise InputError(f"frames a second, {fps:g}: expected {wanted}")
+            expected = f"more than 0, from {_FRAMES[0]:g} to {_FRAMES[1]:g}"
+            raise InputError(f"frames a second, {fps:g}: expected {expected}")
         self.path, self.fps = path, fps
         self.notes: list[str] = []
         with self._open_file():
@@ -141,23 +141,23 @@ class VideoFile:
         self.notes = []
         last = -np.inf
         count = 0
-        dropped = 0
-        broken = False
+        dropped_count = 0
+        is_broken = False
         with self._open_file() as file:
-            stated = file.streams.video[0].frames
+            stated_count = file.streams.video[0].frames
             for seconds, picture in self._decode_frames(file):
                 if picture is None:
-                    broken = True
+                    is_broken = True
                     break
                 time = count / self.fps if self.fps else seconds
                 count += 1
                 # The times of a recording must increase, those of a file need not.
                 if time <= last:
-                    dropped += 1
+                    dropped_count += 1
                     continue
                 last = time
                 yield time, picture
-        self._check_pass(count, stated, broken, dropped)
+        self._check_pass(count, stated_count, is_broken, dropped_count)
 
     def _open_file(self) -> Any:
         """Open the file with PyAV.
@@ -197,25 +197,31 @@ class VideoFile:
         except av.FFmpegError:
             yield np.nan, None
 
-    def _check_pass(self, count: int, stated: int, broken: bool, dropped: int) -> None:
+    def _check_pass(
+        self, count: int, stated_count: int, is_broken: bool, dropped_count: int
+    ) -> None:
         """Add notes about faults of a pass; refuse a file without readable frames.
 
         Args:
             count: Number of frames read.
-            stated: Number of frames that the file states; 0 if unknown.
-            broken: Whether decoding failed.
-            dropped: Number of frames whose times do not increase.
+            stated_count: Number of frames that the file states; 0 if unknown.
+            is_broken: Whether decoding failed.
+            dropped_count: Number of frames whose times do not increase.
         """
         if not count:
             raise InputError(
                 f"{self.path}: no frame of it can be read; "
                 "the file is damaged or breaks off too early"
             )
-        if broken or count < stated:
-            of = f" of {stated}" if stated > count else ""
-            self.notes.append(f"the file is truncated or damaged: {count}{of} frames could be read")
-        if dropped:
-            self.notes.append(f"{dropped} frames whose time stamps do not increase were left out")
+        if is_broken or count < stated_count:
+            total_text = f" of {stated_count}" if stated_count > count else ""
+            self.notes.append(
+                f"the file is truncated or damaged: {count}{total_text} frames could be read"
+            )
+        if dropped_count:
+            self.notes.append(
+                f"{dropped_count} frames whose time stamps do not increase were left out"
+            )
 
 
 def _apply_rotation(frame: Any, degrees: float) -> RgbImage:

@@ -105,7 +105,7 @@ def _make_median_chart(
     """Make panels of median errors against simulations, for pairs of a metric and a range."""
     statistics, budget = view.statistics, view.experiment.budget
     ticks = tuple(float(k) for k in select_checkpoints(budget))
-    across = Axis(
+    x_axis = Axis(
         "simulations used on the target",
         "symlog",
         ("symlog", "linear"),
@@ -116,11 +116,11 @@ def _make_median_chart(
     for metric, kind in keys:
         medians = statistics.compute_median_curves(metric, kind)
         frames.append(medians.assign(range=kind, metric=metric))
-        where = {"range": kind, "metric": metric}
-        lines = _make_lines(view, medians, "median", "line", "low", "high", **where)
+        conditions = {"range": kind, "metric": metric}
+        lines = _make_lines(view, medians, "median", "line", "low", "high", **conditions)
         label = view.format_metric_label(metric)
         panel = _make_panel(
-            view, kind, table, "simulations", lines, across, Axis(f"{label}, median", "log")
+            view, kind, table, "simulations", lines, x_axis, Axis(f"{label}, median", "log")
         )
         title = panel.title
         # A recording has one range only; its panels differ in the runs.
@@ -145,7 +145,7 @@ def make_distance_chart(view: ComparisonView) -> ComparisonChart:
     """Make the chart of the error against the target's distance from the training range."""
     table = view.statistics.medians_by_distance
     label = f"{view.format_metric_label(view.statistics.parameter_error_metric)}, median"
-    across = Axis(
+    x_axis = Axis(
         "distance from the training range [widths of it]", names=tuple(format_bin_labels(table))
     )
     panels = []
@@ -154,18 +154,18 @@ def make_distance_chart(view: ComparisonView) -> ComparisonChart:
             Series(
                 name,
                 "median",
-                look,
+                mark_style,
                 {"tuner": name, "simulations": str(k)},
                 "low",
                 "high",
                 "points",
                 view.style.get_category_offset(name),
             )
-            for name, look in view.get_tuner_styles(table["tuner"])
+            for name, mark_style in view.get_tuner_styles(table["tuner"])
         )
         facets = {"after": f"{k} simulations"}
         title = f"After {k} simulations"
-        panels.append(Panel(title, "distance", "bin", series, across, Axis(label, "log"), facets))
+        panels.append(Panel(title, "distance", "bin", series, x_axis, Axis(label, "log"), facets))
     return ComparisonChart(panels, {"distance": table}, "after", _make_notes(view))
 
 
@@ -174,19 +174,19 @@ def make_runtime_chart(view: ComparisonView) -> ComparisonChart:
     table = view.statistics.runtime_distribution
     budget = int(table["simulations"].max())
     ticks = tuple(float(k) for k in select_checkpoints(budget))
-    across = Axis(
+    x_axis = Axis(
         "simulations used on the target",
         "symlog",
         ("symlog", "linear"),
         ticks,
         ends=(-0.08, budget * 1.1),
     )
-    up = Axis("share of (run, threshold) pairs reached", scales=("linear",), ends=(-0.02, 1.02))
+    y_axis = Axis("share of (run, threshold) pairs reached", scales=("linear",), ends=(-0.02, 1.02))
     panels = []
     for kind in dict.fromkeys(table["range"]):
         # Steps, not slopes: no threshold is reached between two simulations.
         lines = _make_lines(view, table[table["range"] == kind], "share", "steps", range=kind)
-        panel = _make_panel(view, kind, "runtime", "simulations", lines, across, up)
+        panel = _make_panel(view, kind, "runtime", "simulations", lines, x_axis, y_axis)
         targets = view.statistics.curves.select(range=str(kind)).keys["target"].nunique()
         panels.append(replace(panel, title=f"{PANEL_TITLES[str(kind)]} ({targets} targets)"))
     return ComparisonChart(panels, {"runtime": table}, notes=_make_notes(view))
@@ -198,18 +198,18 @@ def make_ert_chart(view: ComparisonView) -> ComparisonChart:
     table = statistics.sorted(
         build_ert_table(statistics.curves, statistics.levels, view.experiment.budget)
     )
-    across = Axis(f"error to be reached{view.unit_of_levels}", "log")
-    up = Axis("expected simulations (ERT)", "log")
+    x_axis = Axis(f"error to be reached{view.unit_of_levels}", "log")
+    y_axis = Axis("expected simulations (ERT)", "log")
     panels = []
     for kind in view.ranges:
         lines = _make_lines(view, table, "ert", "line", "low", "high", range=kind)
-        panels.append(_make_panel(view, kind, "ert", "threshold", lines, across, up))
+        panels.append(_make_panel(view, kind, "ert", "threshold", lines, x_axis, y_axis))
     return ComparisonChart(_select_panels_with_data(panels), {}, notes=_make_notes(view))
 
 
 def make_cost_chart(view: ComparisonView) -> ComparisonChart:
     """Make the chart of seconds per target by the cost of a simulation, with the winners."""
-    across, up = (
+    x_axis, y_axis = (
         Axis("seconds that one simulation takes", "log"),
         Axis("seconds for one target", "log"),
     )
@@ -221,13 +221,16 @@ def make_cost_chart(view: ComparisonView) -> ComparisonChart:
         parts.append(table[rank % _THINNING_STEP == 0].assign(threshold=level))
         for kind in view.ranges:
             winners = list(find_cheapest_tuners(costs.get(kind, {}), TARGETS_PER_TRAINING))
-            looks = dict(view.get_tuner_styles(tuner for _, _, tuner in winners))
+            mark_styles = dict(view.get_tuner_styles(tuner for _, _, tuner in winners))
             spans = tuple(
-                AxisSpan(low, high, tuner, looks[tuner], foot=True) for low, high, tuner in winners
+                AxisSpan(low, high, tuner, mark_styles[tuner], foot=True)
+                for low, high, tuner in winners
             )
-            where = {"range": kind, "threshold": str(level)}
-            lines = _make_lines(view, table[table["range"] == kind], "seconds", "line", **where)
-            panel = _make_panel(view, kind, "seconds", "simulation_seconds", lines, across, up)
+            conditions = {"range": kind, "threshold": str(level)}
+            lines = _make_lines(
+                view, table[table["range"] == kind], "seconds", "line", **conditions
+            )
+            panel = _make_panel(view, kind, "seconds", "simulation_seconds", lines, x_axis, y_axis)
             panels.append(_add_error_threshold(replace(panel, spans=spans), view, level))
     return ComparisonChart(
         _select_panels_with_data(panels), {"seconds": pd.concat(parts)}, notes=_make_notes(view)
@@ -236,7 +239,7 @@ def make_cost_chart(view: ComparisonView) -> ComparisonChart:
 
 def make_amortisation_chart(view: ComparisonView) -> ComparisonChart:
     """Make the chart of the number of targets from which on a training pays."""
-    up = Axis("targets from which on the training pays", "log", ends=(0.1, 1e5))
+    y_axis = Axis("targets from which on the training pays", "log", ends=(0.1, 1e5))
     rules = (
         ReferenceLine(AT_ONCE, "at once: the search never reaches the error"),
         ReferenceLine(NEVER, "never: not within 10 000 targets"),
@@ -245,7 +248,7 @@ def make_amortisation_chart(view: ComparisonView) -> ComparisonChart:
     for level in view.levels:
         costs = view.statistics.tuning_costs[level]
         searching, trained = split_by_training(view, level)
-        across = Axis("tuner that searches", names=tuple(searching))
+        x_axis = Axis("tuner that searches", names=tuple(searching))
         for kind in view.ranges:
             evens = placed_even(
                 build_break_even_table(view.experiment.name, kind, level, costs[kind])
@@ -265,7 +268,7 @@ def make_amortisation_chart(view: ComparisonView) -> ComparisonChart:
                 )
                 for place, name in enumerate(trained)
             )
-            panel = _make_panel(view, kind, "even", "row", series, across, up)
+            panel = _make_panel(view, kind, "even", "row", series, x_axis, y_axis)
             panels.append(_add_error_threshold(replace(panel, rules=rules), view, level))
     return ComparisonChart(
         _select_panels_with_data(panels), {"even": pd.concat(parts)}, notes=_make_notes(view)
@@ -326,17 +329,17 @@ def _make_panel(
     table: str,
     x: str,
     series: tuple[Series, ...],
-    across: Axis,
-    up: Axis,
+    x_axis: Axis,
+    y_axis: Axis,
 ) -> Panel:
     """Make a panel of one range of targets, whose title has the number of targets.
 
-    `table` is the name of the panel's table and `x` its column for the horizontal axis `across`;
-    `up` is the vertical axis.
+    `table` is the name of the panel's table and `x` its column for the horizontal axis `x_axis`;
+    `y_axis` is the vertical axis.
     """
     counted = "starting points" if kind == "real" else "targets"
     title = f"{PANEL_TITLES[kind]} ({view.statistics.target_counts[kind]} {counted})"
-    return Panel(title, table, x, series, across, up, {SIDE_BY_SIDE: PANEL_TITLES[kind]})
+    return Panel(title, table, x, series, x_axis, y_axis, {SIDE_BY_SIDE: PANEL_TITLES[kind]})
 
 
 def _add_error_threshold(panel: Panel, view: ComparisonView, level: float) -> Panel:
@@ -361,7 +364,8 @@ def _make_lines(
     """
     styles: list[tuple[str, MarkStyle]] = view.get_tuner_styles(table["tuner"])
     return tuple(
-        Series(name, y, look, {"tuner": name, **where}, low, high, draw) for name, look in styles
+        Series(name, y, mark_style, {"tuner": name, **where}, low, high, draw)
+        for name, mark_style in styles
     )
 
 

@@ -103,19 +103,20 @@ def list_figure_names(stored: StoredComparison) -> list[str]:
     experiment, runs = stored.experiment, stored.runs
     if runs.empty:
         return []
-    wide = "wide" in experiment.ranges
-    allowed = {
+    has_wide_range = "wide" in experiment.ranges
+    has_data = {
         "error": True,
         # Without a true system other than the simulator, the misfit is only the sensor noise.
         "misfit": bool(experiment.world),
-        "distance": wide and bool(runs.loc[runs["range"] == "wide", "outside"].gt(0).any()),
+        "distance": has_wide_range
+        and bool(runs.loc[runs["range"] == "wide", "outside"].gt(0).any()),
         "runtime": True,
         "cost": True,
         "amortisation": any(simulations for simulations, _ in stored.costs.values()),
         "spectra": stored.spectra is not None,
         "directions": bool(list_directional_metrics(stored)),
     }
-    return [name for name in FIGURE_FILES if allowed[name]]
+    return [name for name in FIGURE_FILES if has_data[name]]
 
 
 def draw_figure(
@@ -138,8 +139,8 @@ def draw_figure(
     Raises:
         InputError: The comparison has no figure of that name, or a reference cannot be drawn.
     """
-    if name not in (known := list_figure_names(stored)):
-        raise make_unknown_name_error("figure", name, known)
+    if name not in (figure_names := list_figure_names(stored)):
+        raise make_unknown_name_error("figure", name, figure_names)
     if behind:
         check_references_allowed(stored, name, behind)
     if name == "spectra":
@@ -176,20 +177,21 @@ def check_references_allowed(
 
 
 def _draw_chart_figure(
-    view: ComparisonView, name: str, behind: Sequence[ReferenceResult]
+    view: ComparisonView, name: str, references: Sequence[ReferenceResult]
 ) -> Figure:
     """Draw the figure called `name`, one of `CHARTS`, with the same panels as on the report page.
 
-    `behind` are the results of other comparisons; they are drawn in grey behind those of `view`.
+    `references` are the results of other comparisons; they are drawn in grey behind those of
+    `view`.
     """
     chart, layout = CHARTS[name](view), _LAYOUTS[name]
     panels = select_first_panels(chart.panels, (chart.side_by_side, layout.rows))
     columns = len({panel.facets[chart.side_by_side] for panel in panels}) if layout.rows else 0
     figure, axes = draw_chart(panels, chart.tables, columns, layout.size, layout.horizontal)
     notes = {name: note.replace("; ", "\n") for name, note in chart.notes.items()}
-    style = TunerStyles(view.experiment, view.statistics.order, behind, notes)
+    style = TunerStyles(view.experiment, view.statistics.order, references, notes)
     for axis, panel in zip(axes, panels, strict=True):
-        for reference in behind:
+        for reference in references:
             _draw_reference_lines(axis, panel, reference, style)
     caption = layout.caption.format(
         level=view.statistics.reference_level,
@@ -213,12 +215,14 @@ def _draw_reference_lines(
     axis: Axes, panel: Panel, reference: ReferenceResult, style: TunerStyles
 ) -> None:
     """Draw each tuner's median of a reference, at the simulation counts of its table."""
-    where = panel.series[0].where
+    conditions = panel.series[0].where
     for tuner in reference.tuners:
-        curve = reference.get_curve(tuner, where["range"], where["metric"], style.experiment.budget)
+        curve = reference.get_curve(
+            tuner, conditions["range"], conditions["metric"], style.experiment.budget
+        )
         if len(curve):
             medians = np.maximum(curve["median"].to_numpy(dtype=np.float64), ERROR_FLOOR)
-            look = style.get_reference_style(reference, tuner)
+            line_style = style.get_reference_style(reference, tuner)
             axis.plot(
-                curve["simulations"], medians, gid=make_reference_id(reference, tuner), **look
+                curve["simulations"], medians, gid=make_reference_id(reference, tuner), **line_style
             )

@@ -76,9 +76,11 @@ class ComparisonView:
 
     def get_tuner_styles(self, tuners: Iterable[str]) -> list[tuple[str, MarkStyle]]:
         """Return the tuners of a column, best first, each with its style."""
-        present = set(tuners)
+        present_tuners = set(tuners)
         return [
-            (name, self.style.get_mark_style(name)) for name in self.style.order if name in present
+            (name, self.style.get_mark_style(name))
+            for name in self.style.order
+            if name in present_tuners
         ]
 
     @property

@@ -54,10 +54,10 @@ def draw_spectra_figure(experiment: Experiment, table: pd.DataFrame) -> Figure:
     _draw_spectra(axes[0, 0], table, len(names))
     _draw_direction_shares(axes[0, 1], table, names)
     figure.suptitle(f"{experiment.title or experiment.name}: what the data identify", fontsize=11)
-    real = set(table["range"]) == {"real"}
-    where = "the nominal parameters" if real else "each target's truth"
+    is_real = set(table["range"]) == {"real"}
+    evaluation_point = "the nominal parameters" if is_real else "each target's truth"
     caption = (
-        f"From the Fisher information at {where} (Cramér–Rao bound). "
+        f"From the Fisher information at {evaluation_point} (Cramér–Rao bound). "
         f"Stiff: 1 sigma below {STIFF_SIGMA_THRESHOLD:g} of the training width (dashed). "
         "Right: mean over targets of the squared component."
     )
@@ -77,10 +77,10 @@ def _draw_spectra(axis: Axes, table: pd.DataFrame, directions: int) -> None:
         targets = part["target"].nunique()
         # Markers of one direction lie side by side within 0.3, the ranges 0.4 apart.
         places = part.groupby("direction").cumcount()
-        within = (places / (targets - 1) - 0.5) * 0.3 if targets > 1 else 0.0 * places
-        across = part["direction"] + within + (place - 0.5 * (len(ranges) - 1)) * 0.4
+        target_offsets = (places / (targets - 1) - 0.5) * 0.3 if targets > 1 else 0.0 * places
+        x_values = part["direction"] + target_offsets + (place - 0.5 * (len(ranges) - 1)) * 0.4
         axis.plot(
-            across,
+            x_values,
             # A direction without effect on the data has an infinite sigma and is drawn at the edge.
             part["sigma"].clip(_MIN_SHOWN_SIGMA, _MAX_SHOWN_SIGMA),
             marker,
@@ -91,11 +91,11 @@ def _draw_spectra(axis: Axes, table: pd.DataFrame, directions: int) -> None:
             label=_WHERE.get(kind, kind) + ("" if kind == "real" else f" (n = {targets})"),
         )
     axis.axhline(STIFF_SIGMA_THRESHOLD, color=CAPTION_GREY, linewidth=0.8, linestyle="--")
-    for name, above in (("sloppy", 3), ("stiff", -9)):
+    for name, text_offset in (("sloppy", 3), ("stiff", -9)):
         axis.annotate(
             name,
             (0.01, STIFF_SIGMA_THRESHOLD),
-            (0, above),
+            (0, text_offset),
             xycoords=("axes fraction", "data"),
             textcoords="offset points",
             fontsize=8,

@@ -149,8 +149,8 @@ def _wait_for_child(child: int, control: int) -> int:
             os.kill(child, signal.SIGKILL)
             _, status = os.waitpid(child, 0)
             return os.waitstatus_to_exitcode(status)
-        ended, status = os.waitpid(child, os.WNOHANG)
-        if ended:
+        ended_child, status = os.waitpid(child, os.WNOHANG)
+        if ended_child:
             return os.waitstatus_to_exitcode(status)
 
 

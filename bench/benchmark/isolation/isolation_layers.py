@@ -207,8 +207,8 @@ def _set_resource_limits(has_user_namespace: bool) -> None:
         **({resource.RLIMIT_NPROC: _THREADS} if has_user_namespace else {}),
     }
     for limit, maximum in limits.items():
-        hard = resource.getrlimit(limit)[1]
-        value = maximum if hard == resource.RLIM_INFINITY else min(maximum, hard)
+        hard_limit = resource.getrlimit(limit)[1]
+        value = maximum if hard_limit == resource.RLIM_INFINITY else min(maximum, hard_limit)
         resource.setrlimit(limit, (value, value))
 
 

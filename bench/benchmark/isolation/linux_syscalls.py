@@ -253,19 +253,19 @@ def restrict_file_access(readable: Iterable[str], writable: Iterable[str]) -> No
     version = get_landlock_version()
     if not version:
         raise OSError("the kernel has no Landlock")
-    everything = sum(rights for since, rights in _LANDLOCK_ALL if since <= version)
+    all_rights = sum(rights for min_version, rights in _LANDLOCK_ALL if min_version <= version)
     network = _LANDLOCK_TCP if version >= 4 else 0
     scope = _LANDLOCK_SCOPE if version >= 6 else 0
     # Each version extended the structure, and the kernel accepts the shorter ones.
-    fields = (everything, network, scope)[: 1 + (version >= 4) + (version >= 6)]
+    fields = (all_rights, network, scope)[: 1 + (version >= 4) + (version >= 6)]
     attributes = struct.pack(f"<{len(fields)}Q", *fields)
     size = ctypes.c_size_t(len(attributes))
     rules = call_system(_LANDLOCK_CREATE, attributes, size, ctypes.c_uint32(0))
     try:
         for path in readable:
-            _add_landlock_rule(rules, path, _LANDLOCK_READ & everything)
+            _add_landlock_rule(rules, path, _LANDLOCK_READ & all_rights)
         for path in writable:
-            _add_landlock_rule(rules, path, everything)
+            _add_landlock_rule(rules, path, all_rights)
         set_no_new_privileges()
         call_system(_LANDLOCK_RESTRICT, ctypes.c_int(rules), ctypes.c_uint32(0))
     finally:

@@ -266,16 +266,16 @@ def unpack_arrays(body: memoryview) -> dict[str, NDArray[Any]]:
         ProtocolError: the body is not valid.
     """
     line, _, _ = bytes(body[:_NAMES]).partition(b"\n")
-    rest = body[len(line) + 1 :]
+    payload = body[len(line) + 1 :]
     try:
         descriptions = json.loads(line)
         arrays, offset = {}, 0
         for name, kind, shape in descriptions[:_ARRAYS]:
-            array, offset = _read_array(rest, offset, kind, shape)
+            array, offset = _read_array(payload, offset, kind, shape)
             arrays[_check_array_name(name)] = array
     except (ValueError, TypeError, KeyError, RecursionError):
         raise ProtocolError("it sent what are no arrays") from None
-    if offset != len(rest) or not len(arrays) == len(descriptions) <= _ARRAYS:
+    if offset != len(payload) or not len(arrays) == len(descriptions) <= _ARRAYS:
         raise ProtocolError("it sent more or less than the arrays that it names")
     return arrays
 

@@ -37,7 +37,7 @@ def create_locked_folder() -> LockedFolder:
     remove_stale_folders()
     while True:
         path = tempfile.mkdtemp(prefix=_PREFIX)
-        lock = _lock_folder(path, wait=True)
+        lock = _lock_folder(path, is_blocking=True)
         # Between creation and lock another process may have removed the folder as unused.
         if lock is not None and os.path.isdir(path):
             return LockedFolder(path, lock)
@@ -46,17 +46,17 @@ def create_locked_folder() -> LockedFolder:
 def remove_stale_folders() -> None:
     """Delete the folders of processes that were killed."""
     for path in Path(tempfile.gettempdir()).glob(f"{_PREFIX}*"):
-        lock = _lock_folder(str(path), wait=False)
+        lock = _lock_folder(str(path), is_blocking=False)
         if lock is not None:
             LockedFolder(str(path), lock).remove()
 
 
-def _lock_folder(path: str, wait: bool) -> int | None:
+def _lock_folder(path: str, is_blocking: bool) -> int | None:
     """Lock a folder, and return the file descriptor.
 
     Args:
         path: path of the folder.
-        wait: True to wait for the lock.
+        is_blocking: True to wait for the lock.
 
     Returns:
         File descriptor; None if another process has the lock, or the folder does not exist.
@@ -66,7 +66,7 @@ def _lock_folder(path: str, wait: bool) -> int | None:
     except OSError:
         return None
     try:
-        fcntl.flock(lock, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+        fcntl.flock(lock, fcntl.LOCK_EX | (0 if is_blocking else fcntl.LOCK_NB))
     except OSError:
         os.close(lock)
         return None

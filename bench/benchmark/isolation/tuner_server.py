@@ -211,7 +211,7 @@ def _exchange_evaluations(channel: MessageChannel, steps: TunerGenerator, task: 
         GeneratorExit: the harness ends the run.
         Exception: the tuner failed.
     """
-    dim, used = task.dim, 0
+    dim, used_simulations = task.dim, 0
     length, channels = task.observed.shape
     proposal = next(steps)
     while True:
@@ -222,7 +222,7 @@ def _exchange_evaluations(channel: MessageChannel, steps: TunerGenerator, task: 
                 recommendation = to_points(recommend, dim, "recommendations")[0]
         points = to_points(proposal, dim, "proposals")
         # One point beyond the budget is enough for the harness to see that the budget is exceeded.
-        points = points[: max(task.budget - used, 0) + 1]
+        points = points[: max(task.budget - used_simulations, 0) + 1]
         channel.send(b"A", recommendation, points, flags=len(recommendation) > 0, size=len(points))
         answer = channel.receive(_LIMIT)
         if answer.kind != b"E":
@@ -230,7 +230,7 @@ def _exchange_evaluations(channel: MessageChannel, steps: TunerGenerator, task: 
         if answer.flags:
             _set_processor(answer.flags - 1)
         numbers, n = answer.to_array(), answer.size
-        used += n
+        used_simulations += n
         proposals = numbers[: n * dim].reshape(n, dim)
         losses = numbers[n * dim : n * dim + n]
         observations = numbers[n * dim + n :].reshape(n, length, channels)
@@ -298,9 +298,11 @@ class _RemoteTrainingSimulator:
         state = rng.bit_generator.state
         is_sendable = state["bit_generator"] == "PCG64"
         # A generator of another type seeds a new PCG64 generator, which can be sent.
-        sent = state if is_sendable else np.random.PCG64(rng.integers(0, 1 << 62, 4).tolist()).state
+        rng_state = (
+            state if is_sendable else np.random.PCG64(rng.integers(0, 1 << 62, 4).tolist()).state
+        )
         requested = np.array(points, dtype=np.float64).reshape(-1, self.dim)
-        request = pack_arrays({"rng": encode_rng_state(sent), "points": requested})
+        request = pack_arrays({"rng": encode_rng_state(rng_state), "points": requested})
         self._channel.send(b"P", *request, flags=2 + self._which)
         arrays = self._read_properties(self._channel.receive(_LIMIT))
         if is_sendable:

@@ -64,7 +64,7 @@ def leave_out_missing_problems(suite: Experiment) -> tuple[Experiment, dict[str,
     """
     if not (suite.suite and suite.experiments):
         return suite, {}
-    kept, reasons = [], {}
+    available_files, reasons = [], {}
     for file in suite.experiments:
         for problem in expand_sweep(suite.chosen(experiments=(file,))):
             missing = availability(problem)
@@ -72,12 +72,12 @@ def leave_out_missing_problems(suite: Experiment) -> tuple[Experiment, dict[str,
                 reasons[problem.name] = missing.data_set.advice
             elif missing.skipped:
                 reasons[problem.name] = missing.skipped
-            elif file not in kept:
-                kept.append(file)
-    if not kept:
-        needs = "; ".join(f"{name} {reason}" for name, reason in reasons.items())
-        raise InputError(f"{suite.suite}: no problem can run here: {needs}")
-    return suite.chosen(experiments=tuple(kept)), reasons
+            elif file not in available_files:
+                available_files.append(file)
+    if not available_files:
+        missing_text = "; ".join(f"{name} {reason}" for name, reason in reasons.items())
+        raise InputError(f"{suite.suite}: no problem can run here: {missing_text}")
+    return suite.chosen(experiments=tuple(available_files)), reasons
 
 
 def _combine_availability(experiment: Experiment) -> Availability:
@@ -93,8 +93,10 @@ def _combine_availability(experiment: Experiment) -> Availability:
         parts = runnable
     data_sets = [part.data_set for part in parts.values() if part.data_set]
     skipped = [f"{name} {part.skipped}" for name, part in parts.items() if part.skipped]
-    absent = {label: why for part in parts.values() for label, why in part.tuners.items()}
-    return Availability(next(iter(data_sets), None), "; ".join(skipped), absent)
+    missing_tuners = {
+        label: reason for part in parts.values() for label, reason in part.tuners.items()
+    }
+    return Availability(next(iter(data_sets), None), "; ".join(skipped), missing_tuners)
 
 
 def _explain_missing_simulator(experiment: Experiment) -> str:
@@ -113,10 +115,10 @@ def _explain_missing_simulator(experiment: Experiment) -> str:
 
 def _find_missing_data_set(experiment: Experiment) -> DataSet | None:
     """Return the data set that an experiment needs and that is missing here."""
-    wanted = [("robot", experiment.model)] if experiment.model else []
+    required_files = [("robot", experiment.model)] if experiment.model else []
     if experiment.recording:
-        wanted.append(("recording", experiment.recording.path))
-    for kind, path in wanted:
+        required_files.append(("recording", experiment.recording.path))
+    for kind, path in required_files:
         data_set = datasets.providing(kind, path)
         if data_set and datasets.find(kind, path) is None:
             return data_set

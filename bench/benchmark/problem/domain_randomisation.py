@@ -66,22 +66,24 @@ class RandomisedSimulator:
         ranges = dict(experiment.nuisance)
         settings: dict[str, Any] = dict(experiment.settings)
         # The effects that the simulator was extended with are known, and keep their coefficients.
-        known = settings.get("fixed", {})
+        fixed_effects = settings.get("fixed", {})
         ranges = {
-            name: ends for name, ends in ranges.items() if _get_effect_name(name) not in known
+            name: limits
+            for name, limits in ranges.items()
+            if _get_effect_name(name) not in fixed_effects
         }
         names = list(dict.fromkeys(_get_effect_name(name) for name in ranges))
         settings["effects"] = [*settings.get("effects", ()), *names]
         observe = [channel.name for channel in problem.channels]
-        who = f"experiment {experiment.name}: nuisance"
+        location = f"experiment {experiment.name}: nuisance"
         try:
             self._simulator = get_simulator_class(experiment)(
                 constants=experiment.fixed, observe=observe, **settings
             )
         except (InputError, TypeError) as error:
-            raise InputError(f"{who}: {error}") from None
+            raise InputError(f"{location}: {error}") from None
         tuned = len(problem.simulator.parameters)
-        self._ranges = _order_bounds(who, self._simulator, tuned, ranges)
+        self._ranges = _order_bounds(location, self._simulator, tuned, ranges)
 
     def simulate(
         self, rng: np.random.Generator, points: Array, scenarios: tuple[Scenario, ...]
@@ -112,9 +114,9 @@ class RandomisedSimulator:
             (count, coefficients) values.
         """
         low, high = self._ranges
-        drawn = rng.uniform(low, high, size=(count, len(low)))
-        there = rng.random((count, 1)) >= NO_EFFECT_SHARE
-        coefficients: Array = np.where(there, drawn, 0.0)
+        samples = rng.uniform(low, high, size=(count, len(low)))
+        has_effect = rng.random((count, 1)) >= NO_EFFECT_SHARE
+        coefficients: Array = np.where(has_effect, samples, 0.0)
         return coefficients
 
     def close(self) -> None:
@@ -124,19 +126,21 @@ class RandomisedSimulator:
 
 def _get_effect_name(name: str) -> str:
     """Return a coefficient's effect: the coefficient's name, or its part before the last dot."""
-    whole, several = name.partition("@")[0], name.rpartition(".")[0]
+    effect_name, prefix = name.partition("@")[0], name.rpartition(".")[0]
     return (
-        several if whole not in library.list_names() and several in library.list_names() else name
+        prefix
+        if effect_name not in library.list_names() and prefix in library.list_names()
+        else name
     )
 
 
 def _order_bounds(
-    who: str, simulator: Simulator, tuned: int, ranges: Mapping[str, tuple[float, float]]
+    location: str, simulator: Simulator, tuned: int, ranges: Mapping[str, tuple[float, float]]
 ) -> tuple[Array, Array]:
     """Return lower and upper bounds in the simulator's order; zero for coefficients not named."""
     names = [parameter.name for parameter in simulator.parameters[tuned:]]
     for name in ranges:
         if name not in names:
-            raise InputError(f"{who}: expected one of {', '.join(names)}, found {name}")
-    ends = np.array([ranges.get(name, (0.0, 0.0)) for name in names]).reshape(-1, 2)
-    return ends[:, 0], ends[:, 1]
+            raise InputError(f"{location}: expected one of {', '.join(names)}, found {name}")
+    limits = np.array([ranges.get(name, (0.0, 0.0)) for name in names]).reshape(-1, 2)
+    return limits[:, 0], limits[:, 1]

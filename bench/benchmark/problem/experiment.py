@@ -267,93 +267,99 @@ class Experiment:
         Raises:
             InputError: a value is not valid, or two values contradict each other.
         """
-        who = f"experiment {self.name}"
-        for what in ("targets", "seeds", "budget"):
-            count = getattr(self, what)
+        subject = f"experiment {self.name}"
+        for key in ("targets", "seeds", "budget"):
+            count = getattr(self, key)
             if count < 1:
-                raise InputError(f"{who}: {what} must be at least 1, found {count}")
+                raise InputError(f"{subject}: {key} must be at least 1, found {count}")
         if self.training_budget < 0:
-            raise make_error(who, "training_budget", "at least 0", self.training_budget)
-        self._check_words(who)
-        self._check_numbers(who)
+            raise make_error(subject, "training_budget", "at least 0", self.training_budget)
+        self._check_words(subject)
+        self._check_numbers(subject)
         for entry in self.tuners:
             if entry.randomised and not self.nuisance and not self.experiments:
-                wanted = "a [nuisance] table of effects to train over"
-                raise InputError(f"{who}: tuner {entry.label} is randomised: expected {wanted}")
+                expected = "a [nuisance] table of effects to train over"
+                raise InputError(
+                    f"{subject}: tuner {entry.label} is randomised: expected {expected}"
+                )
         if self.memory < 0 or not self.timeout > 0:  # negated, so that NaN is refused too
-            raise InputError(f"{who}: expected timeout > 0 and memory >= 0")
+            raise InputError(f"{subject}: expected timeout > 0 and memory >= 0")
         if self.memory > _MOST_MEMORY or _LONGEST < self.timeout < math.inf:
-            wanted = f"timeout of at most {_LONGEST:g} s and memory of at most {_MOST_MEMORY:g} MiB"
-            raise InputError(f"{who}: expected {wanted}")
+            expected = (
+                f"timeout of at most {_LONGEST:g} s and memory of at most {_MOST_MEMORY:g} MiB"
+            )
+            raise InputError(f"{subject}: expected {expected}")
         check_known_names("range", self.ranges, RANGES)
         if not self.ranges or len(set(self.ranges)) < len(self.ranges):
-            raise make_error(who, "ranges", "one or more, each once", list(self.ranges))
+            raise make_error(subject, "ranges", "one or more, each once", list(self.ranges))
         check_known_names("isolation", [self.isolation], ISOLATION_MODES)
-        check_commitment(who, self.salt, self.salt_sha256)
+        check_commitment(subject, self.salt, self.salt_sha256)
         # The range 'real' needs a recording, and the other ranges must not have one.
-        real = "real" in self.ranges
-        if real != (self.recording is not None) or (real and len(self.ranges) != 1):
-            raise InputError(f"{who}: range 'real' and a [recording] go together, and alone")
+        is_real = "real" in self.ranges
+        if is_real != (self.recording is not None) or (is_real and len(self.ranges) != 1):
+            raise InputError(f"{subject}: range 'real' and a [recording] go together, and alone")
         if self.held_out and (self.recording or self.held_out.scenarios < 1):
-            wanted = "simulated targets and scenarios of at least 1"
-            raise InputError(f"{who}: [held_out] needs {wanted}")
-        self._check_calibration(who)
+            expected = "simulated targets and scenarios of at least 1"
+            raise InputError(f"{subject}: [held_out] needs {expected}")
+        self._check_calibration(subject)
 
-    def _check_calibration(self, who: str) -> None:
+    def _check_calibration(self, subject: str) -> None:
         """Raise an error if the calibration has no runs to fit, or is not applicable."""
         if self.calibration is None:
             return
         runs, held_out = self.calibration.runs, self.calibration.held_out
         if not 0 <= held_out < runs:
-            raise make_error(who, "calibration.held_out", f"fewer than the {runs} runs", held_out)
+            raise make_error(
+                subject, "calibration.held_out", f"fewer than the {runs} runs", held_out
+            )
         if self.recording or self.shot:
-            raise InputError(f"{who}: [calibration] needs simulated targets, and no shot")
+            raise InputError(f"{subject}: [calibration] needs simulated targets, and no shot")
 
-    def _check_words(self, who: str) -> None:
+    def _check_words(self, subject: str) -> None:
         """Raise an error for texts that do not fit into figures, tables or paths."""
-        check_text(who, "title", self.title)
-        check_text(who, "says", self.says, most=MAX_DESCRIPTION_LENGTH)
-        check_text(who, "identifiable", self.identifiable, most=MAX_DESCRIPTION_LENGTH)
-        check_text(who, "suite", self.suite, most=MAX_NAME_LENGTH)
-        check_text(who, "same_targets_as", self.same_targets_as)
-        check_text(who, "model", self.model, most=MAX_DESCRIPTION_LENGTH)
+        check_text(subject, "title", self.title)
+        check_text(subject, "says", self.says, most=MAX_DESCRIPTION_LENGTH)
+        check_text(subject, "identifiable", self.identifiable, most=MAX_DESCRIPTION_LENGTH)
+        check_text(subject, "suite", self.suite, most=MAX_NAME_LENGTH)
+        check_text(subject, "same_targets_as", self.same_targets_as)
+        check_text(subject, "model", self.model, most=MAX_DESCRIPTION_LENGTH)
         for word in self.free:
-            check_text(who, "free", word, most=MAX_NAME_LENGTH)
+            check_text(subject, "free", word, most=MAX_NAME_LENGTH)
         for word in self.experiments:
-            check_text(who, "experiments", word)
-        check_text(who, "tags", ", ".join(self.tags), most=MAX_DESCRIPTION_LENGTH)
+            check_text(subject, "experiments", word)
+        check_text(subject, "tags", ", ".join(self.tags), most=MAX_DESCRIPTION_LENGTH)
         for entry in self.tuners:
-            check_text(who, "tuners: label", entry.label, most=MAX_NAME_LENGTH)
+            check_text(subject, "tuners: label", entry.label, most=MAX_NAME_LENGTH)
 
-    def _check_numbers(self, who: str) -> None:
+    def _check_numbers(self, subject: str) -> None:
         """Raise an error for numbers that are not finite or out of range."""
-        if not 0 <= check_finite(who, "negligible_error", self.negligible_error) < 1:
-            wanted = "a share of the training range, from 0 to below 1"
-            raise make_error(who, "negligible_error", wanted, self.negligible_error)
-        rate = check_finite(who, "sampling.rate", self.sampling.rate)
+        if not 0 <= check_finite(subject, "negligible_error", self.negligible_error) < 1:
+            expected = "a share of the training range, from 0 to below 1"
+            raise make_error(subject, "negligible_error", expected, self.negligible_error)
+        rate = check_finite(subject, "sampling.rate", self.sampling.rate)
         if not 0 < rate <= MAX_SAMPLING_RATE_HZ or self.sampling.samples < 1:
-            wanted = (
+            expected = (
                 f"a rate above 0 Hz and up to {MAX_SAMPLING_RATE_HZ:g} Hz, "
                 "and at least 1 of samples"
             )
-            raise make_error(who, "sampling", wanted, asdict(self.sampling))
+            raise make_error(subject, "sampling", expected, asdict(self.sampling))
         for name, sigma in self.noise.items():
-            if check_finite(who, f"noise.{name}", sigma) < 0:
-                raise make_error(who, f"noise.{name}", "at least 0", sigma)
+            if check_finite(subject, f"noise.{name}", sigma) < 0:
+                raise make_error(subject, f"noise.{name}", "at least 0", sigma)
         for name, step in self.resolution.items():
-            if not check_finite(who, f"resolution.{name}", step) > 0:
-                raise make_error(who, f"resolution.{name}", "more than 0", step)
-        held = self.held_out.initial if self.held_out else {}
+            if not check_finite(subject, f"resolution.{name}", step) > 0:
+                raise make_error(subject, f"resolution.{name}", "more than 0", step)
+        held_out_initial = self.held_out.initial if self.held_out else {}
         calibrated = self.calibration.initial if self.calibration else {}
-        for where, given in (
+        for table_name, values in (
             ("initial", self.initial),
             ("constants", self.constants),
-            ("held_out.initial", held),
+            ("held_out.initial", held_out_initial),
             ("calibration.initial", calibrated),
         ):
-            for name, value in given.items():
+            for name, value in values.items():
                 for end in value if isinstance(value, tuple) else (value,):
-                    check_finite(who, f"{where}.{name}", end)
+                    check_finite(subject, f"{table_name}.{name}", end)
 
     def document(self) -> dict[str, Any]:
         """Return the whole configuration as TOML tables, the inverse of `parse_experiment`."""
@@ -394,8 +400,8 @@ class Experiment:
         A registered name that has no entry gets a new one.
         """
         entries = {entry.label: entry for entry in self.tuners}
-        chosen = tuple(entries.get(label, TunerEntry(label, label)) for label in labels)
-        return replace(self, tuners=chosen)
+        entries_in_order = tuple(entries.get(label, TunerEntry(label, label)) for label in labels)
+        return replace(self, tuners=entries_in_order)
 
 
 def check_name(text: str) -> str:
@@ -467,13 +473,15 @@ def parse_experiment(name: str, document: Mapping[str, Any], path: Path) -> Expe
     hints = {key: hint for key, hint in get_type_hints_of(Experiment).items() if key != "name"}
     check_known_names(f"entry of {path}", document, hints)
     tuners = parse_entries(path, document.get("tuners", {}))
-    given = {key: value for key, value in document.items() if key != "tuners"}
-    fields = check_entries(path, "", given, hints)
+    entries = {key: value for key, value in document.items() if key != "tuners"}
+    fields = check_entries(path, "", entries, hints)
     if model := fields.get("model"):
         fields["model"] = resolve_model_path(model, path)
         fields.setdefault("simulator", check_name(Path(model).stem))
-        if (called := fields["simulator"]) != check_name(called):
-            raise make_error(path, "simulator", "letters, digits and _ . + - for a robot", called)
+        if (simulator_name := fields["simulator"]) != check_name(simulator_name):
+            raise make_error(
+                path, "simulator", "letters, digits and _ . + - for a robot", simulator_name
+            )
     elif fields.get("free") or fields.get("actuators"):
         raise InputError(f'{path}: free and actuators are of a robot: expected model = "FILE"')
     if fields.get("experiments"):
@@ -494,8 +502,10 @@ def parse_experiment(name: str, document: Mapping[str, Any], path: Path) -> Expe
     _expand_combinations(experiment, path)  # an error in a swept value is an error of this file
     # The stored configuration of a result may select some of the questions.
     if experiment.suite and experiment.diagnosis and experiment.problem_hashes:
-        found = compute_hash({k: document["diagnosis"].get(k) for k in ("seed", "questions")})
-        check_problem_hash(experiment.suite, experiment.problem_hashes, "questions", found)
+        question_hash = compute_hash(
+            {k: document["diagnosis"].get(k) for k in ("seed", "questions")}
+        )
+        check_problem_hash(experiment.suite, experiment.problem_hashes, "questions", question_hash)
     return experiment
 
 
@@ -532,10 +542,10 @@ _UNHASHED_KEYS = (*SHARED_KEYS, "title", "says", "identifiable", "tags")
 """Keys that do not belong to the definition of a suite's problem: shared ones, and words."""
 
 
-def _as_in(together: Experiment, name: str) -> list[Experiment]:
+def _as_in(suite: Experiment, name: str) -> list[Experiment]:
     """Return an experiment that another one names, with the numbers and tuners of the latter.
 
-    This is how one file, such as a suite, runs many problems with the same settings. `together` is
+    This is how one file, such as a suite, runs many problems with the same settings. `suite` is
     the experiment that names others, and `name` one of these.
 
     Raises:
@@ -543,15 +553,13 @@ def _as_in(together: Experiment, name: str) -> list[Experiment]:
     """
     experiment = load_experiment(name)
     if experiment.experiments:
-        raise InputError(f"experiment {together.name}: {name} names experiments itself")
-    if together.suite:
+        raise InputError(f"experiment {suite.name}: {name} names experiments itself")
+    if suite.suite:
         file = find_experiment_file(name)
-        found = compute_problem_hash(file, frozenset(_UNHASHED_KEYS))
-        check_problem_hash(together.suite, together.problem_hashes, experiment.name, found)
+        problem_hash = compute_problem_hash(file, frozenset(_UNHASHED_KEYS))
+        check_problem_hash(suite.suite, suite.problem_hashes, experiment.name, problem_hash)
     # Tuners are replaced as a whole: options of one experiment may be invalid in the other.
-    shared = {
-        key: getattr(together, key) for key in SHARED_KEYS if key != "tuners" or together.tuners
-    }
+    shared = {key: getattr(suite, key) for key in SHARED_KEYS if key != "tuners" or suite.tuners}
     return expand_sweep(experiment.chosen(**shared))
 
 
@@ -573,10 +581,10 @@ def _expand_combinations(experiment: Experiment, path: Path) -> list[Experiment]
     del document["sweep"]
     # All combinations have the same targets, so that only the swept values make a difference.
     document["same_targets_as"] = experiment.same_targets_as or experiment.name
-    expanded = []
+    experiments = []
     for label, changed in experiment_sweep.expand_documents(path, document, experiment.sweep):
         if experiment.title:
             values = label.replace("=", " = ").replace(",", ", ")
             changed["title"] = f"{experiment.title} ({values})"
-        expanded.append(parse_experiment(f"{experiment.name}[{label}]", changed, path))
-    return expanded
+        experiments.append(parse_experiment(f"{experiment.name}[{label}]", changed, path))
+    return experiments

@@ -57,20 +57,20 @@ def expand_documents(
         yield ",".join(parts), changed
 
 
-def _check_sweep_values(path: Path, where: str, values: Sequence[Any]) -> None:
+def _check_sweep_values(path: Path, key: str, values: Sequence[Any]) -> None:
     """Raise an error for a key of a sweep that has no values, or the same value twice.
 
-    `where` is the key in the file, for the message.
+    `key` is the key in the file, for the message.
     """
     if not values:
-        raise make_error(path, where, "at least one value", values)
-    texts = [_format_swept_value(path, where, value) for value in values]
+        raise make_error(path, key, "at least one value", values)
+    texts = [_format_swept_value(path, key, value) for value in values]
     for text in texts:
         if texts.count(text) > 1:  # two experiments would share one folder
-            raise InputError(f"{path}: {where}: {text} stands twice")
+            raise InputError(f"{path}: {key}: {text} stands twice")
 
 
-def _format_swept_value(path: Path, where: str, value: Any) -> str:
+def _format_swept_value(path: Path, key: str, value: Any) -> str:
     """Return a swept value as text, for the name of its experiment and thus for its folder.
 
     Characters that do not fit into a folder name become hyphens.
@@ -79,9 +79,9 @@ def _format_swept_value(path: Path, where: str, value: Any) -> str:
         InputError: the value is a table.
     """
     if isinstance(value, dict):
-        raise make_error(path, where, "texts, numbers, bools or lists of them", value)
+        raise make_error(path, key, "texts, numbers, bools or lists of them", value)
     if isinstance(value, list | tuple):
-        return "_".join(_format_swept_value(path, where, item) for item in value)
+        return "_".join(_format_swept_value(path, key, item) for item in value)
     if isinstance(value, bool):  # as TOML writes it
         return str(value).lower()
     return _UNFIT.sub("-", str(value))
@@ -92,16 +92,16 @@ def _insert_value(path: Path, document: dict[str, Any], key: str, value: Any) ->
 
     Names that contain dots themselves are recognised if the table has them already.
     """
-    table, rest = document, key
-    while (name := _get_first_key(table, rest)) != rest:
-        table, rest = table.setdefault(name, {}), rest[len(name) + 1 :]
+    table, remaining_key = document, key
+    while (name := _get_first_key(table, remaining_key)) != remaining_key:
+        table, remaining_key = table.setdefault(name, {}), remaining_key[len(name) + 1 :]
         if not isinstance(table, dict):
             raise InputError(f"{path}: sweep.{key}: {name} is no table, and has nothing in it")
-    table[rest] = value
+    table[remaining_key] = value
 
 
 def _get_first_key(table: Mapping[str, Any], key: str) -> str:
     """Return the part of a key that names an entry of the table; effect names can contain dots."""
-    there = [name for name in table if key == name or key.startswith(f"{name}.")]
+    matching_names = [name for name in table if key == name or key.startswith(f"{name}.")]
     # A part that is not in the table is a new table, or a key that later checks refuse.
-    return max(there, key=len, default=key.partition(".")[0])
+    return max(matching_names, key=len, default=key.partition(".")[0])

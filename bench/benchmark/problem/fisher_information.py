@@ -64,8 +64,8 @@ class InformationSpectrum:
     @property
     def is_stiff(self) -> NDArray[np.bool_]:
         """Boolean mask (dim,) of the stiff directions."""
-        known: NDArray[np.bool_] = self.sigmas < STIFF_SIGMA_THRESHOLD
-        return known
+        is_below_threshold: NDArray[np.bool_] = self.sigmas < STIFF_SIGMA_THRESHOLD
+        return is_below_threshold
 
     def compute_directional_errors(self, errors: Array) -> tuple[Array, Array]:
         """Compute RMS errors along the stiff and along the sloppy directions.
@@ -115,14 +115,16 @@ def compute_spectrum(
     dim = len(parameters)
     # The first dim points have one parameter increased, the others have it decreased.
     steps = np.concatenate([np.diag(widths), -np.diag(widths)])
-    moved = np.clip(truth + FINITE_DIFFERENCE_STEP * steps, low, high)
+    shifted_parameters = np.clip(truth + FINITE_DIFFERENCE_STEP * steps, low, high)
     # At a bound only one side moves, and the difference is divided by the shorter step.
-    apart = np.diagonal(moved[:dim] - moved[dim:]) / widths
-    observations = simulate(moved)
+    step_widths = np.diagonal(shifted_parameters[:dim] - shifted_parameters[dim:]) / widths
+    observations = simulate(shifted_parameters)
     changes = (observations[:dim] - observations[dim:]) / scale
     # A failed simulation has no derivative.
     changes = np.nan_to_num(changes, nan=0.0, posinf=0.0, neginf=0.0)
-    return compute_spectrum_from_jacobian((changes.reshape(dim, -1) / apart[:, None]).T)  # (1)
+    return compute_spectrum_from_jacobian(
+        (changes.reshape(dim, -1) / step_widths[:, None]).T
+    )  # (1)
 
 
 def compute_spectrum_from_jacobian(jacobian: Array) -> InformationSpectrum:

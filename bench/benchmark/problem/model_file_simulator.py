@@ -31,17 +31,17 @@ def get_simulator_class(experiment: Experiment) -> type[Simulator]:
     """
     if not experiment.model:
         return simulators.get(experiment.simulator)
-    who = f"experiment {experiment.name}"
+    subject = f"experiment {experiment.name}"
     path = find_model(experiment.model, experiment.name)
     free, actuators, engine = experiment.free, dict(experiment.actuators), {}
     if experiment.recording:
-        stated = read_model_reference(find_recording(experiment.recording.path), path)
-        assert stated is not None  # a model was given
-        actuators, engine = {**stated.actuators, **actuators}, dict(stated.engine)
-        free = free or stated.free
+        reference = read_model_reference(find_recording(experiment.recording.path), path)
+        assert reference is not None  # a model was given
+        actuators, engine = {**reference.actuators, **actuators}, dict(reference.engine)
+        free = free or reference.free
     if not free:
-        wanted = 'free = ["damping@*", ...] or --free, numbers of the model file to tune'
-        raise InputError(f"{who}: expected {wanted}; found none")
+        expected = 'free = ["damping@*", ...] or --free, numbers of the model file to tune'
+        raise InputError(f"{subject}: expected {expected}; found none")
     return make_robot_simulator(path, actuators, engine, free)
 
 
@@ -92,14 +92,18 @@ def find_model(path: str, name: str) -> Path:
     """
     if path.startswith(PACKAGE_SCHEME):
         return _find_packaged_model(path, name)
-    if found := datasets.find("robot", path):
-        return found
+    if robot_path := datasets.find("robot", path):
+        return robot_path
     if is_existing_file(Path(path)):
         return Path(path)
     if data_set := datasets.providing("robot", path):
         raise PartUnavailableError("experiment", name, f"it {data_set.advice}")
-    given = os.environ.get("SIMGAP_ROBOTS")
-    places = f"in {given} (SIMGAP_ROBOTS)" if given else "here (SIMGAP_ROBOTS is not set)"
+    robots_folder = os.environ.get("SIMGAP_ROBOTS")
+    places = (
+        f"in {robots_folder} (SIMGAP_ROBOTS)"
+        if robots_folder
+        else "here (SIMGAP_ROBOTS is not set)"
+    )
     raise PartUnavailableError(
         "experiment", name, f"model {truncate_text(path)}: no such file {places}"
     )
@@ -114,19 +118,19 @@ def _find_packaged_model(path: str, name: str) -> Path:
         InputError: the address is not of this form.
         PartUnavailableError: the package is not installed, or has no such file.
     """
-    package, _, inside = path.removeprefix(PACKAGE_SCHEME).partition("/")
-    if not (package.isidentifier() and inside):
-        wanted = f"{PACKAGE_SCHEME}NAME/FILE of an installed package"
+    package, _, inner_path = path.removeprefix(PACKAGE_SCHEME).partition("/")
+    if not (package.isidentifier() and inner_path):
+        expected = f"{PACKAGE_SCHEME}NAME/FILE of an installed package"
         raise InputError(
-            f"experiment {name}: model: expected {wanted}, found '{truncate_text(path)}'"
+            f"experiment {name}: model: expected {expected}, found '{truncate_text(path)}'"
         )
     # The package is located without importing it, so that its code does not run.
-    known = importlib.util.find_spec(package)
-    if known is None:
+    package_spec = importlib.util.find_spec(package)
+    if package_spec is None:
         reason = f"needs {package}, not installed (pip install {package.split('_')[0]})"
         raise PartUnavailableError("experiment", name, reason)
-    for folder in known.submodule_search_locations or ():
-        if (file := Path(folder, inside)).is_file():
+    for folder in package_spec.submodule_search_locations or ():
+        if (file := Path(folder, inner_path)).is_file():
             return file
     raise PartUnavailableError(
         "experiment", name, f"model {truncate_text(path)}: package {package} has no such file"

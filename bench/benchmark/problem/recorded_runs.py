@@ -52,8 +52,8 @@ def load_recorded_runs(path: str, simulator: Simulator) -> RecordedRuns:
         InputError: the recording cannot be found or read, or lacks a channel of the simulator.
     """
     recording = read_recording(find_recording(path), type(simulator))
-    wanted = [channel.name for channel in simulator.channels]
-    check_known_names(f"channel of {recording.path}", wanted, recording.runs[0].channels)
+    channel_names = [channel.name for channel in simulator.channels]
+    check_known_names(f"channel of {recording.path}", channel_names, recording.runs[0].channels)
     return RecordedRuns(
         _make_observed_runs(recording, recording.training(), simulator),
         _make_observed_runs(recording, recording.held_out(), simulator),
@@ -72,9 +72,9 @@ def _make_observed_runs(
     names = [channel.name for channel in simulator.channels]
     observed = [np.stack([run.channels[name] for name in names], axis=1) for run in runs]
     # Without runs the array has no rows, but it still needs a column per channel.
-    nothing = np.empty((0, len(names)))
+    no_samples = np.empty((0, len(names)))
     scenarios = tuple(make_scenario(run, simulator, recording.constants) for run in runs)
-    return ObservedRuns(scenarios, np.concatenate([nothing, *observed]))
+    return ObservedRuns(scenarios, np.concatenate([no_samples, *observed]))
 
 
 def make_scenario(run: Run, simulator: Simulator, constants: Mapping[str, float]) -> Scenario:

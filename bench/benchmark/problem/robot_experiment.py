@@ -54,17 +54,19 @@ def make_robot_experiment(
     """
     file = Path(model) if model is not None else None
     if recording is not None:
-        stated = read_model_reference(recording, file)
-        file = stated.path if stated is not None else None
+        reference = read_model_reference(recording, file)
+        file = reference.path if reference is not None else None
     if file is None:
-        said = f"{recording}: its description" if recording is not None else "compare"
-        raise InputError(f'{said}: expected model = "robot.xml" or --model FILE, found none')
+        source = f"{recording}: its description" if recording is not None else "compare"
+        raise InputError(f'{source}: expected model = "robot.xml" or --model FILE, found none')
     require_file(file)
     parts = [file.stem] if recording is None else [file.stem, Path(recording).stem]
-    to = f"tuned to {Path(recording).name}" if recording is not None else "tuned to simulations"
-    whole = Experiment(
+    data_note = (
+        f"tuned to {Path(recording).name}" if recording is not None else "tuned to simulations"
+    )
+    experiment = Experiment(
         name=check_name("-".join(parts)),
-        title=f"{file.name}: {', '.join(free)}, {to}",
+        title=f"{file.name}: {', '.join(free)}, {data_note}",
         simulator=check_name(file.stem),
         model=str(file.resolve()),
         free=tuple(free),
@@ -76,7 +78,7 @@ def make_robot_experiment(
         held_out=HeldOutConfig(HELD_OUT_RUNS) if recording is None else None,
         tuners=tuple(TunerEntry(name, name) for name in DEFAULT_TUNERS),
     )
-    whole = complete_robot_experiment(whole)
+    experiment = complete_robot_experiment(experiment)
     if recording is not None:
-        return whole
-    return whole.chosen(noise=dict.fromkeys(whole.observe, DEFAULT_ENCODER_NOISE))
+        return experiment
+    return experiment.chosen(noise=dict.fromkeys(experiment.observe, DEFAULT_ENCODER_NOISE))

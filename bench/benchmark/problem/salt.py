@@ -78,8 +78,8 @@ class TargetStreams:
         """
         self._salt, self._names = salt, names
         self._public = salt in ("", PUBLIC_SALT)
-        experiment, *which = names
-        self._one = make_rng(experiment, "target", *which)
+        experiment, *target_names = names
+        self._one = make_rng(experiment, "target", *target_names)
 
     def get_stream(self, what: str) -> np.random.Generator:
         """Return the random generator of one quantity; public salts share one generator for all."""

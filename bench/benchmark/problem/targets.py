@@ -167,13 +167,13 @@ def _draw_target(problem: TargetProblem, kind: str, index: int, number: int) -> 
     range. `number` is 0 for the first draw, and counts the repeated draws, each from new streams.
     """
     # The stream's name contains no tuner, seed or budget, so that all tuners get the same target.
-    met = problem.experiment.same_targets_as or problem.experiment.name
-    again = ("redraw", number) if number else ()
-    streams = TargetStreams(problem.salt, met, kind, index, *again)
+    experiment_name = problem.experiment.same_targets_as or problem.experiment.name
+    redraw_names = ("redraw", number) if number else ()
+    streams = TargetStreams(problem.salt, experiment_name, kind, index, *redraw_names)
     box = _CUBE if kind == "wide" else problem.cube.training
     start, truth = (
-        streams.get_stream(what).uniform(box[0], box[1], size=problem.cube.dim)
-        for what in ("start", "truth")
+        streams.get_stream(stream_name).uniform(box[0], box[1], size=problem.cube.dim)
+        for stream_name in ("start", "truth")
     )
     name = f"{kind}-{index:03d}"
     recording = problem.recording
@@ -184,11 +184,13 @@ def _draw_target(problem: TargetProblem, kind: str, index: int, number: int) -> 
     )  # one scenario, because only recordings have several runs
     # The parameters of `world` are the first of the tuned ones.
     theta = problem.cube.to_physical(truth[None])[:, : len(problem.world.parameters)]
-    clean = problem.world.simulate(theta, scenarios[0])[0]
-    observed = clean + problem.noise * streams.get_stream("noise").standard_normal(clean.shape)
+    noise_free = problem.world.simulate(theta, scenarios[0])[0]
+    observed = noise_free + problem.noise * streams.get_stream("noise").standard_normal(
+        noise_free.shape
+    )
     fitting = ObservedRuns(scenarios, _round_to_resolution(observed, problem))
     held_out = _simulate_held_out(problem, theta, streams)
-    if any(_is_divergent(each, problem.channels) for each in (clean, held_out.observed)):
+    if any(_is_divergent(each, problem.channels) for each in (noise_free, held_out.observed)):
         return None
     sealed = BlindedTarget(name, kind, start, fitting, held_out)
     return Target(sealed, problem.cube.to_physical(truth), number)
@@ -252,13 +254,13 @@ def _simulate_held_out(problem: TargetProblem, theta: Array, target: TargetStrea
         theta: (1, p) parameters of the target.
         target: random streams of the target; the scenarios depend on nothing else.
     """
-    experiment, wanted = problem.experiment, problem.experiment.held_out
-    if wanted is None:
+    experiment, held_out = problem.experiment, problem.experiment.held_out
+    if held_out is None:
         return ObservedRuns((), np.empty((0, len(problem.channels))))
-    initial = {**experiment.initial, **wanted.initial}
-    inputs = {**experiment.inputs, **wanted.inputs}
+    initial = {**experiment.initial, **held_out.initial}
+    inputs = {**experiment.inputs, **held_out.inputs}
     # Each scenario has its own stream, so that more scenarios do not change the first ones.
-    streams = [target.get_held_out_stream(i) for i in range(wanted.scenarios)]
+    streams = [target.get_held_out_stream(i) for i in range(held_out.scenarios)]
     scenarios = tuple(draw_scenario(experiment, rng, initial, inputs) for rng in streams)
     observed = [problem.world.simulate(theta, each)[0] for each in scenarios]
     return ObservedRuns(scenarios, np.concatenate(observed))

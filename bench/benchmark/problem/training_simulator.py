@@ -123,10 +123,12 @@ class CountedTrainingSimulator:
                 "a learned tuner may only simulate inside the training range while it trains"
             )
         # The whole request is refused; otherwise the tuner would learn from a part of it.
-        asked = self.used + len(points)
-        if asked > self.budget:
-            raise BudgetExceededError(f"{asked} training simulations asked, {self.budget} allowed")
-        self.used = asked
+        requested_total = self.used + len(points)
+        if requested_total > self.budget:
+            raise BudgetExceededError(
+                f"{requested_total} training simulations asked, {self.budget} allowed"
+            )
+        self.used = requested_total
         scenarios = self._problem.draw_scenarios(rng)
         self.scene = self._problem.describe_scenarios(scenarios)
         if self._nuisance is not None:

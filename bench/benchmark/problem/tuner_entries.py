@@ -28,11 +28,11 @@ class TunerEntry:
 
     def to_table(self) -> dict[str, Any]:
         """Return the entry as the table ``[tuners.LABEL]``."""
-        given = {key: value for key, value in asdict(self).items() if value is not None}
-        del given["label"]
+        table = {key: value for key, value in asdict(self).items() if value is not None}
+        del table["label"]
         if not self.randomised:
-            del given["randomised"]
-        return given
+            del table["randomised"]
+        return table
 
 
 def parse_entries(path: Path, value: Any) -> tuple[TunerEntry, ...]:
@@ -49,23 +49,23 @@ def parse_entries(path: Path, value: Any) -> tuple[TunerEntry, ...]:
     if isinstance(value, dict):
         tables = value.items()
         return tuple(
-            _parse_tuner_table(path, f"tuners.{label}", label, own) for label, own in tables
+            _parse_tuner_table(path, f"tuners.{label}", label, table) for label, table in tables
         )
     if not isinstance(value, list):
         raise make_error(path, "tuners", "a list of names or a table for each tuner", value)
-    listed: list[TunerEntry] = []
+    entries: list[TunerEntry] = []
     for place, item in enumerate(value):
         entry = _parse_list_item(path, f"tuners[{place}]", item)
         # Tables and figures distinguish tuners by label; TOML keys cannot occur twice, list items
         # can.
-        if entry.label in [other.label for other in listed]:
-            twice = f"{entry.label} stands twice; give one of them a label"
-            raise InputError(f"{path}: tuners: {twice}")
-        listed.append(entry)
-    return tuple(listed)
+        if entry.label in [listed_entry.label for listed_entry in entries]:
+            problem = f"{entry.label} stands twice; give one of them a label"
+            raise InputError(f"{path}: tuners: {problem}")
+        entries.append(entry)
+    return tuple(entries)
 
 
-def _parse_list_item(path: Path, where: str, item: Any) -> TunerEntry:
+def _parse_list_item(path: Path, key: str, item: Any) -> TunerEntry:
     """Parse one element of a list of tuners: a name, or a table with the key ``tuner``.
 
     The label, under which results are listed, is the key ``label``, or else the name of the tuner.
@@ -73,22 +73,22 @@ def _parse_list_item(path: Path, where: str, item: Any) -> TunerEntry:
     if isinstance(item, str):
         return TunerEntry(item, item)
     if not isinstance(item, dict):
-        raise make_error(path, where, "a name or a table", item)
-    own = dict(item)  # a copy, so that the parsed document is not changed
-    label = own.pop("label", own.get("tuner"))
+        raise make_error(path, key, "a name or a table", item)
+    table = dict(item)  # a copy, so that the parsed document is not changed
+    label = table.pop("label", table.get("tuner"))
     if not isinstance(label, str):
-        raise make_error(path, where, 'a table with tuner = "NAME"', item)
-    return _parse_tuner_table(path, where, label, own)
+        raise make_error(path, key, 'a table with tuner = "NAME"', item)
+    return _parse_tuner_table(path, key, label, table)
 
 
-def _parse_tuner_table(path: Path, where: str, label: str, value: Any) -> TunerEntry:
+def _parse_tuner_table(path: Path, entry_key: str, label: str, value: Any) -> TunerEntry:
     """Parse the table of one tuner; a table without the key ``tuner`` uses its label as the name.
 
-    `path` and `where` (file and key) are for error messages, `value` is the table.
+    `path` and `entry_key` (file and key) are for error messages, `value` is the table.
     """
     hints = {key: hint for key, hint in get_type_hints_of(TunerEntry).items() if key != "label"}
-    own = check_entries(path, where, value, hints)
+    table = check_entries(path, entry_key, value, hints)
     for key in ("seeds", "budget"):
-        if own.get(key, 1) < 1:
-            raise make_error(path, f"{where}.{key}", "at least 1", own[key])
-    return TunerEntry(label, own.pop("tuner", label), **own)
+        if table.get(key, 1) < 1:
+            raise make_error(path, f"{entry_key}.{key}", "at least 1", table[key])
+    return TunerEntry(label, table.pop("tuner", label), **table)

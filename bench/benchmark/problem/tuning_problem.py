@@ -71,8 +71,8 @@ class TuningProblem:
             remedy = "run those that bench.benchmark.problem.experiment.expand_sweep gives"
             raise InputError(f"experiment {experiment.name}: sweeps over {swept}; {remedy}")
         if experiment.experiments:
-            named = ", ".join(experiment.experiments)
-            raise InputError(f"experiment {experiment.name}: names {named}; run these")
+            experiment_names = ", ".join(experiment.experiments)
+            raise InputError(f"experiment {experiment.name}: names {experiment_names}; run these")
         self.experiment = experiment = complete_robot_experiment(experiment)
         self.simulated = 0
         self.salt = experiment.salt if salt is None else salt
@@ -118,8 +118,8 @@ class TuningProblem:
         try:
             return kind(constants=experiment.fixed, observe=observe, **settings)
         except TypeError as error:  # a setting that its constructor does not accept
-            who = f"experiment {experiment.name}: simulator {experiment.simulator}"
-            raise InputError(f"{who}: {error}") from None
+            subject = f"experiment {experiment.name}: simulator {experiment.simulator}"
+            raise InputError(f"{subject}: {error}") from None
 
     def _check_world(self) -> None:
         """Raise an error if the parameters of `world` are not the first of the tuned ones.
@@ -127,24 +127,25 @@ class TuningProblem:
         `world` makes the targets, so a parameter that only `world` has could not be tuned. The
         tuned simulator may have further parameters.
         """
-        tuned, made = (
+        tuned_parameters, world_parameters = (
             [parameter.name for parameter in simulator.parameters]
             for simulator in (self.simulator, self.world)
         )
-        if made != tuned[: len(made)]:
+        if world_parameters != tuned_parameters[: len(world_parameters)]:
             raise InputError(
                 f"experiment {self.experiment.name}: world: expected none but the first of the "
-                f"tuned parameters {', '.join(tuned)}, found {', '.join(made)}; name effects in "
-                "fixed = { NAME = COEFFICIENT }"
+                f"tuned parameters {', '.join(tuned_parameters)}, "
+                f"found {', '.join(world_parameters)}; "
+                "name effects in fixed = { NAME = COEFFICIENT }"
             )
 
     def _check_constants(self) -> None:
         """Raise an error for random constants that the simulator does not have or accept."""
         constants = self.experiment.constants.items()
-        ranges = {name: ends for name, ends in constants if isinstance(ends, tuple)}
+        ranges = {name: limits for name, limits in constants if isinstance(limits, tuple)}
         for end in range(2):
-            drawn = {name: ends[end] for name, ends in ranges.items()}
-            self.simulator.run_constants(Scenario(np.zeros(1), constants=drawn))
+            extreme_values = {name: limits[end] for name, limits in ranges.items()}
+            self.simulator.run_constants(Scenario(np.zeros(1), constants=extreme_values))
 
     def close(self) -> None:
         """Close the simulators."""
@@ -190,11 +191,11 @@ class TuningProblem:
 
         An initial value of an observed channel is left out, because it is the first sample.
         """
-        shown = {c.name for c in self.channels}
+        observed_names = {c.name for c in self.channels}
         initial: list[float] = []
         inputs = []
         for scenario in scenarios:
-            hidden = {k: v for k, v in scenario.initial.items() if k not in shown}
+            hidden = {k: v for k, v in scenario.initial.items() if k not in observed_names}
             # Sorted by name, so that each network input always has the same meaning.
             numbers = sorted({**hidden, **scenario.constants}.items())
             initial += [value for _, value in numbers]
@@ -239,18 +240,18 @@ class TuningProblem:
         Returns:
             The spectrum; None if it is not requested or computed for another start.
         """
-        again = target.truth is None and target.blinded.name != f"{target.blinded.range}-000"
-        if again or not self.has_several_parameters:
+        is_repeated = target.truth is None and target.blinded.name != f"{target.blinded.range}-000"
+        if is_repeated or not self.has_several_parameters:
             return None
         nominal = np.array([parameter.nominal for parameter in self.cube.parameters])
-        at = nominal if target.truth is None else target.truth
+        evaluation_point = nominal if target.truth is None else target.truth
         scenarios = target.blinded.fitting.scenarios
 
         def simulate(theta: Array) -> Array:
             # This bypasses `self.simulate`, because these simulations are not part of any budget.
             return np.concatenate([self.simulator.simulate(theta, s) for s in scenarios], axis=1)
 
-        return compute_spectrum(simulate, at, self.cube.parameters, self.scale)
+        return compute_spectrum(simulate, evaluation_point, self.cube.parameters, self.scale)
 
     def compute_distance_from_training(self, truth: Array) -> float:
         """Return the distance of true parameters (dim,) from the training range.
@@ -259,8 +260,8 @@ class TuningProblem:
         """
         ranges = np.array([p.training_range for p in self.cube.parameters])
         # One of the two differences is positive outside, both are negative inside.
-        beyond = np.maximum(ranges[:, 0] - truth, truth - ranges[:, 1])
-        return float(max(0.0, (beyond / self.cube.compute_training_widths()).max()))
+        excess = np.maximum(ranges[:, 0] - truth, truth - ranges[:, 1])
+        return float(max(0.0, (excess / self.cube.compute_training_widths()).max()))
 
     def make_training_simulator(self, budget: int) -> CountedTrainingSimulator:
         """Return the training simulator for a learned tuner."""

@@ -88,7 +88,7 @@ def _conclude_range(view: ComparisonView, kind: str) -> str:
         "not decided": last.undecided,
         "all runs failed": last.failed,
     }
-    verdicts = "; ".join(f"{what}: {joined(names)}" for what, names in parts.items() if names)
+    verdicts = "; ".join(f"{verdict}: {joined(names)}" for verdict, names in parts.items() if names)
     return f"{title}, after {last.simulations} simulations: {verdicts or 'no tuner is worse'}."
 
 
@@ -195,15 +195,15 @@ def list_small_samples(view: ComparisonView) -> list[str]:
 
 def redraws_text(results: ComparisonReportData) -> str:
     """Describe how many targets were drawn again; empty for none."""
-    redrawn, draws = (
+    redrawn_count, draws = (
         results.environment.get(key, 0) for key in ("redrawn_targets", "target_draws")
     )
     targets = sum(results.view.statistics.target_counts.values())
-    if not redrawn:
+    if not redrawn_count:
         return ""
     return (
-        f"{redrawn} of {targets} targets were drawn again because their own simulation diverged "
-        f"({draws} draws in all)."
+        f"{redrawn_count} of {targets} targets were drawn again because their own simulation "
+        f"diverged ({draws} draws in all)."
     )
 
 
@@ -214,8 +214,8 @@ def write_provenance_notes(results: ComparisonReportData) -> Iterator[str]:
         yield f"{TRUSTED_TUNERS_NOTE.capitalize()}."
     if not experiment.salt_sha256:
         yield "The targets have a public salt, so anyone can draw them."
-    if redrawn := redraws_text(results):
-        yield redrawn
+    if redraw_note := redraws_text(results):
+        yield redraw_note
 
 
 def list_mean_seconds(results: ComparisonReportData) -> list[tuple[str, dict[Hashable, Any]]]:

@@ -28,8 +28,8 @@ def render_page(results: ComparisonReportData) -> str:
         if len(table):
             page.add_table(name, table)
     charts = {
-        name: make(view) if name in results.pictures or name == "ert" else None
-        for name, make in CHARTS.items()
+        name: make_chart(view) if name in results.pictures or name == "ert" else None
+        for name, make_chart in CHARTS.items()
     }
     for chart in charts.values():
         for name, table in chart.tables.items() if chart else ():

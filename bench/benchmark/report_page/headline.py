@@ -121,10 +121,14 @@ def targets_text(statistics: ComparisonStatistics, kind: str) -> str:
         statistics.target_counts[kind],
         _select_range(statistics, kind)["targets"],
     )
-    deciding = int(deciding_counts.max()) if len(deciding_counts) else 0
+    deciding_count = int(deciding_counts.max()) if len(deciding_counts) else 0
     unit = ("starting point" if kind == "real" else "target") + "s" * (count != 1)
     # Targets whose data identify no direction have no deciding error.
-    return f"{count} {unit}" if deciding == count else f"{deciding} of {count} {unit} decide"
+    return (
+        f"{count} {unit}"
+        if deciding_count == count
+        else f"{deciding_count} of {count} {unit} decide"
+    )
 
 
 def floor_text(statistics: ComparisonStatistics) -> str:
@@ -166,12 +170,14 @@ def too_few(statistics: ComparisonStatistics, kind: str) -> str:
         _select_range(statistics, kind)["targets"],
         _count_tested_tuners(statistics, kind),
     )
-    if not comparison_count or int(ranked.max()) >= (needed := targets_needed(comparison_count)):
+    if not comparison_count or int(ranked.max()) >= (
+        required_targets := targets_needed(comparison_count)
+    ):
         return ""
     targets = int(ranked.max())
     return (
         f"{targets} target{'s' * (targets != 1)} cannot decide between {comparison_count + 1} "
-        f"tuners: it takes at least {needed} (--targets {needed})."
+        f"tuners: it takes at least {required_targets} (--targets {required_targets})."
     )
 
 

@@ -86,21 +86,23 @@ def render_multi_problem_page(several: MultiProblemPageData) -> str:
     page.add_table(runtime_panel.table, shares, _DIGITS)
     error_panels, errors = _make_error_panels(several)
     page.add_table("errors", errors, _DIGITS)
-    means = several.ranked.mean().sort_values(kind="stable")
-    best = str(means.index[0])
-    better: list[str] = []
-    undecided: list[str] = []
+    mean_ranks = several.ranked.mean().sort_values(kind="stable")
+    best = str(mean_ranks.index[0])
+    significantly_worse: list[str] = []
+    undecided_tuners: list[str] = []
     if several.p_values is not None:
-        for other, p_value in several.p_values[best].drop(best).items():
-            (better if p_value < SIGNIFICANCE_LEVEL else undecided).append(str(other))
+        for tuner, p_value in several.p_values[best].drop(best).items():
+            (significantly_worse if p_value < SIGNIFICANCE_LEVEL else undecided_tuners).append(
+                str(tuner)
+            )
     return page.render(
         _TEMPLATE,
         several=several,
         problem_count=len(several.ranked),
         best=best,
-        best_rank=float(means.iloc[0]),
-        better=better,
-        undecided=undecided,
+        best_rank=float(mean_ranks.iloc[0]),
+        better=significantly_worse,
+        undecided=undecided_tuners,
         runtime_panel=runtime_panel,
         error_panels=error_panels,
         rank_columns=[[name, "", 3] for name, _ in styles],
@@ -121,21 +123,22 @@ def make_runtime_panel(
         for name, share in shares.items()
     ]
     series = tuple(
-        Series(name, "share", look, {"tuner": name}, draw="steps") for name, look in styles
+        Series(name, "share", mark_style, {"tuner": name}, draw="steps")
+        for name, mark_style in styles
     )
-    across = Axis("simulations used, in hundredths of the problem's budget", scales=("linear",))
-    up = Axis("share of (run, threshold) pairs reached", scales=("linear",), ends=(-0.02, 1.02))
-    panel = Panel("All problems", "runtime", "hundredths", series, across, up)
+    x_axis = Axis("simulations used, in hundredths of the problem's budget", scales=("linear",))
+    y_axis = Axis("share of (run, threshold) pairs reached", scales=("linear",), ends=(-0.02, 1.02))
+    panel = Panel("All problems", "runtime", "hundredths", series, x_axis, y_axis)
     return panel, pd.concat(parts, ignore_index=True)
 
 
-def _make_error_panels(several: MultiProblemPageData) -> tuple[list[Panel], pd.DataFrame]:
+def _make_error_panels(page_data: MultiProblemPageData) -> tuple[list[Panel], pd.DataFrame]:
     """Make the panels of error against simulations, one per problem, with their table."""
     frames, panels = [], []
     counts: Counter[str] = Counter()
-    for experiment, statistics in several.parts:
+    for experiment, statistics in page_data.parts:
         metric = statistics.metric
-        across = Axis(
+        x_axis = Axis(
             "simulations used on the target",
             "symlog",
             ("symlog", "linear"),
@@ -144,20 +147,22 @@ def _make_error_panels(several: MultiProblemPageData) -> tuple[list[Panel], pd.D
         )
         for kind in dict.fromkeys(statistics.curves.keys["range"]):
             medians = statistics.compute_median_curves(metric, str(kind))
-            medians = medians[medians["tuner"].isin(several.tuners)]
+            medians = medians[medians["tuner"].isin(page_data.tuners)]
             problem = f"{experiment.name} {kind}"
             counts[problem] += 1
             # If an experiment is given twice, its curves must not be mixed.
             problem += f", {counts[problem]}" if counts[problem] > 1 else ""
             frames.append(medians.assign(problem=problem, metric=metric))
-            present = set(medians["tuner"])
+            present_tuners = set(medians["tuner"])
             series = tuple(
-                Series(name, "median", look, {"tuner": name, "problem": problem}, "low", "high")
-                for name, look in several.get_tuner_styles()
-                if name in present
+                Series(
+                    name, "median", mark_style, {"tuner": name, "problem": problem}, "low", "high"
+                )
+                for name, mark_style in page_data.get_tuner_styles()
+                if name in present_tuners
             )
             targets = statistics.target_counts[str(kind)]
             title = f"{experiment.title or experiment.name}. {PANEL_TITLES[str(kind)]} ({targets})"
-            up, facets = Axis(_LABELS[metric], "log"), {"problem": problem}
-            panels.append(Panel(title, "errors", "simulations", series, across, up, facets))
+            y_axis, facets = Axis(_LABELS[metric], "log"), {"problem": problem}
+            panels.append(Panel(title, "errors", "simulations", series, x_axis, y_axis, facets))
     return panels, pd.concat(frames, ignore_index=True)

@@ -218,10 +218,10 @@ def _is_defined_in_module(kind: type) -> bool:
     one source, each with other values. A class made by ``type(...)`` from an abstract class names
     `abc` as its module.
     """
-    held: Any = sys.modules.get(kind.__module__)
+    attribute: Any = sys.modules.get(kind.__module__)
     for name in kind.__qualname__.split("."):
-        held = getattr(held, name, None)
-    return held is kind
+        attribute = getattr(attribute, name, None)
+    return attribute is kind
 
 
 def _represent_class(kind: type) -> Any:
@@ -233,8 +233,8 @@ def _represent_class(kind: type) -> Any:
         InputError: there is no source.
     """
     # The digest is not inherited, because a subclass behaves differently.
-    if (own := vars(kind).get("source_digest")) is not None:
-        return own
+    if (source_digest := vars(kind).get("source_digest")) is not None:
+        return source_digest
     if not _is_defined_in_module(kind):
         raise _make_source_error(kind)
     if kind.__module__ == "__main__":

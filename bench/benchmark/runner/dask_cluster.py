@@ -107,18 +107,20 @@ class ClusterPool:
             raise InputError(
                 f"{self.address}: has no workers; start some: dask worker {self.address}"
             )
-        here = (hash_source_folders(), hash_package_versions())
+        local_identity = (hash_source_folders(), hash_package_versions())
         try:
-            there = self._hash_workers()
+            identities = self._hash_workers()
         except Exception as error:  # any error of a worker that lacks our modules
             raise InputError(
                 f"{self.address}: its workers lack simgap ({get_first_line(error)})"
             ) from None
-        others = [worker for worker, answer in there.items() if answer != here]
-        if others:
+        differing_workers = [
+            worker for worker, answer in identities.items() if answer != local_identity
+        ]
+        if differing_workers:
             raise InputError(
-                f"{self.address}: worker {others[0]} has other code or package versions than this "
-                "process; install the same on both"
+                f"{self.address}: worker {differing_workers[0]} has other code or package versions "
+                "than this process; install the same on both"
             )
 
     def _hash_workers(self) -> dict[str, Any]:
@@ -128,11 +130,13 @@ class ClusterPool:
             Exception: a worker failed to compute them.
         """
         for _ in range(_WORKER_CHECK_ATTEMPTS):
-            there: dict[str, Any] = self._client.run(_hash_this_worker, on_error="return")
+            worker_answers: dict[str, Any] = self._client.run(_hash_this_worker, on_error="return")
             # A worker that is lost during the call gives no information about its code.
-            if not any(isinstance(answer, OSError) for answer in there.values()):
+            if not any(isinstance(answer, OSError) for answer in worker_answers.values()):
                 break
-        answers = {w: answer for w, answer in there.items() if not isinstance(answer, OSError)}
+        answers = {
+            w: answer for w, answer in worker_answers.items() if not isinstance(answer, OSError)
+        }
         for answer in answers.values():
             if isinstance(answer, BaseException):
                 raise answer
@@ -146,9 +150,11 @@ class ClusterPool:
         return self
 
     def __exit__(self, *_: object) -> None:
-        closing = threading.Thread(target=self._client.close, kwargs={"timeout": 5}, daemon=True)
-        closing.start()  # in a thread, because closing waits long for a lost scheduler
-        closing.join(timeout=10)
+        closing_thread = threading.Thread(
+            target=self._client.close, kwargs={"timeout": 5}, daemon=True
+        )
+        closing_thread.start()  # in a thread, because closing waits long for a lost scheduler
+        closing_thread.join(timeout=10)
 
     def iterate_results(self, calls: Sequence[Call], seconds: float) -> Iterator[tuple[int, Any]]:
         """Iterate over the results of calls in the order in which they end.
@@ -170,32 +176,39 @@ class ClusterPool:
         waiting: dict[Any, int] = {}
         # The number of workers that each call has lost, and the calls to be executed again.
         losses: dict[int, int] = {}
-        following = iter(range(len(calls)))
-        again: list[int] = []
+        remaining_places = iter(range(len(calls)))
+        repeated_places: list[int] = []
         try:
             while True:
-                ahead = _QUEUED_CALLS_PER_THREAD * max(sum(self._client.nthreads().values()), 1)
+                max_queued = _QUEUED_CALLS_PER_THREAD * max(
+                    sum(self._client.nthreads().values()), 1
+                )
                 while (
-                    len(waiting) < ahead
-                    and (place := again.pop() if again else next(following, None)) is not None
+                    len(waiting) < max_queued
+                    and (
+                        place := repeated_places.pop()
+                        if repeated_places
+                        else next(remaining_places, None)
+                    )
+                    is not None
                 ):
                     waiting[self._submit_call(calls[place], seconds)] = place
                 if not waiting:
                     return
                 for future in self._wait_for_results(list(waiting)):
                     place = waiting.pop(future)
-                    ended = future.status
-                    error = future.exception() if ended in ("error", "cancelled") else None
+                    end_status = future.status
+                    error = future.exception() if end_status in ("error", "cancelled") else None
                     killed = isinstance(error, KilledWorker | CancelledError)
                     # The loss of a worker gives no information about the call.
-                    if killed or ended in ("lost", "cancelled"):
+                    if killed or end_status in ("lost", "cancelled"):
                         losses[place] = losses.get(place, 0) + 1
                         if losses[place] > _MAX_LOST_WORKERS_PER_CALL:
                             raise PoolLostError(
                                 f"cluster {self.address}: lost {_MAX_LOST_WORKERS_PER_CALL} "
                                 "workers on one run"
                             )
-                        again.append(place)
+                        repeated_places.append(place)
                         continue
                     result = error if error is not None else self._receive_result(future.result())
                     # The cluster stores a result until its future is released.
@@ -220,9 +233,9 @@ class ClusterPool:
             # A cancelled future is done; its call is repeated if the scheduler is still running.
             except (TimeoutError, CancelledError):
                 self._check_scheduler()
-            if done := [future for future in futures if future.done()]:
+            if done_futures := [future for future in futures if future.done()]:
                 self._check_scheduler()
-                return done
+                return done_futures
 
     def _check_scheduler(self) -> None:
         """Raise an error unless the scheduler answers within `_SCHEDULER_TIMEOUT_SECONDS`."""

@@ -205,15 +205,15 @@ def check_classes_importable(experiment: Experiment, workers: bool = True) -> No
         InputError: the simulator, a tuner or an effect is such a class.
     """
     tuned: list[tuple[Registry[Any], str]] = [(tuners, e.tuner) for e in experiment.tuners]
-    used = tuned
+    used_parts = tuned
     if workers:
-        named = list_effect_names(experiment.settings, experiment.world)
+        effect_names = list_effect_names(experiment.settings, experiment.world)
         simulated = [] if experiment.model else [(simulators, experiment.simulator)]
-        used = [*simulated, *tuned, *((effects, name) for name in named)]
-    for registry, name in used:
-        added = registry.snapshot().get(name)
-        if added is not None and added.path is None:
-            raise unreachable(registry.kind, name, added.part)
+        used_parts = [*simulated, *tuned, *((effects, name) for name in effect_names)]
+    for registry, name in used_parts:
+        registered = registry.snapshot().get(name)
+        if registered is not None and registered.path is None:
+            raise unreachable(registry.kind, name, registered.part)
 
 
 def unreachable(kind: str, name: str, part: type) -> InputError:
@@ -226,15 +226,15 @@ def unreachable(kind: str, name: str, part: type) -> InputError:
     """
     file = getattr(sys.modules.get(part.__module__), "__file__", None)
     main = part.__module__ == "__main__"
-    where = "this session"
+    source = "this session"
     if file:
-        where = f"the script {Path(file).resolve()}" if main else str(Path(file).resolve())
+        source = f"the script {Path(file).resolve()}" if main else str(Path(file).resolve())
     plugin = f"{name}.py" if main or not file else str(Path(file).resolve())
     move = f"put it into a file of its own, say {plugin}, and " if main or not file else ""
-    named = f"tuners=[{name!r}], " if kind in ("tuner", "diagnoser") else ""
+    name_argument = f"tuners=[{name!r}], " if kind in ("tuner", "diagnoser") else ""
     return InputError(
-        f"{kind} {name}: class {part.__qualname__} is defined in {where}, which "
-        f"worker processes do not import; {move}pass {named}plugins=[{plugin!r}], or pass "
+        f"{kind} {name}: class {part.__qualname__} is defined in {source}, which "
+        f"worker processes do not import; {move}pass {name_argument}plugins=[{plugin!r}], or pass "
         "jobs=0, which runs everything in this process"
     )
 
@@ -260,9 +260,9 @@ def prepare_experiment(experiment: Experiment, salt: str | None = None) -> Exper
     entries = [entry for entry in experiment.tuners if entry.label not in results.skipped]
     if not experiment.trusted:
         results.tuned = {entry.label: make_tuner_spec(entry) for entry in entries}
-    drawn = results.problem.draw_targets()
-    results.redraws = redraws_of(experiment, drawn)
-    results.plan = list(_iterate_planned_runs(experiment, entries, drawn))
+    targets = results.problem.draw_targets()
+    results.redraws = redraws_of(experiment, targets)
+    results.plan = list(_iterate_planned_runs(experiment, entries, targets))
     # Workers open their own simulators, and this process does not need one for now.
     results.problem.close()
     return results
@@ -430,11 +430,11 @@ def _train_learned_entries(
     if not requested:
         return failures
     step = progress("training", len(requested))
-    lessons = [
+    requests = [
         TrainingRequest(entry, seed, results.tuned.get(entry.label), results.hidden_paths)
         for entry, seed in requested
     ]
-    calls = [(train_or_load, (experiment, lesson)) for lesson in lessons]
+    calls = [(train_or_load, (experiment, request)) for request in requests]
     for index, training in pool.iterate_results(calls, math.inf):
         entry, seed = requested[index]
         if isinstance(training, TrainingResult):

@@ -115,11 +115,13 @@ def register_plugins(plugins: Iterable[Plugin]) -> None:
     plugins = list(plugins)
     load_plugins(plugin.path for plugin in plugins if plugin.is_loaded)
     for plugin in plugins:
-        for known in plugin.tuners:
-            tuners.announce(make_tuner_stub(known), Path(plugin.path) if plugin.path else None)
-        for known in plugin.diagnosers:
+        for description in plugin.tuners:
+            tuners.announce(
+                make_tuner_stub(description), Path(plugin.path) if plugin.path else None
+            )
+        for description in plugin.diagnosers:
             diagnosers.announce(
-                make_diagnoser_stub(known), Path(plugin.path) if plugin.path else None
+                make_diagnoser_stub(description), Path(plugin.path) if plugin.path else None
             )
 
 
@@ -141,13 +143,15 @@ def load_plugins_for_experiment(paths: Sequence[str], experiment: Experiment) ->
     Raises:
         InputError: a file cannot be used.
     """
-    known = [Plugin(path) for path in paths]
+    described_plugins = [Plugin(path) for path in paths]
     if not experiment.trusted:
-        needed = {experiment.simulator} | find_named_effects(experiment.settings, experiment.world)
-        known = inspect_plugins(paths, needed | _list_extended_names(paths))
-        _check_no_shared_file(known, experiment)
-    register_plugins(known)
-    _known_plugins.update({plugin.path: plugin for plugin in known})
+        required_names = {experiment.simulator} | find_named_effects(
+            experiment.settings, experiment.world
+        )
+        described_plugins = inspect_plugins(paths, required_names | _list_extended_names(paths))
+        _check_no_shared_file(described_plugins, experiment)
+    register_plugins(described_plugins)
+    _known_plugins.update({plugin.path: plugin for plugin in described_plugins})
     if not experiment.trusted:
         _announce_installed(entry.tuner for entry in experiment.tuners)
 
@@ -177,9 +181,9 @@ def _check_no_shared_file(plugins: Iterable[Plugin], experiment: Experiment) -> 
     """
     labels = {entry.tuner: entry.label for entry in experiment.tuners}
     for plugin in plugins:
-        for known in plugin.tuners:
-            if plugin.is_loaded and known["name"] in labels:
-                raise _make_untrusted_code_error(labels[known["name"]], plugin.path)
+        for plugin_list in plugin.tuners:
+            if plugin.is_loaded and plugin_list["name"] in labels:
+                raise _make_untrusted_code_error(labels[plugin_list["name"]], plugin.path)
 
 
 def _make_untrusted_code_error(label: str, file: object) -> InputError:
@@ -274,7 +278,7 @@ def inspect_plugins(paths: Sequence[str], needed: Iterable[str]) -> list[Plugin]
     """
     needed_names = set(needed)
     plugins = []
-    claimed: dict[tuple[str, str], str] = {}
+    paths_by_name: dict[tuple[str, str], str] = {}
     for path in paths:
         # An extended simulator is data and contains no code.
         if path.endswith(".toml"):
@@ -284,13 +288,15 @@ def inspect_plugins(paths: Sequence[str], needed: Iterable[str]) -> list[Plugin]
         worlds = {part["name"] for part in parts if part["kind"] not in _ISOLATED_REGISTRIES}
         for part in parts:
             if part["name"] in needed_names and part["kind"] not in _ISOLATED_REGISTRIES:
-                _check_name_free(part["kind"], part["name"], path, claimed)
+                _check_name_free(part["kind"], part["name"], path, paths_by_name)
         methods = [tuple(p for p in parts if p["kind"] == kind) for kind in _ISOLATED_REGISTRIES]
         plugins.append(Plugin(path, bool(worlds & needed_names), *methods))
     return plugins
 
 
-def _check_name_free(kind: str, name: str, path: str, claimed: dict[tuple[str, str], str]) -> None:
+def _check_name_free(
+    kind: str, name: str, path: str, paths_by_name: dict[tuple[str, str], str]
+) -> None:
     """Raise an error if a name in a file's description is already in use.
 
     This is checked before the file's code is loaded, because the description may be wrong.
@@ -302,7 +308,7 @@ def _check_name_free(kind: str, name: str, path: str, claimed: dict[tuple[str, s
         is_taken = registry.kind == kind and name in registry.names()
         if is_taken and registry.place(name) != Path(path).resolve():
             raise InputError(f"plugin {path}: {kind} '{name}' exists already; give it another name")
-    other_path = claimed.setdefault((kind, name), path)
+    other_path = paths_by_name.setdefault((kind, name), path)
     if other_path != path:
         raise InputError(
             f"plugin {path}: {kind} '{name}' is in {other_path} too; give one another name"
@@ -320,10 +326,12 @@ def inspect_installed_part(name: str, kind: str = "tuner") -> Plugin:
         PartUnavailableError: it cannot be used here.
         InputError: it cannot be inspected.
     """
-    known = _ask_isolated_process({"file": "", "kind": kind, "name": name}, name)
-    if known and "skipped" in known[0]:
-        raise PartUnavailableError(kind, name, known[0]["skipped"])
-    return Plugin("", False, *(tuple(known) if kind == k else () for k in _ISOLATED_REGISTRIES))
+    descriptions = _ask_isolated_process({"file": "", "kind": kind, "name": name}, name)
+    if descriptions and "skipped" in descriptions[0]:
+        raise PartUnavailableError(kind, name, descriptions[0]["skipped"])
+    return Plugin(
+        "", False, *(tuple(descriptions) if kind == k else () for k in _ISOLATED_REGISTRIES)
+    )
 
 
 def is_external_part(name: str, registry: Registry[Any] = tuners) -> bool:
@@ -334,8 +342,8 @@ def is_external_part(name: str, registry: Registry[Any] = tuners) -> bool:
         registry: registry of the part.
     """
     entry_point = registry.entry(name)
-    known = registry.place(name) is not None or entry_point is None
-    return not known and not str(entry_point).startswith(_PROJECT_PACKAGES)
+    is_registered = registry.place(name) is not None or entry_point is None
+    return not is_registered and not str(entry_point).startswith(_PROJECT_PACKAGES)
 
 
 def _ask_isolated_process(question: dict[str, str], label: str) -> list[dict[str, Any]]:
@@ -383,10 +391,10 @@ def _validate_part(part: Any, file: str) -> dict[str, Any]:
     hashed = [str(part.get("source", "")), Path(file).read_bytes() if file else b""]
     # A part of a file is found by the file; a module name could pass information to its runs.
     module = "" if file else str(part.get("module", ""))
-    rest = {"file": file, "module": module, "source": compute_digest(*hashed)}
+    origin = {"file": file, "module": module, "source": compute_digest(*hashed)}
     flags = {key: part.get(key) for key in ("stochastic", "learned")}
     skipped = {"skipped": str(part["skipped"])[:500]} if "skipped" in part else {}
-    return {**text, **rest, **flags, **skipped}
+    return {**text, **origin, **flags, **skipped}
 
 
 def serve_inspection(
@@ -422,10 +430,10 @@ def _describe_plugin_file(file: str) -> list[dict[str, Any]]:
     load_plugins([file])
     path = Path(file).resolve()
     return [
-        _describe_class(registry.kind, added.part)
+        _describe_class(registry.kind, registered.part)
         for registry in REGISTRIES
-        for added in registry.snapshot().values()
-        if added.path == path
+        for registered in registry.snapshot().values()
+        if registered.path == path
     ]
 
 
@@ -448,12 +456,12 @@ def _describe_class(kind: str, part: Any) -> dict[str, Any]:
     so it needs its properties and the hash of its source from here. Other kinds have a name and a
     first paragraph only.
     """
-    known = {"kind": kind, "name": part.name, "says": (part.__doc__ or "").split("\n\n")[0]}
+    description = {"kind": kind, "name": part.name, "says": (part.__doc__ or "").split("\n\n")[0]}
     if kind not in _ISOLATED_REGISTRIES:
-        return known
+        return description
     try:
         return {
-            **known,
+            **description,
             "module": part.__module__,
             "stochastic": getattr(part, "stochastic", True),
             "learned": part.learned,
@@ -463,4 +471,4 @@ def _describe_class(kind: str, part: Any) -> dict[str, Any]:
             "name": _REGISTRY_OF[kind].get(part.name).name,
         }
     except PartUnavailableError as error:
-        return {**known, "skipped": error.reason}
+        return {**description, "skipped": error.reason}

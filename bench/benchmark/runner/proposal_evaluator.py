@@ -41,9 +41,9 @@ class ProposalEvaluator:
         self._missing = missing if missing.any() else None
         self._observed = np.where(missing, 0.0, side.observed)
         # For a channel without samples the divisor must not be zero.
-        present = np.maximum((~missing).sum(axis=0), 1)
-        self._per_sample = 1.0 / present  # (2)
-        self._per_loss = 1.0 / (present * problem.scale**2 * len(problem.scale))  # (1)
+        sample_counts = np.maximum((~missing).sum(axis=0), 1)
+        self._per_sample = 1.0 / sample_counts  # (2)
+        self._per_loss = 1.0 / (sample_counts * problem.scale**2 * len(problem.scale))  # (1)
         self._only_per_loss = float(self._per_loss[0])
         self._seen: list[Array] = []
 
@@ -103,7 +103,7 @@ class ProposalEvaluator:
         Returns:
             (k, C) root-mean-square errors.
         """
-        known = {
+        rows_by_point = {
             point.tobytes(): row
             for point, row in zip(proposals, self._stack_evaluated_rows(), strict=True)
         }
@@ -111,11 +111,11 @@ class ProposalEvaluator:
         for i, point in enumerate(recommendations):
             # Points are compared by their bytes, so that only an identical point is looked up.
             key = point.tobytes()
-            if key not in known:
-                known[key] = self._sum_squared_errors(
+            if key not in rows_by_point:
+                rows_by_point[key] = self._sum_squared_errors(
                     self._problem.simulate(point[None], self._scenarios)
                 )[0]
-            result[i] = known[key]
+            result[i] = rows_by_point[key]
         errors: Array = np.sqrt(result * self._per_sample)  # (2)
         return errors
 

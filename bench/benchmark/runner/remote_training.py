@@ -63,22 +63,27 @@ def train_remotely(
 
 
 def _handle_message(
-    child: IsolatedProcess, message: Message, grounds: list[Ground], watch: TrainingCallback | None
+    child: IsolatedProcess,
+    message: Message,
+    grounds: list[Ground],
+    callback: TrainingCallback | None,
 ) -> None:
     """Handle one message of a tuner during its training.
 
     Raises:
         ProtocolError: the message is not valid here.
     """
-    if message.kind == b"W" and watch is not None:
-        watch.epoch(*_parse_progress(message.to_document()))
+    if message.kind == b"W" and callback is not None:
+        callback.epoch(*_parse_progress(message.to_document()))
         child.send(b"K", deadline=_NO_DEADLINE)
     elif (
-        message.kind == b"P" and message.flags < 4 and (watch is not None or not message.flags & 1)
+        message.kind == b"P"
+        and message.flags < 4
+        and (callback is not None or not message.flags & 1)
     ):
         # The second simulator is for evaluation only, and exists only if there is a callback.
-        if message.flags & 1 and watch is not None and len(grounds) == 1:
-            grounds.append(watch.ground)
+        if message.flags & 1 and callback is not None and len(grounds) == 1:
+            grounds.append(callback.ground)
         _serve_simulation(child, message, grounds[message.flags & 1])
     else:
         raise ProtocolError("it sent what nobody asked for")

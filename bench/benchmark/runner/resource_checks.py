@@ -124,12 +124,12 @@ def check_comparison_size(
     # A diagnosis is limited by its own time and memory limits.
     if experiment.diagnosis:
         return
-    for one in expand_sweep(experiment):
-        need = estimate_comparison_need(one, jobs, cluster)
-        check_feasible(f"experiment {one.name}", need, get_machine_resources(folder))
-        if one.recording:
-            kind = get_simulator_class(one)
-            path = find_recording(one.recording.path)
+    for part in expand_sweep(experiment):
+        need = estimate_comparison_need(part, jobs, cluster)
+        check_feasible(f"experiment {part.name}", need, get_machine_resources(folder))
+        if part.recording:
+            kind = get_simulator_class(part)
+            path = find_recording(part.recording.path)
             check_recording_plausible(read_recording(path, kind), kind)
 
 
@@ -179,9 +179,9 @@ def estimate_comparison_need(
         "steps": sizes.steps,
         "jobs": jobs,
     }
-    made = ", ".join(f"{name} {count:.4g}" for name, count in counts.items() if count)
+    counts_text = ", ".join(f"{name} {count:.4g}" for name, count in counts.items() if count)
     return ResourceNeed(
-        f"tuners {len(each)}, {made}",
+        f"tuners {len(each)}, {counts_text}",
         _suggest_reduction(counts),
         memory,
         rows * _ROW_DISK,

@@ -27,8 +27,8 @@ def make_unfinished_outcome(
         status: status of the run.
         reason: reason of the status.
     """
-    nothing, start = np.empty(0), target.blinded.start[None]
-    trace = RunTrace(status, reason, start[:0], nothing, start, nothing, nothing)
+    no_values, start = np.empty(0), target.blinded.start[None]
+    trace = RunTrace(status, reason, start[:0], no_values, start, no_values, no_values)
     return RunOutcome(trace, np.full((1, len(problem.channels)), np.nan), None, 0.0)
 
 
@@ -92,15 +92,15 @@ def build_rows(
     columns |= _build_parameter_columns(problem, target, outcome)
     if spectrum is not None and target.truth is not None:
         # Directions combine parameters, which therefore need a common unit: training widths.
-        away = problem.cube.to_physical(trace.recommendations) - target.truth
-        widths = away / problem.cube.compute_training_widths()
+        parameter_errors = problem.cube.to_physical(trace.recommendations) - target.truth
+        widths = parameter_errors / problem.cube.compute_training_widths()
         columns["stiff_error"], columns["sloppy_error"] = spectrum.compute_directional_errors(
             widths
         )
     columns["obs_error"] = outcome.obs_rmse[:, problem.error_channel]
     # All runs of a comparison have the same columns, so that their rows form one table.
-    nothing = np.full((k + 1, len(problem.channels)), np.nan)
-    heldout = nothing if outcome.heldout_rmse is None else outcome.heldout_rmse
+    unknown_errors = np.full((k + 1, len(problem.channels)), np.nan)
+    heldout = unknown_errors if outcome.heldout_rmse is None else outcome.heldout_rmse
     columns["heldout_error"] = heldout[:, problem.error_channel]
     for i, channel in enumerate(problem.channels):
         columns[f"obs_error_{channel.name}"] = outcome.obs_rmse[:, i]

@@ -128,12 +128,12 @@ def check_unchanged(folder: Path, initial: dict[str, str], present: dict[str, st
             f"{folder}: written by an older simgap, which cannot be resumed; start a new comparison"
         )
     # The first difference is reported: direct changes are listed before their consequences.
-    for what, hashed in present.items():
-        if initial.get(what) != hashed:
+    for hash_name, hashed in present.items():
+        if initial.get(hash_name) != hashed:
             raise InputError(
-                f"{folder}: its {what} changed since it was begun ({initial.get(what)} then, "
-                f"{hashed} now); all runs need the same configuration: restore it, or start a new "
-                "comparison"
+                f"{folder}: its {hash_name} changed since it was begun ({initial.get(hash_name)} "
+                f"then, {hashed} now); all runs need the same configuration: restore it, or start "
+                "a new comparison"
             )
 
 
@@ -154,8 +154,8 @@ def check_resumable(
         InputError: something relevant has changed since the study was started.
     """
     # The study's own plugins come first and in their order, as when it was started.
-    additional = {str(Path(p).resolve()) for p in plugins}
-    all_plugins = configuration.plugins + sorted(additional - set(configuration.plugins))
+    added_paths = {str(Path(p).resolve()) for p in plugins}
+    all_plugins = configuration.plugins + sorted(added_paths - set(configuration.plugins))
     load_plugins_for_experiment(all_plugins, configuration.experiment)
     check_unchanged(
         folder,
@@ -207,20 +207,20 @@ class RunIds:
             )
         if target.name not in self._targets:
             self._targets[target.name] = _hash_target(target)
-        what = compute_digest(
+        digest = compute_digest(
             self._world, self._entries[entry.label], self._targets[target.name], seed, budget
         )
-        return f"{entry.label}/{target.name}/{seed}/{what}"
+        return f"{entry.label}/{target.name}/{seed}/{digest}"
 
 
 def _hash_target(target: BlindedTarget) -> str:
     """Hash a target's scenarios, observations and start."""
-    sides = [target.fitting, target.held_out]
+    run_sets = [target.fitting, target.held_out]
     scenarios = [
         [s.times.tobytes(), s.initial, {k: v.tobytes() for k, v in s.inputs.items()}, s.constants]
-        for side in sides
+        for side in run_sets
         for s in side.scenarios
     ]
     return compute_digest(
-        scenarios, [side.observed.tobytes() for side in sides], target.start.tobytes()
+        scenarios, [side.observed.tobytes() for side in run_sets], target.start.tobytes()
     )

@@ -262,36 +262,36 @@ def _run_ask_tell_loop(
         _DivergenceError: the tuner proposed or recommended a point that is not finite.
         Exception: the tuner or the simulator failed.
     """
-    before = perf_counter()
-    asked = next(steps)
+    requested_at = perf_counter()
+    proposed = next(steps)
     while True:
         recommendation = None
-        if type(asked) is Proposal:
-            asked, recommendation = asked
+        if type(proposed) is Proposal:
+            proposed, recommendation = proposed
             if recommendation is not None:
                 record.recommend(recommendation)
-        points = _check_proposals(asked, task.dim, "proposals")
+        points = _check_proposals(proposed, task.dim, "proposals")
         # The check comes here, so that the recommendation after the last simulation is recorded.
-        left = task.budget - record.used
-        if left <= 0:
+        remaining = task.budget - record.used
+        if remaining <= 0:
             # The time that the tuner needed for this recommendation is recorded, too.
-            record.late(perf_counter() - before)
+            record.late(perf_counter() - requested_at)
             return "done", ""
-        cut = len(points) > left
-        if cut:
-            points = points[:left]
-        now = perf_counter()
+        is_cut = len(points) > remaining
+        if is_cut:
+            points = points[:remaining]
+        answered_at = perf_counter()
         observations, losses = evaluate(points)
-        after = perf_counter()
-        record.time(len(points), now - before, after - now)
+        simulated_at = perf_counter()
+        record.time(len(points), answered_at - requested_at, simulated_at - answered_at)
         record.add(points, losses, stays=recommendation is not None)
-        if after > deadline:
+        if simulated_at > deadline:
             return "timeout", ""
         # The tuner gets the evaluations of complete batches only.
-        if cut:
+        if is_cut:
             return "done", ""
-        before = perf_counter()
-        asked = steps.send(Evaluation(points, observations, losses))
+        requested_at = perf_counter()
+        proposed = steps.send(Evaluation(points, observations, losses))
 
 
 def _close_generator(steps: TunerRun | None) -> str:

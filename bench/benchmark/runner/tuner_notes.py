@@ -57,10 +57,10 @@ class Notes:
             if tuner.files:
                 files = "1 file" if tuner.files == 1 else f"{tuner.files} files"
                 names = ", ".join(list(tuner.names)[:_NAMED])
-                more = ", …" if tuner.unnamed or len(tuner.names) > _NAMED else ""
+                suffix = ", …" if tuner.unnamed or len(tuner.names) > _NAMED else ""
                 were = "was" if tuner.files == 1 else "were"
                 lines.append(
-                    f"{files} written by tuner {label} ({names}{more}) {were} discarded with its "
+                    f"{files} written by tuner {label} ({names}{suffix}) {were} discarded with its "
                     "sandbox"
                 )
             seconds = median(tuner.import_seconds or [0.0])

@@ -219,46 +219,48 @@ def train_or_load(
 
 def _train_or_read_weights(
     experiment: Experiment,
-    lesson: TrainingRequest,
-    watch: TrainingCallback | None,
+    request: TrainingRequest,
+    callback: TrainingCallback | None,
     anew: bool,
     earlier_requests: list[str],
 ) -> TrainingResult:
     """Train the tuner of a request, or read its weights from the cache; see `train_or_load`.
 
     The request names the tuner's entry and the seed, and how to build the tuner in isolation.
-    `watch` gets the losses of each epoch. `anew` trains even if the cache has the weights.
+    `callback` gets the losses of each epoch. `anew` trains even if the cache has the weights.
     `earlier_requests` are hashes of the simulations requested before an external kill; the repeated
     training must make the same requests.
     """
-    entry, seed = lesson.entry, lesson.seed
+    entry, seed = request.entry, request.seed
     name = compute_training_key(experiment, entry, seed)
     path = get_weights_folder() / f"{name}.npz"
     if path.exists() and not anew:
         simulations, seconds = _read_checked_arrays(path, name)[_COST_ARRAY]
         # Weights that do not fit must be reported now, and not in every run.
-        _check_weights(lesson, path)
+        _check_weights(request, path)
         return TrainingResult(path, int(simulations), float(seconds), was_cached=True)
     problem = TuningProblem(experiment)
     # Tuners with the same `trains_as` share a random stream, so that they have the same network.
     stream = make_seed_words(
         experiment.name, "fit", tuners.get(entry.tuner).trains_as or entry.tuner, seed
     )
-    learn = _train_in_process if lesson.tuned is None else _train_isolated
-    rough = RandomisedSimulator(problem) if entry.randomised else None
-    practice = _ReplayCheckedSimulator(problem, experiment.training_budget, earlier_requests, rough)
+    learn = _train_in_process if request.tuned is None else _train_isolated
+    randomised_simulator = RandomisedSimulator(problem) if entry.randomised else None
+    practice = _ReplayCheckedSimulator(
+        problem, experiment.training_budget, earlier_requests, randomised_simulator
+    )
     started = perf_counter()
-    state = learn(lesson, practice, stream, watch)
+    state = learn(request, practice, stream, callback)
     seconds = perf_counter() - started
     problem.close()
-    if rough is not None:
-        rough.close()
+    if randomised_simulator is not None:
+        randomised_simulator.close()
     # Cost and key are stored with the weights, so that an exchanged file is detected.
-    about = {
+    metadata = {
         _COST_ARRAY: np.array([practice.used, seconds]),
         _KEY: np.frombuffer(name.encode(), dtype=np.uint8),
     }
-    _write_atomically(path, {**state, **about})
+    _write_atomically(path, {**state, **metadata})
     return TrainingResult(path, practice.used, seconds)
 
 
@@ -308,28 +310,28 @@ class _ReplayCheckedSimulator(CountedTrainingSimulator):
 
 
 def _train_in_process(
-    lesson: TrainingRequest,
+    request: TrainingRequest,
     practice: CountedTrainingSimulator,
     stream: NDArray[np.uint32],
-    watch: TrainingCallback | None,
+    callback: TrainingCallback | None,
 ) -> Mapping[str, Array]:
     """Train a trusted tuner in this process, and return its weights."""
-    tuner = build_tuner(lesson.entry)
-    tuner.watch = watch
+    tuner = build_tuner(request.entry)
+    tuner.watch = callback
     tuner.fit(practice, np.random.default_rng(stream), practice.budget)
     return tuner.state()
 
 
 def _train_isolated(
-    lesson: TrainingRequest,
+    request: TrainingRequest,
     practice: CountedTrainingSimulator,
     stream: NDArray[np.uint32],
-    watch: TrainingCallback | None,
+    callback: TrainingCallback | None,
 ) -> Mapping[str, Array]:
     """Train a tuner in its isolated process, and return its weights; this process simulates."""
-    assert lesson.tuned is not None
-    with start_isolated_tuner(lesson.tuned, lesson.seed, "run", lesson.hidden) as tuner:
-        state = train_remotely(tuner.child, practice, stream, watch)
+    assert request.tuned is not None
+    with start_isolated_tuner(request.tuned, request.seed, "run", request.hidden) as tuner:
+        state = train_remotely(tuner.child, practice, stream, callback)
     # These names are arguments of `np.savez` or reserved in the file.
     reserved = {"file", "allow_pickle", _COST_ARRAY, _KEY} & set(state)
     if reserved:
@@ -339,27 +341,27 @@ def _train_isolated(
     return state
 
 
-def _check_weights(lesson: TrainingRequest, path: Path) -> None:
+def _check_weights(request: TrainingRequest, path: Path) -> None:
     """Raise an error if the tuner does not accept the weights.
 
     Raises:
         WeightsError: the tuner does not accept the weights.
     """
-    if lesson.tuned is None:
-        load_trained_tuner(lesson.entry, path)
+    if request.tuned is None:
+        load_trained_tuner(request.entry, path)
         return
     try:
         with start_isolated_tuner(
-            lesson.tuned, lesson.seed, "run", lesson.hidden, state=read_weights(path)
+            request.tuned, request.seed, "run", request.hidden, state=read_weights(path)
         ):
             return
     except RunEndedError as ended:
         last_line = ended.reason.strip().splitlines()[-1:]
-        raise _make_weights_error(path, lesson.entry, "".join(last_line)) from None
+        raise _make_weights_error(path, request.entry, "".join(last_line)) from None
 
 
-def _make_weights_error(path: Path, entry: TunerEntry, why: object) -> WeightsError:
-    return WeightsError(f"{path}: not the weights of {entry.label}: {why}; {_REMEDY}")
+def _make_weights_error(path: Path, entry: TunerEntry, reason: object) -> WeightsError:
+    return WeightsError(f"{path}: not the weights of {entry.label}: {reason}; {_REMEDY}")
 
 
 def _write_atomically(path: Path, arrays: Mapping[str, Array | NDArray[np.uint8]]) -> None:
@@ -433,9 +435,9 @@ def _read_checked_arrays(path: Path, name: str) -> dict[str, Array]:
         raise WeightsError(
             f"{path}: expected trained weights, found arrays {sorted(arrays)[:4]}; {_REMEDY}"
         )
-    found = stored_key.tobytes().decode("utf-8", "replace")
-    if found != name:
+    stored_name = stored_key.tobytes().decode("utf-8", "replace")
+    if stored_name != name:
         raise WeightsError(
-            f"{path}: expected the weights of {name}, found those of {found:.80}; {_REMEDY}"
+            f"{path}: expected the weights of {name}, found those of {stored_name:.80}; {_REMEDY}"
         )
     return arrays

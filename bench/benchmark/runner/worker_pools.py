@@ -233,24 +233,24 @@ class LocalPool:
         if not self._slots:
             describe_stepping()  # executed here, because a worker cannot report what it waits for
         self._slots = self._slots or [_WorkerSlot(self._plugins) for _ in range(self._jobs)]
-        following = deque(_AssignedCall(place) for place in range(len(calls)))
+        waiting_calls = deque(_AssignedCall(place) for place in range(len(calls)))
         pace = _PrefetchPolicy()
         while True:
-            self._assign_calls(following, pace.depth, calls, limit)
+            self._assign_calls(waiting_calls, pace.depth, calls, limit)
             futures = [future for slot in self._slots for future in slot.given]
             if not futures:
                 return
             # The timeout is needed because a worker that exits with code 0 completes no future.
             wait(futures, timeout=1.0, return_when=FIRST_COMPLETED)
             for slot in self._slots:
-                for call, result in slot.collect(following):
+                for call, result in slot.collect(waiting_calls):
                     pace.note(monotonic() - call.given)
                     yield call.place, result
             pace.adapt()
 
     def _assign_calls(
         self,
-        following: deque[_AssignedCall],
+        waiting_calls: deque[_AssignedCall],
         depth: int,
         calls: Sequence[Call],
         limit: float | None,
@@ -258,8 +258,8 @@ class LocalPool:
         """Assign up to `depth` calls to every worker; all get a first before any gets a second."""
         for _ in range(depth):
             for slot in self._slots:
-                if following and len(slot.given) < depth:
-                    slot.give(following.popleft(), calls, limit)
+                if waiting_calls and len(slot.given) < depth:
+                    slot.give(waiting_calls.popleft(), calls, limit)
 
 
 class _WorkerSlot:
@@ -291,9 +291,9 @@ class _WorkerSlot:
         context = WorkerContext()
         # Each process that the pool starts reports here. A second report means that the first
         # process is dead, which pebble does not notice if the exit code is 0.
-        self._births, telling = context.Pipe(duplex=False)
+        self._births, births_sender = context.Pipe(duplex=False)
         self._born = 0
-        arguments = (self._plugins, telling)
+        arguments = (self._plugins, births_sender)
         self._pool = ProcessPool(
             1, initializer=initialise_worker, initargs=arguments, context=context
         )
@@ -334,26 +334,28 @@ class _WorkerSlot:
         Calls that a lost worker did not begin, or whose end is no fault of theirs, are put back to
         the front of `waiting`. A lost worker is replaced.
         """
-        ended: list[tuple[_AssignedCall, Any]] = []
-        lost = False
+        ended_calls: list[tuple[_AssignedCall, Any]] = []
+        is_lost = False
         for future in [future for future in self.given if future.done()]:
             call, error = self.given.pop(future), future.exception()
-            lost = lost or _loses_the_worker(error)
+            is_lost = is_lost or _loses_the_worker(error)
             if error is None:
                 self._futile = 0
             if _should_retry(call, error):
                 waiting.appendleft(call)
             else:
-                ended.append((call, future.result() if error is None else _convert_error(error)))
-        if not lost and self._was_replaced_without_result():
-            lost = True
+                ended_calls.append(
+                    (call, future.result() if error is None else _convert_error(error))
+                )
+        if not is_lost and self._was_replaced_without_result():
+            is_lost = True
             running = next(future for future in self.given if future.running())
-            ended.append((self.given.pop(running), WorkerDiedError(_describe_worker_exit(0))))
-        if lost:
-            self._futile = 0 if ended else self._futile
+            ended_calls.append((self.given.pop(running), WorkerDiedError(_describe_worker_exit(0))))
+        if is_lost:
+            self._futile = 0 if ended_calls else self._futile
             waiting.extendleft(reversed(self.given.values()))
             self._replace_process()
-        return ended
+        return ended_calls
 
     def _was_replaced_without_result(self) -> bool:
         """Return whether the process was replaced although its running call has no result."""

@@ -42,10 +42,10 @@ def _discard_output() -> None:
     for stream in (sys.stdout, sys.stderr):
         stream.flush()
     # The file descriptors are replaced, because C libraries do not use `sys.stdout`.
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nowhere, 1)
-    os.dup2(nowhere, 2)
-    os.close(nowhere)
+    null_device = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(null_device, 1)
+    os.dup2(null_device, 2)
+    os.close(null_device)
 
 
 def _end_with_parent() -> None:

@@ -140,8 +140,8 @@ def execute_run(
         RunEndedError: the tuner's process was killed externally several times.
     """
     if order.tuned is not None and requests is None:
-        earlier: list[Array] = []
-        return retry_if_killed(lambda: execute_run(experiment, order, earlier))
+        earlier_requests: list[Array] = []
+        return retry_if_killed(lambda: execute_run(experiment, order, earlier_requests))
     problem = get_problem(experiment)
     target = order.target
     evaluator = ProposalEvaluator(problem, target.fitting)
@@ -237,11 +237,11 @@ def _run_isolated(
     assert order.tuned is not None
     state = None if order.weights is None else read_weights(order.weights)
     names = _list_stream_names(experiment, order)
-    opened = start_isolated_tuner(
+    tuner_context = start_isolated_tuner(
         order.tuned, order.seed, experiment.isolation, order.hidden, experiment.memory, state
     )
     try:
-        with opened as tuner:
+        with tuner_context as tuner:
             run = IsolatedRun(tuner, make_seed_words(*names), experiment.timeout)
             trace = drive_tuner(run, task, evaluate, make_rng(*names), experiment.timeout)
             written = tuner.child.written()

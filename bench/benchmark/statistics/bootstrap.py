@@ -62,9 +62,9 @@ def draw_resample_counts(n: int, resamples: int, rng: np.random.Generator) -> Re
     Returns:
         (n, resamples) counts.
     """
-    picked = rng.integers(n, size=(resamples, n))
-    picked += n * np.arange(resamples)[:, None]
-    counts = np.bincount(picked.ravel(), minlength=resamples * n)
+    indices = rng.integers(n, size=(resamples, n))
+    indices += n * np.arange(resamples)[:, None]
+    counts = np.bincount(indices.ravel(), minlength=resamples * n)
     return np.ascontiguousarray(counts.reshape(resamples, n).T.astype(np.min_scalar_type(n)))
 
 
@@ -80,8 +80,8 @@ def compute_resampled_means(values: Array, counts: ResampleCounts) -> Array:
     """
     total = np.zeros((values.shape[1], counts.shape[1]))
     # Rows are added one by one: the summation order of a matrix product depends on the machine.
-    for row, often in zip(values, counts, strict=True):
-        total += row[:, None] * often
+    for row, draw_counts in zip(values, counts, strict=True):
+        total += row[:, None] * draw_counts
     return total / len(values)
 
 

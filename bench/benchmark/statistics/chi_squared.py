@@ -32,10 +32,10 @@ def chi_squared_tail(freedom: int, statistic: float) -> float:
     if statistic == inf:
         return 0.0
     h = statistic / 2.0
-    half = (freedom % 2) / 2.0
+    half_remainder = (freedom % 2) / 2.0
     # Logarithms, since e^{-h} alone is 0 where h is above 745.
     terms = [
-        exp((i - half) * log(h) - lgamma(i - half + 1.0) - h)
-        for i in range(1 if half else 0, (freedom + 1) // 2)
+        exp((i - half_remainder) * log(h) - lgamma(i - half_remainder + 1.0) - h)
+        for i in range(1 if half_remainder else 0, (freedom + 1) // 2)
     ]
-    return min(1.0, fsum([erfc(sqrt(h)) if half else 0.0, *terms]))
+    return min(1.0, fsum([erfc(sqrt(h)) if half_remainder else 0.0, *terms]))

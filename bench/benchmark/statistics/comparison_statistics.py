@@ -116,7 +116,9 @@ class ComparisonStatistics:
     def notes(self) -> dict[str, str]:
         """Notes of legends and tables about tuners with failed runs, by tuner."""
         failed = pd.Series(self._all_runs.failed).groupby(self._all_runs.keys["tuner"], sort=False)
-        return failure_notes({str(t): (int(bad.sum()), len(bad)) for t, bad in failed})
+        return failure_notes(
+            {str(t): (int(is_failed.sum()), len(is_failed)) for t, is_failed in failed}
+        )
 
     def coinciding(self, shown: Sequence[tuple[str, str]]) -> dict[str, str]:
         """Find tuners whose curves are hidden below another curve.
@@ -127,13 +129,15 @@ class ComparisonStatistics:
         Returns:
             Note by tuner, such as ``same as hybrid up to 2``.
         """
-        drawn: dict[str, list[pd.Series[float]]] = {}
+        curves_by_tuner: dict[str, list[pd.Series[float]]] = {}
         for metric, kind in shown:
             for tuner, line in self.compute_median_curves(metric, kind).groupby(
                 "tuner", sort=False
             ):
-                drawn.setdefault(str(tuner), []).append(line.set_index("simulations")["median"])
-        return coinciding(drawn)
+                curves_by_tuner.setdefault(str(tuner), []).append(
+                    line.set_index("simulations")["median"]
+                )
+        return coinciding(curves_by_tuner)
 
     def floor_of(self, metric: str) -> float | None:
         """Return the error below which tuners count as equal, in the unit of a metric.
@@ -143,8 +147,8 @@ class ComparisonStatistics:
         """
         if metric == self.metric:
             return self.floor
-        decides = self.metric == "param_error" and metric == "param_abs_error"
-        return self.floor * self.unit if decides else None
+        is_deciding_metric = self.metric == "param_error" and metric == "param_abs_error"
+        return self.floor * self.unit if is_deciding_metric else None
 
     def labelled(self, tuner: str) -> str:
         """Return the tuner's name, with its number of failed runs if there are any."""
@@ -180,16 +184,20 @@ class ComparisonStatistics:
     def _get_curves_of_all_runs(self, metric: str) -> RunCurves:
         """Return the curves of a metric for all runs that have it, from a cache if possible."""
         if metric not in self._curves:
-            there = self.all_runs[metric].notna()
-            rows = self._all_runs if there.all() else self._make_run_rows(self.all_runs[there])
+            has_metric = self.all_runs[metric].notna()
+            rows = (
+                self._all_runs
+                if has_metric.all()
+                else self._make_run_rows(self.all_runs[has_metric])
+            )
             self._curves[metric] = rows.build_curves(metric)
         return self._curves[metric]
 
     @cached_property
     def _all_runs(self) -> RunRowTable:
         """Table of all runs; equal to the table of the deciding runs if these are all runs."""
-        whole = len(self.runs) == len(self.all_runs)
-        return self._rows if whole else self._make_run_rows(self.all_runs)
+        is_complete = len(self.runs) == len(self.all_runs)
+        return self._rows if is_complete else self._make_run_rows(self.all_runs)
 
     def _make_run_rows(self, runs: pd.DataFrame) -> RunRowTable:
         return RunRowTable(runs, self._statuses, self._budget)

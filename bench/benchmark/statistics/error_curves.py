@@ -61,8 +61,8 @@ class RunCurves:
             Sorted names of the targets, and the row indices of each target.
         """
         codes, names = pd.factorize(self.keys["target"], sort=True)
-        ends = np.cumsum(np.bincount(codes, minlength=len(names)))
-        groups = np.split(np.argsort(codes, kind="stable"), ends[:-1])
+        group_ends = np.cumsum(np.bincount(codes, minlength=len(names)))
+        groups = np.split(np.argsort(codes, kind="stable"), group_ends[:-1])
         return [str(n) for n in names], groups[: len(names)]
 
     def after(self, k: int) -> Array:
@@ -111,8 +111,8 @@ class RunRowTable:
         )
         self.used = np.zeros(len(names), dtype=np.int64)
         np.maximum.at(self.used, codes, self._k)
-        bad = set(statuses.loc[statuses["status"].isin(FAILED_STATUSES), "run"])
-        self.failed = self.keys["run"].isin(bad).to_numpy(dtype=bool)
+        failed_runs = set(statuses.loc[statuses["status"].isin(FAILED_STATUSES), "run"])
+        self.failed = self.keys["run"].isin(failed_runs).to_numpy(dtype=bool)
 
     def build_matrix(self, name: str) -> Array:
         """Arrange a column as a matrix of runs and numbers of simulations.
@@ -121,9 +121,9 @@ class RunRowTable:
             (R, budget + 1) values; NaN after the end of a run.
         """
         values = np.full((len(self.keys), self._budget + 1), np.nan)
-        within = self._k <= self._budget
+        is_within_budget = self._k <= self._budget
         column = self._runs[name].to_numpy(dtype=np.float64)
-        values[self._codes[within], self._k[within]] = column[within]
+        values[self._codes[is_within_budget], self._k[is_within_budget]] = column[is_within_budget]
         return values
 
     def build_curves(self, metric: str) -> RunCurves:

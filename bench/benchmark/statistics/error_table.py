@@ -68,22 +68,24 @@ def build_error_table(
     points = select_checkpoints(budget)
     rows = RunRowTable(runs, statuses, budget)
     timed = ("tuner_seconds", "simulator_seconds")
-    spent = [rows.build_cumulative_seconds(name) if name in runs else None for name in timed]
+    spent_seconds = [
+        rows.build_cumulative_seconds(name) if name in runs else None for name in timed
+    ]
     curves = {m: rows.build_curves(m) for m in ERROR_METRICS if m in runs and runs[m].notna().any()}
     lines = []
     for (experiment, tuner, kind), part in rows.keys.groupby(
         ["experiment", "tuner", "range"], sort=False
     ):
-        mine = part.index.to_numpy()
+        tuner_rows = part.index.to_numpy()
         fit = (trainings or {}).get(str(tuner), (0.0, 0.0))
         seconds = [
-            np.full(len(points), np.nan) if s is None else s[mine][:, points].mean(axis=0)
-            for s in spent
+            np.full(len(points), np.nan) if s is None else s[tuner_rows][:, points].mean(axis=0)
+            for s in spent_seconds
         ]
-        counts = len(mine), int(rows.failed[mine].sum())
+        counts = len(tuner_rows), int(rows.failed[tuner_rows].sum())
         for metric, curve in curves.items():
             values = _summarise_over_targets(
-                curve, mine, points, (str(tuner), str(kind), metric), resamples
+                curve, tuner_rows, points, (str(tuner), str(kind), metric), resamples
             )
             for i, k in enumerate(points):
                 errors, times = values[:, i], (seconds[0][i], seconds[1][i])
@@ -92,25 +94,25 @@ def build_error_table(
     # A tuner that could not be used has a row too, so that the table names every tuner.
     skipped = statuses[statuses["status"] == "skipped"]
     name = runs["experiment"].iloc[0] if len(runs) else ""
-    nothing = (0, "", *[np.nan] * 4, 0, 1, 0.0, 0.0, np.nan, np.nan)
-    lines += [(name, tuner, "", *nothing) for tuner in skipped["tuner"]]
+    empty_cells = (0, "", *[np.nan] * 4, 0, 1, 0.0, 0.0, np.nan, np.nan)
+    lines += [(name, tuner, "", *empty_cells) for tuner in skipped["tuner"]]
     return pd.DataFrame(lines, columns=ERROR_TABLE_COLUMNS)
 
 
 def _summarise_over_targets(
     curves: RunCurves,
-    mine: NDArray[np.int64],
+    rows: NDArray[np.int64],
     points: list[int],
     names: tuple[str, str, str],
     resamples: int,
 ) -> Array:
-    """Compute median, mean, low and high over targets of the runs in rows `mine`.
+    """Compute median, mean, low and high over targets of the runs in `rows`.
 
     Returns:
         (4, len(points)) values.
     """
-    _, groups = curves.select_mask(np.isin(np.arange(len(curves.used)), mine)).group_by_target()
-    values = average_over_seeds(curves.values[mine][:, points], groups)
+    _, groups = curves.select_mask(np.isin(np.arange(len(curves.used)), rows)).group_by_target()
+    values = average_over_seeds(curves.values[rows][:, points], groups)
     low, high = compute_bootstrap_interval(
         values, compute_resampled_means, *names, resamples=resamples
     )

@@ -62,11 +62,11 @@ def compute_hitting_times(curves: RunCurves, threshold: float) -> Array:
         (R,) numbers of simulations; infinite for runs that do not reach the threshold.
     """
     # The comparison is negated, so that NaN counts as above the threshold.
-    beyond = ~(curves.values <= threshold)
-    steps = beyond.shape[1]
+    is_above = ~(curves.values <= threshold)
+    steps = is_above.shape[1]
     # The first index after the last value above the threshold.
-    last = steps - np.argmax(beyond[:, ::-1], axis=1)
-    last = np.where(beyond.any(axis=1), last, 0)
+    last = steps - np.argmax(is_above[:, ::-1], axis=1)
+    last = np.where(is_above.any(axis=1), last, 0)
     return np.where((last >= steps) | curves.failed, np.inf, last.astype(np.float64))
 
 
@@ -103,21 +103,21 @@ class ThresholdEffort:
 
 
 def _divide_by_successes(
-    spent: Array, successes: NDArray[np.int64], picked: NDArray[np.int64] | None
+    efforts: Array, successes: NDArray[np.int64], resample: NDArray[np.int64] | None
 ) -> Array:
     """Divide the total effort by the number of successes; infinite without a success.
 
     Args:
-        spent: (targets,) effort of all runs of each target, in simulations or seconds.
+        efforts: (targets,) effort of all runs of each target, in simulations or seconds.
         successes: (targets,) number of runs of each target that reached the threshold.
-        picked: (..., n) indices of the used targets, such as bootstrap resamples; None for all.
+        resample: (..., n) indices of the used targets, such as bootstrap resamples; None for all.
 
     Returns:
         (...) effort per success.
     """
-    if picked is not None:
-        spent, successes = spent[picked], successes[picked]
-    total, count = spent.sum(axis=-1), successes.sum(axis=-1)
+    if resample is not None:
+        efforts, successes = efforts[resample], successes[resample]
+    total, count = efforts.sum(axis=-1), successes.sum(axis=-1)
     result: Array = np.where(count > 0, total / np.maximum(count, 1), np.inf)
     return result
 
@@ -136,18 +136,18 @@ def compute_effort(
     times = compute_hitting_times(curves, threshold)
     success = np.isfinite(times)
     unsuccessful = np.where(curves.failed, budget, curves.used)
-    spent = np.where(success, times, unsuccessful)
-    seconds = np.zeros(len(spent))
+    simulations = np.where(success, times, unsuccessful)
+    seconds = np.zeros(len(simulations))
     if tuner_seconds is not None:
         # A run that exceeded the budget counts with its seconds at the budget.
-        column = np.minimum(spent, tuner_seconds.shape[1] - 1).astype(np.int64)
-        seconds = tuner_seconds[np.arange(len(spent)), column]
+        column = np.minimum(simulations, tuner_seconds.shape[1] - 1).astype(np.int64)
+        seconds = tuner_seconds[np.arange(len(simulations)), column]
     _, groups = curves.group_by_target()
     return ThresholdEffort(
-        np.array([spent[rows].sum() for rows in groups]),
+        np.array([simulations[rows].sum() for rows in groups]),
         np.array([seconds[rows].sum() for rows in groups]),
         np.array([success[rows].sum() for rows in groups]),
-        len(spent),
+        len(simulations),
     )
 
 
@@ -204,16 +204,25 @@ def build_ert_table(curves: RunCurves, levels: tuple[float, ...], budget: int) -
     for (experiment, kind), _ in curves.keys.groupby(["experiment", "range"], sort=False):
         part = curves.select(experiment=str(experiment), range=str(kind))
         for tuner in part.list_tuners():
-            mine = part.select(tuner=tuner)
+            tuner_curves = part.select(tuner=tuner)
             for level in levels:
-                spent = compute_effort(mine, level, budget)
+                effort = compute_effort(tuner_curves, level, budget)
                 # All tuners use the same draws, so that differences between targets cancel in
                 # comparisons.
-                picked = draw_target_resamples(len(spent.successes), str(experiment), str(kind))
-                low, high = compute_percentile_interval(spent.compute_ert(picked))
-                counts = int(spent.successes.sum()), spent.runs, int(mine.failed.sum())
+                resamples = draw_target_resamples(len(effort.successes), str(experiment), str(kind))
+                low, high = compute_percentile_interval(effort.compute_ert(resamples))
+                counts = int(effort.successes.sum()), effort.runs, int(tuner_curves.failed.sum())
                 lines.append(
-                    (experiment, kind, tuner, level, float(spent.compute_ert()), low, high, *counts)
+                    (
+                        experiment,
+                        kind,
+                        tuner,
+                        level,
+                        float(effort.compute_ert()),
+                        low,
+                        high,
+                        *counts,
+                    )
                 )
     return pd.DataFrame(lines, columns=ERT_COLUMNS)
 
@@ -251,8 +260,8 @@ def build_runtime_table(curves: RunCurves, spread: Array) -> pd.DataFrame:
         Table with the columns `RUNTIME_SHARE_COLUMNS`.
     """
     budget = curves.values.shape[1] - 1
-    between = np.geomspace(1, budget, _RUNTIME_POINT_COUNT).astype(int)
-    points = np.unique(np.concatenate([[0], between, select_checkpoints(budget)]))
+    log_points = np.geomspace(1, budget, _RUNTIME_POINT_COUNT).astype(int)
+    points = np.unique(np.concatenate([[0], log_points, select_checkpoints(budget)]))
     parts = []
     for kind in dict.fromkeys(curves.keys["range"]):
         part = curves.select(range=str(kind))

@@ -42,12 +42,12 @@ def build_identifiability_table(
             target,
             target.split("-")[0],
             i + 1,
-            found.values[i],
-            found.sigmas[i],
-            found.is_stiff[i],
-            *found.vectors[:, i],
+            spectrum.values[i],
+            spectrum.sigmas[i],
+            spectrum.is_stiff[i],
+            *spectrum.vectors[:, i],
         ]
-        for target, found in spectra.items()
-        for i in range(len(found.values))
+        for target, spectrum in spectra.items()
+        for i in range(len(spectrum.values))
     ]
     return pd.DataFrame(lines, columns=[*IDENTIFIABILITY_COLUMNS, *(p.name for p in parameters)])

@@ -52,8 +52,8 @@ _DISTANCE_CHECKPOINTS = (3, 10)
 
 def select_curve_points(budget: int) -> list[int]:
     """Return the numbers of simulations of a curve's points, including those of the tables."""
-    between = np.unique(np.geomspace(1, budget, _CURVE_POINT_COUNT).astype(int))
-    return sorted({*select_checkpoints(budget), *between.tolist()})
+    log_points = np.unique(np.geomspace(1, budget, _CURVE_POINT_COUNT).astype(int))
+    return sorted({*select_checkpoints(budget), *log_points.tolist()})
 
 
 def select_distance_checkpoints(budget: int) -> list[int]:
@@ -114,25 +114,31 @@ def coinciding(drawn: Mapping[str, Sequence[pd.Series[float]]]) -> dict[str, str
     names = list(drawn)
     for place, name in enumerate(names):
         longest = 0
-        for above in names[place + 1 :]:
-            if len(drawn[above]) != len(drawn[name]):
+        for upper_name in names[place + 1 :]:
+            if len(drawn[upper_name]) != len(drawn[name]):
                 continue
-            pairs = list(zip(drawn[name], drawn[above], strict=True))
-            upto = min(_count_equal_simulations(mine, other) for mine, other in pairs)
-            moved = any((mine.loc[:upto] < 0.5 * mine.iloc[0]).any() for mine, _ in pairs)
-            if upto > longest and moved:
+            pairs = list(zip(drawn[name], drawn[upper_name], strict=True))
+            upto = min(
+                _count_equal_simulations(hidden_curve, upper_curve)
+                for hidden_curve, upper_curve in pairs
+            )
+            has_progress = any(
+                (hidden_curve.loc[:upto] < 0.5 * hidden_curve.iloc[0]).any()
+                for hidden_curve, _ in pairs
+            )
+            if upto > longest and has_progress:
                 longest = upto
-                whole = all(upto == mine.index[-1] for mine, _ in pairs)
-                notes[name] = f"same as {above}" + ("" if whole else f" up to {upto}")
+                is_complete = all(upto == hidden_curve.index[-1] for hidden_curve, _ in pairs)
+                notes[name] = f"same as {upper_name}" + ("" if is_complete else f" up to {upto}")
     return notes
 
 
-def _count_equal_simulations(mine: pd.Series[float], other: pd.Series[float]) -> int:
+def _count_equal_simulations(first: pd.Series[float], second: pd.Series[float]) -> int:
     """Return the largest number of simulations up to which two curves look the same; 0 for none."""
-    points = mine.index.intersection(other.index)
-    a, b = mine[points].to_numpy(), other[points].to_numpy()
-    same = np.logical_and.accumulate(np.abs(a - b) <= _SAME * np.maximum(a, b))
-    return int(points[same][-1]) if same.any() else 0
+    points = first.index.intersection(second.index)
+    a, b = first[points].to_numpy(), second[points].to_numpy()
+    is_equal = np.logical_and.accumulate(np.abs(a - b) <= _SAME * np.maximum(a, b))
+    return int(points[is_equal][-1]) if is_equal.any() else 0
 
 
 def compute_medians_by_distance(
@@ -164,13 +170,13 @@ def compute_medians_by_distance(
             for b, names in groups.items():
                 part = values.reindex(names).dropna().to_numpy()
                 if len(part):
-                    ends = float(distances[names].min()), float(distances[names].max())
+                    distance_limits = float(distances[names].min()), float(distances[names].max())
                     lines.append(
                         (
                             k,
                             tuner,
                             b,
-                            *ends,
+                            *distance_limits,
                             len(names),
                             *_compute_median_with_interval(part, tuner, b),
                         )
@@ -184,11 +190,11 @@ def _get_values(frame: pd.DataFrame) -> Array:
 
 def _group_by_distance(distances: pd.Series[float]) -> dict[int, list[str]]:
     """Return the target names of each group: 0 inside the training range, then by distance."""
-    inside = list(distances.index[distances <= 0])
+    names_inside = list(distances.index[distances <= 0])
     outside = list(distances[distances > 0].sort_values(kind="stable").index)
     count = min(max(len(outside) // _GROUP, 1), _MOST_GROUPS)
     parts = [list(part) for part in np.array_split(np.array(outside, dtype=object), count)]
-    return {b: names for b, names in enumerate([inside, *parts]) if names}
+    return {b: names for b, names in enumerate([names_inside, *parts]) if names}
 
 
 def _compute_median_with_interval(
@@ -212,7 +218,7 @@ def format_bin_labels(table: pd.DataFrame) -> list[str]:
         if row is None:
             names.append("inside\nn=0")
             continue
-        ends = [f"{row[end]:.2f}" for end in ("beyond", "to")]
-        name = "–".join(dict.fromkeys(ends)) if b else "inside"
+        limits = [f"{row[end]:.2f}" for end in ("beyond", "to")]
+        name = "–".join(dict.fromkeys(limits)) if b else "inside"
         names.append(f"{name}\nn={row['targets']}")
     return names

@@ -54,9 +54,9 @@ def build_log_error_table(curves: RunCurves, k: int = -1, floor: float = MIN_ERR
     """
     columns = {}
     for tuner in curves.list_tuners():
-        mine = curves.select(tuner=tuner)
-        names, groups = mine.group_by_target()
-        errors = average_over_seeds(mine.after(k), groups)
+        tuner_curves = curves.select(tuner=tuner)
+        names, groups = tuner_curves.group_by_target()
+        errors = average_over_seeds(tuner_curves.after(k), groups)
         columns[tuner] = pd.Series(compute_log_errors(errors, floor), index=names)
     return pd.DataFrame(columns)
 
@@ -146,14 +146,14 @@ def compare_pair(a: Array, b: Array) -> PairedTest:
     """
     from scipy.stats import rankdata, wilcoxon
 
-    there = ~(np.isnan(a) | np.isnan(b))
-    difference = a[there] - b[there]
+    is_paired = ~(np.isnan(a) | np.isnan(b))
+    difference = a[is_paired] - b[is_paired]
     wins = (difference < 0) + 0.5 * (difference == 0)
-    better = float(wins.mean()) if len(difference) else np.nan
+    win_share = float(wins.mean()) if len(difference) else np.nan
     # Wilcoxon's test drops ties.
     unequal = difference[difference != 0]
     if not len(unequal):
-        return PairedTest(len(difference), better, 0.0, 1.0, 1.0)
+        return PairedTest(len(difference), win_share, 0.0, 1.0, 1.0)
     ranks = rankdata(np.abs(unequal))
     # Kerby's simple difference: the share of ranks in favour minus the share against.
     effect = float((ranks[unequal < 0].sum() - ranks[unequal > 0].sum()) / ranks.sum())
@@ -163,7 +163,7 @@ def compare_pair(a: Array, b: Array) -> PairedTest:
         p = float(wilcoxon(unequal).pvalue)
     # The ratio of a failed run and a successful one would overflow.
     ratio = float(np.exp(np.clip(np.median(difference), -700, 700)))
-    return PairedTest(len(difference), better, effect, ratio, p)
+    return PairedTest(len(difference), win_share, effect, ratio, p)
 
 
 def compute_problem_ranks(curves: RunCurves, floor: float = MIN_ERROR) -> pd.DataFrame:

@@ -50,8 +50,8 @@ def compute_mean_ranks(errors: Array) -> Array:
 
     Rank 1 is best. A tuner whose error is NaN or infinite has the last rank on that target.
     """
-    means: Array = _rank_within_targets(errors).mean(axis=0)
-    return means
+    mean_ranks: Array = _rank_within_targets(errors).mean(axis=0)
+    return mean_ranks
 
 
 def _rank_within_targets(errors: Array) -> Array:
@@ -95,8 +95,8 @@ def compute_rank_agreement(first: Array, second: Array, *names: str) -> RankAgre
     )  # (2, targets, tuners)
     count = ranks.shape[1]
     observed = compute_kendall_tau(*ranks.mean(axis=1))
-    drawn = rng.integers(count, size=(BOOTSTRAP_RESAMPLES, count))
-    boot = [compute_kendall_tau(*ranks[:, rows].mean(axis=1)) for rows in drawn]
+    resamples = rng.integers(count, size=(BOOTSTRAP_RESAMPLES, count))
+    boot = [compute_kendall_tau(*ranks[:, rows].mean(axis=1)) for rows in resamples]
     low, high = np.nanquantile(boot, [0.025, 0.975]) if count > 1 else (np.nan, np.nan)
     # Targets that are drawn twice make ranks noisier, and noise moves tau towards 0.
     low, high = min(low, observed), max(high, observed)
@@ -127,13 +127,15 @@ def _compute_mean_split_half_tau(ranks: Array, rng: np.random.Generator) -> floa
     It says how well a ranking of tuners repeats on other targets: 1 is the same order, 0 a random
     one. `ranks` (targets, tuners) are the ranks on each target. NaN with fewer than two targets.
     """
-    half = len(ranks) // 2
-    if not half:
+    half_count = len(ranks) // 2
+    if not half_count:
         return float("nan")
     taus = []
     for _ in range(HALF_SPLIT_COUNT):
         order = rng.permutation(len(ranks))
         taus.append(
-            compute_kendall_tau(ranks[order[:half]].mean(axis=0), ranks[order[half:]].mean(axis=0))
+            compute_kendall_tau(
+                ranks[order[:half_count]].mean(axis=0), ranks[order[half_count:]].mean(axis=0)
+            )
         )
     return float(np.nanmean(taus))

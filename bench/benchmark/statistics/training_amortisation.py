@@ -110,9 +110,9 @@ def compute_tuning_costs(
     result = {}
     for tuner in curves.list_tuners():
         mask = (curves.keys["tuner"] == tuner).to_numpy(dtype=bool)
-        spent = compute_effort(curves.select_mask(mask), threshold, budget, tuner_seconds[mask])
+        effort = compute_effort(curves.select_mask(mask), threshold, budget, tuner_seconds[mask])
         each = float(simulator_seconds[mask][:, -1].sum() / max(curves.used[mask].sum(), 1))
-        result[tuner] = TuningCost(spent, *fits.get(tuner, (0.0, 0.0)), each)
+        result[tuner] = TuningCost(effort, *fits.get(tuner, (0.0, 0.0)), each)
     return result
 
 
@@ -157,20 +157,33 @@ def build_break_even_table(
         One row per pair with 95 % bootstrap intervals over targets, columns `BREAK_EVEN_COLUMNS`.
     """
     lines = []
-    for name, learned in held.items():
-        for other, search in held.items():
+    for name, learned_cost in held.items():
+        for search_name, search in held.items():
             # Only a trained tuner has a training cost, and it is compared with untrained tuners
             # alone.
-            if not learned.fit_simulations or search.fit_simulations:
+            if not learned_cost.fit_simulations or search.fit_simulations:
                 continue
-            picked = draw_target_resamples(len(learned.effort.successes), experiment, kind)
+            resamples = draw_target_resamples(len(learned_cost.effort.successes), experiment, kind)
             low, high = compute_percentile_interval(
-                compute_break_even_targets(learned, search, picked)
+                compute_break_even_targets(learned_cost, search, resamples)
             )
-            costs = learned.fit_simulations, learned.fit_seconds
-            erts = float(learned.effort.compute_ert()), float(search.effort.compute_ert())
-            even = float(compute_break_even_targets(learned, search))
-            lines.append((experiment, kind, threshold, name, other, *costs, *erts, even, low, high))
+            costs = learned_cost.fit_simulations, learned_cost.fit_seconds
+            erts = float(learned_cost.effort.compute_ert()), float(search.effort.compute_ert())
+            break_even = float(compute_break_even_targets(learned_cost, search))
+            lines.append(
+                (
+                    experiment,
+                    kind,
+                    threshold,
+                    name,
+                    search_name,
+                    *costs,
+                    *erts,
+                    break_even,
+                    low,
+                    high,
+                )
+            )
     return pd.DataFrame(lines, columns=BREAK_EVEN_COLUMNS)
 
 
@@ -198,11 +211,11 @@ def find_cheapest_tuners(
     edges = [0, *changes.tolist(), len(SIMULATION_COST_GRID)]
     return [
         (
-            float(SIMULATION_COST_GRID[begin]),
-            float(SIMULATION_COST_GRID[end - 1]),
-            names[best[begin]],
+            float(SIMULATION_COST_GRID[first]),
+            float(SIMULATION_COST_GRID[last - 1]),
+            names[best[first]],
         )
-        for begin, end in itertools.pairwise(edges)
+        for first, last in itertools.pairwise(edges)
     ]
 
 
@@ -234,10 +247,10 @@ def build_time_per_target_table(prices: Mapping[str, Mapping[str, TuningCost]]) 
 
 def placed_even(table: pd.DataFrame) -> pd.DataFrame:
     """Map counts of `build_break_even_table` to a logarithmic axis from `AT_ONCE` to `NEVER`."""
-    placed = table.copy()
+    mapped_table = table.copy()
     for column in ("targets", "low", "high"):
         values = table[column].to_numpy(dtype=np.float64)
         # Counts below one become one; counts beyond the axis are put at its end.
-        within = np.where(values < 1e4, np.maximum(values, 1.0), NEVER)
-        placed[column] = np.where(values == 0, AT_ONCE, within)
-    return placed
+        clipped_values = np.where(values < 1e4, np.maximum(values, 1.0), NEVER)
+        mapped_table[column] = np.where(values == 0, AT_ONCE, clipped_values)
+    return mapped_table

@@ -137,16 +137,16 @@ def _compute_rankings(curves: RunCurves, budget: int, floor: float) -> dict[int,
     """
     failed = {t: bool(curves.select(tuner=t).failed.all()) for t in curves.list_tuners()}
     rankings: dict[int, _Ranking] = {}
-    earlier: list[pd.Series[float]] = []
+    earlier_ranks: list[pd.Series[float]] = []
     for k in ranked_after(budget):
         logs = build_log_error_table(curves, k, floor)
         # Rounding gives errors that differ by the last bits the same rank.
-        medians, means = logs.median().round(9), logs.mean().round(9)
+        medians, mean_logs = logs.median().round(9), logs.mean().round(9)
         ranks = medians.rank(method="min")
-        keys = [pd.Series(failed), medians, means, *reversed(earlier)]
+        keys = [pd.Series(failed), medians, mean_logs, *reversed(earlier_ranks)]
         order = sorted(logs.columns, key=lambda t: [float(key[t]) for key in keys])
         rankings[k] = _Ranking(logs, ranks, order)
-        earlier.append(ranks)
+        earlier_ranks.append(ranks)
     return rankings
 
 
@@ -161,17 +161,21 @@ def _build_verdict_rows(
     """
     logs, ranks, order = ranking
     runs = {t: curves.select(tuner=t).failed for t in order}
-    delivered = [t for t in order if not runs[t].all()]
-    best = delivered[0] if delivered else order[0]
+    successful_tuners = [t for t in order if not runs[t].all()]
+    best = successful_tuners[0] if successful_tuners else order[0]
     tests = {t: compare_pair(logs[t].to_numpy(), logs[best].to_numpy()) for t in order}
-    others = [t for t in delivered if t != best]
+    other_tuners = [t for t in successful_tuners if t != best]
     corrected = dict(
-        zip(others, correct_holm(np.array([tests[t].p_value for t in others])), strict=True)
+        zip(
+            other_tuners,
+            correct_holm(np.array([tests[t].p_value for t in other_tuners])),
+            strict=True,
+        )
     )
     lines = []
     for tuner in order:
         test, p_holm = tests[tuner], corrected.get(tuner, np.nan)
-        if tuner not in delivered:
+        if tuner not in successful_tuners:
             verdict = FAILED
         elif tuner == best:
             verdict = BEST
@@ -179,19 +183,19 @@ def _build_verdict_rows(
             verdict = WORSE
         else:
             verdict = EQUAL if ranks[tuner] == ranks[best] else UNDECIDED
-        worse = int((logs[tuner] > logs[best]).sum())
-        median, least = _compute_median_error(logs[tuner]), _compute_median_error(logs[best])
-        p_value = test.p_value if tuner in others else np.nan
-        against = (
+        worse_count = int((logs[tuner] > logs[best]).sum())
+        median, best_median = _compute_median_error(logs[tuner]), _compute_median_error(logs[best])
+        p_value = test.p_value if tuner in other_tuners else np.nan
+        test_cells = (
             median,
-            median / least if np.isfinite(least) else np.nan,
-            worse,
+            median / best_median if np.isfinite(best_median) else np.nan,
+            worse_count,
             test.targets,
             p_value,
             p_holm,
         )
         counts = len(runs[tuner]), int(runs[tuner].sum())
-        lines.append((*key, int(ranks[tuner]), tuner, verdict, *against, *counts))
+        lines.append((*key, int(ranks[tuner]), tuner, verdict, *test_cells, *counts))
     return pd.DataFrame(lines, columns=RANKING_COLUMNS)
 
 
@@ -211,7 +215,9 @@ def failure_notes(failed: Mapping[str, tuple[int, int]]) -> dict[str, str]:
         Note by tuner with failed runs.
     """
     return {
-        tuner: "all runs failed" if bad == runs else f"{bad} of {runs} runs failed"
-        for tuner, (bad, runs) in failed.items()
-        if bad
+        tuner: "all runs failed"
+        if failure_count == runs
+        else f"{failure_count} of {runs} runs failed"
+        for tuner, (failure_count, runs) in failed.items()
+        if failure_count
     }

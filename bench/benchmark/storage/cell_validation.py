@@ -58,8 +58,8 @@ def select_declared_columns(
             raise CellError(None, f"column {format_value(name)}", "it once", times)
     for column in columns:
         if column.required and column.name not in names:
-            there = format_value(", ".join(names))
-            raise CellError(row, "columns", f"one named {column.name}", there)
+            column_list = format_value(", ".join(names))
+            raise CellError(row, "columns", f"one named {column.name}", column_list)
     return [column for column in columns if column.name in names]
 
 
@@ -86,13 +86,13 @@ def parse_parquet_column(column: ColumnSpec, values: pa.Array) -> pa.Array:
         values = values.cast(kind.value_type)
         kind = values.type
     text = pa.types.is_string(kind) or pa.types.is_large_string(kind)
-    fits: Mapping[type, bool] = {
+    is_convertible: Mapping[type, bool] = {
         str: text,
         int: pa.types.is_integer(kind),
         float: pa.types.is_floating(kind) or pa.types.is_integer(kind),
         bool: pa.types.is_boolean(kind),
     }
-    if not fits[column.kind]:
+    if not is_convertible[column.kind]:
         raise CellError(None, column.name, column.expected_text, f"a column of type {kind}")
     if values.null_count:
         if column.kind is not float:
@@ -121,9 +121,11 @@ def parse_csv_column(column: ColumnSpec, values: pa.Array) -> pa.Array:
 
     if column.kind is str:
         return values
-    sound = compute.match_substring_regex(values, f"^({_TEXTS[column.kind]})$")
+    is_valid = compute.match_substring_regex(values, f"^({_TEXTS[column.kind]})$")
     _raise_for_bad_row(
-        column, to_numpy_mask(compute.invert(sound)), lambda row: format_value(values[row].as_py())
+        column,
+        to_numpy_mask(compute.invert(is_valid)),
+        lambda row: format_value(values[row].as_py()),
     )
     if column.kind is float:
         # An empty cell means NaN.
@@ -146,11 +148,11 @@ def parse_json_column(column: ColumnSpec, values: Sequence[Any]) -> pa.Array:
     kinds = (int, float) if column.kind is float else (column.kind,)
     for row, value in enumerate(values):
         none = value is None and column.kind is float  # JSON has no NaN.
-        mistaken = isinstance(value, bool) and column.kind is not bool
-        if not none and (mistaken or not isinstance(value, kinds) or _exceeds_int64(value)):
+        is_wrong_bool = isinstance(value, bool) and column.kind is not bool
+        if not none and (is_wrong_bool or not isinstance(value, kinds) or _exceeds_int64(value)):
             raise CellError(row, column.name, column.expected_text, format_value(value))
-    given = [np.nan if v is None else v for v in values]
-    return pa.array(given, type=_get_arrow_type(column))
+    numbers = [np.nan if v is None else v for v in values]
+    return pa.array(numbers, type=_get_arrow_type(column))
 
 
 def _exceeds_int64(value: Any) -> bool:
@@ -198,16 +200,16 @@ def check_cells(
     if not column.infinite:
         outside |= np.isinf(numbers)
     _raise_for_bad_row(column, outside, said)
-    wanted = {
+    is_empty_required = {
         EmptyCellRule.NEVER: np.zeros(len(numbers), dtype=bool),
         EmptyCellRule.MAY: empty,
         EmptyCellRule.AT_START: at_start,
         EmptyCellRule.NO_TRUTH: no_truth,
     }[column.empty]
-    if wanted is None:
+    if is_empty_required is None:
         return
-    _raise_for_bad_row(column, empty & ~wanted, said)
-    _raise_for_bad_row(column, wanted & ~empty, said, f"nothing {column.empty.value}")
+    _raise_for_bad_row(column, empty & ~is_empty_required, said)
+    _raise_for_bad_row(column, is_empty_required & ~empty, said, f"nothing {column.empty.value}")
 
 
 def _check_texts(column: ColumnSpec, values: pa.Array) -> None:
@@ -219,13 +221,13 @@ def _check_texts(column: ColumnSpec, values: pa.Array) -> None:
     from pyarrow import compute
 
     if column.words:
-        known = compute.is_in(values, value_set=pa.array(column.words, type=values.type))
-        bad = compute.invert(known)
+        is_allowed = compute.is_in(values, value_set=pa.array(column.words, type=values.type))
+        is_bad = compute.invert(is_allowed)
     elif column.empty is EmptyCellRule.NEVER:
-        bad = compute.equal(values, "")
+        is_bad = compute.equal(values, "")
     else:
         return
-    _raise_for_bad_row(column, to_numpy_mask(bad), lambda row: format_value(values[row].as_py()))
+    _raise_for_bad_row(column, to_numpy_mask(is_bad), lambda row: format_value(values[row].as_py()))
 
 
 def to_numpy_mask(values: pa.Array) -> Mask:
@@ -235,9 +237,9 @@ def to_numpy_mask(values: pa.Array) -> Mask:
 
 
 def _raise_for_bad_row(
-    column: ColumnSpec, bad: Mask, said: Callable[[int], str], wanted: str = ""
+    column: ColumnSpec, is_bad: Mask, describe_row: Callable[[int], str], expected: str = ""
 ) -> None:
     """Raise an error for the first bad row."""
-    if bad.any():
-        row = int(bad.argmax())
-        raise CellError(row, column.name, wanted or column.expected_text, said(row))
+    if is_bad.any():
+        row = int(is_bad.argmax())
+        raise CellError(row, column.name, expected or column.expected_text, describe_row(row))

@@ -47,8 +47,8 @@ class CsvTable:
         self._header = self._split_record(next(self._iterate_records(), (1, ""))[1])
         declared = columns(self._header) if callable(columns) else columns
         try:
-            there = select_declared_columns(self._header, declared)
-            self.table = self._convert_columns(there)
+            present_columns = select_declared_columns(self._header, declared)
+            self.table = self._convert_columns(present_columns)
         except CellError as error:
             raise self.make_error(error.row, error.says) from None
 
@@ -68,30 +68,30 @@ class CsvTable:
         Raises:
             InputError: the file is missing, empty or not UTF-8.
         """
-        wrong = f"{self._path}: not a complete comparison"
+        problem = f"{self._path}: not a complete comparison"
         try:
             data = self._path.read_bytes()
         except OSError as error:
-            raise InputError(f"{wrong}: {error.strerror}; {self._remedy}") from None
+            raise InputError(f"{problem}: {error.strerror}; {self._remedy}") from None
         if not data.strip():
-            raise InputError(f"{wrong}: expected a CSV file, found an empty one; {self._remedy}")
+            raise InputError(f"{problem}: expected a CSV file, found an empty one; {self._remedy}")
         try:
             return data.decode("utf-8-sig")
         except UnicodeDecodeError as error:
             line = data[: error.start].count(b"\n") + 1
-            says = f"expected UTF-8 text, found byte {data[error.start]:#04x}"
-            raise InputError(f"{self._path}, line {line}: {says}; {self._remedy}") from None
+            reason = f"expected UTF-8 text, found byte {data[error.start]:#04x}"
+            raise InputError(f"{self._path}, line {line}: {reason}; {self._remedy}") from None
 
-    def _convert_columns(self, there: Columns) -> pa.Table:
+    def _convert_columns(self, columns: Columns) -> pa.Table:
         """Convert the cells of the declared columns from text to their types, and check them.
 
-        `there` are the declared columns that the file has.
+        `columns` are the declared columns that the file has.
         """
         import pyarrow as pa
 
         texts = self._read_cells()
         typed = {}
-        for column in there:
+        for column in columns:
             values = parse_csv_column(column, texts[column.name].combine_chunks())
             check_cells(column, values)
             typed[column.name] = values
@@ -123,8 +123,8 @@ class CsvTable:
         for number, record in self._iterate_records():
             cells = len(self._split_record(record))
             if cells != len(self._header):
-                says = f"expected {len(self._header)} cells, found {cells}"
-                raise InputError(f"{self._path}, line {number}: {says}; {self._remedy}")
+                reason = f"expected {len(self._header)} cells, found {cells}"
+                raise InputError(f"{self._path}, line {number}: {reason}; {self._remedy}")
 
     def _split_record(self, record: str) -> list[str]:
         """Split one CSV record into its cells.
@@ -140,17 +140,17 @@ class CsvTable:
 
     def _iterate_records(self) -> Iterator[tuple[int, str]]:
         """Yield every record with its first line number; quoted text may span several lines."""
-        first, inside = 1, False
+        first, is_in_quotes = 1, False
         parts: list[str] = []
         for number, line in enumerate(self._text.split("\n"), start=1):
-            if not inside:
+            if not is_in_quotes:
                 first, parts = number, []
             parts.append(line)
             # A quote within quotes is written twice.
-            inside ^= line.count('"') % 2 == 1
-            if not inside and "".join(parts).strip():
+            is_in_quotes ^= line.count('"') % 2 == 1
+            if not is_in_quotes and "".join(parts).strip():
                 yield first, "\n".join(parts).removesuffix("\r")
-        if inside:
+        if is_in_quotes:
             yield first, "\n".join(parts)
 
     def _get_line_number(self, row: int) -> int:

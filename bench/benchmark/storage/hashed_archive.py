@@ -73,11 +73,11 @@ def write_archive(
     """
     if archive.exists():
         raise InputError(f"{archive}: exists already; name another file with --out")
-    listed = [
+    file_entries = [
         {"path": path, "bytes": place.stat().st_size, "sha256": compute_sha256(place)}
         for path, place in sorted(files.items())
     ]
-    manifest = json.dumps({**about, "files": listed}, indent=1, ensure_ascii=False) + "\n"
+    manifest = json.dumps({**about, "files": file_entries}, indent=1, ensure_ascii=False) + "\n"
     try:
         archive.parent.mkdir(parents=True, exist_ok=True)
         with atomic_replacement(archive) as partial, zipfile.ZipFile(partial, "w") as packed:
@@ -87,10 +87,10 @@ def write_archive(
             for path, place in sorted(files.items()):
                 with (
                     place.open("rb") as source,
-                    packed.open(_make_zip_header(f"{name}/{path}"), "w") as to,
+                    packed.open(_make_zip_header(f"{name}/{path}"), "w") as target,
                 ):
                     while block := source.read(_BLOCK):
-                        to.write(block)
+                        target.write(block)
     except OSError as error:
         raise InputError(f"{archive}: cannot be written ({error.strerror})") from None
 
@@ -133,16 +133,16 @@ def unpack_archive(archive: Path) -> Iterator[UnpackedArchive]:
             entries = _check_entries(archive, packed)
             top = _find_top_folder(archive, entries)
             manifest = _read_manifest(archive, packed, top)
-            found = {}
+            sizes_and_hashes = {}
             for entry in entries:
                 path = Path(place, *PurePosixPath(entry.filename).parts)
                 path.parent.mkdir(parents=True, exist_ok=True)
-                found[entry.filename.removeprefix(f"{top}/")] = _unpack_file(
+                sizes_and_hashes[entry.filename.removeprefix(f"{top}/")] = _unpack_file(
                     archive, packed, entry, path
                 )
-            del found[MANIFEST_FILE]
+            del sizes_and_hashes[MANIFEST_FILE]
             yield UnpackedArchive(
-                Path(place, top), manifest, list(_compare_with_manifest(manifest, found))
+                Path(place, top), manifest, list(_compare_with_manifest(manifest, sizes_and_hashes))
             )
     except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, ValueError) as error:
         raise InputError(f"{archive}: expected an archive of simgap bundle; {error}") from None
@@ -160,12 +160,14 @@ def _check_entries(archive: Path, packed: zipfile.ZipFile) -> list[zipfile.ZipIn
     if len(entries) > _MOST:
         raise _make_refusal(archive, f"{len(entries)} files, at most {_MOST} expected")
     for entry in entries:
-        if wrong := _find_entry_error(entry):
-            raise _make_refusal(archive, f"{entry.filename[:80]!r} {wrong}")
+        if problem := _find_entry_error(entry):
+            raise _make_refusal(archive, f"{entry.filename[:80]!r} {problem}")
     # Two names that a file system treats as equal would overwrite each other's file.
-    twice = [name for name, n in Counter(e.filename.casefold() for e in entries).items() if n > 1]
-    if twice:
-        raise _make_refusal(archive, f"{twice[0]!r} is in it twice")
+    repeated_names = [
+        name for name, n in Counter(e.filename.casefold() for e in entries).items() if n > 1
+    ]
+    if repeated_names:
+        raise _make_refusal(archive, f"{repeated_names[0]!r} is in it twice")
     total, size = sum(entry.file_size for entry in entries), archive.stat().st_size
     if total > MAX_UNPACKED_BYTES or (total > _HARMLESS and total > MAX_COMPRESSION_RATIO * size):
         raise _make_refusal(archive, f"it would unpack from {size} bytes to {total}")
@@ -196,8 +198,8 @@ def _find_entry_error(entry: zipfile.ZipInfo) -> str:
     return ""
 
 
-def _make_refusal(archive: Path, why: str) -> InputError:
-    return InputError(f"{archive}: refused: {why}; nothing was unpacked")
+def _make_refusal(archive: Path, reason: str) -> InputError:
+    return InputError(f"{archive}: refused: {reason}; nothing was unpacked")
 
 
 def _find_top_folder(archive: Path, entries: list[zipfile.ZipInfo]) -> str:
@@ -233,10 +235,10 @@ def _read_manifest(archive: Path, packed: zipfile.ZipFile, top: str) -> dict[str
         manifest = json.loads(packed.read(entry))
     except (ValueError, RecursionError):
         manifest = None
-    if wrong := find_violations(manifest, "manifest"):
-        raise InputError(f"{archive}: {MANIFEST_FILE}: {wrong[0]}")
-    found: dict[str, Any] = manifest
-    return found
+    if violations := find_violations(manifest, "manifest"):
+        raise InputError(f"{archive}: {MANIFEST_FILE}: {violations[0]}")
+    checked: dict[str, Any] = manifest
+    return checked
 
 
 def _unpack_file(
@@ -248,13 +250,13 @@ def _unpack_file(
     archive says and fill the disk.
     """
     digest, size = hashlib.sha256(), 0
-    with packed.open(entry) as source, path.open("wb") as to:
+    with packed.open(entry) as source, path.open("wb") as target:
         for block in _read_blocks(source):
             size += len(block)
             if size > entry.file_size:
                 raise _make_refusal(archive, f"{entry.filename!r} holds more than it says")
             digest.update(block)
-            to.write(block)
+            target.write(block)
     return size, digest.hexdigest()
 
 
@@ -264,20 +266,22 @@ def _read_blocks(source: IO[bytes]) -> Iterator[bytes]:
 
 
 def _compare_with_manifest(
-    manifest: dict[str, Any], found: Mapping[str, tuple[int, str]]
+    manifest: dict[str, Any], unpacked: Mapping[str, tuple[int, str]]
 ) -> Iterator[ArchiveFault]:
     """Yield files that are missing, added, or different from the manifest."""
-    listed = {each["path"]: (each["bytes"], each["sha256"]) for each in manifest["files"]}
-    if len(listed) < len(manifest["files"]):
+    listed_files = {each["path"]: (each["bytes"], each["sha256"]) for each in manifest["files"]}
+    if len(listed_files) < len(manifest["files"]):
         yield ArchiveFault(MANIFEST_FILE, "expected each file once, found one listed twice")
-    for path in sorted({*listed, *found}):
-        if path not in found:
+    for path in sorted({*listed_files, *unpacked}):
+        if path not in unpacked:
             yield ArchiveFault(path, "expected it, as the manifest lists it; found none")
-        elif path not in listed:
+        elif path not in listed_files:
             yield ArchiveFault(
                 path, "expected no file that the manifest does not list; found this one"
             )
-        elif listed[path] != found[path]:
-            (size, digest), (other, its) = listed[path], found[path]
-            what = f"{size} bytes with SHA-256 {digest[:12]}"
-            yield ArchiveFault(path, f"expected {what}, found {other} bytes with {its[:12]}")
+        elif listed_files[path] != unpacked[path]:
+            (size, digest), (found_size, found_digest) = listed_files[path], unpacked[path]
+            expected = f"{size} bytes with SHA-256 {digest[:12]}"
+            yield ArchiveFault(
+                path, f"expected {expected}, found {found_size} bytes with {found_digest[:12]}"
+            )

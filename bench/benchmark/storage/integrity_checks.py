@@ -69,19 +69,21 @@ def check_files(
     status = CsvTable(folder / "status.csv", STATUS_COLUMNS, remedy)
     statuses = status.table.to_pandas()
     check_statuses(statuses, experiment, status.make_error)
-    made = statuses[statuses["status"] != "skipped"]
+    executed = statuses[statuses["status"] != "skipped"]
     if not under_way:
-        check_complete(made, experiment, status.make_error)
-        there = set(statuses["tuner"])
-        gone = [label for label in list_tuner_labels(experiment) if label not in there]
-        if gone:
-            raise status.make_error(None, f"tuner: expected runs of {gone[0]}, found none")
+        check_complete(executed, experiment, status.make_error)
+        labels = set(statuses["tuner"])
+        missing_labels = [label for label in list_tuner_labels(experiment) if label not in labels]
+        if missing_labels:
+            raise status.make_error(
+                None, f"tuner: expected runs of {missing_labels[0]}, found none"
+            )
     if plan is not None:
-        known = made["run"].isin(plan)
+        is_planned = executed["run"].isin(plan)
         raise_for_first_bad_row(
-            ~known,
-            lambda i, says: status.make_error(int(made.index[i]), says),
-            lambda i: f"run: expected one of segments/plan.txt, found {made['run'].iloc[i]}",
+            ~is_planned,
+            lambda i, reason: status.make_error(int(executed.index[i]), reason),
+            lambda i: f"run: expected one of segments/plan.txt, found {executed['run'].iloc[i]}",
         )
     check_runs(runs, file, experiment)
     check_rows_match_statuses(runs, file, statuses, status.make_error, "status.csv")
@@ -135,11 +137,11 @@ def _read_identifiability_table(
     file = CsvTable(path, _list_identifiability_columns, remedy)
     spectra: pd.DataFrame = file.table.to_pandas()
     check_known(spectra["target"], list_target_names(experiment), "target", file.make_error)
-    wanted = spectra.groupby("target").cumcount() + 1
+    expected = spectra.groupby("target").cumcount() + 1
     raise_for_first_bad_row(
-        spectra["direction"] != wanted,
+        spectra["direction"] != expected,
         file.make_error,
-        lambda row: f"direction: expected {wanted[row]}, found {spectra['direction'][row]}",
+        lambda row: f"direction: expected {expected[row]}, found {spectra['direction'][row]}",
     )
     return spectra
 
@@ -171,18 +173,20 @@ def check_statuses(statuses: pd.DataFrame, experiment: Experiment, fault: RowErr
     check_known(statuses["tuner"], list_tuner_labels(experiment), "tuner", fault)
     check_known(statuses["simulator"], [experiment.simulator], "simulator", fault)
     skipped = statuses["status"] == "skipped"
-    begins = statuses["tuner"] + "/" + statuses["target"] + "/" + statuses["seed"].astype(str) + "/"
-    named = [
-        run == tuner if never else run.startswith(begin)
-        for run, tuner, begin, never in zip(
-            statuses["run"], statuses["tuner"], begins, skipped, strict=True
+    id_prefixes = (
+        statuses["tuner"] + "/" + statuses["target"] + "/" + statuses["seed"].astype(str) + "/"
+    )
+    has_valid_id = [
+        run == tuner if is_skipped else run.startswith(prefix)
+        for run, tuner, prefix, is_skipped in zip(
+            statuses["run"], statuses["tuner"], id_prefixes, skipped, strict=True
         )
     ]
     raise_for_first_bad_row(
-        ~np.array(named, dtype=bool),
+        ~np.array(has_valid_id, dtype=bool),
         fault,
         lambda row: (
-            f"run: expected one that begins with {begins.iloc[row]}, "
+            f"run: expected one that begins with {id_prefixes.iloc[row]}, "
             f"found {statuses['run'].iloc[row]}"
         ),
     )
@@ -190,26 +194,26 @@ def check_statuses(statuses: pd.DataFrame, experiment: Experiment, fault: RowErr
         statuses["target"][~skipped],
         list_target_names(experiment),
         "target",
-        lambda row, says: fault(int(np.flatnonzero(~skipped)[row]), says),
+        lambda row, reason: fault(int(np.flatnonzero(~skipped)[row]), reason),
     )
     budgets = {entry.label: entry.budget or experiment.budget for entry in experiment.tuners}
     budget = statuses["tuner"].map(budgets).astype(np.int64)  # Also for an empty column.
-    used = statuses["simulations"]
+    simulations = statuses["simulations"]
     raise_for_first_bad_row(
-        used > budget,
+        simulations > budget,
         fault,
         lambda row: (
             f"simulations: expected at most {budget.iloc[row]}, "
-            f"the budget of {statuses['tuner'].iloc[row]}, found {used.iloc[row]}"
+            f"the budget of {statuses['tuner'].iloc[row]}, found {simulations.iloc[row]}"
         ),
     )
     # "done" means that the budget was used; a run that ends earlier has converged or failed.
     raise_for_first_bad_row(
-        (statuses["status"] == "done") & (used != budget),
+        (statuses["status"] == "done") & (simulations != budget),
         fault,
         lambda row: (
             f"simulations: expected {budget.iloc[row]} of a run that is done, "
-            f"found {used.iloc[row]}"
+            f"found {simulations.iloc[row]}"
         ),
     )
 
@@ -235,29 +239,31 @@ def check_rows_match_statuses(
     row_of = runs["row"].to_numpy()
     names = runs["run"]
 
-    def at(i: int, says: str) -> InputError:
-        return file.make_error(int(row_of[i]), says)
+    def at(i: int, reason: str) -> InputError:
+        return file.make_error(int(row_of[i]), reason)
 
     raise_for_first_bad_row(
         places < 0, at, lambda i: f"run: expected one of {source}, found {names[i]}"
     )
-    made = (statuses["status"] != "skipped").to_numpy()
+    is_executed = (statuses["status"] != "skipped").to_numpy()
     raise_for_first_bad_row(
-        ~made[places], at, lambda i: f"run: {names[i]} is skipped by {source}, and has rows"
+        ~is_executed[places], at, lambda i: f"run: {names[i]} is skipped by {source}, and has rows"
     )
-    held = np.zeros(len(statuses), dtype=bool)
-    held[places] = True
+    has_rows = np.zeros(len(statuses), dtype=bool)
+    has_rows[places] = True
     ids = statuses["run"]
     raise_for_first_bad_row(
-        made & ~held, fault, lambda row: f"run: {ids[row]} has no rows in {file.path.name}"
+        is_executed & ~has_rows,
+        fault,
+        lambda row: f"run: {ids[row]} has no rows in {file.path.name}",
     )
-    run_statuses, used = statuses.iloc[places].reset_index(drop=True), runs["used"]
+    run_statuses, used_counts = statuses.iloc[places].reset_index(drop=True), runs["used"]
     raise_for_first_bad_row(
-        run_statuses["simulations"] != used,
-        lambda i, says: fault(int(places[i]), says),
+        run_statuses["simulations"] != used_counts,
+        lambda i, reason: fault(int(places[i]), reason),
         lambda i: (
-            f"simulations: expected {used[i]}, the last k of {names[i]} in {file.path.name}, "
-            f"found {run_statuses['simulations'][i]}"
+            f"simulations: expected {used_counts[i]}, the last k of {names[i]} in "
+            f"{file.path.name}, found {run_statuses['simulations'][i]}"
         ),
     )
     for name in ("tuner", "simulator", "target", "seed"):
@@ -290,8 +296,8 @@ def check_runs(runs: pd.DataFrame, file: RunsTable, experiment: Experiment) -> N
     for name in runs.columns:
         if name.startswith("true_"):
             first = runs.drop_duplicates("target").set_index("target")[name]
-            wanted = runs["target"].map(first)
-            check_equal(runs[name], wanted, name, "as in other runs on this target", at)
+            expected = runs["target"].map(first)
+            check_equal(runs[name], expected, name, "as in other runs on this target", at)
 
 
 def check_segment_statuses(
@@ -327,6 +333,6 @@ def check_segment_statuses(
     statuses = pd.DataFrame([vars(status) for status in held.values()], columns=STATUS_COLUMN_NAMES)
     check_statuses(statuses, experiment, at)
     if plan is not None:
-        wanted = [plan[place] if place < len(plan) else "none" for place in places]
-        check_equal(statuses["run"], pd.Series(wanted, dtype=object), "run", "by plan.txt", at)
+        expected = [plan[place] if place < len(plan) else "none" for place in places]
+        check_equal(statuses["run"], pd.Series(expected, dtype=object), "run", "by plan.txt", at)
     return statuses

@@ -78,10 +78,10 @@ def read_records(path: Path) -> Iterator[tuple[int, RunStatus, pa.Table, int]]:
         end += _HEAD.size + length
         try:
             rows = pa.ipc.open_stream(payload).read_all()
-            held = _convert_statuses([json.loads(rows.schema.metadata[b"status"])])
+            statuses = _convert_statuses([json.loads(rows.schema.metadata[b"status"])])
         except _DAMAGE as error:
             raise _make_damage_error(path, f"a record of a run: {get_first_line(error)}") from None
-        ((place, status),) = held.items()
+        ((place, status),) = statuses.items()
         yield place, status, rows.replace_schema_metadata(), end
 
 
@@ -105,21 +105,21 @@ _DAMAGE = (OSError, ValueError, KeyError, TypeError, CellError, RecursionError, 
 """Errors that reading a damaged segment may raise; they include Arrow's own errors."""
 
 
-def _convert_statuses(held: Any) -> dict[int, RunStatus]:
+def _convert_statuses(entries: Any) -> dict[int, RunStatus]:
     """Convert ``[[place, {column: value}], ...]`` to statuses by index, checking every cell.
 
     Raises:
         CellError: A value violates its declaration.
     """
-    places = cell_validation.parse_json_column(_PLACE, [place for place, _ in held])
+    places = cell_validation.parse_json_column(_PLACE, [place for place, _ in entries])
     cell_validation.check_cells(_PLACE, places)
     columns = [c for c in STATUS_COLUMNS if c.name in STATUS_COLUMN_NAMES]
     for column in columns:
-        values = [status[column.name] for _, status in held]
+        values = [status[column.name] for _, status in entries]
         cell_validation.check_cells(column, cell_validation.parse_json_column(column, values))
     return {
         place: RunStatus(**{name: status[name] for name in STATUS_COLUMN_NAMES})
-        for place, status in held
+        for place, status in entries
     }
 
 
@@ -138,9 +138,9 @@ def check_no_duplicate_runs(path: Path, places: Iterable[int], known: Container[
     Raises:
         InputError: A run is in both.
     """
-    if double := [place for place in places if place in known]:
+    if repeated_places := [place for place in places if place in known]:
         raise _make_damage_error(
-            path, f"every run once, found that of line {double[0] + 1} of the plan again"
+            path, f"every run once, found that of line {repeated_places[0] + 1} of the plan again"
         )
 
 
@@ -170,7 +170,9 @@ def read_finished_statuses(folder: Path) -> dict[int, RunStatus]:
         InputError: A file is damaged.
     """
     return {
-        place: status for _, held in read_statuses_by_file(folder) for place, status in held.items()
+        place: status
+        for _, statuses in read_statuses_by_file(folder)
+        for place, status in statuses.items()
     }
 
 
@@ -180,11 +182,11 @@ def read_statuses_by_file(folder: Path) -> Iterator[tuple[Path, dict[int, RunSta
     for path in list_segments(folder / SEGMENTS_FOLDER, "journal"):
         with suppress(FileNotFoundError):
             yield path, {place: status for place, status, _, _ in read_records(path)}
-    known: set[int] = set()
+    known_places: set[int] = set()
     for path in list_segments(folder / SEGMENTS_FOLDER, "parquet"):
         statuses = read_part_statuses(path)
-        check_no_duplicate_runs(path, statuses, known)
-        known.update(statuses)
+        check_no_duplicate_runs(path, statuses, known_places)
+        known_places.update(statuses)
         yield path, statuses
 
 

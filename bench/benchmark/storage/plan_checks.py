@@ -58,14 +58,14 @@ def check_plan(plan: Sequence[str], experiment: Experiment, path: Path, remedy: 
         if len(parts) != 4 or not _SEED.fullmatch(parts[2]):
             raise at(row, f"expected TUNER/TARGET/SEED/HASH, found {format_value(name)}")
         rows.append((name, parts[0], parts[1], int(parts[2])))
-    planned = pd.DataFrame(rows, columns=["run", "tuner", "target", "seed"])
-    names = planned["run"]
+    plan_table = pd.DataFrame(rows, columns=["run", "tuner", "target", "seed"])
+    names = plan_table["run"]
     raise_for_first_bad_row(
         names.duplicated(), at, lambda row: f"expected every run once, found {names[row]} again"
     )
-    check_known(planned["tuner"], list_tuner_labels(experiment), "tuner", at)
-    check_known(planned["target"], list_target_names(experiment), "target", at)
-    check_complete(planned, experiment, at)
+    check_known(plan_table["tuner"], list_tuner_labels(experiment), "tuner", at)
+    check_known(plan_table["target"], list_target_names(experiment), "target", at)
+    check_complete(plan_table, experiment, at)
 
 
 def check_complete(made: pd.DataFrame, experiment: Experiment, fault: TableErrorFactory) -> None:
@@ -81,23 +81,25 @@ def check_complete(made: pd.DataFrame, experiment: Experiment, fault: TableError
     """
     targets = list_target_names(experiment)
     for entry in experiment.tuners:
-        mine = made[made["tuner"] == entry.label]
-        if mine.empty:
+        tuner_rows = made[made["tuner"] == entry.label]
+        if tuner_rows.empty:
             continue
-        seeds = range(_count_seeds(entry, experiment, mine["seed"].max()))
-        found = set(zip(mine["target"], mine["seed"].tolist(), strict=True))
-        missing = next(((t, s) for t in targets for s in seeds if (t, s) not in found), None)
+        seeds = range(_count_seeds(entry, experiment, tuner_rows["seed"].max()))
+        executed = set(zip(tuner_rows["target"], tuner_rows["seed"].tolist(), strict=True))
+        missing = next(((t, s) for t in targets for s in seeds if (t, s) not in executed), None)
         if missing:
             target, seed = missing
-            says = f"expected a run of {entry.label} on {target} with seed {seed}, found none"
-            raise fault(None, says)
-        if len(mine) > len(targets) * len(seeds):
-            twice = mine.duplicated(["target", "seed"]) | (mine["seed"] >= len(seeds))
-            row = int(mine.index[int(twice.to_numpy().argmax())])
+            problem = f"expected a run of {entry.label} on {target} with seed {seed}, found none"
+            raise fault(None, problem)
+        if len(tuner_rows) > len(targets) * len(seeds):
+            is_surplus = tuner_rows.duplicated(["target", "seed"]) | (
+                tuner_rows["seed"] >= len(seeds)
+            )
+            row = int(tuner_rows.index[int(is_surplus.to_numpy().argmax())])
             raise fault(
                 row,
                 f"run: expected {len(targets)} targets with {len(seeds)} seeds, "
-                f"found one more: {mine['run'][row]}",
+                f"found one more: {tuner_rows['run'][row]}",
             )
 
 
@@ -106,13 +108,13 @@ def _count_seeds(entry: TunerEntry, experiment: Experiment, largest: int) -> int
 
     It equals `bench.benchmark.runner.experiment_runner.count_seeds` if the tuner is known.
     """
-    wanted = entry.seeds or experiment.seeds
-    if wanted == 1 or largest > 0:
-        return wanted
+    seed_count = entry.seeds or experiment.seeds
+    if seed_count == 1 or largest > 0:
+        return seed_count
     # A single seed is correct for a deterministic tuner. The tuner is loaded only now, since it may
     # import large packages.
     try:
         kind = tuners.get(entry.tuner)
     except InputError:  # A tuner of a plugin that is not loaded or cannot be used here.
         return 1
-    return wanted if kind.stochastic or kind.learned else 1
+    return seed_count if kind.stochastic or kind.learned else 1

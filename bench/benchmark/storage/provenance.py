@@ -69,7 +69,7 @@ def format_explain_command(recordings: Iterable[object], settings: Mapping[str, 
             words.append(f"--{name}")
         elif isinstance(value, (list, tuple)):
             # An option that can be given several times.
-            words += [word for one in value for word in (f"--{name}", str(one))]
+            words += [word for item in value for word in (f"--{name}", str(item))]
         elif value not in (None, False, ""):
             words += [f"--{name}", str(value)]
     return words

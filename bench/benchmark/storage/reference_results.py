@@ -93,22 +93,24 @@ class ReferenceResult:
         Raises:
             InputError: It is of another problem, so the errors are not comparable.
         """
-        mine = _normalise_value(experiment.document())
+        drawn_document = _normalise_value(experiment.document())
         # Keys that were added in a later version cannot be compared with an older file.
         differing = [
             key
             for key in (*_SAME_PROBLEM, *_ALIKE)
-            if key in self.document and _normalise_value(self.document[key]) != mine.get(key)
+            if key in self.document
+            and _normalise_value(self.document[key]) != drawn_document.get(key)
         ]
         for key in differing:
             if key in _SAME_PROBLEM:
                 raise InputError(
                     f"{self.name}: of another problem than experiment {experiment.name}: {key} is "
                     f"{_format_setting(self.document[key])}, "
-                    f"expected {_format_setting(mine.get(key))}"
+                    f"expected {_format_setting(drawn_document.get(key))}"
                 )
         return [
-            f"{key}: {_format_setting(self.document[key])}, here {_format_setting(mine.get(key))}"
+            f"{key}: {_format_setting(self.document[key])}, here "
+            f"{_format_setting(drawn_document.get(key))}"
             for key in differing
         ]
 
@@ -152,13 +154,13 @@ class ReferenceResult:
 
 def list_reference_names() -> list[str]:
     """List the names of the references of simgap, which are the names of their folders."""
-    found = [
+    names = [
         table.parent.relative_to(place).as_posix()
         for place in REFERENCE_FOLDERS
         for table in sorted(place.rglob(_TABLE))
         if _is_one(table.parent)
     ]
-    return sorted(set(found))
+    return sorted(set(names))
 
 
 def _is_one(folder: Path) -> bool:
@@ -177,9 +179,9 @@ def find_reference(name: str) -> ReferenceResult:
     Raises:
         InputError: There is no such reference, or it is damaged.
     """
-    known = list_reference_names()
-    endings = [each for each in known if each.endswith(f"/{name}")]
-    if name in known:
+    names = list_reference_names()
+    endings = [each for each in names if each.endswith(f"/{name}")]
+    if name in names:
         return _read_reference(name, _find_reference_folder(name))
     if len(endings) == 1:
         return _read_reference(endings[0], _find_reference_folder(endings[0]))
@@ -188,7 +190,7 @@ def find_reference(name: str) -> ReferenceResult:
         return _read_reference(folder.resolve().name, folder)
     if len(endings) > 1:
         raise InputError(f"reference {name}: expected one of {', '.join(endings)}")
-    error = make_unknown_name_error("reference", name, known)
+    error = make_unknown_name_error("reference", name, names)
     raise InputError(f"{error} (or give the folder of a comparison)")
 
 
@@ -205,30 +207,30 @@ def _read_reference(name: str, folder: Path) -> ReferenceResult:
     path = folder / "environment.json"
     try:
         environment = json.loads(path.read_text(encoding="utf-8"))
-        made = {key: str(environment[key]) for key in ("simgap", "started")}
+        origin = {key: str(environment[key]) for key in ("simgap", "started")}
         revision = str(environment.get("fingerprint", {}).get("code", ""))
     except (OSError, ValueError, KeyError, AttributeError, TypeError) as error:
-        wanted = "expected what a comparison writes"
-        raise InputError(f"{path}: {wanted}, found {get_first_line(error)}") from None
+        expected = "expected what a comparison writes"
+        raise InputError(f"{path}: {expected}, found {get_first_line(error)}") from None
     table = CsvTable(folder / _TABLE, _COLUMNS, f"simgap plot {folder} writes it again").table
     document = read_toml(folder / CONFIGURATION_FILE)
-    return ReferenceResult(name, folder, table.to_pandas(), document, **made, revision=revision)
+    return ReferenceResult(name, folder, table.to_pandas(), document, **origin, revision=revision)
 
 
 def _normalise_value(value: Any) -> Any:
     """Convert numbers to float and tuples to lists, so that TOML and experiments compare equal."""
     if isinstance(value, Mapping):
-        return {str(key): _normalise_value(inner) for key, inner in value.items()}
+        return {str(key): _normalise_value(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_normalise_value(inner) for inner in value]
+        return [_normalise_value(item) for item in value]
     return float(value) if isinstance(value, int) and not isinstance(value, bool) else value
 
 
 def _format_setting(value: Any) -> str:
     """Format a value of a configuration in one line, lists and tables cut off at 80 characters."""
     if isinstance(value, Mapping):
-        inside = ", ".join(f"{key} = {_format_setting(inner)}" for key, inner in value.items())
-        return f"{{{inside}}}"[:80]
+        entries = ", ".join(f"{key} = {_format_setting(item)}" for key, item in value.items())
+        return f"{{{entries}}}"[:80]
     if isinstance(value, list | tuple):
-        return f"[{', '.join(_format_setting(inner) for inner in value)}]"[:80]
+        return f"[{', '.join(_format_setting(item) for item in value)}]"[:80]
     return f"{value:g}" if isinstance(value, float) else str(value)

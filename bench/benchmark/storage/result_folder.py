@@ -169,13 +169,13 @@ def read_configuration(folder: Path) -> FolderConfiguration:
             f"{folder}: expected the folder of a comparison with {CONFIGURATION_FILE} in it, "
             "found none"
         )
-    held = read_environment(folder)
-    experiment = parse_experiment(str(held["experiment"]), read_toml(path), path)
+    environment = read_environment(folder)
+    experiment = parse_experiment(str(environment["experiment"]), read_toml(path), path)
     return FolderConfiguration(
         experiment,
-        list(held["plugins"]),
-        dict(held.get("fingerprint", {})),
-        tuple(held.get("seals", ())),
+        list(environment["plugins"]),
+        dict(environment.get("fingerprint", {})),
+        tuple(environment.get("seals", ())),
     )
 
 
@@ -186,22 +186,22 @@ def read_environment(folder: Path) -> dict[str, Any]:
         InputError: It is damaged.
     """
     path = folder / "environment.json"
-    wrong, remedy = f"{path}: not a complete comparison", "restore it, or start a new comparison"
+    problem, remedy = f"{path}: not a complete comparison", "restore it, or start a new comparison"
     try:
-        said = json.loads(path.read_text(encoding="utf-8"))
+        document = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"{wrong}: {get_first_line(error)}; {remedy}") from None
-    if not isinstance(said, dict):
-        raise InputError(f"{wrong}: expected a table, found {format_value(said)}; {remedy}")
+        raise InputError(f"{problem}: {get_first_line(error)}; {remedy}") from None
+    if not isinstance(document, dict):
+        raise InputError(f"{problem}: expected a table, found {format_value(document)}; {remedy}")
     for key in ENVIRONMENT_KEYS:
-        if key not in said and key not in OPTIONAL_ENVIRONMENT_KEYS:
-            raise InputError(f"{wrong}: expected a key {key}, found none; {remedy}")
-    given = {key: value for key, value in said.items() if key in ENVIRONMENT_KEYS}
+        if key not in document and key not in OPTIONAL_ENVIRONMENT_KEYS:
+            raise InputError(f"{problem}: expected a key {key}, found none; {remedy}")
+    entries = {key: value for key, value in document.items() if key in ENVIRONMENT_KEYS}
     # On some systems the number of processors is unknown.
-    if given["processors"] is None:
-        del given["processors"]
+    if entries["processors"] is None:
+        del entries["processors"]
     try:
-        return check_entries(path, "", given, ENVIRONMENT_KEYS)
+        return check_entries(path, "", entries, ENVIRONMENT_KEYS)
     except InputError as error:
         raise InputError(f"{error}; {remedy}") from None
 
@@ -288,12 +288,12 @@ def read_comparison(folder: Path, columns: Sequence[str] | None = None) -> Store
         )
     plan = read_plan(folder) if under_way else None
     files = check_files(folder, experiment, under_way=under_way, plan=plan)
-    there = parquet.read_schema(path).names
-    wanted = [name for name in there if columns is None or name in columns]
-    runs = parquet.read_table(path, columns=wanted).to_pandas()
+    stored_names = parquet.read_schema(path).names
+    read_names = [name for name in stored_names if columns is None or name in columns]
+    runs = parquet.read_table(path, columns=read_names).to_pandas()
     return StoredComparison(
         experiment,
-        _add_missing_columns(runs, RUN_COLUMNS, columns) if there else runs,
+        _add_missing_columns(runs, RUN_COLUMNS, columns) if stored_names else runs,
         _add_missing_columns(files.statuses, STATUS_COLUMNS),
         _compute_training_costs(files.training),
         files.spectra,
@@ -312,27 +312,27 @@ def read_checked_comparison(folder: Path) -> StoredComparison:
 
 
 def _add_missing_columns(
-    frame: pd.DataFrame, declared: Columns, wanted: Sequence[str] | None = None
+    frame: pd.DataFrame, declared: Columns, selected: Sequence[str] | None = None
 ) -> pd.DataFrame:
     """Add columns that a folder of an older version lacks, filled with their declared default.
 
-    `wanted` are the names of the columns to be used; None for all.
+    `selected` are the names of the columns to be used; None for all.
     """
     missing = {
         column.name: column.default
         for column in declared
         if column.default is not None
         and column.name not in frame
-        and (wanted is None or column.name in wanted)
+        and (selected is None or column.name in selected)
     }
     return frame.assign(**missing)
 
 
 def _compute_training_costs(training: pd.DataFrame) -> dict[str, tuple[float, float]]:
     """Compute simulations and seconds of one training, mean over seeds, by tuner."""
-    means = training.groupby("tuner")[["simulations", "seconds"]].mean()
-    values = means.to_numpy(dtype=float)
+    mean_costs = training.groupby("tuner")[["simulations", "seconds"]].mean()
+    values = mean_costs.to_numpy(dtype=float)
     return {
         str(name): (float(row[0]), float(row[1]))
-        for name, row in zip(means.index, values, strict=True)
+        for name, row in zip(mean_costs.index, values, strict=True)
     }

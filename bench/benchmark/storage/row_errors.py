@@ -75,9 +75,9 @@ def check_equal(
     Raises:
         InputError: A value differs.
     """
-    differ = found.to_numpy() != wanted.to_numpy()
+    is_different = found.to_numpy() != wanted.to_numpy()
     raise_for_first_bad_row(
-        differ & ~(found.isna() & wanted.isna()).to_numpy(),
+        is_different & ~(found.isna() & wanted.isna()).to_numpy(),
         fault,
         lambda i: f"{name}: expected {wanted[i]} {why}, found {found[i]}",
     )

@@ -63,8 +63,8 @@ class RunJournal:
             ) from None
         self._lock = _lock_folder(self.folder / "lock")
         # An incomplete part of a process that was killed while it wrote; its journal still exists.
-        for half in self.folder.glob("*.partial"):
-            half.unlink()
+        for partial_file in self.folder.glob("*.partial"):
+            partial_file.unlink()
         self._part_runs = part_runs
         self.statuses: dict[int, RunStatus] = {}
         self._index: dict[Path, list[int]] = {}
@@ -144,10 +144,10 @@ class RunJournal:
         # The footer allows reading the statuses without reading the rows.
         statuses = json.dumps([[place, asdict(status)] for place, status, _ in self._records])
         tables = [_add_place_column(place, rows) for place, _, rows in self._records]
-        whole = pa.concat_tables(tables).replace_schema_metadata({"statuses": statuses})
+        table = pa.concat_tables(tables).replace_schema_metadata({"statuses": statuses})
         path = self._make_file_path("parquet")
         with atomic_replacement(path) as partial:
-            parquet.write_table(whole, partial, compression="zstd")
+            parquet.write_table(table, partial, compression="zstd")
         # Not earlier: until the part exists, the journal is the only copy of these runs.
         self._file.close()
         self._make_file_path("journal").unlink()
@@ -165,24 +165,26 @@ class RunJournal:
         import pyarrow as pa
         from pyarrow import compute, parquet
 
-        pending = {place: rows for place, _, rows in self._records}
+        rows_by_place = {place: rows for place, _, rows in self._records}
         places = sorted(self.statuses)
         # In chunks, since all rows of a million runs would not fit in memory.
         for first in range(0, len(places), runs):
             chunk = places[first : first + runs]
             low, high = chunk[0], chunk[-1]
             parts = [
-                _add_place_column(place, pending[place]) for place in chunk if place in pending
+                _add_place_column(place, rows_by_place[place])
+                for place in chunk
+                if place in rows_by_place
             ]
-            for path, held in self._index.items():
-                if held[0] <= high and held[-1] >= low:
-                    between = (compute.field("place") >= low) & (compute.field("place") <= high)
-                    parts.append(parquet.read_table(path, filters=between))
-            whole = pa.concat_tables([part.replace_schema_metadata() for part in parts])
+            for path, file_places in self._index.items():
+                if file_places[0] <= high and file_places[-1] >= low:
+                    is_in_chunk = (compute.field("place") >= low) & (compute.field("place") <= high)
+                    parts.append(parquet.read_table(path, filters=is_in_chunk))
+            table = pa.concat_tables([part.replace_schema_metadata() for part in parts])
             order = compute.sort_indices(
-                whole, sort_keys=[("place", "ascending"), ("k", "ascending")]
+                table, sort_keys=[("place", "ascending"), ("k", "ascending")]
             )
-            yield whole.take(order).drop_columns(["place"])
+            yield table.take(order).drop_columns(["place"])
 
     def list_segment_contents(
         self,
@@ -195,8 +197,8 @@ class RunJournal:
         for path, places in self._index.items():
             yield path, {place: self.statuses[place] for place in places}, None
         if self._records:
-            held = {place: status for place, status, _ in self._records}
-            yield self._make_file_path("journal"), held, [rows for _, _, rows in self._records]
+            statuses = {place: status for place, status, _ in self._records}
+            yield self._make_file_path("journal"), statuses, [rows for _, _, rows in self._records]
 
     def close(self) -> None:
         """Close the journal and release the lock of the folder."""
@@ -210,10 +212,10 @@ class RunJournal:
         """
         self.close()
         # An incomplete folder of segments would count as an unfinished comparison.
-        gone = self.folder.with_name(f".{SEGMENTS_FOLDER}.gone")
-        shutil.rmtree(gone, ignore_errors=True)
-        self.folder.rename(gone)
-        shutil.rmtree(gone)
+        trash_folder = self.folder.with_name(f".{SEGMENTS_FOLDER}.gone")
+        shutil.rmtree(trash_folder, ignore_errors=True)
+        self.folder.rename(trash_folder)
+        shutil.rmtree(trash_folder)
 
 
 def _add_place_column(place: int, rows: pa.Table) -> pa.Table:

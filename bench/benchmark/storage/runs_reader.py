@@ -95,8 +95,8 @@ class RunsTable(NamedTuple):
         try:
             if records is None:
                 return read_checked_runs(self._read_batches(), self.list_columns(), experiment)
-            whole = pa.concat_tables(records)
-            return read_checked_runs([whole], whole.column_names, experiment)
+            table = pa.concat_tables(records)
+            return read_checked_runs([table], table.column_names, experiment)
         except CellError as error:
             raise self.make_error(error.row, error.says) from None
         except (OSError, pa.ArrowException, UnicodeDecodeError) as error:
@@ -114,10 +114,10 @@ class RunsTable(NamedTuple):
     def _make_read_error(self, error: Exception) -> InputError:
         """Make the one-line error for a file that is missing, or is not a Parquet file."""
         missing = isinstance(error, FileNotFoundError)
-        what = (
+        reason = (
             "no such file" if missing else f"expected a Parquet file, found {get_first_line(error)}"
         )
-        return InputError(f"{self.path}: not a complete comparison: {what}; {self.remedy}")
+        return InputError(f"{self.path}: not a complete comparison: {reason}; {self.remedy}")
 
 
 def declare_run_columns(names: list[str], experiment: Experiment) -> list[ColumnSpec]:
@@ -152,17 +152,19 @@ def read_checked_runs(
     import pandas as pd
 
     # Without runs there are no columns.
-    there = select_declared_columns(names, declare_run_columns(names, experiment)) if names else []
+    columns = (
+        select_declared_columns(names, declare_run_columns(names, experiment)) if names else []
+    )
     summaries: list[pd.DataFrame] = []
-    before: pa.Table | None = None
+    last_row: pa.Table | None = None
     offset = 0
     for batch in batches:
         if not len(batch):
             continue
-        rows = _convert_batch(batch, there, before, offset)
-        summaries.append(_summarise_new_runs(rows, before is not None, offset))
+        rows = _convert_batch(batch, columns, last_row, offset)
+        summaries.append(_summarise_new_runs(rows, last_row is not None, offset))
         offset += len(batch)
-        before = rows.slice(len(rows) - 1)
+        last_row = rows.slice(len(rows) - 1)
     runs = (
         pd.concat(summaries, ignore_index=True)
         if summaries
@@ -170,16 +172,16 @@ def read_checked_runs(
     )
     # k counts without gaps, so the number of rows gives the last k.
     runs["used"] = np.diff(np.append(runs["row"].to_numpy(dtype=np.int64), offset)) - 1
-    twice = runs["run"].duplicated().to_numpy(dtype=bool)
-    if twice.any():
-        place = int(twice.argmax())
+    is_repeated = runs["run"].duplicated().to_numpy(dtype=bool)
+    if is_repeated.any():
+        place = int(is_repeated.argmax())
         name = runs["run"].iloc[place]
         raise CellError(int(runs["row"].iloc[place]), "run", "every run once", f"{name} again")
     return runs
 
 
 def _convert_batch(
-    batch: pa.Table, there: list[ColumnSpec], before: pa.Table | None, offset: int
+    batch: pa.Table, columns: list[ColumnSpec], last_row: pa.Table | None, offset: int
 ) -> pa.Table:
     """Convert a batch to its declared types and prepend the last row of the previous batch.
 
@@ -190,21 +192,21 @@ def _convert_batch(
     from pyarrow import compute
 
     try:
-        typed = {c.name: parse_parquet_column(c, batch[c.name].combine_chunks()) for c in there}
+        typed = {c.name: parse_parquet_column(c, batch[c.name].combine_chunks()) for c in columns}
         at_start = typed["k"].to_numpy() == 0
         no_truth = to_numpy_mask(compute.equal(typed["range"], "real"))
-        for column in there:
+        for column in columns:
             check_cells(column, typed[column.name], at_start, no_truth)
     except CellError as error:
         row = None if error.row is None else error.row + offset
         raise _shift_error_row(error, row) from None
     rows = pa.table(typed)
-    rows = rows if before is None else pa.concat_tables([before, rows]).combine_chunks()
+    rows = rows if last_row is None else pa.concat_tables([last_row, rows]).combine_chunks()
     try:
-        _check_counts(rows, before is not None)
+        _check_counts(rows, last_row is not None)
         _check_same(rows)
     except CellError as error:
-        raise _shift_error_row(error, (error.row or 0) + offset - (before is not None)) from None
+        raise _shift_error_row(error, (error.row or 0) + offset - (last_row is not None)) from None
     return rows
 
 
@@ -226,9 +228,9 @@ def _find_changes(values: pa.ChunkedArray) -> Mask:
     column = values.combine_chunks()
     if pa.types.is_floating(column.type):
         numbers = column.to_numpy()
-        nothing = np.isnan(numbers[1:]) & np.isnan(numbers[:-1])
-        differ: Mask = (numbers[1:] != numbers[:-1]) & ~nothing
-        return differ
+        is_both_missing = np.isnan(numbers[1:]) & np.isnan(numbers[:-1])
+        is_changed: Mask = (numbers[1:] != numbers[:-1]) & ~is_both_missing
+        return is_changed
     changed = compute.not_equal(column.slice(1), column.slice(0, max(len(column) - 1, 0)))
     return to_numpy_mask(changed)
 
@@ -243,15 +245,15 @@ def _check_counts(rows: pa.Table, goes_on: bool) -> None:
         CellError: k has another value, so that a row is missing or added.
     """
     k: NDArray[np.int64] = rows["k"].to_numpy()
-    wanted = np.append(0, k[:-1] + 1)
-    wanted[_find_run_starts(rows)] = 0
+    expected = np.append(0, k[:-1] + 1)
+    expected[_find_run_starts(rows)] = 0
     if goes_on:  # The first row was checked with the previous batch.
-        wanted[0] = k[0]
-    bad = k != wanted
-    if bad.any():
-        row = int(bad.argmax())
+        expected[0] = k[0]
+    is_wrong = k != expected
+    if is_wrong.any():
+        row = int(is_wrong.argmax())
         run = rows["run"][row].as_py()
-        raise CellError(row, "k", f"{wanted[row]}, the next of {run}", str(k[row]))
+        raise CellError(row, "k", f"{expected[row]}, the next of {run}", str(k[row]))
 
 
 def _list_constant_columns(rows: pa.Table) -> list[str]:
@@ -268,11 +270,11 @@ def _check_same(rows: pa.Table) -> None:
     Raises:
         CellError: a value differs from the row before.
     """
-    within = ~_find_run_starts(rows)[1:]
+    is_same_run = ~_find_run_starts(rows)[1:]
     for name in _list_constant_columns(rows):
-        bad = _find_changes(rows[name]) & within
-        if bad.any():
-            row = int(bad.argmax()) + 1
+        is_changed = _find_changes(rows[name]) & is_same_run
+        if is_changed.any():
+            row = int(is_changed.argmax()) + 1
             values = rows[name].slice(row - 1, 2).to_pylist()
             raise CellError(row, name, f"{values[0]} as in the row before", str(values[1]))
 

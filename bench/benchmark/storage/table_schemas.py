@@ -71,13 +71,13 @@ class ColumnSpec:
             return f"one of {', '.join(word for word in self.words if word)}"
         if self.kind in (str, bool):
             return {str: "text", bool: "True or False"}[self.kind]
-        ends = {
+        limit_texts = {
             (False, False): "",
             (True, False): f" of at least {self.low:g}",
             (True, True): f" from {self.low:g} to {self.high:g}",
         }[self.low > -math.inf, self.high < _LARGEST]
         number = "a whole number" if self.kind is int else "a number"
-        return f"{number}{ends}"
+        return f"{number}{limit_texts}"
 
 
 Columns = Sequence[ColumnSpec]
@@ -348,8 +348,8 @@ def list_parameters(names: Iterable[str]) -> list[str]:
 
 def list_channels(names: Iterable[str]) -> list[str]:
     """List the channels in the names of a file's columns."""
-    found = _list_name_parts(names, "obs_error_", "heldout_error_")
-    return list(dict.fromkeys(name.removesuffix("_in_noise") for name in found))
+    suffixes = _list_name_parts(names, "obs_error_", "heldout_error_")
+    return list(dict.fromkeys(name.removesuffix("_in_noise") for name in suffixes))
 
 
 def _list_name_parts(names: Iterable[str], *prefixes: str) -> list[str]:

@@ -35,12 +35,12 @@ def add_bundle_arguments(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(command=_run_bundle)
 
 
-def _run_bundle(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+def _run_bundle(options: argparse.Namespace, print_line: PrintLine) -> CommandResult:
     """Execute `simgap bundle`: pack a result folder into one archive.
 
     Args:
         options: parsed arguments of the command.
-        say: prints one line of text.
+        print_line: prints one line of text.
 
     Returns:
         The JSON document of the command, and its exit code (0).
@@ -50,10 +50,10 @@ def _run_bundle(options: argparse.Namespace, say: PrintLine) -> CommandResult:
     archived = write_bundle(options.run, options.out, options.recordings)
     document = archived.to_document()
     size = f"{document['bytes'] / 1e6:.3g} MB"
-    say(f"{archived.archive}: {archived.kind}, {archived.files} files, {size}")
-    say(f"SHA-256 {document['sha256']}")
+    print_line(f"{archived.archive}: {archived.kind}, {archived.files} files, {size}")
+    print_line(f"SHA-256 {document['sha256']}")
     for line in archived.left_out:
-        say(f"left out: {line}")
-    say(f"to make it again: {archived.command}")
-    say(f"to check it: simgap verify {archived.archive}")
+        print_line(f"left out: {line}")
+    print_line(f"to make it again: {archived.command}")
+    print_line(f"to check it: simgap verify {archived.archive}")
     return CommandResult(document)

@@ -24,12 +24,12 @@ def add_check_arguments(check: argparse.ArgumentParser) -> None:
     check.set_defaults(command=_run_check)
 
 
-def _run_check(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+def _run_check(options: argparse.Namespace, print_line: PrintLine) -> CommandResult:
     """Execute `simgap check`: run the conformance checks of a part, such as a tuner of a plugin.
 
     Args:
         options: parsed arguments of the command.
-        say: prints one line of text.
+        print_line: prints one line of text.
 
     Returns:
         The JSON document of the command, and its exit code; EXIT_PROBLEMS_FOUND if a check failed.
@@ -38,7 +38,7 @@ def _run_check(options: argparse.Namespace, say: PrintLine) -> CommandResult:
     from bench.core.plugin_registries import load_plugins
 
     load_plugins(options.plugin)
-    checked = run_suite(options.name, options.plugin, say)
+    checked = run_suite(options.name, options.plugin, print_line)
     return CommandResult(
         checked.to_document(), EXIT_OK if checked.has_passed else EXIT_PROBLEMS_FOUND
     )

@@ -86,7 +86,7 @@ def _begin_or_resume(options: argparse.Namespace, print_line: PrintLine) -> list
         )
 
 
-def _run_compare(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+def _run_compare(options: argparse.Namespace, print_line: PrintLine) -> CommandResult:
     """Execute `simgap compare`: run one or several comparisons, one after the other.
 
     The comparisons of a sweep also get a joint report. After an interrupt the remaining ones are
@@ -94,7 +94,7 @@ def _run_compare(options: argparse.Namespace, say: PrintLine) -> CommandResult:
 
     Args:
         options: parsed arguments of the command.
-        say: prints one line of text.
+        print_line: prints one line of text.
 
     Returns:
         The JSON document of the command, and the largest exit code of its comparisons.
@@ -103,16 +103,16 @@ def _run_compare(options: argparse.Namespace, say: PrintLine) -> CommandResult:
 
     # Connect to the cluster first, so that an unreachable scheduler leaves no folder.
     pool = make_cluster_pool(options.cluster)
-    studies = _begin_or_resume(options, say)
+    studies = _begin_or_resume(options, print_line)
     answers = []
     for study in studies:
         if len(studies) > 1:
-            say(f"\n{study.configuration.experiment.name}")
-        answers.append(_run_study(study, pool, options, say))
+            print_line(f"\n{study.configuration.experiment.name}")
+        answers.append(_run_study(study, pool, options, print_line))
         if answers[-1].code == EXIT_INTERRUPTED:
             break
     if len(studies) > 1:
-        report_jointly(studies[0].folder.parent, say)
+        report_jointly(studies[0].folder.parent, print_line)
     return CommandResult(
         {"comparisons": [answer.document for answer in answers]},
         max(answer.code for answer in answers),
@@ -120,7 +120,7 @@ def _run_compare(options: argparse.Namespace, say: PrintLine) -> CommandResult:
 
 
 def _run_study(
-    study: Study, pool: Pool | None, options: argparse.Namespace, say: PrintLine
+    study: Study, pool: Pool | None, options: argparse.Namespace, print_line: PrintLine
 ) -> CommandResult:
     """Run one study until it is complete or stopped, then write its report.
 
@@ -137,9 +137,9 @@ def _run_study(
         outcome = study.run(options.jobs, bars.start_bar, pool)
     progress: JsonDocument = {**outcome._asdict(), "complete": outcome.is_complete}
     if outcome.skipped:
-        say(f"skipped: {outcome.skipped}")
+        print_line(f"skipped: {outcome.skipped}")
         return CommandResult({**summarise_study(study), **progress, "failed": 0, "resume": None})
-    failed = study.report(say)
+    failed = study.report(print_line)
     resume = None if outcome.is_complete else f"simgap compare --resume {study.folder}"
     document = {**summarise_study(study), **progress, "failed": failed, "resume": resume}
     if resume:
@@ -151,10 +151,10 @@ def _run_study(
 
 def _report_missing(study: Study, outcome: StudyOutcome, resume: str) -> int:
     """Print what is missing and how to continue; return the exit code."""
-    why = "interrupted" if outcome.interrupted else outcome.stopped or "stopped"
-    things, ended = study.status().what.rsplit(" ", 1)  # For example: runs finished.
+    reason = "interrupted" if outcome.interrupted else outcome.stopped or "stopped"
+    unit, ended = study.status().what.rsplit(" ", 1)  # For example: runs finished.
     for line in (
-        f"{why}; {outcome.finished} of {outcome.planned} {things} are {ended} and kept",
+        f"{reason}; {outcome.finished} of {outcome.planned} {unit} are {ended} and kept",
         f"to finish: {resume}",
     ):
         print(f"simgap: {line}", file=sys.stderr)

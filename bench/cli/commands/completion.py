@@ -26,12 +26,12 @@ def add_completion_arguments(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(command=_run_completion)
 
 
-def _run_completion(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+def _run_completion(options: argparse.Namespace, print_line: PrintLine) -> CommandResult:
     """Execute `simgap completion`: print the completion script of the named shell."""
     from bench.cli.main import build_parser
 
     script = build_completion_script(build_parser(), options.shell)
-    say(script.rstrip("\n"))
+    print_line(script.rstrip("\n"))
     return CommandResult({"shell": options.shell, "script": script})
 
 
@@ -57,8 +57,8 @@ def build_completion_script(parser: argparse.ArgumentParser, shell: str) -> str:
         "parts": [name for registry in REGISTRIES for name in registry.names()],
         "schemas": list_schema_names(),
     }
-    known = {key: " ".join(values) for key, values in words.items()}
-    functions = _FUNCTIONS.format(**known) if shell == "bash" else ""
+    words_by_key = {key: " ".join(values) for key, values in words.items()}
+    functions = _FUNCTIONS.format(**words_by_key) if shell == "bash" else ""
     script: str = shtab.complete(parser, shell=shell, preamble=functions)
     return script
 
@@ -77,9 +77,9 @@ def _set_completion(command: str, action: argparse.Action, shtab: Any) -> None:
 
     `shtab` is the library that builds the completion script.
     """
-    known = _WORDS.get((command, action.dest))
-    if known:
-        complete = {**shtab.FILE, "bash": known}
+    known_words = _WORDS.get((command, action.dest))
+    if known_words:
+        complete = {**shtab.FILE, "bash": known_words}
     elif is_path_argument(action):
         complete = shtab.FILE
     else:

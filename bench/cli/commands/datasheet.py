@@ -38,7 +38,7 @@ def add_datasheet_arguments(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(command=_run_datasheet)
 
 
-def _run_datasheet(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+def _run_datasheet(options: argparse.Namespace, print_line: PrintLine) -> CommandResult:
     """Make a data sheet; explain the logs first unless an explanation is given."""
     from bench.api.datasheet import DatasheetOptions, check_joint_exists, datasheet
     from bench.api.explain import explain
@@ -67,8 +67,8 @@ def _run_datasheet(options: argparse.Namespace, say: PrintLine) -> CommandResult
         data_sheet = datasheet(options.recordings, **settings)
     paths = data_sheet.write(options.out)
     for line in data_sheet.lines():
-        say(line)
-    say("")
+        print_line(line)
+    print_line("")
     for path in paths:
-        say(f"{path.suffix[1:]:7} {path}")
+        print_line(f"{path.suffix[1:]:7} {path}")
     return CommandResult({"sheet": data_sheet.document(), "files": paths})

@@ -30,7 +30,7 @@ def add_design_arguments(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(command=_run_design)
 
 
-def _run_design(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+def _run_design(options: argparse.Namespace, print_line: PrintLine) -> CommandResult:
     """Execute `simgap design`: explain recordings, then propose the next recording.
 
     The proposal is written to a file of commands (`options.out`), which must not exist yet. The
@@ -38,7 +38,7 @@ def _run_design(options: argparse.Namespace, say: PrintLine) -> CommandResult:
 
     Args:
         options: parsed arguments of the command.
-        say: prints one line of text.
+        print_line: prints one line of text.
 
     Returns:
         The JSON document of the command, and its exit code; EXIT_PROBLEMS_FOUND if there is no
@@ -61,9 +61,9 @@ def _run_design(options: argparse.Namespace, say: PrintLine) -> CommandResult:
             stop=interrupts.is_stop_requested,
             listener=display,
         )
-    say(str(proposed.explanation))
+    print_line(str(proposed.explanation))
     for line in proposed.lines():
-        say(line)
+        print_line(line)
     document = {
         "verdict": proposed.explanation.answer.to_document(),
         "design": None if proposed.design is None else proposed.design.to_document(),
@@ -73,5 +73,5 @@ def _run_design(options: argparse.Namespace, say: PrintLine) -> CommandResult:
     if proposed.design is None:
         return CommandResult(document, EXIT_PROBLEMS_FOUND)
     proposed.write(options.out)
-    say(f"commands {options.out}")
+    print_line(f"commands {options.out}")
     return CommandResult(document)

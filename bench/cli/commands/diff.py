@@ -38,12 +38,12 @@ def add_diff_arguments(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(command=_run_diff)
 
 
-def _run_diff(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+def _run_diff(options: argparse.Namespace, print_line: PrintLine) -> CommandResult:
     """Execute `simgap diff`: print the differences between two result folders of the same kind.
 
     Args:
         options: parsed arguments of the command; `fail_on` says which differences are a failure.
-        say: prints one line of text.
+        print_line: prints one line of text.
 
     Returns:
         The JSON document of the command, and its exit code; EXIT_PROBLEMS_FOUND for a failure.
@@ -56,10 +56,10 @@ def _run_diff(options: argparse.Namespace, say: PrintLine) -> CommandResult:
     fails = options.fail_on == "worse" and difference.is_worse
     fails = fails or (options.fail_on == "change" and difference.has_changed)
     for line in difference.format_lines():
-        say(line)
+        print_line(line)
     if options.out is not None:
         write_files({options.out: difference.to_table().to_csv(index=False)})
-        say(f"table   {options.out}")
+        print_line(f"table   {options.out}")
     return CommandResult(difference.to_document(), EXIT_PROBLEMS_FOUND if fails else EXIT_OK)
 
 
@@ -78,8 +78,8 @@ def _compare_folders(a: Path, b: Path) -> ComparisonDiff | ExplanationDiff:
             diff_explanations.load_side(a), diff_explanations.load_side(b)
         )
     if any(is_explanation):
-        explanation, other = (a, b) if is_explanation[0] else (b, a)
+        explanation, comparison = (a, b) if is_explanation[0] else (b, a)
         raise InputError(
-            f"expected two of one kind: {explanation} is an explanation, {other} is none"
+            f"expected two of one kind: {explanation} is an explanation, {comparison} is none"
         )
     return diff_comparisons.diff_comparisons(a, b)

@@ -43,49 +43,49 @@ def add_download(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(command=_run_download)
 
 
-def _run_download(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+def _run_download(options: argparse.Namespace, print_line: PrintLine) -> CommandResult:
     """Execute `simgap download`: download the named data sets that are not on this machine yet.
 
     Without a name it lists all data sets and downloads nothing.
 
     Args:
         options: parsed arguments of the command.
-        say: prints one line of text.
+        print_line: prints one line of text.
 
     Returns:
         The JSON document of the command, and its exit code (0).
     """
     from bench.datasets import dataset_catalogue
 
-    chosen = (
+    names_to_download = (
         dataset_catalogue.names() if _ALL in options.names else list(dict.fromkeys(options.names))
     )
-    data_sets = [dataset_catalogue.get(name) for name in chosen]
+    data_sets = [dataset_catalogue.get(name) for name in names_to_download]
     if not data_sets:
-        every = [dataset_catalogue.get(name) for name in dataset_catalogue.names()]
-        for data_set in every:
+        catalogue = [dataset_catalogue.get(name) for name in dataset_catalogue.names()]
+        for data_set in catalogue:
             for line in _format_data_set(data_set):
-                say(line)
+                print_line(line)
         return CommandResult(
-            {"data_sets": [_make_data_set_document(each) for each in every], "downloaded": []}
+            {"data_sets": [_make_data_set_document(each) for each in catalogue], "downloaded": []}
         )
     downloaded = []
     for data_set in data_sets:
-        present = _find_present_folder(data_set, options.out)
-        if present:
-            say(f"{data_set.name}: already in {present}")
+        present_folder = _find_present_folder(data_set, options.out)
+        if present_folder:
+            print_line(f"{data_set.name}: already in {present_folder}")
             continue
-        say(f"{data_set.name}: {_download_data_set(data_set, options.source, options.out)}")
+        print_line(f"{data_set.name}: {_download_data_set(data_set, options.source, options.out)}")
         downloaded.append(data_set.name)
         if options.out:
-            say(_explain_folder_lookup(data_set, options.out))
+            print_line(_explain_folder_lookup(data_set, options.out))
         for name in _list_dependent_experiments(data_set):
-            say(f"needed by: simgap compare {name}")
+            print_line(f"needed by: simgap compare {name}")
     documents = [_make_data_set_document(each, options.out) for each in data_sets]
     return CommandResult({"data_sets": documents, "downloaded": downloaded})
 
 
-def _download_data_set(data_set: DataSet, source: str, out: Path | None) -> Path:
+def _download_data_set(data_set: DataSet, source: str, target_folder: Path | None) -> Path:
     """Download one data set with a progress bar; return its folder."""
     import sys
 
@@ -107,36 +107,40 @@ def _download_data_set(data_set: DataSet, source: str, out: Path | None) -> Path
         def advance(count: int) -> None:
             bar.update(count)
 
-        return download(data_set, out or next(search_folders(data_set.kind)), source, advance)
+        return download(
+            data_set, target_folder or next(search_folders(data_set.kind)), source, advance
+        )
 
 
-def _find_present_folder(data_set: DataSet, out: Path | None) -> Path | None:
+def _find_present_folder(data_set: DataSet, target_folder: Path | None) -> Path | None:
     """Return the folder of a data set that is already present; None if it must be downloaded."""
-    if out is None:
+    if target_folder is None:
         return data_set.folder()
-    folder = out / data_set.name
+    folder = target_folder / data_set.name
     return folder if all((folder / file).is_file() for file in data_set.provides) else None
 
 
-def _explain_folder_lookup(data_set: DataSet, out: Path) -> str:
+def _explain_folder_lookup(data_set: DataSet, target_folder: Path) -> str:
     """Explain how experiments find a data set in a folder other than the default one."""
     from bench.datasets.dataset_catalogue import FOLDER_VARIABLES, search_folders
 
-    if out.resolve() in [folder.resolve() for folder in search_folders(data_set.kind)]:
+    if target_folder.resolve() in [folder.resolve() for folder in search_folders(data_set.kind)]:
         return f"{data_set.name}: experiments find it there"
     variable = FOLDER_VARIABLES[data_set.kind]
-    return f"{data_set.name}: experiments find it with {variable}={os.fspath(out.resolve())}"
+    return (
+        f"{data_set.name}: experiments find it with {variable}={os.fspath(target_folder.resolve())}"
+    )
 
 
 def _format_data_set(data_set: DataSet) -> list[str]:
     """Format a data set for the list: size, licence, place, title, experiments and source."""
     folder = data_set.folder()
     state = f"in {folder}" if folder else f"not here: run `{data_set.command}`"
-    needed = ", ".join(_list_dependent_experiments(data_set))
+    experiment_names = ", ".join(_list_dependent_experiments(data_set))
     return [
         f"{data_set.name:22} {data_set.size:>7}  {data_set.licence:11} {state}",
         f"  {data_set.title}",
-        f"  needed by {needed}",
+        f"  needed by {experiment_names}",
         f"  {data_set.repository} at {data_set.commit[:7]}; {data_set.cite}",
     ]
 
@@ -157,10 +161,10 @@ def _list_dependent_experiments(data_set: DataSet) -> list[str]:
     return names
 
 
-def _make_data_set_document(data_set: DataSet, out: Path | None = None) -> JsonDocument:
+def _make_data_set_document(data_set: DataSet, target_folder: Path | None = None) -> JsonDocument:
     """Convert a data set to a JSON document, with the address and hash of each file.
 
-    `out` is the folder that the user named for downloads; None for the default folder.
+    `target_folder` is the folder that the user named for downloads; None for the default folder.
     """
     return {
         "name": data_set.name,
@@ -181,6 +185,6 @@ def _make_data_set_document(data_set: DataSet, out: Path | None = None) -> JsonD
             for file in data_set.files
         ],
         "provides": list(data_set.provides),
-        "folder": _find_present_folder(data_set, out),
+        "folder": _find_present_folder(data_set, target_folder),
         "experiments": _list_dependent_experiments(data_set),
     }

@@ -94,7 +94,7 @@ def add_score_arguments(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(command=_run_score)
 
 
-def _run_explain(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+def _run_explain(options: argparse.Namespace, print_line: PrintLine) -> CommandResult:
     """Explain a recording, write the results, print the text summary."""
     from bench.api.explain import explain
     from bench.benchmark.storage.provenance import get_utc_time, write_explanation_environment
@@ -114,7 +114,7 @@ def _run_explain(options: argparse.Namespace, say: PrintLine) -> CommandResult:
         )
     load_plugins(options.plugin)
     if options.each:
-        return _run_explain_batch(options, say)
+        return _run_explain_batch(options, print_line)
     # Check this before the work, which may take minutes.
     if options.out is not None:
         check_folder_empty(options.out)
@@ -136,15 +136,15 @@ def _run_explain(options: argparse.Namespace, say: PrintLine) -> CommandResult:
     settings = {name: getattr(options, name) for name in _RESULT_RELEVANT_OPTIONS}
     environment_file = write_explanation_environment(folder, started, settings, options.recordings)
     for line in format_summary(explanation.story):
-        say(line)
+        print_line(line)
     left_out = explanation.ranges.left_out if options.ranges else ()
     for line in (*explanation.unsaid, *left_out):
-        say(line)
-    say(f"\nreport  {paths[-1]}")
+        print_line(line)
+    print_line(f"\nreport  {paths[-1]}")
     for path in paths:
         if path.suffix not in _FIGURE_SUFFIXES:
-            say(f"{path.stem:7} {path}")
-    cut = explanation.answer.cut
+            print_line(f"{path.stem:7} {path}")
+    cutoff = explanation.answer.cut
     document = {
         "verdict": explanation.answer.to_document(),
         "title": explanation.story.title,
@@ -153,13 +153,13 @@ def _run_explain(options: argparse.Namespace, say: PrintLine) -> CommandResult:
         "files": [*paths, environment_file],
     }
     if options.ranges:
-        document["ranges"] = [one.document() for one in explanation.ranges.ranges]
+        document["ranges"] = [joint_range.document() for joint_range in explanation.ranges.ranges]
         document["ranges_left_out"] = left_out
-    interrupted = cut is not None and cut.reason == "interrupt"
+    interrupted = cutoff is not None and cutoff.reason == "interrupt"
     return CommandResult(document, EXIT_INTERRUPTED if interrupted else EXIT_OK)
 
 
-def _run_explain_batch(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+def _run_explain_batch(options: argparse.Namespace, print_line: PrintLine) -> CommandResult:
     """Explain every recording separately, print each result, then print the overall summary."""
     from bench.benchmark.runner.plugin_discovery import Plugin
     from bench.benchmark.runner.worker_pools import make_pool
@@ -187,8 +187,8 @@ def _run_explain_batch(options: argparse.Namespace, say: PrintLine) -> CommandRe
             "thorough", "fix_base",
         )
     } | {"free": tuple(parse_name_list(options.free))}  # fmt: skip
-    out = options.out or make_timestamped_path(Path("results"), "explain-each")
-    logs = list_logs(options.recordings, out, settings)
+    output_folder = options.out or make_timestamped_path(Path("results"), "explain-each")
+    logs = list_logs(options.recordings, output_folder, settings)
     started = get_utc_time()
 
     finished = 0
@@ -200,7 +200,9 @@ def _run_explain_batch(options: argparse.Namespace, say: PrintLine) -> CommandRe
         causes = [format_cause(cause) for cause in row.causes]
         seconds = "" if row.seconds is None else f" ({row.seconds:.0f} s)"
         with display.paused():
-            say(f"{row.log}: {row.error or row.verdict} {'; '.join(causes)}".rstrip() + seconds)
+            print_line(
+                f"{row.log}: {row.error or row.verdict} {'; '.join(causes)}".rstrip() + seconds
+            )
         display.advance()
         display.completed(finished / len(logs))
 
@@ -212,33 +214,44 @@ def _run_explain_batch(options: argparse.Namespace, say: PrintLine) -> CommandRe
         )
         with pool:
             pool.load_plugins([Plugin(str(path)) for path in options.plugin])
-            rows = explain_batch(logs, out, settings, pool, done, interrupts.is_stop_requested)
+            rows = explain_batch(
+                logs, output_folder, settings, pool, done, interrupts.is_stop_requested
+            )
     remaining = len(logs) - len(rows)
     folders = {log.name: log.folder for log in logs}
     relevant = {name: getattr(options, name) for name in _RESULT_RELEVANT_OPTIONS} | {"each": True}
-    words = format_explain_command(options.recordings, {**relevant, "out": out})
+    words = format_explain_command(options.recordings, {**relevant, "out": output_folder})
     recordings = dict(zip(folders, options.recordings, strict=True))
-    report = write_summary_page(rows, BatchPageInput(out, folders, recordings, words, remaining))
-    write_explanation_environment(out, started, relevant, options.recordings)
-    together = summarise_causes(rows)
-    for line in ("", *together, f"\nreport  {report}", f"table   {out / LOGS_TABLE_FILE}"):
-        say(line)
+    report = write_summary_page(
+        rows, BatchPageInput(output_folder, folders, recordings, words, remaining)
+    )
+    write_explanation_environment(output_folder, started, relevant, options.recordings)
+    summary_lines = summarise_causes(rows)
+    for line in (
+        "",
+        *summary_lines,
+        f"\nreport  {report}",
+        f"table   {output_folder / LOGS_TABLE_FILE}",
+    ):
+        print_line(line)
     code = EXIT_PROBLEMS_FOUND if any(row.error for row in rows) else EXIT_OK
     if remaining:
-        say(f"{remaining} of {len(logs)} recordings remain; run the same command again to continue")
+        print_line(
+            f"{remaining} of {len(logs)} recordings remain; run the same command again to continue"
+        )
         code = EXIT_INTERRUPTED
     results = [{**asdict(row), "folder": folders[row.log]} for row in rows]
     document = {
         "logs": results,
-        "together": together,
+        "together": summary_lines,
         "left": remaining,
-        "table": out / LOGS_TABLE_FILE,
+        "table": output_folder / LOGS_TABLE_FILE,
         "report": report,
     }
     return CommandResult(document, code)
 
 
-def _run_score(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+def _run_score(options: argparse.Namespace, print_line: PrintLine) -> CommandResult:
     """Print a model's error on a recording."""
     from bench.api.explain import score
     from bench.core.plugin_registries import load_plugins
@@ -247,7 +260,7 @@ def _run_score(options: argparse.Namespace, say: PrintLine) -> CommandResult:
     result = score(options.model, options.recording, held_out=options.held_out, force=options.force)
     units = result.pop("units")
     for channel, error in result["rmse"].items():
-        say(f"{channel}: RMSE {error:.4g} {units[channel]}")
+        print_line(f"{channel}: RMSE {error:.4g} {units[channel]}")
     counts = f"{result['runs']} runs, {result['samples']} samples"
-    say(f"{result['normalised_rmse']:.4g} times the noise; {counts}")
+    print_line(f"{result['normalised_rmse']:.4g} times the noise; {counts}")
     return CommandResult(result)

@@ -70,12 +70,12 @@ def add_track_arguments(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(command=run_track)
 
 
-def run_film(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+def run_film(options: argparse.Namespace, print_line: PrintLine) -> CommandResult:
     """Film a recorded ball.
 
     Args:
         options: Options of `simgap film`.
-        say: Prints a line of text.
+        print_line: Prints a line of text.
     """
     from bench.logs.film_recording import write_film
 
@@ -88,8 +88,10 @@ def run_film(options: argparse.Namespace, say: PrintLine) -> CommandResult:
         options.force,
     )
     camera = options.out.with_suffix(".camera.toml")
-    say(f"{options.out}: {frames} frames, {seconds:.4g} s, {options.size} x {options.size} px")
-    say(f"{camera}: the camera")
+    print_line(
+        f"{options.out}: {frames} frames, {seconds:.4g} s, {options.size} x {options.size} px"
+    )
+    print_line(f"{camera}: the camera")
     return CommandResult(
         {
             "film": options.out,
@@ -101,12 +103,12 @@ def run_film(options: argparse.Namespace, say: PrintLine) -> CommandResult:
     )
 
 
-def run_track(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+def run_track(options: argparse.Namespace, print_line: PrintLine) -> CommandResult:
     """Track a ball; write the recording and its figure.
 
     Args:
         options: Options of `simgap track`.
-        say: Prints a line of text.
+        print_line: Prints a line of text.
     """
     from bench.figures.track_figure import render_track_figure
     from bench.logs.film_tracking import track_film
@@ -118,7 +120,7 @@ def run_track(options: argparse.Namespace, say: PrintLine) -> CommandResult:
     for note in track.notes:
         print(f"simgap: {options.video}: {note}", file=sys.stderr)
     for line in track.lines:
-        say(line)
+        print_line(line)
     endings = (".csv", ".toml", ".png", ".pdf") if options.pdf else (".csv", ".toml", ".png")
     files = [options.out.with_suffix(ending) for ending in endings]
     return CommandResult({**track.to_document(), "recording": options.out, "files": files})

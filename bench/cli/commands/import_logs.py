@@ -32,7 +32,7 @@ def add_import_arguments(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(command=_run_import)
 
 
-def _run_import(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+def _run_import(options: argparse.Namespace, print_line: PrintLine) -> CommandResult:
     """Execute `simgap import`: write a description of log files, from which simgap reads them.
 
     Everything that was guessed is printed, because the user should confirm it. The log files
@@ -40,7 +40,7 @@ def _run_import(options: argparse.Namespace, say: PrintLine) -> CommandResult:
 
     Args:
         options: parsed arguments of the command.
-        say: prints one line of text.
+        print_line: prints one line of text.
 
     Returns:
         The JSON document of the command, and its exit code (0).
@@ -48,14 +48,16 @@ def _run_import(options: argparse.Namespace, say: PrintLine) -> CommandResult:
     from bench.api.recordings import ImportRequest, import_logs
 
     result = import_logs(**collect_options(options, ImportRequest))
-    say(f"{options.out}: {len(result.guessed)} guesses, each marked there; nothing was copied")
+    print_line(
+        f"{options.out}: {len(result.guessed)} guesses, each marked there; nothing was copied"
+    )
     for line in result.checks:
-        say(f"check: {line}")
+        print_line(f"check: {line}")
     for line in result.guessed:
-        say(f"guess: {line}")
+        print_line(f"guess: {line}")
     for line in result.untold:
-        say(f"not told: {line}")
-    say(f"next: simgap inspect {options.out}")
+        print_line(f"not told: {line}")
+    print_line(f"next: simgap inspect {options.out}")
     return CommandResult(
         {
             "description": options.out,

@@ -15,11 +15,11 @@ def add_info_arguments(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(command=_run_info)
 
 
-def _run_info(options: argparse.Namespace, say: PrintLine) -> CommandResult:  # noqa: ARG001
+def _run_info(options: argparse.Namespace, print_line: PrintLine) -> CommandResult:  # noqa: ARG001
     """Execute `simgap info`: print what a bug report should say about this machine."""
     information = collect_info()
     for line in _format_info(information):
-        say(line)
+        print_line(line)
     return CommandResult(information)
 
 
@@ -145,8 +145,8 @@ def _describe_packages() -> Iterator[JsonDocument]:
 
 def _parse_extra(marker: str) -> str:
     """Return the extra that a requirement belongs to; empty if it belongs to none."""
-    _, _, behind = marker.partition("extra == ")
-    return behind.split()[0].strip("\"')") if behind else ""
+    _, _, extra_text = marker.partition("extra == ")
+    return extra_text.split()[0].strip("\"')") if extra_text else ""
 
 
 def _read_package_version(package: str) -> str | None:

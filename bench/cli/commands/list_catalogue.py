@@ -32,13 +32,13 @@ def add_schema_arguments(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(command=_run_schema)
 
 
-def _run_list(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+def _run_list(options: argparse.Namespace, print_line: PrintLine) -> CommandResult:
     """Execute `simgap list`: print one section of the catalogue, or the places of a robot.
 
     Args:
         options: parsed arguments of the command; `what` is the section, None for all of them, which
             needs ``--json``. `model` is the robot's model file, for the section places only.
-        say: prints one line of text.
+        print_line: prints one line of text.
 
     Returns:
         The JSON document of the command, and its exit code (0).
@@ -56,25 +56,25 @@ def _run_list(options: argparse.Namespace, say: PrintLine) -> CommandResult:
         from bench.cli import robot_places
 
         for line in robot_places.format_places(options.model):
-            say(line)
+            print_line(line)
         return CommandResult({"places": robot_places.list_places(options.model)})
     if options.what is None:
         if not options.json:
             raise InputError(f"expected one of {', '.join(_LISTS)}; with --json all are listed")
         return CommandResult(catalogue.build_catalogue(build_parser()))
     if options.what == "commands":
-        found = catalogue.list_commands(build_parser())
+        documents = catalogue.list_commands(build_parser())
     else:
-        found = catalogue.CATALOGUE_SECTIONS[options.what]()
-    for line in format_documents(options.what, found):
-        say(line)
-    return CommandResult({options.what: found})
+        documents = catalogue.CATALOGUE_SECTIONS[options.what]()
+    for line in format_documents(options.what, documents):
+        print_line(line)
+    return CommandResult({options.what: documents})
 
 
-def _run_schema(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+def _run_schema(options: argparse.Namespace, print_line: PrintLine) -> CommandResult:
     """Execute `simgap schema`: print the JSON schema of a document that simgap writes."""
     from bench.schemas import load_schema
 
-    found = load_schema(options.name)
-    say(format_json(found))
-    return CommandResult(found)
+    schema = load_schema(options.name)
+    print_line(format_json(schema))
+    return CommandResult(schema)

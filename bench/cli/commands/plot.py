@@ -42,7 +42,7 @@ def add_plot_arguments(plot: argparse.ArgumentParser) -> None:
     plot.set_defaults(command=_run_plot)
 
 
-def _run_plot(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+def _run_plot(options: argparse.Namespace, print_line: PrintLine) -> CommandResult:
     """Execute `simgap plot`: write tables, figures and report of finished results again.
 
     Several comparisons together give one joint result, which needs the folder `options.out`.
@@ -50,7 +50,7 @@ def _run_plot(options: argparse.Namespace, say: PrintLine) -> CommandResult:
 
     Args:
         options: parsed arguments of the command.
-        say: prints one line of text.
+        print_line: prints one line of text.
 
     Returns:
         The JSON document of the command, and its exit code (0).
@@ -63,7 +63,7 @@ def _run_plot(options: argparse.Namespace, say: PrintLine) -> CommandResult:
     from sims.core.simulator import InputError
 
     if len(options.runs) == 1 and is_stored_suite(options.runs[0]):
-        report_suite(options.runs[0], say)
+        report_suite(options.runs[0], print_line)
         return CommandResult({"comparisons": []})
     files = [str(path.resolve()) for path in map(Path, options.plugin)]
     for folder in options.runs:
@@ -75,7 +75,7 @@ def _run_plot(options: argparse.Namespace, say: PrintLine) -> CommandResult:
         for part in list_study_folders(options.runs[0]):
             for reference in references:
                 reference.find_mismatches(open_study(part).configuration.experiment)
-        return _report_again(options.runs[0], references, say)
+        return _report_again(options.runs[0], references, print_line)
     if not options.out:
         raise InputError("several comparisons give one result: name a folder for it with --out DIR")
     from bench.benchmark.comparison import Comparison
@@ -83,21 +83,21 @@ def _run_plot(options: argparse.Namespace, say: PrintLine) -> CommandResult:
 
     for folder in options.runs:
         if not isinstance(study := open_study(folder), Comparison):
-            asked = study.configuration.experiment
-            found = "a bounce shot" if asked.shot else "a study of two comparisons"
-            found = "a comparison of diagnosers" if asked.diagnosis else found
-            raise InputError(f"{folder}: expected the folder of a comparison, found {found}")
-    document = compare_across_problems(options.runs, options.out, say).to_document()
+            experiment = study.configuration.experiment
+            found_text = "a bounce shot" if experiment.shot else "a study of two comparisons"
+            found_text = "a comparison of diagnosers" if experiment.diagnosis else found_text
+            raise InputError(f"{folder}: expected the folder of a comparison, found {found_text}")
+    document = compare_across_problems(options.runs, options.out, print_line).to_document()
     return CommandResult(
         {
             **document,
-            "behind": _draw_each_with_references(options.runs, references, options.out, say),
+            "behind": _draw_each_with_references(options.runs, references, options.out, print_line),
         }
     )
 
 
 def _report_again(
-    folder: Path, references: Sequence[ReferenceResult], say: PrintLine
+    folder: Path, references: Sequence[ReferenceResult], print_line: PrintLine
 ) -> CommandResult:
     """Report again a study, or the studies of a sweep or of a file with several studies."""
     from bench.cli.study_summary import summarise_study
@@ -106,36 +106,47 @@ def _report_again(
     comparisons = []
     for part in list_study_folders(folder):
         study = open_study(part)
-        failed = study.report(say)
-        behind = _draw_with_references(part, references, part, say)
-        comparisons.append({**summarise_study(study), "failed": failed, "behind": behind})
-    report_jointly(folder, say)
+        failed = study.report(print_line)
+        reference_documents = _draw_with_references(part, references, part, print_line)
+        comparisons.append(
+            {**summarise_study(study), "failed": failed, "behind": reference_documents}
+        )
+    report_jointly(folder, print_line)
     return CommandResult({"comparisons": comparisons})
 
 
 def _draw_each_with_references(
-    folders: Sequence[Path], references: Sequence[ReferenceResult], out: Path, say: PrintLine
+    folders: Sequence[Path],
+    references: Sequence[ReferenceResult],
+    output_folder: Path,
+    print_line: PrintLine,
 ) -> list[JsonDocument]:
     """Draw each of several comparisons over the references that belong to its problem."""
     from sims.core.simulator import InputError
 
-    drawn = []
+    documents = []
     for number, folder in enumerate(folders, 1):
         for reference in references:
             name = f"{number}-{folder.resolve().name}-{reference.name.replace('/', '-')}-"
             try:
-                drawn += _draw_with_references(folder, [reference], out, say, name)
+                documents += _draw_with_references(
+                    folder, [reference], output_folder, print_line, name
+                )
             except InputError as error:
-                say(f"not drawn: {error}")
-    return drawn
+                print_line(f"not drawn: {error}")
+    return documents
 
 
 def _draw_with_references(
-    folder: Path, references: Sequence[ReferenceResult], out: Path, say: PrintLine, name: str = ""
+    folder: Path,
+    references: Sequence[ReferenceResult],
+    output_folder: Path,
+    print_line: PrintLine,
+    name: str = "",
 ) -> list[JsonDocument]:
     """Draw a comparison over references in grey; draw nothing without references."""
     if not references:
         return []
     from bench.benchmark.reference_overlay import draw_with_references
 
-    return draw_with_references(folder, references, out, say, name)
+    return draw_with_references(folder, references, output_folder, print_line, name)

@@ -151,14 +151,14 @@ def add_inspect_arguments(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(command=_run_inspect)
 
 
-def _run_simulate(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+def _run_simulate(options: argparse.Namespace, print_line: PrintLine) -> CommandResult:
     """Execute `simgap simulate`: simulate a recording, and write it with its true parameters.
 
     The true parameters are in a separate file, so that the recording can be explained without them.
 
     Args:
         options: parsed arguments of the command.
-        say: prints one line of text.
+        print_line: prints one line of text.
 
     Returns:
         The JSON document of the command, and its exit code (0).
@@ -170,7 +170,7 @@ def _run_simulate(options: argparse.Namespace, say: PrintLine) -> CommandResult:
 
     load_plugins(options.plugin)
     check_output_path(options.out)
-    given = build_simulation_spec_args(
+    spec_args = build_simulation_spec_args(
         options.theta,
         options.effect,
         options.constant,
@@ -178,16 +178,16 @@ def _run_simulate(options: argparse.Namespace, say: PrintLine) -> CommandResult:
         options.input,
         options.initial,
     )
-    simulated = simulate(**{**collect_options(options, SimulationSpec), **given})
+    simulated = simulate(**{**collect_options(options, SimulationSpec), **spec_args})
     simulated.write(options.out)
     first = simulated.recording.runs[0]
     truth = options.out.with_suffix(".truth.toml")
     runs = f"{options.runs} run{'s' * (options.runs > 1)}"
-    say(
+    print_line(
         f"{options.out}: {runs} of {options.seconds:g} s at {options.rate:g} Hz, channels "
         f"{', '.join(first.channels)}"
     )
-    say(f"{truth}: its true parameters")
+    print_line(f"{truth}: its true parameters")
     return CommandResult(
         {
             "recording": options.out,
@@ -203,7 +203,7 @@ def _run_simulate(options: argparse.Namespace, say: PrintLine) -> CommandResult:
     )
 
 
-def _run_inspect(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+def _run_inspect(options: argparse.Namespace, print_line: PrintLine) -> CommandResult:
     """Execute `simgap inspect`: print what a recording contains, and what looks wrong in it.
 
     It checks times, data quality, drives that do nothing and sign or unit conventions. With
@@ -212,7 +212,7 @@ def _run_inspect(options: argparse.Namespace, say: PrintLine) -> CommandResult:
 
     Args:
         options: parsed arguments of the command.
-        say: prints one line of text.
+        print_line: prints one line of text.
 
     Returns:
         The JSON document of the command, and its exit code; EXIT_PROBLEMS_FOUND if the data do not
@@ -233,26 +233,29 @@ def _run_inspect(options: argparse.Namespace, say: PrintLine) -> CommandResult:
     recording, kind = load_recording(
         options.recording, options.system, options.model, fix_base=options.fix_base
     )
-    about = list(robot_summary.format_robot_summary(kind))
-    found = [
+    robot_lines = list(robot_summary.format_robot_summary(kind))
+    oddities = [
         *odd_logs(recording),
         *find_anomalies(recording, kind),
         *find_missing_base_poses(recording, kind),
     ]
-    odd = [*(o.text for o in found), *robot_summary.format_log_warnings(recording, kind)]
+    warnings_to_print = [
+        *(o.text for o in oddities),
+        *robot_summary.format_log_warnings(recording, kind),
+    ]
     findings = list(check_log_quality(recording, kind))
     active_recording, inactive = _remove_inactive_drives(recording, kind)
     findings += inactive
-    differences, fixes = _find_differing_conventions(options, active_recording, kind)
+    differences, settings_to_fix = _find_differing_conventions(options, active_recording, kind)
     for line in (
-        *about,
+        *robot_lines,
         *format_summary(recording, kind),
-        *(f"odd: {text}" for text in odd),
+        *(f"odd: {text}" for text in warnings_to_print),
         *(f"finding: {finding.text_line}" for finding in findings),
-        *(f"convention: {one.description}" for one in differences),
-        *(f"    set {line}" for line in fixes),
+        *(f"convention: {difference.description}" for difference in differences),
+        *(f"    set {line}" for line in settings_to_fix),
     ):
-        say(line)
+        print_line(line)
     folder = options.out or Path("results/inspect", options.recording.resolve().parent.name)
     corrected: list[Path] = []
     if options.fix:
@@ -261,26 +264,28 @@ def _run_inspect(options: argparse.Namespace, say: PrintLine) -> CommandResult:
         corrected = write_corrected(options.recording, kind, differences, options.fix)
     files = [*write_recording_figure(recording, kind, folder), *corrected]
     for path in files:
-        say(str(path))
-    numbers = _print_identifiability(options, say) if options.check else None
+        print_line(str(path))
+    numbers = _print_identifiability(options, print_line) if options.check else None
     document = {
         **signal_statistics.to_document(recording, kind),
-        "robot": about,
-        "odd": odd,
+        "robot": robot_lines,
+        "odd": warnings_to_print,
         "findings": [finding._asdict() for finding in findings],
         "conventions": [
             {
-                "text": one.hypothesis.description,
-                "alternatives": [other.description for other in one.alternatives],
+                "text": difference.hypothesis.description,
+                "alternatives": [
+                    alternative.description for alternative in difference.alternatives
+                ],
             }
-            for one in differences
+            for difference in differences
         ],
-        "fixes": fixes,
+        "fixes": settings_to_fix,
         "check": numbers,
         "files": files,
     }
-    lost = any(n["free"] and n["word"] == "not identifiable" for n in numbers or ())
-    return CommandResult(document, EXIT_PROBLEMS_FOUND if lost else EXIT_OK)
+    has_unidentifiable = any(n["free"] and n["word"] == "not identifiable" for n in numbers or ())
+    return CommandResult(document, EXIT_PROBLEMS_FOUND if has_unidentifiable else EXIT_OK)
 
 
 def _remove_inactive_drives(
@@ -293,12 +298,12 @@ def _remove_inactive_drives(
         return recording, []
     from bench.diagnosis.prediction_error.inactive_drives import without_inactive_drives
 
-    used = without_inactive_drives(recording, kind)
+    active = without_inactive_drives(recording, kind)
     findings = []
-    for note in used.notes[len(recording.notes) :]:
+    for note in active.notes[len(recording.notes) :]:
         text, _, remedy = note.rpartition("; ")
         findings.append(QualityFinding("drive", text, remedy))
-    return used, findings
+    return active, findings
 
 
 def _find_differing_conventions(
@@ -334,7 +339,9 @@ def _find_differing_conventions(
     return differences, list(lines_of(meta, kind, differences))
 
 
-def _print_identifiability(options: argparse.Namespace, say: PrintLine) -> list[JsonDocument]:
+def _print_identifiability(
+    options: argparse.Namespace, print_line: PrintLine
+) -> list[JsonDocument]:
     """Print which numbers the recording can determine, before any fit.
 
     The numbers are those that the user named with ``--free``, then the coefficients of the possible
@@ -345,7 +352,7 @@ def _print_identifiability(options: argparse.Namespace, say: PrintLine) -> list[
 
     free = parse_name_list(options.free or "")
     numbers = check_identifiability(options.recording, options.system, options.model, free)
-    say("\n".join(("", *format_identifiability(numbers))))
+    print_line("\n".join(("", *format_identifiability(numbers))))
     return [
         {**asdict(number), "mixed": [{"with": n, "correlation": c} for n, c in number.mixed]}
         for number in numbers

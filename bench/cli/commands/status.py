@@ -31,12 +31,12 @@ def add_status_arguments(status: argparse.ArgumentParser) -> None:
     status.set_defaults(command=_run_status)
 
 
-def _run_status(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+def _run_status(options: argparse.Namespace, print_line: PrintLine) -> CommandResult:
     """Execute `simgap status`: print how far a study is, or without one the isolation layers.
 
     Args:
         options: parsed arguments of the command.
-        say: prints one line of text.
+        print_line: prints one line of text.
 
     Returns:
         The JSON document of the command, and its exit code; EXIT_PROBLEMS_FOUND if a study is not
@@ -45,27 +45,29 @@ def _run_status(options: argparse.Namespace, say: PrintLine) -> CommandResult:
     from bench.studies.study import list_study_folders, open_study
 
     if options.run is None:
-        return CommandResult({"seals": _print_isolation_layers(say)})
+        return CommandResult({"seals": _print_isolation_layers(print_line)})
     studies = [
-        _print_progress(open_study(part), options.runs, say)
+        _print_progress(open_study(part), options.runs, print_line)
         for part in list_study_folders(options.run)
     ]
     complete = all(study["complete"] for study in studies)
     return CommandResult({"studies": studies}, EXIT_OK if complete else EXIT_PROBLEMS_FOUND)
 
 
-def _print_isolation_layers(say: PrintLine) -> list[JsonDocument]:
+def _print_isolation_layers(print_line: PrintLine) -> list[JsonDocument]:
     """Print which isolation layers are available on this machine."""
     from bench.benchmark.isolation.isolation_layers import ISOLATION_LAYERS
     from bench.benchmark.runner.sandboxed_tuner import list_active_isolation_layers
 
-    there = list_active_isolation_layers()
-    say("isolation layers of a tuner's process on this machine (docs/sealing.md)")
-    for name, says in ISOLATION_LAYERS.items():
-        say(f"  {name:10} {'active' if name in there else 'NOT AVAILABLE':14} {says}")
+    active_layers = list_active_isolation_layers()
+    print_line("isolation layers of a tuner's process on this machine (docs/sealing.md)")
+    for name, description in ISOLATION_LAYERS.items():
+        print_line(
+            f"  {name:10} {'active' if name in active_layers else 'NOT AVAILABLE':14} {description}"
+        )
     return [
-        {"name": name, "holds": name in there, "says": says}
-        for name, says in ISOLATION_LAYERS.items()
+        {"name": name, "holds": name in active_layers, "says": description}
+        for name, description in ISOLATION_LAYERS.items()
     ]
 
 
@@ -73,9 +75,9 @@ def _describe_isolation(study: Study) -> JsonDocument:
     """Describe how the tuners of a study are isolated from the true parameters."""
     from bench.benchmark.isolation.isolation_layers import ISOLATION_LAYERS
 
-    held = study.configuration
-    experiment = held.experiment
-    missing = [name for name in ISOLATION_LAYERS if name not in held.isolation_layers]
+    configuration = study.configuration
+    experiment = configuration.experiment
+    missing = [name for name in ISOLATION_LAYERS if name not in configuration.isolation_layers]
     return {
         "trusted": experiment.trusted,
         "isolation": experiment.isolation,
@@ -98,37 +100,37 @@ def _format_isolation(seal: JsonDocument) -> str:
     return processes + layers + salt_note + (", revealed" if seal["revealed"] else "")
 
 
-def _print_progress(study: Study, every: bool, say: PrintLine) -> JsonDocument:
+def _print_progress(study: Study, is_all: bool, print_line: PrintLine) -> JsonDocument:
     """Print the progress of a study, and return it as a document."""
     standing = study.status()
-    planned, what = len(standing.ends), standing.what
+    planned, unit = len(standing.ends), standing.what
     seal, groups = _describe_isolation(study), _count_endings(standing)
     resume = None if standing.is_complete else f"simgap compare --resume {study.folder}"
-    shown = standing.ends if every else _select_notable_runs(standing)
+    listed_runs = standing.ends if is_all else _select_notable_runs(standing)
 
     complete = ", complete" if standing.is_complete else ""
-    say(f"{standing.name}: {standing.finished} of {planned} {what}{complete}")
-    say("  " + ", ".join(f"{name} {value}" for name, value in standing.hashes.items()))
-    say(f"  {_format_isolation(seal)}")
+    print_line(f"{standing.name}: {standing.finished} of {planned} {unit}{complete}")
+    print_line("  " + ", ".join(f"{name} {value}" for name, value in standing.hashes.items()))
+    print_line(f"  {_format_isolation(seal)}")
     for line in _format_counts(groups):
-        say(f"  {line}")
-    for end in shown:
-        say(f"{end.status:10} {end.name}  {_get_last_line(end)}".rstrip())
-    if len(standing.ends) > len(shown):
-        say(f"({len(shown)} of {len(standing.ends)} listed; --runs lists all)")
+        print_line(f"  {line}")
+    for run_end in listed_runs:
+        print_line(f"{run_end.status:10} {run_end.name}  {_get_last_line(run_end)}".rstrip())
+    if len(standing.ends) > len(listed_runs):
+        print_line(f"({len(listed_runs)} of {len(standing.ends)} listed; --runs lists all)")
     if resume:
-        say(f"to finish it: {resume}")
+        print_line(f"to finish it: {resume}")
     return {
         "name": standing.name,
         "folder": study.folder,
-        "what": what,
+        "what": unit,
         "finished": standing.finished,
         "planned": planned,
         "complete": standing.is_complete,
         "hashes": dict(standing.hashes),
         "seal": seal,
         "groups": groups,
-        "runs": [end._asdict() for end in shown],
+        "runs": [run_end._asdict() for run_end in listed_runs],
         "resume": resume,
     }
 
@@ -138,7 +140,7 @@ def _count_endings(standing: StudyProgress) -> dict[str, dict[str, int]]:
     groups: dict[str, Counter[str]] = {}
     for end in standing.ends:
         groups.setdefault(end.group, Counter())[end.status] += 1
-    return {group: dict(sorted(ends.items())) for group, ends in groups.items()}
+    return {group: dict(sorted(counts.items())) for group, counts in groups.items()}
 
 
 def _format_counts(groups: dict[str, dict[str, int]]) -> list[str]:
@@ -147,9 +149,9 @@ def _format_counts(groups: dict[str, dict[str, int]]) -> list[str]:
 
     width = max(map(len, groups), default=0)
     lines = []
-    for group, ends in groups.items():
-        ordered = sorted(ends, key=lambda status: (status == MISSING_STATUS, status))
-        lines.append(f"{group:{width}}  {', '.join(f'{ends[s]} {s}' for s in ordered)}")
+    for group, counts in groups.items():
+        ordered = sorted(counts, key=lambda status: (status == MISSING_STATUS, status))
+        lines.append(f"{group:{width}}  {', '.join(f'{counts[s]} {s}' for s in ordered)}")
     return lines
 
 
@@ -157,8 +159,10 @@ def _select_notable_runs(standing: StudyProgress) -> tuple[RunEnd, ...]:
     """Select the runs to list: those without success, or all; at most `_MAX_LISTED_RUNS`."""
     from bench.benchmark.storage.study_progress import SUCCESS_STATUSES
 
-    telling = tuple(end for end in standing.ends if end.status not in SUCCESS_STATUSES)
-    return (telling or standing.ends)[:_MAX_LISTED_RUNS]
+    unsuccessful = tuple(
+        run_end for run_end in standing.ends if run_end.status not in SUCCESS_STATUSES
+    )
+    return (unsuccessful or standing.ends)[:_MAX_LISTED_RUNS]
 
 
 def _get_last_line(end: RunEnd) -> str:

@@ -62,7 +62,7 @@ def add_train_arguments(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(command=_run_train)
 
 
-def _run_train(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+def _run_train(options: argparse.Namespace, print_line: PrintLine) -> CommandResult:
     """Execute `simgap train`: train a learned tuner for each seed, before a comparison needs it.
 
     The weights are stored in the cache, where `simgap compare` finds them. The losses of each epoch
@@ -70,7 +70,7 @@ def _run_train(options: argparse.Namespace, say: PrintLine) -> CommandResult:
 
     Args:
         options: parsed arguments of the command.
-        say: prints one line of text.
+        print_line: prints one line of text.
 
     Returns:
         The JSON document of the command, and its exit code (0).
@@ -93,7 +93,7 @@ def _run_train(options: argparse.Namespace, say: PrintLine) -> CommandResult:
     seeds = options.seeds or count_seeds(experiment, entry)
     check_training_size(experiment, entry, seeds, options.force)
     if options.experiment is None:
-        say(f"experiment: {experiment.name}")
+        print_line(f"experiment: {experiment.name}")
     trained, files = [], []
     with ProgressBars("epoch") as bars:
         losses = LossRecorder(experiment, bars.start_bar)
@@ -103,9 +103,9 @@ def _run_train(options: argparse.Namespace, say: PrintLine) -> CommandResult:
                 training = run_training(experiment, entry, seed, losses, options.again)
             except TrainingBudgetTooSmallError as error:
                 raise InputError(f"tuner {entry.label}: {error}; give a larger --budget") from None
-            how = "trained earlier with" if training.was_cached else "trained with"
+            origin = "trained earlier with" if training.was_cached else "trained with"
             cost = f"{training.simulations} simulations in {training.seconds:.1f} s"
-            say(f"{training.path}: {how} {cost}")
+            print_line(f"{training.path}: {origin} {cost}")
             trained.append(
                 {
                     "seed": seed,
@@ -120,10 +120,10 @@ def _run_train(options: argparse.Namespace, say: PrintLine) -> CommandResult:
         title = f"{entry.label} on {experiment.name}, {training.simulations} simulations"
         files = losses.write(folder, title)
         for path in files:
-            say(str(path))
+            print_line(str(path))
     budget = f" --training-budget {options.budget}" if options.budget else ""
     trust = " --trust" if options.trust else ""
     command = f"simgap compare {options.experiment or experiment.name}{budget}{trust}"
-    say(f"found by: {command}")
+    print_line(f"found by: {command}")
     document = {"tuner": entry.label, "experiment": experiment.name, "found_by": command}
     return CommandResult({**document, "trainings": trained, "files": files})

@@ -24,12 +24,12 @@ def add_verify_arguments(verify: argparse.ArgumentParser) -> None:
     verify.set_defaults(command=_run_verify)
 
 
-def _run_verify(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+def _run_verify(options: argparse.Namespace, print_line: PrintLine) -> CommandResult:
     """Execute `simgap verify`: check that an archive, explanation or comparison is consistent.
 
     Args:
         options: parsed arguments of the command; `run` is the file of an archive, or a folder.
-        say: prints one line of text.
+        print_line: prints one line of text.
 
     Returns:
         The JSON document of the command, and its exit code; EXIT_PROBLEMS_FOUND if a number does
@@ -40,17 +40,17 @@ def _run_verify(options: argparse.Namespace, say: PrintLine) -> CommandResult:
     from bench.studies.verification import verify_comparison
 
     if options.run.is_file():
-        archived = verify_archive(options.run, say, options.plugin, options.all)
+        archived = verify_archive(options.run, print_line, options.plugin, options.all)
         return CommandResult(
             archived.to_document(), EXIT_OK if archived.is_consistent else EXIT_PROBLEMS_FOUND
         )
     document: JsonDocument = {"archive": None, "comparisons": [], "explanation": None}
     if (options.run / VERDICT_FILE).is_file():
-        document["explanation"] = verify_explanation(options.run, say).to_document()
+        document["explanation"] = verify_explanation(options.run, print_line).to_document()
         follows = document["explanation"]["follows"]
     else:
         parts = [
-            verify_comparison(part, say, options.plugin, options.all)
+            verify_comparison(part, print_line, options.plugin, options.all)
             for part in list_study_folders(options.run)
         ]
         document["comparisons"] = [part.to_document() for part in parts]

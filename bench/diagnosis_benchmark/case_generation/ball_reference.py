@@ -45,8 +45,8 @@ class FlightDynamics:
         ]
         self.gust = None
         if "gust" in self.acting:
-            along, up, lasting, *begins = self.acting["gust"]
-            self.gust = along, up, begins[number], begins[number] + lasting
+            gust_x, gust_z, duration, *start_times = self.acting["gust"]
+            self.gust = gust_x, gust_z, start_times[number], start_times[number] + duration
         self.breaks = list(self.gust[2:]) if self.gust else []
 
     def compute_acceleration(self, t: float, y: Any, middle: float) -> Acceleration:
@@ -174,42 +174,42 @@ def simulate_ball(world: TrueSystem, scenario: Scenario, number: int, instants: 
     """
     air, until = FlightDynamics(world, number), float(instants[-1])
     state = np.array([scenario.initial[name] for name in STATES])
-    out = np.empty((instants.size, 6))
-    out[instants <= 0] = state
-    now, rising, resting = 0.0, 0.0, False
-    while now < until:
-        end = min([until, *(b for b in air.breaks if b > now)], default=until)
-        looks = not (rising or resting)
+    states = np.empty((instants.size, 6))
+    states[instants <= 0] = state
+    time, rising, resting = 0.0, 0.0, False
+    while time < until:
+        end = min([until, *(b for b in air.breaks if b > time)], default=until)
+        has_impact_event = not (rising or resting)
         if rising:  # the ground, where the rise after a bounce begins, is no event
-            end = min(end, now + rising)
+            end = min(end, time + rising)
         solved = _integrate_flight(
-            air, now, end, state, world.constants["radius"] if looks else None, resting
+            air, time, end, state, world.constants["radius"] if has_impact_event else None, resting
         )
         reached, state = float(solved.t[-1]), solved.y[:, -1].copy()
-        first, last = np.searchsorted(instants, [now, reached], side="right")
+        first, last = np.searchsorted(instants, [time, reached], side="right")
         if last > first:
-            out[first:last] = solved.sol(instants[first:last]).T
-        now, rising = reached, 0.0
-        if looks and solved.t_events[0].size:
-            state, resting = _compute_bounce(world, now, state)
+            states[first:last] = solved.sol(instants[first:last]).T
+        time, rising = reached, 0.0
+        if has_impact_event and solved.t_events[0].size:
+            state, resting = _compute_bounce(world, time, state)
             state[2] = world.constants["radius"]
             # Seconds of the rise, 0.4 of the time to its top, in which no impact is possible.
             rising = (
                 0.0
                 if resting
-                else 0.4 * state[5] / max(-air.compute_acceleration(now, state, now)[2], 1e-3)
+                else 0.4 * state[5] / max(-air.compute_acceleration(time, state, time)[2], 1e-3)
             )
-    return out
+    return states
 
 
 def _integrate_flight(
-    air: FlightDynamics, now: float, end: float, state: Array, floor: float | None, resting: bool
+    air: FlightDynamics, start: float, end: float, state: Array, floor: float | None, resting: bool
 ) -> Any:
     """Integrate a part of a flight by the Runge-Kutta method DOP853, up to an impact or a time.
 
     Args:
         air: accelerations of the ball.
-        now: begin, s.
+        start: begin, s.
         end: latest end, s.
         state: position and velocity at the begin, (6,).
         floor: height of the centre at which the ball meets the ground, m; None to look for no
@@ -222,7 +222,7 @@ def _integrate_flight(
     Raises:
         RuntimeError: the solver failed.
     """
-    middle = 0.5 * (now + end)
+    middle = 0.5 * (start + end)
 
     def rate(t: float, y: Array) -> tuple[float, ...]:
         """Return the time derivatives of position and velocity; a resting ball does not sink."""
@@ -237,10 +237,10 @@ def _integrate_flight(
     events = None if floor is None else stops
     settings: dict[str, Any] = {
         "dense_output": True,
-        "first_step": min(0.02, end - now),
+        "first_step": min(0.02, end - start),
         **SOLVER_TOLERANCES,
     }
-    solved = solve_ivp(rate, (now, end), state, "DOP853", events=events, **settings)
+    solved = solve_ivp(rate, (start, end), state, "DOP853", events=events, **settings)
     if not solved.success:
         raise RuntimeError(solved.message)
     return solved
@@ -266,9 +266,11 @@ def _compute_bounce(world: TrueSystem, t: float, state: Array) -> tuple[Array, b
         e = min(e * speed ** world.effects["restitution.speed"][0], 1.0)
     if "wear" in world.foreign:  # unmodelled: restitution that decreases with time
         e = min(max(e * (1.0 - world.foreign["wear"][0] * t), 0.0), 1.0)
-    along = hypot(state[3], state[4])
-    lost = world.effects.get("contact.friction", [0.0])[0] * (1 + e) * speed
-    after = state.copy()
-    after[3:5] *= max(1.0 - lost / along, 0.0) if along > 0 else 1.0
-    after[5] = e * speed if e * speed > REST_SPEED else 0.0
-    return after, after[5] == 0.0
+    tangential_speed = hypot(state[3], state[4])
+    speed_loss = world.effects.get("contact.friction", [0.0])[0] * (1 + e) * speed
+    rebound_state = state.copy()
+    rebound_state[3:5] *= (
+        max(1.0 - speed_loss / tangential_speed, 0.0) if tangential_speed > 0 else 1.0
+    )
+    rebound_state[5] = e * speed if e * speed > REST_SPEED else 0.0
+    return rebound_state, rebound_state[5] == 0.0

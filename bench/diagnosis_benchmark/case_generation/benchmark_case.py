@@ -69,5 +69,5 @@ class BenchmarkCase:
     def from_json(cls, document: Mapping[str, Any]) -> BenchmarkCase:
         """Restore a case from its JSON document."""
         effects = {name: tuple(c) for name, c in document["effects"].items()}
-        given = {**document, "effects": effects, "channels": tuple(document["channels"])}
-        return cls(**{**given, "asked": RequestedConditions(*document.get("asked", ()))})
+        fields = {**document, "effects": effects, "channels": tuple(document["channels"])}
+        return cls(**{**fields, "asked": RequestedConditions(*document.get("asked", ()))})

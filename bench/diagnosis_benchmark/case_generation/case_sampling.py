@@ -92,8 +92,8 @@ def find_equivalent_effects(system: str, driven: bool, effect: str) -> frozenset
     """
     classes = (
         names
-        for *where, names in EQUIVALENT_EFFECTS
-        if where == [system, driven] and effect in names
+        for *conditions, names in EQUIVALENT_EFFECTS
+        if conditions == [system, driven] and effect in names
     )
     return frozenset({effect}).union(*classes)
 
@@ -120,12 +120,12 @@ def draw_case(
         The case, or None if the sensors cannot show the effect at this size with a strength up to
         `effect_coefficients.MAX_STRENGTH`, or if another answer explains it too well.
     """
-    asked = effect or "any"
+    effect_label = effect or "any"
     name = "-".join(
         [
             kind,
             system,
-            *([asked] if kind != "clean" else []),
+            *([effect_label] if kind != "clean" else []),
             *([f"{size:g}"] if size else []),
             *(str(part) for part in wanted_so if part is not None),
             str(seed),
@@ -141,18 +141,20 @@ def draw_case(
         setting.channels, seed,
         setting.parameters, asked=wanted_so,
     )  # fmt: skip
-    wanted = size or float(
+    target_size = size or float(
         np.exp(rng.uniform(np.log(3.0 if kind in ("double", "foreign") else 1.0), np.log(10.0)))
     )
     # The effect must be observable in the runs for fitting, because the held-out runs are not
     # fitted.
-    shown = replace(setting, scenarios=setting.scenarios[: item.runs - count_held_out_runs(item)])
+    fitted_setting = replace(
+        setting, scenarios=setting.scenarios[: item.runs - count_held_out_runs(item)]
+    )
     return {
         "clean": _draw_clean,
         "single": _draw_single,
         "double": _draw_pair,
         "foreign": _draw_unmodelled,
-    }[kind](item, shown, hidden, wanted, rng)
+    }[kind](item, fitted_setting, hidden, target_size, rng)
 
 
 def count_held_out_runs(item: BenchmarkCase) -> int:
@@ -202,17 +204,17 @@ def _choose_hidden_causes(
     first = effect or str(rng.choice(names))
     if kind != "double":
         return (first,)
-    alike = find_equivalent_effects(system, True, first) | find_equivalent_effects(
+    equivalent_effects = find_equivalent_effects(system, True, first) | find_equivalent_effects(
         system, False, first
     )
-    return first, str(rng.choice([n for n in names if n not in alike]))
+    return first, str(rng.choice([n for n in names if n not in equivalent_effects]))
 
 
 def _draw_clean(
     item: BenchmarkCase,
     setting: RecordingConditions,
     hidden: tuple[str, ...],
-    wanted: float,
+    target_size: float,
     rng: np.random.Generator,
 ) -> BenchmarkCase | None:
     """Return a clean case unchanged, because it hides nothing.
@@ -227,39 +229,39 @@ def _draw_single(
     item: BenchmarkCase,
     setting: RecordingConditions,
     hidden: tuple[str, ...],
-    wanted: float,
+    target_size: float,
     rng: np.random.Generator,
 ) -> BenchmarkCase | None:
     """Hide one effect of the library, with coefficients that give the requested size.
 
     If the effect has a simpler form and at least the size of the noise, the case is rejected unless
-    that form leaves a visible residual (`beyond`, at least `MIN_SIMPLER_RESIDUAL`): otherwise the
-    simpler form would be a correct answer.
+    that form leaves a visible residual (`unexplained`, at least `MIN_SIMPLER_RESIDUAL`): otherwise
+    the simpler form would be a correct answer.
 
     Args:
         item: the case without its hidden cause.
         setting: recording conditions with the runs for fitting only.
         hidden: the name of the effect.
-        wanted: size in units of the noise.
+        target_size: size in units of the noise.
         rng: random generator.
 
     Returns:
         The case; None if it is rejected or no coefficients give this size.
     """
     (name,) = hidden
-    c = find_coefficients(name, setting, wanted, rng)
+    c = find_coefficients(name, setting, target_size, rng)
     if c is None:
         return None
-    beyond = None
-    if name in SIMPLER_EFFECTS and wanted >= 1.0:
+    unexplained = None
+    if name in SIMPLER_EFFECTS and target_size >= 1.0:
         observed = effect_sizing.simulate_observations(setting, {name: c})
-        beyond = min(
-            competing_effects.compute_refitted_residual(setting, observed, simpler)
-            for simpler in SIMPLER_EFFECTS[name]
+        unexplained = min(
+            competing_effects.compute_refitted_residual(setting, observed, simpler_effect)
+            for simpler_effect in SIMPLER_EFFECTS[name]
         )
-        if beyond < MIN_SIMPLER_RESIDUAL:
+        if unexplained < MIN_SIMPLER_RESIDUAL:
             return None
-    return replace(item, effects={name: c}, size=wanted, beyond=beyond)
+    return replace(item, effects={name: c}, size=target_size, beyond=unexplained)
 
 
 def find_coefficients(
@@ -276,52 +278,59 @@ def find_coefficients(
     Returns:
         Coefficients, or None if there are none.
     """
-    of = effect_coefficients.draw_effect_shape(name, setting, rng)
-    left = effect_sizing.make_gap_function(
-        setting, lambda strength: effect_sizing.simulate_observations(setting, {name: of(strength)})
+    compute_coefficients = effect_coefficients.draw_effect_shape(name, setting, rng)
+    compute_residual = effect_sizing.make_gap_function(
+        setting,
+        lambda strength: effect_sizing.simulate_observations(
+            setting, {name: compute_coefficients(strength)}
+        ),
     )
     strength = effect_sizing.find_strength_for_size(
-        left, wanted, effect_coefficients.get_max_strength(name)
+        compute_residual, wanted, effect_coefficients.get_max_strength(name)
     )
-    return None if strength is None else of(strength)
+    return None if strength is None else compute_coefficients(strength)
 
 
 def _draw_pair(
     item: BenchmarkCase,
     setting: RecordingConditions,
     hidden: tuple[str, ...],
-    wanted: float,
+    target_size: float,
     rng: np.random.Generator,
 ) -> BenchmarkCase | None:
     """Hide two effects, each of the requested size alone.
 
     The case is rejected if one of the two explains both: the residual that the better one leaves
-    (`beyond`) must be at least `MIN_DISTINCT_SIZE`.
+    (`unexplained`) must be at least `MIN_DISTINCT_SIZE`.
 
     Args:
         item: the case without its hidden causes.
         setting: recording conditions with the runs for fitting only.
         hidden: the two names.
-        wanted: size of each effect alone, in units of the noise.
+        target_size: size of each effect alone, in units of the noise.
         rng: random generator.
 
     Returns:
         The case; None if it is rejected or no coefficients give this size.
     """
-    found = {name: find_coefficients(name, setting, wanted, rng) for name in hidden}
-    effects = _order_input_effects({name: c for name, c in found.items() if c is not None})
-    if len(effects) < len(found):
+    coefficients_by_effect = {
+        name: find_coefficients(name, setting, target_size, rng) for name in hidden
+    }
+    effects = _order_input_effects(
+        {name: c for name, c in coefficients_by_effect.items() if c is not None}
+    )
+    if len(effects) < len(coefficients_by_effect):
         return None
     observed = effect_sizing.simulate_observations(setting, effects)
     if not np.isfinite(observed).all():
         return None
-    beyond = min(
+    unexplained = min(
         competing_effects.compute_refitted_residual(setting, observed, name, effects[name])
         for name in effects
     )
     return (
-        replace(item, effects=effects, size=wanted, beyond=beyond)
-        if beyond >= MIN_DISTINCT_SIZE
+        replace(item, effects=effects, size=target_size, beyond=unexplained)
+        if unexplained >= MIN_DISTINCT_SIZE
         else None
     )
 
@@ -335,33 +344,33 @@ def _draw_unmodelled(
     item: BenchmarkCase,
     setting: RecordingConditions,
     hidden: tuple[str, ...],
-    wanted: float,
+    target_size: float,
     rng: np.random.Generator,
 ) -> BenchmarkCase | None:
     """Hide an unmodelled cause, which no effect of the library explains fully.
 
-    The case is rejected if the best effect of the library leaves a residual (`beyond`) below
+    The case is rejected if the best effect of the library leaves a residual (`unexplained`) below
     `MIN_DISTINCT_SIZE`: that effect would then be a correct answer.
 
     Args:
         item: the case without its hidden cause.
         setting: recording conditions with the runs for fitting only.
         hidden: the name of the cause.
-        wanted: size in units of the noise.
+        target_size: size in units of the noise.
         rng: random generator.
 
     Returns:
         The case; None if it is rejected or no strength gives this size.
     """
     (name,) = hidden
-    of = effect_coefficients.draw_unmodelled_cause(name, setting, rng)
+    compute_coefficients = effect_coefficients.draw_unmodelled_cause(name, setting, rng)
 
     def observed(strength: float) -> Array:
         """Simulate noise-free observations (R, T, C) with the cause at a strength, by scipy.
 
         The batch engine cannot be used here, because it does not know unmodelled causes.
         """
-        world = setting.make_true_system(foreign={name: of(strength)})
+        world = setting.make_true_system(foreign={name: compute_coefficients(strength)})
         return np.array(
             [
                 simulate_with_scipy(world, s, setting.channels, i)
@@ -370,13 +379,21 @@ def _draw_unmodelled(
         )
 
     strength = effect_sizing.find_strength_for_size(
-        effect_sizing.make_gap_function(setting, observed), wanted, effect_coefficients.MAX_STRENGTH
+        effect_sizing.make_gap_function(setting, observed),
+        target_size,
+        effect_coefficients.MAX_STRENGTH,
     )
     if strength is None:
         return None
-    _, beyond = competing_effects.find_best_effect(setting, observed(strength))
-    hides = replace(item, effects={name: of(strength)}, size=wanted, beyond=beyond, source="scipy")
-    return hides if beyond >= MIN_DISTINCT_SIZE else None
+    _, unexplained = competing_effects.find_best_effect(setting, observed(strength))
+    hidden_case = replace(
+        item,
+        effects={name: compute_coefficients(strength)},
+        size=target_size,
+        beyond=unexplained,
+        source="scipy",
+    )
+    return hidden_case if unexplained >= MIN_DISTINCT_SIZE else None
 
 
 def write_case(item: BenchmarkCase, folder: str | Path, truth: bool = True) -> Path:
@@ -396,7 +413,7 @@ def write_case(item: BenchmarkCase, folder: str | Path, truth: bool = True) -> P
     noise = setting.noise.sigma if item.stated else {}
     constants = {} if item.system == "slider" else setting.constants
     path = Path(folder) / f"{item.name}.csv"
-    beside = (
+    other_files = (
         {path.with_suffix(".truth.json"): json.dumps(item.to_json(), indent=1) + "\n"}
         if truth
         else {}
@@ -406,7 +423,7 @@ def write_case(item: BenchmarkCase, folder: str | Path, truth: bool = True) -> P
         Recording(path, item.system, "", constants, noise, runs),
         system,
         digits=9,
-        beside=beside,
+        beside=other_files,
     )
     return path
 

@@ -66,22 +66,23 @@ def find_best_effect(setting: RecordingConditions, observed: Array) -> tuple[str
     Returns:
         Name of the effect and RMS residual in units of the noise.
     """
-    bare = NuisanceFitter(setting)(observed)
+    base_fit = NuisanceFitter(setting)(observed)
     usable = library.list_effects_for(SIMULATORS[setting.system].system)
     names = [
         n for n in usable if setting.is_driven or not (n.startswith("input.") or n == "backlash")
     ]
-    first = {n: _rank_starts(setting, observed, n, bare)[0] for n in names}
-    promising = sorted(first, key=lambda n: first[n][0])[:MAX_REFITTED_EFFECTS]
-    left = {
-        n: NuisanceFitter(setting, [n])(observed, first[n][1], bare.starts).left for n in promising
+    first = {n: _rank_starts(setting, observed, n, base_fit)[0] for n in names}
+    promising_names = sorted(first, key=lambda n: first[n][0])[:MAX_REFITTED_EFFECTS]
+    residuals = {
+        n: NuisanceFitter(setting, [n])(observed, first[n][1], base_fit.starts).left
+        for n in promising_names
     }
-    name = min(left, key=lambda n: left[n])
-    return name, min(left[name], bare.left)
+    name = min(residuals, key=lambda n: residuals[n])
+    return name, min(residuals[name], base_fit.left)
 
 
 def _rank_starts(
-    setting: RecordingConditions, observed: Array, name: str, bare: ResidualFit
+    setting: RecordingConditions, observed: Array, name: str, base_fit: ResidualFit
 ) -> list[tuple[float, Array]]:
     """List starting points for refitting an effect, the best first.
 
@@ -89,7 +90,7 @@ def _rank_starts(
         setting: recording conditions.
         observed: noise-free observations, (R, T, C).
         name: name of the effect.
-        bare: fit without the effect.
+        base_fit: fit without the effect.
 
     Returns:
         Pairs of RMS residual (to first order where that is possible) and theta.
@@ -97,17 +98,17 @@ def _rank_starts(
     fit = NuisanceFitter(setting, [name])
     if name == "input.saturation":  # starts below the peak: at the peak the derivative is zero
         peak = max(np.abs(s.inputs["u"]).max() for s in setting.scenarios)
-        guesses = [np.array([*bare.theta, share * peak]) for share in (0.9, 0.6)]
-        result = [(_compute_residual(fit, observed, guess, bare), guess) for guess in guesses]
+        guesses = [np.array([*base_fit.theta, share * peak]) for share in (0.9, 0.6)]
+        result = [(_compute_residual(fit, observed, guess, base_fit), guess) for guess in guesses]
     elif name == "state.limit":  # an end stop that is not reached has no derivative either
         guesses = [
-            np.array([*bare.theta, *stop])
+            np.array([*base_fit.theta, *stop])
             for stop in _iterate_stop_starts(setting, observed[..., 0])
         ]
-        result = [(_compute_residual(fit, observed, guess, bare), guess) for guess in guesses]
+        result = [(_compute_residual(fit, observed, guess, base_fit), guess) for guess in guesses]
     else:
         result = [
-            _linear_least_squares_step(fit, observed, shape, bare)
+            _linear_least_squares_step(fit, observed, shape, base_fit)
             for shape in SHAPE_GRIDS.get(name, [()])
         ]
     return sorted(result, key=lambda pair: pair[0])
@@ -127,15 +128,15 @@ def _iterate_stop_starts(
     """
     low, high = float(path.min()), float(path.max())
     # Scale of the stiffness, N m/rad for a pendulum and N/m for a slider.
-    far = 20.0 if setting.system == "pendulum" else 5000.0
+    max_stiffness = 20.0 if setting.system == "pendulum" else 5000.0
     for share, part in product((0.03, 0.15), (0.001, 0.01, 0.1)):
-        within = share * (high - low)
-        yield part * far, high - within, 0.05
-        yield -part * far, low + within, 0.05
+        inset = share * (high - low)
+        yield part * max_stiffness, high - inset, 0.05
+        yield -part * max_stiffness, low + inset, 0.05
 
 
 def _compute_residual(
-    fit: NuisanceFitter, observed: Array, theta: Array, bare: ResidualFit
+    fit: NuisanceFitter, observed: Array, theta: Array, base_fit: ResidualFit
 ) -> float:
     """Compute the RMS residual at given parameters without refitting, in units of the noise.
 
@@ -146,14 +147,14 @@ def _compute_residual(
         fit: fitter of the model with the effect.
         observed: noise-free observations, (R, T, C).
         theta: base parameters and coefficients of the effect.
-        bare: fit without the effect, whose initial states are used.
+        base_fit: fit without the effect, whose initial states are used.
     """
-    rest, _ = fit.linearise(observed, theta, bare.starts)
-    return float(np.sqrt(np.mean(rest**2)))
+    residual, _ = fit.linearise(observed, theta, base_fit.starts)
+    return float(np.sqrt(np.mean(residual**2)))
 
 
 def _linear_least_squares_step(
-    fit: NuisanceFitter, observed: Array, shape: Sequence[float], bare: ResidualFit
+    fit: NuisanceFitter, observed: Array, shape: Sequence[float], base_fit: ResidualFit
 ) -> tuple[float, Array]:
     """Estimate the residual by one least-squares step from a zero effect with a fixed shape.
 
@@ -162,13 +163,15 @@ def _linear_least_squares_step(
     Returns:
         RMS residual of the linear model, and theta after the step.
     """
-    base, count = bare.theta.size, fit.theta.size
+    base, count = base_fit.theta.size, fit.theta.size
     shape = shape[: count - base - 1]
     scaled = count - len(shape)
-    theta = np.array([*bare.theta, *[0.0] * (scaled - base), *shape])
-    rest, slope = fit.linearise(observed, theta, bare.starts)
+    theta = np.array([*base_fit.theta, *[0.0] * (scaled - base), *shape])
+    residual, slope = fit.linearise(observed, theta, base_fit.starts)
     slope = np.delete(slope, np.s_[scaled:count], axis=1)
     # Almost no damping, because the model is linear here.
-    step = fit.compute_step(rest, slope, 1e-9)
+    step = fit.compute_step(residual, slope, 1e-9)
     theta[:scaled] += step[:scaled] * fit.scales[:scaled]
-    return float(np.sqrt(np.mean((rest - slope @ step) ** 2))), np.clip(theta, fit.low, fit.high)
+    return float(np.sqrt(np.mean((residual - slope @ step) ** 2))), np.clip(
+        theta, fit.low, fit.high
+    )

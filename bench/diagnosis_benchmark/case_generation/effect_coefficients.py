@@ -52,11 +52,13 @@ def draw_effect_shape(
         Coefficients as a function of the strength.
     """
     kind = SIMULATORS[setting.system].system.kind
-    far = max(abs(bound) for bound in library.get_effect(name).coefficients[0].range(kind))
+    coefficient_scale = max(
+        abs(bound) for bound in library.get_effect(name).coefficients[0].range(kind)
+    )
     if name in SHAPE_SAMPLERS:
-        return SHAPE_SAMPLERS[name](far, setting, rng)
+        return SHAPE_SAMPLERS[name](coefficient_scale, setting, rng)
     sign = float(rng.choice([-1, 1])) if name in SIGNED_EFFECTS else 1.0
-    return lambda s: (sign * far * s,)
+    return lambda s: (sign * coefficient_scale * s,)
 
 
 def get_max_strength(name: str) -> float:
@@ -69,12 +71,12 @@ def get_max_strength(name: str) -> float:
 
 
 def _draw_direction(
-    far: float, setting: RecordingConditions, rng: np.random.Generator, *behind: float
+    coefficient_scale: float, setting: RecordingConditions, rng: np.random.Generator, *behind: float
 ) -> CoefficientFunction:
     """Draw the direction of an effect with two components, such as a horizontal or a phase angle.
 
     Args:
-        far: magnitude at strength 1.
+        coefficient_scale: magnitude at strength 1.
         setting: recording conditions; unused here.
         rng: random generator.
         *behind: further coefficients that do not depend on the strength, such as a period.
@@ -84,17 +86,20 @@ def _draw_direction(
         behind.
     """
     angle = rng.uniform(0, 2 * np.pi)
-    along, across = far * float(np.cos(angle)), far * float(np.sin(angle))
-    return lambda s: (along * s, across * s, *behind)
+    cosine_part, sine_part = (
+        coefficient_scale * float(np.cos(angle)),
+        coefficient_scale * float(np.sin(angle)),
+    )
+    return lambda s: (cosine_part * s, sine_part * s, *behind)
 
 
 def _draw_horizontal_direction(
-    far: float, setting: RecordingConditions, rng: np.random.Generator
+    coefficient_scale: float, setting: RecordingConditions, rng: np.random.Generator
 ) -> CoefficientFunction:
     """Draw a horizontal direction: along x, and along y if the system has it.
 
     Args:
-        far: magnitude at strength 1.
+        coefficient_scale: magnitude at strength 1.
         setting: recording conditions.
         rng: random generator.
 
@@ -102,13 +107,13 @@ def _draw_horizontal_direction(
         Function from the strength to the components along x and y, or along x alone.
     """
     if setting.system == "ball":
-        return _draw_direction(far, setting, rng)
+        return _draw_direction(coefficient_scale, setting, rng)
     sign = float(rng.choice([-1, 1]))
-    return lambda s: (sign * far * s,)
+    return lambda s: (sign * coefficient_scale * s,)
 
 
 def _draw_ripple(
-    far: float, setting: RecordingConditions, rng: np.random.Generator
+    coefficient_scale: float, setting: RecordingConditions, rng: np.random.Generator
 ) -> CoefficientFunction:
     """Draw a ripple whose period the motion passes several times.
 
@@ -116,7 +121,7 @@ def _draw_ripple(
     6.28 rad for a pendulum.
 
     Args:
-        far: amplitude at strength 1.
+        coefficient_scale: amplitude at strength 1.
         setting: recording conditions.
         rng: random generator.
 
@@ -125,18 +130,18 @@ def _draw_ripple(
     """
     travel = np.median(_compute_travel_ranges(setting))
     period = min(travel / rng.uniform(2.0, 8.0), 1.0 if setting.system == "slider" else 6.28)
-    return _draw_direction(far, setting, rng, float(period))
+    return _draw_direction(coefficient_scale, setting, rng, float(period))
 
 
 def _draw_periodic_force(
-    far: float, setting: RecordingConditions, rng: np.random.Generator
+    coefficient_scale: float, setting: RecordingConditions, rng: np.random.Generator
 ) -> CoefficientFunction:
     """Draw a periodic force with at least 1.5 periods in a run.
 
     The frequency is drawn log-uniformly up to 4 Hz.
 
     Args:
-        far: amplitude at strength 1.
+        coefficient_scale: amplitude at strength 1.
         setting: recording conditions.
         rng: random generator.
 
@@ -144,11 +149,13 @@ def _draw_periodic_force(
         Function from the strength to sine amplitude, cosine amplitude and frequency.
     """
     low, high = 1.5 / setting.seconds, 4.0
-    return _draw_direction(far, setting, rng, float(np.exp(rng.uniform(np.log(low), np.log(high)))))
+    return _draw_direction(
+        coefficient_scale, setting, rng, float(np.exp(rng.uniform(np.log(low), np.log(high))))
+    )
 
 
 def _draw_wind(
-    far: float, setting: RecordingConditions, rng: np.random.Generator
+    coefficient_scale: float, setting: RecordingConditions, rng: np.random.Generator
 ) -> CoefficientFunction:
     """Draw quadratic drag in moving air: the air velocity is fixed, the drag grows with s.
 
@@ -156,7 +163,7 @@ def _draw_wind(
     horizontal direction at 2 to 8 m/s.
 
     Args:
-        far: drag coefficient at strength 1.
+        coefficient_scale: drag coefficient at strength 1.
         setting: recording conditions.
         rng: random generator.
 
@@ -165,13 +172,17 @@ def _draw_wind(
     """
     if setting.system == "slider":
         speed = float(rng.choice([-1, 1]) * rng.uniform(0.3, 2.0))
-        return lambda s: (far * s, speed)
+        return lambda s: (coefficient_scale * s, speed)
     speed, angle = rng.uniform(2.0, 8.0), rng.uniform(0, 2 * np.pi)
-    return lambda s: (far * s, float(speed * np.cos(angle)), float(speed * np.sin(angle)))
+    return lambda s: (
+        coefficient_scale * s,
+        float(speed * np.cos(angle)),
+        float(speed * np.sin(angle)),
+    )
 
 
 def _draw_stribeck(
-    far: float, setting: RecordingConditions, rng: np.random.Generator
+    coefficient_scale: float, setting: RecordingConditions, rng: np.random.Generator
 ) -> CoefficientFunction:
     """Draw Stribeck friction with a large static part, at speeds that often occur in the motion.
 
@@ -179,7 +190,7 @@ def _draw_stribeck(
     of the median speed.
 
     Args:
-        far: Coulomb friction at strength 1.
+        coefficient_scale: Coulomb friction at strength 1.
         setting: recording conditions.
         rng: random generator.
 
@@ -189,18 +200,18 @@ def _draw_stribeck(
     """
     extra, typical = rng.uniform(2.0, 6.0), np.median(np.abs(_compute_speeds(setting)))
     speed = float(np.clip(typical * rng.uniform(0.15, 0.5), 0.02, 2.0))
-    return lambda s: (far * s, extra * far * s, speed)
+    return lambda s: (coefficient_scale * s, extra * coefficient_scale * s, speed)
 
 
 def _draw_saturation(
-    far: float, setting: RecordingConditions, rng: np.random.Generator
+    coefficient_scale: float, setting: RecordingConditions, rng: np.random.Generator
 ) -> CoefficientFunction:
     """Return an input limit: at strength 0 the peak of the input, at strength 1 zero.
 
     The effect vanishes at strength 0, because the input never exceeds its own peak.
 
     Args:
-        far: unused here.
+        coefficient_scale: unused here.
         setting: recording conditions.
         rng: random generator.
 
@@ -212,12 +223,12 @@ def _draw_saturation(
 
 
 def _draw_one_way_friction(
-    far: float, setting: RecordingConditions, rng: np.random.Generator
+    coefficient_scale: float, setting: RecordingConditions, rng: np.random.Generator
 ) -> CoefficientFunction:
     """Draw friction that is several times larger in one direction.
 
     Args:
-        far: coefficient of the larger direction at strength 1.
+        coefficient_scale: coefficient of the larger direction at strength 1.
         setting: recording conditions.
         rng: random generator.
 
@@ -226,18 +237,18 @@ def _draw_one_way_friction(
     """
     shares = [1.0, float(rng.uniform(0.0, 0.3))]
     rng.shuffle(shares)
-    return lambda s: (far * shares[0] * s, far * shares[1] * s)
+    return lambda s: (coefficient_scale * shares[0] * s, coefficient_scale * shares[1] * s)
 
 
 def _draw_power_law(
-    far: float, setting: RecordingConditions, rng: np.random.Generator
+    coefficient_scale: float, setting: RecordingConditions, rng: np.random.Generator
 ) -> CoefficientFunction:
     """Return a power law of the input that keeps the peak of the input unchanged.
 
     The gain that keeps the peak is peak^-s - 1 at the strength s, which is also the power.
 
     Args:
-        far: unused here.
+        coefficient_scale: unused here.
         setting: recording conditions.
         rng: random generator.
 
@@ -249,12 +260,12 @@ def _draw_power_law(
 
 
 def _draw_rate_limit(
-    far: float, setting: RecordingConditions, rng: np.random.Generator
+    coefficient_scale: float, setting: RecordingConditions, rng: np.random.Generator
 ) -> CoefficientFunction:
     """Return a rate limit: a jump to the input's peak takes 0.8 s times the strength.
 
     Args:
-        far: unused here.
+        coefficient_scale: unused here.
         setting: recording conditions.
         rng: random generator.
 
@@ -266,14 +277,14 @@ def _draw_rate_limit(
 
 
 def _draw_quadratic_friction(
-    far: float, setting: RecordingConditions, rng: np.random.Generator
+    coefficient_scale: float, setting: RecordingConditions, rng: np.random.Generator
 ) -> CoefficientFunction:
     """Draw friction whose quadratic part exceeds the linear one at the peak force.
 
     It is friction that depends on the transmitted load.
 
     Args:
-        far: linear coefficient at strength 2.
+        coefficient_scale: linear coefficient at strength 2.
         setting: recording conditions.
         rng: random generator.
 
@@ -281,19 +292,19 @@ def _draw_quadratic_friction(
         Function from the strength to the linear and the quadratic coefficient.
     """
     peak = max(np.abs(s.inputs["u"]).max() for s in setting.scenarios)
-    square = float(far * rng.uniform(2.0, 6.0) / peak)
-    return lambda s: (0.5 * far * s, square * s)
+    square = float(coefficient_scale * rng.uniform(2.0, 6.0) / peak)
+    return lambda s: (0.5 * coefficient_scale * s, square * s)
 
 
 def _draw_position_friction(
-    far: float, setting: RecordingConditions, rng: np.random.Generator
+    coefficient_scale: float, setting: RecordingConditions, rng: np.random.Generator
 ) -> CoefficientFunction:
     """Draw position-dependent friction whose period the motion passes one to four times.
 
     The periodic part is half to almost all of the friction, with a random phase.
 
     Args:
-        far: friction at strength 1.
+        coefficient_scale: friction at strength 1.
         setting: recording conditions.
         rng: random generator.
 
@@ -304,19 +315,22 @@ def _draw_position_friction(
     low, high = (0.2, 5.0) if setting.system == "slider" else (0.5, 6.2832)
     period = float(np.clip(travel / rng.uniform(1.0, 4.0), low, high))
     angle, share = rng.uniform(0, 2 * np.pi), rng.uniform(0.5, 0.95)
-    sine, cosine = far * share * float(np.sin(angle)), far * share * float(np.cos(angle))
-    return lambda s: (far * (1 - share) * s, sine * s, cosine * s, period)
+    sine, cosine = (
+        coefficient_scale * share * float(np.sin(angle)),
+        coefficient_scale * share * float(np.cos(angle)),
+    )
+    return lambda s: (coefficient_scale * (1 - share) * s, sine * s, cosine * s, period)
 
 
 def _draw_warm_up_friction(
-    far: float, setting: RecordingConditions, rng: np.random.Generator
+    coefficient_scale: float, setting: RecordingConditions, rng: np.random.Generator
 ) -> CoefficientFunction:
     """Draw warm-up friction with a time constant of 0.2 to 0.8 run lengths, partly viscous.
 
     Friction is largest at the begin of a run and decays exponentially.
 
     Args:
-        far: Coulomb friction at the begin, at strength 1.
+        coefficient_scale: Coulomb friction at the begin, at strength 1.
         setting: recording conditions.
         rng: random generator.
 
@@ -324,19 +338,21 @@ def _draw_warm_up_friction(
         Function from the strength to Coulomb friction, viscous friction and time constant.
     """
     time = float(setting.seconds * rng.uniform(0.2, 0.8))
-    viscous = float(far * rng.uniform(0.0, 1.0) / np.median(np.abs(_compute_speeds(setting))))
-    return lambda s: (far * s, viscous * s, max(time, 0.5))
+    viscous = float(
+        coefficient_scale * rng.uniform(0.0, 1.0) / np.median(np.abs(_compute_speeds(setting)))
+    )
+    return lambda s: (coefficient_scale * s, viscous * s, max(time, 0.5))
 
 
 def _draw_sensor_slip(
-    far: float, setting: RecordingConditions, rng: np.random.Generator
+    coefficient_scale: float, setting: RecordingConditions, rng: np.random.Generator
 ) -> CoefficientFunction:
     """Draw a sensor slip at a time well within each run.
 
     From that time on, the reading is shifted by a constant.
 
     Args:
-        far: shift at strength 1.
+        coefficient_scale: shift at strength 1.
         setting: recording conditions.
         rng: random generator.
 
@@ -344,18 +360,18 @@ def _draw_sensor_slip(
         Function from the strength to shift and time, s.
     """
     sign, instant = float(rng.choice([-1, 1])), float(rng.uniform(0.15, 0.85) * setting.seconds)
-    return lambda s: (sign * far * s, instant)
+    return lambda s: (sign * coefficient_scale * s, instant)
 
 
 def _draw_flexible_load(
-    far: float, setting: RecordingConditions, rng: np.random.Generator
+    coefficient_scale: float, setting: RecordingConditions, rng: np.random.Generator
 ) -> CoefficientFunction:
     """Draw a flexible load: from four oscillations per run to a fifth of the sampling rate.
 
     The frequency and the damping ratio are drawn log-uniformly.
 
     Args:
-        far: share of the load at strength 1.
+        coefficient_scale: share of the load at strength 1.
         setting: recording conditions.
         rng: random generator.
 
@@ -365,16 +381,16 @@ def _draw_flexible_load(
     low, high = 2 * np.pi * 4 / setting.seconds, 2 * np.pi * min(0.2 * setting.rate, 40.0)
     frequency = float(np.exp(rng.uniform(np.log(low), np.log(high))))
     ratio = float(np.exp(rng.uniform(np.log(0.01), np.log(0.3))))
-    return lambda s: (min(far * s, 0.95), float(np.clip(frequency, 6, 300)), ratio)
+    return lambda s: (min(coefficient_scale * s, 0.95), float(np.clip(frequency, 6, 300)), ratio)
 
 
 def _draw_backlash(
-    far: float, setting: RecordingConditions, rng: np.random.Generator
+    coefficient_scale: float, setting: RecordingConditions, rng: np.random.Generator
 ) -> CoefficientFunction:
     """Draw backlash between drive and load: at strength 1 the gap is 0.3 of the travel.
 
     Args:
-        far: unused here.
+        coefficient_scale: unused here.
         setting: recording conditions.
         rng: random generator.
 
@@ -386,14 +402,14 @@ def _draw_backlash(
 
 
 def _draw_hysteresis(
-    far: float, setting: RecordingConditions, rng: np.random.Generator
+    coefficient_scale: float, setting: RecordingConditions, rng: np.random.Generator
 ) -> CoefficientFunction:
     """Draw hysteresis with a deflection of 0.02 to 0.2 of the travel.
 
     The deflection is the distance over which friction builds up after a reversal.
 
     Args:
-        far: friction limit at strength 1.
+        coefficient_scale: friction limit at strength 1.
         setting: recording conditions.
         rng: random generator.
 
@@ -402,16 +418,16 @@ def _draw_hysteresis(
     """
     travel = float(np.median(_compute_travel_ranges(setting)))
     deflection = float(travel * np.exp(rng.uniform(np.log(0.02), np.log(0.2))))
-    return lambda s: (far * s, deflection)
+    return lambda s: (coefficient_scale * s, deflection)
 
 
 def _draw_end_stop(
-    far: float, setting: RecordingConditions, rng: np.random.Generator
+    coefficient_scale: float, setting: RecordingConditions, rng: np.random.Generator
 ) -> CoefficientFunction:
     """Draw an end stop near an end of the travel: 5 to 20 % of the samples are beyond it.
 
     Args:
-        far: stiffness at strength 1.
+        coefficient_scale: stiffness at strength 1.
         setting: recording conditions.
         rng: random generator.
 
@@ -419,14 +435,15 @@ def _draw_end_stop(
         Function from the strength to stiffness (its sign is the side of the stop), place, and
         damping.
     """
-    side, within = float(rng.choice([-1, 1])), float(rng.uniform(0.05, 0.2))
+    side, share_beyond = float(rng.choice([-1, 1])), float(rng.uniform(0.05, 0.2))
     place = float(
         np.quantile(
-            np.concatenate(_simulate_base_motion(setting)), 1 - within if side > 0 else within
+            np.concatenate(_simulate_base_motion(setting)),
+            1 - share_beyond if side > 0 else share_beyond,
         )
     )
     loss = float(rng.uniform(0.0, 0.4)) / (5.0 if setting.system == "pendulum" else 1.0)
-    return lambda s: (side * far * s, place, loss)
+    return lambda s: (side * coefficient_scale * s, place, loss)
 
 
 SHAPE_SAMPLERS: dict[str, Callable[..., CoefficientFunction]] = {
@@ -485,14 +502,14 @@ def draw_unmodelled_cause(
 
 
 def _draw_onsets(
-    setting: RecordingConditions, lasting: float, rng: np.random.Generator
+    setting: RecordingConditions, duration: float, rng: np.random.Generator
 ) -> list[float]:
     """Draw the time at which a gust begins in each run, s; always `MAX_RUNS` numbers.
 
     The strength is found from the runs for fitting, but the recording has held-out runs too. A
     begin for every possible run serves both.
     """
-    return [float(rng.uniform(0.1, 0.9) * (setting.seconds - lasting)) for _ in range(MAX_RUNS)]
+    return [float(rng.uniform(0.1, 0.9) * (setting.seconds - duration)) for _ in range(MAX_RUNS)]
 
 
 def _draw_friction_patch(
@@ -508,9 +525,9 @@ def _draw_friction_patch(
         Function from the strength to friction limit, centre and half width of the region.
     """
     low, high = np.quantile(np.concatenate(_simulate_base_motion(setting)), [0.1, 0.9])
-    half = float((high - low) * rng.uniform(0.07, 0.15))
-    centre = float(rng.uniform(low + half, high - half))
-    return lambda s: (_get_unit_force(setting) * s, centre, half)
+    half_width = float((high - low) * rng.uniform(0.07, 0.15))
+    centre = float(rng.uniform(low + half_width, high - half_width))
+    return lambda s: (_get_unit_force(setting) * s, centre, half_width)
 
 
 def _get_unit_force(setting: RecordingConditions) -> float:
@@ -524,9 +541,9 @@ def _draw_gust(setting: RecordingConditions, rng: np.random.Generator) -> Coeffi
     Returns:
         Function from the strength to force, duration (s), and the begin in each run (s).
     """
-    lasting, sign = float(rng.uniform(0.1, 0.3)), float(rng.choice([-1, 1]))
-    begins = _draw_onsets(setting, lasting, rng)
-    return lambda s: (sign * _get_unit_force(setting) * s, lasting, *begins)
+    duration, sign = float(rng.uniform(0.1, 0.3)), float(rng.choice([-1, 1]))
+    start_times = _draw_onsets(setting, duration, rng)
+    return lambda s: (sign * _get_unit_force(setting) * s, duration, *start_times)
 
 
 def _draw_growing_damping(
@@ -536,8 +553,8 @@ def _draw_growing_damping(
 
     At strength 1 this value is 0.1 N m s/rad for a pendulum and 5 N s/m for a slider.
     """
-    far = (0.1 if setting.system == "pendulum" else 5.0) / setting.seconds
-    return lambda s: (far * s,)
+    max_growth = (0.1 if setting.system == "pendulum" else 5.0) / setting.seconds
+    return lambda s: (max_growth * s,)
 
 
 def _draw_soft_stop(setting: RecordingConditions, rng: np.random.Generator) -> CoefficientFunction:
@@ -555,8 +572,8 @@ def _draw_soft_stop(setting: RecordingConditions, rng: np.random.Generator) -> C
     place = float(
         np.quantile(np.concatenate(_simulate_base_motion(setting)), rng.uniform(0.7, 0.85))
     )
-    far = 10.0 if setting.system == "pendulum" else 2000.0
-    return lambda s: (far * s, place)
+    max_stiffness = 10.0 if setting.system == "pendulum" else 2000.0
+    return lambda s: (max_stiffness * s, place)
 
 
 def _draw_updraft(setting: RecordingConditions, rng: np.random.Generator) -> CoefficientFunction:
@@ -566,10 +583,10 @@ def _draw_updraft(setting: RecordingConditions, rng: np.random.Generator) -> Coe
         Function from the strength to acceleration (m/s^2), centre and half width of the region (m).
         The centre lies between the 10 % and 90 % quantiles of x over all runs.
     """
-    where = np.concatenate(_simulate_base_motion(setting))
-    half = float(rng.uniform(0.3, 0.8))
-    centre = float(rng.uniform(*np.quantile(where, [0.1, 0.9])))
-    return lambda s: (10.0 * s, centre, half)
+    positions = np.concatenate(_simulate_base_motion(setting))
+    half_width = float(rng.uniform(0.3, 0.8))
+    centre = float(rng.uniform(*np.quantile(positions, [0.1, 0.9])))
+    return lambda s: (10.0 * s, centre, half_width)
 
 
 def _draw_ball_gust(setting: RecordingConditions, rng: np.random.Generator) -> CoefficientFunction:
@@ -581,13 +598,13 @@ def _draw_ball_gust(setting: RecordingConditions, rng: np.random.Generator) -> C
         Function from the strength to acceleration along x, upward acceleration (m/s^2), duration
         (s), and the begin in each run (s).
     """
-    lasting, angle = float(rng.uniform(0.1, 0.4)), rng.uniform(0, 2 * np.pi)
-    begins = _draw_onsets(setting, lasting, rng)
+    duration, angle = float(rng.uniform(0.1, 0.4)), rng.uniform(0, 2 * np.pi)
+    start_times = _draw_onsets(setting, duration, rng)
     return lambda s: (
         20.0 * s * float(np.cos(angle)),
         20.0 * s * float(np.sin(angle)),
-        lasting,
-        *begins,
+        duration,
+        *start_times,
     )
 
 

@@ -95,25 +95,31 @@ class NuisanceFitter:
         """
         theta = self.theta if theta is None else np.asarray(theta, dtype=float)
         starts, damping = self.starts if starts is None else starts, 1e-6
-        rest, slope = self.linearise(observed, theta, starts)
-        if not np.isfinite(rest).all():
+        residual, slope = self.linearise(observed, theta, starts)
+        if not np.isfinite(residual).all():
             return ResidualFit(np.inf, theta, starts)
         for _ in range(rounds):
-            step = self.compute_step(rest, slope, damping)
+            step = self.compute_step(residual, slope, damping)
             count = theta.size
-            new = np.clip(theta + step[:count] * self.scales, self.low, self.high)
-            begun = starts + step[count:].reshape(starts.shape)
-            tried, steeper = self.linearise(observed, new, begun)
-            if not tried @ tried < rest @ rest:  # a NaN is no improvement
+            new_theta = np.clip(theta + step[:count] * self.scales, self.low, self.high)
+            new_starts = starts + step[count:].reshape(starts.shape)
+            new_residual, new_slope = self.linearise(observed, new_theta, new_starts)
+            if not new_residual @ new_residual < residual @ residual:  # a NaN is no improvement
                 damping *= 30.0
                 if damping > 1e3:
                     break
                 continue
-            gained = 1.0 - np.sqrt((tried @ tried) / (rest @ rest))
-            theta, starts, rest, slope, damping = new, begun, tried, steeper, damping / 10.0
-            if gained < 1e-3:
+            relative_gain = 1.0 - np.sqrt((new_residual @ new_residual) / (residual @ residual))
+            theta, starts, residual, slope, damping = (
+                new_theta,
+                new_starts,
+                new_residual,
+                new_slope,
+                damping / 10.0,
+            )
+            if relative_gain < 1e-3:
                 break
-        return ResidualFit(float(np.sqrt(np.mean(rest**2))), theta, starts)
+        return ResidualFit(float(np.sqrt(np.mean(residual**2))), theta, starts)
 
     @staticmethod
     def compute_step(rest: Array, slope: Array, damping: float) -> Array:
@@ -148,27 +154,34 @@ class NuisanceFitter:
             Jacobian (N, P) of the simulation in units of the scales.
         """
         runs, states, count = len(starts), len(self.states), theta.size
-        moved = 1 + count + states
-        thetas, begun = np.tile(theta, (runs, moved, 1)), np.tile(starts[:, None], (1, moved, 1))
+        variant_count = 1 + count + states
+        thetas, initial_states = (
+            np.tile(theta, (runs, variant_count, 1)),
+            np.tile(starts[:, None], (1, variant_count, 1)),
+        )
         for i in range(count):
             thetas[:, 1 + i, i] += FINITE_DIFFERENCE_STEP * self.scales[i]
         for i in range(states):
-            begun[:, 1 + count + i, i] += FINITE_DIFFERENCE_STEP
-        initial = {name: begun[:, :, i].ravel() for i, name in enumerate(self.states)}
-        scenarios = [s for s in self.scenarios for _ in range(moved)]
-        seen = (
-            self.simulator.simulate_batch(thetas.reshape(runs * moved, count), scenarios, initial)
+            initial_states[:, 1 + count + i, i] += FINITE_DIFFERENCE_STEP
+        initial = {name: initial_states[:, :, i].ravel() for i, name in enumerate(self.states)}
+        scenarios = [s for s in self.scenarios for _ in range(variant_count)]
+        observations = (
+            self.simulator.simulate_batch(
+                thetas.reshape(runs * variant_count, count), scenarios, initial
+            )
             / self.sigma
         )
-        seen = seen.reshape(runs, moved, -1)
-        rest = (observed / self.sigma).reshape(runs, -1) - seen[:, 0]
-        slopes = (seen[:, 1:] - seen[:, :1]) / FINITE_DIFFERENCE_STEP
-        slope = np.zeros((*rest.shape, count + runs * states))
+        observations = observations.reshape(runs, variant_count, -1)
+        residual = (observed / self.sigma).reshape(runs, -1) - observations[:, 0]
+        slopes = (observations[:, 1:] - observations[:, :1]) / FINITE_DIFFERENCE_STEP
+        slope = np.zeros((*residual.shape, count + runs * states))
         for r in range(runs):
             slope[r, :, :count] = slopes[r, :count].T
             slope[r, :, count + r * states : count + (r + 1) * states] = slopes[r, count:].T
-        good = (np.abs(seen) < DIVERGED_VALUE).all()
-        return rest.ravel() if good else np.full(rest.size, np.inf), slope.reshape(rest.size, -1)
+        is_finite = (np.abs(observations) < DIVERGED_VALUE).all()
+        return residual.ravel() if is_finite else np.full(residual.size, np.inf), slope.reshape(
+            residual.size, -1
+        )
 
 
 def simulate_observations(setting: RecordingConditions, effects: EffectCoefficients) -> Array:
@@ -209,14 +222,14 @@ def make_gap_function(
         """
         theta, starts = fit.theta, fit.starts
         if last:  # fitted parameters and states change about in proportion to the strength
-            before, found = last[-1]
-            share = strength / before
-            theta = np.clip(theta + share * (found.theta - theta), fit.low, fit.high)
-            starts = starts + share * (found.starts - starts)
-        found = fit(observed(strength), theta, starts)
-        if np.isfinite(found.left):
-            last.append((strength, found))
-        return found.left
+            last_strength, fitted = last[-1]
+            share = strength / last_strength
+            theta = np.clip(theta + share * (fitted.theta - theta), fit.low, fit.high)
+            starts = starts + share * (fitted.starts - starts)
+        fitted = fit(observed(strength), theta, starts)
+        if np.isfinite(fitted.left):
+            last.append((strength, fitted))
+        return fitted.left
 
     return left
 
@@ -240,22 +253,22 @@ def find_strength_for_size(
     # Bracket: (strength, size) below and above the requested size.
     low, high, strength = (0.0, 0.0), (np.inf, np.inf), first
     for _ in range(12):
-        now = left(strength)
-        if abs(now / wanted - 1) < SIZE_TOLERANCE:
+        size = left(strength)
+        if abs(size / wanted - 1) < SIZE_TOLERANCE:
             return strength
-        if now < wanted:
+        if size < wanted:
             # Too small even if the size grew with the square of the strength.
-            if strength >= largest or now * (largest / strength) ** 2 < wanted:
+            if strength >= largest or size * (largest / strength) ** 2 < wanted:
                 return None
-            low = strength, now
+            low = strength, size
         else:  # also if it is NaN or infinite
-            high = strength, now
+            high = strength, size
         strength = float(min(_choose_next_strength(low, high, wanted), largest))
     return None
 
 
 def _choose_next_strength(
-    low: tuple[float, float], high: tuple[float, float], wanted: float
+    low: tuple[float, float], high: tuple[float, float], target_size: float
 ) -> float:
     """Return the next strength to try.
 
@@ -266,16 +279,18 @@ def _choose_next_strength(
     Args:
         low: strength and size below the requested size; strength 0 if there is none.
         high: strength and size above it; infinite strength if there is none.
-        wanted: requested size.
+        target_size: requested size.
     """
     if not low[0]:
         return (
-            high[0] * min(max(wanted / high[1], 1e-2), 0.9) if np.isfinite(high[1]) else high[0] / 5
+            high[0] * min(max(target_size / high[1], 1e-2), 0.9)
+            if np.isfinite(high[1])
+            else high[0] / 5
         )
     if not np.isfinite(high[0]):
-        return low[0] * min(wanted / max(low[1], 1e-9), MAX_STRENGTH_FACTOR)
+        return low[0] * min(target_size / max(low[1], 1e-9), MAX_STRENGTH_FACTOR)
     if not np.isfinite(high[1]) or high[0] / low[0] > MAX_STRENGTH_FACTOR**2:
         return float(np.sqrt(low[0] * high[0]))
-    share = float(np.log(wanted / low[1]) / np.log(high[1] / low[1]))
+    share = float(np.log(target_size / low[1]) / np.log(high[1] / low[1]))
     part = min(max(share, 0.05), 0.95)
     return float(low[0] * (high[0] / low[0]) ** part)

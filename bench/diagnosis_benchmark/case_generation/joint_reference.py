@@ -100,15 +100,15 @@ def compute_applied_input(
         elif name in STEPWISE_INPUT_EFFECTS:
             levels = STEPWISE_INPUT_EFFECTS[name](levels, *c)
     changes = np.flatnonzero(np.diff(levels)) + 1
-    begins, targets = [0.0, *edges[changes]], [levels[0], *levels[changes]]
-    pieces, state = [], levels[0]
-    for begin, end, target in zip(begins, [*begins[1:], inf], targets, strict=True):
-        if begin < until:
-            pieces.append(
-                InputSegment(float(begin), float(min(end, until)), float(state), float(target), lag)
+    starts, targets = [0.0, *edges[changes]], [levels[0], *levels[changes]]
+    segments, state = [], levels[0]
+    for start, end, target in zip(starts, [*starts[1:], inf], targets, strict=True):
+        if start < until:
+            segments.append(
+                InputSegment(float(start), float(min(end, until)), float(state), float(target), lag)
             )
-            state = pieces[-1].evaluate(pieces[-1].end)
-    return pieces
+            state = segments[-1].evaluate(segments[-1].end)
+    return segments
 
 
 def _interpolate_input(levels: Array, edges: Array, share: float) -> tuple[Array, Array]:
@@ -124,34 +124,38 @@ def _interpolate_input(levels: Array, edges: Array, share: float) -> tuple[Array
     """
     parts = (np.arange(SUBDIVISIONS) + 0.5) / SUBDIVISIONS
     fine = levels[:-1, None] + share * np.diff(levels)[:, None] * parts
-    begins = edges[:-1, None] + np.diff(edges)[:, None] * np.arange(SUBDIVISIONS) / SUBDIVISIONS
-    return np.append(fine.ravel(), levels[-1]), np.append(begins.ravel(), edges[-1])
+    starts = edges[:-1, None] + np.diff(edges)[:, None] * np.arange(SUBDIVISIONS) / SUBDIVISIONS
+    return np.append(fine.ravel(), levels[-1]), np.append(starts.ravel(), edges[-1])
 
 
-def _limit_input_rate(levels: Array, edges: Array, most: float) -> tuple[Array, Array]:
-    """Limit the rate of an input to `most` per second, in short parts of constant level.
+def _limit_input_rate(levels: Array, edges: Array, max_rate: float) -> tuple[Array, Array]:
+    """Limit the rate of an input to `max_rate` per second, in short parts of constant level.
 
     Returns:
         Levels and begins of the parts.
     """
     # The last level is held for another second, in which it may still be approached.
-    ends = [*edges[1:].tolist(), edges[-1] + 1.0]
-    values, begins, state = [], [], float(levels[0])
-    for level, begin, end in zip(levels.tolist(), edges.tolist(), ends, strict=True):
-        while begin < end and state != level:
-            last = min(begin + SLEW_STEP, end)
-            away = level - state
-            lasting = min(abs(away) / most, last - begin)
-            after = level if lasting >= abs(away) / most else state + copysign(most * lasting, away)
+    end_times = [*edges[1:].tolist(), edges[-1] + 1.0]
+    values, starts, state = [], [], float(levels[0])
+    for level, start, end in zip(levels.tolist(), edges.tolist(), end_times, strict=True):
+        while start < end and state != level:
+            last = min(start + SLEW_STEP, end)
+            deviation = level - state
+            ramp_duration = min(abs(deviation) / max_rate, last - start)
+            next_state = (
+                level
+                if ramp_duration >= abs(deviation) / max_rate
+                else state + copysign(max_rate * ramp_duration, deviation)
+            )
             # mean over the part, in which the rise may end
-            values.append(0.5 * (state + after) * lasting / (last - begin))
-            values[-1] += after * (1 - lasting / (last - begin))
-            begins.append(begin)
-            state, begin = after, last
-        if begin < end:
+            values.append(0.5 * (state + next_state) * ramp_duration / (last - start))
+            values[-1] += next_state * (1 - ramp_duration / (last - start))
+            starts.append(start)
+            state, start = next_state, last
+        if start < end:
             values.append(level)
-            begins.append(begin)
-    return np.array(values), np.array(begins)
+            starts.append(start)
+    return np.array(values), np.array(starts)
 
 
 def _apply_backlash(levels: Array, width: float) -> Array:
@@ -219,33 +223,35 @@ class JointDynamics:
             self.weight = lambda x: 0.0
             self.sideways = lambda x: self.inertia
         self.gravity = gravity
-        acting = {**world.effects, **world.foreign}
+        active_effects = {**world.effects, **world.foreign}
         self.forces = [
             FORCE_EFFECTS[name](self, list(c))
-            for name, c in acting.items()
+            for name, c in active_effects.items()
             if name in FORCE_EFFECTS
         ]
         self.limits = [
             DRY_FRICTION_EFFECTS[name](self, list(c))
-            for name, c in acting.items()
+            for name, c in active_effects.items()
             if name in DRY_FRICTION_EFFECTS
         ]
         self.breaks: list[float] = []
-        if "gust" in acting:
-            push, lasting, *begins = acting["gust"]
-            begin = begins[number]
-            self.breaks = [begin, begin + lasting]
+        if "gust" in active_effects:
+            push, duration, *start_times = active_effects["gust"]
+            push_start = start_times[number]
+            self.breaks = [push_start, push_start + duration]
             self.forces.append(
-                lambda t, x, v: push if begin <= self.middle < begin + lasting else 0.0
+                lambda t, x, v: push if push_start <= self.middle < push_start + duration else 0.0
             )
-        self.restless = bool({"force.periodic", "input.lag", "friction.warming"} & set(acting))
-        whole, gravity_of_all = self.inertia, self.weight
+        self.restless = bool(
+            {"force.periodic", "input.lag", "friction.warming"} & set(active_effects)
+        )
+        total_inertia, gravity_of_all = self.inertia, self.weight
         self.behind: list[Any] = [
-            HIDDEN_STATE_EFFECTS[name](whole, gravity_of_all, *c)
-            for name, c in acting.items()
+            HIDDEN_STATE_EFFECTS[name](total_inertia, gravity_of_all, *c)
+            for name, c in active_effects.items()
             if name in HIDDEN_STATE_EFFECTS
         ]
-        self.inertia = whole - sum(part.inertia for part in self.behind)
+        self.inertia = total_inertia - sum(part.inertia for part in self.behind)
 
     def set_input_segment(self, piece: InputSegment) -> None:
         """Set the input interval in which the motion is integrated, before the integration starts.
@@ -269,8 +275,8 @@ class JointDynamics:
         total = self.piece.evaluate(t) + self.weight(x)
         for force in self.forces:
             total += force(t, x, v)
-        for part, own in zip(self.behind, pair_up(z), strict=True):
-            total += part.force(x, v, *own)
+        for part, part_states in zip(self.behind, pair_up(z), strict=True):
+            total += part.force(x, v, *part_states)
         return total
 
     def compute_hidden_rates(self, x: float, v: float, *z: float) -> list[float]:
@@ -282,7 +288,7 @@ class JointDynamics:
             *z: states of the hidden-state effects.
         """
         parts = zip(self.behind, pair_up(z), strict=True)
-        return [rate for part, own in parts for rate in part.rates(x, v, *own)]
+        return [rate for part, part_states in parts for rate in part.rates(x, v, *part_states)]
 
     def compute_friction_limit(self, t: float, x: float, v: float) -> float:
         """Compute the dry friction limit: the sum of all laws that act.
@@ -586,112 +592,115 @@ def simulate_joint(world: TrueSystem, scenario: Scenario, number: int, instants:
     state = np.array([scenario.initial[name] for name in names])
     hidden = [value for part in joint.behind for value in part.get_initial_state(*state)]
     state = np.concatenate([state, hidden])
-    out = np.empty((instants.size, 2))
-    out[instants <= 0] = state[:2]
-    for piece in compute_applied_input(scenario, world.effects, until):
+    states = np.empty((instants.size, 2))
+    states[instants <= 0] = state[:2]
+    for segment in compute_applied_input(scenario, world.effects, until):
         marks = [
-            piece.begin,
-            *(b for b in sorted(joint.breaks) if piece.begin < b < piece.end),
-            piece.end,
+            segment.begin,
+            *(b for b in sorted(joint.breaks) if segment.begin < b < segment.end),
+            segment.end,
         ]
-        for begin, end in pairwise(marks):
-            joint.set_input_segment(piece.slice(begin, end))
-            state = _integrate_segment(joint, state, instants, out)
-    return out
+        for start, end in pairwise(marks):
+            joint.set_input_segment(segment.slice(start, end))
+            state = _integrate_segment(joint, state, instants, states)
+    return states
 
 
-def _integrate_segment(joint: JointDynamics, state: Array, instants: Array, out: Array) -> Array:
+def _integrate_segment(joint: JointDynamics, state: Array, instants: Array, states: Array) -> Array:
     """Integrate to the end of the input interval, from one standstill to the next.
 
     Args:
         joint: the equation of motion.
         state: state at the begin of the interval.
         instants: times of the samples, (T,).
-        out: receives positions and velocities, (T, 2).
+        states: receives positions and velocities, (T, 2).
 
     Returns:
         State at the end.
     """
-    now, end = joint.piece.begin, joint.piece.end
+    time, end = joint.piece.begin, joint.piece.end
     for _ in range(10_000):
-        if now >= end:
+        if time >= end:
             return state
-        reached, after, solution = _integrate_until_stop(joint, now, state)
-        first, last = np.searchsorted(instants, [now, reached], side="right")
+        reached, end_state, solution = _integrate_until_stop(joint, time, state)
+        first, last = np.searchsorted(instants, [time, reached], side="right")
         if last > first:
-            out[first:last] = solution(instants[first:last]).T[:, :2] if solution else state[:2]
-        now, state = reached, after
+            states[first:last] = solution(instants[first:last]).T[:, :2] if solution else state[:2]
+        time, state = reached, end_state
     raise RuntimeError("it never gets through: too many standstills")
 
 
-def _integrate_until_stop(joint: JointDynamics, now: float, state: Array) -> SegmentResult:
+def _integrate_until_stop(joint: JointDynamics, start: float, state: Array) -> SegmentResult:
     """Integrate until the next standstill, break-away or end of the input interval.
 
     A resting coordinate that dry friction can hold is not moved: only its hidden states are
     integrated, or the time of break-away is searched. Otherwise friction opposes the direction of
-    motion `way` (+1 or -1), and an event stops the integration when the velocity changes its sign.
+    motion `direction` (+1 or -1), and an event stops the integration when the velocity changes its
+    sign.
 
     Args:
         joint: the equation of motion, with its input interval.
-        now: begin, s.
+        start: begin, s.
         state: position, velocity and hidden states.
 
     Returns:
         End time, state at that time, and the dense solution (None without motion).
     """
     (x, v, *z), end = state, joint.piece.end
-    way = copysign(1.0, v) if v else 0.0
+    direction = copysign(1.0, v) if v else 0.0
     if joint.limits and v == 0.0:
-        pull = joint.compute_force(now, x, 0.0, *z)
-        if abs(pull) <= joint.compute_friction_limit(now, x, 0.0):
+        pull = joint.compute_force(start, x, 0.0, *z)
+        if abs(pull) <= joint.compute_friction_limit(start, x, 0.0):
             return (
-                _integrate_stuck(joint, now, state)
+                _integrate_stuck(joint, start, state)
                 if z
-                else (_find_break_away(joint, now, x), state, None)
+                else (_find_break_away(joint, start, x), state, None)
             )
-        way = copysign(1.0, pull)
+        direction = copysign(1.0, pull)
 
     def rate(t: float, y: Array) -> list[float]:
         """Return the time derivatives of position, velocity and hidden states.
 
-        Dry friction is `rubbing`, with the fixed sign `way` of the motion, so that the right-hand
-        side is smooth.
+        Dry friction is `dry_friction`, with the fixed sign `way` of the motion, so that the
+        right-hand side is smooth.
         """
-        rubbing = way * joint.compute_friction_limit(t, *y[:2]) if joint.limits else 0.0
+        dry_friction = direction * joint.compute_friction_limit(t, *y[:2]) if joint.limits else 0.0
         return [
             y[1],
-            (joint.compute_force(t, *y) - rubbing) / joint.inertia,
+            (joint.compute_force(t, *y) - dry_friction) / joint.inertia,
             *joint.compute_hidden_rates(*y),
         ]
 
     def turns(t: float, y: Array) -> float:
-        return float(way * y[1])
+        return float(direction * y[1])
 
     stops: Any = turns
     stops.terminal, stops.direction = True, -1
-    events, first = (stops, min(0.01, end - now)) if joint.limits else (None, min(0.02, end - now))
+    events, first = (
+        (stops, min(0.01, end - start)) if joint.limits else (None, min(0.02, end - start))
+    )
     settings: dict[str, Any] = {
         "dense_output": True,
         "max_step": 0.05,
         "first_step": first,
         **SOLVER_TOLERANCES,
     }
-    method: Any = "RK45" if end - now < INTERPOLATION_INTERVAL else "DOP853"
-    solved = solve_ivp(rate, (now, end), state, method, events=events, **settings)
+    method: Any = "RK45" if end - start < INTERPOLATION_INTERVAL else "DOP853"
+    solved = solve_ivp(rate, (start, end), state, method, events=events, **settings)
     if not solved.success:
         raise RuntimeError(solved.message)
-    after = solved.y[:, -1].copy()
+    end_state = solved.y[:, -1].copy()
     if joint.limits and solved.t_events is not None and solved.t_events[0].size:
-        after[1] = 0.0
-    return float(solved.t[-1]), after, solved.sol
+        end_state[1] = 0.0
+    return float(solved.t[-1]), end_state, solved.sol
 
 
-def _integrate_stuck(joint: JointDynamics, now: float, state: Array) -> SegmentResult:
+def _integrate_stuck(joint: JointDynamics, start: float, state: Array) -> SegmentResult:
     """Integrate the hidden states while dry friction holds the coordinate, until it breaks away.
 
     Args:
         joint: the equation of motion, with its input interval.
-        now: begin, s.
+        start: begin, s.
         state: position, velocity (zero) and hidden states.
 
     Returns:
@@ -712,11 +721,11 @@ def _integrate_stuck(joint: JointDynamics, now: float, state: Array) -> SegmentR
     stops: Any = excess
     stops.terminal, stops.direction = True, 1
     settings: dict[str, Any] = {"dense_output": True, "max_step": 0.01, **SOLVER_TOLERANCES}
-    solved = solve_ivp(rate, (now, end), state, "RK45", events=stops, **settings)
+    solved = solve_ivp(rate, (start, end), state, "RK45", events=stops, **settings)
     return float(solved.t[-1]), solved.y[:, -1].copy(), solved.sol
 
 
-def _find_break_away(joint: JointDynamics, now: float, x: float) -> float:
+def _find_break_away(joint: JointDynamics, start: float, x: float) -> float:
     """Find the time at which the coordinate breaks away, or the end of the input interval.
 
     Within an input interval only time-dependent forces and limits change while the coordinate
@@ -729,12 +738,14 @@ def _find_break_away(joint: JointDynamics, now: float, x: float) -> float:
     def excess(t: float) -> float:
         return abs(joint.compute_force(t, x, 0.0)) - joint.compute_friction_limit(t, x, 0.0)
 
-    grid: Sequence[float] = np.linspace(now, end, max(3, int(500 * (end - now)))).tolist()
-    for before, after in pairwise(grid):
-        if excess(after) > 0:
+    grid: Sequence[float] = np.linspace(start, end, max(3, int(500 * (end - start)))).tolist()
+    for left_time, right_time in pairwise(grid):
+        if excess(right_time) > 0:
             # Slightly after the root: at the root, the coordinate would still count as held.
             return min(
-                brentq(excess, before, after, xtol=1e-13) + 1e-12 if excess(before) < 0 else after,
+                brentq(excess, left_time, right_time, xtol=1e-13) + 1e-12
+                if excess(left_time) < 0
+                else right_time,
                 end,
             )
     return end

@@ -234,8 +234,8 @@ def _draw_ball_conditions(
     Returns:
         Parameters by name, names of the channels, and the runs.
     """
-    upright = not set(hidden) & set(GROUND_PARALLEL_EFFECTS) and rng.random() < 0.3
-    speed = 0.0 if upright else 3.0
+    is_vertical = not set(hidden) & set(GROUND_PARALLEL_EFFECTS) and rng.random() < 0.3
+    speed = 0.0 if is_vertical else 3.0
     parameters, scenarios = {"restitution": float(rng.uniform(0.5, 0.9))}, []
     for _ in range(runs):
         vx, vy = rng.uniform(-speed, speed, 2)
@@ -243,7 +243,7 @@ def _draw_ball_conditions(
         scenarios.append(
             Scenario(times, {"x": 0.0, "y": 0.0, "z": z, "vx": vx, "vy": vy, "vz": vz})
         )
-    return parameters, ("z",) if upright else ("x", "y", "z"), scenarios
+    return parameters, ("z",) if is_vertical else ("x", "y", "z"), scenarios
 
 
 def _draw_pendulum_conditions(
@@ -333,8 +333,8 @@ def draw_input_signal(
         Signal, (T,).
     """
     if form == "steps":
-        lasting = rng.uniform(0.25, 1.0)
-        place = np.floor(times / lasting).astype(int)
+        level_duration = rng.uniform(0.25, 1.0)
+        place = np.floor(times / level_duration).astype(int)
         levels: Array = rng.uniform(-1.0, 1.0, place[-1] + 1)[place]
         return levels
     bottom, top = np.log(hertz)

@@ -136,8 +136,8 @@ def simulate_with_mujoco(world: TrueSystem, scenario: Scenario, channels: Sequen
         Readings, (T, C).
     """
     assert not world.foreign
-    more = any(library.get_effect(name).hook == "hidden" for name in world.effects)
-    engine, step = ("batch", 2.5e-3) if more else ("mujoco", MUJOCO_STEP_SECONDS)
+    has_hidden_states = any(library.get_effect(name).hook == "hidden" for name in world.effects)
+    engine, step = ("batch", 2.5e-3) if has_hidden_states else ("mujoco", MUJOCO_STEP_SECONDS)
     effects = {name: list(c) for name, c in world.effects.items()}
     kind = SIMULATORS[world.system]
     simulator = kind(world.constants, channels, engine=engine, fixed=effects, time_step=step)
@@ -194,7 +194,9 @@ def _apply_lag(values: Array, grid: Array, lag: float) -> Array:
     result, y = values.copy(), values[0].copy()
     for k, h in enumerate(np.diff(grid).tolist()):
         slope = (values[k + 1] - values[k]) / h
-        ahead = values[k] - slope * lag  # particular solution: `lag` seconds behind the line
-        y = ahead + slope * h + (y - ahead) * exp(-h / lag)
+        particular_solution = (
+            values[k] - slope * lag
+        )  # particular solution: `lag` seconds behind the line
+        y = particular_solution + slope * h + (y - particular_solution) * exp(-h / lag)
         result[k + 1] = y
     return result

@@ -82,8 +82,8 @@ class _ForwardSelection(Diagnoser):
         effects.
 
         In each round, `rivals` are the models with one more effect, ordered by the criterion. The
-        best becomes the new model; rivals within the tolerance `near` of it are its alternatives
-        (`alike`).
+        best becomes the new model; rivals within the tolerance `near_limit` of it are its
+        alternatives (`alternatives`).
 
         Args:
             evidence: fitted base model and directions of the effects.
@@ -96,20 +96,20 @@ class _ForwardSelection(Diagnoser):
             rivals = [
                 _add_refit(evidence, fit) for fit in _refit_with_one_more_effect(evidence, best.fit)
             ]
-            rivals = [one for one in rivals if np.isfinite(one.squares)]
+            rivals = [candidate for candidate in rivals if np.isfinite(candidate.squares)]
             if not rivals:
                 break
-            rivals.sort(key=lambda one: self.compute_criterion(one, samples))
+            rivals.sort(key=lambda candidate: self.compute_criterion(candidate, samples))
             if self.compute_criterion(rivals[0], samples) >= self.compute_criterion(best, samples):
                 break
-            near = self.compute_criterion(rivals[0], samples) + self.near
-            alike = [
-                one.fit.effects[-1]
-                for one in rivals[1:]
-                if self.compute_criterion(one, samples) <= near
+            near_limit = self.compute_criterion(rivals[0], samples) + self.near
+            alternatives = [
+                candidate.fit.effects[-1]
+                for candidate in rivals[1:]
+                if self.compute_criterion(candidate, samples) <= near_limit
             ]
             best = rivals[0]
-            causes.append((best.fit.effects[-1], tuple(alike)))
+            causes.append((best.fit.effects[-1], tuple(alternatives)))
         return self._make_answer(evidence, first, best, causes, samples)
 
     def _make_answer(
@@ -133,17 +133,17 @@ class _ForwardSelection(Diagnoser):
             causes: each selected effect with its alternatives.
             samples: number of samples.
         """
-        ends = _compute_intervals(evidence, best)
-        parameters = {n: e for n, e in ends.items() if "." not in n}
+        intervals = _compute_intervals(evidence, best)
+        parameters = {n: e for n, e in intervals.items() if "." not in n}
         chance = self.compute_p_value(first, samples)
         if not causes:
             verdict = "adequate" if self.is_sufficient(best, samples) else "unknown"
             return Answer(verdict, (), parameters, chance)
         floor = float(samples - best.numbers)
         gap = max(first.squares - floor, 1e-9)
-        named = tuple(
-            NamedCause(name, others, _select_effect_intervals(ends, name), chance)
-            for name, others in causes
+        named_causes = tuple(
+            NamedCause(name, alternatives, _select_effect_intervals(intervals, name), chance)
+            for name, alternatives in causes
         )
         if (
             not self.is_sufficient(best, samples)
@@ -151,9 +151,9 @@ class _ForwardSelection(Diagnoser):
         ):
             return Answer("unknown", (), parameters, chance)
         if not self.is_sufficient(best, samples):
-            return Answer("partial", named, parameters, chance)
-        open_sets = any(others for _, others in causes)
-        return Answer("ambiguous" if open_sets else "named", named, parameters, chance)
+            return Answer("partial", named_causes, parameters, chance)
+        open_sets = any(alternatives for _, alternatives in causes)
+        return Answer("ambiguous" if open_sets else "named", named_causes, parameters, chance)
 
     near: float
 
@@ -231,15 +231,15 @@ class ForwardBIC(_ForwardSelection):
             causes: each selected effect with its alternatives.
             samples: number of samples; unused here.
         """
-        ends = _compute_intervals(evidence, best)
-        parameters = {n: e for n, e in ends.items() if "." not in n}
-        named = tuple(
-            NamedCause(name, others, _select_effect_intervals(ends, name))
-            for name, others in causes
+        intervals = _compute_intervals(evidence, best)
+        parameters = {n: e for n, e in intervals.items() if "." not in n}
+        named_causes = tuple(
+            NamedCause(name, alternatives, _select_effect_intervals(intervals, name))
+            for name, alternatives in causes
         )
-        sets = any(others for _, others in causes)
-        verdict = "ambiguous" if sets else "named" if named else "adequate"
-        return Answer(verdict, named, parameters)
+        sets = any(alternatives for _, alternatives in causes)
+        verdict = "ambiguous" if sets else "named" if named_causes else "adequate"
+        return Answer(verdict, named_causes, parameters)
 
 
 class ForwardChi2(_ForwardSelection):
@@ -261,7 +261,7 @@ class ForwardChi2(_ForwardSelection):
         return self._compute_p_value(first, samples)
 
     @staticmethod
-    def _compute_p_value(one: RefittedModel, samples: int) -> float:
+    def _compute_p_value(model: RefittedModel, samples: int) -> float:
         """Compute the probability that noise alone gives a sum of squares as large as this one.
 
         The sum of squares is chi-squared distributed with `samples` minus fitted numbers degrees of
@@ -269,7 +269,7 @@ class ForwardChi2(_ForwardSelection):
         """
         from scipy.special import chdtrc
 
-        return float(chdtrc(max(samples - one.numbers, 1), one.squares))
+        return float(chdtrc(max(samples - model.numbers, 1), model.squares))
 
 
 def _add_refit(evidence: RegressionEvidence, fit: TrajectoryFit) -> RefittedModel:
@@ -279,14 +279,14 @@ def _add_refit(evidence: RegressionEvidence, fit: TrajectoryFit) -> RefittedMode
         evidence: the recording and its noise.
         fit: a fitted model. A fit that diverged gets an infinite sum of squares.
     """
-    left = (evidence.world.observed - fit.simulated) / evidence.noise.sigma
-    squares = float(np.square(left[evidence.observed_mask]).sum())
+    residual = (evidence.world.observed - fit.simulated) / evidence.noise.sigma
+    squares = float(np.square(residual[evidence.observed_mask]).sum())
     numbers = fit.free.size + int((~evidence.world.known).sum())
     return RefittedModel(fit, squares if np.isfinite(squares) else np.inf, numbers)
 
 
 def _refit_with_one_more_effect(
-    evidence: RegressionEvidence, at: TrajectoryFit
+    evidence: RegressionEvidence, current_fit: TrajectoryFit
 ) -> list[TrajectoryFit]:
     """Add each of the most promising effects to a model, and refit all parameters by least squares.
 
@@ -295,24 +295,24 @@ def _refit_with_one_more_effect(
 
     Args:
         evidence: fitted base model and directions of the effects.
-        at: the model to which an effect is added.
+        current_fit: the model to which an effect is added.
 
     Returns:
         The best fit for each effect.
     """
     world = evidence.world
-    names = [name for name in world.library if name not in at.effects]
-    evidence = _replace_base_model(evidence, at)
-    found = compute_directions(world, at, names)
+    names = [name for name in world.library if name not in current_fit.effects]
+    evidence = _replace_base_model(evidence, current_fit)
+    directions = compute_directions(world, current_fit, names)
     # The cached property; its value for the base model would include the effects of the model.
-    evidence.__dict__["sensitivity_directions"] = found
-    left, effects = evidence.build_trajectory_regression().project_out_base()
-    best = find_strongest_columns(left, effects, evidence.effect_columns)
+    evidence.__dict__["sensitivity_directions"] = directions
+    residual, effects = evidence.build_trajectory_regression().project_out_base()
+    best = find_strongest_columns(residual, effects, evidence.effect_columns)
     order = sorted(best, key=lambda name: -best[name][0])[:REFITS_PER_ROUND]
     starts = [
         start
         for name in order
-        for start in _choose_starts(evidence, at, name, best[name][1], left, effects)
+        for start in _choose_starts(evidence, current_fit, name, best[name][1], residual, effects)
     ]
     if not starts:
         return []
@@ -327,27 +327,29 @@ def _refit_with_one_more_effect(
     return list(by_name.values())
 
 
-def _replace_base_model(evidence: RegressionEvidence, at: TrajectoryFit) -> RegressionEvidence:
+def _replace_base_model(
+    evidence: RegressionEvidence, current_fit: TrajectoryFit
+) -> RegressionEvidence:
     """Copy the evidence, with another fitted model in place of the base model.
 
     Directions of further effects must be computed at the current model. Cached properties are not
     copied, because they belong to the old model.
     """
-    other = object.__new__(RegressionEvidence)
-    kept = ("world", "noise", "stated", "base", "fitted", "held_out")
-    other.__dict__.update({name: evidence.__dict__[name] for name in kept})
-    other.base = type(evidence.base)(
-        at, evidence.base.insensitive_parameters, evidence.base.unidentified_parameters
+    copied = object.__new__(RegressionEvidence)
+    copied_attributes = ("world", "noise", "stated", "base", "fitted", "held_out")
+    copied.__dict__.update({name: evidence.__dict__[name] for name in copied_attributes})
+    copied.base = type(evidence.base)(
+        current_fit, evidence.base.insensitive_parameters, evidence.base.unidentified_parameters
     )
-    return other
+    return copied
 
 
 def _choose_starts(
     evidence: RegressionEvidence,
-    at: TrajectoryFit,
+    current_fit: TrajectoryFit,
     name: str,
     column: EffectColumn,
-    left: Array,
+    residual: Array,
     effects: Array,
 ) -> list[FitStart]:
     """Choose starting values for a fit with one more effect.
@@ -357,30 +359,30 @@ def _choose_starts(
 
     Args:
         evidence: directions of the effects at the current model.
-        at: the current model.
+        current_fit: the current model.
         name: name of the effect.
         column: the best column of the effect.
-        left: residual after parameters and initial states are projected out, (N,).
+        residual: residual after parameters and initial states are projected out, (N,).
         effects: columns of all directions after this projection, (N, K).
     """
     world = evidence.world
     probes = [evidence.sensitivity_directions.candidates[place] for place in column.places]
     bounds = compute_coefficient_bounds(world, name)
-    sizes = np.linalg.lstsq(effects[:, list(column.places)], left, rcond=1e-9)[0]
+    sizes = np.linalg.lstsq(effects[:, list(column.places)], residual, rcond=1e-9)[0]
     starts = []
     for share in (1.0,) if probes[0].fixed else (1.0, 0.3):
         c = probes[0].coefficients.copy()
         for probe, size in zip(probes, sizes.tolist(), strict=True):
             if not probe.fixed:
                 c[probe.place] = np.clip(share * size, *bounds[probe.place])
-        theta = at.theta.copy()
+        theta = current_fit.theta.copy()
         theta[world.slots[name]] = c
-        starts.append(FitStart((*at.effects, name), theta, at.states))
+        starts.append(FitStart((*current_fit.effects, name), theta, current_fit.states))
     return starts
 
 
 def _compute_intervals(
-    evidence: RegressionEvidence, one: RefittedModel
+    evidence: RegressionEvidence, model: RefittedModel
 ) -> dict[str, tuple[float | None, float | None]]:
     """Compute 95 % intervals of the fitted parameters, by name, from the curvature at the fit.
 
@@ -389,9 +391,9 @@ def _compute_intervals(
 
     Args:
         evidence: the recording and its noise.
-        one: the fitted model.
+        model: the fitted model.
     """
-    world, fit = evidence.world, one.fit
+    world, fit = evidence.world, model.fit
     columns = compute_base_jacobian(world, fit) / evidence.noise.sigma[:, None]
     rows = columns[evidence.observed_mask]
     rows = rows[np.isfinite(rows).all(axis=1)]
@@ -399,23 +401,25 @@ def _compute_intervals(
     scale[scale == 0] = 1.0
     inverse = np.linalg.pinv((rows / scale).T @ (rows / scale), rcond=1e-12)
     spread = np.sqrt(np.abs(np.diag(inverse))) / scale
-    left = one.squares / max(len(rows) - one.numbers, 1)
-    spread = spread * np.sqrt(max(left, 1e-12))
-    ends: dict[str, tuple[float | None, float | None]] = {}
+    residual_variance = model.squares / max(len(rows) - model.numbers, 1)
+    spread = spread * np.sqrt(max(residual_variance, 1e-12))
+    intervals: dict[str, tuple[float | None, float | None]] = {}
     for i, place in enumerate(fit.free.tolist()):
-        value, half = float(fit.theta[place]), Z95 * float(spread[i])
-        ends[world.parameters[place].name] = value - half, value + half
-    return ends
+        value, half_width = float(fit.theta[place]), Z95 * float(spread[i])
+        intervals[world.parameters[place].name] = value - half_width, value + half_width
+    return intervals
 
 
 def _select_effect_intervals(
-    ends: dict[str, tuple[float | None, float | None]], effect: str
+    intervals: dict[str, tuple[float | None, float | None]], effect: str
 ) -> dict[str, tuple[float | None, float | None]]:
     """Select the intervals of one effect's coefficients, by the name of the coefficient alone.
 
     Args:
-        ends: intervals by ``effect.coefficient``, or by the name of a base parameter.
+        intervals: intervals by ``effect.coefficient``, or by the name of a base parameter.
         effect: name of the effect.
     """
-    begin = f"{effect}."
-    return {name.removeprefix(begin): e for name, e in ends.items() if name.startswith(begin)}
+    prefix = f"{effect}."
+    return {
+        name.removeprefix(prefix): e for name, e in intervals.items() if name.startswith(prefix)
+    }

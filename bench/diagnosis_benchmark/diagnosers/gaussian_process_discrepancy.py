@@ -72,21 +72,23 @@ def _compute_gain_p_value(
         return 1.0
     centre, scale = fitted.state.mean(axis=0), fitted.state.std(axis=0)
     moving = scale > 0
-    seen = (fitted.state - centre)[:, moving] / scale[moving]
+    inputs = (fitted.state - centre)[:, moving] / scale[moving]
     unseen = (held_out.state - centre)[:, moving] / scale[moving]
-    chosen = np.sort(rng.choice(len(seen), min(TRAINING_SAMPLE_COUNT, len(seen)), replace=False))
+    training_indices = np.sort(
+        rng.choice(len(inputs), min(TRAINING_SAMPLE_COUNT, len(inputs)), replace=False)
+    )
     kernel = ConstantKernel(1.0, (1e-3, 1e3)) * RBF(
-        np.ones(seen.shape[1]), (0.05, 100.0)
+        np.ones(inputs.shape[1]), (0.05, 100.0)
     ) + WhiteKernel(1.0, (1e-2, 1e2))
     process = GaussianProcessRegressor(kernel, normalize_y=True)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        process.fit(seen[chosen], fitted.left[chosen])
+        process.fit(inputs[training_indices], fitted.left[training_indices])
     predicted = process.predict(unseen)
     gains = np.square(held_out.left) - np.square(held_out.left - predicted)
-    ends = np.linspace(0, len(gains), HELD_OUT_BLOCK_COUNT + 1).astype(int)
-    means = np.array([gains[a:b].mean() for a, b in pairwise(ends.tolist())])
-    spread = float(means.std(ddof=1) / np.sqrt(HELD_OUT_BLOCK_COUNT))
+    edges = np.linspace(0, len(gains), HELD_OUT_BLOCK_COUNT + 1).astype(int)
+    block_means = np.array([gains[a:b].mean() for a, b in pairwise(edges.tolist())])
+    spread = float(block_means.std(ddof=1) / np.sqrt(HELD_OUT_BLOCK_COUNT))
     if spread == 0:
         return 1.0
-    return float(students.sf(means.mean() / spread, HELD_OUT_BLOCK_COUNT - 1))
+    return float(students.sf(block_means.mean() / spread, HELD_OUT_BLOCK_COUNT - 1))

@@ -69,10 +69,10 @@ def summarise_case(case: DiagnosisCase) -> dict[str, Any]:
         sigma = dict(zip(names, map(float, evidence.noise.sigma), strict=True))
         residual = evidence.residual / np.asarray(evidence.noise.sigma)
         runs = [*case.recording.training(), *case.recording.held_out()]
-        described = []
+        run_documents = []
         for run, values in zip(runs, residual, strict=True):
             count = len(run.times)
-            described.append(
+            run_documents.append(
                 {
                     "t": _thin_series(run.times),
                     "inputs": {name: _thin_series(series) for name, series in run.inputs.items()},
@@ -96,7 +96,7 @@ def summarise_case(case: DiagnosisCase) -> dict[str, Any]:
         "effects": {
             name: (kind.__doc__ or "").split("\n")[0] for name, kind in case.library.items()
         },
-        "runs": described,
+        "runs": run_documents,
     }
 
 
@@ -123,7 +123,7 @@ def _run_command(prompt: str, seconds: float) -> str:
             'compare EXPERIMENT --command "COMMAND"'
         )
     try:
-        done = subprocess.run(
+        process = subprocess.run(
             shlex.split(command),
             input=prompt,
             capture_output=True,
@@ -133,10 +133,10 @@ def _run_command(prompt: str, seconds: float) -> str:
         )
     except (OSError, subprocess.TimeoutExpired) as error:
         raise InputError(f"language-model: {command}: {error}") from None
-    if done.returncode:
-        last = "".join(done.stderr.strip().splitlines()[-1:])
-        raise InputError(f"language-model: {command}: exit code {done.returncode}: {last:.200}")
-    return done.stdout
+    if process.returncode:
+        last = "".join(process.stderr.strip().splitlines()[-1:])
+        raise InputError(f"language-model: {command}: exit code {process.returncode}: {last:.200}")
+    return process.stdout
 
 
 def parse_answer(text: str) -> Answer:
@@ -145,7 +145,7 @@ def parse_answer(text: str) -> Answer:
     Raises:
         InputError: there is none, or it is not a valid answer.
     """
-    decoder, found = json.JSONDecoder(), None
+    decoder, answer = json.JSONDecoder(), None
     shortened = text[-_MAX_ANSWER_LENGTH:]
     for start in (i for i, letter in enumerate(shortened) if letter == "{"):
         try:
@@ -153,10 +153,10 @@ def parse_answer(text: str) -> Answer:
         except (ValueError, RecursionError):
             continue
         if isinstance(document, dict) and "verdict" in document:
-            found = document
-    if found is None:
+            answer = document
+    if answer is None:
         raise InputError(
             'language-model: expected a JSON object with "verdict" in the answer, found '
             f"{text.strip()!r:.80}; ask the model for JSON alone"
         )
-    return Answer.of(found)
+    return Answer.of(answer)

@@ -108,28 +108,33 @@ class NeuralClassifier(Diagnoser):
             return Answer("unidentifiable")
         classes = ["", *sorted(library_of(case.kind.system))]
         image, _ = _compute_network_input(case.kind, case.recording)
-        odds = _predict_probabilities(case.learned, image, len(classes))
+        probabilities = _predict_probabilities(case.learned, image, len(classes))
         # Effects that the recorded signals cannot show are excluded.
-        possible = np.array([not name or name in case.library for name in classes])
-        odds = np.where(possible, odds, 0.0)
-        odds = odds / odds.sum()
-        nothing = float(odds[0])
-        if nothing >= CLEAN_PROBABILITY_THRESHOLD:
+        is_possible = np.array([not name or name in case.library for name in classes])
+        probabilities = np.where(is_possible, probabilities, 0.0)
+        probabilities = probabilities / probabilities.sum()
+        clean_probability = float(probabilities[0])
+        if clean_probability >= CLEAN_PROBABILITY_THRESHOLD:
             return Answer("adequate", p_value=None)
-        order = [int(i) for i in np.argsort(-odds) if i]
-        top = float(odds[order[0]])
-        named = [i for i in order if odds[i] >= ALTERNATIVE_PROBABILITY_RATIO * top]
-        if float(odds[named].sum()) < MIN_NAMED_PROBABILITY:
+        order = [int(i) for i in np.argsort(-probabilities) if i]
+        max_probability = float(probabilities[order[0]])
+        named_classes = [
+            i for i in order if probabilities[i] >= ALTERNATIVE_PROBABILITY_RATIO * max_probability
+        ]
+        if float(probabilities[named_classes].sum()) < MIN_NAMED_PROBABILITY:
             return Answer("unknown")
-        first, *others = (classes[i] for i in named)
-        return Answer("ambiguous" if others else "named", (NamedCause(first, tuple(others)),))
+        most_probable, *alternatives = (classes[i] for i in named_classes)
+        return Answer(
+            "ambiguous" if alternatives else "named",
+            (NamedCause(most_probable, tuple(alternatives)),),
+        )
 
 
-def _simulate_example(lesson: DiagnoserTrainingTask, name: str, number: int) -> Array | None:
+def _simulate_example(training_task: DiagnoserTrainingTask, name: str, number: int) -> Array | None:
     """Simulate one recording with an effect, as input of the network.
 
     Args:
-        lesson: the training task.
+        training_task: the training task.
         name: name of the effect; empty for none.
         number: number of the example, added to the random seed.
 
@@ -140,13 +145,13 @@ def _simulate_example(lesson: DiagnoserTrainingTask, name: str, number: int) -> 
     Raises:
         SimulationBudgetExceededError: the budget is used up.
     """
-    rng, kind = lesson.rng, lesson.kind
+    rng, kind = training_task.rng, training_task.kind
     system = kind.system
     low, high = _NOISES[system.kind]
     sigma = float(np.exp(rng.uniform(np.log(low), np.log(high))))
     # In SI units a rate is 5 times as noisy as a position, as in many cases of the benchmark.
     noise = {c.name: sigma * (5.0 if c.name in system.rates else 1.0) for c in kind.channels}
-    effects = {name: _draw_coefficients(lesson, name)} if name else {}
+    effects = {name: _draw_coefficients(training_task, name)} if name else {}
     parameters = {p.name: float(rng.uniform(*p.training_range)) for p in system.parameters}
     channels = [c.name for c in kind.channels if not c.name.startswith("accel")]
     usual = system.usual_recording
@@ -159,7 +164,7 @@ def _simulate_example(lesson: DiagnoserTrainingTask, name: str, number: int) -> 
             a=f"{size:.3g}", b=f"{rng.uniform(0.25, 1.0):.3g}", c=f"{rng.uniform(0.3, 2.5):.3g}"
         )
         inputs[kind.inputs[0].name] = text
-    wish = SimulationSpec(
+    specification = SimulationSpec(
         system=kind.name,
         parameters=parameters,
         effects=effects,
@@ -173,25 +178,25 @@ def _simulate_example(lesson: DiagnoserTrainingTask, name: str, number: int) -> 
         seed=int(rng.integers(1 << 31)) + number,
         force=True,
     )
-    image, left = _compute_network_input(kind, simulate_recording(wish).recording)
-    shown = (
-        TRAINING_RESIDUAL_RANGE[0] <= left <= TRAINING_RESIDUAL_RANGE[1]
+    image, residual_rms = _compute_network_input(kind, simulate_recording(specification).recording)
+    is_usable = (
+        TRAINING_RESIDUAL_RANGE[0] <= residual_rms <= TRAINING_RESIDUAL_RANGE[1]
         if name
-        else left <= TRAINING_RESIDUAL_RANGE[1]
+        else residual_rms <= TRAINING_RESIDUAL_RANGE[1]
     )
-    return image if shown else None
+    return image if is_usable else None
 
 
-def _draw_coefficients(lesson: DiagnoserTrainingTask, name: str) -> tuple[float, ...]:
+def _draw_coefficients(training_task: DiagnoserTrainingTask, name: str) -> tuple[float, ...]:
     """Draw coefficients of an effect for a training example.
 
     The first coefficient, the size, is drawn log-uniformly down to 0.3 % of its maximum; the others
     uniformly. Coefficients that must be positive, such as a period, are always drawn log-uniformly.
     """
-    rng = lesson.rng
+    rng = training_task.rng
     values = []
     for place, parameter in enumerate(
-        make_effect_parameters(lesson.library[name], lesson.kind.system)
+        make_effect_parameters(training_task.library[name], training_task.kind.system)
     ):
         low, high = parameter.bounds
         if low > 0:
@@ -220,8 +225,8 @@ def _compute_network_input(
             compute_noise_floor(world, recording).sigma, np.zeros(len(world.channels))
         )
         fit = fit_base_model(world, noise).fit
-        left = (world.observed - fit.simulated) / noise.sigma
-        rms = float(np.sqrt(np.nanmean(np.square(left))))
+        residual = (world.observed - fit.simulated) / noise.sigma
+        rms = float(np.sqrt(np.nanmean(np.square(residual))))
         names = [c.name for c in kind.channels]
         inputs = [c.name for c in kind.inputs]
         image = np.zeros((len(world.tracks), 3 * len(names) + len(inputs) + 1, GRID_POINT_COUNT))
@@ -231,9 +236,11 @@ def _compute_network_input(
             clock = np.linspace(0.0, 1.0, size)
             for c, name in enumerate(world.channels):
                 place = names.index(name)
-                seen = np.isfinite(left[r, :size, c])
-                path = np.clip(np.nan_to_num(left[r, :size, c]), -_RESIDUAL_CLIP, _RESIDUAL_CLIP)
-                image[r, place] = np.arcsinh(np.interp(grid, clock[seen], path[seen]))
+                is_recorded = np.isfinite(residual[r, :size, c])
+                path = np.clip(
+                    np.nan_to_num(residual[r, :size, c]), -_RESIDUAL_CLIP, _RESIDUAL_CLIP
+                )
+                image[r, place] = np.arcsinh(np.interp(grid, clock[is_recorded], path[is_recorded]))
                 motion = fit.simulated[r, :size, c]
                 spread = float(motion.std()) or 1.0
                 image[r, len(names) + place] = np.interp(
@@ -296,10 +303,10 @@ def _make_network(features: int, classes: int) -> Any:
                 Logits, (B, classes).
             """
             batch, runs = images.shape[:2]
-            read = self.run(images.flatten(0, 1))
-            read = torch.cat([read.mean(dim=2), read.amax(dim=2)], dim=1)
-            read = read.reshape(batch, runs, -1) * weights[..., None]
-            return self.decide(read.sum(dim=1) / weights.sum(dim=1, keepdim=True))
+            features = self.run(images.flatten(0, 1))
+            features = torch.cat([features.mean(dim=2), features.amax(dim=2)], dim=1)
+            features = features.reshape(batch, runs, -1) * weights[..., None]
+            return self.decide(features.sum(dim=1) / weights.sum(dim=1, keepdim=True))
 
     return Network()
 
@@ -315,13 +322,13 @@ def _stack_with_mask(images: Sequence[Array]) -> tuple[Any, Any]:
     """
     import torch
 
-    most = max(len(image) for image in images)
-    whole = np.zeros((len(images), most, *images[0].shape[1:]), dtype=np.float32)
-    there = np.zeros((len(images), most), dtype=np.float32)
-    for row, weights, image in zip(whole, there, images, strict=True):
+    max_runs = max(len(image) for image in images)
+    stacked = np.zeros((len(images), max_runs, *images[0].shape[1:]), dtype=np.float32)
+    mask = np.zeros((len(images), max_runs), dtype=np.float32)
+    for row, weights, image in zip(stacked, mask, images, strict=True):
         row[: len(image)] = image
         weights[: len(image)] = 1.0
-    return torch.from_numpy(whole), torch.from_numpy(there)
+    return torch.from_numpy(stacked), torch.from_numpy(mask)
 
 
 def _train_network(
@@ -347,34 +354,43 @@ def _train_network(
         torch.manual_seed(seed)
         network = _make_network(images[0].shape[1], classes)
         inputs, weights = _stack_with_mask(images)
-        wanted = torch.from_numpy(labels.astype(np.int64))
+        targets = torch.from_numpy(labels.astype(np.int64))
         split = max(1, round(VALIDATION_SHARE * len(labels)))
-        kept, seen = slice(0, split), np.arange(split, len(labels))
+        validation, training = slice(0, split), np.arange(split, len(labels))
         optimiser = torch.optim.Adam(network.parameters(), lr=2e-3, weight_decay=1e-4)
         schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, EPOCHS)
         best, state = np.inf, network.state_dict()
         for _ in range(EPOCHS):
             network.train()
-            order = seen[torch.randperm(len(seen)).numpy()]
+            order = training[torch.randperm(len(training)).numpy()]
             for part in np.array_split(order, max(1, len(order) // BATCH_SIZE)):
                 optimiser.zero_grad()
-                loss = cross_entropy(network(inputs[part], weights[part]), wanted[part])
+                loss = cross_entropy(network(inputs[part], weights[part]), targets[part])
                 loss.backward()  # type: ignore[no-untyped-call]
                 optimiser.step()
             schedule.step()
             network.eval()
             with torch.no_grad():
-                lost = float(cross_entropy(network(inputs[kept], weights[kept]), wanted[kept]))
-            if lost < best:
-                best, state = lost, {k: v.clone() for k, v in network.state_dict().items()}
+                validation_loss = float(
+                    cross_entropy(
+                        network(inputs[validation], weights[validation]), targets[validation]
+                    )
+                )
+            if validation_loss < best:
+                best, state = (
+                    validation_loss,
+                    {k: v.clone() for k, v in network.state_dict().items()},
+                )
     return {name: tensor.numpy() for name, tensor in state.items()}
 
 
-def _predict_probabilities(learned: Mapping[str, Array], image: Array, classes: int) -> Array:
+def _predict_probabilities(
+    trained_arrays: Mapping[str, Array], image: Array, classes: int
+) -> Array:
     """Compute the class probabilities of one recording, (classes,).
 
     Args:
-        learned: trained weights by the name of the layer.
+        trained_arrays: trained weights by the name of the layer.
         image: input of the network, (R, F, POINTS).
         classes: number of classes.
     """
@@ -383,9 +399,11 @@ def _predict_probabilities(learned: Mapping[str, Array], image: Array, classes: 
     # Creating the network draws random weights; the global random generator is restored.
     with torch.random.fork_rng(devices=[]):
         network = _make_network(image.shape[1], classes)
-    network.load_state_dict({k: torch.from_numpy(np.array(v)) for k, v in learned.items()})
+    network.load_state_dict({k: torch.from_numpy(np.array(v)) for k, v in trained_arrays.items()})
     network.eval()
     inputs, weights = _stack_with_mask([image])
     with torch.no_grad():
-        odds: Array = torch.softmax(network(inputs, weights)[0], dim=0).numpy().astype(np.float64)
-    return odds
+        probabilities: Array = (
+            torch.softmax(network(inputs, weights)[0], dim=0).numpy().astype(np.float64)
+        )
+    return probabilities

@@ -79,8 +79,8 @@ class RegressionData:
 
     def select_runs(self, runs: Sequence[int]) -> RegressionData:
         """Select the rows of some runs."""
-        chosen = np.isin(self.run, list(runs))
-        return RegressionData(*(getattr(self, field.name)[chosen] for field in fields(self)))
+        is_selected = np.isin(self.run, list(runs))
+        return RegressionData(*(getattr(self, field.name)[is_selected] for field in fields(self)))
 
     def project_out_base(self) -> tuple[Array, Array]:
         """Project out parameters and initial states.
@@ -93,10 +93,10 @@ class RegressionData:
         basis = self.base[:, scale > 0] / scale[scale > 0]
         orthonormal, triangle = np.linalg.qr(basis)
         # Parameters that depend linearly on others have no direction of their own.
-        kept = orthonormal[:, np.abs(np.diag(triangle)) > 1e-10]
-        left: Array = self.left - kept @ (kept.T @ self.left)
-        effects: Array = self.effects - kept @ (kept.T @ self.effects)
-        return left, effects
+        base_directions = orthonormal[:, np.abs(np.diag(triangle)) > 1e-10]
+        residual: Array = self.left - base_directions @ (base_directions.T @ self.left)
+        effects: Array = self.effects - base_directions @ (base_directions.T @ self.effects)
+        return residual, effects
 
 
 class RegressionEvidence:
@@ -147,8 +147,8 @@ class RegressionEvidence:
     @cached_property
     def residual(self) -> Array:
         """Observed minus simulated, (R, T, C); zero where a sample is missing."""
-        left = self.world.observed - self.base.fit.simulated
-        residual: Array = np.where(self.observed_mask, left, 0.0)
+        difference = self.world.observed - self.base.fit.simulated
+        residual: Array = np.where(self.observed_mask, difference, 0.0)
         return residual
 
     @cached_property
@@ -167,8 +167,8 @@ class RegressionEvidence:
         for i, probe in enumerate(self.sensitivity_directions.candidates):
             # Each direction of a fixed size is a column of its own, because such directions do not
             # add up.
-            alone = i if probe.fixed else -1
-            places.setdefault((probe.effect, probe.group, alone), []).append(i)
+            separate_index = i if probe.fixed else -1
+            places.setdefault((probe.effect, probe.group, separate_index), []).append(i)
         return [EffectColumn(effect, tuple(members)) for (effect, *_), members in places.items()]
 
     def build_trajectory_regression(self) -> RegressionData:
@@ -194,19 +194,21 @@ class RegressionEvidence:
         Args:
             seconds: window of the local polynomials.
         """
-        left, sigma, seen = self._apply_residual_operator(self.residual[..., None], seconds)
+        residual, sigma, is_observed = self._apply_residual_operator(
+            self.residual[..., None], seconds
+        )
         base, _, _ = self._apply_residual_operator(self._compute_base_columns(), seconds)
         effects, _, _ = self._apply_residual_operator(
             self.sensitivity_directions.responses, seconds
         )
-        return self._flatten_to_rows(left[..., 0], base, effects, sigma, seen)
+        return self._flatten_to_rows(residual[..., 0], base, effects, sigma, is_observed)
 
     def _compute_base_columns(self) -> Array:
         """Return the columns of parameters and initial states in equation (1), (R, T, C, B)."""
         return compute_base_jacobian(self.world, self.base.fit)
 
     def _flatten_to_rows(
-        self, left: Array, base: Array, effects: Array, sigma: Array, seen: Mask
+        self, residual: Array, base: Array, effects: Array, sigma: Array, is_observed: Mask
     ) -> RegressionData:
         """Flatten arrays over runs, samples and channels into the rows of a regression.
 
@@ -214,25 +216,25 @@ class RegressionEvidence:
         are left out.
 
         Args:
-            left: residual, (R, T, C).
+            residual: residual, (R, T, C).
             base: columns of parameters and initial states, (R, T, C, B).
             effects: columns of all directions of effects, (R, T, C, K).
             sigma: standard deviation of the noise, (R, T, C).
-            seen: mask of the samples to use, (R, T, C).
+            is_observed: mask of the samples to use, (R, T, C).
         """
-        runs = np.broadcast_to(np.arange(len(left))[:, None, None], seen.shape)
+        runs = np.broadcast_to(np.arange(len(residual))[:, None, None], is_observed.shape)
         # An impact makes some entries very large or not finite; rows that are not finite are
         # excluded.
-        whole = seen & np.isfinite(base).all(axis=3) & np.isfinite(effects).all(axis=3)
-        scale = 1.0 / sigma[whole]
+        is_complete = is_observed & np.isfinite(base).all(axis=3) & np.isfinite(effects).all(axis=3)
+        scale = 1.0 / sigma[is_complete]
         states = self._compute_states()
-        states = np.broadcast_to(states[:, :, None], (*seen.shape, states.shape[2]))
+        states = np.broadcast_to(states[:, :, None], (*is_observed.shape, states.shape[2]))
         return RegressionData(
-            left[whole] * scale,
-            base[whole] * scale[:, None],
-            effects[whole] * scale[:, None],
-            runs[whole],
-            states[whole],
+            residual[is_complete] * scale,
+            base[is_complete] * scale[:, None],
+            effects[is_complete] * scale[:, None],
+            runs[is_complete],
+            states[is_complete],
         )
 
     def _compute_states(self) -> Array:
@@ -273,7 +275,7 @@ class RegressionEvidence:
         runs, length, channels, _ = values.shape
         result = np.full_like(values, np.nan)
         sigma = np.ones((runs, length, channels))
-        used = np.zeros((runs, length, channels), dtype=bool)
+        is_used = np.zeros((runs, length, channels), dtype=bool)
         pairs = dict(zip(system.rates, system.coordinates, strict=False))
         for r, track in enumerate(world.tracks):
             size = int(world.lengths[r])
@@ -308,17 +310,17 @@ class RegressionEvidence:
                     return filtered
 
                 place = system.coordinates.index(pairs[name] if rate else name)
-                own = smooth(order)
+                operated = smooth(order)
                 if rate:
-                    own -= damped[:size, place, None] * smooth(0)
+                    operated -= damped[:size, place, None] * smooth(0)
                 else:
-                    own -= stiff[:size, place, None] * smooth(0)
-                    own -= damped[:size, place, None] * smooth(1)
-                result[r, :size, c] = own
+                    operated -= stiff[:size, place, None] * smooth(0)
+                    operated -= damped[:size, place, None] * smooth(1)
+                result[r, :size, c] = operated
                 weights = savgol_coeffs(window, POLYNOMIAL_DEGREE, deriv=order, delta=step)
                 sigma[r, :size, c] = self.noise.sigma[c] * np.sqrt(np.square(weights).sum())
-                used[r, :size, c] = self._smooth_at(r, size, window)
-        return result, sigma, used & self.observed_mask
+                is_used[r, :size, c] = self._smooth_at(r, size, window)
+        return result, sigma, is_used & self.observed_mask
 
     def _smooth_at(self, run: int, size: int, window: int) -> Mask:
         """Return a mask (T,) of the samples whose window has no impact and no end of the run.
@@ -331,9 +333,9 @@ class RegressionEvidence:
             size: number of samples of the run.
             window: number of samples of the window of the local polynomials.
         """
-        good = np.ones(size, dtype=bool)
-        half = window // 2
-        good[:half] = good[size - half :] = False
+        is_smooth = np.ones(size, dtype=bool)
+        half_window = window // 2
+        is_smooth[:half_window] = is_smooth[size - half_window :] = False
         system = self.world.simulator.system
         name = system.coordinates[-1] if system.bounces else ""
         if name in self.world.channels:
@@ -341,9 +343,9 @@ class RegressionEvidence:
             simulated = self.base.fit.simulated[run, :size, c]
             for path in (simulated, self.world.observed[run, :size, c]):
                 lowest = np.flatnonzero((path[1:-1] < path[:-2]) & (path[1:-1] <= path[2:])) + 1
-                for at in lowest[path[lowest] < _IMPACT_HEIGHT]:
-                    good[max(0, at - half - 1) : at + half + 2] = False
-        return good
+                for impact in lowest[path[lowest] < _IMPACT_HEIGHT]:
+                    is_smooth[max(0, impact - half_window - 1) : impact + half_window + 2] = False
+        return is_smooth
 
     def _linearise(self, run: int) -> tuple[Array, Array]:
         """Compute stiffness A and damping B of equation (2), each (T, D), by finite differences.
@@ -358,18 +360,18 @@ class RegressionEvidence:
         world, system = self.world, self.world.simulator.system
         track = world.tracks[run]
         size, dimensions = int(world.lengths[run]), len(system.coordinates)
-        nothing = np.zeros((size, dimensions))
+        zeros = np.zeros((size, dimensions))
         if system.uniform or dimensions != 1:
-            return nothing, nothing
+            return zeros, zeros
         times = track.scenario.times
         name = system.coordinates[0]
         if name not in world.channels:
-            return nothing, nothing
+            return zeros, zeros
         x = self.base.fit.simulated[run, :size, world.channels.index(name)][:, None]
         v = np.gradient(x[:, 0], times)[:, None]
-        given = {c.name: c.value for c in world.kind.constants}
-        given |= {**world.simulator.constant_values, **track.scenario.constants}
-        constants = {key: np.full((size, 1), float(value)) for key, value in given.items()}
+        values = {c.name: c.value for c in world.kind.constants}
+        values |= {**world.simulator.constant_values, **track.scenario.constants}
+        constants = {key: np.full((size, 1), float(value)) for key, value in values.items()}
         theta = np.tile(self.base.fit.theta[: world.own], (size, 1))
         inputs = {
             channel.name: np.asarray(track.scenario.inputs.get(channel.name, np.zeros(size)))[
@@ -385,9 +387,11 @@ class RegressionEvidence:
             force: Array = moment.system.force(moment) / moment.inertia
             return force
 
-        still = accelerated(x, v)
-        return (accelerated(x + FINITE_DIFFERENCE_STEP, v) - still) / FINITE_DIFFERENCE_STEP, (
-            accelerated(x, v + FINITE_DIFFERENCE_STEP) - still
+        base_acceleration = accelerated(x, v)
+        return (
+            accelerated(x + FINITE_DIFFERENCE_STEP, v) - base_acceleration
+        ) / FINITE_DIFFERENCE_STEP, (
+            accelerated(x, v + FINITE_DIFFERENCE_STEP) - base_acceleration
         ) / FINITE_DIFFERENCE_STEP
 
 
@@ -415,12 +419,12 @@ def compute_base_jacobian(world: RunEvaluator, fit: TrajectoryFit) -> Array:
     """
     shared = fit.free.size
     runs, length, channels, _ = fit.jacobian.shape
-    unknown = [np.flatnonzero(~world.known[r]) for r in range(runs)]
-    width = shared + sum(places.size for places in unknown)
+    unknown_states = [np.flatnonzero(~world.known[r]) for r in range(runs)]
+    width = shared + sum(places.size for places in unknown_states)
     columns = np.zeros((runs, length, channels, width))
     columns[..., :shared] = fit.jacobian[..., :shared]
     first = shared
-    for r, places in enumerate(unknown):
+    for r, places in enumerate(unknown_states):
         columns[r, :, :, first : first + places.size] = fit.jacobian[r][..., shared + places]
         first += places.size
     return columns

@@ -63,15 +63,15 @@ class _SparseRegression(Diagnoser):
         """
         evidence = RegressionEvidence(case)
         try:
-            found = [
+            results = [
                 self._run_regression(evidence, window) for window in POLYNOMIAL_WINDOWS_SECONDS
             ]
         finally:
             evidence.close()
-        known = [one for one in found if one is not None]
-        if not known:
+        valid_results = [result for result in results if result is not None]
+        if not valid_results:
             return Answer("unidentifiable")
-        best = max(known, key=lambda one: one.sigmas)
+        best = max(valid_results, key=lambda result: result.sigmas)
         if not best.causes:
             return Answer("adequate")
         if len(best.causes) > MAX_TERMS:
@@ -102,11 +102,12 @@ class _SparseRegression(Diagnoser):
             <= fitted.base.shape[1] + 2 * HELD_OUT_BLOCK_COUNT
         ):
             return None
-        left, effects = fitted.project_out_base()
-        best = find_strongest_columns(left, effects, evidence.effect_columns)
-        chosen = [column for _, column in best.values()]
+        residual, effects = fitted.project_out_base()
+        best = find_strongest_columns(residual, effects, evidence.effect_columns)
+        chosen_columns = [column for _, column in best.values()]
         terms, library = _drop_duplicate_columns(
-            [(column.effect, place) for column in chosen for place in column.places], effects
+            [(column.effect, place) for column in chosen_columns for place in column.places],
+            effects,
         )
         if not terms:
             return _RegressionResult(0.0, ())
@@ -116,25 +117,27 @@ class _SparseRegression(Diagnoser):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             models = [
-                c for c in self._iterate_models(library / scale, left) if np.isfinite(c).all()
+                c for c in self._iterate_models(library / scale, residual) if np.isfinite(c).all()
             ]
         model, sigmas = _select_by_one_standard_error(
             models, left_out, effects_out[:, places] / scale
         )
-        picked = list(dict.fromkeys(terms[i][0] for i in np.flatnonzero(model)))
+        selected_effects = list(dict.fromkeys(terms[i][0] for i in np.flatnonzero(model)))
         causes = [
-            NamedCause(name, _find_equivalent_effects(name, picked, chosen, effects))
-            for name in picked
+            NamedCause(
+                name, _find_equivalent_effects(name, selected_effects, chosen_columns, effects)
+            )
+            for name in selected_effects
         ]
         return _RegressionResult(sigmas, tuple(causes))
 
     @abstractmethod
-    def _iterate_models(self, library: Array, left: Array) -> Iterator[Array]:
+    def _iterate_models(self, library: Array, residual: Array) -> Iterator[Array]:
         """Yield the coefficients (K,) of models with different numbers of terms.
 
         Args:
             library: columns of the candidate terms with unit mean square, (N, K).
-            left: residual, (N,).
+            residual: residual, (N,).
         """
 
 
@@ -143,7 +146,7 @@ class SequentialThresholdedLeastSquares(_SparseRegression):
 
     name = "stlsq"
 
-    def _iterate_models(self, library: Array, left: Array) -> Iterator[Array]:
+    def _iterate_models(self, library: Array, residual: Array) -> Iterator[Array]:
         """Yield the coefficients (K,) for 16 thresholds.
 
         They go from the largest least-squares coefficient down to 0.1 % of it. The method sets
@@ -152,15 +155,15 @@ class SequentialThresholdedLeastSquares(_SparseRegression):
 
         Args:
             library: columns of the candidate terms with unit mean square, (N, K).
-            left: residual, (N,).
+            residual: residual, (N,).
         """
         from pysindy import optimizers
 
-        size = float(np.abs(np.linalg.lstsq(library, left, rcond=1e-6)[0]).max())
+        size = float(np.abs(np.linalg.lstsq(library, residual, rcond=1e-6)[0]).max())
         # The threshold of the best model is unknown, so it is varied over three decades.
         for threshold in size * np.geomspace(1.0, 1e-3, 16):
-            model = optimizers.STLSQ(threshold=threshold, alpha=RIDGE_PENALTY * len(left))
-            yield model.fit(library, left[:, None]).coef_[0]
+            model = optimizers.STLSQ(threshold=threshold, alpha=RIDGE_PENALTY * len(residual))
+            yield model.fit(library, residual[:, None]).coef_[0]
 
 
 class ForwardOrthogonalLeastSquares(_SparseRegression):
@@ -168,7 +171,7 @@ class ForwardOrthogonalLeastSquares(_SparseRegression):
 
     name = "frols"
 
-    def _iterate_models(self, library: Array, left: Array) -> Iterator[Array]:
+    def _iterate_models(self, library: Array, residual: Array) -> Iterator[Array]:
         """Yield the coefficients (K,) of models with one term, two terms, and so on.
 
         PySINDy fails if too many terms are requested for nearly dependent columns. The largest
@@ -176,16 +179,16 @@ class ForwardOrthogonalLeastSquares(_SparseRegression):
 
         Args:
             library: columns of the candidate terms with unit mean square, (N, K).
-            left: residual, (N,).
+            residual: residual, (N,).
         """
         from pysindy import optimizers
 
-        for most in range(min(2 * MAX_TERMS, library.shape[1]), 0, -1):
-            model = optimizers.FROLS(max_iter=most, alpha=RIDGE_PENALTY * len(left))
+        for max_terms in range(min(2 * MAX_TERMS, library.shape[1]), 0, -1):
+            model = optimizers.FROLS(max_iter=max_terms, alpha=RIDGE_PENALTY * len(residual))
             # FROLS raises an error if the rest of all other terms depends linearly on the selected
             # ones.
             with suppress(ValueError):
-                model.fit(library, left[:, None])
+                model.fit(library, residual[:, None])
                 yield from (coefficients[0] for coefficients in model.history_)
                 return
 
@@ -204,7 +207,7 @@ def _drop_duplicate_columns(
     Returns:
         The terms, and their columns.
     """
-    kept: list[tuple[str, int]] = []
+    kept_terms: list[tuple[str, int]] = []
     columns: list[Array] = []
     for effect, place in terms:
         column = effects[:, place]
@@ -212,41 +215,43 @@ def _drop_duplicate_columns(
         if size < 1e-9 * max(len(column), 1):
             continue
         unit = column / size
-        if all(abs(float(unit @ other)) < DUPLICATE_COLUMN_CORRELATION for other in columns):
-            kept.append((effect, place))
+        if all(
+            abs(float(unit @ kept_column)) < DUPLICATE_COLUMN_CORRELATION for kept_column in columns
+        ):
+            kept_terms.append((effect, place))
             columns.append(unit)
-    library = effects[:, [place for _, place in kept]]
-    return kept, library
+    library = effects[:, [place for _, place in kept_terms]]
+    return kept_terms, library
 
 
 def _select_by_one_standard_error(
-    models: Sequence[Array], left: Array, library: Array
+    models: Sequence[Array], residual: Array, library: Array
 ) -> tuple[Array, float]:
     """Select the simplest model whose held-out error is within one standard error of the best.
 
     Args:
         models: coefficients of each model, (K,).
-        left: residual of the held-out runs, (N,).
+        residual: residual of the held-out runs, (N,).
         library: columns of the terms in the held-out runs, (N, K).
 
     Returns:
         Its coefficients (zero if no model is significantly better than none), and the improvement
         of the best model over no terms in standard errors.
     """
-    nothing = np.zeros(library.shape[1])
-    every = [nothing, *models]
-    errors = np.array([_block_mean_squares(left - library @ c) for c in every])
+    zero_model = np.zeros(library.shape[1])
+    candidates = [zero_model, *models]
+    errors = np.array([_block_mean_squares(residual - library @ c) for c in candidates])
     best = int(errors.mean(axis=1).argmin())
     gain = errors[0] - errors[best]
     sigmas = float(gain.mean() / max(_standard_error(gain), 1e-12)) if best else 0.0
     if sigmas < MIN_IMPROVEMENT_STANDARD_ERRORS:
-        return nothing, sigmas
-    allowed = []
-    for c, error in zip(every[1:], errors[1:], strict=True):
-        worse = error - errors[best]
-        if worse.mean() <= _standard_error(worse):
-            allowed.append(c)
-    return min(allowed or [every[best]], key=np.count_nonzero), sigmas
+        return zero_model, sigmas
+    allowed_models = []
+    for c, error in zip(candidates[1:], errors[1:], strict=True):
+        excess = error - errors[best]
+        if excess.mean() <= _standard_error(excess):
+            allowed_models.append(c)
+    return min(allowed_models or [candidates[best]], key=np.count_nonzero), sigmas
 
 
 def _block_mean_squares(error: Array) -> Array:
@@ -254,8 +259,8 @@ def _block_mean_squares(error: Array) -> Array:
 
     Blocks are used because the errors of neighbouring samples are correlated.
     """
-    ends = np.linspace(0, len(error), HELD_OUT_BLOCK_COUNT + 1).astype(int)
-    return np.array([np.square(error[a:b]).mean() for a, b in pairwise(ends.tolist())])
+    edges = np.linspace(0, len(error), HELD_OUT_BLOCK_COUNT + 1).astype(int)
+    return np.array([np.square(error[a:b]).mean() for a, b in pairwise(edges.tolist())])
 
 
 def _standard_error(differences: Array) -> float:
@@ -264,7 +269,7 @@ def _standard_error(differences: Array) -> float:
 
 
 def _find_equivalent_effects(
-    name: str, picked: Sequence[str], columns: Sequence[EffectColumn], effects: Array
+    name: str, selected_effects: Sequence[str], columns: Sequence[EffectColumn], effects: Array
 ) -> tuple[str, ...]:
     """List effects that were not selected but are nearly collinear with a selected effect.
 
@@ -272,7 +277,7 @@ def _find_equivalent_effects(
 
     Args:
         name: the selected effect.
-        picked: all selected effects.
+        selected_effects: all selected effects.
         columns: one column for each effect.
         effects: columns of all directions, (N, K).
     """
@@ -284,11 +289,13 @@ def _find_equivalent_effects(
         unit: Array = part[:, scale > 1e-9] / scale[scale > 1e-9]
         return unit
 
-    own = next(units(column) for column in columns if column.effect == name)
-    close = {}
+    selected_units = next(units(column) for column in columns if column.effect == name)
+    correlations = {}
     for column in columns:
-        if column.effect not in picked:
-            other = units(column)
-            close[column.effect] = float(np.abs(own.T @ other).max()) if other.size else 0.0
-    order = sorted(close, key=lambda effect: -close[effect])
-    return tuple(effect for effect in order if close[effect] >= SAME_CAUSE_CORRELATION)
+        if column.effect not in selected_effects:
+            column_units = units(column)
+            correlations[column.effect] = (
+                float(np.abs(selected_units.T @ column_units).max()) if column_units.size else 0.0
+            )
+    order = sorted(correlations, key=lambda effect: -correlations[effect])
+    return tuple(effect for effect in order if correlations[effect] >= SAME_CAUSE_CORRELATION)

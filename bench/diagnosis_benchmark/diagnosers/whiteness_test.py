@@ -46,23 +46,23 @@ class WhitenessTest(Diagnoser):
             if chance >= FALSE_ALARM_RATE:
                 return Answer("adequate", p_value=chance)
             rows = evidence.build_trajectory_regression()
-            left, effects = rows.project_out_base()
-            best = find_strongest_columns(left, effects, evidence.effect_columns)
+            residual, effects = rows.project_out_base()
+            best = find_strongest_columns(residual, effects, evidence.effect_columns)
         finally:
             evidence.close()
-        total = float(left @ left)
+        total = float(residual @ residual)
         correlated = {name: (gain / total) ** 0.5 for name, (gain, _) in best.items()}
         order = sorted(correlated, key=lambda name: -correlated[name])
         if not order or correlated[order[0]] < MIN_CORRELATION:
             return Answer("unknown", p_value=chance)
-        first, *others = order
-        alike = [
+        most_correlated, *other_effects = order
+        alternatives = [
             name
-            for name in others
-            if correlated[first] - correlated[name] <= CORRELATION_TIE_TOLERANCE
+            for name in other_effects
+            if correlated[most_correlated] - correlated[name] <= CORRELATION_TIE_TOLERANCE
         ]
-        cause = NamedCause(first, tuple(alike), p_value=chance)
-        return Answer("ambiguous" if alike else "named", (cause,), p_value=chance)
+        cause = NamedCause(most_correlated, tuple(alternatives), p_value=chance)
+        return Answer("ambiguous" if alternatives else "named", (cause,), p_value=chance)
 
 
 def _compute_whiteness_p_value(evidence: RegressionEvidence) -> float:

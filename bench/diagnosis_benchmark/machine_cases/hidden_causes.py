@@ -99,14 +99,14 @@ def list_effect_places(system: str, effect: str) -> tuple[str, ...]:
     if effect in GRAVITY_EFFECTS or system == "servo":
         return (effect,)
     if effect == "mass.scale":
-        at: tuple[str, ...] = plant.bodies
+        places: tuple[str, ...] = plant.bodies
     elif effect in INPUT_EFFECTS:
-        at = plant.motors
+        places = plant.motors
     elif effect in SENSOR_EFFECTS:
-        at = plant.channels
+        places = plant.channels
     else:
-        at = plant.joints
-    return tuple(f"{effect}@{place}" for place in at)
+        places = plant.joints
+    return tuple(f"{effect}@{place}" for place in places)
 
 
 def get_joint(system: str, place: str) -> int:
@@ -138,22 +138,22 @@ def draw_effect_shape(
     """
     effect, _, place = name.partition("@")
     joint = get_joint(setting.system, place)
-    typical = {what: float(values[joint]) for what, values in setting.motion_scales.items()}
+    typical = {quantity: float(values[joint]) for quantity, values in setting.motion_scales.items()}
     sign = float(rng.choice([-1.0, 1.0])) if effect in SIGNED_EFFECTS else 1.0
     if effect in _MAX_COEFFICIENTS:
         return lambda s: (sign * _MAX_COEFFICIENTS[effect] * s,)
     if effect in MOTION_SCALED_EFFECTS:
         return MOTION_SCALED_EFFECTS[effect](typical, rng)
     if effect == "gravity.tilt":
-        more = (0.0,) if setting.system == "arm2" else ()
-        return lambda s: (0.3 * sign * s, *more)
+        phase_coefficients = (0.0,) if setting.system == "arm2" else ()
+        return lambda s: (0.3 * sign * s, *phase_coefficients)
     command = setting.fitted_runs.commands[:, :, joint]
-    most = float(np.abs(command).max())
+    max_command = float(np.abs(command).max())
     return {
         "input.bias": lambda s: (sign * float(np.ptp(command)) / 2 * s,),
-        "input.deadband": lambda s: (most * s,),
+        "input.deadband": lambda s: (max_command * s,),
         # Strength 0 limits the command at its peak, strength 1 at zero.
-        "input.saturation": lambda s: (most * (1 - s),),
+        "input.saturation": lambda s: (max_command * (1 - s),),
         "servo.deadband": lambda s: (0.3 * s,),
     }[effect]
 
@@ -172,8 +172,8 @@ def _make_force_drawer(
 
     def made(typical: dict[str, float], rng: np.random.Generator) -> CoefficientFunction:
         """Draw the effect from the typical scales of its joint; `rng` is not used."""
-        far = 2.0 * typical["force"] / bottom(typical)
-        return lambda s: (far * s,)
+        coefficient_scale = 2.0 * typical["force"] / bottom(typical)
+        return lambda s: (coefficient_scale * s,)
 
     return made
 
@@ -192,7 +192,7 @@ def _draw_ripple(typical: dict[str, float], rng: np.random.Generator) -> Coeffic
     """
     angle = rng.uniform(0, 2 * np.pi)
     period = float(np.clip(typical["travel"] / rng.uniform(1.5, 4.0), 0.08, 1.0))
-    sine, cosine = (2 * typical["force"] * float(of(angle)) for of in (np.sin, np.cos))
+    sine, cosine = (2 * typical["force"] * float(function(angle)) for function in (np.sin, np.cos))
     return lambda s: (sine * s, cosine * s, period)
 
 
@@ -245,11 +245,11 @@ def draw_unmodelled_cause(
     joint = get_joint(setting.system, place)
     force = float(setting.motion_scales["force"][joint])
     if cause == "gust":
-        lasting = float(rng.uniform(0.1, 0.3) * setting.seconds)
-        begin = float(rng.uniform(0.1, 0.6) * setting.seconds)
+        duration = float(rng.uniform(0.1, 0.3) * setting.seconds)
+        start = float(rng.uniform(0.1, 0.6) * setting.seconds)
         sign = float(rng.choice([-1.0, 1.0]))
-        return lambda s: (2.0 * sign * force * s, begin, lasting)
+        return lambda s: (2.0 * sign * force * s, start, duration)
     path = setting.base_motion.q[:, :, joint]
     centre = float(np.quantile(path, rng.uniform(0.3, 0.7)))
-    half = float(np.ptp(path) * rng.uniform(0.08, 0.2))
-    return lambda s: (2.0 * force * s, centre, half)
+    half_width = float(np.ptp(path) * rng.uniform(0.08, 0.2))
+    return lambda s: (2.0 * force * s, centre, half_width)

@@ -81,35 +81,35 @@ def draw_case(
     words = [kind, system, effect or "any", *([f"{size:g}"] if size else [])]
     words += [str(part) for part in wanted_so if part is not None]
     name = "-".join([*words, str(seed)])
-    made, rng = restore_conditions(name, system, wanted_so), _make_rng(name, "cause")
+    conditions, rng = restore_conditions(name, system, wanted_so), _make_rng(name, "cause")
     item = BenchmarkCase(
         name,
         system,
         kind,
         {},
         0.0,
-        made.noise.kind,
-        made.noise.stated,
-        made.rate,
-        made.seconds,
-        len(made.runs.q),
+        conditions.noise.kind,
+        conditions.noise.stated,
+        conditions.rate,
+        conditions.seconds,
+        len(conditions.runs.q),
         "own equations",
         True,
         MACHINES[system].channels,
         seed,
-        made.free_parameters,
+        conditions.free_parameters,
         asked=wanted_so,
     )
     if kind == "clean":
         return item
     low = 3.0 if kind in ("double", "foreign") else 1.0
-    wanted = size or float(np.exp(rng.uniform(np.log(low), np.log(10.0))))
+    target_size = size or float(np.exp(rng.uniform(np.log(low), np.log(10.0))))
     hidden = {
         "single": _hide_one_effect,
         "double": _hide_two_effects,
         "foreign": _hide_unmodelled_cause,
     }[kind]
-    return hidden(item, made, effect, wanted, rng)
+    return hidden(item, conditions, effect, target_size, rng)
 
 
 def _make_rng(name: str, purpose: str) -> np.random.Generator:
@@ -144,85 +144,89 @@ def _draw_place(
     Returns:
         ``effect@place`` or ``effect``; empty if the only place is excluded by `but`.
     """
-    chosen = effect or str(rng.choice(hidden_causes.EFFECTS_BY_MACHINE[item.system]))
-    there = [name for name in hidden_causes.list_effect_places(item.system, chosen) if name != but]
-    return str(rng.choice(there)) if there else ""
+    chosen_effect = effect or str(rng.choice(hidden_causes.EFFECTS_BY_MACHINE[item.system]))
+    places = [
+        name for name in hidden_causes.list_effect_places(item.system, chosen_effect) if name != but
+    ]
+    return str(rng.choice(places)) if places else ""
 
 
 def _hide_one_effect(
     item: BenchmarkCase,
-    made: MachineRecordingConditions,
+    conditions: MachineRecordingConditions,
     effect: str | None,
-    wanted: float,
+    target_size: float,
     rng: np.random.Generator,
 ) -> BenchmarkCase | None:
     """Hide one effect of the library, with coefficients that give the requested size.
 
     Stribeck friction of at least one noise is rejected if Coulomb friction or drag explains it too
-    well: the residual that the better of them leaves (`beyond`) must be at least
+    well: the residual that the better of them leaves (`unexplained`) must be at least
     `MIN_SIMPLER_RESIDUAL`.
 
     Args:
         item: the case without its hidden cause.
-        made: recording conditions.
+        conditions: recording conditions.
         effect: name of the effect; None to draw it.
-        wanted: size in units of the noise.
+        target_size: size in units of the noise.
         rng: random generator.
 
     Returns:
         The case; None if it is rejected or no coefficients give this size.
     """
     name = _draw_place(item, effect, rng)
-    c = _find_sized_coefficients(name, made, wanted, rng)
+    c = _find_sized_coefficients(name, conditions, target_size, rng)
     if c is None:
         return None
     effect, _, place = name.partition("@")
-    beyond = None
-    if effect in SIMPLER_EFFECTS and wanted >= 1.0:
-        other = f"{SIMPLER_EFFECTS[effect]}@{place}" if place else SIMPLER_EFFECTS[effect]
-        rivals = [other, f"drag.linear@{place}" if place else "drag.quadratic"]
-        beyond = _compute_unexplained_size(made, {name: c}, {}, rivals, rng)
-        if beyond < MIN_SIMPLER_RESIDUAL:
+    unexplained = None
+    if effect in SIMPLER_EFFECTS and target_size >= 1.0:
+        simpler_effect = f"{SIMPLER_EFFECTS[effect]}@{place}" if place else SIMPLER_EFFECTS[effect]
+        rivals = [simpler_effect, f"drag.linear@{place}" if place else "drag.quadratic"]
+        unexplained = _compute_unexplained_size(conditions, {name: c}, {}, rivals, rng)
+        if unexplained < MIN_SIMPLER_RESIDUAL:
             return None
-    return replace(item, effects={name: c}, size=wanted, beyond=beyond)
+    return replace(item, effects={name: c}, size=target_size, beyond=unexplained)
 
 
 def _find_sized_coefficients(
-    name: str, made: MachineRecordingConditions, wanted: float, rng: np.random.Generator
+    name: str, conditions: MachineRecordingConditions, target_size: float, rng: np.random.Generator
 ) -> tuple[float, ...] | None:
     """Find coefficients at which a cause has the requested size, with a strength of at most 1.
 
     Args:
         name: ``effect@place``, or ``effect`` alone.
-        made: recording conditions.
-        wanted: size in units of the noise.
+        conditions: recording conditions.
+        target_size: size in units of the noise.
         rng: random generator for the shape of the effect.
 
     Returns:
         The coefficients; None if the size is not reached.
     """
-    of = hidden_causes.draw_effect_shape(name, made, rng)
-    gauge = _ResidualGauge(made)
+    compute_coefficients = hidden_causes.draw_effect_shape(name, conditions, rng)
+    gauge = _ResidualGauge(conditions)
     strength = find_strength_for_size(
-        lambda s: gauge.left(made.simulate_readings({name: of(s)})), wanted, 1.0
+        lambda s: gauge.left(conditions.simulate_readings({name: compute_coefficients(s)})),
+        target_size,
+        1.0,
     )
-    return None if strength is None else of(strength)
+    return None if strength is None else compute_coefficients(strength)
 
 
 def _hide_two_effects(
     item: BenchmarkCase,
-    made: MachineRecordingConditions,
+    conditions: MachineRecordingConditions,
     effect: str | None,
-    wanted: float,
+    target_size: float,
     rng: np.random.Generator,
 ) -> BenchmarkCase | None:
     """Hide two effects, each of the requested size alone; reject the case if one explains both.
 
     Args:
         item: the case without its hidden causes.
-        made: recording conditions.
+        conditions: recording conditions.
         effect: name of the first effect; None to draw it.
-        wanted: size of each effect alone, in units of the noise.
+        target_size: size of each effect alone, in units of the noise.
         rng: random generator.
 
     Returns:
@@ -233,68 +237,78 @@ def _hide_two_effects(
     second = _draw_place(item, None, rng, but=first)
     if not second or second in find_equivalent_causes(item.system, first):
         return None
-    found = {name: _find_sized_coefficients(name, made, wanted, rng) for name in (first, second)}
-    effects = {name: c for name, c in found.items() if c is not None}
+    coefficients_by_effect = {
+        name: _find_sized_coefficients(name, conditions, target_size, rng)
+        for name in (first, second)
+    }
+    effects = {name: c for name, c in coefficients_by_effect.items() if c is not None}
     if len(effects) < 2:
         return None
-    beyond = min(_compute_unexplained_size(made, effects, {}, [name], rng) for name in effects)
+    unexplained = min(
+        _compute_unexplained_size(conditions, effects, {}, [name], rng) for name in effects
+    )
     return (
-        replace(item, effects=effects, size=wanted, beyond=beyond)
-        if beyond >= MIN_DISTINCT_SIZE
+        replace(item, effects=effects, size=target_size, beyond=unexplained)
+        if unexplained >= MIN_DISTINCT_SIZE
         else None
     )
 
 
 def _hide_unmodelled_cause(
     item: BenchmarkCase,
-    made: MachineRecordingConditions,
+    conditions: MachineRecordingConditions,
     cause: str | None,
-    wanted: float,
+    target_size: float,
     rng: np.random.Generator,
 ) -> BenchmarkCase | None:
     """Hide an unmodelled cause, which the library explains only in part.
 
-    The case is rejected if one effect of the library leaves a residual (`beyond`) below
+    The case is rejected if one effect of the library leaves a residual (`unexplained`) below
     `MIN_DISTINCT_SIZE`.
 
     Args:
         item: the case without its hidden cause.
-        made: recording conditions.
+        conditions: recording conditions.
         cause: name of the cause; None to draw it.
-        wanted: size in units of the noise.
+        target_size: size in units of the noise.
         rng: random generator.
 
     Returns:
         The case; None if it is rejected or no strength gives this size.
     """
-    chosen = cause or str(rng.choice(hidden_causes.UNMODELLED_CAUSES))
+    chosen_cause = cause or str(rng.choice(hidden_causes.UNMODELLED_CAUSES))
     joint = str(rng.choice(MACHINES[item.system].joints))
-    name = f"{chosen}@{joint}" if joint else chosen
-    of, gauge = hidden_causes.draw_unmodelled_cause(name, made, rng), _ResidualGauge(made)
+    name = f"{chosen_cause}@{joint}" if joint else chosen_cause
+    compute_coefficients, gauge = (
+        hidden_causes.draw_unmodelled_cause(name, conditions, rng),
+        _ResidualGauge(conditions),
+    )
     strength = find_strength_for_size(
-        lambda s: gauge.left(made.simulate_readings(foreign={name: of(s)})), wanted, 1.0
+        lambda s: gauge.left(conditions.simulate_readings(foreign={name: compute_coefficients(s)})),
+        target_size,
+        1.0,
     )
     if strength is None:
         return None
-    hidden = {name: of(strength)}
-    known = [
+    hidden = {name: compute_coefficients(strength)}
+    library_effects = [
         n
         for e in hidden_causes.EFFECTS_BY_MACHINE[item.system]
         for n in hidden_causes.list_effect_places(item.system, e)
     ]
-    beyond = _compute_unexplained_size(made, {}, hidden, known, rng)
+    unexplained = _compute_unexplained_size(conditions, {}, hidden, library_effects, rng)
     return (
-        replace(item, effects=hidden, size=wanted, beyond=beyond)
-        if beyond >= MIN_DISTINCT_SIZE
+        replace(item, effects=hidden, size=target_size, beyond=unexplained)
+        if unexplained >= MIN_DISTINCT_SIZE
         else None
     )
 
 
 def _compute_unexplained_size(
-    made: MachineRecordingConditions,
+    conditions: MachineRecordingConditions,
     effects: Effects,
     foreign: Effects,
-    others: Sequence[str],
+    other_causes: Sequence[str],
     rng: np.random.Generator,
 ) -> float:
     """Compute the RMS residual that the best of other causes leaves, to first order.
@@ -303,22 +317,26 @@ def _compute_unexplained_size(
     direction of each other cause.
 
     Args:
-        made: recording conditions.
+        conditions: recording conditions.
         effects: hidden effects of the library.
         foreign: hidden unmodelled causes.
-        others: the other causes, each of which may be a wrong answer.
+        other_causes: the other causes, each of which may be a wrong answer.
         rng: random generator for the shapes of the other causes.
     """
-    gauge = _ResidualGauge(made)
-    change = made.simulate_readings(effects, foreign) - gauge.bare
-    bare = made.simulate_readings(coarse=_COARSE_STEP_FACTOR)
-    left = []
-    for name in others:
-        of = hidden_causes.draw_effect_shape(name, made, rng)
-        probe = {name: effects[name]} if name in effects else {name: of(_PROBE_STRENGTH)}
-        direction = made.simulate_readings(probe, coarse=_COARSE_STEP_FACTOR) - bare
-        left.append(gauge.projected(change, direction))
-    return min(left)
+    gauge = _ResidualGauge(conditions)
+    change = conditions.simulate_readings(effects, foreign) - gauge.bare
+    base_readings = conditions.simulate_readings(coarse=_COARSE_STEP_FACTOR)
+    residual_sizes = []
+    for name in other_causes:
+        compute_coefficients = hidden_causes.draw_effect_shape(name, conditions, rng)
+        probe = (
+            {name: effects[name]}
+            if name in effects
+            else {name: compute_coefficients(_PROBE_STRENGTH)}
+        )
+        direction = conditions.simulate_readings(probe, coarse=_COARSE_STEP_FACTOR) - base_readings
+        residual_sizes.append(gauge.projected(change, direction))
+    return min(residual_sizes)
 
 
 class _ResidualGauge:
@@ -357,16 +375,16 @@ class _ResidualGauge:
             q[:, 1 + len(numbers) + j, j] += _FINITE_DIFFERENCE_STEP
             v[:, 1 + len(numbers) + joints + j, j] += _FINITE_DIFFERENCE_STEP
         plant = MACHINES[made.system]({n: a.ravel() for n, a in values.items()}, {}, {})
-        begun = fitted._replace(q=q.reshape(-1, joints), v=v.reshape(-1, joints))
-        seen = read_encoders(simulate_machine(plant, begun), plant, made.runs.times)
-        seen = seen.reshape(runs, lanes, -1)
-        slopes = (seen[:, 1:] - seen[:, :1]) / _FINITE_DIFFERENCE_STEP
+        start_runs = fitted._replace(q=q.reshape(-1, joints), v=v.reshape(-1, joints))
+        readings = read_encoders(simulate_machine(plant, start_runs), plant, made.runs.times)
+        readings = readings.reshape(runs, lanes, -1)
+        slopes = (readings[:, 1:] - readings[:, :1]) / _FINITE_DIFFERENCE_STEP
         shared = np.concatenate(slopes[:, : len(numbers)], axis=1).T
-        own = np.zeros((runs, slopes.shape[2], runs, 2 * joints))
+        state_columns = np.zeros((runs, slopes.shape[2], runs, 2 * joints))
         for r in range(runs):
-            own[r, :, r] = slopes[r, len(numbers) :].T
-        columns = np.column_stack([shared, own.reshape(runs * slopes.shape[2], -1)])
-        self.bare = seen[:, 0].reshape(runs, len(made.runs.times), joints)
+            state_columns[r, :, r] = slopes[r, len(numbers) :].T
+        columns = np.column_stack([shared, state_columns.reshape(runs * slopes.shape[2], -1)])
+        self.bare = readings[:, 0].reshape(runs, len(made.runs.times), joints)
         self._basis = _compute_orthonormal_basis(columns)
 
     def left(self, seen: Array) -> float:
@@ -384,10 +402,14 @@ class _ResidualGauge:
             change: change of the readings, (R, T, N).
             direction: direction of another cause, (R, T, N).
         """
-        rest, way = (self._project_out_parameters(part.ravel()) for part in (change, direction))
-        if way @ way > 0:
-            rest = rest - way * (way @ rest) / (way @ way)
-        return float(np.sqrt(np.mean(rest**2)) / self.made.noise_sigmas)
+        residual, projected_direction = (
+            self._project_out_parameters(part.ravel()) for part in (change, direction)
+        )
+        if projected_direction @ projected_direction > 0:
+            residual = residual - projected_direction * (projected_direction @ residual) / (
+                projected_direction @ projected_direction
+            )
+        return float(np.sqrt(np.mean(residual**2)) / self.made.noise_sigmas)
 
     def _compute_size(self, change: Array) -> float:
         """Return the RMS of a flattened change in units of the noise, parameters projected out."""
@@ -399,8 +421,8 @@ class _ResidualGauge:
 
     def _project_out_parameters(self, change: Array) -> Array:
         """Subtract from a change (RTN,) the part that parameters and initial states explain."""
-        rest: Array = change - self._basis @ (self._basis.T @ change)
-        return rest
+        residual: Array = change - self._basis @ (self._basis.T @ change)
+        return residual
 
 
 def _compute_orthonormal_basis(columns: Array) -> Array:
@@ -413,8 +435,10 @@ def _compute_orthonormal_basis(columns: Array) -> Array:
         columns: columns, (N, P).
     """
     scale = np.sqrt(np.square(columns).sum(axis=0))
-    left, sizes, _ = np.linalg.svd(columns / np.where(scale > 0, scale, 1.0), full_matrices=False)
-    basis: Array = left[:, sizes > 1e-6 * sizes[0]]
+    left_vectors, singular_values, _ = np.linalg.svd(
+        columns / np.where(scale > 0, scale, 1.0), full_matrices=False
+    )
+    basis: Array = left_vectors[:, singular_values > 1e-6 * singular_values[0]]
     return basis
 
 
@@ -452,13 +476,13 @@ def record_case(item: BenchmarkCase) -> tuple[MachineRecordingConditions, Array]
     Returns:
         The recording conditions and the noisy encoder readings, (R, T, N).
     """
-    made = restore_conditions(item.name, item.system, item.asked)
+    conditions = restore_conditions(item.name, item.system, item.asked)
     hidden = item.effects
     foreign = item.kind == "foreign"
-    plant = made.make_machine({} if foreign else hidden, hidden if foreign else {})
-    seen = read_encoders(simulate_machine(plant, made.runs), plant, made.runs.times)
+    plant = conditions.make_machine({} if foreign else hidden, hidden if foreign else {})
+    readings = read_encoders(simulate_machine(plant, conditions.runs), plant, conditions.runs.times)
     rng = _make_rng(item.name, "noise")
-    return made, np.array([made.noise.add_to(run, rng) for run in seen])
+    return conditions, np.array([conditions.noise.add_to(run, rng) for run in readings])
 
 
 def build_description(item: BenchmarkCase, made: MachineRecordingConditions) -> dict[str, object]:
@@ -470,8 +494,8 @@ def build_description(item: BenchmarkCase, made: MachineRecordingConditions) -> 
     """
     robot = item.system == "arm2"
     plant = MACHINES[item.system]
-    stated = {"noise": made.noise_sigmas} if item.stated else {}
-    channels = {name: {"unit": "rad", **stated} for name in plant.channels}
+    noise_entry = {"noise": made.noise_sigmas} if item.stated else {}
+    channels = {name: {"unit": "rad", **noise_entry} for name in plant.channels}
     inputs = (
         {f"u.{name}": {"unit": "N*m"} for name in plant.motors}
         if robot
@@ -479,14 +503,16 @@ def build_description(item: BenchmarkCase, made: MachineRecordingConditions) -> 
     )
     first = item.runs - made.held_out
     runs = {str(number): {"held_out": True} for number in range(first, item.runs)}
-    of = {"model": MODEL_FILE_NAME} if robot else {"system": item.system}
+    source_entry = {"model": MODEL_FILE_NAME} if robot else {"system": item.system}
     constants = {} if robot else {"constants": _get_stated_constants(made)}
-    return {**of, "channels": channels, "inputs": inputs, **constants, "runs": runs}
+    return {**source_entry, "channels": channels, "inputs": inputs, **constants, "runs": runs}
 
 
-def _get_stated_constants(made: MachineRecordingConditions) -> dict[str, float]:
+def _get_stated_constants(conditions: MachineRecordingConditions) -> dict[str, float]:
     """Return the parameters of a servo that its recording states and that are not fitted."""
-    return {name: v for name, v in made.numbers.items() if name not in made.free_parameters}
+    return {
+        name: v for name, v in conditions.numbers.items() if name not in conditions.free_parameters
+    }
 
 
 def format_table(item: BenchmarkCase, made: MachineRecordingConditions, seen: Array) -> str:
@@ -502,8 +528,8 @@ def format_table(item: BenchmarkCase, made: MachineRecordingConditions, seen: Ar
     lines = [",".join(["run", "t", *inputs, *plant.channels])]
     for number, run in enumerate(seen):
         for k, t in enumerate(made.runs.times.tolist()):
-            told = made.runs.commands[number, k].tolist() + ([] if robot else [1.0])
-            cells = [t, *told, *run[k].tolist()]
+            commands = made.runs.commands[number, k].tolist() + ([] if robot else [1.0])
+            cells = [t, *commands, *run[k].tolist()]
             lines.append(",".join([str(number), *(f"{value:.9g}" for value in cells)]))
     return "\n".join(lines) + "\n"
 
@@ -520,11 +546,11 @@ def write_case(item: BenchmarkCase, folder: Path) -> Path:
     """
     import tomli_w
 
-    made, seen = record_case(item)
+    conditions, readings = record_case(item)
     if item.system == "arm2":
-        (folder / MODEL_FILE_NAME).write_text(render_arm_mjcf(made.numbers), encoding="utf-8")
+        (folder / MODEL_FILE_NAME).write_text(render_arm_mjcf(conditions.numbers), encoding="utf-8")
     path = folder / "recording.csv"
-    path.write_text(format_table(item, made, seen), encoding="utf-8")
-    description = tomli_w.dumps(build_description(item, made))
+    path.write_text(format_table(item, conditions, readings), encoding="utf-8")
+    description = tomli_w.dumps(build_description(item, conditions))
     path.with_suffix(".toml").write_text(description, encoding="utf-8")
     return path

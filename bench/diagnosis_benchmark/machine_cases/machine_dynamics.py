@@ -108,10 +108,10 @@ class MachineDynamics(ABC):
         if self.extra.any():
             limit += self.extra * np.exp(-((v / self.speed) ** 2))
         if self.patch:
-            joint, most, centre, half = self.patch
+            joint, max_friction, centre, half_width = self.patch
             # Friction rises linearly over a tenth of the half width at each border.
-            inside = (half - np.abs(q[:, joint] - centre)) / (0.1 * half)
-            limit[:, joint] += most * np.clip(inside, 0.0, 1.0)
+            patch_weight = (half_width - np.abs(q[:, joint] - centre)) / (0.1 * half_width)
+            limit[:, joint] += max_friction * np.clip(patch_weight, 0.0, 1.0)
         return limit
 
     def compute_force(self, t: float, q: Array, v: Array, u: Array) -> Array:
@@ -127,8 +127,8 @@ class MachineDynamics(ABC):
             Forces, (L, N).
         """
         total = self.compute_own_force(q, v, u)
-        for act in self.acts:
-            total = total + act(t, q, v, u)
+        for compute_effect_force in self.acts:
+            total = total + compute_effect_force(t, q, v, u)
         return total
 
     @abstractmethod
@@ -218,15 +218,15 @@ class MachineDynamics(ABC):
         """
         joint = self.joints.index(place)
         if cause == "patch":
-            most, centre, half = c
-            self.patch = joint, most, centre, half
+            max_friction, centre, half_width = c
+            self.patch = joint, max_friction, centre, half_width
         elif cause == "gust":
-            push, begin, lasting = c
+            push, start, duration = c
 
             def blow(t: float, q: Array, v: Array, u: Array) -> Array:
                 """Return the generalised forces (L, N) of the gust at time t."""
                 pushed = np.zeros_like(q)
-                pushed[:, joint] = push * (begin <= t < begin + lasting)
+                pushed[:, joint] = push * (start <= t < start + duration)
                 return pushed
 
             self.acts.append(blow)
@@ -324,13 +324,17 @@ class ArmDynamics(MachineDynamics):
             q: positions, (L, 2).
         """
         n = self.numbers
-        across = n["mass2"] * n["length"] * n["centre2"] * np.cos(q[:, 1])
-        outer = n["inertia2"] + n["mass2"] * n["centre2"] ** 2
-        inner = n["inertia1"] + n["mass1"] * n["centre1"] ** 2 + n["mass2"] * n["length"] ** 2
+        coupling = n["mass2"] * n["length"] * n["centre2"] * np.cos(q[:, 1])
+        outer_inertia = n["inertia2"] + n["mass2"] * n["centre2"] ** 2
+        inner_inertia = (
+            n["inertia1"] + n["mass1"] * n["centre1"] ** 2 + n["mass2"] * n["length"] ** 2
+        )
         inertia = np.empty((len(q), 2, 2))
-        inertia[:, 0, 0] = inner + outer + 2 * across + n["armature1"] + self.added[0]
-        inertia[:, 0, 1] = inertia[:, 1, 0] = outer + across
-        inertia[:, 1, 1] = outer + n["armature2"] + self.added[1]
+        inertia[:, 0, 0] = (
+            inner_inertia + outer_inertia + 2 * coupling + n["armature1"] + self.added[0]
+        )
+        inertia[:, 0, 1] = inertia[:, 1, 0] = outer_inertia + coupling
+        inertia[:, 1, 1] = outer_inertia + n["armature2"] + self.added[1]
         return inertia
 
     def compute_own_force(self, q: Array, v: Array, u: Array) -> Array:
@@ -356,17 +360,18 @@ class ArmDynamics(MachineDynamics):
         """Compute the forces of a unit acceleration along x; see `MachineDynamics`."""
         return -self._compute_mass_moment(np.cos, q)
 
-    def _compute_mass_moment(self, of: Callable[[Array], Array], q: Array) -> Array:
+    def _compute_mass_moment(self, function: Callable[[Array], Array], q: Array) -> Array:
         """Sum mass times lever arm of both links for each joint, as in equation (5), kg m, (L, N).
 
         Args:
-            of: sine for the lever arm of gravity, cosine for that of a horizontal acceleration.
+            function: sine for the lever arm of gravity, cosine for that of a horizontal
+                acceleration.
             q: positions, (L, N).
         """
         n = self.numbers
-        outer = n["mass2"] * n["centre2"] * of(q[:, 0] + q[:, 1])
-        inner = (n["mass1"] * n["centre1"] + n["mass2"] * n["length"]) * of(q[:, 0])
-        return np.stack([inner + outer, outer], axis=1)
+        outer_moment = n["mass2"] * n["centre2"] * function(q[:, 0] + q[:, 1])
+        inner_moment = (n["mass1"] * n["centre1"] + n["mass2"] * n["length"]) * function(q[:, 0])
+        return np.stack([inner_moment + outer_moment, outer_moment], axis=1)
 
 
 MACHINES: dict[str, type[MachineDynamics]] = {"servo": ServoDynamics, "arm2": ArmDynamics}

@@ -194,12 +194,12 @@ def _draw_servo_parameters(rng: np.random.Generator) -> dict[str, float]:
         Torque constant in N m/A, resistance in Ohm, inertia of the rotor in kg m^2, and the
         constants, by name.
     """
-    drawn = {
+    fitted_parameters = {
         "torque_constant": float(rng.uniform(0.3, 0.8)),
         "resistance": float(rng.uniform(2.5, 6.0)),
         "armature": float(rng.uniform(1e-3, 6e-3)),
     }
-    return {c.name: c.value for c in ServoSimulator.constants} | drawn
+    return {c.name: c.value for c in ServoSimulator.constants} | fitted_parameters
 
 
 def _draw_arm_parameters(rng: np.random.Generator) -> dict[str, float]:
@@ -253,17 +253,19 @@ def _draw_runs(
         ]
     )
     commands = np.moveaxis(waves, 1, 2)
-    begun = rng.uniform(-0.4, 0.4, (count, joints))
-    turned = 0.4 * np.ones((1, joints))
+    initial_positions = rng.uniform(-0.4, 0.4, (count, joints))
+    probe_positions = 0.4 * np.ones((1, joints))
     # Amplitude of the commands: rad for a servo, N m for an arm.
     size = (
-        0.7 if plant.motors == ("goal",) else np.abs(plant.compute_gravity_force(turned))[0] * 1.5
+        0.7
+        if plant.motors == ("goal",)
+        else np.abs(plant.compute_gravity_force(probe_positions))[0] * 1.5
     )
     commands = commands * size * rng.uniform(0.5, 1.0, (count, 1, joints))
     for _ in range(MAX_COMMAND_ATTEMPTS):
-        runs = MachineRuns(times, commands, begun, np.zeros_like(begun))
-        farthest = np.abs(simulate_machine(plant, runs, coarse=2.0).q).max(axis=(0, 2))
-        if (farthest <= MAX_JOINT_ANGLE).all():
+        runs = MachineRuns(times, commands, initial_positions, np.zeros_like(initial_positions))
+        max_angles = np.abs(simulate_machine(plant, runs, coarse=2.0).q).max(axis=(0, 2))
+        if (max_angles <= MAX_JOINT_ANGLE).all():
             break
-        commands = commands * np.minimum(1.0, 0.7 * MAX_JOINT_ANGLE / farthest)[:, None, None]
+        commands = commands * np.minimum(1.0, 0.7 * MAX_JOINT_ANGLE / max_angles)[:, None, None]
     return runs

@@ -18,7 +18,7 @@ def render_arm_mjcf(numbers: Mapping[str, float]) -> str:
         (body, joint, {k.removesuffix(end): v for k, v in numbers.items() if k.endswith(end)})
         for body, joint, end in (("upper_arm", "shoulder", "1"), ("forearm", "elbow", "2"))
     ]
-    inner, outer = (_render_link(*link) for link in links)
+    inner_link, outer_link = (_render_link(*link) for link in links)
     return f"""<mujoco model="arm2">
   <compiler angle="radian" autolimits="true"/>
   <option timestep="0.002" integrator="RK4" gravity="0 0 -9.81">
@@ -26,9 +26,9 @@ def render_arm_mjcf(numbers: Mapping[str, float]) -> str:
   </option>
   <worldbody>
     <body name="upper_arm">
-      {inner}
+      {inner_link}
       <body name="forearm" pos="0 0 {-numbers["length"]!r}">
-        {outer}
+        {outer_link}
       </body>
     </body>
   </worldbody>

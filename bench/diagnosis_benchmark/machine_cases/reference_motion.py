@@ -64,16 +64,16 @@ def simulate_machine(
         coarse: factor of the step size.
     """
     rate = runs.times[1] - runs.times[0]
-    wanted = coarse * (
+    max_step = coarse * (
         FRICTION_STEP_SECONDS if plant.has_dry_friction.any() else SMOOTH_STEP_SECONDS
     )
-    parts = int(np.ceil(rate / wanted - 1e-9))
+    parts = int(np.ceil(rate / max_step - 1e-9))
     times = np.linspace(0.0, runs.times[-1], (len(runs.times) - 1) * parts + 1)
-    felt = compute_applied_inputs(runs, plant, times)
+    applied_inputs = compute_applied_inputs(runs, plant, times)
     mover = _MachineIntegrator(plant, runs.q, runs.v)
     q, v = [mover.q], [mover.v]
     for k, t in enumerate(times[:-1].tolist()):
-        mover.step(t, float(times[k + 1]) - t, felt[:, k])
+        mover.step(t, float(times[k + 1]) - t, applied_inputs[:, k])
         q.append(mover.q)
         v.append(mover.v)
     return MachineMotion(times, np.array(q), np.array(v))
@@ -157,9 +157,11 @@ class _MachineIntegrator:
             inertia = np.where(free[:, :, None] & free[:, None], inertia, 0.0)
             inertia += np.eye(q.shape[1]) * self.held[:, :, None]
             force = np.where(free, force, 0.0)
-        one = q.shape[1] == 1
+        is_single_joint = q.shape[1] == 1
         solved = (
-            force / inertia[:, 0] if one else np.linalg.solve(inertia, force[:, :, None])[..., 0]
+            force / inertia[:, 0]
+            if is_single_joint
+            else np.linalg.solve(inertia, force[:, :, None])[..., 0]
         )
         return np.asarray(solved, dtype=np.float64)
 
@@ -181,36 +183,38 @@ class _MachineIntegrator:
         force = self.plant.compute_force(t, self.q, self.v, u) - self.way * limit
         accelerations = self._solve_accelerations(self.q, force)
         # Force needed to hold a joint still while the others move.
-        need = force - np.einsum(
+        holding_force = force - np.einsum(
             "lij,lj->li", self.plant.compute_mass_matrix(self.q), accelerations
         )
-        loose = resting & (np.abs(need) > limit * (1 + _BREAK_AWAY_TOLERANCE))
-        self.way = np.where(loose, np.sign(need), self.way)
+        loose = resting & (np.abs(holding_force) > limit * (1 + _BREAK_AWAY_TOLERANCE))
+        self.way = np.where(loose, np.sign(holding_force), self.way)
         self.held = resting & ~loose
 
-    def _recompute_stopped_joints(self, t: float, h: float, u: Array, before: Array) -> None:
+    def _recompute_stopped_joints(
+        self, t: float, h: float, u: Array, velocity_before: Array
+    ) -> None:
         """Recompute the rest of the step for joints that came to rest within it.
 
         The time of rest is estimated by linear interpolation of the velocity. For the time that is
-        left (`left`), the joint sticks or moves with constant acceleration.
+        left (`remaining_time`), the joint sticks or moves with constant acceleration.
 
         Args:
             t: time at the begin of the step, s.
             h: length of the step, s.
             u: applied input, (L, N).
-            before: velocities at the begin of the step, (L, N).
+            velocity_before: velocities at the begin of the step, (L, N).
         """
-        turned = (self.way * self.v < 0.0) & (self.way * before >= 0.0)
-        if not turned.any():
+        has_stopped = (self.way * self.v < 0.0) & (self.way * velocity_before >= 0.0)
+        if not has_stopped.any():
             return
         with np.errstate(divide="ignore", invalid="ignore"):
-            left = np.where(turned, self.v / (self.v - before), 0.0) * h
-        q = self.q - np.where(turned, 0.5 * self.v * left, 0.0)
-        v = np.where(turned, 0.0, self.v)
+            remaining_time = np.where(has_stopped, self.v / (self.v - velocity_before), 0.0) * h
+        q = self.q - np.where(has_stopped, 0.5 * self.v * remaining_time, 0.0)
+        v = np.where(has_stopped, 0.0, self.v)
         self.q, self.v = q, v
         self._update_stuck_joints(t + h, u)
-        onward = np.where(turned, self._compute_accelerations(t + h, q, v, u), 0.0)
-        self.q, self.v = q + 0.5 * onward * left**2, v + onward * left
+        onward = np.where(has_stopped, self._compute_accelerations(t + h, q, v, u), 0.0)
+        self.q, self.v = q + 0.5 * onward * remaining_time**2, v + onward * remaining_time
 
 
 def compute_applied_inputs(runs: MachineRuns, plant: MachineDynamics, times: Array) -> Array:
@@ -227,21 +231,21 @@ def compute_applied_inputs(runs: MachineRuns, plant: MachineDynamics, times: Arr
         Applied inputs, (L, K, N).
     """
     lanes, _, joints = runs.commands.shape
-    felt = np.empty((lanes, len(times) - 1, joints))
+    applied_inputs = np.empty((lanes, len(times) - 1, joints))
     for joint, motor in enumerate(plant.motors):
-        own = {
+        input_effects = {
             name.partition("@")[0]: c
             for name, c in plant.effects.items()
             if name.startswith("input.") and name.partition("@")[2] in ("", motor)
         }
         for lane in range(lanes):
             levels: Array = runs.commands[lane, :, joint]
-            for name, c in own.items():
+            for name, c in input_effects.items():
                 levels = np.asarray(_apply_static_effects(name, c[0], levels), dtype=np.float64)
-            late = own.get("input.delay", (0.0,))[0]
-            lag = own.get("input.lag", (0.0,))[0]
-            felt[lane, :, joint] = _average_input(runs.times, levels, times, late, lag)
-    return felt
+            delay = input_effects.get("input.delay", (0.0,))[0]
+            lag = input_effects.get("input.lag", (0.0,))[0]
+            applied_inputs[lane, :, joint] = _average_input(runs.times, levels, times, delay, lag)
+    return applied_inputs
 
 
 def _apply_static_effects(name: str, c: float, u: Array) -> Array:
@@ -264,7 +268,7 @@ def _apply_static_effects(name: str, c: float, u: Array) -> Array:
     return u
 
 
-def _average_input(stamps: Array, levels: Array, times: Array, late: float, lag: float) -> Array:
+def _average_input(stamps: Array, levels: Array, times: Array, delay: float, lag: float) -> Array:
     """Average an input over each step, with a zero-order hold, a delay and a lag.
 
     Averages are exact: they are differences of the integral of the input.
@@ -273,30 +277,30 @@ def _average_input(stamps: Array, levels: Array, times: Array, late: float, lag:
         stamps: sample times, s, (T,).
         levels: input at each sample, held until the next one, (T,).
         times: times of the steps, s, (K + 1,).
-        late: delay, s.
+        delay: delay, s.
         lag: time constant of a first-order lag, s; 0 for none.
 
     Returns:
         Averages, (K,).
     """
     # The first level holds before the first sample, the last one after the last sample.
-    ends = np.append(stamps[1:], times[-1] + 1.0)
-    area = np.concatenate([[0.0], np.cumsum(levels * (ends - stamps))])
-    at = times - late
+    end_times = np.append(stamps[1:], times[-1] + 1.0)
+    area = np.concatenate([[0.0], np.cumsum(levels * (end_times - stamps))])
+    delayed_times = times - delay
 
     def integral(t: Array) -> Array:
         """Return the integral of the held input from 0 to t; before 0 it has its first level."""
-        held: Array = np.interp(t, np.append(stamps, ends[-1]), area)
-        return np.where(t < 0, levels[0] * t, held)
+        held_integral: Array = np.interp(t, np.append(stamps, end_times[-1]), area)
+        return np.where(t < 0, levels[0] * t, held_integral)
 
-    over = integral(at)
+    over = integral(delayed_times)
     if lag > 0:
         # x' = (u - x) / lag, so the integral of x is that of u minus lag times the change of x.
-        over = over - lag * _apply_lag(stamps, levels, at, lag)
+        over = over - lag * _apply_lag(stamps, levels, delayed_times, lag)
     return np.diff(over) / np.diff(times)
 
 
-def _apply_lag(stamps: Array, levels: Array, at: Array, lag: float) -> Array:
+def _apply_lag(stamps: Array, levels: Array, query_times: Array, lag: float) -> Array:
     """Evaluate a first-order lag of the levels at given times; it starts at the first level.
 
     Between samples the lag approaches a constant level exponentially, so the result is exact.
@@ -304,7 +308,7 @@ def _apply_lag(stamps: Array, levels: Array, at: Array, lag: float) -> Array:
     Args:
         stamps: sample times, s, (T,).
         levels: input at each sample, (T,).
-        at: times, s, (K,).
+        query_times: times, s, (K,).
         lag: time constant, s.
     """
     reached = np.empty_like(levels)
@@ -312,10 +316,10 @@ def _apply_lag(stamps: Array, levels: Array, at: Array, lag: float) -> Array:
     decay = np.exp(-np.diff(stamps) / lag)
     for k in range(len(stamps) - 1):
         reached[k + 1] = levels[k] + (reached[k] - levels[k]) * decay[k]
-    place = np.clip(np.searchsorted(stamps, at, side="right") - 1, 0, None)
-    since = np.maximum(at - stamps[place], 0.0)
-    followed: Array = levels[place] + (reached[place] - levels[place]) * np.exp(-since / lag)
-    return followed
+    place = np.clip(np.searchsorted(stamps, query_times, side="right") - 1, 0, None)
+    seconds_since = np.maximum(query_times - stamps[place], 0.0)
+    lagged: Array = levels[place] + (reached[place] - levels[place]) * np.exp(-seconds_since / lag)
+    return lagged
 
 
 def read_encoders(motion: MachineMotion, plant: MachineDynamics, times: Array) -> Array:
@@ -330,15 +334,15 @@ def read_encoders(motion: MachineMotion, plant: MachineDynamics, times: Array) -
         Readings, (L, T, N).
     """
     lanes, joints = motion.q.shape[1:]
-    seen = np.empty((lanes, len(times), joints))
+    readings = np.empty((lanes, len(times), joints))
     for joint, channel in enumerate(plant.channels):
-        own = select_sensor_effects(plant.effects, channel)
-        at = np.maximum(times - own.get("sensor.delay", (0.0,))[0], 0.0)
-        values = _interpolate_positions(motion, at)[:, :, joint].T
-        values = values * (1 + own.get("sensor.gain", (0.0,))[0])
-        values = values + own.get("sensor.bias", (0.0,))[0]
-        seen[:, :, joint] = values + own.get("sensor.drift", (0.0,))[0] * times
-    return seen
+        sensor_effects = select_sensor_effects(plant.effects, channel)
+        delayed_times = np.maximum(times - sensor_effects.get("sensor.delay", (0.0,))[0], 0.0)
+        values = _interpolate_positions(motion, delayed_times)[:, :, joint].T
+        values = values * (1 + sensor_effects.get("sensor.gain", (0.0,))[0])
+        values = values + sensor_effects.get("sensor.bias", (0.0,))[0]
+        readings[:, :, joint] = values + sensor_effects.get("sensor.drift", (0.0,))[0] * times
+    return readings
 
 
 def select_sensor_effects(effects: Effects, channel: str) -> dict[str, tuple[float, ...]]:
@@ -358,22 +362,22 @@ def select_sensor_effects(effects: Effects, channel: str) -> dict[str, tuple[flo
     }
 
 
-def _interpolate_positions(motion: MachineMotion, at: Array) -> Array:
+def _interpolate_positions(motion: MachineMotion, query_times: Array) -> Array:
     """Interpolate positions (T, L, N) by cubic Hermite polynomials, which use velocities too.
 
     Args:
         motion: simulated motion with steps of equal length.
-        at: times, s, (T,).
+        query_times: times, s, (T,).
     """
     h = motion.times[1] - motion.times[0]
-    place = np.clip((at / h).astype(int), 0, len(motion.times) - 2)
-    s = ((at - motion.times[place]) / h)[:, None, None]
+    place = np.clip((query_times / h).astype(int), 0, len(motion.times) - 2)
+    s = ((query_times - motion.times[place]) / h)[:, None, None]
     q0, q1 = motion.q[place], motion.q[place + 1]
     v0, v1 = motion.v[place] * h, motion.v[place + 1] * h
-    found: Array = (
+    positions: Array = (
         q0 * (1 + 2 * s) * (1 - s) ** 2
         + v0 * s * (1 - s) ** 2
         + q1 * s**2 * (3 - 2 * s)
         + v1 * s**2 * (s - 1)
     )
-    return found
+    return positions

@@ -39,8 +39,8 @@ def build_chart_tables(data: DiagnoserReportData) -> dict[str, pd.DataFrame]:
     """
     table = data.tables["table"]
     alarms = table[table["metric"] == "false alarms"].set_index("diagnoser")["share"]
-    named = table[(table["metric"] == PRIMARY_METRIC) & (table["of"] > 0)]
-    board = named.assign(alarms=100 * named["diagnoser"].map(alarms))
+    named_rows = table[(table["metric"] == PRIMARY_METRIC) & (table["of"] > 0)]
+    board = named_rows.assign(alarms=100 * named_rows["diagnoser"].map(alarms))
     board[["share", "low", "high"]] *= 100
     places = {metric: place for place, metric in enumerate(_list_shares(data))}
     shares = table[table["metric"].isin(places)]
@@ -54,7 +54,7 @@ def build_chart_tables(data: DiagnoserReportData) -> dict[str, pd.DataFrame]:
         if len(calibration)
         else calibration,
         "sets": sets.assign(place=sets["largest_set"].map(sizes)),
-        "cost": named.merge(data.tables["costs"], on="diagnoser"),
+        "cost": named_rows.merge(data.tables["costs"], on="diagnoser"),
     }
 
 
@@ -83,16 +83,16 @@ def make_charts(data: DiagnoserReportData) -> dict[str, list[Panel]]:
 
 def _make_board(data: DiagnoserReportData) -> list[Panel]:
     """Make the chart of diagnosed single causes against false alarms."""
-    across = Axis(
+    x_axis = Axis(
         "false alarms if nothing is hidden [%]",
         "symlog",
         ("symlog", "linear"),
         (0.0, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0),
         ends=(-0.15, 110.0),
     )
-    up = Axis("single causes named [%]", scales=("linear",), ends=(-3.0, 103.0))
+    y_axis = Axis("single causes named [%]", scales=("linear",), ends=(-3.0, 103.0))
     series, rules = data.make_interval_series("share"), (ReferenceLine(1.0, "1 %", "x"),)
-    return [Panel("", "board", "alarms", series, across, up, rules=rules)]
+    return [Panel("", "board", "alarms", series, x_axis, y_axis, rules=rules)]
 
 
 def _make_shares(data: DiagnoserReportData, table: pd.DataFrame) -> list[Panel]:
@@ -104,20 +104,20 @@ def _make_shares(data: DiagnoserReportData, table: pd.DataFrame) -> list[Panel]:
     """
     counts = table.groupby("metric")["of"].max()
     names = tuple(f"{_SHARES[name]}\nn={int(counts[name])}" for name in _list_shares(data))
-    across = Axis("what is counted; at most n answers or intervals", names=names)
+    x_axis = Axis("what is counted; at most n answers or intervals", names=names)
     series = data.make_interval_series("share", beside=True)
-    return [Panel("", "shares", "place", series, across, _SHARE_AXIS)]
+    return [Panel("", "shares", "place", series, x_axis, _SHARE_AXIS)]
 
 
 def _make_power(data: DiagnoserReportData) -> list[Panel]:
     """Make the chart of the shares named and detected against the size of the hidden effect."""
     table = data.tables["power"]
     sizes = tuple(sorted(float(size) for size in table["size"].unique()))
-    across = Axis("size of the hidden effect [noises]", "log", ticks=sizes)
+    x_axis = Axis("size of the hidden effect [noises]", "log", ticks=sizes)
     panels = []
     for metric, title in (("named", "Named, in a set of at most two"), ("seen", "Detected")):
         lines = data.make_line_series("share", table, metric=metric)
-        panels.append(Panel(title, "power", "size", lines, across, _SHARE_AXIS, {"what": title}))
+        panels.append(Panel(title, "power", "size", lines, x_axis, _SHARE_AXIS, {"what": title}))
     return panels
 
 
@@ -129,15 +129,15 @@ def _make_calibration(data: DiagnoserReportData) -> list[Panel]:
     Args:
         data: the data of the report.
     """
-    ideal = Series(
+    ideal_series = Series(
         "calibrated p-value", "share", make_mark_style(GREY, (4.0, 3.0)), {"diagnoser": ""}
     )
     lines = data.make_line_series("share", data.tables["calibration"])
-    across = Axis("level", "log", ticks=P_VALUE_LEVELS)
-    up = Axis(
+    x_axis = Axis("level", "log", ticks=P_VALUE_LEVELS)
+    y_axis = Axis(
         "share of clean recordings with p below the level", scales=("linear",), ends=_SHARE_LIMITS
     )
-    return [Panel("", "calibration", "level", (*lines, ideal), across, up)]
+    return [Panel("", "calibration", "level", (*lines, ideal_series), x_axis, y_axis)]
 
 
 def _make_sets(data: DiagnoserReportData) -> list[Panel]:
@@ -148,26 +148,26 @@ def _make_sets(data: DiagnoserReportData) -> list[Panel]:
     Args:
         data: the data of the report.
     """
-    across = Axis("effects in the largest set of an answer", names=tuple(SET_SIZE_LABELS))
+    x_axis = Axis("effects in the largest set of an answer", names=tuple(SET_SIZE_LABELS))
     correct = data.make_interval_series("share", beside=True)
     counts = tuple(replace(series, y="of", low="", high="") for series in correct)
-    up = Axis("share of sets with the true cause", scales=("linear",), ends=_SHARE_LIMITS)
-    many = Axis("answers of this size", scales=("linear",), holds=(0.0,))
+    share_axis = Axis("share of sets with the true cause", scales=("linear",), ends=_SHARE_LIMITS)
+    count_axis = Axis("answers of this size", scales=("linear",), holds=(0.0,))
     return [
-        Panel("Correct", "sets", "place", correct, across, up, {"what": "correct"}),
-        Panel("Number", "sets", "place", counts, across, many, {"what": "number"}),
+        Panel("Correct", "sets", "place", correct, x_axis, share_axis, {"what": "correct"}),
+        Panel("Number", "sets", "place", counts, x_axis, count_axis, {"what": "number"}),
     ]
 
 
 def _make_cost(data: DiagnoserReportData) -> list[Panel]:
     """Make the chart of diagnosed single causes against the cost of an answer."""
-    up = Axis("share of single causes named", scales=("linear",), ends=_SHARE_LIMITS)
+    y_axis = Axis("share of single causes named", scales=("linear",), ends=_SHARE_LIMITS)
     labels = {
         "simulations_median": "simulations for an answer, median",
         "processor_seconds_median": "processor time for an answer [s], median",
     }
     series = data.make_interval_series("share")
     return [
-        Panel("", "cost", column, series, Axis(label, "log"), up, {"cost": label})
+        Panel("", "cost", column, series, Axis(label, "log"), y_axis, {"cost": label})
         for column, label in labels.items()
     ]

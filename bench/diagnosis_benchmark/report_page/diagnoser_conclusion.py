@@ -44,17 +44,17 @@ def count_own_failures(data: DiagnoserReportData) -> OwnFailures | None:
     Returns:
         The counts; None if simgap does not take part in the comparison.
     """
-    own = select_graded_answers(data.rows[data.rows["diagnoser"] == REFERENCE_DIAGNOSER])
-    if own.empty:
+    graded_rows = select_graded_answers(data.rows[data.rows["diagnoser"] == REFERENCE_DIAGNOSER])
+    if graded_rows.empty:
         return None
-    wrong = own[~is_correct(own)]
-    counts = {kind: int((own["kind"] == kind).sum()) for kind in _KINDS}
+    wrong_rows = graded_rows[~is_correct(graded_rows)]
+    counts = {kind: int((graded_rows["kind"] == kind).sum()) for kind in _KINDS}
     kinds = [
-        f"{int((wrong['kind'] == kind).sum())} {_KINDS[kind].format(of=count)}"
+        f"{int((wrong_rows['kind'] == kind).sum())} {_KINDS[kind].format(of=count)}"
         for kind, count in counts.items()
         if count
     ]
-    return OwnFailures(len(wrong), len(own), kinds)
+    return OwnFailures(len(wrong_rows), len(graded_rows), kinds)
 
 
 class Leader(NamedTuple):
@@ -90,45 +90,45 @@ def find_leader(data: DiagnoserReportData) -> Leader | None:
     """
     table = data.tables["table"]
     alarms = index_by_diagnoser(table, "false alarms")
-    named = index_by_diagnoser(table, PRIMARY_METRIC)
+    named_shares = index_by_diagnoser(table, PRIMARY_METRIC)
     if not any(row["of"] for row in alarms.values()):
         return None
     with_few_alarms = [
         name for name in data.order if alarms[name]["share"] <= TARGET_FALSE_ALARM_RATE
     ]
-    candidates = [name for name in with_few_alarms if named[name]["of"]]
+    candidates = [name for name in with_few_alarms if named_shares[name]["of"]]
     if not candidates:
         return Leader("")
-    best = max(candidates, key=lambda name: float(named[name]["share"]))
-    others = [name for name in candidates if name != best]
-    low, high = (format_percent(named[best][end]) for end in ("low", "high"))
+    best = max(candidates, key=lambda name: float(named_shares[name]["share"]))
+    other_names = [name for name in candidates if name != best]
+    low, high = (format_percent(named_shares[best][end]) for end in ("low", "high"))
     share = (
-        f"{int(named[best]['count'])} of {int(named[best]['of'])}, "
-        f"{format_percent(named[best]['share'])} (95 % interval {low} to {high})"
+        f"{int(named_shares[best]['count'])} of {int(named_shares[best]['of'])}, "
+        f"{format_percent(named_shares[best]['share'])} (95 % interval {low} to {high})"
     )
     row, text = alarms[best], ""
     if row["high"] > TARGET_FALSE_ALARM_RATE:
         text = f"{int(row['count'])} false alarm{'s' * (row['count'] != 1)}"
-    significance = _format_significance(data, best, others)
+    significance = _format_significance(data, best, other_names)
     return Leader(
         best, tuple(candidates), share, significance, int(row["of"]), text, float(row["high"])
     )
 
 
-def _format_significance(data: DiagnoserReportData, best: str, others: list[str]) -> str:
+def _format_significance(data: DiagnoserReportData, best: str, other_names: list[str]) -> str:
     """Say whether simgap as the best diagnoser differs significantly from the others.
 
     Returns:
         One sentence, or an empty text if there are no others or if simgap is not the best: only
         pairs with simgap are tested.
     """
-    if not others or best != REFERENCE_DIAGNOSER:
+    if not other_names or best != REFERENCE_DIAGNOSER:
         return ""
     rows = index_by_diagnoser(data.tables["pairs"], "named")
-    similar = [name for name in others if float(rows[name]["p_holm"]) >= _SIGNIFICANCE_LEVEL]
+    similar = [name for name in other_names if float(rows[name]["p_holm"]) >= _SIGNIFICANCE_LEVEL]
     if similar:
         return f"It does not differ significantly from {', '.join(similar)} (McNemar, Holm)."
-    largest = max(float(rows[name]["p_holm"]) for name in others)
+    largest = max(float(rows[name]["p_holm"]) for name in other_names)
     return f"It differs significantly from all others ({format_p_value(largest)}; McNemar, Holm)."
 
 
@@ -178,4 +178,6 @@ def summarise_unsupported(left_out: pd.DataFrame) -> list[tuple[str, str, int]]:
         List of (diagnoser, reason, number of cases).
     """
     groups = left_out.groupby(["diagnoser", "reason"], sort=False).size().reset_index(name="of")
-    return [(str(n), str(why), int(count)) for n, why, count in groups.itertuples(index=False)]
+    return [
+        (str(n), str(reason), int(count)) for n, reason, count in groups.itertuples(index=False)
+    ]

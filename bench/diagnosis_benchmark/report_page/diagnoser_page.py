@@ -37,7 +37,7 @@ def render_page(shown: DiagnoserReportData) -> str:
     counts = power[power["metric"] == "named"].drop_duplicates("size")
     metrics = list(dict.fromkeys(groups["metric"]))
     confused = list(dict.fromkeys(confusion["diagnoser"]))
-    better = conclusion.list_better_diagnosers(shown)
+    better_diagnosers = conclusion.list_better_diagnosers(shown)
     trained = costs[costs["training_simulations"] > 0]
     return page.render(
         _TEMPLATE,
@@ -47,7 +47,7 @@ def render_page(shown: DiagnoserReportData) -> str:
         own=conclusion.count_own_failures(shown),
         leader=conclusion.find_leader(shown),
         limit=f"{100 * TARGET_FALSE_ALARM_RATE:g} %",
-        better=better,
+        better=better_diagnosers,
         has_pairs=len(shown.tables["pairs"]) > 0,
         warnings=list(conclusion.write_warnings(shown)),
         has_own_failures=bool((failures["diagnoser"] == REFERENCE_DIAGNOSER).any()),

@@ -65,14 +65,14 @@ class DiagnoserReportData:
             Series(
                 name,
                 y,
-                drawn,
+                line_style,
                 {"diagnoser": name, **where},
                 "low",
                 "high",
                 "points",
                 (place - (count - 1) / 2) * 0.7 / count if beside else 0.0,
             )
-            for place, (name, drawn) in enumerate(self.get_line_styles())
+            for place, (name, line_style) in enumerate(self.get_line_styles())
         )
 
     def make_line_series(self, y: str, frame: pd.DataFrame, **where: str) -> tuple[Series, ...]:
@@ -83,11 +83,11 @@ class DiagnoserReportData:
             frame: the table.
             **where: values of further columns that select the rows of the line.
         """
-        there = set(frame["diagnoser"])
+        names_in_table = set(frame["diagnoser"])
         return tuple(
-            Series(name, y, drawn, {"diagnoser": name, **where}, "low", "high")
-            for name, drawn in self.get_line_styles()
-            if name in there
+            Series(name, y, line_style, {"diagnoser": name, **where}, "low", "high")
+            for name, line_style in self.get_line_styles()
+            if name in names_in_table
         )
 
     def make_static_figure(self, name: str, description: str) -> PrintedFigure | None:

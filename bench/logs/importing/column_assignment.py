@@ -308,21 +308,25 @@ class ColumnAssigner:
     def report_missing_inputs(self) -> None:
         """Report actuators without a command column, and columns that may be the command."""
         signals = self._signals
-        idle = [a for a in signals.robot.actuators if f"u.{a.name}" not in signals.inputs]
-        if not idle and (signals.inputs or signals.robot.actuators):
+        undriven_actuators = [
+            a for a in signals.robot.actuators if f"u.{a.name}" not in signals.inputs
+        ]
+        if not undriven_actuators and (signals.inputs or signals.robot.actuators):
             return
         text = "the model has no input, so that nothing drives it"
         table = f"force.{signals.joints[0].name}"
-        if idle:
-            names = ", ".join(actuator.name for actuator in idle[:MAX_NAMES])
+        if undriven_actuators:
+            names = ", ".join(actuator.name for actuator in undriven_actuators[:MAX_NAMES])
             text = f"actuators without an input: {names}; their commands are taken for 0"
-            table = f"u.{idle[0].name}"
+            table = f"u.{undriven_actuators[0].name}"
         candidates = [
             c.name for c in self._select_by_role("command", "force") if not self._is_used(c)
         ]
-        likely = f"columns that may be it: {', '.join(candidates[:6])}; " if candidates else ""
+        candidates_text = (
+            f"columns that may be it: {', '.join(candidates[:6])}; " if candidates else ""
+        )
         self._result.checks.append(
-            f'{text}; {likely}add [inputs."{table}"] with file, column and unit'
+            f'{text}; {candidates_text}add [inputs."{table}"] with file, column and unit'
         )
 
     def report_unused(self) -> None:
@@ -347,8 +351,8 @@ class ColumnAssigner:
     def _is_used(self, column: LogColumn) -> bool:
         """Return whether a column is a signal or a switch."""
         signals = (*self._signals.channels.values(), *self._signals.inputs.values())
-        used = [signal.column for signal in signals] + self._signals.switches
-        return (column.file, column.name) in {(c.file, c.name) for c in used}
+        used_columns = [signal.column for signal in signals] + self._signals.switches
+        return (column.file, column.name) in {(c.file, c.name) for c in used_columns}
 
 
 def _is_torque(column: LogColumn) -> bool:

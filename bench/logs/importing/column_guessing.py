@@ -172,13 +172,13 @@ def match_joint(column: LogColumn, joints: Sequence[Joint]) -> Joint | None:
     """
     text = _strip_punctuation(column.bare)
     for names in ([joint.name for joint in joints], _strip_shared_words(joints)):
-        named = [
+        matches = [
             (len(name), joint)
             for name, joint in zip(names, joints, strict=True)
             if _strip_punctuation(name) and _strip_punctuation(name) in text
         ]
-        if named:
-            return max(named, key=lambda pair: pair[0])[1]
+        if matches:
+            return max(matches, key=lambda pair: pair[0])[1]
     return None
 
 

@@ -98,8 +98,8 @@ class DescriptionWriter:
         if free:
             places = ["*"] if len(free) == len(servos) else free
             names = [f"{number}@{place}" for place in places for number in FREE_GAINS]
-            listed = ", ".join(map(toml_text, names))
-            head.append(f"free = [{listed}]  # not known: they are estimated")
+            name_list = ", ".join(map(toml_text, names))
+            head.append(f"free = [{name_list}]  # not known: they are estimated")
         return "\n".join([*head, "", *body]).rstrip("\n") + "\n"
 
     def _time_lines(self) -> Iterator[str]:

@@ -41,9 +41,11 @@ def order_of_commands(commands: Sequence[Array], positions: Sequence[Array]) -> 
     moved_places = [i for i, place in enumerate(order) if place != i]
     if not moved_places:
         return None
-    stays = float(np.sqrt(distances[moved_places, moved_places].sum()))
-    moves = float(np.sqrt(distances[moved_places, [order[i] for i in moved_places]].sum()))
-    return order if moves < MAX_DISTANCE_RATIO * stays else None
+    unchanged_distance = float(np.sqrt(distances[moved_places, moved_places].sum()))
+    reordered_distance = float(
+        np.sqrt(distances[moved_places, [order[i] for i in moved_places]].sum())
+    )
+    return order if reordered_distance < MAX_DISTANCE_RATIO * unchanged_distance else None
 
 
 def follow(commands: Sequence[Array], positions: Sequence[Array]) -> bool:

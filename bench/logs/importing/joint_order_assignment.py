@@ -158,14 +158,14 @@ def _prefer_model(
 
 
 def _report_order(
-    signals: SignalAssignment, following: Sequence[str], result: ImportResult
+    signals: SignalAssignment, following_joints: Sequence[str], result: ImportResult
 ) -> None:
     """Report which positions follow their commands, and which joint orders are a guess.
 
     Args:
         signals: Signals of the robot.
-        following: Joints with a servo each of which follows its own command best; empty if some
-            do not.
+        following_joints: Joints with a servo each of which follows its own command best; empty if
+            some do not.
         result: Result to which messages are added.
     """
     guessed: dict[str, set[str]] = {"q": set(), "u": set()}
@@ -174,13 +174,13 @@ def _report_order(
             if signal.placement not in (Placement.MODEL_ORDER, Placement.COMMANDS):
                 continue
             joint = signals.joint_of(name)
-            if signal.placement is Placement.MODEL_ORDER and joint in following:
+            if signal.placement is Placement.MODEL_ORDER and joint in following_joints:
                 table[name] = signal.placed(Placement.CONFIRMED_ORDER)
             guessed.setdefault(name.partition(".")[0], set()).add(joint)
     positions, commands = guessed["q"], guessed["u"]
     # A position that follows a named command, and a command that a named position follows, are
     # certain.
-    if following and not positions & commands:
+    if following_joints and not positions & commands:
         return
     names = [joint.name for joint in signals.joints if joint.name in positions | commands]
     if len(names) < 2 or all(map(signals.has_number_of_joint, names)):

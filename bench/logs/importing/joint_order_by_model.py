@@ -85,8 +85,8 @@ def preferred_order(
     step = float(np.median(np.diff(t)))
     derivatives = [savgol_filter(q, WINDOW, DEGREE, deriv=k, delta=step, axis=1) for k in range(3)]
     motion = np.stack(derivatives)
-    inside = np.linspace(WINDOW, t.size - WINDOW - 1, min(INSTANTS, t.size - 2 * WINDOW))
-    rows = np.unique(inside.astype(np.intp))
+    window_centres = np.linspace(WINDOW, t.size - WINDOW - 1, min(INSTANTS, t.size - 2 * WINDOW))
+    rows = np.unique(window_centres.astype(np.intp))
     residuals = {
         order: _compute_order_residual(
             robot, driven, u[list(order)][:, rows], motion[:, list(order)][:, :, rows]
@@ -149,5 +149,5 @@ def _compute_order_residual(
     with capture_mujoco_warnings():
         forces = motion_forces(model, joints, np.swapaxes(motion, 1, 2), controls)
     missing = float(np.sum((forces.needed - forces.driven) ** 2))
-    acting = float(np.sum(forces.driven**2))
-    return float(np.sqrt(missing / acting)) if acting > 0 else np.inf
+    total_square = float(np.sum(forces.driven**2))
+    return float(np.sqrt(missing / total_square)) if total_square > 0 else np.inf

@@ -173,18 +173,18 @@ class RunLogs:
         # Prefer a name that all files share: the stamp in a message's header over its time of
         # arrival.
         common = set.intersection(*names)
-        chosen = {
+        clocks_by_file = {
             file: next((pair for pair in candidates if pair[0].name in common), candidates[0])
             for file, candidates in clocks.items()
         }
         counts: dict[tuple[str, str], int] = {}
-        for file, (column, unit) in chosen.items():
+        for file, (column, unit) in clocks_by_file.items():
             roles = map(column_guessing.guess_role, _list_all_columns(file, logs[file]))
             key = column.name, unit
             counts[key] = counts.get(key, 0) + sum(role is not None for role in roles)
         self.time_column, self.time_unit = max(counts, key=lambda key: counts[key])
-        zero = min(float(column.values[0]) for column, _ in chosen.values())
-        for file, (column, unit) in chosen.items():
+        zero = min(float(column.values[0]) for column, _ in clocks_by_file.values())
+        for file, (column, unit) in clocks_by_file.items():
             if (column.name, unit) != (self.time_column, self.time_unit):
                 path = logs[file].path
                 error = InputError(

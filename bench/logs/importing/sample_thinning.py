@@ -76,8 +76,10 @@ def _keeps_motion(recording: Recording, stride: int) -> bool:
             if np.isfinite(values).mean() < COMPLETE:
                 return False
             min_error = PRECISION * float(np.ptp(values[np.isfinite(values)]))
-            allowed = max(LARGER * _compute_interpolation_error(run.times, values, 2), min_error)
-            if _compute_interpolation_error(run.times, values, stride) > allowed:
+            allowed_error = max(
+                LARGER * _compute_interpolation_error(run.times, values, 2), min_error
+            )
+            if _compute_interpolation_error(run.times, values, stride) > allowed_error:
                 return False
     return True
 
@@ -94,8 +96,8 @@ def _compute_interpolation_error(times: Array, values: Array, stride: int) -> fl
     is_left_out[:first] = is_left_out[last:] = False
     if not is_left_out.any():
         return 0.0
-    missed = CubicSpline(times[is_node], values[is_node])(times[is_left_out]) - values[is_left_out]
-    return float(np.sqrt(np.mean(np.square(missed))))
+    errors = CubicSpline(times[is_node], values[is_node])(times[is_left_out]) - values[is_left_out]
+    return float(np.sqrt(np.mean(np.square(errors))))
 
 
 def _thin_run(run: Run, stride: int) -> Run:

@@ -48,9 +48,11 @@ def estimate_servo_response(runs: Sequence[tuple[Array, Array, Array]]) -> Servo
     Returns:
         Frequency and damping; None if the position hardly moves or does not follow.
     """
-    clean = [_select_present_samples(*run) for run in runs]
+    present_samples = [_select_present_samples(*run) for run in runs]
     moving = [
-        (t, u, q) for t, u, q in clean if t.size >= MIN_SAMPLES and np.std(u) > 0 and np.std(q) > 0
+        (t, u, q)
+        for t, u, q in present_samples
+        if t.size >= MIN_SAMPLES and np.std(u) > 0 and np.std(q) > 0
     ]
     if not moving:
         return None

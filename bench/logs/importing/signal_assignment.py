@@ -113,8 +113,8 @@ class SignalAssignment:
         """Return the joint of a channel or an input; the signal's own name if it has none."""
         name = signal.partition(".")[2]
         joint = next((a.joint for a in self.robot.actuators if a.name == name), None)
-        added = self.added_servos.get(name)
-        return joint or (added.name if added is not None else name)
+        added_servo = self.added_servos.get(name)
+        return joint or (added_servo.name if added_servo is not None else name)
 
     def place_columns(
         self, columns: Sequence[LogColumn]

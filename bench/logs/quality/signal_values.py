@@ -189,8 +189,8 @@ def _count_saturated_samples(values: Array, end: float, jump: float) -> int:
     is_at_end = np.concatenate([[False], values == end, [False]]).astype(np.int8)
     edges = np.flatnonzero(np.diff(is_at_end))
     first, last = edges[::2], edges[1::2]
-    framed = np.concatenate([[end], values, [end]])
-    jumps = np.fmax(np.abs(framed[first] - end), np.abs(framed[last + 1] - end))
+    padded_values = np.concatenate([[end], values, [end]])
+    jumps = np.fmax(np.abs(padded_values[first] - end), np.abs(padded_values[last + 1] - end))
     lengths = last - first
     return int(lengths[(lengths >= MIN_SATURATED_SAMPLES) & (jumps > jump)].sum())
 

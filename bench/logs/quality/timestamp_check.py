@@ -99,9 +99,9 @@ def find_anomalies(recording: Recording, kind: type[Simulator]) -> Iterator[Anom
     for run in recording.runs:
         if run.times.size < _FEW:
             continue
-        odd = _check_gap(run) or _check_time_scale(recording, run, kind)
-        if odd is not None:
-            yield odd
+        anomaly = _check_gap(run) or _check_time_scale(recording, run, kind)
+        if anomaly is not None:
+            yield anomaly
 
 
 def _check_gap(run: Run) -> Anomaly | None:
@@ -194,10 +194,10 @@ def _compute_rest_accelerations(recording: Recording, run: Run, system: System) 
         for name, usual in zip(system.coordinates, default, strict=True)
     ]
     x = np.stack(columns, axis=1)
-    nothing = np.zeros((count, 1))
-    inputs = {c.name: nothing for c in system.inputs}
+    zeros = np.zeros((count, 1))
+    inputs = {c.name: zeros for c in system.inputs}
     inputs |= {name: signal[:, None] for name, signal in run.inputs.items()}
-    moment = StateSnapshot(system, theta, constants, nothing, x, np.zeros_like(x), inputs)
+    moment = StateSnapshot(system, theta, constants, zeros, x, np.zeros_like(x), inputs)
     with np.errstate(all="ignore"):
         accelerations: Array = system.force(moment) / system.mass(theta, constants)
     return accelerations
@@ -210,11 +210,11 @@ def _estimate_lag(x: Array) -> float:
     recorded.
     """
     variance = float(np.nanvar(x))
-    lag, before = 1, 0
+    lag, previous_lag = 1, 0
     while lag < x.size:
         differences = x[lag:] - x[:-lag]
         differences = differences[np.isfinite(differences)]
         if differences.size and float(np.mean(differences**2)) >= variance:
-            return float(before)
-        before, lag = lag, 2 * lag
-    return float(before)
+            return float(previous_lag)
+        previous_lag, lag = lag, 2 * lag
+    return float(previous_lag)

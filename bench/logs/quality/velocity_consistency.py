@@ -179,12 +179,12 @@ class VelocityComparison(NamedTuple):
     def delay(self) -> VelocityDelay | None:
         """Return the lag by equation (2), in units of the slope; None if it is not significant."""
         slope, dv = self.slope, self.velocity_changes
-        behind = slope * self.velocity_integrals - self.position_changes
+        difference = slope * self.velocity_integrals - self.position_changes
         power = slope * float(dv @ dv)
         if power == 0:
             return None
-        seconds = -float(behind @ dv) / power
-        residual = behind + slope * seconds * dv
+        seconds = -float(difference @ dv) / power
+        residual = difference + slope * seconds * dv
         error = float(np.sqrt(residual @ residual / max(residual.size - 1, 1) / abs(slope * power)))
         if abs(seconds) < max(
             DELAY_THRESHOLD_INTERVALS * self.interval, SIGNIFICANCE_SIGMAS * error

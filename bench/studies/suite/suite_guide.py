@@ -32,9 +32,9 @@ def build_headline(tables: SuiteTables) -> str:
         tables: tables of the suite.
     """
     ranks = tables.ranks[tables.ranks["training"] == FREE]
-    means = ranks.pivot(index="tuner", columns="simulations", values="mean_rank")
-    untrained = means[~means.index.isin(tables.get_trained_tuners())]
-    best = join_segments(choose_segments(means))
+    mean_ranks = ranks.pivot(index="tuner", columns="simulations", values="mean_rank")
+    untrained = mean_ranks[~mean_ranks.index.isin(tables.get_trained_tuners())]
+    best = join_segments(choose_segments(mean_ranks))
     best_untrained = join_segments(choose_segments(untrained))
     if best == best_untrained or untrained.empty:
         return f"Use {best}."
@@ -53,11 +53,11 @@ def choose_segments(means: pd.DataFrame) -> list[tuple[str, int]]:
     Returns:
         Methods, each with the last number of simulations for which it is chosen.
     """
-    near = means <= means.min() + RANK_TOLERANCE
+    is_near_best = means <= means.min() + RANK_TOLERANCE
     checkpoints = [int(str(k)) for k in means]
     segments, start = [], 0
     while start < len(checkpoints):
-        reach = near.iloc[:, start:].cumprod(axis=1).sum(axis=1)
+        reach = is_near_best.iloc[:, start:].cumprod(axis=1).sum(axis=1)
         longest = reach.index[reach == reach.max()]
         stop = start + int(reach.max())
         tuner = str(means.loc[longest, checkpoints[start:stop]].mean(axis=1).idxmin())
@@ -120,13 +120,16 @@ def describe_tests(tables: SuiteTables) -> Iterator[str]:
         if rows.empty:
             continue
         best = str(rows["best"].iloc[0])
-        better = rows[(rows["p_holm"] < _SIGNIFICANCE) & (rows["best_better"] > 0.5)]
-        undecided = [str(name) for name in rows["tuner"] if name not in set(better["tuner"])]
-        if better.empty:
+        significant = rows[(rows["p_holm"] < _SIGNIFICANCE) & (rows["best_better"] > 0.5)]
+        undecided_tuners = [
+            str(name) for name in rows["tuner"] if name not in set(significant["tuner"])
+        ]
+        if significant.empty:
             yield f"After {k}: none of the {len(rows)} differences from {best} is significant."
             continue
-        text = f"After {k}: {best} is significantly better than {len(better)} of {len(rows)} others"
-        yield text + (f"; not decided: {', '.join(undecided)}." if undecided else ".")
+        count = f"{len(significant)} of {len(rows)}"
+        text = f"After {k}: {best} is significantly better than {count} others"
+        yield text + (f"; not decided: {', '.join(undecided_tuners)}." if undecided_tuners else ".")
 
 
 def describe_losses(tables: SuiteTables) -> Iterator[str]:
@@ -140,11 +143,12 @@ def describe_losses(tables: SuiteTables) -> Iterator[str]:
             if losses.empty:
                 yield f"{tuner} loses in none of {count} cells after {k} simulations."
                 continue
-            named = ", ".join(
+            examples = ", ".join(
                 f"{row.cell} ({row.winner}, {_format_ratio(float(row.ratio))})"  # type: ignore[arg-type]
                 for row in losses.itertuples()
             )
-            yield f"{tuner} loses in {len(losses)} of {count} cells after {k} simulations: {named}."
+            cells = f"{len(losses)} of {count} cells"
+            yield f"{tuner} loses in {cells} after {k} simulations: {examples}."
 
 
 def _format_ratio(ratio: float) -> str:

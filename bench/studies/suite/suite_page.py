@@ -66,8 +66,8 @@ def render_suite_page(tables: SuiteTables) -> str:
         "ert": tables.running_times,
         "profile": tables.profile,
     }
-    shown = {name: frame for name, frame in frames.items() if len(frame)}
-    for name, frame in shown.items():
+    shown_frames = {name: frame for name, frame in frames.items() if len(frame)}
+    for name, frame in shown_frames.items():
         page.add_table(name, frame)
     order = _order_tuners(tables)
     styles = {name: get_mark_style(place) for place, name in enumerate(order)}
@@ -96,10 +96,10 @@ def render_suite_page(tables: SuiteTables) -> str:
         ],
         skipped=[f"{row.tuner}: {row.reason}" for row in suite.skipped.itertuples()],
         rank_panel=_make_rank_panel(tables, page, styles) if ranked else None,
-        columns={name: _list_columns(frame) for name, frame in shown.items()},
+        columns={name: _list_columns(frame) for name, frame in shown_frames.items()},
         filters={
             name: tuple(column for column in _FILTERED_COLUMNS if column in frame)
-            for name, frame in shown.items()
+            for name, frame in shown_frames.items()
         },
         budget=suite.budget,
         fit_simulations=_join_range(trained["fit_simulations"].astype(int)),
@@ -118,8 +118,8 @@ def _join_range(values: pd.Series[Any]) -> str:
 def _order_tuners(tables: SuiteTables) -> list[str]:
     """Return the tuners, best mean rank after the whole budget first, incomplete ones last."""
     k = tables.checkpoints[-1]
-    means = tables.get_ranks(k).mean().sort_values(kind="stable")
-    complete = [str(t) for t in means.index if t in tables.complete_tuners]
+    mean_ranks = tables.get_ranks(k).mean().sort_values(kind="stable")
+    complete = [str(t) for t in mean_ranks.index if t in tables.complete_tuners]
     return complete + [t for t in tables.suite.tuners if t not in complete]
 
 
@@ -150,9 +150,11 @@ def _build_rank_rows(tables: SuiteTables, k: int, order: Sequence[str]) -> list[
     """
     ranks = tables.get_ranks(k)
     errors = tables.errors[tables.errors["simulations"] == k].set_index(["cell", "tuner"])
-    means, counts = ranks.mean(), ranks.notna().sum(axis=1)
+    mean_ranks, counts = ranks.mean(), ranks.notna().sum(axis=1)
     rows = []
-    for tuner in sorted(order, key=lambda t: (t not in tables.complete_tuners, means.get(t, 1e9))):
+    for tuner in sorted(
+        order, key=lambda t: (t not in tables.complete_tuners, mean_ranks.get(t, 1e9))
+    ):
         entries = []
         for cell in map(str, ranks.index):
             rank = float(ranks[tuner][cell]) if tuner in ranks else np.nan
@@ -167,7 +169,7 @@ def _build_rank_rows(tables: SuiteTables, k: int, order: Sequence[str]) -> list[
             title += f", {failures} failed runs" if failures else ""
             kind = f"rank-{colour}" + (" failed" if failures else "")
             entries.append({"text": f"{rank:g}", "kind": kind, "anchor": anchor, "title": title})
-        mean = f"{means[tuner]:.1f}" if tuner in tables.complete_tuners else ""
+        mean = f"{mean_ranks[tuner]:.1f}" if tuner in tables.complete_tuners else ""
         rows.append({"tuner": tuner, "mean": mean, "entries": entries})
     return rows
 
@@ -190,18 +192,18 @@ def _build_cells(
             parts.append(frame[np.isfinite(frame["median"])])
     page.add_table("curves", pd.concat(parts, ignore_index=True), _DIGITS)
     ticks = tuple(float(k) for k in (0, *tables.checkpoints))
-    across = Axis("simulations used on the target", "symlog", ("symlog", "linear"), ticks)
+    x_axis = Axis("simulations used on the target", "symlog", ("symlog", "linear"), ticks)
     cells = []
     for row in tables.suite.cells.itertuples():
         cell = str(row.cell)
-        present = set(tables.curves[cell].list_tuners())
+        present_tuners = set(tables.curves[cell].list_tuners())
         series = tuple(
             Series(name, "median", style, {"tuner": name, "cell": cell})
             for name, style in styles.items()
-            if name in present
+            if name in present_tuners
         )
         unit = "held-out RMSE" if row.range == "real" else "error [training widths]"
-        panel = Panel(cell, "curves", "simulations", series, across, Axis(f"{unit}, median", "log"))
+        panel = Panel(cell, "curves", "simulations", series, x_axis, Axis(f"{unit}, median", "log"))
         anchor = _make_anchor(cell)
         cells.append(
             {
@@ -225,9 +227,9 @@ def _make_rank_panel(tables: SuiteTables, page: HtmlPage, styles: dict[str, Mark
         if name in tables.complete_tuners
     )
     ticks = tuple(float(k) for k in tables.checkpoints)
-    across = Axis("simulations used on the target", "log", ("log", "linear"), ticks)
-    up = Axis("mean rank, 1 is best", scales=("linear",))
-    return Panel("Mean rank over all cells", "mean-ranks", "simulations", series, across, up)
+    x_axis = Axis("simulations used on the target", "log", ("log", "linear"), ticks)
+    y_axis = Axis("mean rank, 1 is best", scales=("linear",))
+    return Panel("Mean rank over all cells", "mean-ranks", "simulations", series, x_axis, y_axis)
 
 
 def _list_columns(frame: pd.DataFrame) -> list[tuple[str, str, int]]:

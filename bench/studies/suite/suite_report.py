@@ -39,18 +39,18 @@ def report_suite(folder: Path, print_line: PrintLine) -> SuiteTables:
         InputError: there are no results.
     """
     has_comparisons = any(list_comparison_folders(folder))
-    own = collect_suite_runs(folder) if has_comparisons else read_suite_runs(folder)
-    suite = own
-    stored = find_stored_runs(own.version) if has_comparisons else None
+    new_runs = collect_suite_runs(folder) if has_comparisons else read_suite_runs(folder)
+    suite = new_runs
+    stored = find_stored_runs(new_runs.version) if has_comparisons else None
     if stored is not None:
-        suite = merge_runs(own, stored)
+        suite = merge_runs(new_runs, stored)
     if has_comparisons:
-        write_suite_runs(own, folder)
+        write_suite_runs(new_runs, folder)
     tables = SuiteTables(suite)
     for name, frame in {**tables.build_tables(), "guide": build_guide(tables)}.items():
         write_atomically(folder / f"{name}.csv", frame.to_csv(index=False))
     write_atomically(folder / REPORT_FILE, render_suite_page(tables))
-    _print_results(tables, own, print_line)
+    _print_results(tables, new_runs, print_line)
     print_line(f"report  {folder / REPORT_FILE}")
     return tables
 
@@ -66,16 +66,18 @@ def find_stored_runs(version: str) -> SuiteRuns | None:
     return None
 
 
-def _print_results(tables: SuiteTables, own: SuiteRuns, print_line: PrintLine) -> None:
+def _print_results(tables: SuiteTables, new_runs: SuiteRuns, print_line: PrintLine) -> None:
     """Print the headline, the mean ranks and the losses of the reference methods."""
-    targets = own.runs.groupby("cell")["target"].nunique()
-    added = [name for name in tables.suite.tuners if name not in own.tuners]
+    targets = new_runs.runs.groupby("cell")["target"].nunique()
+    stored_tuners = [name for name in tables.suite.tuners if name not in new_runs.tuners]
     count = (
         f"{targets.min()} to {targets.max()}" if targets.min() != targets.max() else targets.max()
     )
-    print_line(f"\n{own.version}: {len(tables.curves)} cells, {count} targets in each")
-    if added:
-        print_line(f"stored results of {len(added)} other methods on the same targets are included")
+    print_line(f"\n{new_runs.version}: {len(tables.curves)} cells, {count} targets in each")
+    if stored_tuners:
+        print_line(
+            f"stored results of {len(stored_tuners)} other methods on the same targets are included"
+        )
     for row in tables.suite.skipped.itertuples():
         print_line(f"skipped: {row.tuner}: {row.reason}")
     missing = [name for name in tables.suite.tuners if name not in tables.complete_tuners]

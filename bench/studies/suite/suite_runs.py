@@ -91,9 +91,9 @@ class SuiteRuns:
 
     def select(self, mask: pd.Series[bool]) -> SuiteRuns:
         """Return the runs selected by a mask, and their cells."""
-        kept = self.runs[mask].reset_index(drop=True)
-        cells = self.cells[self.cells["cell"].isin(kept["cell"])].reset_index(drop=True)
-        return replace(self, runs=kept, errors=self.errors[mask.to_numpy()], cells=cells)
+        selected_runs = self.runs[mask].reset_index(drop=True)
+        cells = self.cells[self.cells["cell"].isin(selected_runs["cell"])].reset_index(drop=True)
+        return replace(self, runs=selected_runs, errors=self.errors[mask.to_numpy()], cells=cells)
 
 
 def is_stored_suite(folder: Path) -> bool:
@@ -174,12 +174,12 @@ def _collect_comparison(folder: Path, condition: str) -> SuiteRuns:
     )
     errors = curves.values.copy()
     # A run that used up a smaller budget says nothing about more simulations.
-    ended = (status["status"] == "done").to_numpy() & (curves.used < experiment.budget)
+    has_ended_early = (status["status"] == "done").to_numpy() & (curves.used < experiment.budget)
     later = np.arange(errors.shape[1]) > curves.used[:, None]
-    errors[ended[:, None] & later] = np.nan
+    errors[has_ended_early[:, None] & later] = np.nan
     errors[curves.failed] = np.inf
     parameter_count = _count_parameters(experiment)
-    described = [
+    cell_rows = [
         (
             cell,
             problem,
@@ -204,7 +204,7 @@ def _collect_comparison(folder: Path, condition: str) -> SuiteRuns:
         columns=TRAINING_COLUMNS,
     )
     reasons = skipped[SKIPPED_COLUMNS].drop_duplicates("tuner")
-    return SuiteRuns(runs, errors, pd.DataFrame(described, columns=CELL_COLUMNS), training, reasons)
+    return SuiteRuns(runs, errors, pd.DataFrame(cell_rows, columns=CELL_COLUMNS), training, reasons)
 
 
 def name_cell(problem: str, kind: str, condition: str, experiment: Experiment) -> str:
@@ -271,13 +271,13 @@ def merge_runs(own: SuiteRuns, stored: SuiteRuns) -> SuiteRuns:
     common = own_places.isin(stored_places)
     if not common.any():
         return own
-    present = pd.MultiIndex.from_frame(own.runs[["cell", "tuner"]])
-    added = stored_places.isin(own_places)
-    added &= ~pd.MultiIndex.from_frame(stored.runs[["cell", "tuner"]]).isin(present)
+    own_pairs = pd.MultiIndex.from_frame(own.runs[["cell", "tuner"]])
+    is_added = stored_places.isin(own_places)
+    is_added &= ~pd.MultiIndex.from_frame(stored.runs[["cell", "tuner"]]).isin(own_pairs)
     return concatenate(
         [
             own.select(pd.Series(common, index=own.runs.index)),
-            stored.select(pd.Series(added, index=stored.runs.index)),
+            stored.select(pd.Series(is_added, index=stored.runs.index)),
         ]
     )
 

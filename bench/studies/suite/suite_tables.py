@@ -137,13 +137,13 @@ class SuiteTables:
         """
         curves, columns = self.curves[cell], {}
         for tuner in curves.list_tuners():
-            mine = curves.select(tuner=tuner)
+            tuner_curves = curves.select(tuner=tuner)
             share = self._share_of_training(cell, tuner) if training == COUNTED else 0.0
-            column = mine.values[:, max(int(k - share), 0)]
-            means = pd.Series(column).groupby(mine.keys["target"]).mean()
-            means_array: Array = np.asarray(means, dtype=np.float64)
+            column = tuner_curves.values[:, max(int(k - share), 0)]
+            target_means = pd.Series(column).groupby(tuner_curves.keys["target"]).mean()
+            means_array: Array = np.asarray(target_means, dtype=np.float64)
             logs = compute_log_errors(means_array, self.floors[cell])
-            columns[tuner] = pd.Series(logs, index=means.index)
+            columns[tuner] = pd.Series(logs, index=target_means.index)
         return pd.DataFrame(columns)
 
     def _share_of_training(self, cell: str, tuner: str) -> float:
@@ -194,18 +194,18 @@ class SuiteTables:
             ranks = self.get_ranks(k)
             for cell, curves in self.curves.items():
                 for tuner in curves.list_tuners():
-                    mine = curves.select(tuner=tuner)
+                    tuner_curves = curves.select(tuner=tuner)
                     with np.errstate(invalid="ignore"):
-                        median = float(np.median(mine.values[:, k]))
-                    counts = mine.keys["target"].nunique(), int(mine.failed.sum())
+                        median = float(np.median(tuner_curves.values[:, k]))
+                    counts = tuner_curves.keys["target"].nunique(), int(tuner_curves.failed.sum())
                     lines.append((cell, tuner, k, median, ranks.at[cell, tuner], *counts))
         return pd.DataFrame(lines, columns=ERROR_COLUMNS)
 
     @cached_property
     def complete_tuners(self) -> list[str]:
         """Tuners with results in all cells at all checkpoints; only these are compared overall."""
-        present = [self.get_medians(k).notna().all(axis=0) for k in self.checkpoints]
-        return [t for t in self.suite.tuners if all(column.get(t, False) for column in present)]
+        has_results = [self.get_medians(k).notna().all(axis=0) for k in self.checkpoints]
+        return [t for t in self.suite.tuners if all(column.get(t, False) for column in has_results)]
 
     @cached_property
     def ranks(self) -> pd.DataFrame:
@@ -221,9 +221,9 @@ class SuiteTables:
                 if ranks.empty:
                     continue
                 rng = make_rng("suite ranks", k)
-                picked = rng.integers(len(ranks), size=(_RESAMPLES, len(ranks)))
+                resamples = rng.integers(len(ranks), size=(_RESAMPLES, len(ranks)))
                 for tuner, mean in ranks.mean().sort_values(kind="stable").items():
-                    resampled = ranks[tuner].to_numpy()[picked].mean(axis=1)
+                    resampled = ranks[tuner].to_numpy()[resamples].mean(axis=1)
                     interval = compute_percentile_interval(resampled)
                     lines.append((training, k, tuner, mean, *interval, len(ranks)))
         return pd.DataFrame(lines, columns=RANK_COLUMNS)
@@ -257,12 +257,13 @@ class SuiteTables:
                 if medians.shape[1] < 2:
                     continue
                 best = self.find_best(k, training)
-                others = [tuner for tuner in medians if tuner != best]
+                other_tuners = [tuner for tuner in medians if tuner != best]
                 tests = {
-                    t: compare_pair(medians[best].to_numpy(), medians[t].to_numpy()) for t in others
+                    t: compare_pair(medians[best].to_numpy(), medians[t].to_numpy())
+                    for t in other_tuners
                 }
-                corrected = correct_holm(np.array([tests[t].p_value for t in others]))
-                for tuner, p_holm in zip(others, corrected, strict=True):
+                corrected = correct_holm(np.array([tests[t].p_value for t in other_tuners]))
+                for tuner, p_holm in zip(other_tuners, corrected, strict=True):
                     test = tests[tuner]
                     values = test.targets, test.a_better, test.ratio, test.p_value, float(p_holm)
                     lines.append((training, k, best, tuner, *values))
@@ -306,11 +307,11 @@ class SuiteTables:
             ERT, its 95 % interval (two numbers), ERT with training, successes and number of runs.
         """
         # Beyond the end of a smaller budget nothing is known.
-        known = ~np.isnan(curves.values).any(axis=1)
-        budget = self.suite.budget if known.all() else int(np.max(curves.used))
+        is_complete = ~np.isnan(curves.values).any(axis=1)
+        budget = self.suite.budget if is_complete.all() else int(np.max(curves.used))
         effort = compute_effort(curves, threshold, budget)
-        picked = draw_target_resamples(len(effort.successes), "suite")
-        low, high = compute_percentile_interval(effort.compute_ert(picked))
+        resamples = draw_target_resamples(len(effort.successes), "suite")
+        low, high = compute_percentile_interval(effort.compute_ert(resamples))
         ert = float(effort.compute_ert())
         return ert, low, high, ert + share, int(effort.successes.sum()), effort.runs
 

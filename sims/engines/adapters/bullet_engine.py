@@ -79,21 +79,21 @@ def make_engine(
         "lateral_friction": lateral_friction,
         "plane_restitution": plane_restitution,
     }
-    given = {name: value for name, value in native_settings.items() if value is not None}
+    given_settings = {name: value for name, value in native_settings.items() if value is not None}
     if not native_contact:
-        if given:
+        if given_settings:
             raise InputError(
-                f"setting {next(iter(given))} applies to Bullet's native contact only: set"
+                f"setting {next(iter(given_settings))} applies to Bullet's native contact only: set"
                 " native_contact = true"
             )
         return BulletEngine(system, resolve_time_step(time_step, system))
     if not system.bounces:
         raise InputError(f"system {system.name} does not bounce: leave native_contact out")
-    for name, value in given.items():
+    for name, value in given_settings.items():
         if not 0 <= value < math.inf:
             raise InputError(f"{name} must be a number of at least 0, found {value}")
     step = math.inf if time_step is None else resolve_time_step(time_step, system)
-    return BulletEngine(system, step, {**_PUBLISHED_SETTINGS, **given})
+    return BulletEngine(system, step, {**_PUBLISHED_SETTINGS, **given_settings})
 
 
 class BulletEngine:
@@ -176,8 +176,8 @@ class _BulletMover:
         # The world is reset in place, because building one is half the cost of a rollout. But
         # contact points survive a reset, and Bullet would use them as old contacts, which changes
         # the results by rounding. They are removed by placing the ball where it touches nothing.
-        far = 0.0, 0.0, 2.0 * constants["radius"] + 1.0
-        p.resetBasePositionAndOrientation(self._body, far, _NO_ROTATION, self._client)
+        distant_position = 0.0, 0.0, 2.0 * constants["radius"] + 1.0
+        p.resetBasePositionAndOrientation(self._body, distant_position, _NO_ROTATION, self._client)
         p.performCollisionDetection(self._client)
 
     def set_step(self, step: float) -> None:
@@ -266,9 +266,9 @@ class BulletBall(_BulletMover):
         contact_position = x[0], x[1], self._floor - ball_rollout.CONTACT_PENETRATION
         self.set_state(contact_position, (v[0], v[1], v[2] + self._gravity * _IMPACT))
         self._set_contact(True)
-        _, after = self.advance_freely((1,))[0]
+        _, velocity = self.advance_freely((1,))[0]
         self._set_contact(False)
-        return after
+        return velocity
 
     def set_resting_contact(self) -> None:
         """Set contact with zero restitution and zero friction."""

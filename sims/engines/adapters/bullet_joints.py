@@ -56,14 +56,14 @@ class BulletJoint:
         step = p.stepSimulation
         push = p.setJointMotorControl2
         torque = p.TORQUE_CONTROL
-        read = p.getJointState
+        get_joint_state = p.getJointState
         states = []
         for count in counts:
             for _ in range(count):
                 if force:  # Bullet resets applied torques after each step
                     push(body, 0, torque, force=force, physicsClientId=client)
                 step(client)
-            states.append(read(body, 0, client)[:2])
+            states.append(get_joint_state(body, 0, client)[:2])
         return states
 
     def __getstate__(self) -> dict[str, Any]:

@@ -34,9 +34,9 @@ def _discard_output() -> Iterator[None]:
     with contextlib.ExitStack() as undo:
         for stream in (1, 2):
             with contextlib.suppress(OSError):  # a process may lack this stream
-                original = os.dup(stream)
-                undo.callback(os.close, original)
-                undo.callback(os.dup2, original, stream)
+                saved_descriptor = os.dup(stream)
+                undo.callback(os.close, saved_descriptor)
+                undo.callback(os.dup2, saved_descriptor, stream)
                 sink = os.open(os.devnull, os.O_WRONLY)
                 undo.callback(os.close, sink)
                 os.dup2(sink, stream)

@@ -250,13 +250,17 @@ class MujocoBall(MujocoMover):
         self._set_contact_parameters(0.0, (1.0 + restitution) * self._inverse_step)  # (3)
         # The impact removes tangential speed mu (1 + e) |vn| (`engines.ground_contact`), in
         # this one step.
-        along = math.hypot(v[0], v[1])
-        share = min(friction * (1.0 + restitution) * -v[2] / along, 1.0) if along else 0.0
+        tangential_speed = math.hypot(v[0], v[1])
+        share = (
+            min(friction * (1.0 + restitution) * -v[2] / tangential_speed, 1.0)
+            if tangential_speed
+            else 0.0
+        )
         deceleration = share * self._inverse_step
         self._set_contact(True)
-        _, after = self.advance((-deceleration * v[0], -deceleration * v[1], self._gravity))
+        _, velocity = self.advance((-deceleration * v[0], -deceleration * v[1], self._gravity))
         self._set_contact(False)
-        return after
+        return velocity
 
     def set_resting_contact(self) -> None:
         """Set contact that supports the ball: damping, and a weak spring."""

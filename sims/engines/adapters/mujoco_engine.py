@@ -161,12 +161,12 @@ def _suppress_warnings() -> Iterator[None]:
     Unstable batch elements become NaN.
     """
     mujoco = import_mujoco()
-    before = mujoco.get_mju_user_warning()
+    previous_handler = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(_ignore_warning)
     try:
         yield
     finally:
-        mujoco.set_mju_user_warning(before)
+        mujoco.set_mju_user_warning(previous_handler)
 
 
 def _ignore_warning(message: str) -> None:

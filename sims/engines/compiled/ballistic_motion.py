@@ -122,13 +122,15 @@ def compute_impact_time(program: ProgramArrays, block: BlockBuffers) -> float:
     a = block.a
     last = program.flags[DIMENSIONS] - 1
     height = a[X + last, 0] - a[FLOOR_LEVEL, 0]
-    up = a[V + last, 0]
+    upward_velocity = a[V + last, 0]
     down = -a[K1 + last, 0]
-    root = np.sqrt(up * up + 2.0 * down * height)  # NaN if it does not reach the ground
-    if up < 0.0:
-        seconds = 2.0 * height / (root - up)  # (3)
+    root = np.sqrt(
+        upward_velocity * upward_velocity + 2.0 * down * height
+    )  # NaN if it does not reach the ground
+    if upward_velocity < 0.0:
+        seconds = 2.0 * height / (root - upward_velocity)  # (3)
     else:
-        seconds = (up + root) / down if down > 0.0 else np.inf
+        seconds = (upward_velocity + root) / down if down > 0.0 else np.inf
     return float(np.inf if seconds != seconds else a[T, 0] + seconds)
 
 

@@ -150,13 +150,15 @@ class _BatchRunner:
         self._max_steps[elements] = np.where(parts > 1, spans / parts * (1.0 + 1e-9), spans)
         # Elements with many steps begin first; the others fill the remaining slots meanwhile.
         order = np.argsort(-parts, kind="stable")
-        separate = len(order)
+        separate_count = len(order)
         has_events = program.arrays.flags[HAS_FRICTION:GUIDED_COUNT].any()
         if not has_events and len(self._steps) == 1 and self._patience >= 1.0:
-            separate = int(np.count_nonzero(parts > 1))
-        self._run_kernel_function(STEP_BLOCK, program, _select_elements(arrays, order[:separate]))
+            separate_count = int(np.count_nonzero(parts > 1))
         self._run_kernel_function(
-            STEP_IN_LOCKSTEP, program, _select_elements(arrays, order[separate:])
+            STEP_BLOCK, program, _select_elements(arrays, order[:separate_count])
+        )
+        self._run_kernel_function(
+            STEP_IN_LOCKSTEP, program, _select_elements(arrays, order[separate_count:])
         )
 
     def _run_kernel_function(
@@ -192,8 +194,8 @@ def _select_elements(arrays: BatchArrays, places: Indices) -> BatchArrays:
 
 def _count_slots(program: ForceProgram | NumpyForceProgram, arrays: BatchArrays) -> int:
     """Return the number of slots in use."""
-    needed = -(-len(arrays.order) // _SIMD_WIDTH) * _SIMD_WIDTH
-    return min(program.block_width, needed)
+    padded_count = -(-len(arrays.order) // _SIMD_WIDTH) * _SIMD_WIDTH
+    return min(program.block_width, padded_count)
 
 
 def _to_column(values: Array, count: int) -> Array:

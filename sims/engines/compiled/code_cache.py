@@ -17,8 +17,8 @@ _DIGEST = hashlib.sha256().digest_size
 
 def get_cache_folder() -> Path:
     """Return the cache folder: $SIMGAP_COMPILED, else simgap/ in the user's cache folder."""
-    if named := os.environ.get("SIMGAP_COMPILED"):
-        return Path(named)
+    if stated_folder := os.environ.get("SIMGAP_COMPILED"):
+        return Path(stated_folder)
     return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "simgap"
 
 

@@ -170,7 +170,7 @@ def _evaluate_program(
         Forces and, if any, friction limits at each state, then restitution and friction of impacts.
     """
     prepared = program.prepare(1)
-    (_, _, rows, out, flags), r = prepared.arrays, prepared.block.r
+    (_, _, rows, output_rows, flags), r = prepared.arrays, prepared.block.r
     compute_constants, compute_forces, compute_impact = prepared.make_runners()
     r[rows[IN_P] : rows[IN_P] + parameters.size, 0] = parameters
     compute_constants()
@@ -178,7 +178,7 @@ def _evaluate_program(
     for state in states:
         r[rows[IN_T] : rows[IN_P], 0] = state
         compute_forces()
-        results.append(r[out, 0])
+        results.append(r[output_rows, 0])
         if flags[HAS_FRICTION]:
             results.append(r[rows[OUT_LIMIT], :1].copy())
     for speed in (0.3, 2.0):

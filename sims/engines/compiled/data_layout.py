@@ -166,8 +166,14 @@ def make_flags(system: System, names: InputNames, effects: Sequence[Effect]) -> 
     has_friction, has_forces = (
         any(isinstance(effect, kind) for effect in effects) for kind in (Friction, Force)
     )
-    guided = system.guided or names.coordinates
-    flags = names.coordinates, has_friction, has_forces or system.bends, system.bounces, guided
+    guided_count = system.guided or names.coordinates
+    flags = (
+        names.coordinates,
+        has_friction,
+        has_forces or system.bends,
+        system.bounces,
+        guided_count,
+    )
     return np.array(flags, dtype=np.int64)
 
 
@@ -249,5 +255,5 @@ def check_array_layout(
 
 def uses_registers(code: IntTable, count: int) -> bool:
     """Return whether the instructions (n, 5) use only the first `count` registers."""
-    called = code[:, 0] == EXTERNAL
-    return bool(code.min(initial=0) >= 0 and code[~called, 1:].max(initial=-1) < count)
+    is_external = code[:, 0] == EXTERNAL
+    return bool(code.min(initial=0) >= 0 and code[~is_external, 1:].max(initial=-1) < count)

@@ -85,28 +85,28 @@ def begin_step(program: ProgramArrays, block: BlockBuffers, w: int) -> None:
     a = block.a
     r = block.r
     limits = program.rows[OUT_LIMIT]
-    guided = program.flags[GUIDED_COUNT]
+    guided_count = program.flags[GUIDED_COUNT]
     for i in range(w):
         limit = r[limits, i]
         compute_pulling_force(program, block, i, K1)
-        size = compute_norm(a, K1, guided, i)
-        speed = compute_norm(a, V, guided, i)
+        size = compute_norm(a, K1, guided_count, i)
+        speed = compute_norm(a, V, guided_count, i)
         a[BEFORE, i] = size - limit
         a[AFTER, i] = size - limit
         is_still = speed == 0.0
-        sticks = is_still and size <= limit  # (2)
-        block.n[IS_STICKING, i] = sticks
+        is_sticking = is_still and size <= limit  # (2)
+        block.n[IS_STICKING, i] = is_sticking
         # (1) and (3): along the motion, or at rest along the pulling force.
         divisor = speed
         if is_still:
             divisor = size if size > 0.0 else 1.0
-        for k in range(guided):
+        for k in range(guided_count):
             pull = a[K1 + k, i]
             direction = (pull if is_still else a[V + k, i]) / divisor
             friction = limit * direction
             a[DIRECTION + k, i] = direction
             a[F1 + k, i] = friction
-            a[K1 + k, i] = 0.0 if sticks else (pull - friction) / a[MASS, i]
+            a[K1 + k, i] = 0.0 if is_sticking else (pull - friction) / a[MASS, i]
         compute_unguided_acceleration(program, block, i, K1, F1)
 
 
@@ -208,25 +208,25 @@ def compute_acceleration_nd(
         friction_row: first row of dry friction.
     """
     a = block.a
-    guided = program.flags[GUIDED_COUNT]
+    guided_count = program.flags[GUIDED_COUNT]
     velocity = program.rows[IN_V]
     limit = block.r[program.rows[OUT_LIMIT], i]
     compute_pulling_force(program, block, i, row_of_result)
-    a[AFTER, i] = compute_norm(a, row_of_result, guided, i) - limit
+    a[AFTER, i] = compute_norm(a, row_of_result, guided_count, i) - limit
     # The direction may turn within the step, but must not reverse: a reversal is an event at which
     # the step is cut.
     square = 0.0
-    for k in range(guided):
+    for k in range(guided_count):
         square += block.r[velocity + k, i] * block.r[velocity + k, i]
     speed = np.sqrt(square)
-    along = 0.0
-    for k in range(guided):
+    projection = 0.0
+    for k in range(guided_count):
         direction = a[DIRECTION + k, i]
         unit = block.r[velocity + k, i] / speed if speed > 0.0 else direction
         a[friction_row + k, i] = unit
-        along += unit * direction
-    sign = -1.0 if along < 0.0 else 1.0
-    for k in range(guided):
+        projection += unit * direction
+    sign = -1.0 if projection < 0.0 else 1.0
+    for k in range(guided_count):
         friction = limit * (a[friction_row + k, i] * sign)
         a[friction_row + k, i] = friction
         slipping = (a[row_of_result + k, i] - friction) / a[MASS, i]
@@ -269,8 +269,8 @@ def compute_pulling_force(
         block.a[row_of_result + k, i] = block.r[program.out[k], i]
     if block.n[IS_RESTING, i] != 0:
         # The ground pushes but does not pull: an upward force remains.
-        up = row_of_result + d - 1
-        block.a[up, i] = nan_maximum(block.a[up, i], 0.0)
+        last_row = row_of_result + d - 1
+        block.a[last_row, i] = nan_maximum(block.a[last_row, i], 0.0)
 
 
 def compute_frictionless_acceleration(
@@ -292,7 +292,7 @@ def compute_frictionless_acceleration(
         for i in range(w):
             a[row, i] = block.r[force, i] / a[MASS, i]
     if program.flags[BOUNCES] != 0:
-        up = row_of_result + d - 1
+        last_row = row_of_result + d - 1
         for i in range(w):
             if block.n[IS_RESTING, i] != 0:
-                a[up, i] = nan_maximum(block.r[program.out[d - 1], i], 0.0) / a[MASS, i]
+                a[last_row, i] = nan_maximum(block.r[program.out[d - 1], i], 0.0) / a[MASS, i]

@@ -219,8 +219,8 @@ def try_step(program: ProgramArrays, block: BlockBuffers, w: int) -> None:
                     r[x, i] = a[X + k, i] + 0.5 * a[H, i] * a[V + k, i]  # (2)
             elif stage == 2:
                 for i in range(w):
-                    half = 0.5 * a[H, i]
-                    r[x, i] = r[x, i] + (half * half) * a[K1 + k, i]  # (3)
+                    half_step = 0.5 * a[H, i]
+                    r[x, i] = r[x, i] + (half_step * half_step) * a[K1 + k, i]  # (3)
             else:
                 for i in range(w):
                     r[x, i] = a[X + k, i] + a[H, i] * r[v, i]  # (4)
@@ -233,11 +233,11 @@ def try_step(program: ProgramArrays, block: BlockBuffers, w: int) -> None:
         for i in range(w):
             h = a[H, i]
             sixth = h / 6.0
-            inner = a[K2 + k, i] + a[K3 + k, i]
+            middle_sum = a[K2 + k, i] + a[K3 + k, i]
             outer = a[K1 + k, i] + a[K4 + k, i]
             v = a[V + k, i]
-            a[NEXT_X + k, i] = a[X + k, i] + h * (v + sixth * (a[K1 + k, i] + inner))  # (5)
-            a[NEXT_V + k, i] = v + sixth * (outer + 2.0 * inner)  # (6)
+            a[NEXT_X + k, i] = a[X + k, i] + h * (v + sixth * (a[K1 + k, i] + middle_sum))  # (5)
+            a[NEXT_V + k, i] = v + sixth * (outer + 2.0 * middle_sum)  # (6)
 
 
 def detect_possible_events(program: ProgramArrays, block: BlockBuffers, w: int) -> None:

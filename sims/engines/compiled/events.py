@@ -177,9 +177,9 @@ def is_too_nonlinear(program: ProgramArrays, block: BlockBuffers, i: int) -> boo
     if program.flags[HAS_FORCES] != 0:
         square = 0.0
         for k in range(d):
-            outer = a[K1 + k, i] + a[K4 + k, i]
-            inner = a[K2 + k, i] + a[K3 + k, i]
-            square += (outer - inner) * (outer - inner)
+            outer_sum = a[K1 + k, i] + a[K4 + k, i]
+            middle_sum = a[K2 + k, i] + a[K3 + k, i]
+            square += (outer_sum - middle_sum) * (outer_sum - middle_sum)
         is_nonlinear = square > FORCE_NONLINEARITY_TOLERANCE * a[MAX_ACCELERATION, i]
     if program.flags[HAS_FRICTION] != 0:
         largest = nan_maximum(compute_norm(a, F1, d, i), compute_norm(a, F4, d, i))
@@ -244,11 +244,17 @@ def detect_event(program: ProgramArrays, arrays: BatchArrays, block: BlockBuffer
                 has_event = True
         awaits_break_away = block.n[PENDING_EVENT, i] == BREAK_AWAY
         if is_sticking and (is_open or awaits_break_away):
-            before = a[BEFORE, i]
-            after = a[AFTER, i]
+            value_before = a[BEFORE, i]
+            value_after = a[AFTER, i]
             # A scheduled break-away is checked again with a tolerance.
-            if after > (BREAK_AWAY_TIME_TOLERANCE * (after - before) if awaits_break_away else 0.0):
-                seconds = h * (before / (before - after) + 0.1 * BREAK_AWAY_TIME_TOLERANCE)
+            if value_after > (
+                BREAK_AWAY_TIME_TOLERANCE * (value_after - value_before)
+                if awaits_break_away
+                else 0.0
+            ):
+                seconds = h * (
+                    value_before / (value_before - value_after) + 0.1 * BREAK_AWAY_TIME_TOLERANCE
+                )
                 schedule_event(block, i, seconds, BREAK_AWAY)
                 has_event = True
     return has_event
@@ -396,8 +402,8 @@ def compute_rebound_velocity(
         square = 0.0
         for j in range(d - 1):
             square += a[V + j, i] * a[V + j, i]
-        along = abs(a[V, i]) if d == 2 else np.sqrt(square)
-        share = 1.0 - lost_speed / (along if along > 0.0 else 1.0)
+        tangential_speed = abs(a[V, i]) if d == 2 else np.sqrt(square)
+        share = 1.0 - lost_speed / (tangential_speed if tangential_speed > 0.0 else 1.0)
         remaining_share = nan_maximum(share, arrays.ground[MIN_REMAINING_SHARE, element])
         for j in range(d - 1):
             a[V + j, i] *= remaining_share
@@ -441,14 +447,14 @@ def handle_standstill(program: ProgramArrays, block: BlockBuffers, i: int) -> No
     for k in range(d):
         a[X + k, i] += correction * a[V + k, i]
         a[V + k, i] += correction * a[K4 + k, i]
-    along = dot(a, V, DIRECTION, d, i)
+    directed_velocity = dot(a, V, DIRECTION, d, i)
     for k in range(d):
-        a[V + k, i] -= a[DIRECTION + k, i] * along
+        a[V + k, i] -= a[DIRECTION + k, i] * directed_velocity
     # The speed becomes exactly zero, because only an element with zero speed can stick.
-    guided = program.flags[GUIDED_COUNT]
+    guided_count = program.flags[GUIDED_COUNT]
     if (
-        compute_norm(a, V, guided, i)
-        <= REST_SPEED_SHARE * compute_norm(a, K4, guided, i) * a[MAX_STEP, i]
+        compute_norm(a, V, guided_count, i)
+        <= REST_SPEED_SHARE * compute_norm(a, K4, guided_count, i) * a[MAX_STEP, i]
     ):
-        for k in range(guided):
+        for k in range(guided_count):
             a[V + k, i] = 0.0

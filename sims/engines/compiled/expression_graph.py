@@ -81,11 +81,11 @@ class ExpressionGraph:
         )
 
     def _get_or_make(
-        self, key: tuple[object, ...], make: Callable[[], ExpressionNode]
+        self, key: tuple[object, ...], make_node: Callable[[], ExpressionNode]
     ) -> ExpressionNode:
         """Return the node with this key, so that equal expressions share one node."""
         if key not in self._nodes:
-            self._nodes[key] = make()
+            self._nodes[key] = make_node()
         return self._nodes[key]
 
 

@@ -68,10 +68,10 @@ class PreparedProgram(NamedTuple):
 
         The parts are the values of each element, the forces, and the contact parameters.
         """
-        kernel, ends, r = get_kernel(), self.arrays.ends.tolist(), self.block.r
+        kernel, part_ends, r = get_kernel(), self.arrays.ends.tolist(), self.block.r
         runners = [
             kernel.make_instruction_runner(self.arrays.code, first, last, r)
-            for first, last in pairwise(ends)
+            for first, last in pairwise(part_ends)
         ]
         if self.numpy_forces is None:
             return tuple(runners)
@@ -349,9 +349,9 @@ def emit_instructions(
     if len(place) > MAX_REGISTERS:
         raise NotTraceableError(f"it needs more than {MAX_REGISTERS} registers")
     lines = [line for part in parts.values() for line in part]
-    ends = np.cumsum([0, *(len(part) for part in parts.values())])
+    part_ends = np.cumsum([0, *(len(part) for part in parts.values())])
     code = np.array(lines, dtype=np.int64).reshape(-1, 5)
-    return InstructionList(code, ends.astype(np.int64), rows, place, first, np.array(values))
+    return InstructionList(code, part_ends.astype(np.int64), rows, place, first, np.array(values))
 
 
 def _sort_nodes(outputs: Sequence[ExpressionNode]) -> list[ExpressionNode]:

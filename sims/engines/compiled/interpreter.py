@@ -109,7 +109,7 @@ def evaluate_sine(r: FloatArray, o: int, a: int, w: int, ahead: float) -> None:
         w: number of slots in use.
         ahead: number of quarter turns: 0 for sine, 1 for cosine.
     """
-    far = False
+    is_large = False
     for i in range(w):
         x = r[a, i]
         k = (x * TWO_OVER_PI + ROUNDING_OFFSET) - ROUNDING_OFFSET
@@ -124,14 +124,14 @@ def evaluate_sine(r: FloatArray, o: int, a: int, w: int, ahead: float) -> None:
         c = 4.16666666666666019037e-02 + z * (-1.38888888888741095749e-03 + z * c)
         cosine = 1.0 - (0.5 * z - z * z * c)  # (1)
         k = k + ahead
-        half = 0.5 * k
-        odd = half != (half + ROUNDING_OFFSET) - ROUNDING_OFFSET
+        half_quarters = 0.5 * k
+        is_odd = half_quarters != (half_quarters + ROUNDING_OFFSET) - ROUNDING_OFFSET
         quarter = k - 4.0 * ((0.25 * k + ROUNDING_OFFSET) - ROUNDING_OFFSET)  # -2 to 2
-        value = cosine if odd else sine
+        value = cosine if is_odd else sine
         flips = quarter == 2.0 or quarter == -2.0 or quarter == -1.0
         r[o, i] = -value if flips else value
-        far |= not abs(x) <= MAX_REDUCED_ANGLE
-    if far:
+        is_large |= not abs(x) <= MAX_REDUCED_ANGLE
+    if is_large:
         for i in range(w):
             if not abs(r[a, i]) <= MAX_REDUCED_ANGLE:
                 r[o, i] = np.sin(r[a, i]) if ahead == 0.0 else np.cos(r[a, i])
@@ -146,7 +146,7 @@ def evaluate_exponential(r: FloatArray, o: int, a: int, w: int) -> None:
         a: row of the argument.
         w: number of slots in use.
     """
-    far = False
+    is_large = False
     for i in range(w):
         x = r[a, i]
         k = (x * INVERSE_LN_2 + ROUNDING_OFFSET) - ROUNDING_OFFSET
@@ -160,8 +160,8 @@ def evaluate_exponential(r: FloatArray, o: int, a: int, w: int) -> None:
         value = 1.0 - ((low - y * c / (2.0 - c)) - high)  # (2)
         scale = np.int64(np.float64(k + EXPONENT_BIT_OFFSET).view(np.int64) << 52).view(np.float64)
         r[o, i] = value * scale
-        far |= not abs(x) <= MAX_EXPONENT
-    if far:
+        is_large |= not abs(x) <= MAX_EXPONENT
+    if is_large:
         for i in range(w):
             if not abs(r[a, i]) <= MAX_EXPONENT:
                 r[o, i] = np.exp(r[a, i])

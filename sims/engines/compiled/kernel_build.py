@@ -102,7 +102,7 @@ def emit_llvm() -> tuple[str, str]:
     # numba is only partly typed, and its untyped functions would fail the type check.
     numba: Any = typed
     space = _compile_functions(numba, KERNEL_MODULES)
-    space.update(_list_module_names(kernel_entry, keep=space))
+    space.update(_list_module_names(kernel_entry, excluded=space))
     return _emit_llvm_code(numba, kernel_entry.kernel_entry, space, 1)
 
 
@@ -116,7 +116,7 @@ def emit_callback(offsets: Mapping[str, int]) -> tuple[str, str]:
 
     numba: Any = typed
     space = _compile_functions(numba, (interpreter,))
-    space.update(_list_module_names(mujoco_callback, keep=space))
+    space.update(_list_module_names(mujoco_callback, excluded=space))
     space |= {name.upper(): offset for name, offset in offsets.items()}
     limits = mujoco_callback.set_friction_limits
     space["set_friction_limits"] = numba.njit(error_model="numpy")(
@@ -125,9 +125,9 @@ def emit_callback(offsets: Mapping[str, int]) -> tuple[str, str]:
     return _emit_llvm_code(numba, mujoco_callback.add_effect_forces, space, 2)
 
 
-def _list_module_names(module: ModuleType, keep: Collection[str] = ()) -> dict[str, Any]:
+def _list_module_names(module: ModuleType, excluded: Collection[str] = ()) -> dict[str, Any]:
     """Return the names of a module, without those to keep."""
-    return {k: v for k, v in vars(module).items() if not k.startswith("__") and k not in keep}
+    return {k: v for k, v in vars(module).items() if not k.startswith("__") and k not in excluded}
 
 
 def _compile_functions(numba: Any, modules: Sequence[ModuleType]) -> dict[str, Any]:
@@ -231,7 +231,7 @@ def _make_intrinsics(numba: Any) -> dict[str, Any]:
 
 def _get_argument_types(numba: Any) -> dict[str, Any]:
     """Return numba's types by the names of annotations, derived from example values."""
-    whole, whole_table = (np.zeros((1,) * k, dtype=np.int64) for k in (1, 2))
+    ints, int_table = (np.zeros((1,) * k, dtype=np.int64) for k in (1, 2))
     row, table, box = (np.zeros((1,) * k) for k in (1, 2, 3))
     examples = {
         "bool": True,
@@ -239,13 +239,13 @@ def _get_argument_types(numba: Any) -> dict[str, Any]:
         "float": 1.0,
         "Row": row,
         "FloatArray": table,
-        "IntTable": whole_table,
-        "ProgramArrays": data_layout.ProgramArrays(whole_table, whole, whole, whole, whole),
+        "IntTable": int_table,
+        "ProgramArrays": data_layout.ProgramArrays(int_table, ints, ints, ints, ints),
         "BatchArrays": data_layout.BatchArrays(
-            order=whole, parameters=table, mass=row, x=table, v=table, steps=table, inputs=box,
+            order=ints, parameters=table, mass=row, x=table, v=table, steps=table, inputs=box,
             max_steps=row, planned_counts=row, ground=table, steps_per_record=1, patience=1.0,
             records=box,
         ),
-        "BlockBuffers": data_layout.BlockBuffers(table, table, whole_table),
+        "BlockBuffers": data_layout.BlockBuffers(table, table, int_table),
     }  # fmt: skip
     return {name: numba.typeof(value) for name, value in examples.items()}

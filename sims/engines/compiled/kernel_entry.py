@@ -61,7 +61,7 @@ def kernel_entry(arguments_at: Any) -> None:
     selected_count = sizes[2]
     d = sizes[3]
     steps = sizes[7]
-    every = sizes[10]
+    steps_per_sample = sizes[10]
     limits = carray(to_real_pointer(reals[14]), (2,))
     program = ProgramArrays(
         code,
@@ -81,9 +81,9 @@ def kernel_entry(arguments_at: Any) -> None:
         carray(to_real_pointer(reals[8]), (element_count,)),
         carray(to_real_pointer(reals[9]), (element_count,)),
         carray(to_real_pointer(reals[10]), (4, element_count)),
-        every,
+        steps_per_sample,
         limits[0],
-        carray(to_real_pointer(reals[11]), (element_count, steps // every + 1, 3 * d)),
+        carray(to_real_pointer(reals[11]), (element_count, steps // steps_per_sample + 1, 3 * d)),
     )
     block = BlockBuffers(
         r,

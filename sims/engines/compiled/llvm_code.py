@@ -39,8 +39,8 @@ class MachineCode(NamedTuple):
     def unpack(cls, data: bytes) -> MachineCode:
         """Restore code from the bytes of `pack`."""
         head, body = data.split(b"\0", 1)
-        name, needs = json.loads(head)
-        return cls(name, tuple(needs), body)
+        name, symbols = json.loads(head)
+        return cls(name, tuple(symbols), body)
 
 
 def describe_processor() -> list[str]:
@@ -78,12 +78,12 @@ def compile_llvm(text: str, name: str) -> MachineCode:
     tuning.loop_vectorization = True
     builder = llvm.create_pass_builder(target, tuning)
     builder.getModulePassManager().run(module, builder)
-    needs = [
+    symbols = [
         symbol.name
         for symbol in (*module.functions, *module.global_variables)
         if symbol.is_declaration and not symbol.name.startswith("llvm.")
     ]
-    return MachineCode(name, needs, target.emit_object(module))
+    return MachineCode(name, symbols, target.emit_object(module))
 
 
 def load_machine_code(code: MachineCode, pointers: int = 1) -> Callable[..., None]:
@@ -105,15 +105,15 @@ def load_machine_code(code: MachineCode, pointers: int = 1) -> Callable[..., Non
     import llvmlite.binding as llvm
 
     engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _make_target(llvm))
-    nowhere = ctypes.CFUNCTYPE(None)(os.abort)
+    abort_function = ctypes.CFUNCTYPE(None)(os.abort)
     for symbol in code.needs:
         if symbol.startswith(_NEVER_CALLED):
-            llvm.add_symbol(symbol, ctypes.cast(nowhere, ctypes.c_void_p).value)
+            llvm.add_symbol(symbol, ctypes.cast(abort_function, ctypes.c_void_p).value)
         elif not llvm.address_of_symbol(symbol):
             raise CodeNotLoadableError(f"{symbol} is missing")
     engine.add_object_file(llvm.ObjectFileRef.from_data(code.body))
     engine.finalize_object()
-    _owners.append((engine, nowhere))
+    _owners.append((engine, abort_function))
     kind = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * pointers)
     return kind(engine.get_function_address(code.name))
 

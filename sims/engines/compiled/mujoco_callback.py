@@ -141,56 +141,58 @@ def add_effect_forces(model_at: Any, data_at: Any) -> None:  # noqa: ARG001
     if context_address == 0.0:
         return
     words = carray(to_int_pointer(np.int64(context_address)), (CONTEXT_WORDS,))
-    own = CallbackContext(
+    context = CallbackContext(
         *(words[0], words[1], words[2], words[3], words[4], words[5], words[6], words[7]),
         *(words[8], words[9], words[10], words[11], words[12], words[13], words[14], words[15]),
         *(words[16], words[17], words[18], words[19], words[20], words[21], words[22], words[23]),
         *(words[24], words[25], words[26], words[27], words[28], words[29], words[30]),
     )
-    k, stage = divmod(own.evaluation, own.evaluations_per_step)
+    k, stage = divmod(context.evaluation, context.evaluations_per_step)
     words[EVALUATION] += 1
-    if k >= own.steps:
+    if k >= context.steps:
         return
-    joints = own.joints
-    scratch = carray(to_real_pointer(own.scratch), (joints + own.states,))
+    joints = context.joints
+    scratch = carray(to_real_pointer(context.scratch), (joints + context.states,))
     if stage == 0:
-        positions = carray(to_int_pointer(own.positions), (joints,))
-        velocities = carray(to_int_pointer(own.velocities), (joints,))
+        positions = carray(to_int_pointer(context.positions), (joints,))
+        velocities = carray(to_int_pointer(context.velocities), (joints,))
         qpos = carray(to_real_pointer(data[QPOS]), (MAX_DATA_WORDS,))
         qvel = carray(to_real_pointer(data[QVEL]), (MAX_DATA_WORDS,))
         qacc = carray(to_real_pointer(data[QACC]), (MAX_DATA_WORDS,))
         applied = carray(to_real_pointer(data[QFRC_APPLIED]), (MAX_DATA_WORDS,))
-        step = carray(to_real_pointer(own.step), (1,))[0]
-        r = carray(to_real_pointer(own.registers), (own.register_count, 1))
-        r[own.t, 0] = k * step
-        r[own.midpoint, 0] = (k + 0.5) * step
-        r[own.past, 0] = step if k > 0 else 0.5 * step
+        step = carray(to_real_pointer(context.step), (1,))[0]
+        r = carray(to_real_pointer(context.registers), (context.register_count, 1))
+        r[context.t, 0] = k * step
+        r[context.midpoint, 0] = (k + 0.5) * step
+        r[context.past, 0] = step if k > 0 else 0.5 * step
         for j in range(joints):
-            r[own.x + j, 0] = qpos[positions[j]]
-            r[own.v + j, 0] = qvel[velocities[j]]
-            if own.has_acceleration == 1:
-                r[own.a + j, 0] = qacc[velocities[j]]
+            r[context.x + j, 0] = qpos[positions[j]]
+            r[context.v + j, 0] = qvel[velocities[j]]
+            if context.has_acceleration == 1:
+                r[context.a + j, 0] = qacc[velocities[j]]
         words[HAS_ACCELERATION] = 1
-        input_values = carray(to_real_pointer(own.input_values), (own.steps, own.inputs))
-        for i in range(own.inputs):
-            r[own.first_input + i, 0] = input_values[k, i]
-        code = carray(to_int_pointer(own.code), (own.code_rows, 5))
-        run_instructions(code, own.begin, own.end, r, 1)
-        force = carray(to_int_pointer(own.forces), (joints,))
-        limit = carray(to_int_pointer(own.limits), (joints,))
-        losses = carray(to_real_pointer(own.losses), (joints,))
+        input_values = carray(
+            to_real_pointer(context.input_values), (context.steps, context.inputs)
+        )
+        for i in range(context.inputs):
+            r[context.first_input + i, 0] = input_values[k, i]
+        code = carray(to_int_pointer(context.code), (context.code_rows, 5))
+        run_instructions(code, context.begin, context.end, r, 1)
+        force = carray(to_int_pointer(context.forces), (joints,))
+        limit = carray(to_int_pointer(context.limits), (joints,))
+        losses = carray(to_real_pointer(context.losses), (joints,))
         for j in range(joints):
             applied[velocities[j]] += r[force[j], 0]
-            added = r[limit[j], 0]
-            scratch[j] = losses[j] + (added if added > 0.0 else 0.0)
+            added_limit = r[limit[j], 0]
+            scratch[j] = losses[j] + (added_limit if added_limit > 0.0 else 0.0)
         # The registers after a step may be those before it, so the states are copied twice.
-        next_states = carray(to_int_pointer(own.next_states), (own.states,))
-        for i in range(own.states):
+        next_states = carray(to_int_pointer(context.next_states), (context.states,))
+        for i in range(context.states):
             scratch[joints + i] = r[next_states[i], 0]
-        for i in range(own.states):
-            r[own.first_state + i, 0] = scratch[joints + i]
-    if own.friction_rows > 0 and data[EFC_TYPE] != 0:
-        set_friction_limits(data, own, scratch)
+        for i in range(context.states):
+            r[context.first_state + i, 0] = scratch[joints + i]
+    if context.friction_rows > 0 and data[EFC_TYPE] != 0:
+        set_friction_limits(data, context, scratch)
 
 
 def set_friction_limits(data: Any, own: Any, limits: Any) -> None:

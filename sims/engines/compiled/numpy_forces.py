@@ -179,12 +179,12 @@ def lay_out_registers(
     parameters += sum(len(effect.coefficients) for effect in effects)
     d = names.coordinates
     sizes = [1, d, d, len(names.inputs), parameters, 1, 1, 1, 1, 1, 1, d]
-    ends = np.cumsum(sizes)
+    block_ends = np.cumsum(sizes)
     program = ProgramArrays(
         code=np.zeros((PART_COUNT, 5), dtype=np.int64),
         ends=np.arange(PART_COUNT + 1),
-        rows=np.array([0, *ends[:10]]),
-        out=np.arange(ends[10], ends[11]),
+        rows=np.array([0, *block_ends[:10]]),
+        out=np.arange(block_ends[10], block_ends[11]),
         flags=make_flags(system, names, effects),
     )
-    return program, int(ends[-1])
+    return program, int(block_ends[-1])

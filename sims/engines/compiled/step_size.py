@@ -87,10 +87,10 @@ def choose_step_divisions(
                     element = block.n[ELEMENT, i]
                     phase = np.sqrt(block.a[MAX_ACCELERATION, i]) * spans[element]
                     decay = block.a[MAX_FRICTION, i] * spans[element] * PHASE_TO_DECAY_RATIO
-                    needed = np.ceil(nan_maximum(phase, decay) / max_phase)
+                    needed_divisions = np.ceil(nan_maximum(phase, decay) / max_phase)
                     # NaN does not change the number of parts.
-                    if needed > divisions[element]:
-                        divisions[element] = min(needed, MAX_STEP_DIVISIONS)
+                    if needed_divisions > divisions[element]:
+                        divisions[element] = min(needed_divisions, MAX_STEP_DIVISIONS)
 
 
 def select_sampled_steps(arrays: BatchArrays, block: BlockBuffers, i: int) -> None:

@@ -159,13 +159,13 @@ class TracedArray(NDArrayOperatorsMixin):
             result = args[0]._reduce_axis(ufunc.__name__, axis, bool(kwargs.get("keepdims")))
             assert isinstance(result, TracedArray)
             return result
-        out = kwargs.pop("out", None)
-        if method != "__call__" or kwargs or (out and not isinstance(out[0], TracedArray)):
+        outputs = kwargs.pop("out", None)
+        if method != "__call__" or kwargs or (outputs and not isinstance(outputs[0], TracedArray)):
             raise NotTraceableError(f"numpy.{ufunc.__name__} is traced only as a plain call")
         result = _apply_elementwise(self.graph, ufunc.__name__, args)
-        if not out:
+        if not outputs:
             return result
-        target = out[0]
+        target = outputs[0]
         assert isinstance(target, TracedArray)
         target.nodes[...] = result.nodes
         return target
@@ -178,10 +178,10 @@ class TracedArray(NDArrayOperatorsMixin):
         name = func.__name__
         if name in RESHAPING_FUNCTIONS:
             return _wrap_result(self.graph, func(*_unwrap_arguments(self.graph, args), **kwargs))
-        known = _FUNCTIONS.get(name)
-        if known is None:
+        trace_function = _FUNCTIONS.get(name)
+        if trace_function is None:
             raise NotTraceableError(f"numpy.{name} is not traced")
-        return known(*args, **kwargs)
+        return trace_function(*args, **kwargs)
 
     def _make_like(self, nodes: Any) -> TracedArray:
         return TracedArray(self.graph, nodes, self.mask)
@@ -192,8 +192,8 @@ class TracedArray(NDArrayOperatorsMixin):
         An axis of None means all elements.
         """
         if axis is None:
-            whole = self.reshape(-1)._reduce_axis(operation, 0, False)
-            return whole.reshape((1,) * self.ndim) if keepdims else whole
+            reduced = self.reshape(-1)._reduce_axis(operation, 0, False)
+            return reduced.reshape((1,) * self.ndim) if keepdims else reduced
         parts = list(np.moveaxis(self.nodes, axis, 0))
         total = TracedArray(self.graph, to_node_array(parts[0]))
         for part in parts[1:]:

@@ -45,8 +45,8 @@ BallState = tuple[Vector, Vector]
 def get_gravity(element: ElementWork) -> Vector:
     """Return the acceleration of gravity, which is constant."""
     start = np.zeros((1, 1))
-    nothing = np.zeros((1, 3))
-    moment = element.make_snapshot(start, nothing, nothing, {})
+    zeros = np.zeros((1, 3))
+    moment = element.make_snapshot(start, zeros, zeros, {})
     weight: list[float] = element.system.weight(moment)[0].tolist()
     return weight
 
@@ -140,10 +140,10 @@ def integrate_ball(ball: BallWithImpacts, element: ElementWork) -> Trajectory:
     recorded_steps = set(element.recorded_steps.tolist())
     steps = element.steps.tolist()
     rows = [rollout.state]
-    for begin, counts in split_into_legs(element):
-        states = rollout.advance_leg(steps[begin], counts)
+    for first, counts in split_into_legs(element):
+        states = rollout.advance_leg(steps[first], counts)
         # A leg may end between two samples, where no state is recorded.
-        rows.extend(states if begin + sum(counts) in recorded_steps else states[:-1])
+        rows.extend(states if first + sum(counts) in recorded_steps else states[:-1])
         if not math.isfinite(sum(rollout.state)):
             break
     return make_trajectory(element, rows)
@@ -278,10 +278,10 @@ class BallRollout:
             self.w = None
         if self.w is None:
             # Equation (1) backwards, from the previous step.
-            half = 0.5 * step
+            half_step = 0.5 * step
             x, y, z = self.v
             ax, ay, az = self.a
-            self.w = x - half * ax, y - half * ay, z - half * az
+            self.w = x - half_step * ax, y - half_step * ay, z - half_step * az
             self._ball.set_state(self.x, self.w)
         return self.w
 
@@ -311,16 +311,16 @@ class BallRollout:
         It applies the force of (4), which gives the velocity of (3) second order in the
         step.
         """
-        half = 0.5 * step
+        half_step = 0.5 * step
         wx, wy, wz = self._prepare_step(step)
         x, y, z = self.v
         ax, ay, az = self.a
         gx, gy, gz = self._gravity
         # (4); at rest the engine's contact balances any force that presses the ball on the ground.
-        lift = self.lift - gz if self.rests else (z + half * az - wz) / step - gz
-        along = (x + half * ax - wx) / step - gx
-        across = (y + half * ay - wy) / step - gy
-        self.x, self.w = self._ball.advance((along, across, lift))
+        lift = self.lift - gz if self.rests else (z + half_step * az - wz) / step - gz
+        force_x = (x + half_step * ax - wx) / step - gx
+        force_y = (y + half_step * ay - wy) / step - gy
+        self.x, self.w = self._ball.advance((force_x, force_y, lift))
         self.time += step
         wx, wy, wz = self.w
         # The acceleration at the end is evaluated at the velocity that (3) gives with the
@@ -328,7 +328,11 @@ class BallRollout:
         self.v = 2.0 * wx - x, 2.0 * wy - y, 0.0 if self.rests else 2.0 * wz - z
         self._update_acceleration()
         ax, ay, az = self.a
-        self.v = wx + half * ax, wy + half * ay, 0.0 if self.rests else wz + half * az
+        self.v = (
+            wx + half_step * ax,
+            wy + half_step * ay,
+            0.0 if self.rests else wz + half_step * az,
+        )
 
     def _update_acceleration(self) -> None:
         """Evaluate the acceleration at the present state; at rest the vertical one is zero."""
@@ -383,15 +387,15 @@ class BallRollout:
         """
         # Equation numbers refer to `sims.engines.ground_contact`.
         restitution, friction = self._forces.compute_impact(speed)
-        up = restitution * speed  # (1)
-        flight = 2.0 * up / down if down > 0.0 else math.inf  # (3)
+        rebound_speed = restitution * speed  # (1)
+        flight = 2.0 * rebound_speed / down if down > 0.0 else math.inf  # (3)
         self._short_flights = self._short_flights + 1 if flight < SHORT_FLIGHT_SECONDS else 0
         if flight >= MIN_FLIGHT_SECONDS and self._short_flights <= MAX_SHORT_FLIGHTS:
             return restitution, friction, False
         # Engines remove mu (1 + e) |vn| with the returned e, which is 0. Therefore all of (4) and
         # the factor 1 + e of this impact are included in the friction.
         omitted_speed = (
-            up / (1.0 - restitution) if restitution < 1.0 else 0.0
+            rebound_speed / (1.0 - restitution) if restitution < 1.0 else 0.0
         )  # (4), divided by mu (1 + e)
         total = friction * (1.0 + restitution) * (1.0 + omitted_speed / speed) if speed else 0.0
         return 0.0, total, True

@@ -100,9 +100,9 @@ class ElementWork:
             The snapshot.
         """
         n = len(x)
-        known = {name: np.repeat(value, n, axis=0) for name, value in self.constants.items()}
+        constants = {name: np.repeat(value, n, axis=0) for name, value in self.constants.items()}
         theta = np.repeat(self.theta, n, axis=0)
-        return StateSnapshot(self.system, theta, known, t, x, v, inputs)
+        return StateSnapshot(self.system, theta, constants, t, x, v, inputs)
 
 
 RolloutFunction = Callable[[ElementWork], Trajectory]
@@ -175,12 +175,12 @@ def is_finite(path: Trajectory) -> bool:
     return all(bool(np.isfinite(values).all()) for values in path)
 
 
-def _compute_timing(steps: Array, every: int) -> tuple[Indices, Array, Indices, Indices]:
+def _compute_timing(steps: Array, steps_per_sample: int) -> tuple[Indices, Array, Indices, Indices]:
     """Return which steps of one element have a length, and when its state is recorded.
 
     Args:
         steps: (S,) step sizes in seconds; zero where the element waits.
-        every: number of steps from one recorded state to the next.
+        steps_per_sample: number of steps from one recorded state to the next.
 
     Returns:
         Indices of the steps with length > 0, their lengths, the step counts at which a state is
@@ -190,9 +190,9 @@ def _compute_timing(steps: Array, every: int) -> tuple[Indices, Array, Indices, 
     # one.
     moves = steps > 0
     moving = np.flatnonzero(moves)
-    taken = np.concatenate([[0], np.cumsum(moves)])[::every]
-    recorded, rows = np.unique(taken, return_inverse=True)
-    return moving, equalise_steps(steps[moving], every), recorded, rows
+    step_counts = np.concatenate([[0], np.cumsum(moves)])[::steps_per_sample]
+    recorded, rows = np.unique(step_counts, return_inverse=True)
+    return moving, equalise_steps(steps[moving], steps_per_sample), recorded, rows
 
 
 def _make_element(
@@ -207,8 +207,8 @@ def _make_element(
         steps: lengths of these steps in seconds.
         recorded_steps: numbers of the steps after which the state is recorded.
     """
-    acting = [(effect, c[:, i : i + 1]) for effect, c in batch.effects]
-    effects = tuple((effect, c) for effect, c in acting if c.any())
+    batch_effects = [(effect, c[:, i : i + 1]) for effect, c in batch.effects]
+    effects = tuple((effect, c) for effect, c in batch_effects if c.any())
     forces = [(e, c) for e, c in effects if isinstance(e, Force | Friction | Contact)]
     program = get_force_program(batch, np.array([i]), [effect for effect, _ in forces])
     numbers = [batch.theta[i], *(value[i] for value in batch.constants.values())]
@@ -261,8 +261,8 @@ def equalise_steps(steps: Array, every: int) -> Array:
     # The error of the sample times is compared, not that of each step, because errors of rounded
     # time stamps do not add up.
     mean_step = math.fsum(steps) / steps.size
-    ends = mean_step * np.arange(1, steps.size + 1)
-    largest_deviation = np.abs(np.cumsum(steps) - ends).max()
+    equal_times = mean_step * np.arange(1, steps.size + 1)
+    largest_deviation = np.abs(np.cumsum(steps) - equal_times).max()
     are_equal = largest_deviation <= TIME_TOLERANCE * mean_step * every
     return np.full(steps.size, mean_step) if are_equal else steps
 
@@ -286,13 +286,13 @@ def split_into_legs(element: ElementWork, *signals: Array) -> list[tuple[int, li
     # The engine is stopped at the beginning of each leg and where a state is recorded.
     stops = is_new_leg.copy()
     stops[element.recorded_steps[element.recorded_steps < size]] = True
-    begins = np.flatnonzero(stops)
-    counts = np.diff(begins, append=size).tolist()
-    firsts = is_new_leg[begins].tolist()
+    leg_starts = np.flatnonzero(stops)
+    counts = np.diff(leg_starts, append=size).tolist()
+    firsts = is_new_leg[leg_starts].tolist()
     result: list[tuple[int, list[int]]] = []
-    for begin, count, first in zip(begins.tolist(), counts, firsts, strict=True):
+    for leg_start, count, first in zip(leg_starts.tolist(), counts, firsts, strict=True):
         if first:
-            result.append((begin, []))
+            result.append((leg_start, []))
         result[-1][1].append(count)
     return result
 
@@ -310,6 +310,6 @@ def resolve_time_step(time_step: float | None, system: type[System]) -> float:
     if time_step is None:
         return DEFAULT_MAX_STEPS[system.kind]
     if not (is_plausible_number(time_step) and time_step > 0):
-        found = truncate_text(str(time_step))
-        raise InputError(f"time_step must be a positive number of seconds, found {found}")
+        found_text = truncate_text(str(time_step))
+        raise InputError(f"time_step must be a positive number of seconds, found {found_text}")
     return float(time_step)

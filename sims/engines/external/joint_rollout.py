@@ -128,11 +128,11 @@ def _find_equivalent_damping(element: ElementWork) -> float | None:
     """Return the viscous damping that is equivalent to all effects; None if there is none."""
     if not element.effects:
         return 0.0
-    (effect, c), *others = element.effects
+    (effect, c), *other_effects = element.effects
     damping = float(c[0, 0, 0])
     # A plugin may replace an effect of this name with another law.
     is_drag = effect.name == "drag.linear" and type(effect).__module__ == "sims.effects.drag"
-    return damping if is_drag and not others and damping > 0.0 else None
+    return damping if is_drag and not other_effects and damping > 0.0 else None
 
 
 class LinearisedForces:
@@ -226,9 +226,9 @@ def integrate_velocity(
     """
     if velocity and limit:
         slope = subtract_dry_friction(velocity, force, limit) * inverse
-        after = velocity + slope * duration
-        if after * velocity >= 0:
-            return after
+        final_velocity = velocity + slope * duration
+        if final_velocity * velocity >= 0:
+            return final_velocity
         # The body stops at time -v / slope; the remaining time begins there.
         duration += velocity / slope
         velocity = 0.0
@@ -241,8 +241,8 @@ def _compute_drive_forces(element: ElementWork) -> Array:
         return np.zeros(max(element.steps.size, 1))
     signals = {name: values[:, None] for name, values in element.inputs.items()}
     size = len(next(iter(signals.values())))
-    nothing = np.zeros((size, 1))
-    moment = element.make_snapshot(nothing, nothing, nothing, signals)
+    zeros = np.zeros((size, 1))
+    moment = element.make_snapshot(zeros, zeros, zeros, signals)
     drive: Array = element.system.drive(moment)[:, 0]
     return drive
 
@@ -264,13 +264,13 @@ def _integrate_open_loop(
     step = math.nan
     drive_force = forces[0]
     rows = [(x, w, step, drive_force)]
-    for begin, counts in split_into_legs(element, drive):
-        h = steps[begin]
-        u = forces[begin]
-        end = begin + sum(counts)
+    for first, counts in split_into_legs(element, drive):
+        h = steps[first]
+        u = forces[first]
+        end = first + sum(counts)
         if h != step:
             # The velocity half a step earlier depends on the step size.
-            if begin:
+            if first:
                 v = _to_full_step_velocity(
                     w, joint.compute_gravity_force(x) + drive_force, inertia, damping, step
                 )
@@ -331,8 +331,8 @@ def _to_full_step_velocity(w: Any, force: Any, inertia: Any, damping: Any, step:
         damping: viscous damping.
         step: step size in seconds.
     """
-    half = 0.5 * step / inertia
-    return (w + half * force) / (1.0 + half * damping)  # (6)
+    half_step_mobility = 0.5 * step / inertia
+    return (w + half_step_mobility * force) / (1.0 + half_step_mobility * damping)  # (6)
 
 
 def _to_half_step_velocity(v: Any, force: Any, inertia: Any, damping: Any, step: Any) -> Any:
@@ -347,8 +347,8 @@ def _to_half_step_velocity(v: Any, force: Any, inertia: Any, damping: Any, step:
         damping: viscous damping.
         step: step size in seconds.
     """
-    half = 0.5 * step / inertia
-    return (1.0 + half * damping) * v - half * force  # (7)
+    half_step_mobility = 0.5 * step / inertia
+    return (1.0 + half_step_mobility * damping) * v - half_step_mobility * force  # (7)
 
 
 def _compute_transition_force(
@@ -412,13 +412,13 @@ def _integrate_stepwise(joint: JointBody, element: ElementWork, inertia: float) 
 
 def _compute_weights(element: ElementWork, x: Array) -> Array:
     """Return the force of gravity (n,) at positions (n,)."""
-    nothing = np.zeros((x.size, 1))
-    moment = element.make_snapshot(nothing, x[:, None], nothing, {})
+    zeros = np.zeros((x.size, 1))
+    moment = element.make_snapshot(zeros, x[:, None], zeros, {})
     weights: Array = element.system.weight(moment)[:, 0]
     return weights
 
 
 def _make_failed_trajectory(element: ElementWork) -> Trajectory:
     """Return a trajectory of NaN for a failed element."""
-    nothing = np.full((element.recorded_steps.size, 1), np.nan)
-    return nothing, nothing, nothing
+    missing_values = np.full((element.recorded_steps.size, 1), np.nan)
+    return missing_values, missing_values, missing_values

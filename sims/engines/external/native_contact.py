@@ -81,9 +81,9 @@ def integrate_native_ball(ball: NativeContactBall, element: ElementWork) -> Traj
     t = 0.0
     step = math.nan
     rows = [(*x, *w, *compute_force(t, x, w))]
-    for begin, counts in split_into_legs(element):
-        if steps[begin] != step:
-            step = steps[begin]
+    for first, counts in split_into_legs(element):
+        if steps[first] != step:
+            step = steps[first]
             ball.set_step(step)
         if forces.acts or changes_impacts:
             states = []
@@ -102,7 +102,7 @@ def integrate_native_ball(ball: NativeContactBall, element: ElementWork) -> Traj
         else:
             # No force must be evaluated: the engine runs from sample to sample.
             states = [(*x, *w, 0.0, 0.0, 0.0) for x, w in ball.advance_freely(counts)]
-        rows.extend(states if begin + sum(counts) in recorded_steps else states[:-1])
+        rows.extend(states if first + sum(counts) in recorded_steps else states[:-1])
         if not math.isfinite(sum(rows[-1])):
             break
     positions, v, effect_forces = make_trajectory(element, rows)

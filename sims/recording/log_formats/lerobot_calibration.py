@@ -103,8 +103,8 @@ def motor_of(column: str, motors: Iterable[str]) -> str | None:
     Returns:
         The name of the motor; None if none matches.
     """
-    named = [motor for motor in motors if motor.lower() in column.lower()]
-    return max(named, key=len, default=None)
+    matching_motors = [motor for motor in motors if motor.lower() in column.lower()]
+    return max(matching_motors, key=len, default=None)
 
 
 def angle_scale(motor: MotorRange, from_zero: bool) -> AngleScale:

@@ -157,10 +157,10 @@ def read_log(path: str | Path, wanted: frozenset[str] = frozenset()) -> LogFile:
         )
     episode = lerobot_dataset.split_episode_path(path)
     if episode is not None:
-        abouts = [file.stat() for file in lerobot_dataset.list_episode_files(*episode)]
-        changed = max(file_stat.st_mtime_ns for file_stat in abouts)
+        file_stats = [file.stat() for file in lerobot_dataset.list_episode_files(*episode)]
+        changed = max(file_stat.st_mtime_ns for file_stat in file_stats)
         return _read_episode(
-            FileVersion(path, changed, sum(file_stat.st_size for file_stat in abouts))
+            FileVersion(path, changed, sum(file_stat.st_size for file_stat in file_stats))
         )
     group = hdf5_files.group_of(path)
     if group is not None:
@@ -267,18 +267,20 @@ def _read_npz(path: Path) -> LogFile:
         raise InputError(f"{path}: not an archive of arrays of numbers: {reason}") from None
     except Exception as error:  # numpy raises many kinds of errors
         raise InputError(f"{path}: not a NumPy archive: {type(error).__name__}") from None
-    named, unlisted = arrays_by_name(columns, names)
-    return LogFile(path, {**columns, **named}, tuple(texts), "entry", unlisted=unlisted)
+    named_columns, unlisted = arrays_by_name(columns, names)
+    return LogFile(path, {**columns, **named_columns}, tuple(texts), "entry", unlisted=unlisted)
 
 
 def _make_array_log(path: Path, columns: dict[str, Array], texts: dict[str, list[str]]) -> LogFile:
     """Make a log of arrays, whose entries are named by lists of names in the file."""
     if not columns:
         raise InputError(f"{path}: expected columns of numbers, found none")
-    named, unlisted = arrays_by_name(
+    named_columns, unlisted = arrays_by_name(
         columns, {name: name_list for name, name_list in texts.items() if name_list}
     )
-    return LogFile(path, {**columns, **named}, tuple(texts), "entry", unlisted=unlisted, first=0)
+    return LogFile(
+        path, {**columns, **named_columns}, tuple(texts), "entry", unlisted=unlisted, first=0
+    )
 
 
 def _read_torch_file(path: Path) -> LogFile:

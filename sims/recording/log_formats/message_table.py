@@ -155,8 +155,8 @@ def _iterate_numbers(path: str, value: Any, depth: int) -> Iterator[tuple[str, f
     if 0 < len(value) <= MAX_LIST_LENGTH:
         for place, entry in enumerate(value):
             name = (_get_fields(entry) or {}).get("name")
-            inner = f"{path}.{name}" if name and isinstance(name, str) else f"{path}[{place}]"
-            yield from _iterate_numbers(inner, entry, depth + 1)
+            entry_path = f"{path}.{name}" if name and isinstance(name, str) else f"{path}[{place}]"
+            yield from _iterate_numbers(entry_path, entry, depth + 1)
 
 
 def _iterate_message_numbers(
@@ -172,12 +172,12 @@ def _iterate_message_numbers(
         # The stamp is the column of times.
         if field == "header" or (field in STAMP_FIELDS and _get_fields(value) is not None):
             continue
-        inner = f"{path}.{field}" if path else field
+        field_path = f"{path}.{field}" if path else field
         if _is_named(value, names):
             for name, number in zip(names, value, strict=True):
-                yield f"{inner}.{name}", _to_float(number)
+                yield f"{field_path}.{name}", _to_float(number)
         else:
-            yield from _iterate_numbers(inner, value, depth + 1)
+            yield from _iterate_numbers(field_path, value, depth + 1)
 
 
 def _is_named(values: Any, names: Any) -> bool:

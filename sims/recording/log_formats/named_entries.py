@@ -44,7 +44,7 @@ def entries_by_name(
             prefix = column[: len(stem["prefix"]) + 1] if stem["prefix"] else ""
             style = prefix, match["left"], match["right"]
             groups.setdefault(style, {})[int(match["place"])] = column
-    named: dict[str, Array] = {}
+    named_columns: dict[str, Array] = {}
     unlisted: set[str] = set()
     for style, places in groups.items():
         names = [list(texts[places[place]]) for place in sorted(places)]
@@ -56,9 +56,9 @@ def entries_by_name(
             )
             entries = _sort_by_name(values, names, f"{siblings}.")
             if entries and not entries.keys() & columns.keys():
-                named |= entries
+                named_columns |= entries
                 unlisted |= set(columns_by_number.values())
-    return named, frozenset(unlisted)
+    return named_columns, frozenset(unlisted)
 
 
 def lists_by_name(
@@ -73,7 +73,7 @@ def lists_by_name(
     Returns:
         The numbers by the names of their joints, and the lists that they replace.
     """
-    named: dict[str, Array] = {}
+    named_columns: dict[str, Array] = {}
     unlisted: set[str] = set()
     for names_column, cells in texts.items():
         stem = _NAMES_COLUMN.fullmatch(names_column)
@@ -85,9 +85,9 @@ def lists_by_name(
             if values.ndim == 2 and values.shape[1] == len(names):
                 entries = _sort_by_name(values, names, f"{name}.")
                 if entries and not entries.keys() & columns.keys():
-                    named |= entries
+                    named_columns |= entries
                     unlisted.add(name)
-    return named, frozenset(unlisted)
+    return named_columns, frozenset(unlisted)
 
 
 def arrays_by_name(
@@ -102,19 +102,19 @@ def arrays_by_name(
     Returns:
         The numbers by the names of their joints, and the arrays that they replace.
     """
-    named: dict[str, Array] = {}
+    named_columns: dict[str, Array] = {}
     unlisted: set[str] = set()
     for array, entry_names in names.items():
         if not re.search(r"name|joint|motor|label", array, re.IGNORECASE):
             continue
         for name, values in columns.items():
             if values.ndim == 2 and values.shape[1] == len(entry_names) == len(set(entry_names)):
-                named |= {
+                named_columns |= {
                     f"{name}.{entry_name}": make_read_only(values[:, k])
                     for k, entry_name in enumerate(entry_names)
                 }
                 unlisted.add(name)
-    return named, frozenset(unlisted)
+    return named_columns, frozenset(unlisted)
 
 
 def _group_numbered_columns(

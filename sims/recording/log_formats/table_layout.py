@@ -88,16 +88,16 @@ def find_layout(path: Path) -> Layout:
     width = _find_row_width([row for n, row in rows.items() if not COMMENT.match(lines[n - 1])])
     columns = _find_numeric_columns(rows.values(), width)
     first = next((n for n, row in rows.items() if _is_data(row, width, columns)), 0)
-    above = [n for n in rows if n < first] if first else list(rows)
+    rows_above = [n for n in rows if n < first] if first else list(rows)
     units_row: dict[int, str] = {}
     if (
-        above
+        rows_above
         and first
-        and (row_units := _parse_units(_normalise_row(rows[above[-1]], width), columns))
+        and (row_units := _parse_units(_normalise_row(rows[rows_above[-1]], width), columns))
     ):
         units_row = row_units
-        above.pop()
-    for n in reversed(above):
+        rows_above.pop()
+    for n in reversed(rows_above):
         names = _parse_header(lines[n - 1], separator, width, columns)
         if names is not None:
             units = {names[place]: unit for place, unit in units_row.items()}
@@ -105,11 +105,11 @@ def find_layout(path: Path) -> Layout:
     if not first:
         first_line = format_value(lines[0].strip())
         raise InputError(f"{path}: expected a header and rows of numbers, found {first_line}")
-    above = [n for n in above if not COMMENT.match(lines[n - 1])]
-    if not above and (column_numbers := _make_column_numbers(rows, first)):
+    rows_above = [n for n in rows_above if not COMMENT.match(lines[n - 1])]
+    if not rows_above and (column_numbers := _make_column_numbers(rows, first)):
         return Layout(encoding, separator, column_numbers, {}, first, first + 1, width)
-    if above and len(rows[above[-1]]) > 1 and width > 1:
-        n = above[-1]
+    if rows_above and len(rows[rows_above[-1]]) > 1 and width > 1:
+        n = rows_above[-1]
         raise InputError(
             f"{path}, row {n}: expected {width} names, one for each cell of row {first}, found "
             f"{len(rows[n])}; give each column a name"
@@ -253,8 +253,8 @@ def _make_column_numbers(rows: Mapping[int, Sequence[str]], first: int) -> tuple
     if len(numbers) < 3 or numbers not in counts:
         return ()
     # A first row 0, 1, 2, ... may also be data, unless the following rows contain fractions.
-    following = [row for line, row in rows.items() if line > first]
-    fractions = any("." in cell or "," in cell for row in following for cell in row)
+    following_rows = [row for line, row in rows.items() if line > first]
+    fractions = any("." in cell or "," in cell for row in following_rows for cell in row)
     return cells if fractions else ()
 
 

@@ -75,10 +75,10 @@ def read_text_table(path: Path) -> TextTable:
             texts[name] = kind.texts.tolist()
         else:
             columns[name] = make_read_only(values)
-    named, unlisted = entries_by_name(columns, texts)
-    listed, replaced = lists_by_name(columns, texts)
+    named_columns, unlisted = entries_by_name(columns, texts)
+    list_columns, replaced = lists_by_name(columns, texts)
     return TextTable(
-        {**columns, **named, **listed},
+        {**columns, **named_columns, **list_columns},
         tuple(texts),
         layout.units,
         unlisted | replaced,
@@ -208,12 +208,12 @@ def _iterate_rows(path: Path, layout: Layout) -> Iterator[tuple[int, int, list[s
         for _ in range(layout.first - 1):
             next(file, "")
         reader = csv.reader(file, delimiter=layout.separator, skipinitialspace=True)
-        before = layout.first - 1
+        last_line = layout.first - 1
         for row in reader:
             last = layout.first - 1 + reader.line_num
             if any(row) and not COMMENT.match(row[0]):
-                yield before + 1, last, row
-            before = last
+                yield last_line + 1, last, row
+            last_line = last
 
 
 def _find_last_line(path: Path, layout: Layout) -> int:
@@ -260,8 +260,8 @@ class _CellKind:
         ):
             return
         self.has_commas = True
-        several = (commas.str.count(",") > 1) | commas.str.contains(r",.*\.", regex=True)
-        self.is_thousands = bool(several.any())
+        has_several_commas = (commas.str.count(",") > 1) | commas.str.contains(r",.*\.", regex=True)
+        self.is_thousands = bool(has_several_commas.any())
         if separator != ",":
             self.has_decimal_commas = not self.is_thousands
         else:
@@ -370,8 +370,8 @@ class _CellKind:
         for number, text in enumerate(self.texts):
             match = NUMBERS.fullmatch(text)
             try:
-                inside = match["inside"].replace(",", " ").split() if match else None
-                row = [float(part) for part in inside] if inside is not None else None
+                list_entries = match["inside"].replace(",", " ").split() if match else None
+                row = [float(part) for part in list_entries] if list_entries is not None else None
             except ValueError:
                 row = None
             if row is None or (rows and len(row) != len(rows[0])) or len(row) > MAX_COLUMNS:

@@ -127,15 +127,15 @@ def _flatten_containers(name: str, value: Any, depth: int) -> list[tuple[str, An
     Raises:
         ValueError: There are more than `MAX_COLUMNS` entries, as where containers hold each other.
     """
-    inside: list[tuple[Any, Any]] = []
+    children: list[tuple[Any, Any]] = []
     if isinstance(value, dict):
-        inside = list(value.items())
+        children = list(value.items())
     elif type(value) in (list, tuple) and any(map(_is_container, value)):
-        inside = list(enumerate(value))
-    if not inside or depth > MAX_DEPTH:
+        children = list(enumerate(value))
+    if not children or depth > MAX_DEPTH:
         return [(name or "tensor", value)]
     entries: list[tuple[str, Any]] = []
-    for key, child in inside:
+    for key, child in children:
         entries += _flatten_containers(f"{name}/{key}" if name else str(key), child, depth + 1)
         if len(entries) > MAX_COLUMNS:
             raise ValueError("too many entries")

@@ -99,9 +99,9 @@ def split_unit(name: str) -> NamedUnit:
     for place in range(1, len(name)):
         if name[place] not in _JOINERS:
             continue
-        spelled = name[place:].strip(_JOINERS).removeprefix("in_").removeprefix("in ")
-        unit = read_unit(spelled)
-        if unit is not None and spelled.lower() not in _NEEDS_BRACKETS:
+        unit_text = name[place:].strip(_JOINERS).removeprefix("in_").removeprefix("in ")
+        unit = read_unit(unit_text)
+        if unit is not None and unit_text.lower() not in _NEEDS_BRACKETS:
             return NamedUnit(name[:place], *unit)
     camel = _CAMEL.fullmatch(name)
     if camel:
