@@ -89,16 +89,16 @@ def written_causes(
         }
         if selected_numbers:
             selected_causes[effect] = selected_numbers
-        for place, fitted in unidentified.items():
+        for place, fitted_value in unidentified.items():
             # A number that was never fitted has the value of the model file.
-            if fitted.at_bound is None and not fitted.value:
+            if fitted_value.at_bound is None and not fitted_value.value:
                 continue
-            end = {"low": "lower", "high": "upper", None: ""}[fitted.at_bound]
+            end = {"low": "lower", "high": "upper", None: ""}[fitted_value.at_bound]
             reason = f"lies at the {end} bound of its range" if end else "has no finite interval"
             name = effect if not place else f"{effect.partition('@')[0]}@{place}"
             left_out.append(
-                f"{name} is not written to the model file: its value, {fitted.value:.3g} "
-                f"{fitted.unit}, {reason} and is not a result"
+                f"{name} is not written to the model file: its value, {fitted_value.value:.3g} "
+                f"{fitted_value.unit}, {reason} and is not a result"
             )
     return selected_causes, tuple(left_out)
 

@@ -128,9 +128,9 @@ def choose_friction_form(
     Returns:
         The model in the other form; None if the present form is kept.
     """
-    fitted = _refit_in(other_world, models, model)
-    gain = fitted.likelihood.value - model.likelihood.value
-    return fitted if gain >= margin else None
+    refitted_model = _refit_in(other_world, models, model)
+    gain = refitted_model.likelihood.value - model.likelihood.value
+    return refitted_model if gain >= margin else None
 
 
 def _refit_in(world: RunEvaluator, models: ModelSet, model: FittedModel) -> FittedModel:
@@ -143,15 +143,15 @@ def _refit_in(world: RunEvaluator, models: ModelSet, model: FittedModel) -> Fitt
     other_models = ModelSet(
         world, models.noise, models.frozen, make_rng("friction form"), models.stated
     )
-    fitted = other_models.fit_one(FitStart(names, theta, model.fit.states))
+    refitted_model = other_models.fit_one(FitStart(names, theta, model.fit.states))
     if models.world.correction is None:
-        return fitted
+        return refitted_model
     # Both forms are compared without the discretisation error of the integrator.
     from bench.diagnosis.fitting.linearised_runs import correct_discretisation
 
-    correct_discretisation(world, models.noise, fitted.fit.theta, fitted.fit.states)
+    correct_discretisation(world, models.noise, refitted_model.fit.theta, refitted_model.fit.states)
     other_models.models.clear()
-    return other_models.fit_one(fitted.fit.make_start())
+    return other_models.fit_one(refitted_model.fit.make_start())
 
 
 def _is_dry_friction(effect: type[Effect]) -> bool:

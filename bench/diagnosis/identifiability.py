@@ -215,8 +215,8 @@ class _Identified:
             key = probe.effect, probe.place
             if key not in best or powers[k] > powers[best[key]]:
                 best[key] = k
-        chosen = list(best.values())
-        units = columns[:, chosen] / np.maximum(powers[chosen], 1e-300)
+        selected_columns = list(best.values())
+        units = columns[:, selected_columns] / np.maximum(powers[selected_columns], 1e-300)
         correlations = np.abs(units.T @ units)
         numbers = []
         for row, ((name, place), k) in zip(correlations, best.items(), strict=True):
@@ -225,7 +225,9 @@ class _Identified:
             half_width = Z95 / powers[k] if powers[k] > 0 else np.inf
             confounders = [
                 (other_effect, float(correlation))
-                for (other_effect, _), j, correlation in zip(best, chosen, row, strict=True)
+                for (other_effect, _), j, correlation in zip(
+                    best, selected_columns, row, strict=True
+                )
                 if other_effect != name and powers[j] > 0
             ]
             is_single_coefficient = sum(1 for effect, _ in best if effect == name) == 1
@@ -288,12 +290,14 @@ def _classify_parameter(
     )
 
 
-def format_identifiability(numbers: Sequence[ParameterIdentifiability], most: int = 8) -> list[str]:
+def format_identifiability(
+    numbers: Sequence[ParameterIdentifiability], max_count: int = 8
+) -> list[str]:
     """Format the free parameters and the best identifiable causes as lines for the terminal.
 
     Args:
         numbers: Result of `assess_identifiability`.
-        most: Maximum number of causes with their own line, and of names in a list.
+        max_count: Maximum number of causes with their own line, and of names in a list.
     """
     lines = ["what this recording can determine (95 % intervals, white noise assumed):"]
     lines += [f"  {_format_parameter(number)}" for number in numbers if number.free]
@@ -302,11 +306,14 @@ def format_identifiability(numbers: Sequence[ParameterIdentifiability], most: in
     lines.append(f"causes, each by itself, surest first: {', '.join(counts)}")
     # A limit has no interval, and follows the causes that have one.
     identifiable = sorted(causes["identifiable"], key=lambda number: bool(np.isnan(number.half)))
-    lines += [f"  {_format_parameter(number)}" for number in identifiable[:most]]
-    for level, members in (("identifiable too", identifiable[most:]), *list(causes.items())[1:]):
+    lines += [f"  {_format_parameter(number)}" for number in identifiable[:max_count]]
+    for level, members in (
+        ("identifiable too", identifiable[max_count:]),
+        *list(causes.items())[1:],
+    ):
         if members:
-            lines.append(f"  {level}: {listed(_count_effects(members), most)}")
-    if any(len(members) > most for members in causes.values()):
+            lines.append(f"  {level}: {listed(_count_effects(members), max_count)}")
+    if any(len(members) > max_count for members in causes.values()):
         lines.append("  every cause with its number: the same command with --json")
     return lines
 
@@ -328,19 +335,21 @@ def _count_effects(numbers: Sequence[ParameterIdentifiability]) -> list[str]:
     for number in numbers:
         effect, _, place = number.name.partition(" ")[0].partition("@")
         places.setdefault(effect, set()).add(place)
-    several = {name: len(effect_places) for name, effect_places in places.items()}
-    return [f"{name} ({n} places)" if n > 1 else name for name, n in several.items()]
+    place_counts = {name: len(effect_places) for name, effect_places in places.items()}
+    return [f"{name} ({n} places)" if n > 1 else name for name, n in place_counts.items()]
 
 
-def listed(names: Sequence[str], most: int) -> str:
+def listed(names: Sequence[str], max_count: int) -> str:
     """Join the first names, and count the remaining ones.
 
     Args:
         names: Names.
-        most: Maximum number of names to write.
+        max_count: Maximum number of names to write.
     """
-    unnamed_count = len(names) - most
-    return ", ".join(names[:most]) + (f" and {unnamed_count} more" if unnamed_count > 0 else "")
+    unnamed_count = len(names) - max_count
+    return ", ".join(names[:max_count]) + (
+        f" and {unnamed_count} more" if unnamed_count > 0 else ""
+    )
 
 
 _WORDS: tuple[IdentifiabilityLevel, ...] = ("identifiable", "weak", "not identifiable")

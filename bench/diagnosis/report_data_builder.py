@@ -180,13 +180,13 @@ class DiagnosisReportDataBuilder:
     def _summarise_held_out(self, sigma: Array) -> tuple[DataSplit | None, list[GapLocation]]:
         """Return the held-out runs and their gap locations; None and empty if not measured."""
         world = self.assessor.held_out_evaluator
-        measured = self.finding.held_out_fits
+        held_out_fits = self.finding.held_out_fits
         names = self.finding.model.effects
         # If the data do not identify the base model, it is not validated on held-out runs.
-        if world is None or measured is None or names not in measured:
+        if world is None or held_out_fits is None or names not in held_out_fits:
             return None, []
-        before = measured[()].simulated
-        after = measured[names].simulated
+        before = held_out_fits[()].simulated
+        after = held_out_fits[names].simulated
         places = residual_analysis.compute_gap_locations(
             world, before, after, sigma, f" ({self._how_validated})"
         )

@@ -186,8 +186,8 @@ def _simulate_runs(world: RunEvaluator, extended: ExtendedSimulator, sigma: Arra
     """Simulate the runs (R, T, C) with the model's numbers, from fitted initial states."""
     white = np.zeros(len(sigma))
     runs = HeldOutRuns(world, NoiseModel(sigma, white))
-    (measured,) = runs.fit_initial_states([build_theta(world, extended)])
-    return measured.simulated
+    (prediction,) = runs.fit_initial_states([build_theta(world, extended)])
+    return prediction.simulated
 
 
 def _compute_squared_errors(world: RunEvaluator, simulated: Array) -> Array:

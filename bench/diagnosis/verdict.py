@@ -298,7 +298,7 @@ class Verdict:
         # Null means that there is no value.
         heldout, proposed = document["heldout"], document["next_experiment"]
         # Older files do not have this key.
-        cut = document.get("cut")
+        early_stop = document.get("cut")
         return cls(
             document["verdict"],
             document["system"],
@@ -310,7 +310,7 @@ class Verdict:
             DiscriminatingRun(**proposed) if proposed is not None else None,
             document["simulations"],
             document["seconds"],
-            EarlyStop.from_document(cut) if cut is not None else None,
+            EarlyStop.from_document(early_stop) if early_stop is not None else None,
             tuple(RecordingFault.of(fault) for fault in document.get("recording_faults", ())),
             tuple(document.get("recording_notes", ())),
         )

@@ -139,25 +139,25 @@ class VerdictBuilder:
         Returns:
             Estimates by index in the parameter vector; those that were not fitted have no interval.
         """
-        fitted = compute_intervals(search, model)
+        intervals = compute_intervals(search, model)
         ranges = self._get_bounds(model)
         result = {}
         for place, parameter in enumerate(self.fitting_evaluator.parameters):
             # Insensitive parameters stay nominal; effects that are not in the model are zero.
             unfitted_estimate = float(model.fit.theta[place]), np.nan, np.nan
-            value, low, high = fitted.get(place, unfitted_estimate)
+            value, low, high = intervals.get(place, unfitted_estimate)
             if is_instant(parameter):
                 # The time of an event is only known to one sample spacing.
                 low, high = (
                     low - self.fitting_evaluator.sample_interval / 2,
                     high + self.fitting_evaluator.sample_interval / 2,
                 )
-            at_bound = bound_of(value, *ranges[place]) if place in fitted else None
+            at_bound = bound_of(value, *ranges[place]) if place in intervals else None
             # JSON has no number for an unknown bound; at a bound the curvature gives no interval.
             is_bounded = np.isfinite(low) and np.isfinite(high) and at_bound is None
             ends = (low, high) if is_bounded else (None, None)
             plausible_range = (
-                self._get_plausible_range(place) if place in fitted else parameter.bounds
+                self._get_plausible_range(place) if place in intervals else parameter.bounds
             )
             exceeded_range = (
                 plausible_range
@@ -192,9 +192,11 @@ class VerdictBuilder:
         from sims.robot.export.model_file_totals import totals
 
         placed_effects = list(self._iterate_fitted_effects(model))
-        fitted = [(effect, [numbers[i].value for i in places]) for effect, places in placed_effects]
+        fitted_effects = [
+            (effect, [numbers[i].value for i in places]) for effect, places in placed_effects
+        ]
         for (effect, places), effect_totals in zip(
-            placed_effects, totals(kind.robot, fitted), strict=True
+            placed_effects, totals(kind.robot, fitted_effects), strict=True
         ):
             # The model file keeps its gravity if the bodies are gravity-compensated.
             is_compensated = is_gravity_compensated(effect.name, {"": numbers[places[0]]})
@@ -294,10 +296,10 @@ class VerdictBuilder:
 
     def _compute_held_out_excess(self, finding: DiagnosisResult) -> float | None:
         """Return the excess RMS residual of the base model on held-out runs; None without them."""
-        runs, measured = self.held_out_evaluator, finding.held_out_fits
-        if runs is None or measured is None or () not in measured:
+        runs, held_out_fits = self.held_out_evaluator, finding.held_out_fits
+        if runs is None or held_out_fits is None or () not in held_out_fits:
             return None
-        normalised_residual = (runs.observed - measured[()].simulated) / self.noise_floor.sigma
+        normalised_residual = (runs.observed - held_out_fits[()].simulated) / self.noise_floor.sigma
         return (
             float(np.sqrt(np.square(normalised_residual[np.isfinite(runs.observed)]).mean())) - 1.0
         )
@@ -307,8 +309,8 @@ class VerdictBuilder:
 
         A cause may then compensate for a value beyond the bound.
         """
-        fitted = [numbers[i] for i in self.fitting_evaluator.base.tolist()]
-        return any(n.at_bound is not None and not n.is_result for n in fitted)
+        base_estimates = [numbers[i] for i in self.fitting_evaluator.base.tolist()]
+        return any(n.at_bound is not None and not n.is_result for n in base_estimates)
 
     def estimate_noise_sigma(self, finding: DiagnosisResult) -> Array:
         """Return the noise floor (C,).
@@ -380,14 +382,14 @@ class VerdictBuilder:
         Return None if the prediction of the base model failed, or if no runs were predicted with
         both models.
         """
-        runs, measured, names = (
+        runs, held_out_fits, names = (
             self.held_out_evaluator,
             finding.held_out_fits,
             finding.model.effects,
         )
-        if runs is None or measured is None or names not in measured:
+        if runs is None or held_out_fits is None or names not in held_out_fits:
             return None
-        before, after = measured[()].simulated, measured[names].simulated
+        before, after = held_out_fits[()].simulated, held_out_fits[names].simulated
         before = before if self.before is None else self.before
         # Without a prediction of the base model there is no gap to measure.
         if not np.isfinite(before[np.isfinite(runs.observed)]).all():
@@ -420,9 +422,9 @@ class VerdictBuilder:
         for i, effect in enumerate(scores.effects):
             score = float(scores.score[i])
             # A fit may gain more than the linear score predicts, in particular far from the data.
-            alone = search.models.get(frozenset({effect}))
-            if alone is not None:
-                score = max(score, float(alone.likelihood.value - base))
+            single_effect_model = search.models.get(frozenset({effect}))
+            if single_effect_model is not None:
+                score = max(score, float(single_effect_model.likelihood.value - base))
             beyond_chance = np.array([score - scores.null_quantiles[i]])
             p_value = float(
                 np.clip(estimate_tail_p_value(scores.null_scores, beyond_chance), 0.0, 1.0)
@@ -435,14 +437,14 @@ class VerdictBuilder:
 
     def _get_closed_share(self, finding: DiagnosisResult, names: EffectNames) -> float | None:
         """Return the share of the held-out gap that a model closes; None if it is not measured."""
-        runs, measured = self.held_out_evaluator, finding.held_out_fits
-        if runs is None or measured is None or names not in measured:
+        runs, held_out_fits = self.held_out_evaluator, finding.held_out_fits
+        if runs is None or held_out_fits is None or names not in held_out_fits:
             return None
-        counted = self._list_counted_channels()
+        counted_channels = self._list_counted_channels()
         floor = self._compute_noise_floor(finding)
         # As for the gain of the whole model, an error below the noise floor is not a gain.
-        before = _compute_rmse(runs, measured[()].simulated, counted)
-        after = _compute_rmse(runs, measured[names].simulated, counted)
+        before = _compute_rmse(runs, held_out_fits[()].simulated, counted_channels)
+        after = _compute_rmse(runs, held_out_fits[names].simulated, counted_channels)
         share = 0.0
         # At the noise floor there is no gap, and the quotient would be a rounding error.
         if before > floor * 1.001:
@@ -458,12 +460,12 @@ class VerdictBuilder:
         Returns:
             Low and high end by effect, for effects that were simulated alone on held-out runs.
         """
-        runs, measured = self.held_out_evaluator, finding.held_out_fits
-        if runs is None or measured is None:
+        runs, held_out_fits = self.held_out_evaluator, finding.held_out_fits
+        if runs is None or held_out_fits is None:
             return {}
-        before = measured[()].simulated
+        before = held_out_fits[()].simulated
         intervals = {}
-        for names, simulated in measured.items():
+        for names, simulated in held_out_fits.items():
             share = self._get_closed_share(finding, names)
             if len(names) != 1 or share is None or share <= MIN_REPORTED_GAIN:
                 continue
@@ -512,8 +514,10 @@ def _compute_rmse(world: RunEvaluator, simulated: Array, channels: list[int]) ->
 
 def _propose_identifying_run(unidentified: tuple[str, ...]) -> DiscriminatingRun:
     """Propose how to identify parameters that the data do not identify."""
-    several = len(unidentified) > 1
-    condition_text = "they act differently from each other" if several else "it makes a difference"
+    has_several = len(unidentified) > 1
+    condition_text = (
+        "they act differently from each other" if has_several else "it makes a difference"
+    )
     names = " and ".join(unidentified)
     return DiscriminatingRun(f"Measure {names} apart, or record runs in which {condition_text}")
 

@@ -54,12 +54,12 @@ def find_preceding_joint(robot: RobotModel, name: str) -> Joint | None:
 @cache_per_robot
 def list_coupling_places(robot: RobotModel) -> tuple[str, ...]:
     """List the joints whose drives can be coupled to the preceding joint."""
-    driven = {actuator.joint for actuator in robot.actuators}
+    driven_joints = {actuator.joint for actuator in robot.actuators}
     return tuple(
         joint.name
         for joint in robot.joints
         if joint.has_one_coordinate
-        and joint.name in driven
+        and joint.name in driven_joints
         and find_preceding_joint(robot, joint.name) is not None
     )
 

@@ -77,13 +77,13 @@ class FittedCause:
 
     def format(self, recording: str) -> str:
         """Format as ``friction.coulomb@elbow: 0.3 N·m (95 %: 0.28 to 0.32), fitted to log.csv``."""
-        several = len(self.numbers) > 1
+        has_several = len(self.numbers) > 1
         numbers = [
-            (f"{name} " if several else "") + _format_estimate(number)
+            (f"{name} " if has_several else "") + _format_estimate(number)
             for name, number in self.numbers.items()
         ]
-        fitted = f", fitted to {recording}" if recording else ""
-        return f"{self.name}: {', '.join(numbers)}{fitted}"
+        origin_text = f", fitted to {recording}" if recording else ""
+        return f"{self.name}: {', '.join(numbers)}{origin_text}"
 
 
 def _format_estimate(number: FittedValue) -> str:

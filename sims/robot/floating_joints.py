@@ -159,7 +159,7 @@ class FloatingJoints:
                 )
         return result
 
-    def displaced(self, pose: Array, moves: Array) -> Array:
+    def displaced(self, pose: Array, displacements: Array) -> Array:
         """Displace poses (n, P) by small displacements (n, F) by (1), in m and rad.
 
         Positions move along the axes of the world; rotations are about the axes of the body.
@@ -167,8 +167,8 @@ class FloatingJoints:
         result = pose.copy()
         for axes, quaternion_columns, first in self._joint_addresses:
             place = slice(quaternion_columns.start - len(axes), quaternion_columns.start)
-            result[:, place] += moves[:, first : first + len(axes)]
-            rotation = moves[:, first + len(axes) : first + len(axes) + len(SPIN)]
+            result[:, place] += displacements[:, first : first + len(axes)]
+            rotation = displacements[:, first + len(axes) : first + len(axes) + len(SPIN)]
             angle = np.linalg.norm(rotation, axis=1, keepdims=True)
             # sin(a / 2) / a, whose limit is 1 / 2 at a = 0.
             half_sinc = 0.5 * np.sinc(angle / (2.0 * np.pi))
@@ -212,16 +212,16 @@ def _multiply_quaternions(first: Array, second: Array) -> Array:
     """Compute the Hamilton products (n, 4) of `first` and `second`, quaternions (w, x, y, z)."""
     a, u = first[:, :1], first[:, 1:]
     b, v = second[:, :1], second[:, 1:]
-    real = a * b - np.sum(u * v, axis=1, keepdims=True)
-    return np.concatenate([real, a * v + b * u + np.cross(u, v)], axis=1)
+    real_part = a * b - np.sum(u * v, axis=1, keepdims=True)
+    return np.concatenate([real_part, a * v + b * u + np.cross(u, v)], axis=1)
 
 
 def _compute_rotation_vectors(quaternions: Array) -> Array:
     """Compute rotation vectors (n, 3) of unit quaternions, with angles of at most pi."""
     sign = np.where(quaternions[:, :1] < 0, -1.0, 1.0)
-    real, vector = sign * quaternions[:, :1], sign * quaternions[:, 1:]
+    real_part, vector = sign * quaternions[:, :1], sign * quaternions[:, 1:]
     length = np.linalg.norm(vector, axis=1, keepdims=True)
-    angle = 2.0 * np.arctan2(length, real)
+    angle = 2.0 * np.arctan2(length, real_part)
     is_small = length < MIN_QUATERNION_NORM
     scale = np.where(is_small, 2.0, angle / np.where(is_small, 1.0, length))
     return vector * scale

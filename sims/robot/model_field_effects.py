@@ -400,14 +400,14 @@ def _limit_force(fields: Fields, robot: RobotModel, place: str, c: Array) -> Non
     `free` marks elements whose actuator has no force range yet; theirs starts from ±infinity.
     """
     number = robot.actuator(place).id
-    limited, ranges = fields["actuator_forcelimited"], fields["actuator_forcerange"]
+    is_limited, ranges = fields["actuator_forcelimited"], fields["actuator_forcerange"]
     limits = c[0] > 0
-    free = limits & ~limited[:, number].astype(bool)
+    free = limits & ~is_limited[:, number].astype(bool)
     ranges[free, number] = (-np.inf, np.inf)
-    cut = np.stack([-c[0], c[0]], axis=1)[limits]
+    force_range = np.stack([-c[0], c[0]], axis=1)[limits]
     low, high = ranges[limits, number].T
-    ranges[limits, number] = np.clip(cut, low[:, None], high[:, None])  # (5)
-    limited[limits, number] = True
+    ranges[limits, number] = np.clip(force_range, low[:, None], high[:, None])  # (5)
+    is_limited[limits, number] = True
 
 
 COUPLING_FIELD = "wrap_prm"

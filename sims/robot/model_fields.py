@@ -77,8 +77,10 @@ def _make_servo_gain_finder(term: int) -> Find:
 def _force_range(robot: RobotModel, place: str) -> list[list[ModelField]]:
     """Return both ends of an actuator's force range, which one positive limit determines."""
     number = robot.actuator(place).id
-    ends = [ModelField("actuator_forcerange", (number, end), (-1, 1)[end]) for end in (1, 0)]
-    return [ends]
+    range_fields = [
+        ModelField("actuator_forcerange", (number, end), (-1, 1)[end]) for end in (1, 0)
+    ]
+    return [range_fields]
 
 
 def _make_gravity_finder(*axes: int) -> Find:

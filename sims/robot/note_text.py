@@ -13,21 +13,25 @@ MAX_LISTED_WITH_NUMBERS = 4
 
 
 def format_name_list(
-    names: Iterable[str], most: int = MAX_LISTED_NAMES, separator: str = ", "
+    names: Iterable[str], max_names: int = MAX_LISTED_NAMES, separator: str = ", "
 ) -> str:
     """Format names as a list without duplicates.
 
     Args:
         names: names to list; each is shortened to 200 characters.
-        most: maximum number of names to list.
+        max_names: maximum number of names to list.
         separator: text between two names.
 
     Returns:
-        The first `most` names, followed by the number of the remaining ones ("and 3 more").
+        The first `max_names` names, followed by the number of the remaining ones ("and 3 more").
     """
     unique_names = list(dict.fromkeys(names))
-    others_text = f" and {len(unique_names) - most} more" if len(unique_names) > most else ""
-    return separator.join(truncate_text(name, 200) for name in unique_names[:most]) + others_text
+    others_text = (
+        f" and {len(unique_names) - max_names} more" if len(unique_names) > max_names else ""
+    )
+    return (
+        separator.join(truncate_text(name, 200) for name in unique_names[:max_names]) + others_text
+    )
 
 
 def format_item_list(items: Sequence[str]) -> str:

@@ -134,8 +134,8 @@ def strip_shapes(robot: RobotModel) -> RobotModel:
         geom.contype = geom.conaffinity = 0
     try:
         spec.discard_visual()
-        bare = replace(robot, spec=spec)
-        return bare if bare.compiled.nq == robot.compiled.nq else robot
+        stripped_robot = replace(robot, spec=spec)
+        return stripped_robot if stripped_robot.compiled.nq == robot.compiled.nq else robot
     except ValueError:
         return robot
 

@@ -255,13 +255,13 @@ class RobotModel:
         control, controls = i, 1
         if hasattr(model, "actuator_ctrladr"):
             control, controls = int(model.actuator_ctrladr[i]), int(model.actuator_ctrlnum[i])
-        limited = controls > 0 and bool(model.actuator_ctrllimited[control])
-        moves = self._get_tendon_joints(i)
+        is_limited = controls > 0 and bool(model.actuator_ctrllimited[control])
+        moved_joints = self._get_tendon_joints(i)
         motion = None
         if joint is not None:
             motion = self.joint(joint).motion
         elif int(model.actuator_trntype[i]) == int(mujoco.mjtTrn.mjTRN_TENDON):
-            kinds = {self.joint(name).motion for name in moves}
+            kinds = {self.joint(name).motion for name in moved_joints}
             # A spatial tendon has a length, and no joints of its own.
             motion = kinds.pop() if len(kinds) == 1 else None if kinds else "slide"
         elif int(model.actuator_trntype[i]) == int(mujoco.mjtTrn.mjTRN_SITE):
@@ -271,12 +271,12 @@ class RobotModel:
             id=i,
             joint=joint,
             kind=_detect_actuator_kind(model, i),
-            range=_get_limit(model.actuator_ctrlrange[control], True) if limited else None,
+            range=_get_limit(model.actuator_ctrlrange[control], True) if is_limited else None,
             force=_get_limit(model.actuator_forcerange[i], bool(model.actuator_forcelimited[i])),
             control=control,
             controls=controls,
             motion=motion,
-            moves=moves if joint is None else (),
+            moves=moved_joints if joint is None else (),
         )
 
     def _get_tendon_joints(self, i: int) -> tuple[str, ...]:
@@ -299,16 +299,16 @@ class RobotModel:
     def bodies(self) -> tuple[Body, ...]:
         """Bodies that joints move, directly or through other bodies."""
         model = self.compiled
-        fused: dict[str, list[str]] = {}
+        fused_names: dict[str, list[str]] = {}
         for alias, name in (self.aliases or {}).items():
-            fused.setdefault(name, []).append(alias)
+            fused_names.setdefault(name, []).append(alias)
         moving_bodies = []
         for i in range(1, model.nbody):
             # Bodies welded to the world do not move; those welded to other bodies move with them.
             if int(model.body_weldid[i]) == 0:
                 continue
             name = model.body(i).name or f"body{i}"
-            aliases = tuple(fused.get(name, ()))
+            aliases = tuple(fused_names.get(name, ()))
             moving_bodies.append(Body(name, i, float(model.body_mass[i]), aliases))
         return tuple(moving_bodies)
 
@@ -320,9 +320,11 @@ class RobotModel:
         for i in range(model.nsensor):
             name = model.sensor(i).name or f"sensor{i}"
             begin, count = int(model.sensor_adr[i]), int(model.sensor_dim[i])
-            ends = [""] if count == 1 else [f".{axis}" for axis in _list_axis_suffixes(count)]
+            name_endings = (
+                [""] if count == 1 else [f".{axis}" for axis in _list_axis_suffixes(count)]
+            )
             unit = self._get_sensor_unit(i)
-            rows += [SensorRow(name + end, begin + k, unit) for k, end in enumerate(ends)]
+            rows += [SensorRow(name + end, begin + k, unit) for k, end in enumerate(name_endings)]
         return tuple(rows)
 
     def _get_sensor_unit(self, sensor: int) -> str:
@@ -416,8 +418,8 @@ def cache_per_robot(
     return asked
 
 
-def _get_limit(values: Any, limited: bool) -> tuple[float, float] | None:
-    return (float(values[0]), float(values[1])) if limited else None
+def _get_limit(values: Any, is_limited: bool) -> tuple[float, float] | None:
+    return (float(values[0]), float(values[1])) if is_limited else None
 
 
 def _detect_actuator_kind(model: Any, i: int) -> ActuatorKind:
@@ -453,8 +455,12 @@ def filters() -> tuple[int, int]:
 
 def _list_axis_suffixes(count: int) -> list[str]:
     """Return name endings for the numbers of a sensor: axes, quaternion entries, or indices."""
-    named = {3: "xyz", 4: "wxyz"}
-    return list(named[count]) if count in named else [str(k) for k in range(count)]
+    suffixes_by_count = {3: "xyz", 4: "wxyz"}
+    return (
+        list(suffixes_by_count[count])
+        if count in suffixes_by_count
+        else [str(k) for k in range(count)]
+    )
 
 
 _UNITS: Mapping[int, str] = {

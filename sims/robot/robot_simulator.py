@@ -344,7 +344,7 @@ class RobotSimulator(SystemSimulator):
             if self._drives
             else applied_inputs
         )
-        begins: Array = self.time_step * np.arange(float(steps))
+        step_starts: Array = self.time_step * np.arange(float(steps))
         model = self.robot.compiled
         controls = np.zeros((n, steps, model.nu))
         forces = np.zeros((n, steps, model.nv))
@@ -367,7 +367,7 @@ class RobotSimulator(SystemSimulator):
                 forces[:, :, joint.velocity] = applied_inputs[f"force.{joint.name}"]
         dofs = self.addresses.velocities
         forces[:, :, dofs] += compute_time_dependent_forces(
-            self.robotic, batch.acting, begins, len(dofs), n
+            self.robotic, batch.acting, step_starts, len(dofs), n
         )
         initial_activations = np.zeros((n, model.na))
         for activation_filter in activation_filters(self.robot):
@@ -662,7 +662,7 @@ def make_robot_simulator(
     identity_text = repr((robot.digest, tuple(free), tuple(numerics)))
     identity_text += "" if robot.friction_form == "stiff" else robot.friction_form
     system = make_robot_system(robot, free)
-    declared = {
+    attributes = {
         "system": system,
         "robot": robot,
         "numerics": numerics,
@@ -672,4 +672,4 @@ def make_robot_simulator(
         "__module__": __name__,
         "__doc__": f"The robot of {robot.path.name}.",
     }
-    return type("RobotOfFile", (RobotSimulator,), declared)
+    return type("RobotOfFile", (RobotSimulator,), attributes)

@@ -262,7 +262,7 @@ def make_robot_system(robot: RobotModel, free: Sequence[str] = ()) -> type[Robot
         if len(position_servos) == 1:
             servos[number] = f"u.{position_servos[0].name}"
             gears[number] = float(model.actuator_gear[position_servos[0].id, 0])
-    declared: dict[str, Any] = {
+    attributes: dict[str, Any] = {
         "name": robot.name,
         "says": f"the robot of {robot.path.name}",
         "parameters": (),
@@ -289,14 +289,14 @@ def make_robot_system(robot: RobotModel, free: Sequence[str] = ()) -> type[Robot
             {f"u.{a.name}": INTEGRATES for a in robot.actuators if robot.integrates(a)}
         ),
     }
-    system: type[RobotSystem] = type("RobotSystemOfFile", (RobotSystem,), declared)
+    system: type[RobotSystem] = type("RobotSystemOfFile", (RobotSystem,), attributes)
     if not free:
         return system
     effects = list_freed_effects(system, free)
-    declared["freed_parameters"] = frozenset(effect.name for effect in effects)
-    declared["parameters"] = tuple(p for effect in effects for p in _make_parameters(effect))
-    declared["freed_effects"] = tuple(effects)
-    return type("RobotSystemOfFile", (RobotSystem,), declared)
+    attributes["freed_parameters"] = frozenset(effect.name for effect in effects)
+    attributes["parameters"] = tuple(p for effect in effects for p in _make_parameters(effect))
+    attributes["freed_effects"] = tuple(effects)
+    return type("RobotSystemOfFile", (RobotSystem,), attributes)
 
 
 def list_freed_effects(system: type[RobotSystem], free: Sequence[str]) -> list[type[Effect]]:
@@ -335,8 +335,8 @@ def _make_parameters(effect: type[Effect]) -> list[Parameter]:
         # A coefficient that cannot be observed has an empty range; it gets wider bounds, and the
         # data will not identify it.
         if c.least is not None and c.least != c.most:
-            most = np.inf if c.most is None else c.most
-            bounds = max(bounds[0], c.least), min(bounds[1], most)
+            upper_limit = np.inf if c.most is None else c.most
+            bounds = max(bounds[0], c.least), min(bounds[1], upper_limit)
         name = effect.name if len(effect.coefficients) == 1 else f"{effect.name}.{c.name}"
         unit = c.units[0] or "1"
         result.append(Parameter(name, unit, 0.0, bounds, (low, high), says=effect.says))

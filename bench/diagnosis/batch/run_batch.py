@@ -74,7 +74,7 @@ def explain_batch(
     out: Path,
     settings: Mapping[str, Any],
     pool: Pool,
-    done: Callable[[LogResult], None],
+    report_result: Callable[[LogResult], None],
     stop: Callable[[], bool] = lambda: False,
 ) -> list[LogResult]:
     """Explain every log that is not explained yet, and write the table of all.
@@ -84,7 +84,7 @@ def explain_batch(
         out: Output folder of the batch; results of an earlier call in it are reused.
         settings: Settings as for `list_logs`.
         pool: Worker pool that makes the calls.
-        done: Callback that receives the result of each log.
+        report_result: Callback that receives the result of each log.
         stop: Function that is called after each log; if it returns True, the other logs remain for
             another call.
 
@@ -93,7 +93,7 @@ def explain_batch(
     """
     rows = _load_previous_results(out, logs)
     for row in rows.values():
-        done(row)
+        report_result(row)
     remaining = [log for log in logs if log.name not in rows]
     # A worker process does not know the figure settings of this process.
     calls = [(explain_log, (log, dict(settings), is_pdf_wanted())) for log in remaining]
@@ -107,7 +107,7 @@ def explain_batch(
         rows[log.name] = row
         ordered = [rows[batch_log.name] for batch_log in logs if batch_log.name in rows]
         _write_results(out, ordered)
-        done(row)
+        report_result(row)
         if stop():
             break
     ordered = [rows[log.name] for log in logs if log.name in rows]
@@ -153,10 +153,10 @@ def _load_previous_results(out: Path, logs: Sequence[BatchLog]) -> dict[str, Log
         check_folder_empty(out)
         return {}
     try:
-        stored = [LogResult(**row) for row in json.loads(path.read_text())]
+        stored_results = [LogResult(**row) for row in json.loads(path.read_text())]
     except (OSError, ValueError, TypeError):
         raise InputError(f"{path}: is none of simgap's; name another folder") from None
-    by_name = {row.log: row for row in stored}
+    by_name = {row.log: row for row in stored_results}
     unchanged = {log.name: by_name[log.name] for log in logs if log.name in by_name}
     digests = {log.name: log.digest for log in logs}
     return {

@@ -209,11 +209,11 @@ def _linearise_extended(
     Only the initial states are fitted; parameters and coefficients keep their values.
     """
     theta = build_theta(evaluator, extended)
-    (measured,) = HeldOutRuns(evaluator, noise).fit_initial_states([theta])
+    (prediction,) = HeldOutRuns(evaluator, noise).fit_initial_states([theta])
     known_values = [extended.parameters.get(p.name) for p in evaluator.parameters[: evaluator.own]]
     # A parameter without an interval was not fitted.
     frozen = {i for i, number in enumerate(known_values) if number is None or number.low is None}
-    start = FitStart(tuple(extended.effects), theta, measured.states)
+    start = FitStart(tuple(extended.effects), theta, prediction.states)
     return TrajectoryFitter(evaluator, noise, frozenset(frozen)).fit_models([start], iterations=0)[
         0
     ]

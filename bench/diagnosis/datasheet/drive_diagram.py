@@ -120,21 +120,21 @@ class DriveDiagram:
 
 
 def compute_drive_diagram(
-    subject: SheetSubject, extended: ExtendedSimulator, strongest: float | None
+    subject: SheetSubject, extended: ExtendedSimulator, force_limit: float | None
 ) -> DriveDiagram:
     """Compute the diagram of a joint.
 
     Args:
         subject: Joint or system.
         extended: Extended simulator.
-        strongest: Force limit of the drive; None if it has none.
+        force_limit: Force limit of the drive; None if it has none.
     """
     joint = _Joint(subject, extended)
     zero = np.zeros(1)
     no_load_friction = float(joint.friction(zero, zero)[0])
-    reach = strongest or DEFAULT_LOAD_FACTOR * no_load_friction or 1.0
-    load = np.linspace(-reach, reach, LOAD_POINT_COUNT)
-    search_range = MAX_FORCE_FACTOR * reach
+    load_range = force_limit or DEFAULT_LOAD_FACTOR * no_load_friction or 1.0
+    load = np.linspace(-load_range, load_range, LOAD_POINT_COUNT)
+    search_range = MAX_FORCE_FACTOR * load_range
 
     def forward_balance(u: Array, p: Array) -> Array:
         return u - p + joint.pull(u, p) - joint.friction(u, p)  # (1)
@@ -153,7 +153,7 @@ def compute_drive_diagram(
         float(_find_roots(lambda u: forward_balance(u, zero), search_range, 1)[0]),
         float(_find_roots(unpowered_balance, search_range, 1)[0]),
         joint.names,
-        reach,
+        load_range,
         joint.without,
     )
 

@@ -83,14 +83,15 @@ def draw_diagram(axes: Axes, diagram: DriveDiagram) -> None:
         axes: Axes to draw on.
         diagram: Diagram to draw.
     """
-    reach, unit = diagram.reach, format_unit(diagram.unit)
+    load_range, unit = diagram.reach, format_unit(diagram.unit)
     load = diagram.load
     forward, backward = (
-        np.clip(boundary, -2 * reach, 2 * reach) for boundary in (diagram.forward, diagram.back)
+        np.clip(boundary, -2 * load_range, 2 * load_range)
+        for boundary in (diagram.forward, diagram.back)
     )
-    axes.fill_between(load, forward, 2 * reach, color=style.PALE_BLUE, linewidth=0)
+    axes.fill_between(load, forward, 2 * load_range, color=style.PALE_BLUE, linewidth=0)
     axes.fill_between(load, backward, forward, color=style.HELD_OUT_GREY, linewidth=0)
-    axes.fill_between(load, -2 * reach, backward, color=style.PALE_RUST, linewidth=0)
+    axes.fill_between(load, -2 * load_range, backward, color=style.PALE_RUST, linewidth=0)
     axes.plot(load, forward, color=style.BLUE, linewidth=1.5)
     axes.plot(load, backward, color=style.VERMILION, linewidth=1.5, linestyle=(0, (5, 2)))
     axes.plot(load, load, color=style.CONNECTOR_GREY, linewidth=0.8, linestyle=":")
@@ -100,22 +101,22 @@ def draw_diagram(axes: Axes, diagram: DriveDiagram) -> None:
         (diagram.breakaway, (0.0, diagram.breakaway), "o"),
         (diagram.backdrive, (diagram.backdrive, 0.0), "s"),
     ):
-        if 0 < force <= reach:
+        if 0 < force <= load_range:
             axes.plot(
                 *position, marker=marker, color=style.NEUTRAL_MARK, markersize=5, linestyle="none"
             )
             text = f" {format_number(force)} {unit}"
             axes.annotate(text, position, xytext=(4, 4), textcoords="offset points")
     text_style: dict[str, Any] = {"ha": "center", "va": "center", "color": style.CAPTION_GREY}
-    axes.text(-0.55 * reach, 0.75 * reach, "moves forward", **text_style)
-    axes.text(0.55 * reach, -0.75 * reach, "moves back", **text_style)
-    axes.text(0.72 * reach, 0.25 * reach, "back-driven:\nthe load slips", **text_style)
-    middle = 0.62 * reach
-    if np.interp(middle, load, forward - backward) > 0.15 * reach:
+    axes.text(-0.55 * load_range, 0.75 * load_range, "moves forward", **text_style)
+    axes.text(0.55 * load_range, -0.75 * load_range, "moves back", **text_style)
+    axes.text(0.72 * load_range, 0.25 * load_range, "back-driven:\nthe load slips", **text_style)
+    middle = 0.62 * load_range
+    if np.interp(middle, load, forward - backward) > 0.15 * load_range:
         axes.text(middle, middle, "holds", **text_style)
     axes.set(
-        xlim=(-reach, reach),
-        ylim=(-reach, reach),
+        xlim=(-load_range, load_range),
+        ylim=(-load_range, load_range),
         xlabel=f"load [{unit}]",
         ylabel=f"force of the motor [{unit}]",
     )
@@ -140,10 +141,10 @@ def draw_sheet(content: SheetContent) -> Figure:
         text = "\n".join(textwrap.wrap(content.without_drive(), _LETTERS))
         figure.text(_MARGIN, top - 0.01, text, va="top", linespacing=1.4)
         # Without a diagram there is space for a table with a larger font.
-        _draw_effects_not_shown(figure, content, size=_SMALL_SIZE + 1.4, begins=top - 0.09)
+        _draw_effects_not_shown(figure, content, size=_SMALL_SIZE + 1.4, table_top=top - 0.09)
         return figure
-    below = _draw_effects_not_shown(figure, content, size=_SMALL_SIZE)
-    height = min(_MAX_DIAGRAM_HEIGHT, top - below - 0.09)
+    table_top = _draw_effects_not_shown(figure, content, size=_SMALL_SIZE)
+    height = min(_MAX_DIAGRAM_HEIGHT, top - table_top - 0.09)
     if height > 0.1:
         width = height * A4_INCHES[1] / A4_INCHES[0]
         draw_diagram(figure.add_axes((_MARGIN + 0.09, top - height - 0.03, width, height)), diagram)
@@ -172,7 +173,7 @@ def _draw_number_table(figure: Figure, content: SheetContent, top: float) -> flo
             sanitise(format_name(row), 60),
             sanitise(format_fitted_value(row.number), 70),
             format_prediction_interval(row),
-            sanitise(format_evidence(row, short=True), 60),
+            sanitise(format_evidence(row, is_short=True), 60),
         )
         for row in content.rows
         if row.number is not None
@@ -201,12 +202,14 @@ def _choose_table_layout(rows: Sequence[Sequence[str]]) -> tuple[float, list[flo
         ):
             break
         size -= 0.25
-    begins = np.concatenate([[0.0], np.cumsum(widths[:-1]) + gap * np.arange(1, len(widths))])
-    return size, (_MARGIN + begins / A4_INCHES[0]).tolist()
+    column_positions = np.concatenate(
+        [[0.0], np.cumsum(widths[:-1]) + gap * np.arange(1, len(widths))]
+    )
+    return size, (_MARGIN + column_positions / A4_INCHES[0]).tolist()
 
 
 def _draw_effects_not_shown(
-    figure: Figure, content: SheetContent, size: float, begins: float = 0.0
+    figure: Figure, content: SheetContent, size: float, table_top: float = 0.0
 ) -> float:
     """Draw the effects that are not shown in two columns.
 
@@ -214,7 +217,7 @@ def _draw_effects_not_shown(
         figure: Page to draw on.
         content: Content of the data sheet.
         size: Font size in points.
-        begins: Height of the first line, as a share of the page; 0 for a table that ends at the
+        table_top: Height of the first line, as a share of the page; 0 for a table that ends at the
             foot of the page.
 
     Returns:
@@ -237,11 +240,11 @@ def _draw_effects_not_shown(
     line = _SMALL * 1.2 * size / _SMALL_SIZE
     heights = [len(lines) for _, lines in rows]
     split_row = next((i for i in range(len(rows) + 1) if 2 * sum(heights[:i]) >= sum(heights)), 0)
-    tallest = line * max(sum(heights[:split_row]), sum(heights[split_row:]))
+    table_height = line * max(sum(heights[:split_row]), sum(heights[split_row:]))
     # A long table must not overlap the foot of the page.
-    begins = max(begins, 0.045 + tallest)
+    table_top = max(table_top, 0.045 + table_height)
     for column, part in enumerate((rows[:split_row], rows[split_row:])):
-        x, y = _MARGIN + 0.45 * column, begins
+        x, y = _MARGIN + 0.45 * column, table_top
         for name, lines in part:
             figure.text(
                 x, y, sanitise(name, name_length), va="top", fontsize=size, family="monospace"
@@ -250,10 +253,10 @@ def _draw_effects_not_shown(
             figure.text(x + beside_name, y, limit_text, va="top", fontsize=size, linespacing=1.25)
             y -= line * len(lines)
     heading = "Not shown by these data, and how small a number they would have shown (95 %)"
-    figure.text(_MARGIN, begins + 0.018, heading, weight="bold", va="top")
+    figure.text(_MARGIN, table_top + 0.018, heading, weight="bold", va="top")
     text = "Limits and gaps show from the size given on. Made by simgap datasheet."
     figure.text(_MARGIN, 0.028, text, fontsize=6, color=style.CAPTION_GREY, va="top")
-    return begins + 0.02
+    return table_top + 0.02
 
 
 def _draw_diagram_text(figure: Figure, diagram: DriveDiagram, x: float, y: float) -> None:

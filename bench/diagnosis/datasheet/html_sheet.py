@@ -37,9 +37,11 @@ def render_page(
         diagram_files: Diagram as SVG, and as PDF if requested; None without a drive.
         mjcf: MJCF files with their notes.
     """
-    page, still = HtmlPage(), None
+    page, printed_figure = HtmlPage(), None
     if sheet.diagram is not None and diagram_files is not None:
-        still = PrintedFigure(*diagram_files, _describe_rest_forces(sheet.diagram), DIAGRAM_NAME)
+        printed_figure = PrintedFigure(
+            *diagram_files, _describe_rest_forces(sheet.diagram), DIAGRAM_NAME
+        )
         columns = {
             "load": sheet.diagram.load.tolist(),
             "moves_forward": sheet.diagram.forward.tolist(),
@@ -49,7 +51,7 @@ def render_page(
     return page.render(
         _TEMPLATE,
         sheet=sheet,
-        still=still,
+        still=printed_figure,
         runs=_format_runs([run.name for run in sheet.recording.training()]),
         elsewhere=joined(list(sheet.elsewhere())),
         class_file=CLASS_FILE,

@@ -201,8 +201,8 @@ def group_runs_by_constants(facts: SheetContent) -> list[ConstantsGroup]:
         by_constants.setdefault(tuple(sorted(run.constants.items())), []).append(run)
     defaults = {c.name: c.value for c in facts.subject.kind.constants}
     defaults |= {p.name: p.nominal for p in facts.subject.kind.parameters}
-    fitted = {name: number.value for name, number in facts.extended.parameters.items()}
-    numbers = {**defaults, **facts.recording.constants, **facts.extended.constants, **fitted}
+    fitted_values = {name: number.value for name, number in facts.extended.parameters.items()}
+    numbers = {**defaults, **facts.recording.constants, **facts.extended.constants, **fitted_values}
     return [
         ConstantsGroup(
             "_".join(f"{name}{value:g}" for name, value in constants) if by_constants else "",
@@ -244,8 +244,8 @@ def _map_effects_to_model(
         causes[f"{name}@{place}" if place else name] = coefficients
     if dry_friction:
         key = f"friction.coulomb@{model.joint}"
-        fitted = causes.get(key, {}).get("coefficient")
-        total = dry_friction + (fitted.value if fitted else 0.0)
+        fitted_friction = causes.get(key, {}).get("coefficient")
+        total = dry_friction + (fitted_friction.value if fitted_friction else 0.0)
         causes[key] = {"coefficient": FittedValue(total, "N*m", None, None)}
     return causes, notes
 

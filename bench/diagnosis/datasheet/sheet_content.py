@@ -69,8 +69,14 @@ class SheetContent:
         """Return the diagram of a drive; without a drive, the dry friction that holds the joint."""
         if self.diagram is not None:
             return {"diagram": self.diagram.to_document()}
-        rest = self.rest
-        return {"rest": {"unit": rest.unit, "laws": list(rest.laws), "breakaway": rest.breakaway}}
+        rest_diagram = self.rest
+        return {
+            "rest": {
+                "unit": rest_diagram.unit,
+                "laws": list(rest_diagram.laws),
+                "breakaway": rest_diagram.breakaway,
+            }
+        }
 
     @cached_property
     def is_driven(self) -> bool:
@@ -89,11 +95,11 @@ class SheetContent:
             reason = (
                 f"joint {self.subject.joint} has no actuator in the model, and no force in the log"
             )
-        rest = self.rest
-        if rest.laws and rest.breakaway > 0:
-            force = append_unit(format_number(rest.breakaway), rest.unit)
+        rest_diagram = self.rest
+        if rest_diagram.laws and rest_diagram.breakaway > 0:
+            force = append_unit(format_number(rest_diagram.breakaway), rest_diagram.unit)
             friction_text = (
-                f"At rest, dry friction holds against up to {force} ({joined(rest.laws)})"
+                f"At rest, dry friction holds against up to {force} ({joined(rest_diagram.laws)})"
             )
         else:
             friction_text = "No law of friction was found that holds it at rest"
@@ -106,8 +112,8 @@ class SheetContent:
     @cached_property
     def rest(self) -> DriveDiagram:
         """Diagram of where the joint moves, holds and slips, also without a drive."""
-        strongest = [row.number.value for row in self.rows if row.strongest and row.number]
-        return compute_drive_diagram(self.subject, self.extended, next(iter(strongest), None))
+        force_limits = [row.number.value for row in self.rows if row.strongest and row.number]
+        return compute_drive_diagram(self.subject, self.extended, next(iter(force_limits), None))
 
     def elsewhere(self) -> Iterator[str]:
         """Yield causes of the model that act at other places, or in the world."""
@@ -124,8 +130,11 @@ class SheetContent:
             for r in identified
             if r.number
         ]
-        absent = [row.name for row in self.rows if row.number is None]
-        absent_names, unnamed_count = absent[:NAMES_IN_TERMINAL], len(absent) - NAMES_IN_TERMINAL
+        all_absent_names = [row.name for row in self.rows if row.number is None]
+        absent_names, unnamed_count = (
+            all_absent_names[:NAMES_IN_TERMINAL],
+            len(all_absent_names) - NAMES_IN_TERMINAL,
+        )
         if unnamed_count > 0:
             absent_names = [
                 *absent_names,

@@ -79,7 +79,7 @@ class SheetRow:
         return row
 
 
-def _make_limit_keys(reach: DetectionLimit) -> dict[str, Any]:
+def _make_limit_keys(detection_limit: DetectionLimit) -> dict[str, Any]:
     """Return the TOML keys of a detection limit in the row of a data sheet.
 
     `resolved` is the detectable size of a proportional effect; `none_above` and `none_below`
@@ -87,16 +87,16 @@ def _make_limit_keys(reach: DetectionLimit) -> dict[str, Any]:
     insensitive to the effect.
     """
     row: dict[str, Any] = {}
-    if np.isfinite(reach.size):
-        row[{"": "resolved", "above": "none_above", "below": "none_below"}[reach.limit]] = (
-            reach.size
-        )
-        if reach.vague:
+    if np.isfinite(detection_limit.size):
+        row[
+            {"": "resolved", "above": "none_above", "below": "none_below"}[detection_limit.limit]
+        ] = detection_limit.size
+        if detection_limit.vague:
             row["vague"] = True
-        if reach.is_nonzero_if_fitted:
-            row["leans_to"] = reach.estimate_if_fitted
-    if reach.confounded_with:
-        row["mixed_with"] = list(reach.confounded_with)
+        if detection_limit.is_nonzero_if_fitted:
+            row["leans_to"] = detection_limit.estimate_if_fitted
+    if detection_limit.confounded_with:
+        row["mixed_with"] = list(detection_limit.confounded_with)
     return row
 
 
@@ -223,7 +223,7 @@ class _Rows:
 
     def _make_hidden_row(self, row: SheetRow, effect: str, number: FittedValue) -> SheetRow:
         """Build the row of a cause at other places that is not shown here."""
-        reach = _make_number_limit(number, self.subject.get_model_file_value(effect))
+        detection_limit = _make_number_limit(number, self.subject.get_model_file_value(effect))
         return SheetRow(
             row.name,
             row.says,
@@ -231,7 +231,7 @@ class _Rows:
             "not shown",
             row.unit,
             stated=row.stated,
-            detection_limit=reach,
+            detection_limit=detection_limit,
         )
 
     def absent(self) -> Iterator[SheetRow]:
@@ -245,7 +245,7 @@ class _Rows:
             yield self._make_absent_effect_row(effect, label, unit, detection_limit)
 
     def _make_absent_effect_row(
-        self, effect: str, label: str, unit: str, reach: DetectionLimit
+        self, effect: str, label: str, unit: str, detection_limit: DetectionLimit
     ) -> SheetRow:
         """Build the row of an effect that is not in the model, with its detection limit.
 
@@ -256,10 +256,12 @@ class _Rows:
         value = None
         if file_value is not None:
             unit, value = file_value.unit, file_value.value
-            reach = replace(
-                reach,
-                size=file_value.compute_half_width(reach.size),
-                estimate_if_fitted=file_value.compute_half_width(reach.estimate_if_fitted),
+            detection_limit = replace(
+                detection_limit,
+                size=file_value.compute_half_width(detection_limit.size),
+                estimate_if_fitted=file_value.compute_half_width(
+                    detection_limit.estimate_if_fitted
+                ),
             )
         alternatives = tuple(c.effect for c in self.verdict.causes if effect in c.alternatives)
         description = format_effect_name(effect.partition("@")[0])
@@ -271,7 +273,7 @@ class _Rows:
             "not shown",
             unit,
             stated=value,
-            detection_limit=reach,
+            detection_limit=detection_limit,
             alternatives=alternatives,
         )
 

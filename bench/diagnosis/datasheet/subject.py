@@ -44,9 +44,9 @@ class ModelFileValue(NamedTuple):
             self._add_correction(high),
         )
 
-    def compute_half_width(self, half: float) -> float:
+    def compute_half_width(self, coefficient_half_width: float) -> float:
         """Convert half an interval of the coefficient to half an interval of the total."""
-        return half * self.value if self.share else half
+        return coefficient_half_width * self.value if self.share else coefficient_half_width
 
     def _add_correction(self, c: float) -> float:
         return self.value * (1.0 + c) if self.share else self.value + c
@@ -188,6 +188,8 @@ def make_subject(kind: type[SystemSimulator], joint: str | None) -> SheetSubject
     joint = joints[0] if joint is None else joint
     if joint not in joints:
         raise make_unknown_name_error(f"joint of robot {kind.name}", joint, joints)
-    bare = SheetSubject(kind, joint, frozenset())
+    subject_without_values = SheetSubject(kind, joint, frozenset())
     channels = {f"{kind_of}.{joint}" for kind_of in ("q", "qd", "tau")}
-    return SheetSubject(kind, joint, frozenset({joint, *bare.actuators, *channels}))
+    return SheetSubject(
+        kind, joint, frozenset({joint, *subject_without_values.actuators, *channels})
+    )

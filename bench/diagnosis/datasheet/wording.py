@@ -58,12 +58,12 @@ def format_short_name(row: SheetRow) -> str:
     return " ".join(part for part in (effect, coefficient, channel) if part)
 
 
-def format_evidence(row: SheetRow, short: bool = False) -> str:
+def format_evidence(row: SheetRow, is_short: bool = False) -> str:
     """Format the evidence for a number on the sheet.
 
     Args:
         row: Row of the sheet.
-        short: Whether to use the short form for print.
+        is_short: Whether to use the short form for print.
     """
     if row.state == "derived":
         return "computed from the numbers below"
@@ -74,13 +74,13 @@ def format_evidence(row: SheetRow, short: bool = False) -> str:
             else "not identified by these data"
         )
     is_judged = row.p_value is None or row.p_value <= UNJUDGED_P_VALUE
-    unjudged_text = "not judged" if short else "the search ended before it was judged"
+    unjudged_text = "not judged" if is_short else "the search ended before it was judged"
     parts = [format_p_value(row.p_value) if is_judged else unjudged_text]
     if row.share is not None:
         closed_share = format_percent(row.share)
         parts.append(
             f"{closed_share} held out"
-            if short
+            if is_short
             else f"alone it closes {closed_share} of the held-out gap"
         )
     if row.alternatives:
@@ -90,17 +90,19 @@ def format_evidence(row: SheetRow, short: bool = False) -> str:
 
 def format_detection_limit(row: SheetRow) -> str:
     """Format in words how large an absent effect could be without being detected."""
-    reach = row.detection_limit
-    if reach is None or reach.size == float("inf"):
+    detection_limit = row.detection_limit
+    if detection_limit is None or detection_limit.size == float("inf"):
         return "none: the data do not depend on it"
-    size = format_number(reach.size, 2)
-    if reach.vague:
+    size = format_number(detection_limit.size, 2)
+    if detection_limit.vague:
         return append_unit(f"± {size}", row.unit) + ", more than any plausible value"
-    if reach.limit:
-        return append_unit(f"none {reach.limit} {size}", row.unit)
-    if reach.is_nonzero_if_fitted:
+    if detection_limit.limit:
+        return append_unit(f"none {detection_limit.limit} {size}", row.unit)
+    if detection_limit.is_nonzero_if_fitted:
         return (
-            append_unit(f"{format_number(reach.estimate_if_fitted, 2)} ± {size}", row.unit)
+            append_unit(
+                f"{format_number(detection_limit.estimate_if_fitted, 2)} ± {size}", row.unit
+            )
             + ", not named"
         )
     return append_unit(f"0 ± {size}", row.unit)

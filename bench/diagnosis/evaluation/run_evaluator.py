@@ -140,12 +140,12 @@ class RunEvaluator:
         self.engine = engine
         self.runs = tuple(runs)
         self.extra = tuple(extra)
-        usable = library.list_effects_for(kind.system)
+        applicable_effects = library.list_effects_for(kind.system)
         recorded_signals = {*self.runs[0].channels, *(c.name for c in kind.inputs)}
         # An effect on a channel that is not recorded is not observable.
         observable_effects = [
             name
-            for name, effect in usable.items()
+            for name, effect in applicable_effects.items()
             if _is_effect_observable(effect, recorded_signals)
             and (effect.hook != "hidden" or kind.has_model or engine in HIDDEN_STATE_ENGINES)
         ]
@@ -343,10 +343,10 @@ class RunEvaluator:
     def get_sample_mask(self, share: float) -> Mask:
         """Return the mask (R, T, C) of available samples within the first share of each run."""
         numbers = np.arange(self.observed.shape[1])
-        ends = np.ceil(share * self.lengths)
-        first = numbers < ends[:, None]
-        counted: Mask = np.isfinite(self.observed) & first[:, :, None]
-        return counted
+        sample_counts = np.ceil(share * self.lengths)
+        first = numbers < sample_counts[:, None]
+        sample_mask: Mask = np.isfinite(self.observed) & first[:, :, None]
+        return sample_mask
 
     def simulate(
         self,
@@ -512,12 +512,12 @@ class RunEvaluator:
         ]
 
     def simulate_batch(
-        self, fine: bool, theta: Array, runs: Indices, states: Array, share: float
+        self, is_fine: bool, theta: Array, runs: Indices, states: Array, share: float
     ) -> Array:
         """Simulate batch elements of one group in one engine call.
 
         Args:
-            fine: whether to use the fine time step that filters need.
+            is_fine: whether to use the fine time step that filters need.
             theta: (L, P) parameters.
             runs: (L,) index of the run of each batch element.
             states: (L, s) initial states.
@@ -526,7 +526,7 @@ class RunEvaluator:
         Returns:
             Observations (L, T', C).
         """
-        simulator = self._fine if fine else self.simulator
+        simulator = self._fine if is_fine else self.simulator
         scenarios = self._scenarios(theta, runs, share)
         # The simulator does not treat freed constants as parameters.
         freed_indices = np.arange(self.own, self.base.size)

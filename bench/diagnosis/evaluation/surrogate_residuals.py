@@ -251,11 +251,11 @@ def _yule_walker(covariances: Array, order: int) -> tuple[Array, float]:
         return np.zeros(0), float(power)
     numbers = np.arange(order)
     lags = np.abs(numbers[:, None] - numbers)
-    later = covariances[1 : order + 1]
+    lagged_covariances = covariances[1 : order + 1]
     # Left-hand matrix of (3), with a ridge.
     matrix = covariances[lags] + YULE_WALKER_RIDGE * power * np.eye(order)
-    weights = np.linalg.solve(matrix, later)
-    variance = float(power - weights @ later)
+    weights = np.linalg.solve(matrix, lagged_covariances)
+    variance = float(power - weights @ lagged_covariances)
     if variance <= 0 or _max_root(weights) > MAX_ROOT:
         return np.zeros(0), np.inf
     return weights, variance

@@ -290,8 +290,12 @@ def can_fork() -> bool:
     This requires Linux, no other threads (their locks would stay locked in the child), and a
     process that may have children.
     """
-    alone = threading.active_count() == 1
-    return sys.platform == "linux" and alone and not multiprocessing.current_process().daemon
+    has_single_thread = threading.active_count() == 1
+    return (
+        sys.platform == "linux"
+        and has_single_thread
+        and not multiprocessing.current_process().daemon
+    )
 
 
 class _Pickler(pickle.Pickler):

@@ -125,10 +125,10 @@ class RigModel:
         for state in self._iterate_initial_states():
             yield RunPlan(states=(state,))
         groups = [(name,) for name in self.driven]
-        for driven in [*groups, self.driven] if len(groups) > 1 else groups:
+        for input_groups in [*groups, self.driven] if len(groups) > 1 else groups:
             for size in COMMAND_SIZE_FACTORS:
                 for form in COMMAND_FORMS:
-                    yield RunPlan(driven, form, size)
+                    yield RunPlan(input_groups, form, size)
 
     def list_variants(self, plan: RunPlan) -> Iterator[RunPlan]:
         """Yield variants of a plan with one property changed, to improve the best plans."""
@@ -196,33 +196,35 @@ class RigModel:
             for name in self.old.inputs
         }
         states = self.begin.copy()
-        limited = []
+        limited_inputs = []
         for number, name in enumerate(plan.driven_inputs):
             signal = plan.size * _compute_command(
                 plan.form, times, self.step, np.random.default_rng(number)
             )
             command = self.rest[name] + self.largest[name] * (signal + plan.level)
             inputs[name] = self._limit_command(name, command)
-            limited += [name] if (inputs[name] != command).any() else []
+            limited_inputs += [name] if (inputs[name] != command).any() else []
         for name, value in plan.states:
             states[self.world.states.index(name)] = value
         constants = {**self.old.constants, **dict(plan.constants)}
         scenario = replace(self.old, times=times, inputs=inputs, constants=constants)
-        return CandidateRun(plan, self._describe_plan(plan, inputs, limited), scenario, states)
+        return CandidateRun(
+            plan, self._describe_plan(plan, inputs, limited_inputs), scenario, states
+        )
 
     def _limit_command(self, name: str, values: Array) -> Array:
         """Clip a command to the limits of its actuator and its joint."""
         return np.asarray(np.clip(values, *self.limits.commands.get(name, UNLIMITED)))
 
     def _describe_plan(
-        self, plan: RunPlan, inputs: Mapping[str, Array], limited: Sequence[str]
+        self, plan: RunPlan, inputs: Mapping[str, Array], limited_inputs: Sequence[str]
     ) -> str:
         """Describe a plan in words that tell the user how to record the run.
 
         Args:
             plan: Plan of the run.
             inputs: (T,) commands by name, after they are limited.
-            limited: Names of the inputs that were clipped to the limits of the setup.
+            limited_inputs: Names of the inputs that were clipped to the limits of the setup.
         """
         if plan.driven_inputs:
             input_text = plan.driven_inputs[0] if len(plan.driven_inputs) == 1 else "all inputs"
@@ -232,7 +234,7 @@ class RigModel:
         if plan.level:
             medians = [f"{name} = {np.median(inputs[name]):.3g}" for name in plan.driven_inputs]
             text += f", about {', '.join(medians)}"
-        for name in limited:
+        for name in limited_inputs:
             low, high = self.limits.commands[name]
             text += f", {name} limited to {low:.4g} to {high:.4g}"
         initial_texts = [f"{name} = {value:.3g}" for name, value in plan.states]

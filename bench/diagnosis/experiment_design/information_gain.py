@@ -160,9 +160,9 @@ class RunRanker:
             value = _compute_information_gain(slopes[0], self.known[0])
             return RunValue(run, np.array([value]), value)
         values = np.zeros((len(slopes), len(slopes)))
-        for true, competing_index in self.pairs:
-            gap = slopes[true].centre - slopes[competing_index].centre
-            values[true, competing_index] = _compute_remaining_difference(
+        for true_index, competing_index in self.pairs:
+            gap = slopes[true_index].centre - slopes[competing_index].centre
+            values[true_index, competing_index] = _compute_remaining_difference(
                 gap, slopes[competing_index], self.known[competing_index]
             )[0]
         return RunValue(run, values, _sum_discrimination(values))
@@ -172,9 +172,9 @@ class RunRanker:
         if not self.pairs:
             return entry._replace(is_exact=True)
         values = entry.values.copy()
-        for true, competing_index in self.pairs:
-            values[true, competing_index] = self._compute_discrimination(
-                entry.run, self.known[true], self.known[competing_index]
+        for true_index, competing_index in self.pairs:
+            values[true_index, competing_index] = self._compute_discrimination(
+                entry.run, self.known[true_index], self.known[competing_index]
             )
         # The run must be within the limits, whichever model is true.
         for known_model in self.known[1:]:
@@ -231,8 +231,8 @@ class RunRanker:
             displaced_theta[place] += known_model.spread[row]
             thetas[1 + row] = displaced_theta
         shifts = STATE_STEP_SHARE * np.eye(begin.size)[self.free]
-        begins = [begin] * (1 + len(free)) + [begin + shift for shift in shifts]
-        simulated = self._simulate_run(run, thetas, begins)
+        initial_states = [begin] * (1 + len(free)) + [begin + shift for shift in shifts]
+        simulated = self._simulate_run(run, thetas, initial_states)
         if not np.isfinite(simulated).all():
             return None
         differences = np.abs(simulated[1 + len(free) :] - simulated[0])
@@ -247,16 +247,16 @@ class RunRanker:
         return _LinearisedRun(lanes[0], parameter_responses.T, state_responses.T / STATE_STEP_SHARE)
 
     def _compute_discrimination(
-        self, run: CandidateRun, true: _Known, competing_model: _Known
+        self, run: CandidateRun, true_model: _Known, competing_model: _Known
     ) -> float:
         """Compute the discrimination T of eq. (1) of a run, to which the competitor is refitted.
 
-        The prediction of the model `true` takes the place of the recording. The fit of
+        The prediction of the model `true_model` takes the place of the recording. The fit of
         `competing_model` by Levenberg-Marquardt may move its parameters as far as the present data
         allow.
         """
         fit = competing_model.model.fit
-        simulated = self._simulate_run(run, [true.model.fit.theta], [run.states])
+        simulated = self._simulate_run(run, [true_model.model.fit.theta], [run.states])
         target = self._whiten(simulated)[0]
         theta, states, deviation = fit.theta.copy(), run.states.copy(), np.zeros(fit.free.size)
         linearisation, damping = self._linearise_run(run, competing_model, theta), 1e-6

@@ -95,7 +95,7 @@ def design_next_run(
     model: FittedModel,
     competing_models: Sequence[FittedModel],
     seconds: float,
-    longest: float,
+    max_seconds: float,
 ) -> NextRunDesign | None:
     """Design the best run that could be recorded next.
 
@@ -104,7 +104,7 @@ def design_next_run(
         model: Model of the present diagnosis.
         competing_models: Competing models that explain the data as well; empty if there are none.
         seconds: Duration of the run in seconds.
-        longest: Maximum duration in seconds, if a run of `seconds` does not decide.
+        max_seconds: Maximum duration in seconds, if a run of `seconds` does not decide.
 
     Returns:
         The design; None if no run can be simulated.
@@ -130,8 +130,8 @@ def design_next_run(
         evaluated_plans.update(new_plans)
         ranked_runs = [*ranked_runs, *ranker.rank_runs([rig.make_run(plan) for plan in new_plans])]
     ranked_runs = _evaluate_fully(ranker, ranked_runs)
-    if ranked_runs and _would_longer_run_help(ranked_runs[0], longest / seconds):
-        longer_rig = RigModel(models.world, longest)
+    if ranked_runs and _would_longer_run_help(ranked_runs[0], max_seconds / seconds):
+        longer_rig = RigModel(models.world, max_seconds)
         longer_runs = ranker.rank_runs(
             [longer_rig.make_run(entry.run.plan) for entry in ranked_runs[:PLANS_TESTED_FOR_LENGTH]]
         )

@@ -175,8 +175,10 @@ def compute_gauss_newton_step(
     runs, size = len(residual), jacobian.shape[3]
     j = jacobian.reshape(runs, -1, size)
     r = residual.reshape(runs, -1)
-    arrow = _apply_damping(_assemble_normal_equations(j, r, q, drift, prior), damping, known_mask)
-    parameter_step, state_steps = arrow.solved(blocked_mask)
+    equations = _apply_damping(
+        _assemble_normal_equations(j, r, q, drift, prior), damping, known_mask
+    )
+    parameter_step, state_steps = equations.solved(blocked_mask)
     return GaussNewtonStep(
         parameter_step,
         state_steps,
@@ -216,21 +218,21 @@ def _assemble_normal_equations(
 
 
 def _apply_damping(
-    arrow: _ArrowheadEquations, damping: float, known_mask: Mask
+    equations: _ArrowheadEquations, damping: float, known_mask: Mask
 ) -> _ArrowheadEquations:
     """Add the damping λ times their own diagonals to U and V, and hold known initial states fixed.
 
     A small ridge is always added to U, so that it can be inverted if parameters have the same
     response. `known_mask` (R, s) marks the known initial states.
     """
-    diagonal = np.einsum("rii->ri", arrow.inner)
-    inner = arrow.inner + damping * diagonal[:, :, None] * np.eye(arrow.inner.shape[1])
-    inner, cross = hold_known_states(inner, arrow.cross, known_mask)
-    pull = np.where(known_mask, 0.0, arrow.pull)
+    diagonal = np.einsum("rii->ri", equations.inner)
+    inner = equations.inner + damping * diagonal[:, :, None] * np.eye(equations.inner.shape[1])
+    inner, cross = hold_known_states(inner, equations.cross, known_mask)
+    pull = np.where(known_mask, 0.0, equations.pull)
 
-    scale = np.maximum(np.diagonal(arrow.shared), MIN_DIAGONAL)
-    shared = arrow.shared + np.diag(damping * scale + RIDGE_SHARE * scale + MIN_DIAGONAL)
-    return _ArrowheadEquations(shared, cross, inner, arrow.gradient, pull)
+    scale = np.maximum(np.diagonal(equations.shared), MIN_DIAGONAL)
+    shared = equations.shared + np.diag(damping * scale + RIDGE_SHARE * scale + MIN_DIAGONAL)
+    return _ArrowheadEquations(shared, cross, inner, equations.gradient, pull)
 
 
 def _predict_decrease(

@@ -151,20 +151,23 @@ class TrajectoryFitter:
             The fits in the order of their starts.
         """
         problems = [self._problem(start) for start in starts]
-        for leg in iterate_rounds(iterations, race):
+        for racing_round in iterate_rounds(iterations, race):
             # Unfinished fits continue in groups, which exchange nothing within a round.
             unfinished = [i for i, problem in enumerate(problems) if not problem.is_finished]
             if not unfinished or (
-                leg.first and self.world.watch.should_abandon_fit(leg.first / iterations)
+                racing_round.first
+                and self.world.watch.should_abandon_fit(racing_round.first / iterations)
             ):
                 break
             best = min(lowest_cost, *(problem.point.cost for problem in problems))
             groups = self._groups(problems, unfinished)
-            calls = [(self._terms(), [problems[i] for i in g], leg, race, best) for g in groups]
+            calls = [
+                (self._terms(), [problems[i] for i in g], racing_round, race, best) for g in groups
+            ]
             for number, members in self.world.crew.map_unordered(self.world, _advance_group, calls):
                 for i, problem in zip(groups[number], members, strict=True):
                     problems[i] = problem
-                    if problem.is_finished or leg.last >= iterations:
+                    if problem.is_finished or racing_round.last >= iterations:
                         finished()
         return [p.make_fit() for p in problems]
 
@@ -198,13 +201,17 @@ class TrajectoryFitter:
         return [part.tolist() for part in parts]
 
     def advance_round(
-        self, problems: Sequence[FitState], leg: RacingRound, race: bool, lowest_cost: float
+        self,
+        problems: Sequence[FitState],
+        racing_round: RacingRound,
+        race: bool,
+        lowest_cost: float,
     ) -> list[FitState]:
         """Advance fits by one racing round.
 
         Args:
             problems: states of the fits.
-            leg: the steps to make.
+            racing_round: the steps to make.
             race: whether to stop fits that are far behind the best fit or behind `lowest_cost`.
             lowest_cost: lowest cost of other models, including those of other groups.
 
@@ -213,9 +220,9 @@ class TrajectoryFitter:
         """
         # Mask of the samples that count, (R, T, C).
         sample_mask = self.world.get_sample_mask(self.share)
-        if not leg.first:
+        if not racing_round.first:
             self._begin(problems, sample_mask)
-        for iteration in range(leg.first, leg.last):
+        for iteration in range(racing_round.first, racing_round.last):
             # In the first steps even the correct model may be far behind.
             if race and iteration >= MIN_ITERATIONS_BEFORE_ELIMINATION:
                 eliminate_losing_fits(problems, lowest_cost)
@@ -228,7 +235,7 @@ class TrajectoryFitter:
             if not trials and any(p.is_waiting and not p.is_finished for p in problems):
                 continue
             # The caller checks whether the fit was stopped early here.
-            if not trials or self.world.watch.should_abandon_fit(iteration / leg.all):
+            if not trials or self.world.watch.should_abandon_fit(iteration / racing_round.all):
                 break
             make_points = self._plain_points if self.world.has_linearisation else self._points
             for (problem, _), point in zip(trials, make_points(trials, sample_mask), strict=True):
@@ -533,7 +540,7 @@ class TrajectoryFitter:
 
         The derivatives of a robot are updated by Broyden's method instead of simulations.
         """
-        gained = problem.point.cost - point.cost
+        decrease = problem.point.cost - point.cost
         is_own_jacobian = problem.has_own_jacobian
         if point.cost < problem.point.cost:
             if self.world.has_linearisation:
@@ -541,7 +548,7 @@ class TrajectoryFitter:
                 problem.has_own_jacobian = not problem.free.size
             else:
                 self._take(problem, point)
-            problem.accept_step(gained, point.cost, is_own_jacobian)
+            problem.accept_step(decrease, point.cost, is_own_jacobian)
         else:
             problem.reject_step()
 
@@ -561,7 +568,7 @@ def compute_state_prior(world: RunEvaluator) -> Array:
     system, recorded_channels = world.simulator.system, set(world.channels)
     # Samples of a coordinate also show its rate; a user-defined system may have further states.
     pairs = dict(zip(system.rates, system.coordinates, strict=False))
-    measured = [
+    is_measured = [
         name in recorded_channels or pairs.get(name) in recorded_channels for name in world.states
     ]
-    return np.where(measured, OBSERVED_STATE_PRIOR_SIGMA, UNOBSERVED_STATE_PRIOR_SIGMA)
+    return np.where(is_measured, OBSERVED_STATE_PRIOR_SIGMA, UNOBSERVED_STATE_PRIOR_SIGMA)

@@ -37,7 +37,7 @@ DIFFERENCE_EFFECTS = frozenset(
 _MORE = {True: "larger", False: "smaller"}
 
 
-def format_effect_set(names: Sequence[str], last: str = "or") -> str:
+def format_effect_set(names: Sequence[str], conjunction: str = "or") -> str:
     """Format a set of effects.
 
     For example ``Coulomb friction at any of the joints a, b or c``, or ``linear drag or Coulomb
@@ -45,25 +45,25 @@ def format_effect_set(names: Sequence[str], last: str = "or") -> str:
 
     Args:
         names: Names of the effects.
-        last: ``or`` if one of them is meant, ``and`` for all.
+        conjunction: ``or`` if one of them is meant, ``and`` for all.
     """
     if not any("@" in name for name in names):
-        return joined([format_effect(name) for name in names], last)
-    parts = _group_effects(names, last)
+        return joined([format_effect(name) for name in names], conjunction)
+    parts = _group_effects(names, conjunction)
     if len(parts) > MAX_NAMED_MEMBERS:
         parts = [
             *parts[: MAX_NAMED_MEMBERS - 1],
             f"one of {len(parts) - MAX_NAMED_MEMBERS + 1} others",
         ]
     # Nested lists are separated by a comma before the last conjunction too.
-    nested = len(parts) > 1 and any(f" {last} " in part for part in parts)
-    return f", {last} ".join(parts) if nested else joined(parts, last)
+    nested = len(parts) > 1 and any(f" {conjunction} " in part for part in parts)
+    return f", {conjunction} ".join(parts) if nested else joined(parts, conjunction)
 
 
-def _group_effects(names: Sequence[str], last: str) -> list[str]:
+def _group_effects(names: Sequence[str], conjunction: str) -> list[str]:
     """Group effects that share a name or a place, and format one text for each group.
 
-    `last` is the conjunction, such as "or".
+    `conjunction` is the conjunction, such as "or".
     """
     by_effect: dict[str, list[str]] = {}
     for name in names:
@@ -72,15 +72,15 @@ def _group_effects(names: Sequence[str], last: str) -> list[str]:
     by_place: dict[str, list[str]] = {}
     for group in by_effect.values():
         _, place = split_effect_name(group[0])
-        alone = len(group) == 1 and place not in ("", ALL_PLACES)
+        is_single_place = len(group) == 1 and place not in ("", ALL_PLACES)
         # A family comes last, after the single places.
         group.sort(key=lambda name: split_effect_name(name)[1] == ALL_PLACES)
-        key = f"{get_place_kind(group[0])} {place}" if alone else group[0]
+        key = f"{get_place_kind(group[0])} {place}" if is_single_place else group[0]
         by_place.setdefault(key, []).extend(group)
-    return [_format_effect_group(group, last) for group in by_place.values()]
+    return [_format_effect_group(group, conjunction) for group in by_place.values()]
 
 
-def _format_effect_group(group: Sequence[str], last: str) -> str:
+def _format_effect_group(group: Sequence[str], conjunction: str) -> str:
     """Format effects of one name at several places, or several effects at one place."""
     if len(group) == 1:
         return format_effect(group[0])
@@ -90,11 +90,11 @@ def _format_effect_group(group: Sequence[str], last: str) -> str:
     is_parameter = all(is_parameter_error(base) for base in bases)
     kind = get_place_kind(group[0])
     named_places = [place for place in places if place != ALL_PLACES]
-    text = joined(nouns, last) + format_places(kind, named_places, last, is_parameter)
+    text = joined(nouns, conjunction) + format_places(kind, named_places, conjunction, is_parameter)
     return (
         text
         if named_places == places
-        else f"{text} {last}{format_places(kind, [ALL_PLACES], last, is_parameter)}"
+        else f"{text} {conjunction}{format_places(kind, [ALL_PLACES], conjunction, is_parameter)}"
     )
 
 
@@ -195,38 +195,44 @@ def _make_difference_formatter(quantity: str) -> Callable[[str, Sequence[FittedV
     return say
 
 
-def _format_displaced_mass_centre(where: str, values: Sequence[FittedValue]) -> str:
-    """Say how far the centre of mass at `where` is from that of the model file.
+def _format_displaced_mass_centre(place_text: str, values: Sequence[FittedValue]) -> str:
+    """Say how far the centre of mass at `place_text` is from that of the model file.
 
     `values` has the fitted displacement along each axis.
     """
     distance = append_unit(
         format_number(float(np.linalg.norm([n.value for n in values])), 2), values[0].unit
     )
-    return f"the centre of mass {where} is {distance} from where the model file has it"
+    return f"the centre of mass {place_text} is {distance} from where the model file has it"
 
 
-def _format_joint_zero(where: str, values: Sequence[FittedValue]) -> str:
+def _format_joint_zero(place_text: str, values: Sequence[FittedValue]) -> str:
     """Say how far the zero of a joint, for command and reading, is from that of the model file."""
     size = append_unit(format_number(abs(values[0].value), 2), values[0].unit)
-    return f"the zero {where}, of command and reading alike, is {size} from that of the model file"
+    return (
+        f"the zero {place_text}, of command and reading alike, "
+        f"is {size} from that of the model file"
+    )
 
 
-def _format_tilted_axis(where: str, values: Sequence[FittedValue]) -> str:
+def _format_tilted_axis(place_text: str, values: Sequence[FittedValue]) -> str:
     """Say by how many degrees the axis of a joint is tilted; `values` has the angles in rad."""
     angle = np.rad2deg(np.linalg.norm([n.value for n in values]))
-    return f"the axis {where} is tilted by {format_number(float(angle), 2)}° from the model file"
+    return (
+        f"the axis {place_text} is tilted by {format_number(float(angle), 2)}° from the model file"
+    )
 
 
-def _format_link_length(where: str, values: Sequence[FittedValue]) -> str:
-    """Say by which percentage the length of the link at `where` differs from the model file.
+def _format_link_length(place_text: str, values: Sequence[FittedValue]) -> str:
+    """Say by which percentage the length of the link at `place_text` differs from the model file.
 
     `values[0]` is the relative change of the length.
     """
     c = values[0].value
     percent = format_percent(abs(c))
     return (
-        f"the distance {where} from its parent is {percent} {_MORE[c > 0]} than the model file says"
+        f"the distance {place_text} from its parent is {percent} {_MORE[c > 0]} "
+        "than the model file says"
     )
 
 

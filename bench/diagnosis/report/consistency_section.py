@@ -58,15 +58,17 @@ def format_consistency(report: DiagnosisReportData) -> list[str]:
             f"without {causes}, {joined(names[:MAX_NAMED_PARAMETERS])} differed between "
             f"{_pluralise_group(reconciled[0].by)} by more than the intervals"
         )
-    rivals = [s for s in report.consistency.alternative_effect if not s.is_consistent]
-    for rival in _select_clearest(rivals)[:1]:
+    competitors = [s for s in report.consistency.alternative_effect if not s.is_consistent]
+    for competitor in _select_clearest(competitors)[:1]:
         trend = ""
-        if _has_trend(rival):
-            trend = f", and it {_get_trend_direction(rival)} with {sanitise(rival.by, 40)}"
+        if _has_trend(competitor):
+            trend = (
+                f", and it {_get_trend_direction(competitor)} with {sanitise(competitor.by, 40)}"
+            )
         sentences.append(
-            f"with {_get_number_name(rival)} instead of {causes}, its value would differ between "
-            f"{_pluralise_group(rival.by)}, {_format_span(rival)} "
-            f"({format_p_value(rival.p_value)}){trend}; "
+            f"with {_get_number_name(competitor)} instead of {causes}, its value would differ "
+            f"between {_pluralise_group(competitor.by)}, {_format_span(competitor)} "
+            f"({format_p_value(competitor.p_value)}){trend}; "
             f"this difference speaks for {causes}"
         )
     inconsistent = _select_clearest([spread for spread in after if not spread.is_consistent])
@@ -201,7 +203,10 @@ def build_agreement_rows(report: DiagnosisReportData) -> list[AgreementRow]:
                 f"{len(halves)} {_pluralise_group(spread.by)}",
                 spread.p_value,
                 draw_intervals(
-                    [("after", value, value - half, value + half) for value, half in halves],
+                    [
+                        ("after", value, value - half_width, value + half_width)
+                        for value, half_width in halves
+                    ],
                     (spread.value - Z95 * spread.error, spread.value + Z95 * spread.error),
                     distance=8,
                 ),
@@ -211,8 +216,8 @@ def build_agreement_rows(report: DiagnosisReportData) -> list[AgreementRow]:
 
 
 def _format_interval(spread: ParameterConsistency, error: float) -> str:
-    half = Z95 * error
-    text = format_estimate(spread.value, spread.value - half, spread.value + half)
+    half_width = Z95 * error
+    text = format_estimate(spread.value, spread.value - half_width, spread.value + half_width)
     return append_unit(text, spread.unit)
 
 
@@ -228,7 +233,9 @@ def build_consistency_rows(report: DiagnosisReportData) -> list[tuple[object, ..
             estimates += [(part.group, part.value, part.error) for part in spread.group_estimates]
             estimates.append(("another", spread.value, spread.prediction_sigma))
             for group, value, error in estimates:
-                half = Z95 * error
-                ends = (value, value - half, value + half)
-                rows.append((model, spread.number, spread.unit, spread.by, group, *ends))
+                half_width = Z95 * error
+                estimate_with_interval = (value, value - half_width, value + half_width)
+                rows.append(
+                    (model, spread.number, spread.unit, spread.by, group, *estimate_with_interval)
+                )
     return rows

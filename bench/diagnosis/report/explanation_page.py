@@ -97,13 +97,15 @@ _FEW = 5
 
 
 def render_report(
-    report: DiagnosisReportData, drawn: Mapping[str, RenderedFigure], folder: Path | None = None
+    report: DiagnosisReportData,
+    rendered_figures: Mapping[str, RenderedFigure],
+    folder: Path | None = None,
 ) -> str:
     """Render the report as HTML.
 
     Args:
         report: Report data.
-        drawn: Figures by name; missing ones are left out.
+        rendered_figures: Figures by name; missing ones are left out.
         folder: Folder in which the report is written with the other files; None for a page alone.
     """
     page = HtmlPage(_STYLE.read_text(encoding="utf-8"))
@@ -152,13 +154,15 @@ def render_report(
         closed_interval=format_interval(held_out) if held_out else "",
         bars=list(_make_bars(report)),
         motion=motion,
-        stills={name: _make_still(report, drawn, name) for name in _FIGURES},
-        joint_positions=drawn["robot"].joint_positions if "robot" in drawn else (),
+        stills={name: _make_still(report, rendered_figures, name) for name in _FIGURES},
+        joint_positions=rendered_figures["robot"].joint_positions
+        if "robot" in rendered_figures
+        else (),
         marks=_list_marks(report),
         identifiability=build_identifiability_section(report),
         profile_panels=make_residual_profile_panels(report),
         less_informative=list_less_informative_profiles(report),
-        channel_headings=[f"-RMSE{when}, {name} runs" for name, _, when in splits],
+        channel_headings=[f"-RMSE{model_suffix}, {name} runs" for name, _, model_suffix in splits],
         channels=_list_channels(report),
         has_absorbed=any(p.is_sensitive and has_absorbed_gap(p) for p in report.parameters),
         parameters=[_make_parameter_row(p) for p in report.parameters],
@@ -321,13 +325,13 @@ class ChannelRow(NamedTuple):
 
 def _list_splits(report: DiagnosisReportData) -> list[tuple[str, DataSplit, str]]:
     """List name, runs, and `` before`` or `` after``, of each error of a channel."""
-    whens = (" before", " after") if report.verdict.causes else ("",)
+    model_suffixes = (" before", " after") if report.verdict.causes else ("",)
     splits = [("fitted", report.fitting), (report.validation_run, report.held_out)]
     return [
-        (name, split, when)
+        (name, split, model_suffix)
         for name, split in splits
         if split is not None and len(split.names)
-        for when in whens
+        for model_suffix in model_suffixes
     ]
 
 
@@ -338,8 +342,8 @@ def _list_channels(report: DiagnosisReportData) -> list[ChannelRow]:
     `_list_splits`.
     """
     columns = [
-        compute_channel_errors(split)[:, int(when == " after")]
-        for _, split, when in _list_splits(report)
+        compute_channel_errors(split)[:, int(model_suffix == " after")]
+        for _, split, model_suffix in _list_splits(report)
     ]
     rows = []
     for i, channel in enumerate(report.channels):

@@ -66,15 +66,15 @@ _FIRST = 1.0
 """Position of the first row."""
 
 
-def shorten_label(name: object, unit: str = "1", most: int = 30) -> str:
+def shorten_label(name: object, unit: str = "1", max_length: int = 30) -> str:
     """Format a text from a file, optionally with its unit, short enough for a label.
 
     Args:
         name: Text of the label.
         unit: Unit; ``1`` for none.
-        most: Maximum number of characters of the text.
+        max_length: Maximum number of characters of the text.
     """
-    return format_label(sanitise(name, most), sanitise(unit, 12))
+    return format_label(sanitise(name, max_length), sanitise(unit, 12))
 
 
 def has_extended_model(report: DiagnosisReportData) -> bool:
@@ -86,14 +86,14 @@ def select_gap_locations(places: Sequence[GapLocation]) -> list[GapLocation]:
     """Select the runs, channels and phases with the largest gaps, in their original order."""
     result: list[GapLocation] = []
     # A part without samples has no RMS.
-    measured = [p for p in places if np.isfinite(p.before) and p.samples > 0]
-    for kind, most in (
+    measured_locations = [p for p in places if np.isfinite(p.before) and p.samples > 0]
+    for kind, max_count in (
         ("run", MAX_RUNS),
         ("channel", MAX_GAP_LOCATIONS),
         ("phase", MAX_GAP_LOCATIONS),
     ):
-        locations_of_kind = [p for p in measured if p.kind == kind]
-        worst_locations = sorted(locations_of_kind, key=lambda p: -p.before)[:most]
+        locations_of_kind = [p for p in measured_locations if p.kind == kind]
+        worst_locations = sorted(locations_of_kind, key=lambda p: -p.before)[:max_count]
         # The original order is kept, because readers look for run 3 after run 2.
         result += [p for p in locations_of_kind if p in worst_locations]
     return result
@@ -214,8 +214,8 @@ def select_informative_profiles(profiles: Sequence[ResidualProfile]) -> list[Res
 
     Each variable comes once before any comes a second time.
     """
-    measured = [p for p in profiles if np.isfinite(_compute_profile_significance(p))]
-    strongest_first = sorted(measured, key=lambda p: -_compute_profile_significance(p))
+    measured_profiles = [p for p in profiles if np.isfinite(_compute_profile_significance(p))]
+    strongest_first = sorted(measured_profiles, key=lambda p: -_compute_profile_significance(p))
     variables = [p.variable for p in strongest_first]
     is_repeated = [name in variables[:i] for i, name in enumerate(variables)]
     # The sort is stable: first profiles of each variable come first, each group by significance.

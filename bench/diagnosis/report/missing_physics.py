@@ -73,7 +73,7 @@ parameter have different explanations.
 
 
 def name_missing_physics(
-    number: str, kind: CovariateKind, name: str, grows: bool, known: Collection[str]
+    number: str, kind: CovariateKind, name: str, is_increasing: bool, known_effects: Collection[str]
 ) -> str:
     """Name the effect that would explain a trend, or else the dependence itself.
 
@@ -81,14 +81,14 @@ def name_missing_physics(
         number: Name of the parameter; for a coefficient of a cause, it includes the effect.
         kind: Category of the covariate.
         name: Covariate in words.
-        grows: Whether the parameter increases with the covariate.
-        known: Effects in the model already, which cannot be missing.
+        is_increasing: Whether the parameter increases with the covariate.
+        known_effects: Effects in the model already, which cannot be missing.
     """
     base_name = number.partition("@")[0]
-    family = next((law for law, begins in LAW_PREFIXES.items() if base_name.startswith(begins)), "")
+    family = next((law for law, prefix in LAW_PREFIXES.items() if base_name.startswith(prefix)), "")
     explanation = MISSING_PHYSICS_NAMES.get((family, kind), "")
-    text = explanation if isinstance(explanation, str) else explanation[0 if grows else 1]
+    text = explanation if isinstance(explanation, str) else explanation[0 if is_increasing else 1]
     effect = text.partition("(")[2].rstrip(")")
-    if not text or any(known_effect.partition("@")[0] == effect for known_effect in known):
+    if not text or any(known_effect.partition("@")[0] == effect for known_effect in known_effects):
         return f"{LAW_NAMES.get(family, 'something')} that depends on {name}"
     return text

@@ -70,14 +70,14 @@ def _list_commented_elements(lines: Sequence[str]) -> Iterator[ModelFileChange]:
 
 def _pair_with_comments(lines: Sequence[str]) -> Iterator[tuple[str, str]]:
     """Yield each XML element (a line) with the comments before it that explain a fitted value."""
-    above: list[str] = []
+    comments: list[str] = []
     for line in lines:
         if match := _COMMENT.fullmatch(line):
             # A comment on the whole file does not describe the next element.
-            above += [match[1]] if FITTED_COMMENT_MARKER in match[1] else []
+            comments += [match[1]] if FITTED_COMMENT_MARKER in match[1] else []
             continue
-        yield line, "; ".join(above)
-        above = []
+        yield line, "; ".join(comments)
+        comments = []
 
 
 def _format_element(line: str) -> str:

@@ -79,17 +79,17 @@ class MotionTable(NamedTuple):
     absent: int
 
 
-def build_motion_table(report: DiagnosisReportData, most: int = MAX_ROWS) -> MotionTable:
+def build_motion_table(report: DiagnosisReportData, max_rows: int = MAX_ROWS) -> MotionTable:
     """Build the table of samples to show.
 
     Args:
         report: Report data.
-        most: Approximate maximum number of samples.
+        max_rows: Approximate maximum number of samples.
     """
     runs = _sort_runs(report)
     count = len(report.channels)
-    shown_runs = runs[: max(1, most // (MIN_ROWS_PER_CHANNEL * count))]
-    samples_per_run = max(MIN_ROWS_PER_CHANNEL, most // (len(shown_runs) * count))
+    shown_runs = runs[: max(1, max_rows // (MIN_ROWS_PER_CHANNEL * count))]
+    samples_per_run = max(MIN_ROWS_PER_CHANNEL, max_rows // (len(shown_runs) * count))
     parts = [
         _format_rows(report, run, c, samples_per_run) for run in shown_runs for c in range(count)
     ]
@@ -123,9 +123,9 @@ def _sort_runs(report: DiagnosisReportData) -> list[ShownRun]:
     return sorted(runs, key=lambda run: ((id(run.side), run.row) != first_run, -run.gap))
 
 
-def _count_parts(report: DiagnosisReportData, most: int) -> int:
+def _count_parts(report: DiagnosisReportData, max_rows: int) -> int:
     """Return the number of parts of a long run: the extremes of two or three signals are kept."""
-    return max(1, most // (6 if has_extended_model(report) else 4))
+    return max(1, max_rows // (6 if has_extended_model(report) else 4))
 
 
 def select_extreme_samples(signals: Sequence[Array], stretches: int) -> NDArray[np.intp]:
@@ -147,20 +147,22 @@ def select_extreme_samples(signals: Sequence[Array], stretches: int) -> NDArray[
     indices = np.minimum(edges[:, None] + np.arange(part_length), size - 1)
     is_inside = indices < np.append(edges[1:], size)[:, None]
     rows = np.arange(len(edges))
-    chosen = [np.array([0, size - 1])]
+    selected_samples = [np.array([0, size - 1])]
     for signal in signals:
         for sign in (1.0, -1.0):
             values = np.where(
                 is_inside & np.isfinite(signal[indices]), sign * signal[indices], -np.inf
             )
-            chosen.append(indices[rows, values.argmax(axis=1)])
-    return np.unique(np.concatenate(chosen))
+            selected_samples.append(indices[rows, values.argmax(axis=1)])
+    return np.unique(np.concatenate(selected_samples))
 
 
-def _format_rows(report: DiagnosisReportData, run: ShownRun, c: int, most: int) -> list[list[str]]:
+def _format_rows(
+    report: DiagnosisReportData, run: ShownRun, c: int, max_rows: int
+) -> list[list[str]]:
     """Format the samples of a channel of a run as columns of text for the chart's table.
 
-    If there are more than `most` samples, only the extremes of short parts are kept.
+    If there are more than `max_rows` samples, only the extremes of short parts are kept.
     """
     split, channel = run.side, report.channels[c]
     times = split.times[run.row]
@@ -169,8 +171,8 @@ def _format_rows(report: DiagnosisReportData, run: ShownRun, c: int, most: int) 
     simulated = [getattr(split, model)[run.row, : len(times), c] for model in models]
     residuals = [(observed - signal) / channel.sigma for signal in simulated]
     rows = np.arange(len(times))
-    if len(times) > most:
-        rows = select_extreme_samples([observed, *residuals], _count_parts(report, most))
+    if len(times) > max_rows:
+        rows = select_extreme_samples([observed, *residuals], _count_parts(report, max_rows))
     digits = (
         int(np.clip(ceil(log10(NOISE_RESOLUTION / channel.sigma)), 0, 15))
         if channel.sigma > 0
@@ -178,10 +180,10 @@ def _format_rows(report: DiagnosisReportData, run: ShownRun, c: int, most: int) 
     )
     step = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
     # A thousandth of a step shows whether time stamps have jitter.
-    fine = int(np.clip(3 - floor(log10(step)), 0, 9)) if step > 0 else 6
+    decimals = int(np.clip(3 - floor(log10(step)), 0, 9)) if step > 0 else 6
     count = len(rows)
     texts = [[sanitise(split.names[run.row], 80)] * count, [sanitise(channel.name, 80)] * count]
-    texts.append(_format_numbers(times[rows], fine))
+    texts.append(_format_numbers(times[rows], decimals))
     texts += [_format_numbers(values[rows], digits) for values in (observed, *simulated)]
     return texts + [_format_numbers(values[rows], 2) for values in residuals]
 
@@ -299,10 +301,10 @@ def _make_panels(
     value_axis = Axis(
         format_label(brief(sanitise(channel.name), 24), channel.unit), scales=("linear",)
     )
-    band = (AxisSpan(-2.0, 2.0, "±2σ: 95 % of the noise", along="y"),)
+    noise_band = (AxisSpan(-2.0, 2.0, "±2σ: 95 % of the noise", along="y"),)
     tooltip_lines = _make_tooltip_lines(format_unit(channel.unit), channel.sigma, extended)
     heights = (_ROW, _ROW) if is_wide else (_TALL, _LOW)
-    above = Panel(
+    motion_panel = Panel(
         name,
         MOTION_TABLE_NAME,
         "t",
@@ -315,7 +317,7 @@ def _make_panels(
         tooltip_lines,
         heights[0],
     )
-    below = Panel(
+    residual_panel = Panel(
         f"{name}: residual",
         MOTION_TABLE_NAME,
         "t",
@@ -323,11 +325,11 @@ def _make_panels(
         time_axis,
         residual,
         facets,
-        spans=band,
+        spans=noise_band,
         tells=tooltip_lines,
         height=heights[1],
     )
-    return above, below
+    return motion_panel, residual_panel
 
 
 def _make_tooltip_lines(unit: str, sigma: float, extended: bool) -> tuple[TooltipLine, ...]:

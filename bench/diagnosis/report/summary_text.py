@@ -177,8 +177,8 @@ def format_headline(report: DiagnosisReportData) -> str:
         return format_sentence(number_error)
     if is_overstated(cause):
         return f"The simulation has too much {format_effect(cause.effect)}."
-    lacking = format_lacking([replace(cause, alternatives=())])
-    return f"The simulation {lacking}: {_describe_within_sentence(cause)}."
+    lacking_text = format_lacking([replace(cause, alternatives=())])
+    return f"The simulation {lacking_text}: {_describe_within_sentence(cause)}."
 
 
 def _format_unconfirmed_reason(causes: Sequence[Cause]) -> str:
@@ -243,14 +243,18 @@ def _format_early_stop_headline(verdict: Verdict) -> str:
 
 def format_early_stop(report: DiagnosisReportData) -> str:
     """Format why the search stopped early and which questions it skipped; empty if complete."""
-    cut = report.verdict.cut
-    if cut is None:
+    early_stop = report.verdict.cut
+    if early_stop is None:
         return ""
-    reason = {"budget": "its time budget", "interrupt": "an interrupt"}[cut.reason]
+    reason = {"budget": "its time budget", "interrupt": "an interrupt"}[early_stop.reason]
     skipped_questions = joined(
-        [QUESTION_TEXTS[name] for name in cut.skipped_questions if name in QUESTION_TEXTS]
+        [QUESTION_TEXTS[name] for name in early_stop.skipped_questions if name in QUESTION_TEXTS]
     )
-    last_step = f"; last step: {sanitise(cut.during_question, 80)}" if cut.during_question else ""
+    last_step = (
+        f"; last step: {sanitise(early_stop.during_question, 80)}"
+        if early_stop.during_question
+        else ""
+    )
     return f"The search was stopped by {reason}{last_step}. Not completed: {skipped_questions}."
 
 
@@ -366,8 +370,8 @@ def _format_closed_gap_subject(report: DiagnosisReportData) -> str:
         return format_sentence(f"{format_effect(causes[0].effect)} closes").rstrip(".")
     if report.verdict.verdict != "ambiguous":
         return "It closes"
-    several = len(causes[0].alternatives) > 1 and has_placed_causes(report)
-    return "Each closes" if several else "Either closes"
+    has_several = len(causes[0].alternatives) > 1 and has_placed_causes(report)
+    return "Each closes" if has_several else "Either closes"
 
 
 def _format_fitted_gain(report: DiagnosisReportData) -> str:
@@ -383,8 +387,8 @@ def _format_fitted_gain(report: DiagnosisReportData) -> str:
     if report.verdict.causes:
         error += f" before and {format_number(after)} times after"
     caution = "No run is held out, so the gain is not measured independently"
-    cut = report.verdict.cut
-    if cut is not None and "held_out" in cut.skipped_questions:
+    early_stop = report.verdict.cut
+    if early_stop is not None and "held_out" in early_stop.skipped_questions:
         caution = f"The gain was not measured on {report.validation_runs}"
     return f"{caution}; on the fitted runs {error}."
 

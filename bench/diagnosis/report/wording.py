@@ -97,14 +97,14 @@ def is_parameter_error(effect: str) -> bool:
 
 
 def format_places(
-    kind: str, places: Sequence[str], last: str = "or", is_parameter: bool = False
+    kind: str, places: Sequence[str], conjunction: str = "or", is_parameter: bool = False
 ) -> str:
     """Format places: `` at joint elbow``, `` at every joint``, `` at any of the joints a, b or c``.
 
     Args:
         kind: Kind of the places.
         places: Names of the places.
-        last: Conjunction before the last name.
+        conjunction: Conjunction before the last name.
         is_parameter: Whether the effect is a wrong value of the place: `` of joint elbow``.
     """
     preposition, plural = _AT.get(kind, ("at", "places"))
@@ -113,9 +113,9 @@ def format_places(
     if names == [ALL_PLACES]:
         return f" {preposition} every {kind}" if kind else " everywhere"
     if len(names) < 3:
-        return f" {preposition} {kind} {joined(names, last)}".replace("  ", " ")
-    quantifier = "any" if last == "or" else "each"
-    return f" {preposition} {quantifier} of the {plural} {joined(names, last)}"
+        return f" {preposition} {kind} {joined(names, conjunction)}".replace("  ", " ")
+    quantifier = "any" if conjunction == "or" else "each"
+    return f" {preposition} {quantifier} of the {plural} {joined(names, conjunction)}"
 
 
 def format_effect_name(effect: str) -> str:
@@ -138,22 +138,22 @@ def format_sentence(text: object) -> str:
 def format_unit(unit: str) -> str:
     """Format a unit for print, such as ``kg·m²``; empty for a pure number."""
     power = r"(?:\^|\*\*)(-?\d+)"
-    raised = re.sub(power, lambda match: match[1].translate(SUPERSCRIPT_DIGITS), sanitise(unit, 60))
-    return "" if raised == "1" else raised.replace("*", "·")
+    text = re.sub(power, lambda match: match[1].translate(SUPERSCRIPT_DIGITS), sanitise(unit, 60))
+    return "" if text == "1" else text.replace("*", "·")
 
 
-def format_label(name: str, unit: str, most: int = 30) -> str:
+def format_label(name: str, unit: str, max_length: int = 30) -> str:
     """Format a label with its unit: ``q [rad]``, or ``q`` for a pure number.
 
     Args:
         name: Text of the label.
         unit: Unit.
-        most: Maximum number of characters of the text.
+        max_length: Maximum number of characters of the text.
     """
     return (
-        f"{sanitise(name, most)} [{format_unit(unit)}]"
+        f"{sanitise(name, max_length)} [{format_unit(unit)}]"
         if format_unit(unit)
-        else sanitise(name, most)
+        else sanitise(name, max_length)
     )
 
 

@@ -68,15 +68,16 @@ class AlternativeFinder:
         """Return p-value, gain and indistinguishable alternatives of one effect of the model.
 
         The gain is the increase of twice the log-likelihood over the model without the effect
-        (`reduced_model`). `rivals` has pairs of distance and name, the effect itself included.
+        (`reduced_model`). `competing_effects` has pairs of distance and name, the effect itself
+        included.
         """
         reduced_model = self._rest(model, effect)
         gain = model.likelihood.value - reduced_model.likelihood.value
         p_value = self._p_value(reduced_model, effect, gain)
-        rivals = self._rivals(model, effect)
+        competing_effects = self._rivals(model, effect)
         # Effects with implausible coefficients come last in their set.
-        rivals.sort(key=lambda rival: (not self._is_plausible(rival[1]), rival))
-        ordered = [name for _, name in rivals]
+        competing_effects.sort(key=lambda rival: (not self._is_plausible(rival[1]), rival))
+        ordered = [name for _, name in competing_effects]
         alternatives = tuple(name for name in ordered if name != effect)
         # With structure in the residual, indistinguishable does not mean equally likely, so the
         # effect found is kept.
@@ -125,7 +126,7 @@ class AlternativeFinder:
         log-likelihood; the effect itself has the distance 0.
         """
         shared = set(model.effects) - {effect}
-        rivals = [(0.0, effect)]
+        competing_effects = [(0.0, effect)]
         for other_model in list(self.search.models.values()):
             names = set(other_model.effects)
             has_same_size = len(names) == len(model.effects)
@@ -138,8 +139,8 @@ class AlternativeFinder:
                 continue
             distance = self._behind(model, other_model)
             if is_indistinguishable(distance) and not self._buys_nothing(effect, added, distance):
-                rivals.append((distance, added))
-        return self._without_richer(rivals)
+                competing_effects.append((distance, added))
+        return self._without_richer(competing_effects)
 
     def _buys_nothing(self, effect: str, other_effect: str, distance: float) -> bool:
         """Return whether another effect needs more coefficients without reducing the excess enough.
@@ -158,16 +159,20 @@ class AlternativeFinder:
             [MAX_RICHER_LAW_EXCESS_RATIO]
         )
 
-    def _without_richer(self, rivals: list[tuple[float, str]]) -> list[tuple[float, str]]:
+    def _without_richer(
+        self, competing_effects: list[tuple[float, str]]
+    ) -> list[tuple[float, str]]:
         """Return the rivals without those that contain another rival.
 
         These are families of which one member explains as much, and richer laws of which the
         simpler one does.
         """
         effects = self.search.world.available_effects
-        names = {name for _, name in rivals}
+        names = {name for _, name in competing_effects}
         return [
-            (distance, name) for distance, name in rivals if not names & set(effects[name].contains)
+            (distance, name)
+            for distance, name in competing_effects
+            if not names & set(effects[name].contains)
         ]
 
     def _behind(self, model: FittedModel, other_model: FittedModel) -> float:

@@ -218,18 +218,18 @@ class Inquiry:
         Only existing fits and scores are used; nothing is simulated here.
         """
         search = self._search
-        cut = self._watch.make_early_stop(self._held_out is not None)
+        early_stop = self._watch.make_early_stop(self._held_out is not None)
         model = self._model or search.get_best_so_far()
         # The residual was not tested, so it is counted as structure and not as noise.
         lack_of_fit = replace(assess_residual_size(search, model), p_value=0.0)
         alternatives = AlternativeFinder(search, self._trial, structure=False, simulates=False)
         causes = alternatives.collect_evidence(model)
         share = compute_gap_closed(search, model, lack_of_fit)
-        verdict = decide_early_stop_verdict(len(causes), share, cut.skipped_questions)
+        verdict = decide_early_stop_verdict(len(causes), share, early_stop.skipped_questions)
         result = self._finding(
             verdict, search.base_model, model, causes, assess_residual_size(search, model)
         )
-        return replace(result, early_stop=cut)
+        return replace(result, early_stop=early_stop)
 
     def _finding(
         self,
@@ -240,8 +240,10 @@ class Inquiry:
         lack_of_fit: LackOfFitResult,
     ) -> DiagnosisResult:
         """Bundle a verdict with its models, and with the held-out predictions if there are any."""
-        measured = self._trial.held_out_fits if self._trial is not None else None
-        return DiagnosisResult(verdict, model, base, causes, lack_of_fit, held_out_fits=measured)
+        held_out_fits = self._trial.held_out_fits if self._trial is not None else None
+        return DiagnosisResult(
+            verdict, model, base, causes, lack_of_fit, held_out_fits=held_out_fits
+        )
 
 
 def is_motionless(search: EffectSearch) -> bool:
@@ -339,15 +341,15 @@ def _select_preferred_model(
 def _is_unexplained(search: EffectSearch, model: FittedModel, lack_of_fit: LackOfFitResult) -> bool:
     """Return whether the model lacks something: structure in the residual, or a significant effect.
 
-    The p-value of the best missing effect (`chance`) comes from an earlier score test, or from one
+    The p-value of the best missing effect (`p_value`) comes from an earlier score test, or from one
     that is made here if the residual is above the noise.
     """
-    chance = search.best_p_values.get(frozenset(model.effects))
+    p_value = search.best_p_values.get(frozenset(model.effects))
     # A model with a residual above the noise was not scored, because the search did not need it.
-    if chance is None:
+    if p_value is None:
         is_above_noise = not lack_of_fit.has_structure and not search.is_noise_like(model)
-        chance = search.score_missing_effects(model).p_value if is_above_noise else 1.0
-    return verdict_rules.is_unexplained(lack_of_fit.has_structure, chance)
+        p_value = search.score_missing_effects(model).p_value if is_above_noise else 1.0
+    return verdict_rules.is_unexplained(lack_of_fit.has_structure, p_value)
 
 
 def compute_gap_closed(
@@ -365,8 +367,8 @@ def compute_gap_closed(
     """
     residual_sigma = model.likelihood.sigma
     # A residual without structure is noise, even if it exceeds an estimated noise floor.
-    usable = np.isfinite(residual_sigma) & ~lack_of_fit.has_structure
-    floor = np.where(usable, residual_sigma, search.noise.sigma)
+    is_noise = np.isfinite(residual_sigma) & ~lack_of_fit.has_structure
+    floor = np.where(is_noise, residual_sigma, search.noise.sigma)
     noise = np.maximum(floor, search.noise.sigma)
     before = _compute_normalised_rms(search, search.base_model, noise)
     after = _compute_normalised_rms(search, model, noise)

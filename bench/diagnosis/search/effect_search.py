@@ -193,7 +193,7 @@ class EffectSearch(ModelMoves):
         if self._explained_by(size):
             return self.get_best(size)
         if size == 1:
-            self.refit_extensions(smaller_models, MAX_REFITTED_CANDIDATES, patient=True)
+            self.refit_extensions(smaller_models, MAX_REFITTED_CANDIDATES, fits_all=True)
         else:
             for members in self._turns(smaller_models[1:]):
                 self.refit_extensions(members, MAX_REFITTED_CANDIDATES)
@@ -214,12 +214,16 @@ class EffectSearch(ModelMoves):
             model = self.without_step_errors(model)
         return self.is_noise_like(model) and self.is_complete(model, EFFECT_P_VALUE_THRESHOLD)
 
-    def _turns(self, rivals: Sequence[FittedModel]) -> Sequence[Sequence[FittedModel]]:
+    def _turns(self, competing_models: Sequence[FittedModel]) -> Sequence[Sequence[FittedModel]]:
         """Return groups of models to extend together.
 
         If simulations are expensive, models are extended one by one until the data are explained.
         """
-        return [[rival] for rival in rivals] if self.world.has_linearisation else [rivals]
+        return (
+            [[competing_model] for competing_model in competing_models]
+            if self.world.has_linearisation
+            else [competing_models]
+        )
 
     def refit_from_segments(self, size: int) -> None:
         """Search on short segments of the runs, and refit the best models to whole runs.
@@ -230,18 +234,22 @@ class EffectSearch(ModelMoves):
         """
         if size > MAX_EFFECTS_ON_SEGMENTS or self._forgets:
             return
-        cut = make_segment_evaluator(self.world)
-        if cut is None:
+        segment_evaluator = make_segment_evaluator(self.world)
+        if segment_evaluator is None:
             return
         # One search on segments serves every size; it decides nothing, and only provides starts.
         if self._sketch is None:
             self._sketch = EffectSearch(
-                cut, self.noise, self.frozen, self.make_rng("pieces"), self.stated
+                segment_evaluator, self.noise, self.frozen, self.make_rng("pieces"), self.stated
             )
-            self._sketch.refit_models([FitStart((), self.base_model.fit.theta, cut.guess)])
-        sketch = self._sketch
-        sketch.refit_extensions(select_beam(sketch, size - 1), MAX_REFITTED_CANDIDATES)
-        best = select_by_size(sketch, size)[:SEGMENT_MODELS_KEPT]
+            self._sketch.refit_models(
+                [FitStart((), self.base_model.fit.theta, segment_evaluator.guess)]
+            )
+        segment_models = self._sketch
+        segment_models.refit_extensions(
+            select_beam(segment_models, size - 1), MAX_REFITTED_CANDIDATES
+        )
+        best = select_by_size(segment_models, size)[:SEGMENT_MODELS_KEPT]
         if best:
             self.refit_models([join_segment_fits(self.world, model.fit) for model in best])
 
@@ -291,13 +299,13 @@ def select_beam(search: EffectSearch, size: int) -> list[FittedModel]:
         return members
     base = search.base_model.penalised_log_likelihood
     best_gain = members[0].penalised_log_likelihood - base
-    rivals = [
+    best_models = [
         model
         for model in members
         if model.penalised_log_likelihood - base >= MIN_RELATIVE_GAIN_IN_BEAM * best_gain
     ][:BEAM_WIDTH]
     nearest_models = sorted(members, key=lambda model: model.fit.cost)[:BEAM_WIDTH_BY_SQUARES]
-    return rivals + [model for model in nearest_models if model not in rivals]
+    return best_models + [model for model in nearest_models if model not in best_models]
 
 
 def is_hopeless(search: EffectSearch, larger: FittedModel) -> bool:

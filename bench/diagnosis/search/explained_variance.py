@@ -129,9 +129,9 @@ def _solve_best_subset(gram: Array, cross: Array, positive: Sequence[bool]) -> t
     number, count, samples = cross.shape
     best = np.zeros((number, samples))
     coefficients = np.zeros((number, count))
-    for chosen in _enumerate_subsets(count):
-        solution = _solved(gram, cross, chosen)
-        constrained = [place for place, i in enumerate(chosen) if positive[i]]
+    for subset in _enumerate_subsets(count):
+        solution = _solved(gram, cross, subset)
+        constrained = [place for place, i in enumerate(subset) if positive[i]]
         previous_best = best[solution.groups]
         # More columns must explain more than rounding error, otherwise the smaller subset is kept.
         is_better = solution.gain > previous_best * (1.0 + 1e-9)
@@ -142,15 +142,15 @@ def _solve_best_subset(gram: Array, cross: Array, positive: Sequence[bool]) -> t
         is_improved = is_better[:, 0]
         rows = solution.groups[is_improved]
         coefficients[rows] = 0.0
-        coefficients[rows[:, None], chosen] = solution.own[is_improved]
+        coefficients[rows[:, None], subset] = solution.own[is_improved]
     return best, coefficients
 
 
 def _enumerate_subsets(count: int) -> Iterator[list[int]]:
     """Yield every nonempty subset of `count` columns, the smallest first."""
     for size in range(1, count + 1):
-        for chosen in combinations(range(count), size):
-            yield list(chosen)
+        for subset in combinations(range(count), size):
+            yield list(subset)
 
 
 class _SubsetSolution(NamedTuple):
@@ -169,13 +169,13 @@ class _SubsetSolution(NamedTuple):
     own: Array
 
 
-def _solved(gram: Array, cross: Array, chosen: list[int]) -> _SubsetSolution:
+def _solved(gram: Array, cross: Array, subset: list[int]) -> _SubsetSolution:
     """Solve the normal equations G c = h of each group for a subset of its columns.
 
     Groups whose columns are zero or collinear are left out. `gram` G is (n, k, k), `cross` h (n, k,
-    S), and `chosen` has the indices of the columns.
+    S), and `subset` has the indices of the columns.
     """
-    products = gram[:, chosen][:, :, chosen]
+    products = gram[:, subset][:, :, subset]
     lengths = np.sqrt(np.maximum(np.diagonal(products, axis1=1, axis2=2), 0.0))
     nonzero_groups = np.flatnonzero((lengths > 0).all(axis=1))
     scale = lengths[nonzero_groups][:, :, None]
@@ -184,7 +184,7 @@ def _solved(gram: Array, cross: Array, chosen: list[int]) -> _SubsetSolution:
     has_full_rank = np.linalg.eigvalsh(normal)[:, 0] >= RANK_TOLERANCE
     solvable = nonzero_groups[has_full_rank]
     scale = scale[has_full_rank]
-    right_hand_side = cross[solvable[:, None], chosen] / scale
+    right_hand_side = cross[solvable[:, None], subset] / scale
     # With hundreds of right-hand sides, inverses are faster, and these matrices have unit
     # diagonals.
     scaled = np.linalg.inv(normal[has_full_rank]) @ right_hand_side

@@ -57,9 +57,9 @@ class HeldOutValidation:
         are fitted again from those of the model that predicts best.
         """
         # Stored by effects, so that a repeated model is simulated only once.
-        chosen = {model.effects: model for model in models}
-        results = self.runs.validate([model.fit for model in chosen.values()])
-        self.held_out_fits.update(zip(chosen, results, strict=True))
+        models_by_effects = {model.effects: model for model in models}
+        results = self.runs.validate([model.fit for model in models_by_effects.values()])
+        self.held_out_fits.update(zip(models_by_effects, results, strict=True))
 
     def compute_excess(self, names: EffectNames, sigma: Array | None = None) -> float:
         """Return the RMS residual of a model on the held-out runs in units of the noise, minus one.

@@ -40,18 +40,20 @@ class JointHatForce(Force):
 
         All batch elements of a call have the same joint, variable and direction.
         """
-        strength, joint, variable, centre, width, direction, slow = c
-        acting = np.flatnonzero(strength[:, 0])
-        if not acting.size:
+        strength, joint, variable, centre, width, direction, reversal_speed = c
+        active_elements = np.flatnonzero(strength[:, 0])
+        if not active_elements.size:
             return np.zeros_like(moment.x)
-        j = int(joint[acting[0], 0])
+        j = int(joint[active_elements[0], 0])
         x, v = moment.x[:, j, None], moment.v[:, j, None]
-        variable_index = int(variable[acting[0], 0])
+        variable_index = int(variable[active_elements[0], 0])
         value = (moment.t, x, np.abs(v))[variable_index]
         # A hat that is off has zero width, which must not be a divisor.
         height = np.maximum(1.0 - np.abs(value - centre) / np.maximum(width, 1e-12), 0.0)
-        dry = -v / (np.abs(v) + np.maximum(slow, 1e-9))
-        force_direction = (np.ones_like(v), -v, dry)[int(direction[acting[0], 0])]
+        dry_direction = -v / (np.abs(v) + np.maximum(reversal_speed, 1e-9))
+        force_direction = (np.ones_like(v), -v, dry_direction)[
+            int(direction[active_elements[0], 0])
+        ]
         result = np.zeros_like(moment.x)
         result[:, j] = (strength * height * force_direction)[:, 0]
         return result
@@ -69,13 +71,13 @@ class JointHatFamily(NamedTuple):
     slow: float
 
 
-def list_joint_families(world: RunEvaluator, slow: float) -> Iterator[JointHatFamily]:
+def list_joint_families(world: RunEvaluator, speed_share: float) -> Iterator[JointHatFamily]:
     """Yield every family of hats that the recording can show.
 
     Args:
         world: the runs.
-        slow: speed over which dry friction reverses its sign, as a share of the high speed of a
-            joint.
+        speed_share: speed over which dry friction reverses its sign, as a share of the high speed
+            of a joint.
     """
     longest_run = world.longest
     for joint, name in enumerate(world.simulator.system.coordinates):
@@ -85,7 +87,7 @@ def list_joint_families(world: RunEvaluator, slow: float) -> Iterator[JointHatFa
         # Quantiles instead of extremes, so that single outliers do not widen the range.
         low, high = (float(v) for v in np.nanquantile(values, [0.01, 0.99]))
         speed = _fastest(world, world.channels.index(name))
-        reversal_speed = slow * speed
+        reversal_speed = speed_share * speed
         yield JointHatFamily(
             f"time, along {name}", joint, TIME, ALONG, 0.0, longest_run, reversal_speed
         )

@@ -96,7 +96,7 @@ class HatForce(Force):
                 over which dry friction reverses its sign).
             moment: States of all batch elements at one time.
         """
-        strength, variable, centre, width, direction, slow = c
+        strength, variable, centre, width, direction, reversal_speed = c
         axes = moment.x.shape[1]
         variables = [moment.t, moment.speed, *(moment.x[:, k, None] for k in range(axes))]
         # The batch elements of one call follow different variables; each element has exactly one.
@@ -105,12 +105,12 @@ class HatForce(Force):
             for i, variable_value in enumerate(variables)
         )
         # A hat that is off has zero width, which must not be a divisor.
-        reach = np.maximum(width, 1e-12)
-        distance = np.abs(value - centre) / reach
+        half_width = np.maximum(width, 1e-12)
+        distance = np.abs(value - centre) / half_width
         height = np.maximum(1.0 - distance, 0.0)  # (1)
         # The force is smooth in the speed, so no step must be shortened where the motion reverses.
-        dry = -moment.v / (moment.speed + np.maximum(slow, 1e-9))
-        force_directions = [-moment.v, dry, *(np.eye(axes)[axis] for axis in range(axes))]
+        dry_direction = -moment.v / (moment.speed + np.maximum(reversal_speed, 1e-9))
+        force_directions = [-moment.v, dry_direction, *(np.eye(axes)[axis] for axis in range(axes))]
         selected_direction = sum(
             np.where(direction == i, force_direction, 0.0)
             for i, force_direction in enumerate(force_directions)
@@ -245,8 +245,8 @@ def compute_hat_directions(world: RunEvaluator, model: FittedModel) -> Direction
     changed = compute_responses(world, model.fit, added)
     values = np.nan_to_num(np.moveaxis(changed, 0, -1)) / size
     # A hat outside the range of all runs changes nothing and would be a column of zeros.
-    acting = np.flatnonzero(np.abs(values).max(axis=(0, 1, 2)) > 0)
-    return DirectionSet(tuple(probes[i] for i in acting), values[..., acting])
+    active_hats = np.flatnonzero(np.abs(values).max(axis=(0, 1, 2)) > 0)
+    return DirectionSet(tuple(probes[i] for i in active_hats), values[..., active_hats])
 
 
 def hat_probes(world: RunEvaluator) -> tuple[list[CandidateDirection], float]:
@@ -278,9 +278,14 @@ def _shapes(world: RunEvaluator, size: float) -> Iterator[tuple[str, float, floa
         for joint in joint_families(world, SIGN_CHANGE_SPEED_SHARE):
             yield joint.label, joint.low, joint.high, partial(_on_joint, joint, size)
         return
-    slow = SIGN_CHANGE_SPEED_SHARE * _high_speed_quantile(world)
+    reversal_speed = SIGN_CHANGE_SPEED_SHARE * _high_speed_quantile(world)
     for family in _families(world):
-        yield family.label, family.low, family.high, partial(_anywhere, family, size, slow)
+        yield (
+            family.label,
+            family.low,
+            family.high,
+            partial(_anywhere, family, size, reversal_speed),
+        )
 
 
 def _on_joint(
@@ -292,13 +297,16 @@ def _on_joint(
 
 
 def _anywhere(
-    family: _Family, size: float, slow: float, centre: float, width: float
+    family: _Family, size: float, reversal_speed: float, centre: float, width: float
 ) -> tuple[str, Array]:
     """Return effect name and coefficients of one hat force on a system without joints.
 
-    `size` is the strength of the hat, and `slow` the speed over which dry friction reverses.
+    `size` is the strength of the hat, and `reversal_speed` the speed over which dry friction
+    reverses.
     """
-    return HatForce.name, np.array([size, family.variable, centre, width, family.direction, slow])
+    return HatForce.name, np.array(
+        [size, family.variable, centre, width, family.direction, reversal_speed]
+    )
 
 
 class _Family(NamedTuple):

@@ -56,7 +56,7 @@ def select_refit_starts(
     model: FittedModel,
     direction_set: DirectionSet,
     scores: CandidateScores,
-    most: int,
+    max_count: int,
     patient: bool,
 ) -> list[FitStart]:
     """Return starts for fits with the most promising candidates.
@@ -67,18 +67,18 @@ def select_refit_starts(
         model: the model to extend.
         direction_set: sensitivity directions of the candidates.
         scores: their scores.
-        most: maximum number of candidates.
+        max_count: maximum number of candidates.
         patient: whether to include all candidates, or for robots up to `MAX_REFITS_THOROUGH`.
     """
     numbered = []
     # If scores use derivatives of the simulator, few candidates are better than their score.
     share = MIN_RELATIVE_SCORE_EXACT if world.has_linearisation else MIN_RELATIVE_SCORE
     if patient and world.has_linearisation:
-        most, share = MAX_REFITS_THOROUGH, 0.0
+        max_count, share = MAX_REFITS_THOROUGH, 0.0
     # If scores are less reliable, they only order the patient fits, and exclude none.
     is_all_wanted = patient and not world.has_linearisation
     for i in _rank_candidates(
-        scores, most, share, is_all_wanted, _find_simulated_scores(world, scores)
+        scores, max_count, share, is_all_wanted, _find_simulated_scores(world, scores)
     ):
         name = scores.effects[i]
         # The score peaks of an effect are fitted separately, because each may lead to its own
@@ -114,13 +114,17 @@ def _find_simulated_scores(world: RunEvaluator, scores: CandidateScores) -> froz
 
 
 def _rank_candidates(
-    scores: CandidateScores, most: int, share: float, is_all_wanted: bool, simulated: frozenset[int]
+    scores: CandidateScores,
+    max_count: int,
+    share: float,
+    is_all_wanted: bool,
+    simulated: frozenset[int],
 ) -> list[int]:
     """Return the indices of the candidates to refit, the most promising first.
 
     Args:
         scores: scores of all candidates.
-        most: maximum number of candidates by their score.
+        max_count: maximum number of candidates by their score.
         share: minimum score above the null level, as a share of the best one.
         is_all_wanted: whether to return all candidates.
         simulated: candidates scored by full simulation, which are selected separately.
@@ -132,7 +136,7 @@ def _rank_candidates(
     # Far from the data, the score of a full simulation may exceed the first-order score of the true
     # effect, so such candidates are added to the others and displace none.
     order = [i for i in ranked if i not in simulated]
-    selected = [i for i in order if score_excess[i] >= share * score_excess[order[0]]][:most]
+    selected = [i for i in order if score_excess[i] >= share * score_excess[order[0]]][:max_count]
     by_squares = [
         int(i) for i in np.argsort(-scores.white_noise_scores, kind="stable") if i not in simulated
     ]
@@ -235,13 +239,13 @@ def _list_start_sizes(
     if len(group.column_indices) > 1:
         return
     place = world.slots[name].start + first.place
-    _, reach = world.parameters[place].bounds
+    _, upper_bound = world.parameters[place].bounds
     shares = list(RANGE_SHARES)
     if first.signed:
         shares += [-share for share in RANGE_SHARES]
     for share in shares:
         c = first.coefficients.copy()
-        c[first.place] = share * reach
+        c[first.place] = share * upper_bound
         yield c
 
 

@@ -209,8 +209,8 @@ class _BestScores:
         # For each group: twice its log-likelihood, its correlation and its coefficients.
         self._values = np.full(len(members), -np.inf)
         self._phis = np.zeros(len(members))
-        widest = max((len(group.column_indices) for group in members), default=0)
-        self._coefficients = np.zeros((len(members), widest))
+        max_columns = max((len(group.column_indices) for group in members), default=0)
+        self._coefficients = np.zeros((len(members), max_columns))
         self._gains = np.zeros((effects, residuals))
         self._phi = self._determinant = 0.0
         self._total = np.zeros(residuals)
@@ -311,19 +311,19 @@ class _BestScores:
         effect.
         """
         values = self._values[places]
-        several = len(places) > SHAPE_COUNT_FOR_MULTISTART
+        has_many_shapes = len(places) > SHAPE_COUNT_FOR_MULTISTART
         peaks = values == values.max()
-        if several:
+        if has_many_shapes:
             # Neighbours of the best group give the same result, so only local maxima count.
-            around = np.concatenate([[-np.inf], values, [-np.inf]])
-            above_former = values >= around[:-2]
-            above_latter = values >= around[2:]
+            padded_values = np.concatenate([[-np.inf], values, [-np.inf]])
+            above_former = values >= padded_values[:-2]
+            above_latter = values >= padded_values[2:]
             peaks = above_former & above_latter
         order = np.argsort(-values, kind="stable")
-        most = STARTS_PER_EFFECT if several else 1
-        chosen = [places[i] for i in order if peaks[i]][:most]
+        max_peaks = STARTS_PER_EFFECT if has_many_shapes else 1
+        peak_places = [places[i] for i in order if peaks[i]][:max_peaks]
         result = []
-        for i in chosen:
+        for i in peak_places:
             group = self._groups[i]
             result.append((group, self._coefficients[i, : len(group.column_indices)].copy()))
         return tuple(result)
@@ -356,5 +356,5 @@ def estimate_tail_p_value(null_values: Array, observed: Array) -> float:
     # The scale of an exponential distribution is its mean excess over the threshold.
     tail_excess = extreme - begin
     mean_excess = max(float(tail_excess.mean()), 1e-9)
-    chance = TAIL_SHARE * np.exp(-(value - begin) / mean_excess)
-    return float(chance)
+    p_value = TAIL_SHARE * np.exp(-(value - begin) / mean_excess)
+    return float(p_value)

@@ -188,9 +188,9 @@ class ScoredModelSet(ModelSet):
                 )
             )
         if calls:
-            most = max(len(missing_effects) for _, missing_effects, *_ in calls)
+            max_effects = max(len(missing_effects) for _, missing_effects, *_ in calls)
             further_text = f" beside {len(calls)} models" if len(calls) > 1 else ""
-            self.world.watch.stage(f"testing {most} effects{further_text}", len(calls))
+            self.world.watch.stage(f"testing {max_effects} effects{further_text}", len(calls))
         scans = {}
         for number, scan in self.world.crew.map_unordered(self.world, _scan_model, calls):
             scans[number] = scan
@@ -259,14 +259,14 @@ class ScoredModelSet(ModelSet):
         return [name for name in self.world.library if name not in included_effects]
 
     def refit_extensions(
-        self, beam: Iterable[FittedModel], most: int, patient: bool = False
+        self, beam: Iterable[FittedModel], max_count: int, fits_all: bool = False
     ) -> None:
         """Refit the most promising extensions of models; known ones only if patient.
 
         Args:
             beam: models to extend.
-            most: maximum number of candidates per model.
-            patient: whether to include all candidates, and fit the beginnings of the runs first.
+            max_count: maximum number of candidates per model.
+            fits_all: whether to include all candidates, and fit the beginnings of the runs first.
         """
         starts = []
         models = list(beam)
@@ -286,13 +286,13 @@ class ScoredModelSet(ModelSet):
                 latest_model,
                 stored_scan.directions,
                 stored_scan.scores,
-                most,
-                patient,
+                max_count,
+                fits_all,
             )
-            starts += [s for s in extension_starts if patient or self._is_new(s, latest_model)]
-        if not self.world.has_linearisation or patient:
+            starts += [s for s in extension_starts if fits_all or self._is_new(s, latest_model)]
+        if not self.world.has_linearisation or fits_all:
             if starts:
-                self.refit_models(starts, patient=patient)
+                self.refit_models(starts, patient=fits_all)
             return
         # Laws that are evaluated in every step cost most, and the laws that they contain are often
         # sufficient.

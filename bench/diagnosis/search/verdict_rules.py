@@ -159,14 +159,14 @@ def has_structure(p_value: float, level: float, channels_above_noise: Sequence[s
     return p_value < level or len(channels_above_noise) > 0
 
 
-def is_unexplained(structure: bool, chance: float) -> bool:
+def is_unexplained(structure: bool, p_value: float) -> bool:
     """Return whether a model lacks something: a structure in the residual, or a library effect.
 
     Args:
         structure: whether the residual has structure.
-        chance: p-value of the best score of the library.
+        p_value: p-value of the best score of the library.
     """
-    return structure or chance < EFFECT_P_VALUE_THRESHOLD
+    return structure or p_value < EFFECT_P_VALUE_THRESHOLD
 
 
 def improves_held_out(merits: tuple[float, float], excesses: tuple[float, float]) -> bool:

@@ -294,12 +294,16 @@ class WhiteningDesign:
         for place in self._places():
             # Concatenate section by section, because whole copies would double the memory.
             parts = [self._columns(some, place) for some in residuals]
-            left = SegmentColumns(*(np.concatenate(rows) for rows in zip(*parts, strict=True)))
-            own = self._columns(self._jacobian, place)
+            residual_columns = SegmentColumns(
+                *(np.concatenate(rows) for rows in zip(*parts, strict=True))
+            )
+            jacobian_columns = self._columns(self._jacobian, place)
             some = self._columns(self._directions, place, has_neighbours=False)
-            add_self_products(squares, left, place)
-            add_cross_products(select_run(shared, place.run), own, left, place)
-            add_cross_products(cross, some, left, place)
+            add_self_products(squares, residual_columns, place)
+            add_cross_products(
+                select_run(shared, place.run), jacobian_columns, residual_columns, place
+            )
+            add_cross_products(cross, some, residual_columns, place)
         return squares, shared, cross
 
     def project_out(self, residuals: Array) -> Array:
@@ -467,7 +471,7 @@ def _matrix_root(normal: Array) -> Array:
     scale = np.where(scale > 0, scale, np.inf)[..., None]
     values, vectors = np.linalg.eigh(normal / scale / np.swapaxes(scale, -1, -2))
     largest = np.maximum(values[..., -1:], 1e-300)
-    counted = values > RANK_TOLERANCE * largest
-    root = np.where(counted, 1.0 / np.sqrt(np.where(counted, values, 1.0)), 0.0)
+    is_counted = values > RANK_TOLERANCE * largest
+    root = np.where(is_counted, 1.0 / np.sqrt(np.where(is_counted, values, 1.0)), 0.0)
     result: Array = vectors * root[..., None, :] / scale
     return result

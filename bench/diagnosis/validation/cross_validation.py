@@ -161,20 +161,20 @@ class CrossValidation:
         prediction.
         """
         thetas = [fit.theta.copy() for fit in fits]
-        trials = [(i, name) for i, fit in enumerate(fits) for name in fit.effects]
-        if not trials:
+        removals = [(i, name) for i, fit in enumerate(fits) for name in fit.effects]
+        if not removals:
             return thetas
         runs = len(world.tracks)
-        lanes = np.stack([fits[i].theta for i, _ in trials])
-        for lane, (_, name) in zip(lanes, trials, strict=True):
+        lanes = np.stack([fits[i].theta for i, _ in removals])
+        for lane, (_, name) in zip(lanes, removals, strict=True):
             lane[world.get_coefficient_indices(name)] = 0.0
         simulated_without = world.simulate(
             np.repeat(lanes, runs, axis=0),
-            np.tile(np.arange(runs), len(trials)),
-            np.concatenate([fits[i].states for i, _ in trials]),
-        ).reshape(len(trials), *world.observed.shape)
+            np.tile(np.arange(runs), len(removals)),
+            np.concatenate([fits[i].states for i, _ in removals]),
+        ).reshape(len(removals), *world.observed.shape)
         observed_mask = np.isfinite(world.observed)
-        for (i, name), simulated in zip(trials, simulated_without, strict=True):
+        for (i, name), simulated in zip(removals, simulated_without, strict=True):
             change = ((fits[i].simulated - simulated) / self.noise.sigma)[observed_mask]
             # If the simulation fails without the effect, the change is NaN and the effect is kept.
             if np.linalg.norm(change) < SHOWN:

@@ -85,13 +85,13 @@ def compute_central_jacobian(
     rows = np.repeat(vectors, runs, axis=0)
     lanes = np.tile(np.arange(runs), len(vectors))
     simulated = world.simulate(rows, lanes, states.reshape(-1, size))
-    below, above = simulated.reshape(2, steps.size, *fit.simulated.shape)
+    lower_side, upper_side = simulated.reshape(2, steps.size, *fit.simulated.shape)
 
     # Row j has changed parameter j, so the widths are on the diagonal.
     lower, upper = theta[:, :q, fit.free]
     parameter_widths = np.diagonal(upper - lower)
     widths = np.concatenate([parameter_widths, 2.0 * steps[q:]])
-    jacobian = np.moveaxis(above - below, 0, -1) / widths
+    jacobian = np.moveaxis(upper_side - lower_side, 0, -1) / widths
     # A simulation that failed on one side gives no slope.
     jacobian = np.nan_to_num(jacobian, nan=0.0, posinf=0.0, neginf=0.0)
     state_jacobian = fit.jacobian[..., q:] if world.has_linearisation else jacobian[..., q:]

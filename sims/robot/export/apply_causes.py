@@ -319,8 +319,8 @@ def set_attributes(element: Any, statement: AttributeStatement) -> None:
         if name in ENUM_ATTRIBUTES:
             value: Any = getattr(mujoco, ENUM_ATTRIBUTES[name])(int(values[0]))
         elif name in FLAG_ATTRIBUTES:
-            limited = mujoco.mjtLimited
-            value = limited.mjLIMITED_TRUE if values[0] else limited.mjLIMITED_FALSE
+            limit_states = mujoco.mjtLimited
+            value = limit_states.mjLIMITED_TRUE if values[0] else limit_states.mjLIMITED_FALSE
         elif name in INTEGER_ATTRIBUTES:
             value = int(values[0])
         elif kind == "frame" and name == "pos":

@@ -106,9 +106,9 @@ class MjcfDocument:
         self, tag: XmlElement, bodies: list[XmlElement], joints: list[XmlElement]
     ) -> None:
         """Collect bodies depth first, and the joints of each body before those of its children."""
-        below: list[XmlElement] = []
-        self._append_children(tag, below, joints)
-        for body in below:
+        child_bodies: list[XmlElement] = []
+        self._append_children(tag, child_bodies, joints)
+        for body in child_bodies:
             bodies.append(body)
             self._collect_bodies(body, bodies, joints)
 

@@ -57,8 +57,8 @@ def _get_gravity_strength(f: Fields, robot: RobotModel, place: str) -> Sequence[
 def _get_force_limit(f: Fields, robot: RobotModel, place: str) -> Sequence[float]:
     """Return the upper force limit of an actuator in a list of one; infinite if none."""
     number = robot.actuator(place).id
-    limited = f["actuator_forcelimited"][0, number]
-    return [f["actuator_forcerange"][0, number, 1]] if limited else [np.inf]
+    is_limited = f["actuator_forcelimited"][0, number]
+    return [f["actuator_forcerange"][0, number, 1]] if is_limited else [np.inf]
 
 
 class Reading(NamedTuple):

@@ -190,9 +190,9 @@ def simulate_test_motion(model: Any, pose: Array | None = None) -> Array:
     data.qpos[:] = displace_reference_pose(model) if pose is None else pose
     low, high = model.actuator_ctrlrange.T
     middle, half_range = (low + high) / 2.0, (high - low) / 2.0
-    limited = model.actuator_ctrllimited.astype(bool)
+    is_limited = model.actuator_ctrllimited.astype(bool)
     signs = 0.5 * np.cos(np.arange(model.nu))
-    control = np.where(limited, middle + half_range * signs, signs)
+    control = np.where(is_limited, middle + half_range * signs, signs)
     steps = min(int(COMPARED_SECONDS / model.opt.timestep), MAX_COMPARED_STEPS)
     state = np.zeros(mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS))
     mujoco.mj_getState(model, data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)

@@ -283,8 +283,8 @@ class MjcfEditor:
 
     def _format_heading(self) -> str:
         """Format the comment at the top: the origin of the file, and notes."""
-        fitted = f", with what was found in {self.recording}" if self.recording else ""
-        return format_heading([f"{self.robot.path.name}{fitted}", *self.applied.notes])
+        origin_text = f", with what was found in {self.recording}" if self.recording else ""
+        return format_heading([f"{self.robot.path.name}{origin_text}", *self.applied.notes])
 
 
 def compile_mjcf(text: str) -> Any:

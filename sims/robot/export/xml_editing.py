@@ -196,7 +196,9 @@ class XmlText:
 
     def _render_inserted(self, tag: XmlElement, indent: bytes) -> bytes:
         """Return the text of the elements inserted before all children."""
-        below = self._get_indentation(tag.children[0].begin) if tag.children else indent + b"  "
+        child_indent = (
+            self._get_indentation(tag.children[0].begin) if tag.children else indent + b"  "
+        )
         parts = []
         inserted = [(child.before, _render_new_element(child)) for child in tag.inserted]
         for comments, element in [*tag.within, *inserted]:
@@ -204,7 +206,7 @@ class XmlText:
                 *map(self._render_comment, comments),
                 *([element.encode()] if element else []),
             ]:
-                parts += [self._newline + below, line]
+                parts += [self._newline + child_indent, line]
         return b"".join(parts)
 
     def _render_start_tag(self, tag: XmlElement) -> bytes:
@@ -255,8 +257,8 @@ def format_heading(lines: list[str]) -> str:
     Args:
         lines: description of the file, followed by notes.
     """
-    first, *more = lines
-    return "\n     ".join([f"{first}; written by simgap", *more])
+    first, *other_lines = lines
+    return "\n     ".join([f"{first}; written by simgap", *other_lines])
 
 
 def strip_heading(text: str) -> str:

@@ -77,7 +77,7 @@ def add_actuators(spec: Any, tables: Mapping[str, Any], source: str) -> tuple[st
     Raises:
         InputError: a table is invalid; existing names are listed.
     """
-    rated = []
+    rate_controlled = []
     for name, entries in tables.items():
         table_name = f"actuators.{name}"
         table = toml_validation.check_entries(
@@ -85,8 +85,8 @@ def add_actuators(spec: Any, tables: Mapping[str, Any], source: str) -> tuple[st
         )
         _check_actuator_table(spec, source, table_name, name, table)
         _add_actuator(spec, name, table)
-        rated += [name] if "kd" in table else []
-    return tuple(rated)
+        rate_controlled += [name] if "kd" in table else []
+    return tuple(rate_controlled)
 
 
 def _check_actuator_table(

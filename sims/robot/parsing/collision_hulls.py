@@ -283,14 +283,14 @@ def write_hulls(model: Any, hulls: Mapping[str, Hull]) -> None:
         rows = slice(polygon, polygon + hull.polygons.sizes.size)
         model.mesh_polynum[i] = hull.polygons.sizes.size
         model.mesh_polynormal[rows] = hull.normals
-        begins, counts = model.mesh_polyvertadr[rows], model.mesh_polyvertnum[rows]
-        corner = _write_lists(model.mesh_polyvert, begins, counts, hull.polygons, corner)
+        first_indices, counts = model.mesh_polyvertadr[rows], model.mesh_polyvertnum[rows]
+        corner = _write_lists(model.mesh_polyvert, first_indices, counts, hull.polygons, corner)
         polygon = rows.stop
         first_vertex = int(model.mesh_vertadr[i])
         model.mesh_polymapnum[first_vertex : first_vertex + int(model.mesh_vertnum[i])] = 0
         rows = slice(first_vertex, first_vertex + hull.around.sizes.size)
-        begins, counts = model.mesh_polymapadr[rows], model.mesh_polymapnum[rows]
-        mapped = _write_lists(model.mesh_polymap, begins, counts, hull.around, mapped)
+        first_indices, counts = model.mesh_polymapadr[rows], model.mesh_polymapnum[rows]
+        mapped = _write_lists(model.mesh_polymap, first_indices, counts, hull.around, mapped)
 
 
 def _count_hull_elements(hulls: Iterable[Hull]) -> Array:
@@ -300,18 +300,20 @@ def _count_hull_elements(hulls: Iterable[Hull]) -> Array:
     return total
 
 
-def _gather_lists(values: Integers, begins: Integers, sizes: Integers) -> Lists:
+def _gather_lists(values: Integers, first_indices: Integers, sizes: Integers) -> Lists:
     """Copy lists of the given begins and sizes out of a flat array."""
-    ends = np.cumsum(sizes)
-    places = np.repeat(begins - ends + sizes, sizes) + np.arange(ends[-1] if ends.size else 0)
+    list_ends = np.cumsum(sizes)
+    places = np.repeat(first_indices - list_ends + sizes, sizes) + np.arange(
+        list_ends[-1] if list_ends.size else 0
+    )
     return Lists(values[places], sizes.copy())
 
 
 def _write_lists(
-    values: Integers, begins: Integers, sizes: Integers, lists: Lists, first: int
+    values: Integers, first_indices: Integers, sizes: Integers, lists: Lists, first: int
 ) -> int:
     """Write lists into an array from index `first` on; return the end index."""
-    ends = first + np.cumsum(lists.sizes)
-    begins[:], sizes[:] = ends - lists.sizes, lists.sizes
+    list_ends = first + np.cumsum(lists.sizes)
+    first_indices[:], sizes[:] = list_ends - lists.sizes, lists.sizes
     values[first : first + lists.values.size] = lists.values
     return first + lists.values.size

@@ -30,11 +30,17 @@ def compute_triangle_violation(moments: Array) -> float:
 
 def find_nearest_valid_moments(moments: Array) -> Array:
     """Return the nearest physically valid moments, in kg m^2: positive, with A + B >= C."""
-    raised: Array = np.maximum(moments, np.where(moments < NEGLIGIBLE_MOMENT, MIN_MOMENT, 0.0))
-    third = (compute_triangle_violation(raised) + ROUNDING_SHARE * np.max(raised)) / 3
-    if third <= ROUNDING_SHARE * np.max(raised) / 3:
-        return raised
-    return np.where(raised == np.max(raised), raised - third, raised + third)
+    raised_moments: Array = np.maximum(
+        moments, np.where(moments < NEGLIGIBLE_MOMENT, MIN_MOMENT, 0.0)
+    )
+    third = (
+        compute_triangle_violation(raised_moments) + ROUNDING_SHARE * np.max(raised_moments)
+    ) / 3
+    if third <= ROUNDING_SHARE * np.max(raised_moments) / 3:
+        return raised_moments
+    return np.where(
+        raised_moments == np.max(raised_moments), raised_moments - third, raised_moments + third
+    )
 
 
 def compute_principal_moments(entries: Sequence[float]) -> tuple[Array, Array]:

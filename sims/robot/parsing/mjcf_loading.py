@@ -94,7 +94,7 @@ def load_referenced_files(files: ModelFileReader, root: Element) -> MissingFiles
         InputError: a count, a size or a file is too large, or an attached model is missing.
     """
     _check_sizes(files, root, 1.0)
-    absent = MissingFiles()
+    missing_files = MissingFiles()
     settings = {key: value for e in find_children(root, "compiler") for key, value in e.items()}
     asset_folder = settings.get("assetdir", "")
     mesh_folder = settings.get("meshdir", asset_folder)
@@ -116,8 +116,8 @@ def load_referenced_files(files: ModelFileReader, root: Element) -> MissingFiles
                 if not _read_asset(files, folder, name, strip)
             ]
             if missing:
-                _insert_placeholder(absent, asset, element, missing[0])
-    return absent
+                _insert_placeholder(missing_files, asset, element, missing[0])
+    return missing_files
 
 
 def _check_sizes(files: ModelFileReader, element: Element, factor: float) -> None:
@@ -131,14 +131,14 @@ def _check_sizes(files: ModelFileReader, element: Element, factor: float) -> Non
             if key in (*COUNT_ATTRIBUTES, *MAX_SIZE_ATTRIBUTES)
             else []
         )
-        most = MAX_SIZE_ATTRIBUTES.get(key, MAX_COUNT)
+        max_value = MAX_SIZE_ATTRIBUTES.get(key, MAX_COUNT)
         if key in COUNT_ATTRIBUTES:
             factor *= math.prod(max(number, 1.0) for number in numbers)
-        if max([factor, *numbers]) > most or (
+        if max([factor, *numbers]) > max_value or (
             key.startswith("nuser_") and _parse_size(value) > MAX_COUNT
         ):
             raise files.make_error(
-                element, f'{key}="{truncate_text(value)}" is too much: at most {most:g} in all'
+                element, f'{key}="{truncate_text(value)}" is too much: at most {max_value:g} in all'
             )
     for child in element:
         _check_sizes(files, child, factor)
@@ -189,21 +189,23 @@ def _read_asset(files: ModelFileReader, folder: str, name: str, strip: bool) -> 
     return True
 
 
-def _insert_placeholder(absent: MissingFiles, asset: Element, element: Element, file: str) -> None:
+def _insert_placeholder(
+    missing_files: MissingFiles, asset: Element, element: Element, file: str
+) -> None:
     """Replace an asset with a missing file by a placeholder that loads, if possible."""
     name = element.get("name") or PurePosixPath(file.replace("\\", "/")).stem
     if element.tag == "mesh":
-        absent.meshes[name] = file
+        missing_files.meshes[name] = file
         attributes = {"name": name, "vertex": PLACEHOLDER_MESH_VERTICES}
     elif element.tag == "hfield":
-        absent.fields[name] = file
+        missing_files.fields[name] = file
         attributes = {"name": name, "nrow": "2", "ncol": "2", "size": "1 1 1 1"}
     elif element.tag == "texture":
-        absent.pictures.append(file)
+        missing_files.pictures.append(file)
         attributes = {"name": name, "type": element.get("type", "cube"), "builtin": "flat"}
         attributes |= {"width": "1", "height": "1"}
     elif element.tag == "skin":
-        absent.pictures.append(file)
+        missing_files.pictures.append(file)
         asset.remove(element)
         return
     else:

@@ -100,10 +100,10 @@ def _make_robot(
         spec = _parse_repaired_file(files, root)
         urdf_loading.stiffen_mimics(spec)
     else:
-        absent = mjcf_loading.load_referenced_files(files, root)
+        missing_files = mjcf_loading.load_referenced_files(files, root)
         spec = _parse_repaired_file(files, root)
-        absent.remove_from_spec(spec, repairs.left)
-    rated = added_actuators.add_actuators(spec, actuators, source)
+        missing_files.remove_from_spec(spec, repairs.left)
+    rate_controlled = added_actuators.add_actuators(spec, actuators, source)
     notes += added_actuators.apply_engine_settings(spec, engine, source)
     notes += element_names.name_unnamed_elements(spec)
     parents = {body.name: body.parent.name for body in spec.bodies if body.parent is not None}
@@ -133,7 +133,7 @@ def _make_robot(
         ),
         aliases=aliases,
         digest=files.digest.hexdigest(),
-        rate_controlled_actuators=rated,
+        rate_controlled_actuators=rate_controlled,
         actuator_tables=actuators,
         engine_table=engine,
         speeds=urdf_loading.read_velocity_limits(root) if kind == "urdf" else {},

@@ -51,11 +51,11 @@ def repair_inertials(
     Raises:
         InputError: a mass is negative, or an entry is not a number.
     """
-    points, raised, inferred = [], [], []
+    point_masses, raised_links, inferred_links = [], [], []
     for name, link in links.items():
         inertials = find_children(link, "inertial")
         if not inertials:
-            inferred += (
+            inferred_links += (
                 [name] if find_children(link, "collision") and name not in fixed_links else []
             )
             continue
@@ -77,9 +77,9 @@ def repair_inertials(
         change = _raise_moments(tensor, entries)
         if name in fixed_links or weight < FRAME_MASS_THRESHOLD or not change:
             continue
-        points += [name] if max(map(abs, entries)) < inertia_repair.NEGLIGIBLE_MOMENT else []
-        raised += [f"{name} {change}"] if name not in points else []
-    return _format_repair_notes(points, raised, inferred)
+        point_masses += [name] if max(map(abs, entries)) < inertia_repair.NEGLIGIBLE_MOMENT else []
+        raised_links += [f"{name} {change}"] if name not in point_masses else []
+    return _format_repair_notes(point_masses, raised_links, inferred_links)
 
 
 def _raise_moments(tensor: Element, entries: Sequence[float]) -> str:
@@ -95,30 +95,32 @@ def _raise_moments(tensor: Element, entries: Sequence[float]) -> str:
     return inertia_repair.format_moments(moments, after)
 
 
-def _format_repair_notes(points: list[str], raised: list[str], inferred: list[str]) -> list[str]:
+def _format_repair_notes(
+    point_masses: list[str], raised_links: list[str], inferred_links: list[str]
+) -> list[str]:
     """Return the notes about repaired inertials of links, one for each kind of repair.
 
     Args:
-        points: links with a mass and no moments of inertia.
-        raised: links with moments that were not positive, with the values before and after.
-        inferred: links without an inertial, whose mass follows from their collision shapes.
+        point_masses: links with a mass and no moments of inertia.
+        raised_links: links with moments that were not positive, with the values before and after.
+        inferred_links: links without an inertial, whose mass follows from their collision shapes.
     """
     notes = []
-    if points:
+    if point_masses:
         min_moment = f"{inertia_repair.MIN_MOMENT:g} kg m^2"
         notes.append(
             f"a mass and no moments of inertia, so a point ({min_moment}): "
-            f"{format_name_list(points)}"
+            f"{format_name_list(point_masses)}"
         )
-    if raised:
+    if raised_links:
         notes.append(
             "principal moments that are not positive; the nearest that a body can have are taken "
-            f"(kg m^2): {format_item_list(raised)}"
+            f"(kg m^2): {format_item_list(raised_links)}"
         )
-    if inferred:
+    if inferred_links:
         notes.append(
             "no mass stated; it follows from the collision shapes at 1000 kg/m^3, as MuJoCo does: "
-            f"{format_name_list(inferred)}"
+            f"{format_name_list(inferred_links)}"
         )
     return notes
 
@@ -141,11 +143,13 @@ def remove_unusable_shapes(
         InputError: the mass of a moving link would depend on a missing mesh.
     """
     meshes = MeshLookup(files, compiler.get("meshdir") or compiler.get("assetdir") or "")
-    inferring = compiler.get("inertiafromgeom") == "true"
+    is_mass_inferred = compiler.get("inertiafromgeom") == "true"
     for key in MESH_FOLDER_SETTINGS:
         compiler.attrib.pop(key, None)
     for name, link in links.items():
-        has_mass = (bool(find_children(link, "inertial")) and not inferring) or name in fixed_links
+        has_mass = (
+            bool(find_children(link, "inertial")) and not is_mass_inferred
+        ) or name in fixed_links
         for shape in find_children(link, "visual"):
             link.remove(shape)
         for shape in find_children(link, "collision"):

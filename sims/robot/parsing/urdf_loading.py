@@ -153,8 +153,8 @@ def _get_link_name(files: ModelFileReader, joint: Element, tag: str) -> str:
     Raises:
         InputError: the joint does not state this link.
     """
-    ends = find_children(joint, tag)
-    name = ends[0].get("link") if ends else None
+    end_elements = find_children(joint, tag)
+    name = end_elements[0].get("link") if end_elements else None
     if not name:
         label = truncate_text(joint.get("name") or "without a name")
         raise files.make_error(joint, f"joint {label} states no {tag} link")
@@ -195,13 +195,13 @@ def _find_parent_links(
     return parents
 
 
-def _is_fixed_to_root(above: Mapping[str, tuple[str, Element]], name: str) -> bool:
+def _is_fixed_to_root(parents: Mapping[str, tuple[str, Element]], name: str) -> bool:
     """Return whether only fixed joints are between a link and the root, so that it never moves.
 
-    `above` maps a link to its parent link and the joint between them.
+    `parents` maps a link to its parent link and the joint between them.
     """
-    while name in above:
-        name, joint = above[name]
+    while name in parents:
+        name, joint = parents[name]
         if joint.get("type") != "fixed":
             return False
     return True

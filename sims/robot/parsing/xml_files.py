@@ -60,12 +60,12 @@ class ModelFileReader:
         element = self.given[number - 1] if 0 < number <= len(self.given) else None
         return self.make_error(element, re.sub(r", line \d+", "", message))
 
-    def read_content(self, path: Path, most: int) -> bytes:
+    def read_content(self, path: Path, max_bytes: int) -> bytes:
         """Read a file, and add its bytes to the digest.
 
         Args:
             path: path of the file.
-            most: maximum size in bytes.
+            max_bytes: maximum size in bytes.
 
         Raises:
             InputError: the file cannot be read, or is too large.
@@ -73,8 +73,8 @@ class ModelFileReader:
         require_file(path)
         try:
             size = path.stat().st_size
-            if size > most:
-                raise InputError(f"{path}: {size} bytes; a file of a model has at most {most}")
+            if size > max_bytes:
+                raise InputError(f"{path}: {size} bytes; a file of a model has at most {max_bytes}")
             data = path.read_bytes()
         except OSError as error:
             raise InputError(f"{path}: cannot be read ({error.strerror})") from None
@@ -107,16 +107,16 @@ def parse_tree(files: ModelFileReader, path: Path) -> Element:
         )
     # Like MuJoCo's parser, accept blank lines before the declaration and zero bytes after the end.
     text = data.rstrip(b"\0").lstrip(b" \t\r\n")
-    above = data[: data.find(text[:1])].count(b"\n") if text else 0
+    skipped_lines = data[: data.find(text[:1])].count(b"\n") if text else 0
     parser = expat.ParserCreate()
-    builder = _LineTrackingTreeBuilder(files, path, parser, above)
+    builder = _LineTrackingTreeBuilder(files, path, parser, skipped_lines)
     try:
         parser.Parse(text, True)
     except InputError:
         raise
     except expat.ExpatError as error:
         reason = expat.ErrorString(error.code)
-        line = error.lineno + above
+        line = error.lineno + skipped_lines
         expectation = "a robot's model file is MJCF or URDF"
         raise InputError(f"{path}:{line}: not well-formed XML: {reason}; {expectation}") from None
     except (ValueError, LookupError) as error:  # The declared encoding does not exist.
@@ -127,13 +127,13 @@ def parse_tree(files: ModelFileReader, path: Path) -> Element:
 class _LineTrackingTreeBuilder:
     """XML tree under construction by a parser."""
 
-    def __init__(self, files: ModelFileReader, path: Path, parser: Any, above: int) -> None:
+    def __init__(self, files: ModelFileReader, path: Path, parser: Any, skipped_lines: int) -> None:
         """Set the handlers of the parser, which call this object for each tag.
 
-        `above` is the number of lines of the file above the parsed text; it is added to
+        `skipped_lines` is the number of lines of the file above the parsed text; it is added to
         line numbers.
         """
-        self.files, self.path, self.parser, self.above = files, path, parser, above
+        self.files, self.path, self.parser, self.above = files, path, parser, skipped_lines
         self.open: list[Element] = []
         self.top: Element | None = None
         parser.StartElementHandler = self.begin

@@ -50,8 +50,8 @@ class ExcitationCommand(NamedTuple):
 
     def to_signal_text(self, share: float) -> str:
         """Format as a signal text, with the amplitude multiplied by a share."""
-        swing = f"multisine:{share * self.size:.4g}:{SLOW:g}:{FAST:g}"
-        return f"{self.centre:.6g} + {swing}" if self.centre else swing
+        signal_text = f"multisine:{share * self.size:.4g}:{SLOW:g}:{FAST:g}"
+        return f"{self.centre:.6g} + {signal_text}" if self.centre else signal_text
 
 
 class LazyDefaultRecording:
@@ -95,11 +95,11 @@ def _make_commands(robot: RobotModel, joints: Sequence[Joint]) -> list[Excitatio
     Each command oscillates about a holding value that balances gravity in the reference pose.
     """
     holding, forces = _compute_reference_forces(robot, joints)
-    driven = {joint.name: joint for joint in joints}
+    joints_by_name = {joint.name: joint for joint in joints}
     commands = []
     for actuator in robot.actuators:
-        if actuator.joint in driven:
-            joint = driven[actuator.joint]
+        if actuator.joint in joints_by_name:
+            joint = joints_by_name[actuator.joint]
             holding_force, force = holding[joint.name], forces[joint.name]
             commands.append(_make_command(robot, actuator, joint, holding_force, force))
     if commands:
@@ -124,9 +124,9 @@ def _compute_reference_forces(
     holding, forces = {}, {}
     for number, joint in enumerate(joints):
         holding[joint.name] = float(bias[joint.velocity])
-        swing = _choose_amplitude(joint, float(model.qpos0[joint.position]))
+        amplitude = _choose_amplitude(joint, float(model.qpos0[joint.position]))
         # The inertia force of a free joint at the centre frequency; gravity restrains other joints.
-        free = sizes.inertia[number] * CENTRE_FREQUENCY**2 * swing
+        free = sizes.inertia[number] * CENTRE_FREQUENCY**2 * amplitude
         forces[joint.name] = float(max(free, MIN_GRAVITY_FORCE_SHARE * sizes.force[number]))
     return holding, forces
 
@@ -138,12 +138,12 @@ def _choose_amplitude(joint: Joint, start: float) -> float:
         joint: joint to move.
         start: position about which it moves, in rad or m.
     """
-    swing = SWING_AMPLITUDES[joint.kind]
+    amplitude = SWING_AMPLITUDES[joint.kind]
     if joint.range is None:
-        return swing
+        return amplitude
     low, high = joint.range
     margin = MAX_MARGIN_SHARE * min(start - low, high - start)
-    return min(swing, MAX_RANGE_SHARE * (high - low), margin if margin > 0 else swing)
+    return min(amplitude, MAX_RANGE_SHARE * (high - low), margin if margin > 0 else amplitude)
 
 
 def _make_command(
@@ -156,11 +156,11 @@ def _make_command(
     """
     model = robot.compiled
     start = float(model.qpos0[joint.position])
-    swing = _choose_amplitude(joint, start)
+    amplitude = _choose_amplitude(joint, start)
     if actuator.kind in ("position", "pid"):
-        centre, size = start, swing
+        centre, size = start, amplitude
     elif actuator.kind == "velocity":
-        centre, size = 0.0, CENTRE_FREQUENCY * swing
+        centre, size = 0.0, CENTRE_FREQUENCY * amplitude
     else:
         gain = float(model.actuator_gear[actuator.id, 0] * model.actuator_gainprm[actuator.id, 0])
         gain = gain or 1.0
@@ -185,9 +185,9 @@ def _stays_within_ranges(
 
     model = robot.compiled
     data = mujoco.MjData(model)
-    limited = [joint for joint in joints if joint.range is not None]
-    places = [joint.position for joint in limited]
-    low, high = np.array([joint.range for joint in limited]).reshape(-1, 2).T
+    limited_joints = [joint for joint in joints if joint.range is not None]
+    places = [joint.position for joint in limited_joints]
+    low, high = np.array([joint.range for joint in limited_joints]).reshape(-1, 2).T
     # The reference pose of a file may violate the file's limits, so limits include it.
     low, high = np.minimum(low, model.qpos0[places]), np.maximum(high, model.qpos0[places])
     control_array: Any = (

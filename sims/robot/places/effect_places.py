@@ -101,10 +101,10 @@ def make_placed_effect(effect: type[Effect], spot: EffectPlace) -> type[Effect]:
         changed["limit"] = _limit_of(effect)
     elif issubclass(effect, HiddenStateEffect):
         changed["act"] = _make_act_method(effect)
-        declared = effect.between or effect.coefficients
+        declared_coefficients = effect.between or effect.coefficients
         coefficients = [
             _add_search_starts(_adapt_to_place(effect, c, spot))
-            for c in declared
+            for c in declared_coefficients
             if not _has_quantity(spot, c)
         ]
         contained_names = [
@@ -132,9 +132,9 @@ def _force_of(effect: type[Force]) -> Callable[[Force, Array, StateSnapshot], Ar
     def force(self: Force, c: Array, moment: StateSnapshot) -> Array:
         """Compute the force (L, D) along the joint of the effect."""
         joint = cast(int, self.coordinate)
-        alone = cast(RobotSnapshot, moment).get_joint_snapshot(joint)
+        joint_snapshot = cast(RobotSnapshot, moment).get_joint_snapshot(joint)
         result = np.zeros_like(moment.x)
-        result[:, joint] = effect.force(self, c, alone)[:, 0]
+        result[:, joint] = effect.force(self, c, joint_snapshot)[:, 0]
         return result
 
     return force
@@ -193,8 +193,8 @@ def _limit_of(effect: type[Friction]) -> Callable[[Friction, Array, StateSnapsho
 
     def limit(self: Friction, c: Array, moment: StateSnapshot) -> Array:
         """Compute the friction limit (L, 1) of the effect's joint."""
-        alone = cast(RobotSnapshot, moment).get_joint_snapshot(cast(int, self.coordinate))
-        return effect.limit(self, c, alone)
+        joint_snapshot = cast(RobotSnapshot, moment).get_joint_snapshot(cast(int, self.coordinate))
+        return effect.limit(self, c, joint_snapshot)
 
     return limit
 
@@ -246,9 +246,9 @@ def _make_act_method(effect: type[HiddenStateEffect]) -> Callable[..., tuple[Arr
     ) -> tuple[Array, Array]:
         """Compute the force (L, D) along the effect's joint, and the rate of its hidden state."""
         joint = cast(int, self.coordinate)
-        alone = cast(RobotSnapshot, moment).get_joint_snapshot(joint)
+        joint_snapshot = cast(RobotSnapshot, moment).get_joint_snapshot(joint)
         result = np.zeros_like(moment.x)
-        force, rate = effect.act(self, c, alone, state)
+        force, rate = effect.act(self, c, joint_snapshot, state)
         result[:, joint] = force[:, 0]
         return result, rate
 
@@ -364,8 +364,8 @@ def _adapt_to_place(effect: type[Effect], c: Coefficient, spot: EffectPlace) -> 
     if c.of == "give":
         high = 1.0 / (spot.inertia * MIN_LOAD_FREQUENCY**2)
     upper_limit = c.most
-    with_total = effect.at == "joint" or effect.name == "gravity.compensation"
-    file_value = spot.stated.get(effect.name) if with_total else None
+    has_total = effect.at == "joint" or effect.name == "gravity.compensation"
+    file_value = spot.stated.get(effect.name) if has_total else None
     if file_value is not None:
         # The total must not be negative, so the difference can at most remove the value of the
         # file.
@@ -423,11 +423,11 @@ def _needs_no_engine_support(effect: type[Effect]) -> bool:
     if issubclass(effect, Input | Sensor):
         return True
     # A force that needs more than its own joint is undefined at one of several joints.
-    alone = effect.needs in ("", "guide", "input", "servo")
+    has_known_need = effect.needs in ("", "guide", "input", "servo")
     if issubclass(effect, HiddenStateEffect):
         # An effect with a share of the joint's inertia must declare what it connects.
         return bool(effect.between) or effect.behind is HiddenStateEffect.behind
-    return alone and issubclass(effect, Force | Friction)
+    return has_known_need and issubclass(effect, Force | Friction)
 
 
 def _acts_at(

@@ -97,7 +97,7 @@ def test_free_numbers_are_asked_about_with_the_check_alone(tmp_path, capsys):
 def test_of_many_causes_the_surest_are_listed_and_the_others_counted(tmp_path):
     numbers = check_identifiability(recorded(tmp_path))
     causes = [n for n in numbers if not n.free]
-    lines = format_identifiability(numbers, most=3)
+    lines = format_identifiability(numbers, max_count=3)
     sure = [n.name for n in causes if n.word == "identifiable"]
     assert len(sure) > 6
     assert f"{len(sure)} identifiable" in lines[2]
