@@ -132,7 +132,7 @@ class FloatingJoints:
         return FloatingState(pose, rate)
 
     def displace(self, pose: Array, number: int, displacement: float) -> Array:
-        """Displace poses along one degree of freedom, by (1): add to a position, or rotate.
+        """Displace poses along one degree of freedom, by eq. (1): add to a position, or rotate.
 
         Args:
             pose: (n, P) poses.
@@ -160,7 +160,7 @@ class FloatingJoints:
         return result
 
     def displaced(self, pose: Array, displacements: Array) -> Array:
-        """Displace poses (n, P) by small displacements (n, F) by (1), in m and rad.
+        """Displace poses (n, P) by small displacements (n, F) by eq. (1), in m and rad.
 
         Positions move along the axes of the world; rotations are about the axes of the body.
         """

@@ -145,12 +145,12 @@ def write_friction_form(fields: Fields, robot: RobotModel, lanes: Any, dofs: Any
 
 
 def add_to_stated(file_value: Any, c: Any) -> Any:
-    """Add a coefficient to a value, at least zero (1); a negative value of the file may remain."""
+    """Add a coefficient to a value by eq. (1), at least zero; a negative file value may remain."""
     return np.maximum(file_value + c, np.minimum(file_value, 0.0))
 
 
 def compute_factor(c: Any) -> Any:
-    """Return the factor 1 + c of (2), at least `MIN_FACTOR`."""
+    """Return the factor 1 + c of eq. (2), at least `MIN_FACTOR`."""
     return np.maximum(1.0 + c, MIN_FACTOR)
 
 
@@ -165,14 +165,14 @@ def _add_dof(field: str) -> FieldWriter:
 
 
 def _add_quadratic(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
-    """Add c to the quadratic damping of a joint, force = -c |v| v, by (1)."""
+    """Add c to the quadratic damping of a joint, force = -c |v| v, by eq. (1)."""
     # The first number of the polynomial multiplies |v| v.
     column = fields["dof_dampingpoly"][:, robot.joint(place).velocity]
     column[:, 0] = add_to_stated(column[:, 0], c[0])
 
 
 def _add_friction(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
-    """Add c to the dry friction of a joint by (1), in N m or N.
+    """Add c to the dry friction of a joint by eq. (1), in N m or N.
 
     Where the friction increases, it also becomes stiff, so that the joint hardly creeps at rest;
     with `friction_form` soft, the file's solver parameters remain.
@@ -186,7 +186,7 @@ def _add_friction(fields: Fields, robot: RobotModel, place: str, c: Array) -> No
 
 
 def _add_spring(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
-    """Add c to the linear stiffness of a joint by (1), in N m/rad or N/m."""
+    """Add c to the linear stiffness of a joint by eq. (1), in N m/rad or N/m."""
     column = fields["jnt_stiffness"]
     number = robot.joint(place).id
     column[:, number] = add_to_stated(column[:, number], c[0])
@@ -200,24 +200,24 @@ def _add_cubic(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
 
 
 def _scale_mass(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
-    """Scale mass and inertia of a body by 1 + c (2), as if its density changed."""
+    """Scale mass and inertia of a body by 1 + c, eq. (2), as if its density changed."""
     number = robot.body(place).id
     fields["body_mass"][:, number] *= compute_factor(c[0])
     fields["body_inertia"][:, number] *= compute_factor(c[0])[:, None]
 
 
 def _scale_inertia(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
-    """Scale the inertia of a body by 1 + c (2), with the same mass."""
+    """Scale the inertia of a body by 1 + c, eq. (2), with the same mass."""
     fields["body_inertia"][:, robot.body(place).id] *= compute_factor(c[0])[:, None]
 
 
 def _offset_mass(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
-    """Move the centre of mass of a body by c (3 numbers, m) in the body frame (3)."""
+    """Move the centre of mass of a body by c (3 numbers, m) in the body frame, eq. (3)."""
     fields["body_ipos"][:, robot.body(place).id] += c.T  # (3)
 
 
 def _scale_stiffness(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
-    """Scale the stiffness of a position servo by 1 + c (2).
+    """Scale the stiffness of a position servo by 1 + c, eq. (2).
 
     MuJoCo computes the servo force as gainprm[0] u + biasprm[1] l + biasprm[2] l', with the
     control u, the length l and its rate l'. The gain is scaled too where it is the same
@@ -231,7 +231,7 @@ def _scale_stiffness(fields: Fields, robot: RobotModel, place: str, c: Array) ->
 
 
 def _scale_damping(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
-    """Scale the damping of a servo by 1 + c (2).
+    """Scale the damping of a servo by 1 + c, eq. (2).
 
     MuJoCo computes the servo force as gainprm[0] u + biasprm[1] l + biasprm[2] l', with the
     control u, the length l and its rate l'. The gain is scaled too where it is the same
@@ -269,7 +269,7 @@ def _scale_gravity(fields: Fields, robot: RobotModel, place: str, c: Array) -> N
 
 
 def _tilt_gravity(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:  # noqa: ARG001
-    """Tilt gravity by adding g c_x along x and g c_y along y (4), with the magnitude g."""
+    """Tilt gravity by adding g c_x along x and g c_y along y, eq. (4), with the magnitude g."""
     size = float(np.linalg.norm(robot.compiled.opt.gravity))
     fields["opt.gravity"][:, :2] += size * c.T  # (4)
 
@@ -294,7 +294,7 @@ def _move_zero(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
 
 
 def _turn_axis(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
-    """Turn the axis of a joint by the rotation vector c in rad (6), where c is not zero.
+    """Turn the axis of a joint by the rotation vector c in rad, eq. (6), where c is not zero.
 
     `vector` (n, 3) holds the rotation vectors of these n elements. The rotation follows
     Rodrigues' formula; the result is normalised because MuJoCo expects a unit vector.
@@ -332,7 +332,7 @@ def _compensate_gravity(fields: Fields, robot: RobotModel, place: str, c: Array)
 
 
 def _add_payload(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
-    """Add a point mass to a body (7), in the batch elements whose payload is not zero.
+    """Add a point mass to a body by eq. (7), in the batch elements whose payload is not zero.
 
     The coefficients are the mass in kg and its offset from the file's centre of mass in m, in
     the body frame. MuJoCo stores principal moments and their axes, so the tensor is composed in
@@ -359,7 +359,7 @@ def _add_payload(fields: Fields, robot: RobotModel, place: str, c: Array) -> Non
 
 
 def compute_point_inertias(arms: Array) -> Array:
-    """Return J(d) = |d|^2 1 - d d' of (7), the inertia tensors of unit masses at d.
+    """Return J(d) = |d|^2 1 - d d' of eq. (7), the inertia tensors of unit masses at d.
 
     Args:
         arms: (L, 3) vectors d from the reference point, in m.
@@ -395,7 +395,7 @@ def _compute_quaternions(matrices: Array) -> Array:
 
 
 def _limit_force(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
-    """Restrict the force range of an actuator to [-c, c] (5), in batch elements with c > 0.
+    """Restrict the force range of an actuator to [-c, c], eq. (5), in batch elements with c > 0.
 
     `free` marks elements whose actuator has no force range yet; theirs starts from ±infinity.
     """

@@ -74,8 +74,8 @@ class DetectionLimit:
     Attributes:
         size: Half its 95 % interval; for a limit or backlash the size at which it is detectable;
             infinite if the data are insensitive to it.
-        estimate_if_fitted: Estimate after one Gauss-Newton step from zero, (2); zero for a limit or
-            backlash.
+        estimate_if_fitted: Estimate after one Gauss-Newton step from zero, eq. (2) of the module
+            docstring; zero for a limit or backlash.
         limit: ``above`` for backlash, which is detectable from that size on; ``below`` for a limit,
             which is detectable up to it; empty for proportional effects.
         confounded_with: Parameters of the model that are confounded with it.

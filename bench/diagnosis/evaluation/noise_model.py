@@ -75,10 +75,10 @@ def _has_predecessor(observed_mask: Mask) -> Mask:
 
 
 def whiten(values: Array, observed_mask: Mask, noise: NoiseModel) -> Array:
-    """Whiten values by (2).
+    """Whiten values with AR(1) noise, by eq. (2) of the module docstring.
 
     Args:
-        values: (R, T, C, ...) noise, or derivatives of noisy signals, because (2) is linear.
+        values: (R, T, C, ...) noise, or derivatives of noisy signals, because whitening is linear.
         observed_mask: (R, T, C) mask of available samples; the others become zero.
         noise: noise of each channel.
 
@@ -108,7 +108,7 @@ def whiten(values: Array, observed_mask: Mask, noise: NoiseModel) -> Array:
 
 
 def compute_log_determinant(observed_mask: Mask, phi: Array | float) -> float:
-    """Return half the log-determinant of whitening at unit variance, -m/2 log(1 - φ²) of (3)."""
+    """Return half the log-determinant of whitening at unit variance: -m/2 log(1 - φ²)."""
     predecessor_counts = _has_predecessor(observed_mask).sum(axis=(0, 1))
     logarithms = np.log1p(-np.square(phi))
     return float(-0.5 * (predecessor_counts * logarithms).sum())
@@ -119,8 +119,8 @@ class Likelihood:
     """Twice the log-likelihood of a residual, maximised over phi and sigma of each channel.
 
     Attributes:
-        value: (4) summed over the channels, without its last term, which is the same for all
-            models.
+        value: twice the log-likelihood, eq. (4) of the module docstring, summed over the channels,
+            without its last term, which is the same for all models.
         sigma: (C,) standard deviation of the noise of each channel; NaN for a channel without
             samples.
         phi: (C,) AR(1) correlation of each channel.
@@ -170,7 +170,7 @@ def _maximise_channel_likelihood(
     observed_mask: Mask,
     share: float,
 ) -> tuple[float, float, float]:
-    """Return the maximum of (4) for one channel (R, T, 1), with its correlation and variance.
+    """Return the maximum of eq. (4) for one channel (R, T, 1), with its correlation and variance.
 
     The variance is estimated with the remaining degrees of freedom. The likelihood counts all
     samples, because Schwarz's criterion has a separate penalty for fitted parameters.
@@ -242,7 +242,7 @@ def compute_portmanteau_p_value(
 
 
 def _correlated(w: Array, count: int) -> float:
-    """Return the sum Σ r_k² / (n - k) of eq. (5), the Ljung-Box test of autocorrelation.
+    """Return the sum Σ r_k² / (n - k) of the Ljung-Box test of `compute_portmanteau_p_value`.
 
     `w` (R, T) has the whitened values of a channel, and `count` is n, the number of samples.
     """

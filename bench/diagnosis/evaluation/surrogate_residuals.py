@@ -92,7 +92,7 @@ def _simulate_autoregression(
     count: int,
     rng: np.random.Generator,
 ) -> Array:
-    """Simulate the autoregressions (1) with resampled innovations of a residual.
+    """Simulate autoregressions, eq. (1), with resampled innovations of a residual.
 
     Args:
         residual: (R, T, C) residual.
@@ -127,7 +127,7 @@ def _simulate_autoregression(
 
 
 def _correct_bias(weights: Array, projected_pilots: Array, observed_mask: Mask) -> Array:
-    """Correct weights (p,) for the bias of a fit, by (2).
+    """Correct weights (p,) for the bias of a fit, by eq. (2) of the module docstring.
 
     Args:
         weights: (p,) weights of an autoregression.
@@ -243,7 +243,8 @@ def _yule_walker(covariances: Array, order: int) -> tuple[Array, float]:
 
         Σ_l γ_|k-l| a_l = γ_k,   var u = γ_0 - Σ_k a_k γ_k                                       (3)
 
-    The variance is infinite if (1) is not stationary, so that this order is not selected.
+    The variance is infinite if the autoregression is not stationary, so that this order is not
+    selected.
     """
     power = covariances[0]
     # Order zero is white noise; without power there is no signal.
@@ -262,6 +263,6 @@ def _yule_walker(covariances: Array, order: int) -> tuple[Array, float]:
 
 
 def _max_root(weights: Array) -> float:
-    """Return the largest modulus of the roots; the response of (1) is a sum of their powers."""
+    """Return the largest modulus of the roots; the impulse response is a sum of their powers."""
     roots = np.roots(np.concatenate([[1.0], -weights]))
     return float(np.abs(roots).max(initial=0.0))

@@ -141,7 +141,7 @@ def _find_first_within_limits(
     Args:
         world: Run evaluator of the present runs.
         models: Models that may be true.
-        runs: Candidate runs with the difference of the models (1), largest first.
+        runs: Candidate runs with the RMS difference of the two models, largest first.
 
     Returns:
         A run with its difference, which is 0 if no discriminating run is within the limits; None

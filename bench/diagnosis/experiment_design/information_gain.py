@@ -90,9 +90,10 @@ class RunValue(NamedTuple):
 
     Attributes:
         run: Candidate run.
-        values: (1) of each ordered pair of models, or (2) alone.
+        values: Discrimination T of each ordered pair of models, eq. (1) of the module docstring;
+            with one model the information gain D, eq. (2).
         value: Value of the run over all pairs.
-        is_exact: Whether (1) is computed exactly, not only to first order.
+        is_exact: Whether T is computed exactly, not only to first order.
     """
 
     run: CandidateRun
@@ -130,7 +131,11 @@ class RunRanker:
     # -- runs
 
     def rank_runs(self, runs: Sequence[CandidateRun]) -> list[RunValue]:
-        """Return the runs within the limits, the best first, by (1) to first order or by (2)."""
+        """Return the runs within the limits, the best first.
+
+        They are ordered by the linearised discrimination T, or with one model by the information
+        gain D: eqs. (1) and (2) of the module docstring.
+        """
         diagnosed_model = self.known[0].model
         allowed_runs = [
             run
@@ -168,7 +173,7 @@ class RunRanker:
         return RunValue(run, values, _sum_discrimination(values))
 
     def evaluate_exactly(self, entry: RunValue) -> RunValue:
-        """Compute (1) exactly, because the competing model may be far from linear on the run."""
+        """Compute the discrimination T exactly, as the competing model may be far from linear."""
         if not self.pairs:
             return entry._replace(is_exact=True)
         values = entry.values.copy()
@@ -334,7 +339,7 @@ def _compute_remaining_difference(
     deviation: Array | None = None,
     damping: float = 1e-9,
 ) -> tuple[float, Array, Array]:
-    """Compute (1) to first order, and the steps of parameters and states at its minimum.
+    """Compute the discrimination T to first order, and the steps to the minimum of eq. (1).
 
     Args:
         gap: (n,) residual of the competing model.
@@ -358,7 +363,7 @@ def _compute_remaining_difference(
 
 
 def _compute_information_gain(slopes: _LinearisedRun, known_model: _Known) -> float:
-    """Compute (2), the logarithm of the decrease of the uncertainty."""
+    """Compute the information gain D, eq. (2): the logarithm of the decrease of uncertainty."""
     basis, _ = np.linalg.qr(slopes.states)
     projected_slopes = slopes.numbers - basis @ (basis.T @ slopes.numbers)
     covariance = np.linalg.pinv(known_model.inverse, hermitian=True)

@@ -38,10 +38,10 @@ class NextRunDesign:
     Attributes:
         says: Commands in words.
         by: Criterion: ``T`` if the run distinguishes models, ``D`` if it narrows parameters.
-        gain: For ``D``, (2) of `information_gain`, the logarithm of the factor by which the volume
-            of the confidence region shrinks; for ``T``, the smallest `discrimination`.
+        gain: For ``D``, eq. (2) of `information_gain`, the logarithm of the factor by which the
+            volume of the confidence region shrinks; for ``T``, the smallest `discrimination`.
         effect: Effect of the present model that is to be distinguished; empty for ``D``.
-        discrimination: (1) of `information_gain` from each alternative effect; empty for ``D``.
+        discrimination: Eq. (1) of `information_gain` from each alternative effect; empty for ``D``.
         times: (T,) sample times in seconds.
         inputs: (T,) values by input, each held until the next sample.
         initial: Initial states by name.

@@ -277,7 +277,9 @@ class FitState:
         return steps
 
     def update_jacobian(self, new_point: FitPoint) -> Array:
-        """Return derivatives (R, T, C, q + s) at a new point by Broyden's update (4), run by run.
+        """Return derivatives (R, T, C, q + s) at a new point by Broyden's update of each run.
+
+        The update is eq. (4) of the module docstring.
 
         Args:
             new_point: the point that the step has reached.

@@ -60,7 +60,7 @@ class GaussNewtonStep:
 
 @dataclass(frozen=True)
 class _ArrowheadEquations:
-    """The normal equations (2) and (3) of R runs, q shared parameters and s initial states.
+    """The normal equations, eqs. (2) and (3), of R runs, q shared parameters and s initial states.
 
     Attributes:
         shared: (q, q) U.
@@ -123,7 +123,7 @@ def compute_schur_complement(shared: Array, cross: Array, inner: Array) -> tuple
         inner: (R, s, s) all V_i.
 
     Returns:
-        The matrix (q, q) of (4), and all V_i⁻¹ W_iᵀ (R, s, q).
+        The matrix (q, q) of eq. (4), and all V_i⁻¹ W_iᵀ (R, s, q).
     """
     transposed = cross.transpose(0, 2, 1)
     solution = np.linalg.solve(inner, transposed)
@@ -166,8 +166,8 @@ def compute_gauss_newton_step(
         residual: (R, T, C) whitened residual, observed minus simulated.
         jacobian: (R, T, C, q + s) whitened derivatives of the simulation; initial states last.
         q: number of shared parameters.
-        drift: (R, s) the d of (1): deviations of initial states from their guesses, in sigmas.
-        prior: (s,) the π of (1).
+        drift: (R, s) the d of eq. (1): deviations of initial states from their guesses, in sigmas.
+        prior: (s,) the π of eq. (1).
         known_mask: (R, s) initial states that do not move.
         damping: Levenberg-Marquardt damping λ.
         blocked_mask: (q,) parameters that do not move.
@@ -193,7 +193,7 @@ def _assemble_normal_equations(
     drift: Array,
     prior: Array,
 ) -> _ArrowheadEquations:
-    """Build the normal equations (2) and (3) of all runs, without damping.
+    """Build the normal equations, eqs. (2) and (3), of all runs, without damping.
 
     Args:
         j: (R, n, q + s) whitened derivatives, initial states last; n samples of all channels.

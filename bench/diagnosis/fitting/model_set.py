@@ -63,8 +63,8 @@ class FittedModel:
     Attributes:
         fit: the fit.
         likelihood: likelihood of the residual of the fit.
-        penalised_log_likelihood: penalised log-likelihood (1); it counts parameters, coefficients,
-            and the initial states that the data determine.
+        penalised_log_likelihood: penalised log-likelihood, eq. (1) of the module docstring; it
+            counts parameters, coefficients, and the initial states that the data determine.
     """
 
     fit: TrajectoryFit
@@ -151,7 +151,7 @@ class ModelSet:
         return self.models[key]
 
     def _of(self, fit: TrajectoryFit) -> FittedModel:
-        """Return a fit with its likelihood and its merit (1), the penalised log-likelihood."""
+        """Return a fit with its likelihood and its penalised log-likelihood, eq. (1)."""
         freedom = fit.free.size + count_identified_states(self.world, fit, self.noise)
         # A model that could not be simulated is stored, too, so that it is not tried again.
         likelihood = _LOST

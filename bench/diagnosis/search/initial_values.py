@@ -185,7 +185,7 @@ def generate_neighbouring_end_stops(world: RunEvaluator, name: str, c: Array) ->
 def generate_equal_travel_end_stops(world: RunEvaluator, name: str, c: Array) -> Iterator[Array]:
     """Yield softer and harder end stops (k,) with the same turning point as a given one.
 
-    The depth of contact for a motion of equal energy is proportional to k^(-2/5), by (2) of
+    The depth of contact for a motion of equal energy is proportional to k^(-2/5), by eq. (2) of
     `sims.effects.state_limits`.
 
     Args:

@@ -330,7 +330,7 @@ class _BestScores:
 
 
 def estimate_tail_p_value(null_values: Array, observed: Array) -> float:
-    """Return the p-value (5) of the largest observed value.
+    """Return the p-value of the largest observed value, eq. (5) of the module docstring.
 
     Beyond the most extreme fifth of the surrogates, the tail is assumed to be exponential, as that
     of a likelihood ratio is.

@@ -387,7 +387,7 @@ class WhiteningDesign:
 
 
 class InnerProducts:
-    """Inner products (2) of residuals and directions, with fitted unknowns projected out.
+    """Inner products, eq. (2), of residuals and directions, with fitted unknowns projected out.
 
     Args:
         design: the Jacobian of the model and the directions.

@@ -151,7 +151,7 @@ def _bounds_around(world: RunEvaluator, fit: TrajectoryFit) -> Array:
 
 
 def compute_covariance(models: ModelSet, model: FittedModel) -> Array:
-    """Compute the covariance (q, q) of the fitted parameters, (2), with autocorrelated noise."""
+    """Compute the covariance (q, q) of the fitted parameters with AR(1) noise, by eq. (2)."""
     fisher_blocks = compute_fisher_blocks(models, model)
     parameter_curvature = fisher_blocks.own.sum(axis=0)
     # The Schur complement that solves a step of the fit also eliminates the initial states here.
@@ -167,7 +167,7 @@ def invert_scaled(parameter_curvature: Array, schur_complement: Array) -> Array:
     Directions that the data do not identify get a huge variance.
 
     Args:
-        parameter_curvature: (q, q) curvature by the parameters alone, the first sum of (2); it
+        parameter_curvature: (q, q) curvature by the parameters alone, the first sum of eq. (2); it
             scales the inversion.
         schur_complement: (q, q) curvature after elimination of the initial states.
     """
@@ -188,7 +188,7 @@ def invert_scaled(parameter_curvature: Array, schur_complement: Array) -> Array:
 
 
 class FisherBlocks(NamedTuple):
-    """Blocks of (2) for each run.
+    """Blocks of the covariance, eq. (2) of the module docstring, for each run.
 
     Attributes:
         noise: Noise used for whitening: the residual of the model.
@@ -291,7 +291,7 @@ class HeldOutGain:
         base: RMS error of the base model, in the unit of the channels.
         extended: RMS error of the extended model.
         floor: RMS of the noise.
-        gap_closed: Share of the gap closed (1).
+        gap_closed: Share of the gap closed, eq. (1) of the module docstring.
         low: Lower end of its 95 % interval; NaN if there is none.
         high: Upper end of its 95 % interval; NaN if there is none.
     """
@@ -313,7 +313,7 @@ def compute_held_out_gain(
     rng: np.random.Generator,
     by_stretches: bool = False,
 ) -> HeldOutGain:
-    """Compute the share of the gap closed (1), with a bootstrap interval over runs.
+    """Compute the share of the gap closed, eq. (1), with a bootstrap interval over runs.
 
     With a single run, or on request, segments of the runs are resampled (D. N. Politis, J. P.
     Romano 1992).

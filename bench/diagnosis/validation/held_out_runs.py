@@ -52,10 +52,10 @@ class HeldOutFit:
 
     Attributes:
         simulated: (R, T, C) prediction; NaN if the simulation failed.
-        penalised_log_likelihood: Penalised log-likelihood (1); minus infinity if the simulation
-            failed.
+        penalised_log_likelihood: Penalised log-likelihood, eq. (1) of the module docstring; minus
+            infinity if the simulation failed.
         states: (R, s) initial states, fitted to these runs.
-        freedom: Effective number of initial states, f in (1).
+        freedom: Effective number of initial states, f in eq. (1).
     """
 
     simulated: Array
@@ -241,7 +241,7 @@ class HeldOutRuns:
 
 
 def merit_of(observed: Array, simulated: Array, free: float) -> float:
-    """Compute the penalised log-likelihood (1) of predictions.
+    """Compute the penalised log-likelihood of predictions, eq. (1) of the module docstring.
 
     Args:
         observed: (R, T, C) observations; NaN where missing.

@@ -116,8 +116,8 @@ class ParameterConsistency:
         value: Estimate of the joint fit.
         error: Standard error of the joint estimate, from the curvature.
         group_estimates: Estimates of the groups that identify the parameter.
-        scatter: Tau of (4), the standard deviation between groups beyond their errors.
-        p_value: P-value of test (3).
+        scatter: Tau of eq. (4), the standard deviation between groups beyond their errors.
+        p_value: P-value of Cochran's Q test, eq. (3) of the module docstring.
         is_consistent: Whether the groups are consistent.
         trend: Trend with a constant or with the order of logs; None by run or with fewer than three
             groups.
@@ -138,7 +138,7 @@ class ParameterConsistency:
 
     @property
     def prediction_sigma(self) -> float:
-        """Standard error for a run that is not yet recorded, (5)."""
+        """Standard error for a run that is not yet recorded, eq. (5) of the module docstring."""
         return float(np.hypot(self.error, self.scatter))
 
 
@@ -292,7 +292,7 @@ def _list_groupings(runs: Sequence[Run]) -> Iterator[_RunGrouping]:
 
 
 def _compute_run_normal_equations(models: ModelSet, model: FittedModel) -> tuple[Array, Array]:
-    """Compute the normal equations of each run: H (R, q, q) and g (R, q) of (1)."""
+    """Compute the normal equations of each run: H (R, q, q) and g (R, q) of eq. (1)."""
     world, fit = models.world, model.fit
     q = fit.free.size
     fisher_blocks = compute_fisher_blocks(models, model)
@@ -372,7 +372,7 @@ def _regularised_inverse(curvature: Array) -> Array:
 
 
 def _estimate_heterogeneity(parts: Sequence[GroupEstimate]) -> tuple[float, float]:
-    """Estimate by how much groups differ beyond their errors: tau of (4), and the p-value of (3).
+    """Estimate by how much groups differ beyond their errors: tau of eq. (4), and the p-value.
 
     The method is that of DerSimonian and Laird, with Cochran's Q.
     """

@@ -37,7 +37,7 @@ class _Actuator:
     """The fields of one actuator, and its properties."""
 
     def __init__(self, fields: Fields, robot: RobotModel, place: str) -> None:
-        """Read the fields of the actuator with this name, and the properties that (1) and (2) need.
+        """Read the fields of the actuator with this name, and its properties for eqs. (1) and (2).
 
         `gain` and `bias` are views, so that writing to them changes `fields`. `direct`
         means without activation dynamics, `fixed` with a constant gain, `clamped` with a
@@ -116,7 +116,7 @@ _NOT_LINEAR = "its actuator is not a gain and a bias of one control"
 
 
 def _write_input_gain(fields: Fields, robot: RobotModel, cause: FittedCause) -> UnstatableReason:
-    """Write an input gain into the actuator: scale its gain (1), and its control range (2)."""
+    """Write an input gain into the actuator: scale its gain, eq. (1), and its range, eq. (2)."""
     actuator, (a,) = _Actuator(fields, robot, cause.place), cause.coefficients
     scaled = actuator.single and actuator.fixed and (actuator.direct or actuator.filtered)
     if not scaled:
@@ -131,7 +131,7 @@ def _write_input_gain(fields: Fields, robot: RobotModel, cause: FittedCause) -> 
 
 
 def _write_input_bias(fields: Fields, robot: RobotModel, cause: FittedCause) -> UnstatableReason:
-    """Write an input bias into the actuator: shift its force (1), and its control range (2).
+    """Write an input bias into the actuator: shift its force, eq. (1), and its range, eq. (2).
 
     `share` is the factor 1 + a of an input gain that is in the fields already.
     """
@@ -147,7 +147,7 @@ def _write_input_bias(fields: Fields, robot: RobotModel, cause: FittedCause) -> 
 
 
 def _write_saturation(fields: Fields, robot: RobotModel, cause: FittedCause) -> UnstatableReason:
-    """Write a saturation of the input at ±s as a narrower control range of the actuator (2).
+    """Write a saturation of the input at ±s as a narrower control range, eq. (2).
 
     A saturation s of zero or less has no effect, as in the simulation.
     """

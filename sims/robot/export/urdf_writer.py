@@ -123,7 +123,7 @@ class UrdfWriter:
         return inertials or None
 
     def _write_mass(self, cause: FittedCause) -> str | None:
-        """Scale mass and inertia tensor of each link in the body, by (1).
+        """Scale mass and inertia tensor of each link in the body, by eq. (1).
 
         The result is None, or the reason why the URDF cannot state the cause.
         """
@@ -155,7 +155,7 @@ class UrdfWriter:
         return None
 
     def _write_centre_of_mass(self, cause: FittedCause) -> str | None:
-        """Move the centre of mass of each link in the body by the same vector in metres, by (2).
+        """Move the centre of mass of each link in the body by the same vector in metres, eq. (2).
 
         The result is None, or the reason why the URDF cannot state the cause.
         """
@@ -170,7 +170,7 @@ class UrdfWriter:
         return None
 
     def _write_joint_zero(self, cause: FittedCause) -> str | None:
-        """Move the zero of a joint by c (rad or m): turn or move its origin, by (3).
+        """Move the zero of a joint by c (rad or m): turn or move its origin, by eq. (3).
 
         The result is None, or the reason why the URDF cannot state the cause.
         """
@@ -202,7 +202,7 @@ class UrdfWriter:
         return None
 
     def _write_link_length(self, cause: FittedCause) -> str | None:
-        """Lengthen a link: move its joint away from the joint of the parent body, by (4).
+        """Lengthen a link: move its joint away from the joint of the parent body, by eq. (4).
 
         `carrier` is the parent body in the compiled model, and `axes` are the axes of the
         parent link in it. The result is None, or the reason why the URDF cannot state the
@@ -220,7 +220,7 @@ class UrdfWriter:
         return None
 
     def _write_payload(self, cause: FittedCause) -> str | None:
-        """Add a point mass to a link: new mass, centre of mass, and inertia tensor by (5).
+        """Add a point mass to a link: new mass, centre of mass, and inertia tensor by eq. (5).
 
         The coefficients are the mass `added_mass` in kg and its offset from the body's centre of
         mass in m. The tensor is computed in the axes of the link about the common centre of

@@ -170,7 +170,7 @@ def _add_actuator(spec: Any, name: str, table: Mapping[str, Any]) -> None:
 
 
 def _set_pid(actuator: Any, gains: dict[str, float], kd: float | None) -> None:
-    """Make an actuator a PID servo, (4) or (5).
+    """Make an actuator a PID servo, by eq. (4) or (5) of `add_actuators`.
 
     With kd, a gain on the rate of the error, the actuator has two controls: the set point and
     its rate.
