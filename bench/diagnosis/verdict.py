@@ -274,7 +274,7 @@ class Verdict:
     def to_document(self) -> JsonDocument:
         """Return the content of verdict.json."""
         # The keys keep the order of the documentation and of older files.
-        proposed = self.next_experiment
+        next_run = self.next_experiment
         faults = [fault.document() for fault in self.recording_faults]
         return {
             "verdict": self.verdict,
@@ -284,7 +284,7 @@ class Verdict:
             "parameters": _convert_estimates(self.parameters),
             "heldout": self.heldout.to_document() if self.heldout is not None else None,
             "candidates": [candidate.to_document() for candidate in self.candidates],
-            "next_experiment": proposed.to_document() if proposed is not None else None,
+            "next_experiment": next_run.to_document() if next_run is not None else None,
             "simulations": self.simulations,
             "seconds": self.seconds,
             "cut": self.cut.to_document() if self.cut is not None else None,
@@ -296,7 +296,7 @@ class Verdict:
     def from_document(cls, document: Mapping[str, Any]) -> Verdict:
         """Build a verdict from the content of a verdict.json that explain has written."""
         # Null means that there is no value.
-        heldout, proposed = document["heldout"], document["next_experiment"]
+        heldout, next_run = document["heldout"], document["next_experiment"]
         # Older files do not have this key.
         early_stop = document.get("cut")
         return cls(
@@ -307,7 +307,7 @@ class Verdict:
             _read_estimates(document["parameters"]),
             HeldOutResult(**heldout) if heldout is not None else None,
             tuple(Candidate(**candidate) for candidate in document["candidates"]),
-            DiscriminatingRun(**proposed) if proposed is not None else None,
+            DiscriminatingRun(**next_run) if next_run is not None else None,
             document["simulations"],
             document["seconds"],
             EarlyStop.from_document(early_stop) if early_stop is not None else None,

@@ -102,7 +102,7 @@ class VerdictBuilder:
             simulations += self.validation.simulations
         heldout = self._measure_held_out_gain(finding, rng)
         candidates = self._list_candidates(search, finding)
-        proposed = self._propose_next_run(search, finding)
+        next_run = self._propose_next_run(search, finding)
         return Verdict(
             finding.verdict,
             self.recording.system,
@@ -111,7 +111,7 @@ class VerdictBuilder:
             parameters,
             heldout,
             candidates,
-            proposed,
+            next_run,
             int(simulations),
             time.perf_counter() - started,
             finding.early_stop,

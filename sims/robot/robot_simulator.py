@@ -567,12 +567,17 @@ class RobotSimulator(SystemSimulator):
             recorded_fields["qpos"][:, :, second.positions],
             recorded_fields["qvel"][:, :, second.velocities],
         )
-        hidden = [
+        second_states = [
             np.concatenate([first[:, None], later_values], axis=1)
             for first, later_values in zip(initial_second, later_second, strict=True)
         ]
         return BatchResult(
-            x, v, recorded_fields, inputs.activations, bench.failed, (hidden[0], hidden[1])
+            x,
+            v,
+            recorded_fields,
+            inputs.activations,
+            bench.failed,
+            (second_states[0], second_states[1]),
         )
 
     def _bench(self, derived: bool, count: int, series: SeriesJoints = ()) -> MujocoBatch:

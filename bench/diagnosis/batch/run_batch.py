@@ -105,14 +105,14 @@ def explain_batch(
             else LogResult(log.name, log.digest, error=_format_error(result))
         )
         rows[log.name] = row
-        ordered = [rows[batch_log.name] for batch_log in logs if batch_log.name in rows]
-        _write_results(out, ordered)
+        ordered_results = [rows[batch_log.name] for batch_log in logs if batch_log.name in rows]
+        _write_results(out, ordered_results)
         report_result(row)
         if stop():
             break
-    ordered = [rows[log.name] for log in logs if log.name in rows]
-    _write_results(out, ordered)
-    return ordered
+    ordered_results = [rows[log.name] for log in logs if log.name in rows]
+    _write_results(out, ordered_results)
+    return ordered_results
 
 
 def explain_log(log: BatchLog, settings: Mapping[str, Any], pdf: bool = False) -> LogResult:

@@ -153,8 +153,11 @@ def _format_verdicts(rows: Sequence[LogResult]) -> str:
     Logs that could not be explained have no verdict; they are counted at the end.
     """
     counts = Counter(row.verdict for row in rows if row.verdict)
-    ordered = [*_VERDICT_ORDER, *(verdict for verdict in counts if verdict not in _VERDICT_ORDER)]
-    parts = [f"{counts[verdict]} {verdict}" for verdict in ordered if counts[verdict]]
+    ordered_verdicts = [
+        *_VERDICT_ORDER,
+        *(verdict for verdict in counts if verdict not in _VERDICT_ORDER),
+    ]
+    parts = [f"{counts[verdict]} {verdict}" for verdict in ordered_verdicts if counts[verdict]]
     failed = sum(1 for row in rows if row.error)
     if failed:
         parts.append(f"{failed} could not be explained")

@@ -70,7 +70,9 @@ class SheetSubject:
     def actuators(self) -> tuple[str, ...]:
         """Names of the actuators that drive the joint."""
         return tuple(
-            spot.name for spot in self._get_spots().get("actuator", ()) if self._is_on_joint(spot)
+            effect_place.name
+            for effect_place in self._get_spots().get("actuator", ())
+            if self._is_on_joint(effect_place)
         )
 
     @property
@@ -138,33 +140,33 @@ class SheetSubject:
         """Return the value in the model file that an effect changes; None if there is none."""
         base, _, place = effect.partition("@")
         for kind in ("joint", "actuator"):
-            for spot in self._get_spots().get(kind, ()):
-                if spot.name == place and base in spot.stated:
-                    return self._get_file_value(base, spot)
+            for effect_place in self._get_spots().get(kind, ()):
+                if effect_place.name == place and base in effect_place.stated:
+                    return self._get_file_value(base, effect_place)
         return None
 
-    def _get_file_value(self, base: str, spot: Any) -> ModelFileValue:
+    def _get_file_value(self, base: str, effect_place: Any) -> ModelFileValue:
         """Return the model file's value of the number that an effect changes here.
 
-        `base` is the name of the effect without its place, and `spot` the joint or actuator. A
-        number that an effect changes by a share of its value has its own unit; for others the value
-        has the unit of the effect's coefficient.
+        `base` is the name of the effect without its place, and `effect_place` the joint or
+        actuator. A number that an effect changes by a share of its value has its own unit; for
+        others the value has the unit of the effect's coefficient.
         """
-        length, force = ("m", "N") if spot.kind == "slide" else ("rad", "N*m")
+        length, force = ("m", "N") if effect_place.kind == "slide" else ("rad", "N*m")
         share = base in _SHARES
-        effect = library.find_effect(f"{base}@{spot.name}", self.kind.system)
+        effect = library.find_effect(f"{base}@{effect_place.name}", self.kind.system)
         unit = _SHARES[base] if share else effect.coefficients[0].units[0] or "1"
         # A servo has a negative bias, but its gain is positive.
-        value = abs(spot.stated[base])
+        value = abs(effect_place.stated[base])
         return ModelFileValue(value, unit.format(force=force, length=length), share)
 
     def _get_spots(self) -> Mapping[str, Any]:
         spots: Mapping[str, Any] = getattr(self.kind.system, "places", {})
         return spots
 
-    def _is_on_joint(self, spot: Any) -> bool:
+    def _is_on_joint(self, effect_place: Any) -> bool:
         (joint,) = (s for s in self._get_spots()["joint"] if s.name == self.joint)
-        return bool(spot.coordinate == joint.coordinate)
+        return bool(effect_place.coordinate == joint.coordinate)
 
 
 def make_subject(kind: type[SystemSimulator], joint: str | None) -> SheetSubject:
@@ -182,7 +184,7 @@ def make_subject(kind: type[SystemSimulator], joint: str | None) -> SheetSubject
             raise InputError(f"--joint: expected none, as {kind.name} is no robot; found {joint}")
         return SheetSubject(kind, "", frozenset())
     spots: Mapping[str, Any] = vars(kind.system)["places"]
-    joints = [spot.name for spot in spots["joint"]]
+    joints = [effect_place.name for effect_place in spots["joint"]]
     if joint is None and len(joints) > 1:
         raise InputError(f"robot {kind.name}: expected --joint, one of {', '.join(joints)}")
     joint = joints[0] if joint is None else joint

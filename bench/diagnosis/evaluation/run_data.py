@@ -138,14 +138,14 @@ def _find_unobserved_states(simulator: SystemSimulator) -> set[str]:
     They keep their defaults, because the data cannot determine them.
     """
     system, recorded_channels = simulator.system, {c.name for c in simulator.channels}
-    hidden = set()
+    unobserved_states = set()
     pairs = zip(system.coordinates, system.rates, strict=False)
     for axis, (coordinate, rate) in enumerate(pairs):
         related_channels = {coordinate, rate, f"accel_{coordinate}"}
         # Biases and springs act on the primary coordinate, so its states are always estimated.
         if axis != system.primary and not related_channels & recorded_channels:
-            hidden |= {coordinate, rate}
-    return hidden
+            unobserved_states |= {coordinate, rate}
+    return unobserved_states
 
 
 def take_first_samples(scenario: Scenario, samples: int) -> Scenario:

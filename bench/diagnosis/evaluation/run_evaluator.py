@@ -295,16 +295,16 @@ class RunEvaluator:
             The indices in theta of coefficients that shift sample times, and of those that need
             fine steps.
         """
-        shifting: list[int] = []
+        shifting_indices: list[int] = []
         filtering: list[int] = []
         for effect in self.simulator.effects:
             places = self.get_coefficient_indices(effect.name)
             if _shifts_sample_times(effect):
-                shifting.extend(places)
+                shifting_indices.extend(places)
             if effect.sharp or (isinstance(effect, Sensor) and effect.filters):
                 filtering.extend(places)
         # The type must be given, because an empty list would become an array of floats.
-        return np.array(shifting, dtype=np.intp), np.array(filtering, dtype=np.intp)
+        return np.array(shifting_indices, dtype=np.intp), np.array(filtering, dtype=np.intp)
 
     def _on_time_scale(self) -> tuple[Parameter, ...]:
         """Return the parameters with coefficient ranges for the time scale of the runs."""
@@ -481,9 +481,9 @@ class RunEvaluator:
             theta: (L, P) parameters.
         """
         active = theta != 0
-        shifting = active[:, self._shifting].any(axis=1)
+        is_shifting = active[:, self._shifting].any(axis=1)
         filtering = active[:, self._filtering].any(axis=1)
-        kinds: Indices = shifting + 2 * filtering
+        kinds: Indices = is_shifting + 2 * filtering
         return kinds
 
     @property

@@ -195,8 +195,8 @@ class ModelSet:
         slot = self.world.slots[name]
         # If there are few shapes, the coefficients alone pay for the gain under the null
         # hypothesis.
-        paid = (slot.stop - slot.start) * self.parameter_penalty
-        return float(max(self.null_gains.get(name, 0.0) - paid, 0.0))
+        parameter_penalties = (slot.stop - slot.start) * self.parameter_penalty
+        return float(max(self.null_gains.get(name, 0.0) - parameter_penalties, 0.0))
 
     def refit_models(
         self,
@@ -221,8 +221,8 @@ class ModelSet:
         if patient:
             starts = self._sifted(starts, noise)
         # Sums of squares with different weights are not comparable.
-        racing = race and noise is self.noise
-        lowest_cost = self._reached(starts) if racing else np.inf
+        is_race = race and noise is self.noise
+        lowest_cost = self._reached(starts) if is_race else np.inf
         fitter = TrajectoryFitter(self.world, noise, self.frozen)
         watch.stage(_fitting(starts), len(starts))
         for fit in fitter.fit_models(

@@ -49,12 +49,12 @@ def rank_candidates(report: DiagnosisReportData) -> list[RankedCandidate]:
 
     Without places each candidate is an entry. Otherwise each effect and each cause is one entry.
     """
-    ordered = sorted(report.verdict.candidates, key=lambda c: c.score, reverse=True)
+    ordered_candidates = sorted(report.verdict.candidates, key=lambda c: c.score, reverse=True)
     if not has_placed_causes(report):
-        return [RankedCandidate(candidate) for candidate in ordered]
+        return [RankedCandidate(candidate) for candidate in ordered_candidates]
     causes = {cause.effect for cause in report.verdict.causes}
     groups: dict[str, list[Candidate]] = {}
-    for candidate in ordered:
+    for candidate in ordered_candidates:
         groups.setdefault(split_effect_name(candidate.effect)[0], []).append(candidate)
     entries = []
     for group in groups.values():
@@ -80,15 +80,15 @@ def _choose_representative(group: list[Candidate]) -> Candidate:
 
 def select_shown_candidates(report: DiagnosisReportData) -> list[Candidate]:
     """Select the candidates to show, the highest score first; diagnosed causes are included."""
-    ordered = [entry.best for entry in rank_candidates(report)]
+    ordered_candidates = [entry.best for entry in rank_candidates(report)]
     # A diagnosed cause is shown even with a low score.
     unneeded_candidates = [
-        c for c in ordered if get_candidate_status(report, c.effect) == "not needed"
+        c for c in ordered_candidates if get_candidate_status(report, c.effect) == "not needed"
     ]
     hidden_candidates = unneeded_candidates[
-        max(0, MAX_SHOWN_CANDIDATES - len(ordered) + len(unneeded_candidates)) :
+        max(0, MAX_SHOWN_CANDIDATES - len(ordered_candidates) + len(unneeded_candidates)) :
     ]
-    return [c for c in ordered if c not in hidden_candidates]
+    return [c for c in ordered_candidates if c not in hidden_candidates]
 
 
 LONGEST_PLACE = 64

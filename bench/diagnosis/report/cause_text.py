@@ -56,8 +56,8 @@ def format_effect_set(names: Sequence[str], conjunction: str = "or") -> str:
             f"one of {len(parts) - MAX_NAMED_MEMBERS + 1} others",
         ]
     # Nested lists are separated by a comma before the last conjunction too.
-    nested = len(parts) > 1 and any(f" {conjunction} " in part for part in parts)
-    return f", {conjunction} ".join(parts) if nested else joined(parts, conjunction)
+    is_nested = len(parts) > 1 and any(f" {conjunction} " in part for part in parts)
+    return f", {conjunction} ".join(parts) if is_nested else joined(parts, conjunction)
 
 
 def _group_effects(names: Sequence[str], conjunction: str) -> list[str]:

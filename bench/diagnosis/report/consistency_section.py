@@ -45,18 +45,18 @@ def format_consistency(report: DiagnosisReportData) -> list[str]:
     effects = [cause.effect for cause in report.verdict.causes]
     causes = joined([sanitise(effect, 60) for effect in effects])
     sentences = []
-    reconciled = [
+    reconciled_spreads = [
         spread
         for spread in after
         if spread.is_consistent
         and (spread_before := before.get((spread.number, spread.by))) is not None
         and not spread_before.is_consistent
     ]
-    if reconciled and causes:
-        names = list(dict.fromkeys(_get_number_name(spread) for spread in reconciled))
+    if reconciled_spreads and causes:
+        names = list(dict.fromkeys(_get_number_name(spread) for spread in reconciled_spreads))
         sentences.append(
             f"without {causes}, {joined(names[:MAX_NAMED_PARAMETERS])} differed between "
-            f"{_pluralise_group(reconciled[0].by)} by more than the intervals"
+            f"{_pluralise_group(reconciled_spreads[0].by)} by more than the intervals"
         )
     competitors = [s for s in report.consistency.alternative_effect if not s.is_consistent]
     for competitor in _select_clearest(competitors)[:1]:
@@ -71,13 +71,15 @@ def format_consistency(report: DiagnosisReportData) -> list[str]:
             f"({format_p_value(competitor.p_value)}){trend}; "
             f"this difference speaks for {causes}"
         )
-    inconsistent = _select_clearest([spread for spread in after if not spread.is_consistent])
-    named_spreads = inconsistent[:MAX_NAMED_PARAMETERS]
+    inconsistent_spreads = _select_clearest(
+        [spread for spread in after if not spread.is_consistent]
+    )
+    named_spreads = inconsistent_spreads[:MAX_NAMED_PARAMETERS]
     sentences += [_format_inconsistency(spread, effects) for spread in named_spreads]
-    if len(inconsistent) > len(named_spreads):
-        count = len(inconsistent) - len(named_spreads)
+    if len(inconsistent_spreads) > len(named_spreads):
+        count = len(inconsistent_spreads) - len(named_spreads)
         sentences.append(f"{count} more numbers differ between their groups")
-    if after and not inconsistent:
+    if after and not inconsistent_spreads:
         groups = _pluralise_group(after[0].by)
         sentences.append(f"all {groups} agree on every number within its interval")
     return [format_sentence(text) for text in (*sentences, *_format_drifts(after))]

@@ -131,12 +131,14 @@ def build_identifiability_section(report: DiagnosisReportData) -> Identifiabilit
     if not report.identifiability:
         return None
     rows = _list_rows(report)
-    present = [status for status in _STANDINGS if any(row.standing == status for row in rows)]
+    present_statuses = [
+        status for status in _STANDINGS if any(row.standing == status for row in rows)
+    ]
     unclear_rows, identifiable_rows = _separate_identifiable(
         [row for row in rows if _get_place(row)]
     )
     count = len({split_effect_name(row.effect)[0] for row in identifiable_rows})
-    ordered = sorted(rows, key=lambda row: _STANDINGS.index(row.standing))
+    ordered_rows = sorted(rows, key=lambda row: _STANDINGS.index(row.standing))
     without_place = [row for row in rows if not _get_place(row)]
     columns = [s for s in _STANDINGS if any(row.standing == s for row in without_place)]
     return IdentifiabilitySection(
@@ -146,7 +148,7 @@ def build_identifiability_section(report: DiagnosisReportData) -> Identifiabilit
             for number in report.identifiability
             if number.free
         ],
-        legend="; ".join(f"{_SIGNS[status]} {_LEGEND[status]}" for status in present),
+        legend="; ".join(f"{_SIGNS[status]} {_LEGEND[status]}" for status in present_statuses),
         matrices=_build_matrices(unclear_rows),
         family_headings=[f"{_SIGNS[status]} {_LEGEND[status]}" for status in columns],
         families=_build_family_table(without_place, columns),
@@ -154,7 +156,7 @@ def build_identifiability_section(report: DiagnosisReportData) -> Identifiabilit
             f"{count} {'more ' * bool(unclear_rows)}effects that can be identified at every place"
         ),
         identifiable_matrices=_build_matrices(identifiable_rows),
-        all=[_format_table_row(row.number, _LEGEND[row.standing]) for row in ordered],
+        all=[_format_table_row(row.number, _LEGEND[row.standing]) for row in ordered_rows],
     )
 
 

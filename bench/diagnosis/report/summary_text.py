@@ -119,8 +119,8 @@ def format_details(report: DiagnosisReportData) -> Iterator[str]:
     if report.lack_of_fit:
         yield "What remains: " + " ".join(format_sentence(text) for text in report.lack_of_fit)
     # For an ambiguous verdict, the experiment directly follows the headline.
-    if verdict != "ambiguous" and (proposed := format_next_run(report)):
-        yield f"Next experiment: {proposed}"
+    if verdict != "ambiguous" and (next_run := format_next_run(report)):
+        yield f"Next experiment: {next_run}"
     yield format_simulation_count(report)
 
 
@@ -153,8 +153,8 @@ def format_headline(report: DiagnosisReportData) -> str:
     if verdict == "partial" and (open_causes := [c for c in causes if c.open_numbers]):
         reason = _format_unconfirmed_reason(open_causes)
         return f"The simulation {format_lacking(causes)}, but {reason}."
-    if bordering := report.verdict.bordering:
-        (name, first), *_ = bordering.items()
+    if parameters_at_bounds := report.verdict.bordering:
+        (name, first), *_ = parameters_at_bounds.items()
         end = f"the {END[first.at_bound or 'high']} bound of its range"
         value = append_unit(format_number(first.value), first.unit)
         bound_text = f"parameter {sanitise(name, 60)} ends at {end}, {value}"
@@ -614,8 +614,8 @@ def has_absorbed_gap(p: ParameterChange) -> bool:
 
 def format_next_run(report: DiagnosisReportData) -> str:
     """Format the proposed next experiment; empty if there is none."""
-    proposed = report.verdict.next_experiment
-    return format_sentence(proposed.says) if proposed is not None else ""
+    next_run = report.verdict.next_experiment
+    return format_sentence(next_run.says) if next_run is not None else ""
 
 
 def format_simulation_count(report: DiagnosisReportData) -> str:

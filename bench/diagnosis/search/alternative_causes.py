@@ -77,17 +77,19 @@ class AlternativeFinder:
         competing_effects = self._rivals(model, effect)
         # Effects with implausible coefficients come last in their set.
         competing_effects.sort(key=lambda rival: (not self._is_plausible(rival[1]), rival))
-        ordered = [name for _, name in competing_effects]
-        alternatives = tuple(name for name in ordered if name != effect)
+        ordered_effects = [name for _, name in competing_effects]
+        alternatives = tuple(name for name in ordered_effects if name != effect)
         # With structure in the residual, indistinguishable does not mean equally likely, so the
         # effect found is kept.
-        preferred = effect if self.structure and effect in ordered else ordered[0]
+        preferred_effect = (
+            effect if self.structure and effect in ordered_effects else ordered_effects[0]
+        )
         return CauseEvidence(
             effect=effect,
             alternatives=alternatives,
             p_value=float(np.clip(p_value, 0.0, 1.0)),
             gain=float(gain),
-            preferred=preferred,
+            preferred=preferred_effect,
         )
 
     def _rest(self, model: FittedModel, effect: str) -> FittedModel:

@@ -332,10 +332,10 @@ def _select_preferred_model(
     alternatives = AlternativeFinder(search, validation, lack_of_fit.has_structure)
     causes = alternatives.collect_evidence(model)
     names = frozenset(cause.preferred for cause in causes)
-    preferred = search.models.get(names, model)
-    if preferred is model:
+    preferred_model = search.models.get(names, model)
+    if preferred_model is model:
         return model, causes
-    return preferred, alternatives.collect_evidence(preferred)
+    return preferred_model, alternatives.collect_evidence(preferred_model)
 
 
 def _is_unexplained(search: EffectSearch, model: FittedModel, lack_of_fit: LackOfFitResult) -> bool:

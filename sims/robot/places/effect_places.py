@@ -84,17 +84,17 @@ def make_world_effect(effect: type[Effect]) -> type[Effect]:
     return _create_placed_effect(effect, effect.name, "", coefficients, {})
 
 
-def make_placed_effect(effect: type[Effect], spot: EffectPlace) -> type[Effect]:
+def make_placed_effect(effect: type[Effect], effect_place: EffectPlace) -> type[Effect]:
     """Make the class of a registered effect at one joint, actuator, body or channel.
 
     It has the units and plausible ranges that apply there, and methods that read and write only
     the coordinate or the signal of that place.
     """
-    tilts = spot.tilts if effect.name == "joint.axis" else None
+    tilts = effect_place.tilts if effect.name == "joint.axis" else None
     observable_coefficients = [c for c in effect.coefficients if tilts is None or c.name in tilts]
-    coefficients = [_adapt_to_place(effect, c, spot) for c in observable_coefficients]
-    changed: dict[str, Any] = {"coordinate": spot.coordinate, "signal": spot.signal}
-    changed["says"] = f"{effect.says} (at {spot.words})"
+    coefficients = [_adapt_to_place(effect, c, effect_place) for c in observable_coefficients]
+    changed: dict[str, Any] = {"coordinate": effect_place.coordinate, "signal": effect_place.signal}
+    changed["says"] = f"{effect.says} (at {effect_place.words})"
     if issubclass(effect, Force):
         changed["force"] = _force_of(effect)
     elif issubclass(effect, Friction):
@@ -103,22 +103,24 @@ def make_placed_effect(effect: type[Effect], spot: EffectPlace) -> type[Effect]:
         changed["act"] = _make_act_method(effect)
         declared_coefficients = effect.between or effect.coefficients
         coefficients = [
-            _add_search_starts(_adapt_to_place(effect, c, spot))
+            _add_search_starts(_adapt_to_place(effect, c, effect_place))
             for c in declared_coefficients
-            if not _has_quantity(spot, c)
+            if not _has_quantity(effect_place, c)
         ]
         contained_names = [
-            f"{contained_effect}@{spot.name}" for contained_effect in effect.contains
+            f"{contained_effect}@{effect_place.name}" for contained_effect in effect.contains
         ]
         # A rigid transmission with the drive's inertia is the armature effect.
-        drive = f"inertia.armature@{spot.name}"
+        drive = f"inertia.armature@{effect_place.name}"
         for number, c in enumerate(coefficients):
             if c.of == "rotor":
                 contained_names.append(drive)
-                changed["taking"] = _make_taking_method(drive, spot.inertia, number, c.plausible[0])
+                changed["taking"] = _make_taking_method(
+                    drive, effect_place.inertia, number, c.plausible[0]
+                )
         changed["contains"] = tuple(contained_names)
     return _create_placed_effect(
-        effect, f"{effect.name}@{spot.name}", spot.name, coefficients, changed
+        effect, f"{effect.name}@{effect_place.name}", effect_place.name, coefficients, changed
     )
 
 
@@ -199,10 +201,10 @@ def _limit_of(effect: type[Friction]) -> Callable[[Friction, Array, StateSnapsho
     return limit
 
 
-def _has_quantity(spot: EffectPlace, c: Coefficient) -> bool:
+def _has_quantity(effect_place: EffectPlace, c: Coefficient) -> bool:
     """Return whether the model file specifies the quantity of a coefficient."""
-    file_armature = spot.stated.get("inertia.armature", 0.0)
-    return c.of == "rotor" and file_armature > c.plausible[0][0] * spot.inertia
+    file_armature = effect_place.stated.get("inertia.armature", 0.0)
+    return c.of == "rotor" and file_armature > c.plausible[0][0] * effect_place.inertia
 
 
 def _make_taking_method(
@@ -338,45 +340,45 @@ def _unify_units(c: Coefficient) -> Coefficient:
     return replace(c, units=(c.units[i],) * 3, plausible=(c.plausible[i],) * 3)
 
 
-def _adapt_to_place(effect: type[Effect], c: Coefficient, spot: EffectPlace) -> Coefficient:
+def _adapt_to_place(effect: type[Effect], c: Coefficient, effect_place: EffectPlace) -> Coefficient:
     """Give a coefficient the unit, plausible range and limits that apply at a place.
 
     Ranges of forces are scaled with the typical force of the joint. If the file specifies a
     value, the coefficient is a difference from it, limited so that the total is not negative.
     """
-    i = 2 if spot.kind == "hinge" else 1
+    i = 2 if effect_place.kind == "hinge" else 1
     unit, (low, high) = c.units[i], c.plausible[i]
     lower_limit = c.least
     if c.of.startswith(("input", "error")):
-        unit = c.of.replace("error", "input").replace("input", spot.unit)
+        unit = c.of.replace("error", "input").replace("input", effect_place.unit)
     elif c.of.startswith("reading"):
-        unit = c.of.replace("reading", spot.unit)
+        unit = c.of.replace("reading", effect_place.unit)
     # Plausible ranges of the library refer to small joints, so forces are scaled with the joint.
     if unit is None:
         unit = "1"
-    share = spot.size / REFERENCE_FORCES[spot.kind]
+    share = effect_place.size / REFERENCE_FORCES[effect_place.kind]
     if unit.startswith("N"):
         low, high = share * low, share * high
     elif unit.startswith(("1/N", "1/(N")):
         low, high = low / share, high / share
     if effect.name == "inertia.armature":
-        high = 3.0 * spot.inertia
+        high = 3.0 * effect_place.inertia
     if c.of == "give":
-        high = 1.0 / (spot.inertia * MIN_LOAD_FREQUENCY**2)
+        high = 1.0 / (effect_place.inertia * MIN_LOAD_FREQUENCY**2)
     upper_limit = c.most
     has_total = effect.at == "joint" or effect.name == "gravity.compensation"
-    file_value = spot.stated.get(effect.name) if has_total else None
+    file_value = effect_place.stated.get(effect.name) if has_total else None
     if file_value is not None:
         # The total must not be negative, so the difference can at most remove the value of the
         # file.
         high = max(high, 2.0 * abs(file_value))
         low = lower_limit = min(0.0 - file_value, 0.0)
     if effect.name == "payload" and c.name == "mass":
-        high = MAX_PAYLOAD_SHARE * spot.mass
-    if c.name in spot.limits.get(effect.name, {}):
-        lower_limit, upper_limit = spot.limits[effect.name][c.name]
+        high = MAX_PAYLOAD_SHARE * effect_place.mass
+    if c.name in effect_place.limits.get(effect.name, {}):
+        lower_limit, upper_limit = effect_place.limits[effect.name][c.name]
         if effect.name == "payload":
-            begin, end = spot.limits["mass.offset"][c.name]
+            begin, end = effect_place.limits["mass.offset"][c.name]
             low, high = (begin, end) if begin < end else (low, high)
         elif lower_limit < upper_limit:
             low, high = max(low, lower_limit), min(high, upper_limit)
@@ -431,43 +433,46 @@ def _needs_no_engine_support(effect: type[Effect]) -> bool:
 
 
 def _acts_at(
-    effect: type[Effect], spot: EffectPlace, places: Mapping[str, Sequence[EffectPlace]]
+    effect: type[Effect], effect_place: EffectPlace, places: Mapping[str, Sequence[EffectPlace]]
 ) -> bool:
     """Return whether a place has the quantity that an effect changes.
 
     `places` lists all places by kind. An actuator effect needs a joint with an actuator, for
     example, and a servo effect a position servo.
     """
-    if effect.at == "joint" and effect.coefficients[0].unit(_KINDS[spot.kind]) is None:
+    if effect.at == "joint" and effect.coefficients[0].unit(_KINDS[effect_place.kind]) is None:
         return False
     if effect.at == "joint" and effect.needs == "input":
-        return any(actuator.coordinate == spot.coordinate for actuator in places["actuator"])
+        return any(
+            actuator.coordinate == effect_place.coordinate for actuator in places["actuator"]
+        )
     if issubclass(effect, HiddenStateEffect) and effect.between:
         # The effect connects the drive of a joint to its load, so both must exist.
-        return spot.last and any(
-            actuator_place.coordinate == spot.coordinate for actuator_place in places["actuator"]
+        return effect_place.last and any(
+            actuator_place.coordinate == effect_place.coordinate
+            for actuator_place in places["actuator"]
         )
-    if effect.needs == "servo" and not spot.servo:
+    if effect.needs == "servo" and not effect_place.servo:
         return False
-    if effect.name == "joint.coupling" and not spot.coupled:
+    if effect.name == "joint.coupling" and not effect_place.coupled:
         return False
     if effect.at == "actuator":
         if issubclass(effect, ModelValueEffect):
-            return spot.stated.get(effect.name, 1.0) != 0.0
+            return effect_place.stated.get(effect.name, 1.0) != 0.0
         # A power effect is undefined for a set point.
-        if effect.name == "input.power" and not spot.unit.startswith(("N", "1")):
+        if effect.name == "input.power" and not effect_place.unit.startswith(("N", "1")):
             return False
         # On a tendon or a site, only the command is defined.
-        return spot.coordinate is not None or issubclass(effect, Input)
-    if effect.name == "link.length" and not spot.stated["link.length"]:
+        return effect_place.coordinate is not None or issubclass(effect, Input)
+    if effect.name == "link.length" and not effect_place.stated["link.length"]:
         return False
-    if effect.name == "joint.axis" and not spot.tilts:
+    if effect.name == "joint.axis" and not effect_place.tilts:
         return False
-    if effect.name in POSITION_SENSOR_EFFECTS and not spot.name.startswith("q."):
+    if effect.name in POSITION_SENSOR_EFFECTS and not effect_place.name.startswith("q."):
         return False
     # Angular coefficients apply to encoders, and not to other channels.
     if effect.at == "channel" and not effect.coefficients[0].of:
-        unit = effect.coefficients[0].unit(_KINDS[spot.kind])
-        if unit is None or (unit == "rad" and spot.unit != "rad"):
+        unit = effect.coefficients[0].unit(_KINDS[effect_place.kind])
+        if unit is None or (unit == "rad" and effect_place.unit != "rad"):
             return False
     return True

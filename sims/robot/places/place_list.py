@@ -148,7 +148,7 @@ def list_places(
             axis: (middle[k] - distance, middle[k] + distance) if k in axes else (0.0, 0.0)
             for k, axis in enumerate("xyz")
         }
-        spot = EffectPlace(
+        body_place = EffectPlace(
             body.name,
             "hinge",
             None,
@@ -161,7 +161,7 @@ def list_places(
             limits={"mass.offset": offsets, "payload": loads},
             mass=mass,
         )
-        places["body"].append(spot)
+        places["body"].append(body_place)
     for name, unit in channels:
         _, _, joint_name = name.partition(".")
         coordinate = numbers.get(joint_name) if name.startswith(("q.", "qd.", "tau.")) else None
