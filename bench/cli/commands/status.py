@@ -135,10 +135,10 @@ def _print_progress(study: Study, is_all: bool, print_line: PrintLine) -> JsonDo
     }
 
 
-def _count_endings(standing: StudyProgress) -> dict[str, dict[str, int]]:
+def _count_endings(progress: StudyProgress) -> dict[str, dict[str, int]]:
     """Count the runs of each tuner or kind of ball by status."""
     groups: dict[str, Counter[str]] = {}
-    for end in standing.ends:
+    for end in progress.ends:
         groups.setdefault(end.group, Counter())[end.status] += 1
     return {group: dict(sorted(counts.items())) for group, counts in groups.items()}
 
@@ -155,14 +155,14 @@ def _format_counts(groups: dict[str, dict[str, int]]) -> list[str]:
     return lines
 
 
-def _select_notable_runs(standing: StudyProgress) -> tuple[RunEnd, ...]:
+def _select_notable_runs(progress: StudyProgress) -> tuple[RunEnd, ...]:
     """Select the runs to list: those without success, or all; at most `_MAX_LISTED_RUNS`."""
     from bench.benchmark.storage.study_progress import SUCCESS_STATUSES
 
     unsuccessful = tuple(
-        run_end for run_end in standing.ends if run_end.status not in SUCCESS_STATUSES
+        run_end for run_end in progress.ends if run_end.status not in SUCCESS_STATUSES
     )
-    return (unsuccessful or standing.ends)[:_MAX_LISTED_RUNS]
+    return (unsuccessful or progress.ends)[:_MAX_LISTED_RUNS]
 
 
 def _get_last_line(end: RunEnd) -> str:

@@ -32,7 +32,7 @@ from bench.diagnosis.verdict import Cause
 
 MAX_NAMED_CAUSES = 6
 """Maximum number of names in a cell or list; the remaining ones are counted."""
-_STANDINGS = ("found", "set", "identifiable", "weak", "not identifiable")
+_STATUSES = ("found", "set", "identifiable", "weak", "not identifiable")
 """Status of a cause, the most certain first."""
 _SIGNS: Mapping[str, str] = {
     "found": "★",
@@ -59,12 +59,12 @@ class _Row:
     Attributes:
         number: Identifiability of the coefficient.
         effect: Registered name of the effect.
-        standing: One of `_STANDINGS`.
+        status: One of `_STATUSES`.
     """
 
     number: ParameterIdentifiability
     effect: str
-    standing: str
+    status: str
 
 
 class IdentifiabilityRow(NamedTuple):
@@ -131,16 +131,14 @@ def build_identifiability_section(report: DiagnosisReportData) -> Identifiabilit
     if not report.identifiability:
         return None
     rows = _list_rows(report)
-    present_statuses = [
-        status for status in _STANDINGS if any(row.standing == status for row in rows)
-    ]
+    present_statuses = [status for status in _STATUSES if any(row.status == status for row in rows)]
     unclear_rows, identifiable_rows = _separate_identifiable(
         [row for row in rows if _get_place(row)]
     )
     count = len({split_effect_name(row.effect)[0] for row in identifiable_rows})
-    ordered_rows = sorted(rows, key=lambda row: _STANDINGS.index(row.standing))
+    ordered_rows = sorted(rows, key=lambda row: _STATUSES.index(row.status))
     without_place = [row for row in rows if not _get_place(row)]
-    columns = [s for s in _STANDINGS if any(row.standing == s for row in without_place)]
+    columns = [s for s in _STATUSES if any(row.status == s for row in without_place)]
     return IdentifiabilitySection(
         counts=format_counts(report),
         free=[
@@ -156,7 +154,7 @@ def build_identifiability_section(report: DiagnosisReportData) -> Identifiabilit
             f"{count} {'more ' * bool(unclear_rows)}effects that can be identified at every place"
         ),
         identifiable_matrices=_build_matrices(identifiable_rows),
-        all=[_format_table_row(row.number, _LEGEND[row.standing]) for row in ordered_rows],
+        all=[_format_table_row(row.number, _LEGEND[row.status]) for row in ordered_rows],
     )
 
 
@@ -166,7 +164,7 @@ def _separate_identifiable(rows: Sequence[_Row]) -> tuple[list[_Row], list[_Row]
     Returns:
         Rows of the other effects, and rows of effects that are identifiable at every place.
     """
-    unclear_effects = {split_effect_name(r.effect)[0] for r in rows if r.standing != "identifiable"}
+    unclear_effects = {split_effect_name(r.effect)[0] for r in rows if r.status != "identifiable"}
     unclear_rows = [row for row in rows if split_effect_name(row.effect)[0] in unclear_effects]
     return unclear_rows, [
         row for row in rows if split_effect_name(row.effect)[0] not in unclear_effects
@@ -185,8 +183,8 @@ def _build_matrices(rows: Sequence[_Row]) -> list[Matrix]:
 def format_counts(report: DiagnosisReportData) -> str:
     """Format how many causes are identifiable, and which were found."""
     rows = _list_rows(report)
-    statuses = [str("identifiable" if r.standing == "found" else r.number.word) for r in rows]
-    counts = {s: statuses.count(s) for s in _STANDINGS[2:]}
+    statuses = [str("identifiable" if r.status == "found" else r.number.word) for r in rows]
+    counts = {s: statuses.count(s) for s in _STATUSES[2:]}
     sentence = (
         f"Of {len(rows)} causes, each considered alone, this recording can identify "
         f"{counts['identifiable']} well, {counts['weak']} roughly and "
@@ -210,12 +208,12 @@ def _list_rows(report: DiagnosisReportData) -> list[_Row]:
     status_by_effect: dict[str, str] = {}
     for cause in _list_supported_causes(report):
         for name in (cause.effect, *cause.alternatives):
-            standing = "set" if cause.alternatives else "found"
-            status_by_effect.setdefault(name, standing)
+            status = "set" if cause.alternatives else "found"
+            status_by_effect.setdefault(name, status)
             # For a family, members with a coefficient of their own are marked.
             for key in cause.coefficients if name == cause.effect else ():
                 if place := split_effect_name(key)[1]:
-                    status_by_effect.setdefault(f"{split_effect_name(name)[0]}@{place}", standing)
+                    status_by_effect.setdefault(f"{split_effect_name(name)[0]}@{place}", status)
     rows = []
     for number in report.identifiability:
         if not number.free:
@@ -238,11 +236,11 @@ def _build_matrix(rows: Sequence[_Row], kind: str) -> Matrix:
         by_place = by_effect.setdefault(split_effect_name(row.effect)[0], {})
         # Of several coefficients at a place, the best one is shown.
         best = by_place.setdefault(_get_place(row), row)
-        if _STANDINGS.index(row.standing) < _STANDINGS.index(best.standing):
+        if _STATUSES.index(row.status) < _STATUSES.index(best.status):
             by_place[_get_place(row)] = row
 
     def order(effect: str) -> list[int]:
-        return sorted(_STANDINGS.index(row.standing) for row in by_effect[effect].values())
+        return sorted(_STATUSES.index(row.status) for row in by_effect[effect].values())
 
     return Matrix(
         _KINDS.get(kind, "places"),
@@ -263,8 +261,8 @@ def _make_cell(row: _Row | None) -> MatrixCell | None:
     if row is None:
         return None
     interval = _format_half_interval(row.number)
-    label = f"{row.effect}: {_LEGEND[row.standing]}{', ' * bool(interval)}{interval}"
-    return MatrixCell(_SIGNS[row.standing], label, row.standing in ("found", "set"))
+    label = f"{row.effect}: {_LEGEND[row.status]}{', ' * bool(interval)}{interval}"
+    return MatrixCell(_SIGNS[row.status], label, row.status in ("found", "set"))
 
 
 def _build_family_table(
@@ -274,7 +272,7 @@ def _build_family_table(
     families: dict[str, dict[str, list[str]]] = {}
     for row in rows:
         by_status = families.setdefault(row.effect.partition(".")[0], {})
-        by_status.setdefault(row.standing, []).append(row.effect)
+        by_status.setdefault(row.status, []).append(row.effect)
     return [
         (
             family,
