@@ -164,21 +164,21 @@ def _fault(world: SteppableSimulator, error: Exception) -> InputError:
     return InputError(f"simulator {world.name}: {description} ({location})")
 
 
-def observed(world: SteppableSimulator, seen: Mapping[str, float], name: str) -> float:
+def observed(world: SteppableSimulator, observation: Mapping[str, float], name: str) -> float:
     """Return one number from what the user's `observe` returned, checked.
 
     Args:
         world: Simulator.
-        seen: Result of its `observe`.
+        observation: Result of its `observe`.
         name: Name of a channel, coordinate, rate or level.
 
     Raises:
         InputError: The value is missing, or not a number.
     """
     try:
-        value = seen[name]
+        value = observation[name]
     except (KeyError, TypeError, IndexError):
-        raise _unobserved(world, seen, name) from None
+        raise _unobserved(world, observation, name) from None
     if isinstance(value, float):  # shortcut (NumPy floats, too), because the general test is slow
         return float(value)
     if shape := np.shape(value):

@@ -63,19 +63,20 @@ def with_all_cores(options: SearchOptions) -> SearchOptions:
 
 
 def list_sources(
-    recording: RecordingSource | Sequence[RecordingSource], about: FrameDescription | None = None
+    recording: RecordingSource | Sequence[RecordingSource],
+    frame_description: FrameDescription | None = None,
 ) -> list[str | Path | Recording]:
     """Return recordings as a list of paths and of recordings in memory.
 
     Args:
         recording: One recording, or several.
-        about: Description of data frames among them.
+        frame_description: Description of data frames among them.
 
     Raises:
-        InputError: No recording is given, a data frame is malformed, or `about` describes
-            recordings that are not data frames.
+        InputError: No recording is given, a data frame is malformed, or `frame_description`
+            describes recordings that are not data frames.
     """
-    about = about or FrameDescription()
+    frame_description = frame_description or FrameDescription()
     single = isinstance(recording, str | Path | Recording | SimulatedRecording | Frame)
     each: list[Any] = [recording] if single else [*cast(Sequence[RecordingSource], recording)]
     if not each:
@@ -85,10 +86,10 @@ def list_sources(
     for source in each:
         if isinstance(source, Frame):
             number = f" {len(sources) + 1}" if len(each) > 1 else ""
-            sources.append(recording_of(source, about, f"DataFrame{number}"))
+            sources.append(recording_of(source, frame_description, f"DataFrame{number}"))
         else:
             if not frames:
-                about.refuse_for_files(source)
+                frame_description.refuse_for_files(source)
             sources.append(source.recording if isinstance(source, SimulatedRecording) else source)
     return sources
 

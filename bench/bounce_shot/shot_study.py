@@ -227,7 +227,7 @@ class _ShotStages:
     """
 
     def __init__(
-        self, study: BounceShotStudy, left: list[ShotSetup], progress: ProgressFactory
+        self, study: BounceShotStudy, missing_shots: list[ShotSetup], progress: ProgressFactory
     ) -> None:
         """Collect the isolated tuners, the hidden folders, and the paths of the recordings.
 
@@ -235,13 +235,15 @@ class _ShotStages:
         folders, which isolated tuners must not read, are the result folder and the cache of trained
         weights.
         """
-        self._study, self._left, self._progress = study, left, progress
+        self._study, self._left, self._progress = study, missing_shots, progress
         self._experiment, self._settings = study.experiment, study.config
         self._tuned: dict[str, TunerSpec] = {}
         if not self._experiment.trusted:
             self._tuned = {entry.label: make_tuner_spec(entry) for entry in self._experiment.tuners}
         self._hidden = tuple(str(place.resolve()) for place in (study.folder, get_weights_folder()))
-        self._paths = [study.folder / RECORDINGS_FOLDER / f"{shot.name}.csv" for shot in left]
+        self._paths = [
+            study.folder / RECORDINGS_FOLDER / f"{shot.name}.csv" for shot in missing_shots
+        ]
 
     def run(self, jobs: int, pool: Pool | None) -> None:
         """Record the drops, train tuners, tune and plan, and execute the shots.

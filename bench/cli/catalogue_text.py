@@ -8,23 +8,24 @@ from bench.cli.catalogue import CATALOGUE_SECTIONS
 from bench.cli.output import JsonDocument
 
 
-def format_catalogue(what: str) -> list[str]:
+def format_catalogue(section: str) -> list[str]:
     """Return the lines of one section of the catalogue.
 
     Args:
-        what: One of `bench.cli.catalogue.CATALOGUE_SECTIONS`, e.g. tuners, simulators or schemas.
+        section: One of `bench.cli.catalogue.CATALOGUE_SECTIONS`, e.g. tuners, simulators or
+            schemas.
     """
-    return format_documents(what, CATALOGUE_SECTIONS[what]())
+    return format_documents(section, CATALOGUE_SECTIONS[section]())
 
 
-def format_documents(what: str, documents: list[JsonDocument]) -> list[str]:
+def format_documents(section: str, documents: list[JsonDocument]) -> list[str]:
     """Format given documents of a section of the catalogue.
 
     Args:
-        what: Name of the section.
+        section: Name of the section.
         documents: Documents of its entries.
     """
-    format_entry = _LAID_OUT.get(what, _format_plain_entry)
+    format_entry = _LAID_OUT.get(section, _format_plain_entry)
     return [line for document in documents for line in format_entry(document)]
 
 

@@ -201,19 +201,19 @@ class _Parser(argparse.ArgumentParser):
 
         raise _UsageError(f"{InputError(message)}; see {self.prog} --help")
 
-    def refuse_unknown(self, kind: str, name: str, known: Iterable[str]) -> NoReturn:
+    def refuse_unknown(self, kind: str, name: str, known_names: Iterable[str]) -> NoReturn:
         """Report an unknown command or option with the most similar known ones.
 
         Args:
             kind: What it is, for the message.
             name: Unknown name.
-            known: Known names.
+            known_names: Known names.
         """
         from difflib import get_close_matches
 
         from sims.core.value_limits import truncate_text
 
-        similar_names = get_close_matches(name[:_LONGEST_NAME], list(known), cutoff=0.5)
+        similar_names = get_close_matches(name[:_LONGEST_NAME], list(known_names), cutoff=0.5)
         hint = f"; did you mean {', '.join(similar_names)}?" if similar_names else ""
         self.error(f"unknown {kind} '{truncate_text(name)}'{hint}")
 

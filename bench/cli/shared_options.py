@@ -92,12 +92,12 @@ def add_out_option(
     parser.add_argument("--out", metavar=metavar, type=parse_path, required=required, help=text)
 
 
-def add_plugin_option(parser: argparse.ArgumentParser, more: str) -> None:
-    """Add the option ``--plugin FILE``; `more` says what such a file adds.
+def add_plugin_option(parser: argparse.ArgumentParser, parts: str) -> None:
+    """Add the option ``--plugin FILE``; `parts` says what such a file adds.
 
     Args:
         parser: Parser of the command.
-        more: Parts that the file adds, e.g. "systems".
+        parts: Parts that the file adds, e.g. "systems".
     """
     parser.add_argument(
         "--plugin",
@@ -105,7 +105,7 @@ def add_plugin_option(parser: argparse.ArgumentParser, more: str) -> None:
         action="append",
         default=[],
         metavar="FILE",
-        help=f"Python file with further {more}",
+        help=f"Python file with further {parts}",
     )
 
 

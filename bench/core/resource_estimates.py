@@ -96,12 +96,12 @@ class ResourceNeed:
 
 
 def check_feasible(
-    who: str, need: ResourceNeed, machine: MachineResources, force: bool = False
+    subject: str, need: ResourceNeed, machine: MachineResources, force: bool = False
 ) -> None:
     """Raise an error for work that is not feasible on this machine.
 
     Args:
-        who: beginning of the message.
+        subject: beginning of the message.
         need: resources that the work needs.
         machine: resources of the machine.
         force: True to skip the check.
@@ -110,7 +110,7 @@ def check_feasible(
         InputError: the work needs more than is available.
     """
     if not force and (excess := need.find_excess(machine)):
-        raise InputError(f"{who}: {need.made} would need {excess}; {need.change}, {FORCE_HINT}")
+        raise InputError(f"{subject}: {need.made} would need {excess}; {need.change}, {FORCE_HINT}")
 
 
 def get_machine_resources(folder: Path | None = None) -> MachineResources:

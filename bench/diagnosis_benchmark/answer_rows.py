@@ -50,7 +50,7 @@ def _iterate_rows(diagnoser: str, answers: AnswersByCase) -> Iterator[dict[str, 
 
 
 def build_answer_row(
-    question: str, item: BenchmarkCase, given: Mapping[str, Any]
+    question: str, item: BenchmarkCase, stored_answer: Mapping[str, Any]
 ) -> dict[str, Any]:
     """Build the result row of one answer: its case, true causes, answer, grade and cost.
 
@@ -59,7 +59,7 @@ def build_answer_row(
     Args:
         question: name of the case.
         item: the case with its truth.
-        given: stored answer of one diagnoser, with its status, reason and cost.
+        stored_answer: stored answer of one diagnoser, with its status, reason and cost.
 
     Returns:
         Values by column. ``found`` and ``found_class`` tell whether the cause was identified
@@ -67,7 +67,7 @@ def build_answer_row(
         says that something is missing; a missing answer counts as an alarm. ``intervals`` is the
         number of closed 95 % intervals, ``holding`` how many of them contain the true value.
     """
-    answer = given["answer"]
+    answer = stored_answer["answer"]
     mark = grade_answer(item, answer)
     covered = [is_covered for is_covered in mark.covered.values() if is_covered is not None]
     causes = answer["causes"] if answer else []
@@ -75,17 +75,17 @@ def build_answer_row(
     case_columns[RUN_SECONDS_COLUMN] = case_columns.pop("seconds")
     return {
         "question": question,
-        "diagnoser": given["diagnoser"],
+        "diagnoser": stored_answer["diagnoser"],
         "kind": item.kind,
         "system": item.system,
         "hidden": " + ".join(item.effects),
         **case_columns,
         "channels": " ".join(item.channels),
-        "status": given["status"],
-        "reason": (given["reason"].strip().splitlines() or [""])[-1][:200],
+        "status": stored_answer["status"],
+        "reason": (stored_answer["reason"].strip().splitlines() or [""])[-1][:200],
         "verdict": answer["verdict"] if answer else "",
         "named": mark.named,
-        "outcome": SKIPPED_STATUS if given["status"] == SKIPPED_STATUS else mark.outcome,
+        "outcome": SKIPPED_STATUS if stored_answer["status"] == SKIPPED_STATUS else mark.outcome,
         "set_size": mark.set_size,
         "class_size": mark.class_size,
         "largest_set": max((1 + len(c["alternatives"]) for c in causes), default=0),
@@ -95,8 +95,8 @@ def build_answer_row(
         "p_value": answer["p_value"] if answer else None,
         "intervals": len(covered),
         "holding": sum(covered),
-        "simulations": given["simulations"],
-        "seconds": given["seconds"],
-        "processor_seconds": given["processor_seconds"],
-        "trusted": given["trusted"],
+        "simulations": stored_answer["simulations"],
+        "seconds": stored_answer["seconds"],
+        "processor_seconds": stored_answer["processor_seconds"],
+        "trusted": stored_answer["trusted"],
     }

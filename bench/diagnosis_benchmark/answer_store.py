@@ -50,17 +50,17 @@ class AnswerStore:
             self._file.write("\n")
             self._file.flush()
 
-    def append(self, one: Mapping[str, Any]) -> None:
+    def append(self, document: Mapping[str, Any]) -> None:
         """Append the answers to a case; they survive a kill of the process after this call.
 
         Args:
-            one: JSON document of `case_evaluation.evaluate_case`: name of the case, the case, and
-                one
+            document: JSON document of `case_evaluation.evaluate_case`: name of the case, the case,
+                and one
                 row per diagnoser that was asked.
         """
-        self._file.write(json.dumps(one) + "\n")
+        self._file.write(json.dumps(document) + "\n")
         self._file.flush()
-        _add_line(self.answered, one)
+        _add_line(self.answered, document)
 
     def close(self) -> None:
         """Close the file and release its lock."""

@@ -52,7 +52,7 @@ def draw_case(
     seed: int,
     effect: str | None = None,
     size: float | None = None,
-    asked: RequestedConditions = ANY_CONDITIONS,
+    requested: RequestedConditions = ANY_CONDITIONS,
 ) -> BenchmarkCase | None:
     """Draw a case; see `bench.diagnosis_benchmark.case_generation.case_sampling.draw_case`.
 
@@ -62,13 +62,13 @@ def draw_case(
         seed: seed of the case.
         effect: hidden effect; None to draw it.
         size: size in units of the noise; None to draw it.
-        asked: recording conditions that are not drawn.
+        requested: recording conditions that are not drawn.
 
     Returns:
         The case, or None if the hidden cause is not observable.
     """
     draw = machines.draw_case if system in machines.MACHINE_NAMES else case_sampling.draw_case
-    return draw(kind, system, seed, effect, size, asked)
+    return draw(kind, system, seed, effect, size, requested)
 
 
 def list_hideable_effects(system: str) -> list[str]:

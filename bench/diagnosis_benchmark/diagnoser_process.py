@@ -47,7 +47,7 @@ _DOCUMENT = 1 << 30
 """Maximum size in bytes of a case document."""
 
 
-def serve_requests(channel: MessageChannel, reach: AccessPolicy, held: list[str]) -> None:
+def serve_requests(channel: MessageChannel, reach: AccessPolicy, first_document: list[str]) -> None:
     """Answer requests of the harness until the channel is closed.
 
     Requests have a kind of one letter: L brings trained arrays, Q a case, F a training. The answers
@@ -57,9 +57,9 @@ def serve_requests(channel: MessageChannel, reach: AccessPolicy, held: list[str]
     Args:
         channel: message channel to the harness.
         reach: access policy of this process, with its own writable folder.
-        held: sent in the first message of this process.
+        first_document: sent in the first message of this process.
     """
-    channel.send_document(b"R", held)
+    channel.send_document(b"R", first_document)
     trained_arrays: Mapping[str, Array] = {}
     with suppress(PeerClosedError):
         while True:
@@ -92,13 +92,13 @@ _USED = "simulations"
 """Name of the array with the number of simulations that a training used."""
 
 
-def load_diagnoser(wanted: Mapping[str, Any]) -> Diagnoser:
+def load_diagnoser(specification: Mapping[str, Any]) -> Diagnoser:
     """Load a diagnoser from its module or file, and create it.
 
     Args:
-        wanted: name, module, and file of a plugin (empty for a module).
+        specification: name, module, and file of a plugin (empty for a module).
     """
-    kind: type[Diagnoser] = load_class(dict(wanted), Diagnoser)
+    kind: type[Diagnoser] = load_class(dict(specification), Diagnoser)
     return kind()
 
 

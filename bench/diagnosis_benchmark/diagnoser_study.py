@@ -259,7 +259,9 @@ class DiagnosisStudy:
 class _EvaluationRun:
     """Execution of the cases that have missing answers."""
 
-    def __init__(self, study: DiagnosisStudy, kept: AnswerStore, progress: ProgressFactory) -> None:
+    def __init__(
+        self, study: DiagnosisStudy, answer_store: AnswerStore, progress: ProgressFactory
+    ) -> None:
         """Collect what the run needs: salt, limits of an answer, and hidden folders.
 
         Diagnosers must not read the hidden folders: the result folder, which contains the true
@@ -267,10 +269,10 @@ class _EvaluationRun:
 
         Args:
             study: the study.
-            kept: store of the answers, opened for appending.
+            answer_store: store of the answers, opened for appending.
             progress: makes progress callbacks.
         """
-        self._study, self._kept, self._progress = study, kept, progress
+        self._study, self._kept, self._progress = study, answer_store, progress
         self._experiment = study.configuration.experiment
         self._hidden = tuple(str(place.resolve()) for place in (study.folder, trained()))
         self._salt = (

@@ -309,16 +309,20 @@ def build_pair_table(rows: pd.DataFrame, order: Sequence[str]) -> pd.DataFrame:
     return frame
 
 
-def compute_mcnemar_p_value(ours: int, theirs: int) -> float:
+def compute_mcnemar_p_value(first_only: int, second_only: int) -> float:
     """Compute the p-value of McNemar's exact test, two-sided.
 
     Args:
-        ours: number of cases that only the first diagnoser answered correctly.
-        theirs: number of cases that only the second diagnoser answered correctly.
+        first_only: number of cases that only the first diagnoser answered correctly.
+        second_only: number of cases that only the second diagnoser answered correctly.
     """
     from scipy.stats import binomtest
 
-    return float(binomtest(ours, ours + theirs).pvalue) if ours + theirs else 1.0
+    return (
+        float(binomtest(first_only, first_only + second_only).pvalue)
+        if first_only + second_only
+        else 1.0
+    )
 
 
 def index_by_diagnoser(frame: pd.DataFrame, metric: str = "") -> dict[str, TableRow]:

@@ -256,19 +256,19 @@ def _sort_downwards(labels: Sequence[_Label]) -> list[_Label]:
 
 
 def arrange_labels(
-    wanted: Sequence[float], sizes: Sequence[float], low: float, high: float
+    wanted_positions: Sequence[float], sizes: Sequence[float], low: float, high: float
 ) -> Array:
     """Compute (N,) middles of labels that do not overlap, close to the wanted ones.
 
     One pass in each direction moves the labels apart.
 
     Args:
-        wanted: (N,) wanted middles, from top to bottom.
+        wanted_positions: (N,) wanted middles, from top to bottom.
         sizes: (N,) heights of the labels.
         low: Lower end of the column.
         high: Upper end of the column, which has space for all labels.
     """
-    middles = np.array(wanted, dtype=np.float64)
+    middles = np.array(wanted_positions, dtype=np.float64)
     ceiling = high
     for i, size in enumerate(sizes):
         middles[i] = min(middles[i], ceiling - size / 2)

@@ -263,7 +263,7 @@ def style_of(
     experiment: Experiment,
     statistics: ComparisonStatistics,
     behind: Sequence[ReferenceResult] = (),
-    shown: Sequence[tuple[str, str]] = (),
+    panels: Sequence[tuple[str, str]] = (),
 ) -> TunerStyles:
     """Return the styles of a comparison's tuners, in the order of its ranking.
 
@@ -271,10 +271,10 @@ def style_of(
         experiment: The experiment.
         statistics: Its statistics.
         behind: Reference results drawn behind the curves.
-        shown: Metric and range of each panel of curves against simulations; the legend says which
+        panels: Metric and range of each panel of curves against simulations; the legend says which
             curves coincide in them.
     """
-    notes = [statistics.notes, statistics.coinciding(shown)]
+    notes = [statistics.notes, statistics.coinciding(panels)]
     joined_notes = {t: "\n".join(n[t] for n in notes if t in n) for t in {*notes[0], *notes[1]}}
     return TunerStyles(experiment, statistics.order, behind, joined_notes)
 

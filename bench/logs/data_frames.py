@@ -53,30 +53,32 @@ class FrameDescription:
                 )
 
 
-def recording_of(frame: Frame, about: FrameDescription, name: str = "DataFrame") -> Recording:
+def recording_of(
+    frame: Frame, frame_description: FrameDescription, name: str = "DataFrame"
+) -> Recording:
     """Read the recording in a data frame; only runs that are marked so are held out.
 
     Args:
         frame: Columns ``run`` (if there are several), ``t`` and one for each channel and input.
-        about: Description by the user.
+        frame_description: Description by the user.
         name: Name of the recording in messages.
 
     Raises:
         InputError: The data frame or its description is malformed; the message is one line.
     """
-    meta = dict(about.description or {})
-    if about.system is not None:
+    meta = dict(frame_description.description or {})
+    if frame_description.system is not None:
         meta.pop("model", None)
-        meta["system"] = about.system
-    if about.model is not None:
+        meta["system"] = frame_description.system
+    if frame_description.model is not None:
         meta.pop("system", None)
-        meta["model"] = str(about.model)
-    if about.constants:
+        meta["model"] = str(frame_description.model)
+    if frame_description.constants:
         stated_constants = check_table(name, "constants", meta.get("constants", {}))
-        meta["constants"] = {**stated_constants, **about.constants}
+        meta["constants"] = {**stated_constants, **frame_description.constants}
     kind = _get_simulator_class(name, meta)
     meta.setdefault("title", f"{kind.name}, {name}")
-    return recording_of_frame(frame, kind, meta, about.units or {}, name)
+    return recording_of_frame(frame, kind, meta, frame_description.units or {}, name)
 
 
 def _get_simulator_class(name: str, meta: Mapping[str, Any]) -> type[Simulator]:

@@ -19,17 +19,17 @@ CHUNK_BYTES = 1 << 20
 _INCLUDE = re.compile(rb"<include\s+file\s*=\s*[\"']([^\"']+)[\"']")
 
 
-def compute_recording_digest(path: Path, told: str = "") -> str:
+def compute_recording_digest(path: Path, further_text: str = "") -> str:
     """Hash a recording: its table, its description, the mapped logs and bags, and its model.
 
     Args:
         path: Path of its table or description.
-        told: Further text that is part of the hash.
+        further_text: Further text that is part of the hash.
 
     Raises:
         InputError: The table or the description cannot be read.
     """
-    digest = hashlib.sha256(told.encode())
+    digest = hashlib.sha256(further_text.encode())
     description = get_description_path(path)
     for file in dict.fromkeys([path, description]):
         try:

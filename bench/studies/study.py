@@ -125,8 +125,8 @@ def begin_studies(
     from bench.benchmark.problem.experiment import expand_sweep
     from bench.benchmark.runner.study_setup import prepare_study
 
-    def begin(one: Experiment, place: Path | None) -> Study:
-        return get_study_class(one).begin(prepare_study(one, plugins, place, jobs, salt))
+    def begin(part: Experiment, place: Path | None) -> Study:
+        return get_study_class(part).begin(prepare_study(part, plugins, place, jobs, salt))
 
     experiments = expand_sweep(experiment)
     if len(experiments) == 1:

@@ -78,7 +78,7 @@ class HistoryValidationMonitor(NamedTuple):
 
 def train_history_transformer(
     material: TrainingHistories,
-    drawn: Callable[[np.random.Generator], HistoryIndices],
+    draw_histories: Callable[[np.random.Generator], HistoryIndices],
     design: HistoryTransformerDesign,
     rng: np.random.Generator,
     watched: HistoryValidationMonitor | None = None,
@@ -87,7 +87,7 @@ def train_history_transformer(
 
     Args:
         material: training data.
-        drawn: function that draws the histories of a batch.
+        draw_histories: function that draws the histories of a batch.
         design: design of the network and of its training.
         rng: seeds the initial weights and all random draws; global random state is not changed.
         watched: held-out data and callback for the losses, without the penalty; the weights do not
@@ -104,7 +104,7 @@ def train_history_transformer(
             material.shown.shape[-1], material.parameters.shape[-1], design
         )
         w = _draw_initial_weights(shapes_by_name, generator)
-        _minimise_loss(w, material, drawn, design, rng, watched)
+        _minimise_loss(w, material, draw_histories, design, rng, watched)
         return {name: v.detach().numpy().astype(np.float64) for name, v in w.items()}
 
 

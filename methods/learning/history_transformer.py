@@ -96,7 +96,7 @@ def predict_proposals(
     w: dict[str, Any],
     design: HistoryTransformerDesign,
     target: Any,
-    shown: Any,
+    simulations: Any,
     tried: Any,
 ) -> Any:
     """Compute the proposals before and after each simulation of a history.
@@ -108,14 +108,14 @@ def predict_proposals(
         w: weight arrays as in `get_weight_shapes`.
         design: design of the network.
         target: (..., d) row of the target, projected by W.
-        shown: (..., k, d) rows of the simulations, projected by W; k is at most the window.
+        simulations: (..., k, d) rows of the simulations, projected by W; k is at most the window.
         tried: (..., k, dim) parameters of the simulations, in half widths from the middle.
 
     Returns:
         (..., k + 1, dim) proposals, in half widths from the middle.
     """
     target_row = target[..., None, :]
-    differences = shown - target_row
+    differences = simulations - target_row
     size = xp.sqrt((differences**2).mean(axis=-1, keepdims=True) + _STILL**2)
     unit = differences / size  # (1)
     base_features = [
@@ -156,8 +156,8 @@ def _compute_step_features(xp: Any, differences: Any, proposed: Any) -> tuple[An
     length = xp.sqrt((step**2).sum(axis=-1, keepdims=True) + _STILL**2)
     slope = (differences[..., 1:, :] - differences[..., :-1, :]) / length  # (2)
 
-    def begun(like: Any, rest: Any) -> Any:
-        return xp.concatenate([xp.zeros_like(like[..., :1, :]), rest], axis=-2)
+    def begun(like: Any, later_values: Any) -> Any:
+        return xp.concatenate([xp.zeros_like(like[..., :1, :]), later_values], axis=-2)
 
     return begun(proposed, step / length), begun(differences, xp.arcsinh(slope))
 

@@ -145,10 +145,10 @@ class NoiseMatchedNetworks(Generic[Learner]):
         return cls(clean_network, noisy_network, limit)
 
 
-def add_noise_to_held_out(apart: TrainingData, noise: Array | None) -> TrainingData:
+def add_noise_to_held_out(held_out: TrainingData, noise: Array | None) -> TrainingData:
     """Add noise of standard deviations (C,) to held-out simulations; None for no noise."""
     # A separate random stream keeps the training independent of the evaluation.
-    return apart if noise is None else apart.with_noise(noise, np.random.default_rng(0))
+    return held_out if noise is None else held_out.with_noise(noise, np.random.default_rng(0))
 
 
 def check_shapes(

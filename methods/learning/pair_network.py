@@ -304,7 +304,7 @@ def _make_loss(
         output = hidden @ w["output.weight"] + w["output.bias"]  # (1)
         return torch.tanh(output) if design.bounded else output
 
-    def objective(x: Any, seen: Any, y: Any) -> Any:
+    def objective(x: Any, target_rows: Any, y: Any) -> Any:
         """Compute the mean squared error of the estimated parameter differences; see `_make_loss`.
 
         All m (m - 1) / 2 pairs of the m simulations of a scenario are used. With `alone` (one
@@ -312,10 +312,10 @@ def _make_loss(
 
         Args:
             x: (n, m, D) input rows of the proposed side, for n scenarios of m simulations.
-            seen: (n, m, E) input rows of the target's side.
+            target_rows: (n, m, E) input rows of the target's side.
             y: (n, m, dim) parameters.
         """
-        b = branch(seen, "target")
+        b = branch(target_rows, "target")
         if is_target_only:
             # A proposed input of zero leaves the branch's bias.
             zero_branch = unit(w["proposed.bias"]).expand_as(b)

@@ -258,33 +258,33 @@ class PairTuner(Tuner):
         self.train_on(data, rng, held_out_data)
 
     def train_on(
-        self, data: TrainingData, rng: np.random.Generator, apart: TrainingData | None = None
+        self, data: TrainingData, rng: np.random.Generator, held_out: TrainingData | None = None
     ) -> None:
         """Train on simulations.
 
         Args:
             data: training data.
             rng: random generator.
-            apart: held-out data for the losses that `callback` gets; None for none.
+            held_out: held-out data for the losses that `callback` gets; None for none.
         """
         callback = self.watch
 
-        def fitted(stage: str, shown: TrainingData, noise: Array | None) -> TrainedPairNetwork:
+        def fitted(stage: str, noisy_data: TrainingData, noise: Array | None) -> TrainedPairNetwork:
             """Train the network for one noise level; called by `NoiseMatchedNetworks.train`.
 
             Args:
                 stage: name of this training, for the callback.
-                shown: simulations to train on, with noise.
+                noisy_data: simulations to train on, with noise.
                 noise: noise that is also added to the held-out simulations; None for none.
             """
             monitor = None
-            if callback is not None and apart is not None:
+            if callback is not None and held_out is not None:
                 monitor = TrainingMonitor(
-                    add_noise_to_held_out(apart, noise), partial(callback.epoch, stage)
+                    add_noise_to_held_out(held_out, noise), partial(callback.epoch, stage)
                 )
             return TrainedPairNetwork.train(
                 self.make_network_design(),
-                shown,
+                noisy_data,
                 rng,
                 self.make_feature_config(),
                 self.is_single_input,

@@ -77,7 +77,9 @@ def generate_training_data(
     budget: int,
     scenarios: int,
     each: int,
-    drawn: Callable[[TrainingSimulator, np.random.Generator, int], Array] = draw_uniform_points,
+    draw_parameters: Callable[
+        [TrainingSimulator, np.random.Generator, int], Array
+    ] = draw_uniform_points,
 ) -> TrainingData:
     """Simulate several points in each of several scenarios; fewer scenarios for a small budget.
 
@@ -87,7 +89,7 @@ def generate_training_data(
         budget: maximum number of simulations.
         scenarios: maximum number of scenarios.
         each: number of points in each scenario.
-        drawn: function that draws the points of a scenario.
+        draw_parameters: function that draws the points of a scenario.
 
     Raises:
         TrainingBudgetTooSmallError: the budget is smaller than two scenarios.
@@ -103,7 +105,7 @@ def generate_training_data(
     observations = []
     scenes = []
     for _ in range(count):
-        points = drawn(simulator, rng, each)
+        points = draw_parameters(simulator, rng, each)
         simulated = simulator.simulate(rng, points)
         # A scenario with a failed simulation is left out, because all need the same number of
         # points.

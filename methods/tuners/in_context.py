@@ -77,18 +77,20 @@ class TrainedHistoryNetwork:
         """Project input rows (n, D) by W to (n, d)."""
         return rows @ self.weights["seen.weight"]
 
-    def propose_next(self, target: Array, shown: list[Array], tried: list[Array]) -> Array:
+    def propose_next(
+        self, target: Array, simulations_seen: list[Array], tried: list[Array]
+    ) -> Array:
         """Propose the next point (dim,) of the unit cube.
 
         Args:
             target: (d,) projected row of the target.
-            shown: projected rows (d,) of the simulations so far.
+            simulations_seen: projected rows (d,) of the simulations so far.
             tried: points (dim,) of the simulations so far.
         """
         window = self.design.window
         half_widths = (self.training_range[1] - self.training_range[0]) / 2.0
         middle = self.training_range.mean(axis=0)
-        simulations = np.array(shown[-window:]).reshape(-1, target.size)
+        simulations = np.array(simulations_seen[-window:]).reshape(-1, target.size)
         points = np.array(tried[-window:]).reshape(-1, half_widths.size)
         proposals = predict_proposals(
             np, self.weights, self.design, target, simulations, (points - middle) / half_widths
@@ -218,15 +220,17 @@ class InContextTransformer(Tuner):
             )
         box = np.array(simulator.training, dtype=np.float64)
 
-        def learned(stage: str, shown: TrainingData, noise: Array | None) -> TrainedHistoryNetwork:
+        def learned(
+            stage: str, noisy_data: TrainingData, noise: Array | None
+        ) -> TrainedHistoryNetwork:
             """Train the network for one noise level; called by `NoiseMatchedNetworks.train`.
 
             Args:
                 stage: name of this training, for the callback.
-                shown: simulations to train on, with noise.
+                noisy_data: simulations to train on, with noise.
                 noise: noise that is also added to the held-out simulations; None for none.
             """
-            features = InputFeatures.fit(shown, self.make_feature_config())
+            features = InputFeatures.fit(noisy_data, self.make_feature_config())
             monitor = None
             if callback is not None and held_out_data is not None:
                 material = _build_training_histories(
@@ -234,7 +238,7 @@ class InContextTransformer(Tuner):
                 )
                 monitor = HistoryValidationMonitor(material, partial(callback.epoch, stage))
             design = self.make_network_design()
-            material = _build_training_histories(features, shown, box)
+            material = _build_training_histories(features, noisy_data, box)
             weights = train_history_transformer(
                 material, partial(self._draw_histories, each), design, rng, monitor
             )

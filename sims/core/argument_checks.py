@@ -117,18 +117,18 @@ def bind_checked(
     return bound
 
 
-def check_options(options: Callable[..., R], given: Mapping[str, object]) -> R:
+def check_options(options: Callable[..., R], values: Mapping[str, object]) -> R:
     """Make an options dataclass from checked and converted values.
 
     Args:
         options: Dataclass, whose annotations describe the values.
-        given: Values by field.
+        values: Values by field.
 
     Raises:
         InputError: A value is wrong.
     """
     signature = inspect.signature(options)
-    bound = bind_checked("options", signature, get_hints(options), (), given)
+    bound = bind_checked("options", signature, get_hints(options), (), values)
     return options(**bound.arguments)
 
 

@@ -207,7 +207,7 @@ class Effect(metaclass=EffectType):
         heavy = any(c.name == "gravity" for c in system.constants)
         says_push = system_class.push is not System.push
         in_space = len(system.coordinates) == 3
-        reasons = {
+        reason = {
             "": "",
             "input": "" if system.inputs else "it has no input",
             "ground": "" if system.bounces else "it meets no ground",
@@ -224,7 +224,7 @@ class Effect(metaclass=EffectType):
             "level": "" if system_class.levels else "it names no level that could spill over",
         }[cls.needs]
         undefined = "" if cls.on(system) else f"it is not defined for a {system.kind} system"
-        return reasons or undefined or system.refuses(cls)
+        return reason or undefined or system.refuses(cls)
 
     @classmethod
     def on(cls, system: System | type[System]) -> tuple[Coefficient, ...]:

@@ -52,29 +52,29 @@ MAX_LISTED_NAMES = 10
 """Maximum number of known names that a message lists although some are similar to the unknown."""
 
 
-def make_unknown_name_error(kind: str, name: str, known: Sequence[str]) -> InputError:
+def make_unknown_name_error(kind: str, name: str, known_names: Sequence[str]) -> InputError:
     """Make the error for an unknown name, which lists the most similar or all known names.
 
     Args:
         kind: Kind of the name in the message.
         name: Unknown name.
-        known: Known names.
+        known_names: Known names.
     """
-    suggestion = similar(str(name), known)
+    suggestion = similar(str(name), known_names)
     name_list = (
         ""
-        if suggestion and len(known) > MAX_LISTED_NAMES
-        else f"; there are: {', '.join(sorted(known))}"
+        if suggestion and len(known_names) > MAX_LISTED_NAMES
+        else f"; there are: {', '.join(sorted(known_names))}"
     )
     return InputError(f"unknown {kind} '{truncate_text(str(name))}'{name_list}{suggestion}")
 
 
-def similar(name: str, known: Iterable[str]) -> str:
+def similar(name: str, known_names: Iterable[str]) -> str:
     """Format the names most similar to an unknown name as the end of a message.
 
     Args:
         name: Unknown name.
-        known: Known names.
+        known_names: Known names.
 
     Returns:
         A question with the similar names; empty if there are none.
@@ -82,7 +82,7 @@ def similar(name: str, known: Iterable[str]) -> str:
     from difflib import get_close_matches
 
     # Ignore case and accept prefixes: users write Pendulum for pendulum, or a family for a member.
-    names = {known_name.lower(): known_name for known_name in known}
+    names = {known_name.lower(): known_name for known_name in known_names}
     lower_name = name.lower()[:MAX_QUOTED_NAME_LENGTH]
     similar = [key for key in names if len(lower_name) >= 3 and key.startswith(lower_name)]
     similar = similar or get_close_matches(lower_name, names, cutoff=_ALIKE)

@@ -224,8 +224,8 @@ class JointBacklash(DrivenLoad):
             moment: state snapshot of L batch elements.
             state: position and velocity of the load.
         """
-        gap = moment.primary - state.x
-        indentation = gap - np.clip(gap, -0.5 * c[0], 0.5 * c[0])
+        relative_position = moment.primary - state.x
+        indentation = relative_position - np.clip(relative_position, -0.5 * c[0], 0.5 * c[0])
         pressed = np.abs(indentation) / (np.abs(indentation) + CONTACT_DAMPING_DEPTH * c[0])
         push = CONTACT_FREQUENCY * indentation + 4.0 * pressed * (moment.v[:, :1] - state.v)
         pull = (1.0 - self.behind(c)) * CONTACT_FREQUENCY * push  # (4)

@@ -112,7 +112,7 @@ def check_switches(
     path: Path,
     switches: Sequence[DriveSwitch],
     actuators: Sequence[str],
-    taken: Sequence[str],
+    used_columns: Sequence[str],
 ) -> None:
     """Check the switch columns of a description.
 
@@ -120,7 +120,7 @@ def check_switches(
         path: Path of the description, for messages.
         switches: Switch columns from `read_switches`.
         actuators: Names of the actuators of the model.
-        taken: Names of columns with another meaning.
+        used_columns: Names of columns with another meaning.
 
     Raises:
         InputError: There is no such actuator, or the column is a channel or an input.
@@ -132,7 +132,7 @@ def check_switches(
             raise InputError(
                 f"{location}: {make_unknown_name_error('actuator', switch.actuator, names)}"
             )
-        if switch.column in taken:
+        if switch.column in used_columns:
             raise InputError(
                 f"{location}: expected a column that says when the drive is on, found "
                 f"{switch.column}, which is a channel or input; name a column of its own"

@@ -17,14 +17,14 @@ MIN_FAST_PARSE_BYTES = 1 << 20
 
 
 def read_csv_fast(
-    path: Path, header: Sequence[str], wanted: Sequence[str], gaps: Collection[str]
+    path: Path, header: Sequence[str], column_names: Sequence[str], gaps: Collection[str]
 ) -> tuple[list[str], dict[str, Array]] | None:
     """Read the run names and the numeric columns of a CSV table with pyarrow.
 
     Args:
         path: Table whose first line is its header.
         header: Checked names of its columns, including ``run``.
-        wanted: Names of the numeric columns to read.
+        column_names: Names of the numeric columns to read.
         gaps: Those among them whose cells may be empty (NaN).
 
     Returns:
@@ -35,7 +35,7 @@ def read_csv_fast(
     from pyarrow import csv
 
     types = {"run": arrow.string()}
-    types |= {name: arrow.float64() for name in wanted}
+    types |= {name: arrow.float64() for name in column_names}
     try:
         table = csv.read_csv(
             path,
@@ -52,7 +52,7 @@ def read_csv_fast(
     except (arrow.ArrowException, OSError):
         return None
     columns: dict[str, Array] = {}
-    for name in wanted:
+    for name in column_names:
         cells = table[name]
         values = cells.to_numpy()
         # An empty cell is NaN and allowed in a gap; NaN or inf written as text is not.

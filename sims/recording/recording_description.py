@@ -358,18 +358,18 @@ def _read_drive_switches(
     return switches
 
 
-def check_run_names(path: Path, marked: Iterable[str], there: Iterable[str]) -> None:
+def check_run_names(path: Path, marked: Iterable[str], table_names: Iterable[str]) -> None:
     """Check that all runs in the description exist in the table.
 
     Args:
         path: Path of the description, for messages.
         marked: Names of the runs in the description.
-        there: Names of the runs in the table.
+        table_names: Names of the runs in the table.
 
     Raises:
         InputError: The description mentions another run.
     """
-    _check_known_names(path, "runs", marked, there)
+    _check_known_names(path, "runs", marked, table_names)
 
 
 def _check_known_names(
@@ -430,21 +430,21 @@ def _read_columns(
     }
 
 
-def dotted(given: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
+def dotted(entries: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
     """Flatten entries whose names contain dots.
 
     TOML reads unquoted dotted names as nested tables: ``[channels.q.elbow]`` becomes the entry
     ``q.elbow``.
 
     Args:
-        given: Entries as read from TOML.
+        entries: Entries as read from TOML.
         names: Names that may contain dots.
 
     Returns:
         The entries by their full names.
     """
     result: dict[str, Any] = {}
-    for name, value in given.items():
+    for name, value in entries.items():
         is_nested = isinstance(value, dict) and name not in names
         if is_nested and any(known_name.startswith(f"{name}.") for known_name in names):
             flat_entries = {f"{name}.{key}": entry for key, entry in value.items()}

@@ -188,26 +188,26 @@ def _make_unassigned_column_error(path: Path, name: str, declared: DeclaredSigna
     )
 
 
-def read_frame(path: Path, frame: Frame, about: RecordingDescription) -> list[CsvRun]:
+def read_frame(path: Path, frame: Frame, description: RecordingDescription) -> list[CsvRun]:
     """Read the runs of a frame in order of appearance.
 
     Args:
         path: Name of the frame, for messages.
         frame: Data frame with columns as returned by `with_index`; it is one run if it has no
             column ``run``.
-        about: Checked description of the frame.
+        description: Checked description of the frame.
 
     Raises:
         InputError: The frame is malformed; the message is one line.
     """
-    sources = about.sources
+    sources = description.sources
     if sources.folders or any(
         source.file for source in (*sources.signals.values(), *sources.extra.values())
     ):
         raise InputError(f"{path}: expected no file and no folder in the description of a frame")
-    return _FrameTable(path, list(about.channels), list(about.inputs), list(about.extra)).of(
-        frame, about
-    )
+    return _FrameTable(
+        path, list(description.channels), list(description.inputs), list(description.extra)
+    ).of(frame, description)
 
 
 class _FrameTable(Table):
@@ -217,14 +217,14 @@ class _FrameTable(Table):
         """Return the location of row `record` (counted from 0) for a message."""
         return f"{self.path}.iloc[{record}]"
 
-    def of(self, frame: Frame, about: RecordingDescription) -> list[CsvRun]:
+    def of(self, frame: Frame, description: RecordingDescription) -> list[CsvRun]:
         """Return the runs of a frame.
 
         Args:
             frame: Data frame.
-            about: Checked description of the frame.
+            description: Checked description of the frame.
         """
-        sources = about.sources
+        sources = description.sources
         places = {
             "t": SignalSource("", (sources.time,)),
             **sources.signals,

@@ -123,19 +123,19 @@ def find_inliers(fitted: CircleFit) -> NDArray[np.bool_]:
     return result
 
 
-def select_better_fit(one: CircleFit | None, other: CircleFit | None) -> CircleFit | None:
+def select_better_fit(first: CircleFit | None, second: CircleFit | None) -> CircleFit | None:
     """Return the circle that has more of the points on it.
 
     Args:
-        one: First circle, or None.
-        other: Second circle, or None.
+        first: First circle, or None.
+        second: Second circle, or None.
 
     Returns:
         The better circle; None if both are None.
     """
-    if one is None or other is None:
-        return one or other
-    return other if find_inliers(other).sum() > find_inliers(one).sum() else one
+    if first is None or second is None:
+        return first or second
+    return second if find_inliers(second).sum() > find_inliers(first).sum() else first
 
 
 def fit_arc(points: Array) -> Circle | None:

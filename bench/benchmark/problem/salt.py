@@ -33,11 +33,11 @@ def compute_commitment(salt: str) -> str:
     return hashlib.sha256(salt.encode()).hexdigest()
 
 
-def check_commitment(who: str, salt: str, committed: str) -> None:
+def check_commitment(subject: str, salt: str, committed: str) -> None:
     """Raise an error if a salt does not match its commitment.
 
     Args:
-        who: name of the experiment, for messages.
+        subject: name of the experiment, for messages.
         salt: the salt; may be empty.
         committed: SHA-256 of the salt; empty if there is no commitment.
 
@@ -46,16 +46,16 @@ def check_commitment(who: str, salt: str, committed: str) -> None:
     """
     if len(salt) > MAX_SALT_LENGTH:
         raise InputError(
-            f"{who}: expected a salt of up to {MAX_SALT_LENGTH} characters, found {len(salt)}"
+            f"{subject}: expected a salt of up to {MAX_SALT_LENGTH} characters, found {len(salt)}"
         )
     if committed and not _HASH.match(committed):
         raise InputError(
-            f"{who}: salt_sha256: expected 64 hexadecimal digits, found {committed!r:.80}"
+            f"{subject}: salt_sha256: expected 64 hexadecimal digits, found {committed!r:.80}"
         )
     if committed and salt and compute_commitment(salt) != committed:
         raise InputError(
-            f"{who}: its salt has SHA-256 {compute_commitment(salt)}, committed was {committed}; "
-            "one of the two was changed"
+            f"{subject}: its salt has SHA-256 {compute_commitment(salt)}, committed was "
+            f"{committed}; one of the two was changed"
         )
 
 
@@ -81,9 +81,9 @@ class TargetStreams:
         experiment, *target_names = names
         self._one = make_rng(experiment, "target", *target_names)
 
-    def get_stream(self, what: str) -> np.random.Generator:
+    def get_stream(self, quantity: str) -> np.random.Generator:
         """Return the random generator of one quantity; public salts share one generator for all."""
-        return self._one if self._public else self._make_salted_rng(what)
+        return self._one if self._public else self._make_salted_rng(quantity)
 
     def get_held_out_stream(self, scenario: int) -> np.random.Generator:
         """Return the random generator of a held-out scenario."""

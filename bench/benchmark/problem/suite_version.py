@@ -61,21 +61,23 @@ def _list_referenced_files(path: Path, tables: Mapping[str, Any]) -> Iterator[Pa
         yield (path.parent / recording).with_suffix(".toml")
 
 
-def check_problem_hash(suite: str, expected: Mapping[str, str], name: str, found: str) -> None:
+def check_problem_hash(
+    suite: str, expected: Mapping[str, str], name: str, computed_hash: str
+) -> None:
     """Raise an error if a problem is not the one that belongs to a suite's version.
 
     Args:
         suite: name and version of the suite.
         expected: hashes by name of the suite's problems.
         name: name of the problem.
-        found: its hash.
+        computed_hash: its hash.
 
     Raises:
         InputError: the hash is another one, or the suite states none.
     """
-    if expected.get(name) != found:
+    if expected.get(name) != computed_hash:
         raise InputError(
-            f"suite {suite}: problem {name} has the hash {found}, expected "
+            f"suite {suite}: problem {name} has the hash {computed_hash}, expected "
             f"{expected.get(name, 'one in [problem_hashes]')}; a changed problem needs a new "
             'version: raise the number in suite = "..." and write the new hash'
         )

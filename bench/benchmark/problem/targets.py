@@ -130,21 +130,21 @@ def draw_target(problem: TargetProblem, kind: str, index: int) -> Target:
     raise _make_divergence_error(problem.experiment, MAX_DRAWS, MAX_DRAWS)
 
 
-def redraws_of(experiment: Experiment, drawn: Sequence[Target]) -> Redraws:
+def redraws_of(experiment: Experiment, drawn_targets: Sequence[Target]) -> Redraws:
     """Count the draws of all targets.
 
     Args:
         experiment: configuration of the experiment.
-        drawn: all targets.
+        drawn_targets: all targets.
 
     Raises:
         InputError: more than `MAX_FAILED_SHARE` of the draws diverged.
     """
-    failed = sum(target.redraws for target in drawn)
-    draws = failed + len(drawn)
+    failed = sum(target.redraws for target in drawn_targets)
+    draws = failed + len(drawn_targets)
     if failed > MAX_FAILED_SHARE * draws:
         raise _make_divergence_error(experiment, failed, draws)
-    return Redraws(sum(target.redraws > 0 for target in drawn), draws)
+    return Redraws(sum(target.redraws > 0 for target in drawn_targets), draws)
 
 
 def _make_divergence_error(experiment: Experiment, failed: int, draws: int) -> InputError:

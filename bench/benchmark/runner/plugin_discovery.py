@@ -65,16 +65,16 @@ class TunerStub(Tuner):
     source_digest: ClassVar[str] = ""
 
 
-def make_tuner_stub(known: dict[str, Any]) -> type[TunerStub]:
+def make_tuner_stub(description: dict[str, Any]) -> type[TunerStub]:
     """Make the stub class of a tuner from its description."""
     fields: dict[str, Any] = {
-        "name": str(known["name"]),
-        "stochastic": known["stochastic"] is not False,
-        "learned": known["learned"] is True,
-        "trains_as": str(known["trains_as"]),
-        "module": str(known["module"]),
-        "source_digest": str(known["source"]),
-        "__doc__": str(known["says"]),
+        "name": str(description["name"]),
+        "stochastic": description["stochastic"] is not False,
+        "learned": description["learned"] is True,
+        "trains_as": str(description["trains_as"]),
+        "module": str(description["module"]),
+        "source_digest": str(description["source"]),
+        "__doc__": str(description["says"]),
         "__module__": __name__,
     }
     stub: type[TunerStub] = type(fields["name"], (TunerStub,), fields)
@@ -92,14 +92,14 @@ class DiagnoserStub(Diagnoser):
         raise NotImplementedError
 
 
-def make_diagnoser_stub(known: dict[str, Any]) -> type[DiagnoserStub]:
+def make_diagnoser_stub(description: dict[str, Any]) -> type[DiagnoserStub]:
     """Make the stub class of a diagnoser from its description."""
     fields: dict[str, Any] = {
-        "name": str(known["name"]),
-        "learned": known["learned"] is True,
-        "module": str(known["module"]),
-        "source_digest": str(known["source"]),
-        "__doc__": str(known["says"]),
+        "name": str(description["name"]),
+        "learned": description["learned"] is True,
+        "module": str(description["module"]),
+        "source_digest": str(description["source"]),
+        "__doc__": str(description["says"]),
         "__module__": __name__,
     }
     stub: type[DiagnoserStub] = type(fields["name"], (DiagnoserStub,), fields)

@@ -120,17 +120,17 @@ class ComparisonStatistics:
             {str(t): (int(is_failed.sum()), len(is_failed)) for t, is_failed in failed}
         )
 
-    def coinciding(self, shown: Sequence[tuple[str, str]]) -> dict[str, str]:
+    def coinciding(self, panels: Sequence[tuple[str, str]]) -> dict[str, str]:
         """Find tuners whose curves are hidden below another curve.
 
         Args:
-            shown: metric and range of each panel of curves.
+            panels: metric and range of each panel of curves.
 
         Returns:
             Note by tuner, such as ``same as hybrid up to 2``.
         """
         curves_by_tuner: dict[str, list[pd.Series[float]]] = {}
-        for metric, kind in shown:
+        for metric, kind in panels:
             for tuner, line in self.compute_median_curves(metric, kind).groupby(
                 "tuner", sort=False
             ):

@@ -97,27 +97,27 @@ def compute_median_curves(curves: RunCurves, metric: str, budget: int) -> pd.Dat
     return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=MEDIAN_COLUMNS)
 
 
-def coinciding(drawn: Mapping[str, Sequence[pd.Series[float]]]) -> dict[str, str]:
+def coinciding(curves_by_tuner: Mapping[str, Sequence[pd.Series[float]]]) -> dict[str, str]:
     """Find curves that cannot be seen because another one is drawn above them.
 
     A curve coincides with a later one up to k if the two differ by less than `_SAME` in every panel
     up to k, and if they have halved the initial error by then. Before that most tuners are equal.
 
     Args:
-        drawn: curves of each tuner in drawing order, one per panel: medians by number of
+        curves_by_tuner: curves of each tuner in drawing order, one per panel: medians by number of
             simulations.
 
     Returns:
         Note by tuner whose curve is covered: ``same as hybrid up to 2``, or ``same as hybrid``.
     """
     notes = {}
-    names = list(drawn)
+    names = list(curves_by_tuner)
     for place, name in enumerate(names):
         longest = 0
         for upper_name in names[place + 1 :]:
-            if len(drawn[upper_name]) != len(drawn[name]):
+            if len(curves_by_tuner[upper_name]) != len(curves_by_tuner[name]):
                 continue
-            pairs = list(zip(drawn[name], drawn[upper_name], strict=True))
+            pairs = list(zip(curves_by_tuner[name], curves_by_tuner[upper_name], strict=True))
             upto = min(
                 _count_equal_simulations(hidden_curve, upper_curve)
                 for hidden_curve, upper_curve in pairs

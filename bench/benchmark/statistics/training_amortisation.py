@@ -143,7 +143,7 @@ def compute_break_even_targets(
 
 
 def build_break_even_table(
-    experiment: str, kind: str, threshold: float, held: Mapping[str, TuningCost]
+    experiment: str, kind: str, threshold: float, costs_by_tuner: Mapping[str, TuningCost]
 ) -> pd.DataFrame:
     """Compare every learned tuner with every search tuner by break-even targets.
 
@@ -151,14 +151,14 @@ def build_break_even_table(
         experiment: name of the experiment.
         kind: range of the targets.
         threshold: error threshold of the metric.
-        held: cost by tuner.
+        costs_by_tuner: cost by tuner.
 
     Returns:
         One row per pair with 95 % bootstrap intervals over targets, columns `BREAK_EVEN_COLUMNS`.
     """
     lines = []
-    for name, learned_cost in held.items():
-        for search_name, search in held.items():
+    for name, learned_cost in costs_by_tuner.items():
+        for search_name, search in costs_by_tuner.items():
             # Only a trained tuner has a training cost, and it is compared with untrained tuners
             # alone.
             if not learned_cost.fit_simulations or search.fit_simulations:
@@ -188,23 +188,28 @@ def build_break_even_table(
 
 
 def find_cheapest_tuners(
-    held: Mapping[str, TuningCost], targets: float
+    costs_by_tuner: Mapping[str, TuningCost], targets: float
 ) -> list[tuple[float, float, str]]:
     """Find the fastest tuner for each duration of one simulation.
 
     Args:
-        held: cost by tuner.
+        costs_by_tuner: cost by tuner.
         targets: number of targets that share the cost of one training.
 
     Returns:
         List of (from, to, tuner): bounds of the duration of one simulation in seconds, and the
         tuner that needs the least time between them. Empty if no tuner reaches the threshold.
     """
-    names = [name for name, price in held.items() if np.isfinite(price.effort.compute_ert())]
+    names = [
+        name for name, price in costs_by_tuner.items() if np.isfinite(price.effort.compute_ert())
+    ]
     if not names:
         return []
     best = np.argmin(
-        [held[name].compute_seconds_per_target(SIMULATION_COST_GRID, targets) for name in names],
+        [
+            costs_by_tuner[name].compute_seconds_per_target(SIMULATION_COST_GRID, targets)
+            for name in names
+        ],
         axis=0,
     )
     changes = np.flatnonzero(np.diff(best)) + 1

@@ -72,13 +72,13 @@ def ranked_after(budget: int) -> list[int]:
     return [k for k in _RANKED_AFTER if k < budget] + [budget]
 
 
-def targets_needed(others: int) -> int:
-    """Return the number of targets that can decide between the best tuner and `others` tuners.
+def targets_needed(comparison_count: int) -> int:
+    """Return how many targets can decide `comparison_count` comparisons with the best tuner.
 
     The smallest two-sided p-value of Wilcoxon's signed-rank test on n pairs is 2 / 2^n; Holm's
     first step multiplies it by the number of comparisons.
     """
-    return next(n for n in itertools.count(1) if 2.0 ** (1 - n) * others < SIGNIFICANCE)
+    return next(n for n in itertools.count(1) if 2.0 ** (1 - n) * comparison_count < SIGNIFICANCE)
 
 
 def rank_tuners(curves: RunCurves, budget: int, floor: float) -> pd.DataFrame:

@@ -33,9 +33,9 @@ class CellError(Exception):
         says: Column, expected and found value.
     """
 
-    def __init__(self, row: int | None, column: str, wanted: str, found: str) -> None:
+    def __init__(self, row: int | None, column: str, expected: str, found: str) -> None:
         self.row = row
-        self.says = f"{column}: expected {wanted}, found {found}"
+        self.says = f"{column}: expected {expected}, found {found}"
         super().__init__(self.says)
 
 

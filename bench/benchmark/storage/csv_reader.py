@@ -52,15 +52,15 @@ class CsvTable:
         except CellError as error:
             raise self.make_error(error.row, error.says) from None
 
-    def make_error(self, row: int | None, says: str) -> InputError:
+    def make_error(self, row: int | None, problem: str) -> InputError:
         """Make the error for a row, counted from 0, or for the whole file.
 
         Args:
             row: Row, or None for the file.
-            says: What is wrong.
+            problem: What is wrong.
         """
         place = "" if row is None else f", line {self._get_line_number(row)}"
-        return InputError(f"{self._path}{place}: {says}; {self._remedy}")
+        return InputError(f"{self._path}{place}: {problem}; {self._remedy}")
 
     def _read_text(self) -> str:
         """Read the file as text, without the byte order mark that Excel writes at the beginning.

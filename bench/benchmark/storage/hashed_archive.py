@@ -58,7 +58,7 @@ class ArchiveFault(NamedTuple):
 
 
 def write_archive(
-    archive: Path, name: str, files: Mapping[str, Path], about: Mapping[str, Any]
+    archive: Path, name: str, files: Mapping[str, Path], metadata: Mapping[str, Any]
 ) -> None:
     """Write an archive completely or not at all.
 
@@ -66,7 +66,7 @@ def write_archive(
         archive: Path of a new file.
         name: Name of the folder in the archive.
         files: Path of each file on disk, by its path in that folder.
-        about: Entries of the manifest in addition to the files.
+        metadata: Entries of the manifest in addition to the files.
 
     Raises:
         InputError: The archive exists already, or a file cannot be read or written.
@@ -77,7 +77,7 @@ def write_archive(
         {"path": path, "bytes": place.stat().st_size, "sha256": compute_sha256(place)}
         for path, place in sorted(files.items())
     ]
-    manifest = json.dumps({**about, "files": file_entries}, indent=1, ensure_ascii=False) + "\n"
+    manifest = json.dumps({**metadata, "files": file_entries}, indent=1, ensure_ascii=False) + "\n"
     try:
         archive.parent.mkdir(parents=True, exist_ok=True)
         with atomic_replacement(archive) as partial, zipfile.ZipFile(partial, "w") as packed:

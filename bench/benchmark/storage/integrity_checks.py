@@ -282,8 +282,8 @@ def check_runs(runs: pd.DataFrame, file: RunsTable, experiment: Experiment) -> N
         InputError: A check fails.
     """
 
-    def at(i: int, says: str) -> InputError:
-        return file.make_error(int(runs["row"][i]), says)
+    def at(i: int, problem: str) -> InputError:
+        return file.make_error(int(runs["row"][i]), problem)
 
     check_known(runs["experiment"], [experiment.name], "experiment", at)
     check_equal(
@@ -302,7 +302,7 @@ def check_runs(runs: pd.DataFrame, file: RunsTable, experiment: Experiment) -> N
 
 def check_segment_statuses(
     path: Path,
-    held: Mapping[int, RunStatus],
+    statuses_by_index: Mapping[int, RunStatus],
     experiment: Experiment,
     plan: Sequence[str] | None,
     remedy: str,
@@ -311,7 +311,7 @@ def check_segment_statuses(
 
     Args:
         path: Path of the part or journal.
-        held: Statuses by index in the plan.
+        statuses_by_index: Statuses by index in the plan.
         experiment: The experiment.
         plan: The id of every run; None if unknown.
         remedy: Advice for a damaged file.
@@ -324,13 +324,15 @@ def check_segment_statuses(
     """
     import pandas as pd
 
-    places = list(held)
+    places = list(statuses_by_index)
 
-    def at(row: int | None, says: str) -> InputError:
+    def at(row: int | None, problem: str) -> InputError:
         place = "" if row is None else f", run {places[row]}"
-        return InputError(f"{path}{place}: {says}; {remedy}")
+        return InputError(f"{path}{place}: {problem}; {remedy}")
 
-    statuses = pd.DataFrame([vars(status) for status in held.values()], columns=STATUS_COLUMN_NAMES)
+    statuses = pd.DataFrame(
+        [vars(status) for status in statuses_by_index.values()], columns=STATUS_COLUMN_NAMES
+    )
     check_statuses(statuses, experiment, at)
     if plan is not None:
         expected = [plan[place] if place < len(plan) else "none" for place in places]

@@ -127,18 +127,20 @@ def _make_damage_error(path: Path, expected: str) -> InputError:
     return InputError(f"{path}: expected {expected}; {SEGMENT_REMEDY}")
 
 
-def check_no_duplicate_runs(path: Path, places: Iterable[int], known: Container[int]) -> None:
+def check_no_duplicate_runs(
+    path: Path, places: Iterable[int], known_places: Container[int]
+) -> None:
     """Reject runs that another file contains already.
 
     Args:
         path: Path of the file.
         places: Indices of its runs.
-        known: Indices of the runs in other files.
+        known_places: Indices of the runs in other files.
 
     Raises:
         InputError: A run is in both.
     """
-    if repeated_places := [place for place in places if place in known]:
+    if repeated_places := [place for place in places if place in known_places]:
         raise _make_damage_error(
             path, f"every run once, found that of line {repeated_places[0] + 1} of the plan again"
         )

@@ -48,9 +48,9 @@ def check_plan(plan: Sequence[str], experiment: Experiment, path: Path, remedy: 
     """
     import pandas as pd
 
-    def at(row: int | None, says: str) -> InputError:
+    def at(row: int | None, problem: str) -> InputError:
         place = "" if row is None else f", line {row + 1}"
-        return InputError(f"{path}{place}: {says}; {remedy}")
+        return InputError(f"{path}{place}: {problem}; {remedy}")
 
     rows = []
     for row, name in enumerate(plan):
@@ -68,11 +68,13 @@ def check_plan(plan: Sequence[str], experiment: Experiment, path: Path, remedy: 
     check_complete(plan_table, experiment, at)
 
 
-def check_complete(made: pd.DataFrame, experiment: Experiment, fault: TableErrorFactory) -> None:
+def check_complete(
+    executed_runs: pd.DataFrame, experiment: Experiment, fault: TableErrorFactory
+) -> None:
     """Check that each tuner with runs has all of its runs, and no more.
 
     Args:
-        made: Tuner, target and seed of each run; the index is the row in the file.
+        executed_runs: Tuner, target and seed of each run; the index is the row in the file.
         experiment: The experiment.
         fault: Makes the error for a row, or for the file.
 
@@ -81,7 +83,7 @@ def check_complete(made: pd.DataFrame, experiment: Experiment, fault: TableError
     """
     targets = list_target_names(experiment)
     for entry in experiment.tuners:
-        tuner_rows = made[made["tuner"] == entry.label]
+        tuner_rows = executed_runs[executed_runs["tuner"] == entry.label]
         if tuner_rows.empty:
             continue
         seeds = range(_count_seeds(entry, experiment, tuner_rows["seed"].max()))

@@ -135,12 +135,12 @@ class ReferenceResult:
         ]
         return part[["simulations", "median"]].dropna().sort_values("simulations")
 
-    def to_document(self, experiment: Experiment, drawn: list[Path]) -> dict[str, Any]:
+    def to_document(self, experiment: Experiment, figure_files: list[Path]) -> dict[str, Any]:
         """Build the JSON document of the reference.
 
         Args:
             experiment: Experiment that is drawn over it.
-            drawn: Paths of the figures.
+            figure_files: Paths of the figures.
         """
         return {
             "name": self.name,
@@ -148,7 +148,7 @@ class ReferenceResult:
             "revision": self.revision or None,
             "started": self.started,
             "mismatches": self.find_mismatches(experiment),
-            "drawn": drawn,
+            "drawn": figure_files,
         }
 
 

@@ -21,14 +21,14 @@ TableErrorFactory = Callable[[int | None, str], InputError]
 
 
 def raise_for_first_bad_row(
-    bad: pd.Series | Mask, fault: RowErrorFactory, says: Callable[[int], str]
+    bad: pd.Series | Mask, fault: RowErrorFactory, describe_row: Callable[[int], str]
 ) -> None:
     """Raise an error for the first bad row.
 
     Args:
         bad: Mask of bad rows.
         fault: Makes the error.
-        says: Describes what is wrong in a row.
+        describe_row: Describes what is wrong in a row.
 
     Raises:
         InputError: There is a bad row.
@@ -36,38 +36,40 @@ def raise_for_first_bad_row(
     mask = np.asarray(bad, dtype=bool)
     if mask.any():
         row = int(mask.argmax())
-        raise fault(row, says(row))
+        raise fault(row, describe_row(row))
 
 
-def check_known(values: pd.Series, known: Iterable[str], what: str, fault: RowErrorFactory) -> None:
+def check_known(
+    values: pd.Series, known_values: Iterable[str], column: str, fault: RowErrorFactory
+) -> None:
     """Reject values that the experiment does not define.
 
     Args:
         values: Values to check.
-        known: Values that the experiment defines.
-        what: Name of the quantity.
+        known_values: Values that the experiment defines.
+        column: Name of the quantity.
         fault: Makes the error.
 
     Raises:
         InputError: There is an unknown value.
     """
     raise_for_first_bad_row(
-        ~values.isin(list(known)),
+        ~values.isin(list(known_values)),
         fault,
         lambda row: (
-            f"{what}: expected one of experiment.toml, found {format_value(values.iloc[row])}"
+            f"{column}: expected one of experiment.toml, found {format_value(values.iloc[row])}"
         ),
     )
 
 
 def check_equal(
-    found: pd.Series, wanted: pd.Series, name: str, why: str, fault: RowErrorFactory
+    found: pd.Series, expected: pd.Series, name: str, why: str, fault: RowErrorFactory
 ) -> None:
     """Reject values that differ from the expected ones; two missing values are equal.
 
     Args:
         found: Values to check.
-        wanted: Expected values.
+        expected: Expected values.
         name: Name of the column.
         why: Reason for the expected values.
         fault: Makes the error.
@@ -75,9 +77,9 @@ def check_equal(
     Raises:
         InputError: A value differs.
     """
-    is_different = found.to_numpy() != wanted.to_numpy()
+    is_different = found.to_numpy() != expected.to_numpy()
     raise_for_first_bad_row(
-        is_different & ~(found.isna() & wanted.isna()).to_numpy(),
+        is_different & ~(found.isna() & expected.isna()).to_numpy(),
         fault,
-        lambda i: f"{name}: expected {wanted[i]} {why}, found {found[i]}",
+        lambda i: f"{name}: expected {expected[i]} {why}, found {found[i]}",
     )

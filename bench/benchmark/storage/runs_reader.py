@@ -51,15 +51,15 @@ class RunsTable(NamedTuple):
     path: Path
     remedy: str
 
-    def make_error(self, row: int | None, says: str) -> InputError:
+    def make_error(self, row: int | None, problem: str) -> InputError:
         """Make the error for a row, counted from 0, or for the whole file.
 
         Args:
             row: Row, or None for the file.
-            says: What is wrong.
+            problem: What is wrong.
         """
         place = "" if row is None else f", row {row}"
-        return InputError(f"{self.path}{place}: {says}; {self.remedy}")
+        return InputError(f"{self.path}{place}: {problem}; {self.remedy}")
 
     def list_columns(self) -> list[str]:
         """List the columns of the file.

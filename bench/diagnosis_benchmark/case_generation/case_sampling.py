@@ -168,10 +168,10 @@ def _make_rng(name: str, purpose: str) -> np.random.Generator:
 
 @lru_cache(maxsize=16)
 def _draw_conditions(
-    name: str, system: str, hidden: tuple[str, ...], asked: RequestedConditions = ANY_CONDITIONS
+    name: str, system: str, hidden: tuple[str, ...], requested: RequestedConditions = ANY_CONDITIONS
 ) -> RecordingConditions:
     """Draw the recording conditions of a case from its name, and cache them."""
-    return drawn_setting(system, _make_rng(name, "setting"), hidden, asked=asked)
+    return drawn_setting(system, _make_rng(name, "setting"), hidden, requested=requested)
 
 
 def restore_conditions(item: BenchmarkCase) -> RecordingConditions:
@@ -265,14 +265,14 @@ def _draw_single(
 
 
 def find_coefficients(
-    name: str, setting: RecordingConditions, wanted: float, rng: np.random.Generator
+    name: str, setting: RecordingConditions, target_size: float, rng: np.random.Generator
 ) -> tuple[float, ...] | None:
     """Find coefficients of an effect at which the residual has the requested size.
 
     Args:
         name: name of the effect.
         setting: recording conditions.
-        wanted: size in units of the noise.
+        target_size: size in units of the noise.
         rng: random generator for the shape of the effect.
 
     Returns:
@@ -286,7 +286,7 @@ def find_coefficients(
         ),
     )
     strength = effect_sizing.find_strength_for_size(
-        compute_residual, wanted, effect_coefficients.get_max_strength(name)
+        compute_residual, target_size, effect_coefficients.get_max_strength(name)
     )
     return None if strength is None else compute_coefficients(strength)
 

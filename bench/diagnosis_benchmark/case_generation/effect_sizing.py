@@ -122,14 +122,14 @@ class NuisanceFitter:
         return ResidualFit(float(np.sqrt(np.mean(residual**2))), theta, starts)
 
     @staticmethod
-    def compute_step(rest: Array, slope: Array, damping: float) -> Array:
+    def compute_step(residual: Array, slope: Array, damping: float) -> Array:
         """Solve the damped normal equations of Levenberg and Marquardt.
 
         The damping is relative to the diagonal. The small constant part, 1e-9 of its largest entry,
         keeps the matrix regular if an unknown has no influence.
 
         Args:
-            rest: residual, (N,).
+            residual: residual, (N,).
             slope: Jacobian in units of the scales, (N, P).
             damping: damping factor of the diagonal.
 
@@ -139,7 +139,7 @@ class NuisanceFitter:
         gram = slope.T @ slope
         diagonal = np.diag(gram)
         gram = gram + np.diag(damping * diagonal + 1e-9 * diagonal.max())
-        return np.asarray(np.linalg.solve(gram, slope.T @ rest), dtype=np.float64)
+        return np.asarray(np.linalg.solve(gram, slope.T @ residual), dtype=np.float64)
 
     def linearise(self, observed: Array, theta: Array, starts: Array) -> tuple[Array, Array]:
         """Compute the residual and its Jacobian by finite differences.
@@ -235,15 +235,18 @@ def make_gap_function(
 
 
 def find_strength_for_size(
-    left: Callable[[float], float], wanted: float, largest: float, first: float = 1e-3
+    compute_residual: Callable[[float], float],
+    target_size: float,
+    largest: float,
+    first: float = 1e-3,
 ) -> float | None:
     """Find the strength at which the size has the requested value.
 
     The method is the secant method on logarithmic scales, within a bracket as soon as there is one.
 
     Args:
-        left: size as a function of the strength, increasing from zero.
-        wanted: requested size.
+        compute_residual: size as a function of the strength, increasing from zero.
+        target_size: requested size.
         largest: maximum strength.
         first: first strength to try.
 
@@ -253,17 +256,17 @@ def find_strength_for_size(
     # Bracket: (strength, size) below and above the requested size.
     low, high, strength = (0.0, 0.0), (np.inf, np.inf), first
     for _ in range(12):
-        size = left(strength)
-        if abs(size / wanted - 1) < SIZE_TOLERANCE:
+        size = compute_residual(strength)
+        if abs(size / target_size - 1) < SIZE_TOLERANCE:
             return strength
-        if size < wanted:
+        if size < target_size:
             # Too small even if the size grew with the square of the strength.
-            if strength >= largest or size * (largest / strength) ** 2 < wanted:
+            if strength >= largest or size * (largest / strength) ** 2 < target_size:
                 return None
             low = strength, size
         else:  # also if it is NaN or infinite
             high = strength, size
-        strength = float(min(_choose_next_strength(low, high, wanted), largest))
+        strength = float(min(_choose_next_strength(low, high, target_size), largest))
     return None
 
 

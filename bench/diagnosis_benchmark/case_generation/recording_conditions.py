@@ -160,7 +160,7 @@ def draw_conditions(
     rng: np.random.Generator,
     hidden: Sequence[str] = (),
     short: bool = False,
-    asked: RequestedConditions = ANY_CONDITIONS,
+    requested: RequestedConditions = ANY_CONDITIONS,
 ) -> RecordingConditions:
     """Draw recording conditions in which the hidden effects can be observed.
 
@@ -169,14 +169,14 @@ def draw_conditions(
         rng: random generator.
         hidden: names of the hidden effects.
         short: whether there are always three runs.
-        asked: conditions that are not drawn.
+        requested: conditions that are not drawn.
     """
     # Rate in Hz and length of a run in s.
     rate = int(rng.choice([50, 100, 200], p=[0.3, 0.5, 0.2]))
     seconds = float(rng.choice([2.0, 3.0, 4.0, 5.0, 6.0], p=[0.1, 0.2, 0.4, 0.2, 0.1]))
     runs = 3 if short else int(rng.choice([3, 4, 5, MAX_RUNS], p=[0.25, 0.4, 0.2, 0.15]))
     # These values are drawn in any case, so that later draws do not depend on the request.
-    rate, runs = asked.rate or rate, asked.runs or runs
+    rate, runs = requested.rate or rate, requested.runs or runs
     times = np.arange(round(rate * seconds)) / rate
     draw = {
         "ball": _draw_ball_conditions,
@@ -185,7 +185,7 @@ def draw_conditions(
     }[system]
     parameters, channels, scenarios = draw(rng, times, runs, hidden)
     noise = _draw_sensor_noise(rng, system, channels)
-    noise = replace(noise, kind=asked.noise or noise.kind)
+    noise = replace(noise, kind=requested.noise or noise.kind)
     return RecordingConditions(
         system, parameters, get_constants(system), channels, tuple(scenarios), noise, rate, seconds
     )

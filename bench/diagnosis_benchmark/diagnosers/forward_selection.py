@@ -158,20 +158,20 @@ class _ForwardSelection(Diagnoser):
     near: float
 
     @abstractmethod
-    def compute_criterion(self, one: RefittedModel, samples: int) -> float:
+    def compute_criterion(self, model: RefittedModel, samples: int) -> float:
         """Compute the criterion, which is minimised.
 
         Args:
-            one: a fitted model.
+            model: a fitted model.
             samples: number of samples.
         """
 
     @abstractmethod
-    def is_sufficient(self, one: RefittedModel, samples: int) -> bool:
+    def is_sufficient(self, model: RefittedModel, samples: int) -> bool:
         """Return whether a model is sufficient, so that the search can stop.
 
         Args:
-            one: a fitted model.
+            model: a fitted model.
             samples: number of samples.
         """
 
@@ -194,16 +194,16 @@ class ForwardBIC(_ForwardSelection):
     name = "forward-bic"
     near = BIC_TOLERANCE
 
-    def compute_criterion(self, one: RefittedModel, samples: int) -> float:
+    def compute_criterion(self, model: RefittedModel, samples: int) -> float:
         """Compute the Bayesian information criterion, BIC = n log(S / n) + k log n, equation (1).
 
         Args:
-            one: a fitted model, with sum of squares S and k numbers.
+            model: a fitted model, with sum of squares S and k numbers.
             samples: number of samples n.
         """
-        return float(samples * np.log(one.squares / samples) + one.numbers * np.log(samples))
+        return float(samples * np.log(model.squares / samples) + model.numbers * np.log(samples))
 
-    def is_sufficient(self, one: RefittedModel, samples: int) -> bool:
+    def is_sufficient(self, model: RefittedModel, samples: int) -> bool:
         """Return False: BIC only compares models; the search continues while a model is better."""
         return False
 
@@ -248,13 +248,13 @@ class ForwardChi2(_ForwardSelection):
     name = "forward-chi2"
     near = CHI_SQUARED_TOLERANCE
 
-    def compute_criterion(self, one: RefittedModel, samples: int) -> float:
+    def compute_criterion(self, model: RefittedModel, samples: int) -> float:
         """Return the sum of squares."""
-        return one.squares
+        return model.squares
 
-    def is_sufficient(self, one: RefittedModel, samples: int) -> bool:
+    def is_sufficient(self, model: RefittedModel, samples: int) -> bool:
         """Return whether the chi-squared p-value of the model is above `FALSE_ALARM_RATE`."""
-        return self._compute_p_value(one, samples) > FALSE_ALARM_RATE
+        return self._compute_p_value(model, samples) > FALSE_ALARM_RATE
 
     def compute_p_value(self, first: RefittedModel, samples: int) -> float | None:
         """Compute the chi-squared p-value of the base model."""

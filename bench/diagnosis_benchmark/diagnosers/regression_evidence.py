@@ -115,7 +115,7 @@ class RegressionEvidence:
         held_out: indices of the held-out runs.
     """
 
-    def __init__(self, case: DiagnosisCase, every: bool = True) -> None:
+    def __init__(self, case: DiagnosisCase, has_held_out: bool = True) -> None:
         """Find the noise of each channel and fit the base model.
 
         Runs for fitting come first, held-out runs after them. Systems without an engine of their
@@ -123,7 +123,7 @@ class RegressionEvidence:
         are first used.
         """
         recording = case.recording
-        runs = [*recording.training(), *(recording.held_out() if every else ())]
+        runs = [*recording.training(), *(recording.held_out() if has_held_out else ())]
         # The simulator of a robot uses the step that its model file states.
         engine = None if case.kind.own_engine else "batch"
         self.world = RunEvaluator(case.kind, recording, runs, engine, candidates=list(case.library))
@@ -431,7 +431,7 @@ def compute_base_jacobian(world: RunEvaluator, fit: TrajectoryFit) -> Array:
 
 
 def find_strongest_columns(
-    left: Array, effects: Array, columns: Sequence[EffectColumn]
+    residual: Array, effects: Array, columns: Sequence[EffectColumn]
 ) -> dict[str, tuple[float, EffectColumn]]:
     """Find for each effect the column that explains most of the residual.
 
@@ -439,7 +439,7 @@ def find_strongest_columns(
     directions that the column contains.
 
     Args:
-        left: residual after projection, (N,).
+        residual: residual after projection, (N,).
         effects: effect columns after projection, (N, K).
         columns: columns of the effects.
 
@@ -454,7 +454,7 @@ def find_strongest_columns(
             continue
         part = part[:, scale > 1e-9] / scale[scale > 1e-9]
         gram = part.T @ part + 1e-9 * np.eye(part.shape[1])
-        cross = part.T @ left
+        cross = part.T @ residual
         gain = float(cross @ np.linalg.solve(gram, cross))
         if column.effect not in best or gain > best[column.effect][0]:
             best[column.effect] = gain, column

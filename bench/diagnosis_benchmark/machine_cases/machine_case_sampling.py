@@ -118,16 +118,16 @@ def _make_rng(name: str, purpose: str) -> np.random.Generator:
 
 @lru_cache(maxsize=4)
 def restore_conditions(
-    name: str, system: str, asked: RequestedConditions = ANY_CONDITIONS
+    name: str, system: str, requested: RequestedConditions = ANY_CONDITIONS
 ) -> MachineRecordingConditions:
     """Restore the recording conditions of a case.
 
     Args:
         name: name of the case.
         system: servo or arm2.
-        asked: conditions that were not drawn.
+        requested: conditions that were not drawn.
     """
-    return drawn_setting(system, _make_rng(name, "setting"), asked)
+    return drawn_setting(system, _make_rng(name, "setting"), requested)
 
 
 def _draw_place(
@@ -349,34 +349,34 @@ class _ResidualGauge:
         bare: readings without hidden causes, (R, T, N).
     """
 
-    def __init__(self, made: MachineRecordingConditions) -> None:
+    def __init__(self, conditions: MachineRecordingConditions) -> None:
         """Simulate the runs with each parameter and initial state changed, for their directions.
 
         All simulations are one batch of R runs times 1 + P + 2 N variants: unchanged, each of P
         parameters, each of N angles and each of N velocities. A parameter changes all runs, an
         initial state only its own run.
         """
-        self.made = made
-        runs, joints = made.fitted_runs.q.shape
-        numbers = list(made.free_parameters)
+        self.made = conditions
+        runs, joints = conditions.fitted_runs.q.shape
+        numbers = list(conditions.free_parameters)
         lanes = 1 + len(numbers) + 2 * joints
         # Each run once as it is, and once for each fitted parameter and initial state.
         fitted = MachineRuns(
-            made.fitted_runs.times,
-            np.repeat(made.fitted_runs.commands, lanes, axis=0),
-            np.repeat(made.fitted_runs.q, lanes, axis=0),
-            np.repeat(made.fitted_runs.v, lanes, axis=0),
+            conditions.fitted_runs.times,
+            np.repeat(conditions.fitted_runs.commands, lanes, axis=0),
+            np.repeat(conditions.fitted_runs.q, lanes, axis=0),
+            np.repeat(conditions.fitted_runs.v, lanes, axis=0),
         )
-        values = {name: np.full((runs, lanes), value) for name, value in made.numbers.items()}
+        values = {name: np.full((runs, lanes), value) for name, value in conditions.numbers.items()}
         for k, name in enumerate(numbers):
             values[name][:, 1 + k] *= 1 + _FINITE_DIFFERENCE_STEP
         q, v = (part.reshape(runs, lanes, joints).copy() for part in (fitted.q, fitted.v))
         for j in range(joints):
             q[:, 1 + len(numbers) + j, j] += _FINITE_DIFFERENCE_STEP
             v[:, 1 + len(numbers) + joints + j, j] += _FINITE_DIFFERENCE_STEP
-        plant = MACHINES[made.system]({n: a.ravel() for n, a in values.items()}, {}, {})
+        plant = MACHINES[conditions.system]({n: a.ravel() for n, a in values.items()}, {}, {})
         start_runs = fitted._replace(q=q.reshape(-1, joints), v=v.reshape(-1, joints))
-        readings = read_encoders(simulate_machine(plant, start_runs), plant, made.runs.times)
+        readings = read_encoders(simulate_machine(plant, start_runs), plant, conditions.runs.times)
         readings = readings.reshape(runs, lanes, -1)
         slopes = (readings[:, 1:] - readings[:, :1]) / _FINITE_DIFFERENCE_STEP
         shared = np.concatenate(slopes[:, : len(numbers)], axis=1).T
@@ -384,16 +384,16 @@ class _ResidualGauge:
         for r in range(runs):
             state_columns[r, :, r] = slopes[r, len(numbers) :].T
         columns = np.column_stack([shared, state_columns.reshape(runs * slopes.shape[2], -1)])
-        self.bare = readings[:, 0].reshape(runs, len(made.runs.times), joints)
+        self.bare = readings[:, 0].reshape(runs, len(conditions.runs.times), joints)
         self._basis = _compute_orthonormal_basis(columns)
 
-    def left(self, seen: Array) -> float:
+    def left(self, readings: Array) -> float:
         """Compute the size of the change in readings by a hidden cause; infinite if they diverge.
 
         Args:
-            seen: readings with the hidden cause, (R, T, N).
+            readings: readings with the hidden cause, (R, T, N).
         """
-        return self._compute_size((seen - self.bare).ravel())
+        return self._compute_size((readings - self.bare).ravel())
 
     def projected(self, change: Array, direction: Array) -> float:
         """Compute the size of a change after a further direction is projected out.
@@ -485,26 +485,28 @@ def record_case(item: BenchmarkCase) -> tuple[MachineRecordingConditions, Array]
     return conditions, np.array([conditions.noise.add_to(run, rng) for run in readings])
 
 
-def build_description(item: BenchmarkCase, made: MachineRecordingConditions) -> dict[str, object]:
+def build_description(
+    item: BenchmarkCase, conditions: MachineRecordingConditions
+) -> dict[str, object]:
     """Build the description of the recording, as the document of a TOML file.
 
     Args:
         item: the case.
-        made: its recording conditions.
+        conditions: its recording conditions.
     """
     robot = item.system == "arm2"
     plant = MACHINES[item.system]
-    noise_entry = {"noise": made.noise_sigmas} if item.stated else {}
+    noise_entry = {"noise": conditions.noise_sigmas} if item.stated else {}
     channels = {name: {"unit": "rad", **noise_entry} for name in plant.channels}
     inputs = (
         {f"u.{name}": {"unit": "N*m"} for name in plant.motors}
         if robot
         else {"goal": {"unit": "rad"}, "torque_enable": {"unit": "1"}}
     )
-    first = item.runs - made.held_out
+    first = item.runs - conditions.held_out
     runs = {str(number): {"held_out": True} for number in range(first, item.runs)}
     source_entry = {"model": MODEL_FILE_NAME} if robot else {"system": item.system}
-    constants = {} if robot else {"constants": _get_stated_constants(made)}
+    constants = {} if robot else {"constants": _get_stated_constants(conditions)}
     return {**source_entry, "channels": channels, "inputs": inputs, **constants, "runs": runs}
 
 
@@ -515,20 +517,22 @@ def _get_stated_constants(conditions: MachineRecordingConditions) -> dict[str, f
     }
 
 
-def format_table(item: BenchmarkCase, made: MachineRecordingConditions, seen: Array) -> str:
+def format_table(
+    item: BenchmarkCase, conditions: MachineRecordingConditions, readings: Array
+) -> str:
     """Format the recording as CSV text.
 
     Args:
         item: the case.
-        made: its recording conditions.
-        seen: encoder readings, (R, T, N).
+        conditions: its recording conditions.
+        readings: encoder readings, (R, T, N).
     """
     plant, robot = MACHINES[item.system], item.system == "arm2"
     inputs = [f"u.{name}" for name in plant.motors] if robot else ["goal", "torque_enable"]
     lines = [",".join(["run", "t", *inputs, *plant.channels])]
-    for number, run in enumerate(seen):
-        for k, t in enumerate(made.runs.times.tolist()):
-            commands = made.runs.commands[number, k].tolist() + ([] if robot else [1.0])
+    for number, run in enumerate(readings):
+        for k, t in enumerate(conditions.runs.times.tolist()):
+            commands = conditions.runs.commands[number, k].tolist() + ([] if robot else [1.0])
             cells = [t, *commands, *run[k].tolist()]
             lines.append(",".join([str(number), *(f"{value:.9g}" for value in cells)]))
     return "\n".join(lines) + "\n"

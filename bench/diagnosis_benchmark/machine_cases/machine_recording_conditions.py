@@ -157,19 +157,19 @@ SERVO_PARAMETERS = ("torque_constant", "resistance", "armature")
 
 
 def draw_conditions(
-    system: str, rng: np.random.Generator, asked: RequestedConditions = ANY_CONDITIONS
+    system: str, rng: np.random.Generator, requested: RequestedConditions = ANY_CONDITIONS
 ) -> MachineRecordingConditions:
     """Draw recording conditions.
 
     Args:
         system: servo or arm2.
         rng: random generator.
-        asked: conditions that are not drawn.
+        requested: conditions that are not drawn.
     """
     rate, seconds = int(rng.choice(SAMPLING_RATES_HZ)), float(rng.choice(RUN_LENGTHS_SECONDS))
     count = int(rng.choice(FITTED_RUN_COUNTS))
     # These values are drawn in any case, so that later draws do not depend on the request.
-    rate, count = asked.rate or rate, asked.runs or count
+    rate, count = requested.rate or rate, requested.runs or count
     times = np.arange(round(rate * seconds)) / rate
     numbers = _draw_servo_parameters(rng) if system == "servo" else _draw_arm_parameters(rng)
     plant = MACHINES[system](numbers, {}, {})
@@ -177,7 +177,7 @@ def draw_conditions(
     sigma = float(np.exp(rng.uniform(*np.log(ENCODER_NOISE_RANGE))))
     noise = SensorNoise(
         dict.fromkeys(plant.channels, sigma),
-        asked.noise or str(rng.choice(NOISE_KINDS)),
+        requested.noise or str(rng.choice(NOISE_KINDS)),
         float(rng.uniform(0.3, 0.9)),
         float(rng.uniform(0.3, 0.6)),
         bool(rng.random() < 0.5),

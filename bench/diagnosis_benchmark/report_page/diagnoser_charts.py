@@ -105,7 +105,7 @@ def _make_shares(data: DiagnoserReportData, table: pd.DataFrame) -> list[Panel]:
     counts = table.groupby("metric")["of"].max()
     names = tuple(f"{_SHARES[name]}\nn={int(counts[name])}" for name in _list_shares(data))
     x_axis = Axis("what is counted; at most n answers or intervals", names=names)
-    series = data.make_interval_series("share", beside=True)
+    series = data.make_interval_series("share", is_shifted=True)
     return [Panel("", "shares", "place", series, x_axis, _SHARE_AXIS)]
 
 
@@ -149,7 +149,7 @@ def _make_sets(data: DiagnoserReportData) -> list[Panel]:
         data: the data of the report.
     """
     x_axis = Axis("effects in the largest set of an answer", names=tuple(SET_SIZE_LABELS))
-    correct = data.make_interval_series("share", beside=True)
+    correct = data.make_interval_series("share", is_shifted=True)
     counts = tuple(replace(series, y="of", low="", high="") for series in correct)
     share_axis = Axis("share of sets with the true cause", scales=("linear",), ends=_SHARE_LIMITS)
     count_axis = Axis("answers of this size", scales=("linear",), holds=(0.0,))

@@ -17,48 +17,48 @@ _DIGITS = 6
 """Number of significant digits of stored numbers."""
 
 
-def render_page(shown: DiagnoserReportData) -> str:
+def render_page(data: DiagnoserReportData) -> str:
     """Render the HTML report of a comparison of diagnosers.
 
     The tables are embedded in the page for its charts; the numbers of the text are computed here.
 
     Args:
-        shown: the data of the report.
+        data: the data of the report.
     """
     page = HtmlPage()
-    failures = build_failure_table(shown.rows, shown.order)
-    tables = {**shown.tables, "failures": failures, "items": shown.rows}
-    tables |= charts.build_chart_tables(shown)
+    failures = build_failure_table(data.rows, data.order)
+    tables = {**data.tables, "failures": failures, "items": data.rows}
+    tables |= charts.build_chart_tables(data)
     for name, table in tables.items():
         if len(table):
             page.add_table(name, table, _DIGITS)
-    table, power, groups = (shown.tables[name] for name in ("table", "power", "groups"))
-    confusion, costs = shown.tables["confusion"], shown.tables["costs"]
+    table, power, groups = (data.tables[name] for name in ("table", "power", "groups"))
+    confusion, costs = data.tables["confusion"], data.tables["costs"]
     counts = power[power["metric"] == "named"].drop_duplicates("size")
     metrics = list(dict.fromkeys(groups["metric"]))
     confused = list(dict.fromkeys(confusion["diagnoser"]))
-    better_diagnosers = conclusion.list_better_diagnosers(shown)
+    better_diagnosers = conclusion.list_better_diagnosers(data)
     trained = costs[costs["training_simulations"] > 0]
     return page.render(
         _TEMPLATE,
-        shown=shown,
+        shown=data,
         REFERENCE=REFERENCE_DIAGNOSER,
         PRIMARY_METRIC=PRIMARY_METRIC,
-        own=conclusion.count_own_failures(shown),
-        leader=conclusion.find_leader(shown),
+        own=conclusion.count_own_failures(data),
+        leader=conclusion.find_leader(data),
         limit=f"{100 * TARGET_FALSE_ALARM_RATE:g} %",
         better=better_diagnosers,
-        has_pairs=len(shown.tables["pairs"]) > 0,
-        warnings=list(conclusion.write_warnings(shown)),
+        has_pairs=len(data.tables["pairs"]) > 0,
+        warnings=list(conclusion.write_warnings(data)),
         has_own_failures=bool((failures["diagnoser"] == REFERENCE_DIAGNOSER).any()),
-        charts=charts.make_charts(shown),
+        charts=charts.make_charts(data),
         clean_count=int(table.loc[table["metric"] == "false alarms", "of"].max()),
         single_count=int(table.loc[table["metric"] == PRIMARY_METRIC, "of"].max()),
         power_counts=", ".join(
             f"{int(count)} of {size:g} noises" for size, count in counts[["size", "of"]].to_numpy()
         ),
-        calibration_count=int(shown.tables["calibration"]["of"].max())
-        if len(shown.tables["calibration"])
+        calibration_count=int(data.tables["calibration"]["of"].max())
+        if len(data.tables["calibration"])
         else 0,
         trained=list(
             trained[["diagnoser", "training_simulations"]].itertuples(index=False, name=None)

@@ -50,14 +50,14 @@ class DiagnoserReportData:
         return ((name, get_mark_style(place)) for place, name in enumerate(self.order))
 
     def make_interval_series(
-        self, y: str, *, beside: bool = False, **where: str
+        self, y: str, *, is_shifted: bool = False, **where: str
     ) -> tuple[Series, ...]:
         """Make one series of points with error bars for each diagnoser.
 
         Args:
             y: column with the value.
-            beside: whether the points of the diagnosers are shifted sideways, so that they do not
-                overlap on a category axis.
+            is_shifted: whether the points of the diagnosers are shifted sideways, so that they do
+                not overlap on a category axis.
             **where: values of further columns that select the rows of the series.
         """
         count = len(self.order)
@@ -70,7 +70,7 @@ class DiagnoserReportData:
                 "low",
                 "high",
                 "points",
-                (place - (count - 1) / 2) * 0.7 / count if beside else 0.0,
+                (place - (count - 1) / 2) * 0.7 / count if is_shifted else 0.0,
             )
             for place, (name, line_style) in enumerate(self.get_line_styles())
         )

@@ -256,27 +256,28 @@ def concatenate(parts: Sequence[SuiteRuns]) -> SuiteRuns:
     )
 
 
-def merge_runs(own: SuiteRuns, stored: SuiteRuns) -> SuiteRuns:
+def merge_runs(new_runs: SuiteRuns, stored: SuiteRuns) -> SuiteRuns:
     """Add stored runs of other tuners to own runs, in the cells and on the targets of both.
 
     Own runs in cells of which no target is stored are left out, unless nothing is in common.
 
     Args:
-        own: runs of one or more tuners.
-        stored: runs of any tuners; those of a tuner that `own` has in the same cell are left out.
+        new_runs: runs of one or more tuners.
+        stored: runs of any tuners; those of a tuner that `new_runs` has in the same cell are left
+            out.
     """
     own_places, stored_places = (
-        pd.MultiIndex.from_frame(part.runs[["cell", "target"]]) for part in (own, stored)
+        pd.MultiIndex.from_frame(part.runs[["cell", "target"]]) for part in (new_runs, stored)
     )
     common = own_places.isin(stored_places)
     if not common.any():
-        return own
-    own_pairs = pd.MultiIndex.from_frame(own.runs[["cell", "tuner"]])
+        return new_runs
+    own_pairs = pd.MultiIndex.from_frame(new_runs.runs[["cell", "tuner"]])
     is_added = stored_places.isin(own_places)
     is_added &= ~pd.MultiIndex.from_frame(stored.runs[["cell", "tuner"]]).isin(own_pairs)
     return concatenate(
         [
-            own.select(pd.Series(common, index=own.runs.index)),
+            new_runs.select(pd.Series(common, index=new_runs.runs.index)),
             stored.select(pd.Series(is_added, index=stored.runs.index)),
         ]
     )

@@ -195,25 +195,25 @@ def add_effect_forces(model_at: Any, data_at: Any) -> None:  # noqa: ARG001
         set_friction_limits(data, context, scratch)
 
 
-def set_friction_limits(data: Any, own: Any, limits: Any) -> None:
+def set_friction_limits(data: Any, context: Any, limits: Any) -> None:
     """Write limits of dry friction into the constraints of the present evaluation.
 
     Args:
         data: MuJoCo's data.
-        own: the context of the simulation.
+        context: the context of the simulation.
         limits: (D,) limits.
     """
-    velocities = carray(to_int_pointer(own.velocities), (own.joints,))
+    velocities = carray(to_int_pointer(context.velocities), (context.joints,))
     kinds = carray(to_short_pointer(data[EFC_TYPE]), (MAX_DATA_WORDS,))
     ids = carray(to_short_pointer(data[EFC_ID]), (MAX_DATA_WORDS,))
     loss = carray(to_real_pointer(data[EFC_FRICTIONLOSS]), (MAX_DATA_WORDS,))
     first = 0
     while kinds[first] == EQUALITY_ROW:
         first += 1
-    for row in range(first, first + own.friction_rows):
+    for row in range(first, first + context.friction_rows):
         if kinds[row] != FRICTION_ROW:
             break
-        for j in range(own.joints):
+        for j in range(context.joints):
             if velocities[j] != ids[row]:
                 continue
             loss[row] = limits[j]

@@ -133,13 +133,13 @@ class LogFile:
         return result
 
 
-def read_log(path: str | Path, wanted: frozenset[str] = frozenset()) -> LogFile:
+def read_log(path: str | Path, columns_to_read: frozenset[str] = frozenset()) -> LogFile:
     """Read the columns of a log.
 
     Args:
         path: Path of the log.
-        wanted: Columns that will be used; all if empty. Of a bag, which may be larger than the
-            memory, only these are stored if it has all of them.
+        columns_to_read: Columns that will be used; all if empty. Of a bag, which may be larger than
+            the memory, only these are stored if it has all of them.
 
     Raises:
         InputError: The log cannot be read; the message is one line.
@@ -149,11 +149,13 @@ def read_log(path: str | Path, wanted: frozenset[str] = frozenset()) -> LogFile:
     if bag is not None:
         file_stat = bag[0].stat()
         stamp = FileVersion(path, file_stat.st_mtime_ns, file_stat.st_size)
-        log = _read_topic(stamp, wanted)
+        log = _read_topic(stamp, columns_to_read)
         column_names = {name.lower() for name in log.columns}
         # The error for a missing column lists all columns of the log.
         return (
-            log if {name.strip().lower() for name in wanted} <= column_names else _read_topic(stamp)
+            log
+            if {name.strip().lower() for name in columns_to_read} <= column_names
+            else _read_topic(stamp)
         )
     episode = lerobot_dataset.split_episode_path(path)
     if episode is not None:

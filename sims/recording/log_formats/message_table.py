@@ -39,14 +39,16 @@ class MessageTable:
         wanted: Names of the numbers to store, in any case; all if empty.
     """
 
-    def __init__(self, wanted: Collection[str] = ()) -> None:
+    def __init__(self, wanted_names: Collection[str] = ()) -> None:
         """Start with no messages; the wanted names are compared in lower case.
 
         `_stamps` and `_written` hold the times of the messages in seconds: from their
         headers, and when they were written to the log.
         """
         # A column named run may number the runs of the log.
-        self._wanted = {name.strip().lower() for name in (*wanted, "run")} if wanted else set()
+        self._wanted = (
+            {name.strip().lower() for name in (*wanted_names, "run")} if wanted_names else set()
+        )
         self._stamps = array("d")
         self._written = array("d")
         self._numbers: dict[str, array[float]] = {}

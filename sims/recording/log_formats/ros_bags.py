@@ -53,13 +53,13 @@ def list_topics(bag: Path) -> list[str]:
         return sorted({connection.topic.lstrip("/") for connection in reader.connections})
 
 
-def read_topic(bag: Path, topic: str, wanted: Collection[str] = ()) -> dict[str, Array]:
+def read_topic(bag: Path, topic: str, wanted_names: Collection[str] = ()) -> dict[str, Array]:
     """Read the numbers of a topic, ordered by time stamp.
 
     Args:
         bag: Bag file or folder.
         topic: Name of the topic with its leading slash.
-        wanted: Names of the numbers to store, in any case; all if empty.
+        wanted_names: Names of the numbers to store, in any case; all if empty.
 
     Returns:
         Columns (T,) by name, including the time stamps.
@@ -67,7 +67,7 @@ def read_topic(bag: Path, topic: str, wanted: Collection[str] = ()) -> dict[str,
     Raises:
         InputError: The bag has no such topic, or its messages cannot be read.
     """
-    table = MessageTable(wanted)
+    table = MessageTable(wanted_names)
     topics = mcap_messages.list_topics(bag)
     if topics:
         # Topics of other loggers need not begin with a slash.
