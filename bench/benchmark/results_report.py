@@ -236,26 +236,26 @@ def _describe_best_tuners(view: ComparisonView) -> list[str]:
     for kind in view.ranges:
         range_text = f"{headline.WHERE[kind]}, {headline.targets_text(statistics, kind)}"
         lines = [f"\nbest tuners, {range_text} ({label}; {headline.floor_text(statistics)})"]
-        for standing in headline.standings(statistics, kind):
-            lines += _format_standing(standing)
+        for verdicts in headline.standings(statistics, kind):
+            lines += _format_standing(verdicts)
         lines += [headline.failed_runs(statistics, kind)]
         lines += [headline.too_few(statistics, kind) or headline.how_decided(statistics, kind)]
         texts.append("\n".join(line for line in lines if line))
     return texts
 
 
-def _format_standing(standing: headline.Standing) -> list[str]:
+def _format_standing(verdicts: headline.Standing) -> list[str]:
     """Format the lines of one number of simulations; verdicts without tuners are left out."""
     best = (
-        f"{', '.join(standing.best)} ({standing.error})"
-        if standing.best
+        f"{', '.join(verdicts.best)} ({verdicts.error})"
+        if verdicts.best
         else "none: every run failed"
     )
     parts = {
         "best": best,
-        "worse": ", ".join(standing.worse),
-        "not decided": ", ".join(standing.undecided),
-        "all runs failed": ", ".join(standing.failed),
+        "worse": ", ".join(verdicts.worse),
+        "not decided": ", ".join(verdicts.undecided),
+        "all runs failed": ", ".join(verdicts.failed),
     }
     lines = [
         textwrap.fill(
@@ -264,7 +264,7 @@ def _format_standing(standing: headline.Standing) -> list[str]:
         for verdict, names in parts.items()
         if names
     ]
-    lines[0] = f"  after {standing.simulations}".ljust(12) + lines[0].lstrip()
+    lines[0] = f"  after {verdicts.simulations}".ljust(12) + lines[0].lstrip()
     return lines
 
 

@@ -81,17 +81,17 @@ def execute_shot(setup: ShotSetup, settings: ShotConfig, model: TunedModel) -> S
         0.0,
         setup.scene.compute_contact_height(setup.ball.radius) + model.height + setup.release[1],
     )
-    flown = simulate_shot(setup.ball, ground, start, times)
-    x, y = compute_hoop_crossings(flown[None], setup.scene)[0].tolist()
+    flown_path = simulate_shot(setup.ball, ground, start, times)
+    x, y = compute_hoop_crossings(flown_path[None], setup.scene)[0].tolist()
     miss_distance = x - setup.scene.hoop_x
     is_hit = math.hypot(miss_distance, y) < setup.scene.hoop_radius
     # Beyond the hoop's plane, nothing was planned.
     last = min(
         _find_descent_index(planned_path, setup.scene.hoop_z),
-        _find_descent_index(flown, setup.scene.hoop_z),
+        _find_descent_index(flown_path, setup.scene.hoop_z),
     )
-    error = float(np.linalg.norm(planned_path - flown, axis=1)[: last + 1].mean())
-    return ShotResult(is_hit, miss_distance, error, times, planned_path, flown)
+    error = float(np.linalg.norm(planned_path - flown_path, axis=1)[: last + 1].mean())
+    return ShotResult(is_hit, miss_distance, error, times, planned_path, flown_path)
 
 
 def _find_descent_index(path: Array, height: float) -> int:

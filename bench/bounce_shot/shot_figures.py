@@ -245,15 +245,15 @@ def select_example_shots(
     ]
     missed_by_untuned = miss_by_method[miss_by_method.index.isin(missed_shots)]
     missed_by_untuned = miss_by_method if missed_by_untuned.empty else missed_by_untuned
-    typical = (
+    typical_shot = (
         (missed_by_untuned[reference_method] - miss_by_method[reference_method].median())
         .abs()
         .idxmin()
     )
-    worst = miss_by_method[reference_method].idxmax()
+    worst_shot = miss_by_method[reference_method].idxmax()
     return [
         (by_name[str(name)], methods_shown)
-        for name in dict.fromkeys((typical, worst))
+        for name in dict.fromkeys((typical_shot, worst_shot))
         if name in stored
     ]
 
@@ -345,8 +345,8 @@ def draw_shot_panel(axis: Axes, setup: ShotSetup, method: str, shot: ExampleShot
     axis.set_title(
         f"{get_method_label(method)}: {result}\nrestitution {restitution:.2f}", fontsize=9
     )
-    reach = scene.hoop_x + 4 * scene.hoop_radius
-    axis.set(xlim=(-0.25, reach), ylim=(-0.35, shot.top), aspect="equal")
+    right_limit = scene.hoop_x + 4 * scene.hoop_radius
+    axis.set(xlim=(-0.25, right_limit), ylim=(-0.35, shot.top), aspect="equal")
     axis.spines[["top", "right"]].set_visible(False)
 
 
@@ -365,6 +365,6 @@ def find_path_end(path: Array, scene: ShotGeometry) -> int:
     z = path[:, 2]
     # Before the bounce, the ball falls through the same heights.
     has_risen = np.concatenate([[False], np.logical_or.accumulate(z[1:] > z[:-1])])
-    falling = np.concatenate([[0], np.diff(z)]) < 0
-    indices_below = np.flatnonzero(has_risen & (z < scene.hoop_z - _BELOW) & falling)
+    is_falling = np.concatenate([[0], np.diff(z)]) < 0
+    indices_below = np.flatnonzero(has_risen & (z < scene.hoop_z - _BELOW) & is_falling)
     return int(indices_below[0]) if indices_below.size else len(z)

@@ -78,8 +78,15 @@ def check_global_random_state(look: str) -> Iterator[None]:
     finally:
         random.setstate(python)
         np.random.set_state(legacy)  # noqa: NPY002
-    touched = [name for name in states_before if states_before[name] != states_after[name]]
-    check(not touched, "global random state left alone", f"changed: {', '.join(touched)}", look)
+    changed_generators = [
+        name for name in states_before if states_before[name] != states_after[name]
+    ]
+    check(
+        not changed_generators,
+        "global random state left alone",
+        f"changed: {', '.join(changed_generators)}",
+        look,
+    )
 
 
 def _get_random_states() -> dict[str, object]:

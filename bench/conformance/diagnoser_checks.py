@@ -175,7 +175,7 @@ class _Run(NamedTuple):
 def _diagnose_cached(kind: type[Diagnoser], hidden: bool = True, turn: int = 0) -> _Run:  # noqa: ARG001
     """Run a diagnoser; the result is cached for several checks, once for each value of `turn`."""
     with _open_case(kind, hidden) as case:
-        files_before, touched = _copy_case_bytes(case), ""
+        files_before, random_state_error = _copy_case_bytes(case), ""
         answers: list[Answer] = []
         try:
             with check_global_random_state(f"case.rng in {kind.__name__}.diagnose"):
@@ -184,11 +184,11 @@ def _diagnose_cached(kind: type[Diagnoser], hidden: bool = True, turn: int = 0) 
             # Without an answer, there is nothing else to check.
             if not answers:
                 raise
-            touched = str(error)
+            random_state_error = str(error)
         (answer,) = answers
         names = {name for group in list_named_sets(answer) for name in group}
         foreign = tuple(sorted(names - set(case.library)))
-        return _Run(answer, foreign, _copy_case_bytes(case) != files_before, touched)
+        return _Run(answer, foreign, _copy_case_bytes(case) != files_before, random_state_error)
 
 
 def _run_diagnoser(kind: type[Diagnoser], case: DiagnosisCase) -> Answer:

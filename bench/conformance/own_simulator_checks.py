@@ -176,9 +176,9 @@ def check_forces_act(kind: type[Simulator]) -> NotApplicable | None:
         reset = f"{user_class.__name__}.reset: it must take away a force that was applied"
         check(is_restored, "the same run after one with forces", "another", reset)
         velocity = np.abs(forced - unforced)[:, len(user_class.coordinates) + place]
-        grown = 0.0 < velocity[1] * _GROWN < velocity[_LATER]
+        has_grown = 0.0 < velocity[1] * _GROWN < velocity[_LATER]
         expected = f"a force along {name} to act in the next step alone"
-        check(not grown, expected, "that it acts in later steps too", location)
+        check(not has_grown, expected, "that it acts in later steps too", location)
     simulator.close()
     return None
 

@@ -110,7 +110,7 @@ def check_it_acts_at_its_place_alone(effect: type[Effect]) -> NotApplicable | No
     """
     classes = list_effect_places(effect)
     kind = make_arm_simulator(effect)
-    touched = {}
+    fields_by_part = {}
     for effect_class in classes:
         location = f"{effect.__name__} at {effect_class.place or 'the world'}"
         thetas = np.concatenate(
@@ -147,11 +147,11 @@ def check_it_acts_at_its_place_alone(effect: type[Effect]) -> NotApplicable | No
         for part, coefficients in effect_class().parts(
             np.ones((len(effect_class.coefficients), 2, 1))
         ):
-            touched[part.name] = _acts_on(part, coefficients, kind)
+            fields_by_part[part.name] = _acts_on(part, coefficients, kind)
     are_disjoint = len(
-        {changed_fields for changed_fields in touched.values() if changed_fields}
-    ) == sum(map(bool, touched.values()))
-    check(are_disjoint, "each place to be touched by one alone", touched, effect.__name__)
+        {changed_fields for changed_fields in fields_by_part.values() if changed_fields}
+    ) == sum(map(bool, fields_by_part.values()))
+    check(are_disjoint, "each place to be touched by one alone", fields_by_part, effect.__name__)
     return None if classes else NO_PLACE
 
 

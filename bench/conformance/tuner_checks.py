@@ -188,12 +188,12 @@ def check_same_seed_gives_the_same_run(kind: type[Tuner]) -> None:
     # Two runs of one instance, because state left by a run must not matter either.
     tuner = make_trained_tuner(kind, 2)
     first = run_tuner(tuner, 2, 25, seed=3)
-    saved = np.random.get_state()  # noqa: NPY002
+    saved_state = np.random.get_state()  # noqa: NPY002
     np.random.seed(12345)  # noqa: NPY002 - a tuner that draws from it would now differ
     try:
         second = run_tuner(tuner, 2, 25, seed=3)
     finally:
-        np.random.set_state(saved)  # noqa: NPY002
+        np.random.set_state(saved_state)  # noqa: NPY002
     is_same = is_bitwise_equal(first.proposals, second.proposals) and is_bitwise_equal(
         first.recommendations, second.recommendations
     )
@@ -285,11 +285,11 @@ def check_beats_random_search(kind: type[Tuner]) -> None:
     """
     from scipy.stats import wilcoxon
 
-    tuner, chance = make_trained_tuner(kind, 2), _RandomSearchBaseline()
+    tuner, random_search = make_trained_tuner(kind, 2), _RandomSearchBaseline()
     logs: list[Array] = []
     for target_count in _SEQUENTIAL_TEST_TARGETS:
         logs += [
-            _compute_final_log_errors((tuner, chance), target)
+            _compute_final_log_errors((tuner, random_search), target)
             for target in range(len(logs), target_count)
         ]
         tuner_logs, random = np.array(logs).T

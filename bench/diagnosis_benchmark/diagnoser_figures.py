@@ -194,7 +194,7 @@ def draw_outcomes(rows: pd.DataFrame, order: Sequence[str], title: str) -> Figur
         for place, width, bar_start, count in zip(places, widths, bar_starts, counts, strict=True):
             # A narrower part has no room for its number.
             if width > 4:
-                dark = colour in (style.BLACK, style.BLUE, style.VERMILION)
+                is_dark = colour in (style.BLACK, style.BLUE, style.VERMILION)
                 axis.text(
                     bar_start + width / 2,
                     place,
@@ -202,7 +202,7 @@ def draw_outcomes(rows: pd.DataFrame, order: Sequence[str], title: str) -> Figur
                     ha="center",
                     va="center",
                     fontsize=8,
-                    color="white" if dark else style.NEUTRAL_MARK,
+                    color="white" if is_dark else style.NEUTRAL_MARK,
                 )
         bar_starts += widths
     axis.set_yticks(places, order)

@@ -172,8 +172,8 @@ def _smooth_radius(track: BallTrack) -> Array:
     for _ in range(_FITS):
         deviations = np.abs(radii - np.polyval(line, places))
         # A frame whose outline is far off, as at an impact, gets a small weight.
-        typical = max(float(np.median(deviations)), 1e-9)
-        line = np.polyfit(places, radii, 1, w=1 / (1 + (deviations / typical) ** 2))
+        typical_deviation = max(float(np.median(deviations)), 1e-9)
+        line = np.polyfit(places, radii, 1, w=1 / (1 + (deviations / typical_deviation) ** 2))
     # The line may cross zero outside the frames that show the ball; a radius may not.
     result: Array = np.maximum(np.polyval(line, s), 0.3 * float(np.median(radii)))
     return result
@@ -210,11 +210,11 @@ def _fit_free_flights(times: Array, q: Array) -> list[_Flight]:
 
 def _compute_gravity_scale(arcs: list[_Flight]) -> float | None:
     """Return the S for which the flights fall with gravity; None without a falling flight."""
-    falling = [arc for arc in arcs if arc.curve[0] > 0]
-    if not falling:
+    falling_arcs = [arc for arc in arcs if arc.curve[0] > 0]
+    if not falling_arcs:
         return None
-    curvatures = [2 * arc.curve[0] for arc in falling]
-    mean = np.average(curvatures, weights=[arc.weight for arc in falling])
+    curvatures = [2 * arc.curve[0] for arc in falling_arcs]
+    mean = np.average(curvatures, weights=[arc.weight for arc in falling_arcs])
     return float(DEFAULT_GRAVITY / mean)  # Equation (3).
 
 
@@ -249,7 +249,7 @@ def estimate_height_noise(times: Array, z: Array) -> float:
     Returns:
         Standard deviation (1 sigma) in m; NaN without a flight.
     """
-    squares, freedom = 0.0, 0
+    squares, degrees_of_freedom = 0.0, 0
     for arc in _fit_free_flights(times, -z):
         is_in_flight = (times >= arc.begin) & (times <= arc.end) & np.isfinite(z)
         t = times[is_in_flight] - arc.begin
@@ -257,8 +257,8 @@ def estimate_height_noise(times: Array, z: Array) -> float:
             cubic = np.polyfit(t, z[is_in_flight], 3)
             squares += float(np.sum((z[is_in_flight] - np.polyval(cubic, t)) ** 2))
             # Four coefficients are fitted.
-            freedom += len(t) - 4
-    return float(np.sqrt(squares / freedom)) if freedom else float("nan")
+            degrees_of_freedom += len(t) - 4
+    return float(np.sqrt(squares / degrees_of_freedom)) if degrees_of_freedom else float("nan")
 
 
 def find_release_frame(track: BallTrack) -> int:

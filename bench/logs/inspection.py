@@ -229,10 +229,10 @@ def _format_constants(recording: Recording, kind: type[Simulator]) -> Iterator[s
 
 def _format_constant(recording: Recording, name: str, default: float, unit: str) -> str:
     """Describe a constant's value, and list the runs with each value if it differs."""
-    usual = recording.constants.get(name, default)
+    common_value = recording.constants.get(name, default)
     runs_by_value: dict[float, list[str]] = {}
     for run in recording.runs:
-        runs_by_value.setdefault(run.constants.get(name, usual), []).append(run.name)
+        runs_by_value.setdefault(run.constants.get(name, common_value), []).append(run.name)
     unit = "" if unit == "1" else f" {unit}"
     if len(runs_by_value) > 1:
         parts = [

@@ -64,14 +64,14 @@ def load_joined(
         for key, value in first.constants.items()
         if all(recording.constants.get(key) == value for recording in recordings)
     }
-    usual = {c.name: c.value for c in kind.constants}
+    default_values = {c.name: c.value for c in kind.constants}
     differing = {key for recording in recordings for key in recording.constants} - set(constants)
     runs = [
         replace(
             run,
             name=f"{name}: {run.name}",
             log=name,
-            constants={key: _get_constant(key, recording, run, usual) for key in differing}
+            constants={key: _get_constant(key, recording, run, default_values) for key in differing}
             | dict(run.constants),
         )
         for name, recording in zip(names, recordings, strict=True)
@@ -90,8 +90,10 @@ def load_joined(
     return (split_held_out(joined_recording, folds=True) if folds else joined_recording), kind
 
 
-def _get_constant(key: str, recording: Recording, run: Run, usual: dict[str, float]) -> float:
-    return run.constants.get(key, recording.constants.get(key, usual.get(key, np.nan)))
+def _get_constant(
+    key: str, recording: Recording, run: Run, default_values: dict[str, float]
+) -> float:
+    return run.constants.get(key, recording.constants.get(key, default_values.get(key, np.nan)))
 
 
 def _refuse_other(

@@ -333,8 +333,12 @@ def _get_default_recording(kind: type[Simulator]) -> DefaultRecording:
     """
     if not issubclass(kind, SystemSimulator):
         return DefaultRecording()
-    usual = kind.system.usual_recording
-    return usual if kind.name == kind.system.name else replace(usual, observe=())
+    default_recording = kind.system.usual_recording
+    return (
+        default_recording
+        if kind.name == kind.system.name
+        else replace(default_recording, observe=())
+    )
 
 
 def _count_held_out_runs(options: SimulationSpec) -> int:

@@ -256,8 +256,8 @@ class ComparisonDiff:
     def is_worse(self) -> bool:
         """Whether an error has grown significantly, or the fraction of failed runs has grown."""
         significant_errors = self._select_significant_errors()
-        grown = bool(len(significant_errors) and (significant_errors["ratio"] > 1).any())
-        return grown or any(b > a for a, b in self._compute_failure_shares())
+        has_grown = bool(len(significant_errors) and (significant_errors["ratio"] > 1).any())
+        return has_grown or any(b > a for a, b in self._compute_failure_shares())
 
     def _select_significant_errors(self) -> pd.DataFrame:
         return self.errors[self.errors["significant"]] if len(self.errors) else self.errors

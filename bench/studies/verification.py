@@ -242,9 +242,9 @@ def _verify_losses(
             rmse = ProposalEvaluator(problem, side).compute_rmse(
                 recommended[:0], recommended[has_value]
             )
-            typical = _SIMULATION_TOLERANCE * float(problem.scale[channel])
+            tolerance = _SIMULATION_TOLERANCE * float(problem.scale[channel])
             yield from _find_first_difference(
-                rows[has_value], column, rmse[:, channel], _SIMULATION_TOLERANCE, typical
+                rows[has_value], column, rmse[:, channel], _SIMULATION_TOLERANCE, tolerance
             )
 
 

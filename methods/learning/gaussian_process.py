@@ -187,12 +187,12 @@ class GaussianProcess:
 
         to_known = (points[:, None] - self.points) ** 2
         squared_distances = (points[:, None] - points) ** 2
-        cross, _ = self._compute_correlation(to_known)
+        cross_correlation, _ = self._compute_correlation(to_known)
         prior, _ = self._compute_correlation(squared_distances)
-        explained = solve_triangular(self._lower, cross.T, lower=True)
+        explained = solve_triangular(self._lower, cross_correlation.T, lower=True)
         spread = _compute_cholesky_factor(prior - explained.T @ explained, 1e-10)  # (2.26)
         noise = rng.standard_normal((draws, len(points)))
-        centre = self.mean + cross @ self._alpha  # (2.25)
+        centre = self.mean + cross_correlation @ self._alpha  # (2.25)
         samples = centre + self.variance**0.5 * (noise @ spread.T)
         return np.asarray(samples, dtype=np.float64)
 

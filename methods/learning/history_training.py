@@ -151,9 +151,9 @@ def _minimise_loss(
     decay = 2.0 * design.weight_decay
     optimiser: Any = torch.optim.Adam(list(w.values()), design.rate, weight_decay=decay, fused=True)
     for epoch in range(design.epochs):
-        falling = 0.5 + 0.5 * float(np.cos(np.pi * epoch / design.epochs))
+        rate_factor = 0.5 + 0.5 * float(np.cos(np.pi * epoch / design.epochs))
         for group in optimiser.param_groups:
-            group["lr"] = design.rate * falling
+            group["lr"] = design.rate * rate_factor
         order = rng.permutation(len(parts[0]))
         losses = []
         for first in range(0, len(order), design.batch):

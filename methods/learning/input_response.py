@@ -77,7 +77,7 @@ def _compute_run_response(series: Array, inputs: Array) -> Array:
     bump = parabola**4  # (3)
     # Derivatives w' and w'' of the bump, per sample.
     slope = -8 * s * parabola**3 / bump_width
-    bend = (48 * s**2 * parabola**2 - 8 * parabola**3) / bump_width**2
+    second_derivative = (48 * s**2 * parabola**2 - 8 * parabola**3) / bump_width**2
     stride = max(1, half_width // 4)
 
     def integral(signal: Array, kernel: Array) -> Array:
@@ -94,20 +94,20 @@ def _compute_run_response(series: Array, inputs: Array) -> Array:
         [constant, series, series**3, _compute_smoothed_velocity_signs(series), driven], axis=2
     )
     regressors = np.concatenate([integral(signals, bump), -integral(series, slope)], axis=2)  # (2)
-    accelerations = integral(series, bend)  # (2)
+    accelerations = integral(series, second_derivative)  # (2)
     return _fit_ridge_regression(regressors, accelerations).reshape(len(series), -1)
 
 
 def _compute_smoothed_velocity_signs(series: Array) -> Array:
     """Compute smoothed signs of the rates of change (n, T, C), a regressor for dry friction."""
     # Slopes of lines through seven samples; noise would change the sign of single differences.
-    reach = np.arange(-3, 4)
-    line = reach / (reach**2).sum()
+    offsets = np.arange(-3, 4)
+    line = offsets / (offsets**2).sum()
     padded = np.pad(series, ((0, 0), (3, 3), (0, 0)), mode="edge")
-    rates = sliding_window_view(padded, len(reach), axis=1) @ line
-    typical = np.abs(rates).mean(axis=1, keepdims=True) + _ZERO
+    rates = sliding_window_view(padded, len(offsets), axis=1) @ line
+    mean_rate = np.abs(rates).mean(axis=1, keepdims=True) + _ZERO
     # tanh replaces the sign function, which would jump where noise crosses zero.
-    return np.asarray(np.tanh(_STEEPNESS * rates / typical), dtype=np.float64)
+    return np.asarray(np.tanh(_STEEPNESS * rates / mean_rate), dtype=np.float64)
 
 
 def _fit_ridge_regression(regressors: Array, values: Array) -> Array:

@@ -293,7 +293,7 @@ def _compute_sensitivities(parameters: Array, rows: Array) -> tuple[Array, Array
     count = rows.shape[2]
     offsets = parameters - parameters.mean(axis=1, keepdims=True)
     # A fit with 1 + dim free numbers leaves this share of the variance of pure noise.
-    free = max(each - 1 - dim, 1) / each
+    free_share = max(each - 1 - dim, 1) / each
     total = np.zeros(count)
     residual_variance = np.zeros(count)
     explained = np.zeros((dim, count))
@@ -302,7 +302,7 @@ def _compute_sensitivities(parameters: Array, rows: Array) -> tuple[Array, Array
         slopes = np.linalg.lstsq(delta, centred, rcond=None)[0]  # (1)
         left_over = centred - delta @ slopes
         total += np.mean(centred**2, axis=0)
-        residual_variance += np.mean(left_over**2, axis=0) / free
+        residual_variance += np.mean(left_over**2, axis=0) / free_share
         explained += np.mean(delta**2, axis=0)[:, None] * slopes**2
     return (
         np.sqrt(total / scenarios),

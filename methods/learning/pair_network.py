@@ -307,8 +307,8 @@ def _make_loss(
     def objective(x: Any, target_rows: Any, y: Any) -> Any:
         """Compute the mean squared error of the estimated parameter differences; see `_make_loss`.
 
-        All m (m - 1) / 2 pairs of the m simulations of a scenario are used. With `alone` (one
-        input), the network estimates the parameters y themselves from the target's side.
+        All m (m - 1) / 2 pairs of the m simulations of a scenario are used. With `is_target_only`
+        (one input), the network estimates the parameters y themselves from the target's side.
 
         Args:
             x: (n, m, D) input rows of the proposed side, for n scenarios of m simulations.
@@ -360,11 +360,11 @@ def _run_optimiser(
     kind = torch.optim.Adam if design.adam else torch.optim.SGD
     optimiser: Any = kind(weights, lr=design.rate)
     for epoch in range(design.epochs):
-        falling = _LEARNING_RATE_DECAY**epoch
+        rate_factor = _LEARNING_RATE_DECAY**epoch
         if design.adam:
-            falling = 0.5 + 0.5 * np.cos(np.pi * epoch / design.epochs)
+            rate_factor = 0.5 + 0.5 * np.cos(np.pi * epoch / design.epochs)
         for group in optimiser.param_groups:
-            group["lr"] = design.rate * float(falling)
+            group["lr"] = design.rate * float(rate_factor)
         order = torch.randperm(len(x), generator=generator)
         losses = []
         for first in range(0, len(x), design.batch):

@@ -98,6 +98,6 @@ class DirectRegressor(PairTuner):
         target = network.read(task.observed[None], task.lengths, task.scene)[0]
         # The proposed input is zero, so the difference is the parameters themselves.
         zero_input = np.zeros_like(target)
-        guess = np.clip(network.predict_difference(zero_input, target), 0.0, 1.0)
-        yield Proposal(guess, recommend=guess)
+        estimate = np.clip(network.predict_difference(zero_input, target), 0.0, 1.0)
+        yield Proposal(estimate, recommend=estimate)
         return "it estimates once"

@@ -70,7 +70,7 @@ class TuneNetLeastSquares(TuneNet):
         finish = LeastSquares(reproduced=_ROUNDING_LOSS)
         run = EvaluationHistory(task, _ROUNDING_LOSS)
         loss_tolerance = run.enough / _ROUNDING_LOSS * finish.reproduced
-        trusted = yield from self._take_network_steps(run, task)
+        is_trusted = yield from self._take_network_steps(run, task)
         # Without any successful simulation, the middle of the training range is the start.
         if not np.isfinite(run.losses).any():
             yield from finish.fit_from_point(run, task.training.mean(axis=0))
@@ -79,11 +79,11 @@ class TuneNetLeastSquares(TuneNet):
             if run.finished or not np.isfinite(run.losses).any():
                 break
             model = yield from self._build_linear_model(run, finish)
-            model.trusted = trusted
+            model.trusted = is_trusted
             yield from fit.fit_from_model(run, model)
             if min(run.losses) <= loss_tolerance:
                 break
-            trusted = False
+            is_trusted = False
         while min(run.losses) > loss_tolerance:
             yield from finish.fit_from_point(run, run.find_untried_point(rng))
         return "the simulation reproduces the target"
@@ -91,8 +91,8 @@ class TuneNetLeastSquares(TuneNet):
     def _take_network_steps(self, run: EvaluationHistory, task: Task) -> SimulationGenerator[bool]:
         """Take TuneNet's steps while each one reduces the loss enough.
 
-        A step pays if the loss falls below `pays` times the lowest one before; after `patience`
-        steps in a row that do not pay, the network is given up.
+        A step pays if the loss falls below `pays` times the lowest one before; after
+        `patience` steps in a row that do not pay, the network is given up.
 
         Returns:
             True if the last step paid, so that least squares can trust the point reached.
@@ -107,8 +107,8 @@ class TuneNetLeastSquares(TuneNet):
             run.record(evaluation)
             loss = float(evaluation.losses[0])
             # The first successful simulation has no loss to be compared with.
-            pays = loss < self.pays * lowest or not np.isfinite(lowest)
-            unprofitable_steps = 0 if pays else unprofitable_steps + 1
+            is_profitable = loss < self.pays * lowest or not np.isfinite(lowest)
+            unprofitable_steps = 0 if is_profitable else unprofitable_steps + 1
             lowest = min(lowest, loss)
             # A single increase of a jagged loss is not enough to stop.
             if unprofitable_steps == self.patience:

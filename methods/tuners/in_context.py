@@ -311,8 +311,8 @@ class InContextTransformer(Tuner):
             else:
                 # Half the distance to the last successful point, or to the middle of the training
                 # range.
-                refuge = proposals[-1] if proposals else task.training.mean(axis=0)
-                guess = (point + refuge) / 2.0
+                fallback = proposals[-1] if proposals else task.training.mean(axis=0)
+                guess = (point + fallback) / 2.0
 
 
 def _build_training_histories(

@@ -171,25 +171,27 @@ class LeastSquares(Tuner):
         outdated. `is_selected` masks the residuals, for example to a short horizon at first, since
         a long simulation can have many local minima.
         """
-        worthwhile = _FINAL_CONVERGENCE_SHARE if is_selected.all() else _HORIZON_CONVERGENCE_SHARE
+        convergence_share = (
+            _FINAL_CONVERGENCE_SHARE if is_selected.all() else _HORIZON_CONVERGENCE_SHARE
+        )
         damping = _Damping(self.damping)
-        stalled = 0
+        stalled_steps = 0
         failed = 0
-        while stalled < self.patience:
+        while stalled_steps < self.patience:
             error_before = model.compute_error(is_selected)
             step, predicted_decrease = model.compute_step(is_selected, damping.mu)
             if (
                 np.abs(step).max() < self.step_tolerance
-                or predicted_decrease <= worthwhile * error_before
+                or predicted_decrease <= convergence_share * error_before
             ):
                 break
             proposal = model.point + step
             # On a short horizon, or after a wrong prediction, a step is too uncertain to be
             # recommended.
-            trusted = self.ahead and model.trusted and is_selected.all()
-            expected_proposal = proposal if trusted else None
+            is_trusted = self.ahead and model.trusted and is_selected.all()
+            expected_proposal = proposal if is_trusted else None
             (residual,) = yield from run.simulate(proposal[None], expected_proposal)
-            # The error is NaN if the simulation failed, and then `better` is False.
+            # The error is NaN if the simulation failed, and then `is_better` is False.
             error_after = float(residual[is_selected] @ residual[is_selected])
             is_better = error_after < error_before
             # A step that increased the error still gives information about the slope along it.
@@ -202,12 +204,14 @@ class LeastSquares(Tuner):
             model.trusted = decrease > _MIN_TRUST_RATIO * predicted_decrease
             damping.adapt(decrease / predicted_decrease)  # (2)
             failed = 0 if is_better else failed + 1
-            stalled = 0 if error_after < (1.0 - self.progress) * error_before else stalled + 1
+            stalled_steps = (
+                0 if error_after < (1.0 - self.progress) * error_before else stalled_steps + 1
+            )
             if run.finished:
                 break
             # With one parameter the secant is the slope; with several the secants may be outdated.
-            stale = failed == 2 and len(step) > 1
-            if stale or (is_better and not self.secant):
+            is_stale = failed == 2 and len(step) > 1
+            if is_stale or (is_better and not self.secant):
                 longest = float(np.abs(step).max())
                 model = yield from self._compute_differences(
                     run, model.point, model.residual, longest
@@ -284,14 +288,14 @@ class LinearModel:
         # A parameter at a bound that would leave the cube stays at the bound.
         is_at_lower_bound = (self.point <= 0.0) & (gradient > 0.0)
         is_at_upper_bound = (self.point >= 1.0) & (gradient < 0.0)
-        free = ~(is_at_lower_bound | is_at_upper_bound)
+        is_free = ~(is_at_lower_bound | is_at_upper_bound)
         scale = np.sqrt((jacobian**2).sum(0))
         scale = np.maximum(scale, _MIN_DAMPING_SENSITIVITY * scale.max())
         # (1) is solved as a least-squares problem, which does not square the condition number of J.
-        stacked = np.vstack([jacobian, np.diag(np.sqrt(mu) * scale)])[:, free]
+        stacked = np.vstack([jacobian, np.diag(np.sqrt(mu) * scale)])[:, is_free]
         step = np.zeros_like(self.point)
         target = np.append(-r, np.zeros_like(step))
-        step[free] = np.linalg.lstsq(stacked, target, rcond=None)[0]
+        step[is_free] = np.linalg.lstsq(stacked, target, rcond=None)[0]
         # The step is clipped to the cube, and the predicted decrease is that of the clipped step.
         step = np.clip(self.point + step, 0.0, 1.0) - self.point
         remaining = r + jacobian @ step

@@ -146,15 +146,16 @@ class NeuralPosteriorEstimation(Tuner):
         Raises:
             ValueError: arrays have other names or shapes, or numbers that are not finite.
         """
-        flow = {name: array for name, array in state.items() if name.startswith("flow.")}
-        feature_arrays = {name: array for name, array in state.items() if name not in flow}
+        flow_arrays = {name: array for name, array in state.items() if name.startswith("flow.")}
+        feature_arrays = {name: array for name, array in state.items() if name not in flow_arrays}
         features, foreign = InputFeatures.from_arrays(feature_arrays, self._make_feature_config())
-        not_finite = [name for name, array in flow.items() if not np.isfinite(array).all()]
+        not_finite = [name for name, array in flow_arrays.items() if not np.isfinite(array).all()]
         if foreign or not_finite:
             name = [*foreign, *not_finite][0]
             raise ValueError(f"array {name}: expected an array of the flow, of finite numbers")
         self._flow = self._rebuild_flow(
-            {name.removeprefix("flow."): a for name, a in flow.items()}, features.feature_count
+            {name.removeprefix("flow."): a for name, a in flow_arrays.items()},
+            features.feature_count,
         )
         self._read = features
 

@@ -220,8 +220,8 @@ class BroydenSearch:
         if not np.isfinite(residual).all():
             # The simulation failed: go half the way to the best point, or to the middle of the
             # training range.
-            refuge = self._fallback if self._residual is None else self.best
-            return (point + refuge) / 2.0
+            fallback = self._fallback if self._residual is None else self.best
+            return (point + fallback) / 2.0
         if self._last is not None:
             self._update_slope(point - self._last[0], residual - self._last[1])
         self._last = point, residual

@@ -86,8 +86,8 @@ def survey_frames(frames: Iterable[tuple[float, RgbImage]]) -> FrameSurvey:
             change[:] = 0
         times.append(time)
         # Ignore small changes: noise would make a static picture look busy.
-        usual = np.median(change)
-        excess = change - 2 * usual - _GRAIN
+        median_change = np.median(change)
+        excess = change - 2 * median_change - _GRAIN
         motions.append(float(np.maximum(excess, 0).mean()))
         previous_frame = coarse
     return FrameSurvey(np.array(times), np.array(motions), tuple(cuts), size)

@@ -175,20 +175,26 @@ class BallDetector:
         large = sorted(lengths, reverse=True)[:_MOST_SPOTS]
         detections = []
         for _, i in large:
-            spot = self._measure_object(contours[i], (brightness, difference), shade)
-            if spot is not None:
-                detections.append(self._add_colour(spot, picture))
-        return detections if ghosts else [spot for spot in detections if not spot.is_ghost]
+            detection = self._measure_object(contours[i], (brightness, difference), shade)
+            if detection is not None:
+                detections.append(self._add_colour(detection, picture))
+        return (
+            detections
+            if ghosts
+            else [detection for detection in detections if not detection.is_ghost]
+        )
 
-    def _add_colour(self, spot: BallDetection, picture: RgbImage) -> BallDetection:
+    def _add_colour(self, detection: BallDetection, picture: RgbImage) -> BallDetection:
         """Add to a detection its colour, its contrast, and whether it is a background artefact."""
-        centre_colour = _compute_centre_colour(picture, spot)
-        background_colour = _compute_centre_colour(self.background, spot)
-        surrounding_colour = _compute_surrounding_colour(picture, spot)
-        out_behind = _compute_surrounding_colour(self.background, spot)
+        centre_colour = _compute_centre_colour(picture, detection)
+        background_colour = _compute_centre_colour(self.background, detection)
+        surrounding_colour = _compute_surrounding_colour(picture, detection)
+        background_surrounding = _compute_surrounding_colour(self.background, detection)
         contrast = float(np.abs(centre_colour - background_colour).max())
-        ghost = self._is_ghost((centre_colour, surrounding_colour), (background_colour, out_behind))
-        return spot._replace(
+        ghost = self._is_ghost(
+            (centre_colour, surrounding_colour), (background_colour, background_surrounding)
+        )
+        return detection._replace(
             colour=tuple(centre_colour.tolist()), contrast=contrast, is_ghost=ghost
         )
 
@@ -295,10 +301,10 @@ class BallDetector:
         u = left + float(column) - 1
         v = top + float(row) - 1
         # Use a window around it in which shadow counts as background unless the region encloses it.
-        reach = int(2 * max(radius, 0.5 * max(width, height))) + 4
-        u0 = max(0, int(u) - reach)
-        v0 = max(0, int(v) - reach)
-        place = np.s_[v0 : int(v) + reach + 1, u0 : int(u) + reach + 1]
+        half_size = int(2 * max(radius, 0.5 * max(width, height))) + 4
+        u0 = max(0, int(u) - half_size)
+        v0 = max(0, int(v) - half_size)
+        place = np.s_[v0 : int(v) + half_size + 1, u0 : int(u) + half_size + 1]
         windows = np.stack([each[place] for each in differences]).astype(np.float32)
         # The edge itself, half ball and half background, must not be treated as shadow.
         hidden = shade[place].astype(np.uint8)
@@ -354,16 +360,16 @@ class BallDetector:
             on_it = circle_fit.find_inliers(fitted)
             if change < _STILL:
                 break
-        agree = float(on_it.sum()) / _RAYS
+        agreement = float(on_it.sum()) / _RAYS
         height, width = windows.shape[1:]
         # A centre outside the window belongs to an arc of a large object.
         is_within = -0.5 <= u <= width - 0.5
         is_within &= -0.5 <= v <= height - 0.5
-        if edges is None or agree < _MIN_RAY_AGREEMENT or not is_within:
+        if edges is None or agreement < _MIN_RAY_AGREEMENT or not is_within:
             return None
         scatter = float(np.sqrt(np.mean(residuals[on_it] ** 2)))
         picture_edges = edges + np.array([u0, v0])
-        return BallDetection(u + u0, v + v0, radius, agree, scatter, picture_edges)
+        return BallDetection(u + u0, v + v0, radius, agreement, scatter, picture_edges)
 
     def _locate_edges(self, windows: GreyLevels, u: float, v: float, radius: float) -> Array | None:
         """Locate the points (n, 2) where the difference falls to half along rays from (u, v).
@@ -400,9 +406,9 @@ class BallDetector:
         is_bright &= brightness > 0.7 * worst
         values = np.where(is_bright[:, None], *profiles)
         half_level = 0.5 * np.where(is_bright, brightness, worst)
-        crossed = half_level[:, None]
-        is_crossing = values[:, 1:] < crossed
-        is_crossing &= values[:, :-1] >= crossed
+        crossing_level = half_level[:, None]
+        is_crossing = values[:, 1:] < crossing_level
+        is_crossing &= values[:, :-1] >= crossing_level
         # A dark patch further inside is not an edge.
         is_crossing[:, : int(np.flatnonzero(is_inner)[0])] = False
         # Take the first of several crossings.
@@ -461,22 +467,22 @@ def _compute_median_colours(
     return inside_colour, outside_colour
 
 
-def _compute_centre_colour(picture: RgbImage, spot: BallDetection) -> Array:
+def _compute_centre_colour(picture: RgbImage, detection: BallDetection) -> Array:
     """Return the mean colour (3,) at a detection's centre."""
-    side = 2 * max(1, int(0.4 * spot.radius)) + 1
-    patch = import_package("cv2").getRectSubPix(picture, (side, side), (spot.u, spot.v))
+    side = 2 * max(1, int(0.4 * detection.radius)) + 1
+    patch = import_package("cv2").getRectSubPix(picture, (side, side), (detection.u, detection.v))
     colour: Array = patch.reshape(-1, 3).mean(axis=0)
     return colour
 
 
-def _compute_surrounding_colour(picture: RgbImage, spot: BallDetection) -> Array:
+def _compute_surrounding_colour(picture: RgbImage, detection: BallDetection) -> Array:
     """Return the median colour (3,) on a circle around a detection, in grey levels."""
     cos, sin = _compute_ray_directions()
     height, width = picture.shape[:2]
-    circle_radius = _AROUND * spot.radius
+    circle_radius = _AROUND * detection.radius
     median_index = _RAYS // 2
-    rows = (spot.v + circle_radius * sin[:, 0] + 0.5).astype(np.intp)
-    columns = (spot.u + circle_radius * cos[:, 0] + 0.5).astype(np.intp)
+    rows = (detection.v + circle_radius * sin[:, 0] + 0.5).astype(np.intp)
+    columns = (detection.u + circle_radius * cos[:, 0] + 0.5).astype(np.intp)
     # Beyond the border, the outermost pixels are repeated.
     rows = rows.clip(0, height - 1)
     columns = columns.clip(0, width - 1)

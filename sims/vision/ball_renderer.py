@@ -201,20 +201,20 @@ class BallScene:
         if window is None:
             return
         self._move_body(self._ball, position)
-        fine = 3 if semi_major_axis < _SMALL else 2
-        ball, covered = self._render_body(window, fine, self._ball)
+        oversampling = 3 if semi_major_axis < _SMALL else 2
+        ball, covered = self._render_body(window, oversampling, self._ball)
         left, top, right, bottom = window
         place = np.s_[top:bottom, left:right]
         picture[place] = covered * ball + (1 - covered) * picture[place]
 
     def _render_body(
-        self, window: PixelWindow, fine: int, body: int
+        self, window: PixelWindow, oversampling: int, body: int
     ) -> tuple[ColourArray, ColourArray]:
         """Render a body in a window of the picture.
 
         Args:
             window: Window (left, top, right, bottom).
-            fine: Factor of oversampling.
+            oversampling: Factor of oversampling.
             body: Id of the body.
 
         Returns:
@@ -229,7 +229,7 @@ class BallScene:
         pixel_size = _NEAR / camera.focal
         # The renderer counts pixels from their corner: shift by half a fine pixel, measured on
         # spheres.
-        shift = 0.5 / fine
+        shift = 0.5 / oversampling
         u, v = camera.principal_point - (shift, -shift)
         # The edges of the window are half a pixel outside the centres of its outermost pixels.
         left_edge = left - 0.5 - u
@@ -246,8 +246,8 @@ class BallScene:
         )
         view = p.computeViewMatrix(camera.position, camera.target, (0, 0, 1))
         _, _, colours, _, bodies = p.getCameraImage(
-            width * fine,
-            height * fine,
+            width * oversampling,
+            height * oversampling,
             view,
             projection,
             lightDirection=self.look.light.tolist(),
@@ -256,12 +256,12 @@ class BallScene:
             physicsClientId=self._client,
         )
         # Average the fine pixels of each pixel; only colours of the body itself count.
-        grouped = height, fine, width, fine
+        grouped = height, oversampling, width, oversampling
         is_body = np.reshape(bodies, (*grouped, 1)) == body
         share = is_body.mean(axis=(1, 3), dtype=np.float32)
         colour = np.reshape(colours, (*grouped, 4))[..., :3]
         sums = np.where(is_body, colour, 0).sum(axis=(1, 3), dtype=np.float32)
-        count = np.maximum(share * fine**2, 1)
+        count = np.maximum(share * oversampling**2, 1)
         return sums / count, share
 
 

@@ -89,13 +89,13 @@ def track_ball(frames: Iterable[tuple[float, RgbImage]]) -> BallTrack:
     wanted_frames = set(numbers)
     pictures = [picture for number, (_, picture) in enumerate(frames) if number in wanted_frames]
     finder = _make_detector(pictures)
-    spots = []
+    detections = []
     for number, (_, picture) in enumerate(frames):
         if first <= number < end:
-            spots.append(finder.detect(picture))
-    paths = link_detections(spots)
+            detections.append(finder.detect(picture))
+    paths = link_detections(detections)
     if not paths:
-        raise InputError(_format_no_ball_message(end - first, sum(map(bool, spots))))
+        raise InputError(_format_no_ball_message(end - first, sum(map(bool, detections))))
     path, other_paths = merge_continuations(paths)
     # An object that hardly moves may be a ball, but its fall cannot be measured.
     if len(path.frames) < _LEAST_FRAMES or path.travel < path.radius:
@@ -212,8 +212,11 @@ def _make_detector(pictures: list[RgbImage]) -> BallDetector:
 def _compute_roundness(pictures: list[list[BallDetection]]) -> float:
     """Return the sum over frames of the best circle's fraction of agreeing rays."""
     return sum(
-        max((spot.ray_agreement for spot in spots if not spot.is_ghost), default=0.0)
-        for spots in pictures
+        max(
+            (detection.ray_agreement for detection in detections if not detection.is_ghost),
+            default=0.0,
+        )
+        for detections in pictures
     )
 
 
@@ -225,9 +228,9 @@ def _list_hiding_circles(detections: list[list[BallDetection]]) -> list[list[Cir
     """
     balls: list[list[Circle]] = []
     ghosts: list[list[Circle]] = []
-    for spots in detections:
-        balls.append([(s.u, s.v, s.radius) for s in spots if not s.is_ghost])
-        ghosts.append([(s.u, s.v, s.radius) for s in spots if s.is_ghost])
+    for picture_detections in detections:
+        balls.append([(s.u, s.v, s.radius) for s in picture_detections if not s.is_ghost])
+        ghosts.append([(s.u, s.v, s.radius) for s in picture_detections if s.is_ghost])
     for ghost_circle in [ghost for circles in ghosts for ghost in circles]:
         missing_flags = [
             any(_is_same_object(ghost_circle, circle) for circle in circles) for circles in ghosts
@@ -303,10 +306,10 @@ def _make_track(
     """
     columns = np.full((3, len(times)), np.nan)
     steady, misfits = _refine_with_smooth_radius(path.spots)
-    for frame, spot, misfit in zip(path.frames, steady, misfits, strict=True):
+    for frame, detection, misfit in zip(path.frames, steady, misfits, strict=True):
         # An empty cell is better than the position of another object.
         if not misfit:
-            columns[:, frame] = spot.u, spot.v, spot.radius
+            columns[:, frame] = detection.u, detection.v, detection.radius
     u, v, radius = columns
     missing_count = int(np.isnan(u).sum())
     if missing_count:
@@ -319,7 +322,7 @@ def _make_track(
         noise = max(estimate_roughness(u), estimate_roughness(v))
     # If the path is too short or at rest, use the distance of the edges from their circles.
     if not (np.isfinite(noise) and noise > 0):
-        noise = float(np.median([spot.scatter for spot in path.spots]))
+        noise = float(np.median([detection.scatter for detection in path.spots]))
     return BallTrack(
         times,
         u,
@@ -334,32 +337,32 @@ def _make_track(
 
 
 def _refine_with_smooth_radius(
-    spots: list[BallDetection],
+    detections: list[BallDetection],
 ) -> tuple[list[BallDetection], list[bool]]:
     """Refit the centres with radii that change linearly along the path, as perspective implies.
 
     Args:
-        spots: Detections of the ball.
+        detections: Detections of the ball.
 
     Returns:
         The refitted detections, and whether the radius of each deviates too much from the linear
         trend, which means that another object was measured.
     """
-    if len(spots) < _WINDOW:
-        return spots, [False] * len(spots)
-    places = np.array([(spot.u, spot.v) for spot in spots])
+    if len(detections) < _WINDOW:
+        return detections, [False] * len(detections)
+    places = np.array([(detection.u, detection.v) for detection in detections])
     offsets = places - places.mean(axis=0)
     spread = np.maximum(np.ptp(places, axis=0), 1.0)
     # position along the path's main direction, about -1 to 1
     axes = np.linalg.svd(offsets, full_matrices=False)[2]
     path_position = offsets @ axes[0] / spread.max()
     basis = np.stack([np.ones_like(path_position), path_position], axis=1)
-    radius = np.array([s.radius for s in spots])
+    radius = np.array([s.radius for s in detections])
     weights = np.ones_like(radius)
     line = np.zeros(2)
     for _ in range(_ROUNDS):
-        weighed = basis * weights[:, None]
-        line = np.linalg.lstsq(weighed, radius * weights, rcond=None)[0]
+        weighted_basis = basis * weights[:, None]
+        line = np.linalg.lstsq(weighted_basis, radius * weights, rcond=None)[0]
         deviations = np.abs(radius - basis @ line)
         # Weights with heavy tails: measurements of other objects must not affect the trend.
         width = max(float(np.median(deviations)), _SURE)
@@ -367,7 +370,7 @@ def _refine_with_smooth_radius(
     fitted = np.maximum(basis @ line, 0.5)
     tolerance = np.maximum(_MISFIT * fitted, 1.0)
     is_wrong = np.abs(radius - fitted) > tolerance
-    steady = [s.refit_with_radius(float(r)) for s, r in zip(spots, fitted, strict=True)]
+    steady = [s.refit_with_radius(float(r)) for s, r in zip(detections, fitted, strict=True)]
     return steady, is_wrong.tolist()
 
 

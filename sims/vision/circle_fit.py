@@ -174,8 +174,8 @@ def fit_arc(points: Array) -> Circle | None:
     deviations = distances - radius[:, None]
     # Half the tolerance of `find_inliers`: points graze the circle of a wrong arc.
     tolerance = np.maximum(0.35, 0.05 * radius)
-    agree = np.abs(deviations) < tolerance[:, None]
-    best = int(agree.sum(axis=1).argmax())
+    is_on_circle = np.abs(deviations) < tolerance[:, None]
+    best = int(is_on_circle.sum(axis=1).argmax())
     return (
         float(u[best] + middle[0]),
         float(v[best] + middle[1]),

@@ -250,11 +250,11 @@ def make_amortisation_chart(view: ComparisonView) -> ComparisonChart:
         searching, trained = split_by_training(view, level)
         x_axis = Axis("tuner that searches", names=tuple(searching))
         for kind in view.ranges:
-            evens = placed_even(
+            break_even_rows = placed_even(
                 build_break_even_table(view.experiment.name, kind, level, costs[kind])
             )
-            evens = evens[evens["learned"].isin(trained)]
-            parts.append(evens.assign(row=evens["search"].map(searching.index)))
+            break_even_rows = break_even_rows[break_even_rows["learned"].isin(trained)]
+            parts.append(break_even_rows.assign(row=break_even_rows["search"].map(searching.index)))
             series = tuple(
                 Series(
                     name,

@@ -33,16 +33,16 @@ def get_simulator_class(experiment: Experiment) -> type[Simulator]:
         return simulators.get(experiment.simulator)
     subject = f"experiment {experiment.name}"
     path = find_model(experiment.model, experiment.name)
-    free, actuators, engine = experiment.free, dict(experiment.actuators), {}
+    free_names, actuators, engine = experiment.free, dict(experiment.actuators), {}
     if experiment.recording:
         reference = read_model_reference(find_recording(experiment.recording.path), path)
         assert reference is not None  # a model was given
         actuators, engine = {**reference.actuators, **actuators}, dict(reference.engine)
-        free = free or reference.free
-    if not free:
+        free_names = free_names or reference.free
+    if not free_names:
         expected = 'free = ["damping@*", ...] or --free, numbers of the model file to tune'
         raise InputError(f"{subject}: expected {expected}; found none")
-    return make_robot_simulator(path, actuators, engine, free)
+    return make_robot_simulator(path, actuators, engine, free_names)
 
 
 def complete_robot_experiment(experiment: Experiment) -> Experiment:
@@ -58,10 +58,10 @@ def complete_robot_experiment(experiment: Experiment) -> Experiment:
         path = find_recording(experiment.recording.path)
         changes["observe"] = tuple(read_recording(path, kind).runs[0].channels)
     elif issubclass(kind, SystemSimulator):
-        usual = kind.system.usual_recording
-        changes["observe"] = usual.observe
-        changes["initial"] = dict(usual.initial)
-        changes["inputs"] = dict(usual.inputs)
+        default_recording = kind.system.usual_recording
+        changes["observe"] = default_recording.observe
+        changes["initial"] = dict(default_recording.initial)
+        changes["inputs"] = dict(default_recording.inputs)
     left_out = {key: value for key, value in changes.items() if not getattr(experiment, key)}
     return experiment.chosen(**left_out)
 

@@ -103,8 +103,8 @@ class TuningProblem:
         self.noise: Array = np.array([noise.get(c.name, 0.0) for c in self.channels])
         # Channels with different units are scaled by their noise, or else by their typical
         # magnitude.
-        typical = [c.scale for c in self.channels]
-        self.scale: Array = np.where(self.noise > 0, self.noise, typical)
+        channel_scales = [c.scale for c in self.channels]
+        self.scale: Array = np.where(self.noise > 0, self.noise, channel_scales)
 
     def _build_simulator(
         self, kind: type[Simulator], observe: Sequence[str], settings: Mapping[str, Any]

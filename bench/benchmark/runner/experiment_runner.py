@@ -143,10 +143,16 @@ class ExperimentRun:
         """Return rows of status.csv for tuners that could not be used."""
         experiment = self.problem.experiment
         simulator = experiment.simulator
-        fixed = {"target": "", "seed": 0, "status": "skipped", "simulations": 0, "seconds": 0.0}
-        fixed["trusted"] = experiment.trusted
+        common_cells = {
+            "target": "",
+            "seed": 0,
+            "status": "skipped",
+            "simulations": 0,
+            "seconds": 0.0,
+        }
+        common_cells["trusted"] = experiment.trusted
         return [
-            {"run": label, "tuner": label, "simulator": simulator, **fixed, "reason": reason}
+            {"run": label, "tuner": label, "simulator": simulator, **common_cells, "reason": reason}
             for label, reason in self.skipped.items()
         ]
 

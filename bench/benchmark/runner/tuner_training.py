@@ -221,20 +221,20 @@ def _train_or_read_weights(
     experiment: Experiment,
     request: TrainingRequest,
     callback: TrainingCallback | None,
-    anew: bool,
+    is_repeated: bool,
     earlier_requests: list[str],
 ) -> TrainingResult:
     """Train the tuner of a request, or read its weights from the cache; see `train_or_load`.
 
     The request names the tuner's entry and the seed, and how to build the tuner in isolation.
-    `callback` gets the losses of each epoch. `anew` trains even if the cache has the weights.
-    `earlier_requests` are hashes of the simulations requested before an external kill; the repeated
-    training must make the same requests.
+    `callback` gets the losses of each epoch. `is_repeated` trains even if the cache has the
+    weights. `earlier_requests` are hashes of the simulations requested before an external kill; the
+    repeated training must make the same requests.
     """
     entry, seed = request.entry, request.seed
     name = compute_training_key(experiment, entry, seed)
     path = get_weights_folder() / f"{name}.npz"
-    if path.exists() and not anew:
+    if path.exists() and not is_repeated:
         simulations, seconds = _read_checked_arrays(path, name)[_COST_ARRAY]
         # Weights that do not fit must be reported now, and not in every run.
         _check_weights(request, path)

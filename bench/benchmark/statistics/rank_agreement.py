@@ -96,8 +96,8 @@ def compute_rank_agreement(first: Array, second: Array, *names: str) -> RankAgre
     count = ranks.shape[1]
     observed = compute_kendall_tau(*ranks.mean(axis=1))
     resamples = rng.integers(count, size=(BOOTSTRAP_RESAMPLES, count))
-    boot = [compute_kendall_tau(*ranks[:, rows].mean(axis=1)) for rows in resamples]
-    low, high = np.nanquantile(boot, [0.025, 0.975]) if count > 1 else (np.nan, np.nan)
+    resampled_taus = [compute_kendall_tau(*ranks[:, rows].mean(axis=1)) for rows in resamples]
+    low, high = np.nanquantile(resampled_taus, [0.025, 0.975]) if count > 1 else (np.nan, np.nan)
     # Targets that are drawn twice make ranks noisier, and noise moves tau towards 0.
     low, high = min(low, observed), max(high, observed)
     p = _compute_permutation_p_value(ranks[1] - ranks[0], rng)

@@ -137,8 +137,8 @@ def compute_break_even_targets(
     hopeless = np.isinf(learned.effort.compute_ert(picked))
     # The difference is NaN or not positive if both tuners fail or need the same number.
     with np.errstate(invalid="ignore", divide="ignore"):
-        saved = search.effort.compute_ert(picked) - learned.effort.compute_ert(picked)
-        result: Array = np.where(hopeless | ~(saved > 0), np.inf, learned.fit_simulations / saved)
+        saving = search.effort.compute_ert(picked) - learned.effort.compute_ert(picked)
+        result: Array = np.where(hopeless | ~(saving > 0), np.inf, learned.fit_simulations / saving)
     return result
 
 

@@ -148,9 +148,9 @@ def _read_identifiability_table(
 
 def _list_identifiability_columns(names: list[str]) -> list[ColumnSpec]:
     """Return the columns of identifiability.csv: all without a declared name are parameters."""
-    fixed = [column.name for column in IDENTIFIABILITY_COLUMNS]
+    declared_names = [column.name for column in IDENTIFIABILITY_COLUMNS]
     return expand_columns(
-        IDENTIFIABILITY_COLUMNS, [name for name in names if name not in fixed], ()
+        IDENTIFIABILITY_COLUMNS, [name for name in names if name not in declared_names], ()
     )
 
 

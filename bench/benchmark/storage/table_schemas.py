@@ -353,5 +353,5 @@ def list_channels(names: Iterable[str]) -> list[str]:
 
 
 def _list_name_parts(names: Iterable[str], *prefixes: str) -> list[str]:
-    rests = [name[len(p) :] for name in names for p in prefixes if name.startswith(p)]
-    return list(dict.fromkeys(rests))
+    name_parts = [name[len(p) :] for name in names for p in prefixes if name.startswith(p)]
+    return list(dict.fromkeys(name_parts))

@@ -176,12 +176,12 @@ def simulate_ball(world: TrueSystem, scenario: Scenario, number: int, instants: 
     state = np.array([scenario.initial[name] for name in STATES])
     states = np.empty((instants.size, 6))
     states[instants <= 0] = state
-    time, rising, resting = 0.0, 0.0, False
+    time, rise_duration, resting = 0.0, 0.0, False
     while time < until:
         end = min([until, *(b for b in air.breaks if b > time)], default=until)
-        has_impact_event = not (rising or resting)
-        if rising:  # the ground, where the rise after a bounce begins, is no event
-            end = min(end, time + rising)
+        has_impact_event = not (rise_duration or resting)
+        if rise_duration:  # the ground, where the rise after a bounce begins, is no event
+            end = min(end, time + rise_duration)
         solved = _integrate_flight(
             air, time, end, state, world.constants["radius"] if has_impact_event else None, resting
         )
@@ -189,12 +189,12 @@ def simulate_ball(world: TrueSystem, scenario: Scenario, number: int, instants: 
         first, last = np.searchsorted(instants, [time, reached], side="right")
         if last > first:
             states[first:last] = solved.sol(instants[first:last]).T
-        time, rising = reached, 0.0
+        time, rise_duration = reached, 0.0
         if has_impact_event and solved.t_events[0].size:
             state, resting = _compute_bounce(world, time, state)
             state[2] = world.constants["radius"]
             # Seconds of the rise, 0.4 of the time to its top, in which no impact is possible.
-            rising = (
+            rise_duration = (
                 0.0
                 if resting
                 else 0.4 * state[5] / max(-air.compute_acceleration(time, state, time)[2], 1e-3)
@@ -232,9 +232,9 @@ def _integrate_flight(
     def meets(t: float, y: Array) -> float:
         return float(y[2] - floor)
 
-    stops: Any = meets
-    stops.terminal, stops.direction = True, -1
-    events = None if floor is None else stops
+    impact_event: Any = meets
+    impact_event.terminal, impact_event.direction = True, -1
+    events = None if floor is None else impact_event
     settings: dict[str, Any] = {
         "dense_output": True,
         "first_step": min(0.02, end - start),

@@ -198,8 +198,8 @@ def _draw_stribeck(
         Function from the strength to Coulomb friction, additional friction at rest, and Stribeck
         speed.
     """
-    extra, typical = rng.uniform(2.0, 6.0), np.median(np.abs(_compute_speeds(setting)))
-    speed = float(np.clip(typical * rng.uniform(0.15, 0.5), 0.02, 2.0))
+    extra, median_speed = rng.uniform(2.0, 6.0), np.median(np.abs(_compute_speeds(setting)))
+    speed = float(np.clip(median_speed * rng.uniform(0.15, 0.5), 0.02, 2.0))
     return lambda s: (coefficient_scale * s, extra * coefficient_scale * s, speed)
 
 

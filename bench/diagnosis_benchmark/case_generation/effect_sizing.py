@@ -136,10 +136,10 @@ class NuisanceFitter:
         Returns:
             Step in units of the scales, (P,).
         """
-        gram = slope.T @ slope
-        diagonal = np.diag(gram)
-        gram = gram + np.diag(damping * diagonal + 1e-9 * diagonal.max())
-        return np.asarray(np.linalg.solve(gram, slope.T @ residual), dtype=np.float64)
+        normal_matrix = slope.T @ slope
+        diagonal = np.diag(normal_matrix)
+        normal_matrix = normal_matrix + np.diag(damping * diagonal + 1e-9 * diagonal.max())
+        return np.asarray(np.linalg.solve(normal_matrix, slope.T @ residual), dtype=np.float64)
 
     def linearise(self, observed: Array, theta: Array, starts: Array) -> tuple[Array, Array]:
         """Compute the residual and its Jacobian by finite differences.
@@ -192,8 +192,8 @@ def simulate_observations(setting: RecordingConditions, effects: EffectCoefficie
         effects: coefficients by name of the effect.
     """
     kind = SIMULATORS[setting.system]
-    fixed = {name: list(c) for name, c in effects.items()}
-    simulator = kind(setting.constants, setting.channels, engine="batch", fixed=fixed)
+    fixed_effects = {name: list(c) for name, c in effects.items()}
+    simulator = kind(setting.constants, setting.channels, engine="batch", fixed=fixed_effects)
     theta = np.array(
         [[setting.parameters[p.name] for p in kind.system.parameters]] * len(setting.scenarios)
     )

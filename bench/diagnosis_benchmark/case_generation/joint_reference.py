@@ -123,9 +123,9 @@ def _interpolate_input(levels: Array, edges: Array, share: float) -> tuple[Array
         Levels and begins of the parts.
     """
     parts = (np.arange(SUBDIVISIONS) + 0.5) / SUBDIVISIONS
-    fine = levels[:-1, None] + share * np.diff(levels)[:, None] * parts
+    fine_levels = levels[:-1, None] + share * np.diff(levels)[:, None] * parts
     starts = edges[:-1, None] + np.diff(edges)[:, None] * np.arange(SUBDIVISIONS) / SUBDIVISIONS
-    return np.append(fine.ravel(), levels[-1]), np.append(starts.ravel(), edges[-1])
+    return np.append(fine_levels.ravel(), levels[-1]), np.append(starts.ravel(), edges[-1])
 
 
 def _limit_input_rate(levels: Array, edges: Array, max_rate: float) -> tuple[Array, Array]:
@@ -649,19 +649,19 @@ def _integrate_until_stop(joint: JointDynamics, start: float, state: Array) -> S
     (x, v, *z), end = state, joint.piece.end
     direction = copysign(1.0, v) if v else 0.0
     if joint.limits and v == 0.0:
-        pull = joint.compute_force(start, x, 0.0, *z)
-        if abs(pull) <= joint.compute_friction_limit(start, x, 0.0):
+        force = joint.compute_force(start, x, 0.0, *z)
+        if abs(force) <= joint.compute_friction_limit(start, x, 0.0):
             return (
                 _integrate_stuck(joint, start, state)
                 if z
                 else (_find_break_away(joint, start, x), state, None)
             )
-        direction = copysign(1.0, pull)
+        direction = copysign(1.0, force)
 
     def rate(t: float, y: Array) -> list[float]:
         """Return the time derivatives of position, velocity and hidden states.
 
-        Dry friction is `dry_friction`, with the fixed sign `way` of the motion, so that the
+        Dry friction is `dry_friction`, with the fixed sign `direction` of the motion, so that the
         right-hand side is smooth.
         """
         dry_friction = direction * joint.compute_friction_limit(t, *y[:2]) if joint.limits else 0.0
@@ -674,10 +674,10 @@ def _integrate_until_stop(joint: JointDynamics, start: float, state: Array) -> S
     def turns(t: float, y: Array) -> float:
         return float(direction * y[1])
 
-    stops: Any = turns
-    stops.terminal, stops.direction = True, -1
+    stop_event: Any = turns
+    stop_event.terminal, stop_event.direction = True, -1
     events, first = (
-        (stops, min(0.01, end - start)) if joint.limits else (None, min(0.02, end - start))
+        (stop_event, min(0.01, end - start)) if joint.limits else (None, min(0.02, end - start))
     )
     settings: dict[str, Any] = {
         "dense_output": True,
@@ -718,10 +718,10 @@ def _integrate_stuck(joint: JointDynamics, start: float, state: Array) -> Segmen
             1 + 1e-9
         )
 
-    stops: Any = excess
-    stops.terminal, stops.direction = True, 1
+    break_away_event: Any = excess
+    break_away_event.terminal, break_away_event.direction = True, 1
     settings: dict[str, Any] = {"dense_output": True, "max_step": 0.01, **SOLVER_TOLERANCES}
-    solved = solve_ivp(rate, (start, end), state, "RK45", events=stops, **settings)
+    solved = solve_ivp(rate, (start, end), state, "RK45", events=break_away_event, **settings)
     return float(solved.t[-1]), solved.y[:, -1].copy(), solved.sol
 
 

@@ -266,11 +266,11 @@ def _draw_pendulum_conditions(
     parameters = {"inertia": float(rng.uniform(2e-3, 6e-3))}
     driven = any(name.startswith(INPUT_DEPENDENT_EFFECTS) for name in hidden) or rng.random() < 0.5
     channels = ("q",) if rng.random() < 0.6 else ("q", "qd")
-    form = str(rng.choice(["steps", "sine", "chirp"]))
+    signal_form = str(rng.choice(["steps", "sine", "chirp"]))
     scenarios: list[Scenario] = []
     while len(scenarios) < runs:
         inputs = (
-            {"u": rng.uniform(0.05, 0.2) * draw_input_signal(form, times, rng, (0.3, 3.0))}
+            {"u": rng.uniform(0.05, 0.2) * draw_input_signal(signal_form, times, rng, (0.3, 3.0))}
             if driven
             else {}
         )
@@ -303,13 +303,13 @@ def _draw_slider_conditions(
     """
     parameters = {"mass": float(rng.uniform(0.5, 2.0))}
     channels = ("x",) if rng.random() < 0.6 else ("x", "v")
-    form, scenarios = str(rng.choice(["steps", "sine", "chirp"])), []
+    signal_form, scenarios = str(rng.choice(["steps", "sine", "chirp"])), []
     for _ in range(runs):
         start = {
             "x": rng.choice([0.0, rng.uniform(-0.5, 0.5)]),
             "v": rng.choice([0.0, rng.uniform(-0.3, 0.3)]),
         }
-        u = draw_input_signal(form, times, rng, (0.3, 2.0))
+        u = draw_input_signal(signal_form, times, rng, (0.3, 2.0))
         u -= u.mean()  # otherwise the slider drifts away
         travel = np.ptp(np.cumsum(np.cumsum(u))) * times[1] ** 2 / parameters["mass"]
         scenarios.append(
@@ -339,8 +339,8 @@ def draw_input_signal(
         return levels
     bottom, top = np.log(hertz)
     low, high = np.sort(np.exp(rng.uniform(bottom, top, 2)))
-    turns = (
+    cycles = (
         low * times if form == "sine" else low * times + (high - low) * times**2 / (2 * times[-1])
     )
-    signal: Array = np.sin(2 * np.pi * (turns + rng.random()))
+    signal: Array = np.sin(2 * np.pi * (cycles + rng.random()))
     return signal

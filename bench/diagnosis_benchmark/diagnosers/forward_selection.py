@@ -135,25 +135,25 @@ class _ForwardSelection(Diagnoser):
         """
         intervals = _compute_intervals(evidence, best)
         parameters = {n: e for n, e in intervals.items() if "." not in n}
-        chance = self.compute_p_value(first, samples)
+        p_value = self.compute_p_value(first, samples)
         if not causes:
             verdict = "adequate" if self.is_sufficient(best, samples) else "unknown"
-            return Answer(verdict, (), parameters, chance)
+            return Answer(verdict, (), parameters, p_value)
         floor = float(samples - best.numbers)
         gap = max(first.squares - floor, 1e-9)
         named_causes = tuple(
-            NamedCause(name, alternatives, _select_effect_intervals(intervals, name), chance)
+            NamedCause(name, alternatives, _select_effect_intervals(intervals, name), p_value)
             for name, alternatives in causes
         )
         if (
             not self.is_sufficient(best, samples)
             and (first.squares - best.squares) / gap < MIN_GAP_CLOSED
         ):
-            return Answer("unknown", (), parameters, chance)
+            return Answer("unknown", (), parameters, p_value)
         if not self.is_sufficient(best, samples):
-            return Answer("partial", named_causes, parameters, chance)
+            return Answer("partial", named_causes, parameters, p_value)
         open_sets = any(alternatives for _, alternatives in causes)
-        return Answer("ambiguous" if open_sets else "named", named_causes, parameters, chance)
+        return Answer("ambiguous" if open_sets else "named", named_causes, parameters, p_value)
 
     near: float
 

@@ -42,10 +42,10 @@ class GaussianProcessDiscrepancy(Diagnoser):
             rows = evidence.build_acceleration_regression()
         finally:
             evidence.close()
-        chance = _compute_gain_p_value(
+        p_value = _compute_gain_p_value(
             rows.select_runs(evidence.fitted), rows.select_runs(evidence.held_out), case.rng
         )
-        return Answer("adequate" if chance >= FALSE_ALARM_RATE else "unknown", p_value=chance)
+        return Answer("adequate" if p_value >= FALSE_ALARM_RATE else "unknown", p_value=p_value)
 
 
 def _compute_gain_p_value(

@@ -154,10 +154,10 @@ def _simulate_example(training_task: DiagnoserTrainingTask, name: str, number: i
     effects = {name: _draw_coefficients(training_task, name)} if name else {}
     parameters = {p.name: float(rng.uniform(*p.training_range)) for p in system.parameters}
     channels = [c.name for c in kind.channels if not c.name.startswith("accel")]
-    usual = system.usual_recording
-    observe = list(usual.observe) or (channels if rng.random() < 0.4 else channels[:1])
+    default_recording = system.usual_recording
+    observe = list(default_recording.observe) or (channels if rng.random() < 0.4 else channels[:1])
     forms = ("steps:{a}:{b}", "sine:{a}:{c}", "chirp:{a}:0.3:{c}")
-    inputs = dict(usual.inputs)
+    inputs = dict(default_recording.inputs)
     if kind.inputs and not system.servo and (system.kind != "rotary" or rng.random() < 0.5):
         size = rng.uniform(0.05, 0.2) if system.kind == "rotary" else rng.uniform(0.5, 4.0)
         text = str(rng.choice(forms)).format(

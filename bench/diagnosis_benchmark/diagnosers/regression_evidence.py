@@ -453,9 +453,9 @@ def find_strongest_columns(
         if not (scale > 1e-9).any():
             continue
         part = part[:, scale > 1e-9] / scale[scale > 1e-9]
-        gram = part.T @ part + 1e-9 * np.eye(part.shape[1])
-        cross = part.T @ residual
-        gain = float(cross @ np.linalg.solve(gram, cross))
+        normal_matrix = part.T @ part + 1e-9 * np.eye(part.shape[1])
+        projected_residual = part.T @ residual
+        gain = float(projected_residual @ np.linalg.solve(normal_matrix, projected_residual))
         if column.effect not in best or gain > best[column.effect][0]:
             best[column.effect] = gain, column
     return best

@@ -17,7 +17,7 @@ class SimgapExplain(Diagnoser):
 
         verdict = explain(case.path, seed=int(case.rng.integers(1 << 31))).answer
         # p-value of the best score of the whole library, from surrogate data.
-        chance = min((candidate.p_value for candidate in verdict.candidates), default=None)
+        p_value = min((candidate.p_value for candidate in verdict.candidates), default=None)
         causes = tuple(
             NamedCause(
                 cause.effect,
@@ -28,7 +28,7 @@ class SimgapExplain(Diagnoser):
             for cause in verdict.causes
         )
         parameters = {name: _get_interval(number) for name, number in verdict.parameters.items()}
-        return Answer(verdict.verdict, causes, parameters, chance)
+        return Answer(verdict.verdict, causes, parameters, p_value)
 
 
 def _get_interval(number: FittedValue) -> tuple[float | None, float | None]:

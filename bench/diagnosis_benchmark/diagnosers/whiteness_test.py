@@ -42,9 +42,9 @@ class WhitenessTest(Diagnoser):
         """
         evidence = RegressionEvidence(case)
         try:
-            chance = _compute_whiteness_p_value(evidence)
-            if chance >= FALSE_ALARM_RATE:
-                return Answer("adequate", p_value=chance)
+            p_value = _compute_whiteness_p_value(evidence)
+            if p_value >= FALSE_ALARM_RATE:
+                return Answer("adequate", p_value=p_value)
             rows = evidence.build_trajectory_regression()
             residual, effects = rows.project_out_base()
             best = find_strongest_columns(residual, effects, evidence.effect_columns)
@@ -54,15 +54,15 @@ class WhitenessTest(Diagnoser):
         correlated = {name: (gain / total) ** 0.5 for name, (gain, _) in best.items()}
         order = sorted(correlated, key=lambda name: -correlated[name])
         if not order or correlated[order[0]] < MIN_CORRELATION:
-            return Answer("unknown", p_value=chance)
+            return Answer("unknown", p_value=p_value)
         most_correlated, *other_effects = order
         alternatives = [
             name
             for name in other_effects
             if correlated[most_correlated] - correlated[name] <= CORRELATION_TIE_TOLERANCE
         ]
-        cause = NamedCause(most_correlated, tuple(alternatives), p_value=chance)
-        return Answer("ambiguous" if alternatives else "named", (cause,), p_value=chance)
+        cause = NamedCause(most_correlated, tuple(alternatives), p_value=p_value)
+        return Answer("ambiguous" if alternatives else "named", (cause,), p_value=p_value)
 
 
 def _compute_whiteness_p_value(evidence: RegressionEvidence) -> float:
@@ -76,12 +76,12 @@ def _compute_whiteness_p_value(evidence: RegressionEvidence) -> float:
     """
     from statsmodels.stats.diagnostic import acorr_ljungbox
 
-    chances = []
+    p_values = []
     runs, _, channels = evidence.residual.shape
     for r in range(runs):
         for c in range(channels):
             values = evidence.residual[r][evidence.observed_mask[r, :, c], c]
             if values.size > 2 * LAG_COUNT and np.ptp(values) > 0:
                 table = acorr_ljungbox(values, lags=[LAG_COUNT])
-                chances.append(float(table["lb_pvalue"].iloc[0]))
-    return min(1.0, len(chances) * min(chances)) if chances else 1.0
+                p_values.append(float(table["lb_pvalue"].iloc[0]))
+    return min(1.0, len(p_values) * min(p_values)) if p_values else 1.0

@@ -138,12 +138,14 @@ def draw_effect_shape(
     """
     effect, _, place = name.partition("@")
     joint = get_joint(setting.system, place)
-    typical = {quantity: float(values[joint]) for quantity, values in setting.motion_scales.items()}
+    typical_scales = {
+        quantity: float(values[joint]) for quantity, values in setting.motion_scales.items()
+    }
     sign = float(rng.choice([-1.0, 1.0])) if effect in SIGNED_EFFECTS else 1.0
     if effect in _MAX_COEFFICIENTS:
         return lambda s: (sign * _MAX_COEFFICIENTS[effect] * s,)
     if effect in MOTION_SCALED_EFFECTS:
-        return MOTION_SCALED_EFFECTS[effect](typical, rng)
+        return MOTION_SCALED_EFFECTS[effect](typical_scales, rng)
     if effect == "gravity.tilt":
         phase_coefficients = (0.0,) if setting.system == "arm2" else ()
         return lambda s: (0.3 * sign * s, *phase_coefficients)
@@ -178,29 +180,33 @@ def _make_force_drawer(
     return made
 
 
-def _draw_ripple(typical: dict[str, float], rng: np.random.Generator) -> CoefficientFunction:
+def _draw_ripple(typical_scales: dict[str, float], rng: np.random.Generator) -> CoefficientFunction:
     """Draw a force that is periodic in the joint angle; its amplitude is twice the typical force.
 
     The motion passes 1.5 to 4 periods, and the period is between 0.08 and 1 rad.
 
     Args:
-        typical: typical scales of the joint: force, inertia, position, speed and travel.
+        typical_scales: typical scales of the joint: force, inertia, position, speed and travel.
         rng: random generator.
 
     Returns:
         Function from the strength to sine amplitude, cosine amplitude, and period.
     """
     angle = rng.uniform(0, 2 * np.pi)
-    period = float(np.clip(typical["travel"] / rng.uniform(1.5, 4.0), 0.08, 1.0))
-    sine, cosine = (2 * typical["force"] * float(function(angle)) for function in (np.sin, np.cos))
+    period = float(np.clip(typical_scales["travel"] / rng.uniform(1.5, 4.0), 0.08, 1.0))
+    sine, cosine = (
+        2 * typical_scales["force"] * float(function(angle)) for function in (np.sin, np.cos)
+    )
     return lambda s: (sine * s, cosine * s, period)
 
 
-def _draw_stribeck(typical: dict[str, float], rng: np.random.Generator) -> CoefficientFunction:
+def _draw_stribeck(
+    typical_scales: dict[str, float], rng: np.random.Generator
+) -> CoefficientFunction:
     """Draw Stribeck friction: Coulomb friction and a larger part that ends at some speed.
 
     Args:
-        typical: typical scales of the joint: force, inertia, position, speed and travel.
+        typical_scales: typical scales of the joint: force, inertia, position, speed and travel.
         rng: random generator.
 
     Returns:
@@ -208,8 +214,12 @@ def _draw_stribeck(typical: dict[str, float], rng: np.random.Generator) -> Coeff
         speed.
     """
     extra = float(rng.uniform(2.0, 6.0))
-    speed = typical["speed"] * float(rng.uniform(0.15, 0.5))
-    return lambda s: (0.3 * typical["force"] * s, 0.3 * extra * typical["force"] * s, speed)
+    speed = typical_scales["speed"] * float(rng.uniform(0.15, 0.5))
+    return lambda s: (
+        0.3 * typical_scales["force"] * s,
+        0.3 * extra * typical_scales["force"] * s,
+        speed,
+    )
 
 
 MOTION_SCALED_EFFECTS: dict[str, Callable[..., CoefficientFunction]] = {

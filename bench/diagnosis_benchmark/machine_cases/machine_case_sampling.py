@@ -131,7 +131,7 @@ def restore_conditions(
 
 
 def _draw_place(
-    item: BenchmarkCase, effect: str | None, rng: np.random.Generator, but: str = ""
+    item: BenchmarkCase, effect: str | None, rng: np.random.Generator, excluded_place: str = ""
 ) -> str:
     """Draw the effect, if it is not given, and its place: a joint, body, motor or sensor channel.
 
@@ -139,14 +139,16 @@ def _draw_place(
         item: the case; its system determines the effects and places.
         effect: name of the effect; None to draw it.
         rng: random generator.
-        but: effect with place that must not be drawn, because the case already hides it.
+        excluded_place: effect with place that must not be drawn, because the case already hides it.
 
     Returns:
-        ``effect@place`` or ``effect``; empty if the only place is excluded by `but`.
+        ``effect@place`` or ``effect``; empty if the only place is excluded by `excluded_place`.
     """
     chosen_effect = effect or str(rng.choice(hidden_causes.EFFECTS_BY_MACHINE[item.system]))
     places = [
-        name for name in hidden_causes.list_effect_places(item.system, chosen_effect) if name != but
+        name
+        for name in hidden_causes.list_effect_places(item.system, chosen_effect)
+        if name != excluded_place
     ]
     return str(rng.choice(places)) if places else ""
 
@@ -234,7 +236,7 @@ def _hide_two_effects(
         size.
     """
     first = _draw_place(item, effect, rng)
-    second = _draw_place(item, None, rng, but=first)
+    second = _draw_place(item, None, rng, excluded_place=first)
     if not second or second in find_equivalent_causes(item.system, first):
         return None
     coefficients_by_effect = {

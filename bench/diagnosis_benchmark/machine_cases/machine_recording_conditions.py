@@ -244,11 +244,11 @@ def _draw_runs(
         count: number of runs.
         rng: random generator.
     """
-    form = str(rng.choice(["steps", "sine", "chirp"]))
+    signal_form = str(rng.choice(["steps", "sine", "chirp"]))
     joints = len(plant.joints)
     waves = np.array(
         [
-            [draw_input_signal(form, times, rng, (0.3, 2.0)) for _ in range(joints)]
+            [draw_input_signal(signal_form, times, rng, (0.3, 2.0)) for _ in range(joints)]
             for _ in range(count)
         ]
     )

@@ -151,12 +151,12 @@ class _MachineIntegrator:
             q: positions, (L, N).
             force: generalised forces, (L, N).
         """
-        free = ~self.held
+        is_free = ~self.held
         inertia = self.plant.compute_mass_matrix(q)
         if self.held.any():
-            inertia = np.where(free[:, :, None] & free[:, None], inertia, 0.0)
+            inertia = np.where(is_free[:, :, None] & is_free[:, None], inertia, 0.0)
             inertia += np.eye(q.shape[1]) * self.held[:, :, None]
-            force = np.where(free, force, 0.0)
+            force = np.where(is_free, force, 0.0)
         is_single_joint = q.shape[1] == 1
         solved = (
             force / inertia[:, 0]

@@ -40,15 +40,15 @@ def build_chart_tables(data: DiagnoserReportData) -> dict[str, pd.DataFrame]:
     table = data.tables["table"]
     alarms = table[table["metric"] == "false alarms"].set_index("diagnoser")["share"]
     named_rows = table[(table["metric"] == PRIMARY_METRIC) & (table["of"] > 0)]
-    board = named_rows.assign(alarms=100 * named_rows["diagnoser"].map(alarms))
-    board[["share", "low", "high"]] *= 100
+    leaderboard = named_rows.assign(alarms=100 * named_rows["diagnoser"].map(alarms))
+    leaderboard[["share", "low", "high"]] *= 100
     places = {metric: place for place, metric in enumerate(_list_shares(data))}
     shares = table[table["metric"].isin(places)]
     levels = pd.DataFrame({"diagnoser": "", "level": P_VALUE_LEVELS, "share": P_VALUE_LEVELS})
     calibration, sets = data.tables["calibration"], data.tables["sets"]
     sizes = {label: place for place, label in enumerate(SET_SIZE_LABELS)}
     return {
-        "board": board.dropna(subset="alarms"),
+        "board": leaderboard.dropna(subset="alarms"),
         "shares": shares.assign(place=shares["metric"].map(places)),
         "calibration": pd.concat([calibration, levels], ignore_index=True)
         if len(calibration)

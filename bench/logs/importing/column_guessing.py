@@ -184,8 +184,10 @@ def match_joint(column: LogColumn, joints: Sequence[Joint]) -> Joint | None:
 
 def _strip_shared_words(joints: Sequence[Joint]) -> list[str]:
     """Return joint names without words that all may share: ``elbow`` for ``elbow_joint``."""
-    usual = {"joint", "motor", "link", "actuator", "dof"}
-    stems = ["".join(w for w in split_name(joint.name) if w not in usual) for joint in joints]
+    shared_words = {"joint", "motor", "link", "actuator", "dof"}
+    stems = [
+        "".join(w for w in split_name(joint.name) if w not in shared_words) for joint in joints
+    ]
     # A short stem, or one that two joints share, is ambiguous.
     return [
         stem if len(stem) > 2 and not stem.isdigit() and stems.count(stem) == 1 else ""

@@ -94,9 +94,9 @@ class DescriptionWriter:
             body += ['unit = "1"', ""]
         head = [*(f"# check: {line}" for line in self._result.checks)]
         head += [f"model = {toml_text(self._make_relative(self._model))}"]
-        free = [servo.name for servo in servos if servo.is_free]
-        if free:
-            places = ["*"] if len(free) == len(servos) else free
+        free_servos = [servo.name for servo in servos if servo.is_free]
+        if free_servos:
+            places = ["*"] if len(free_servos) == len(servos) else free_servos
             names = [f"{number}@{place}" for place in places for number in FREE_GAINS]
             name_list = ", ".join(map(toml_text, names))
             head.append(f"free = [{name_list}]  # not known: they are estimated")

@@ -108,6 +108,6 @@ def _thin_run(run: Run, stride: int) -> Run:
     inputs = dict(part.inputs)
     for name in part.inputs:
         if name not in run.linear:
-            weighed = np.add.reduceat(run.inputs[name] * spans, first)
-            inputs[name] = weighed / np.add.reduceat(spans, first)
+            weighted_sums = np.add.reduceat(run.inputs[name] * spans, first)
+            inputs[name] = weighted_sums / np.add.reduceat(spans, first)
     return replace(part, inputs=inputs)

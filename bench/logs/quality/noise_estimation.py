@@ -85,8 +85,8 @@ def differences_sigma(signals: Iterable[tuple[Array, Array]], order: int) -> flo
 
 def _estimate_sigma(runs: list[tuple[Array, Array]], order: int) -> float:
     """Return 1 sigma from differences of one order, over all runs; NaN if all are too short."""
-    rests = [_compute_divided_differences(t, y, order) for t, y in runs if t.size > order + 1]
-    pooled = np.concatenate(rests) if rests else np.empty(0)
+    differences = [_compute_divided_differences(t, y, order) for t, y in runs if t.size > order + 1]
+    pooled = np.concatenate(differences) if differences else np.empty(0)
     return _MAD * float(np.median(np.abs(pooled))) if pooled.size else np.nan
 
 
@@ -104,8 +104,8 @@ def _compute_divided_differences(times: Array, values: Array, order: int) -> Arr
     # Equation (1): a polynomial of lower order becomes zero, white noise keeps its variance.
     weights = 1.0 / time_differences.prod(axis=2)
     weights /= np.sqrt((weights * weights).sum(axis=1, keepdims=True))
-    rests: Array = (weights * y).sum(axis=1)
-    return rests
+    differences: Array = (weights * y).sum(axis=1)
+    return differences
 
 
 def _find_quantisation_step(runs: list[tuple[Array, Array]]) -> float:

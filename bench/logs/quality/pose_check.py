@@ -272,10 +272,10 @@ def _check_exchanged(
     """
     for i, (command, position) in enumerate(servo_signals):
         for other_command, other_position in servo_signals[i + 1 :]:
-            crossed = pairs[command, other_position], pairs[other_command, position]
+            crossed_pairs = pairs[command, other_position], pairs[other_command, position]
             own_pairs = pairs[command, position], pairs[other_command, other_position]
             if (
-                min(pair.correlation for pair in crossed) > MIN_FOLLOWING_CORRELATION
+                min(pair.correlation for pair in crossed_pairs) > MIN_FOLLOWING_CORRELATION
                 and max(abs(pair.correlation) for pair in own_pairs) < MAX_UNRELATED_CORRELATION
             ):
                 subject = (

@@ -99,8 +99,8 @@ def _compute_uneven_share(times: Array) -> float:
     steps = np.diff(times)
     if not steps.size:
         return 1.0
-    usual = float(np.median(steps))
-    return float(np.mean(np.abs(steps - usual) > 0.01 * usual))
+    median_step = float(np.median(steps))
+    return float(np.mean(np.abs(steps - median_step) > 0.01 * median_step))
 
 
 def check_repeated_samples(recording: Recording) -> Iterator[QualityFinding]:
@@ -139,12 +139,12 @@ def _count_stale_samples(run: Run) -> tuple[int, float]:
     moving = (
         np.nan_to_num(np.max(neighbour_changes, axis=0, initial=0.0), nan=0.0) >= FAST_SIGNAL_STEPS
     )
-    stale = is_unchanged.all(axis=0)[1:-1] & moving
+    is_stale = is_unchanged.all(axis=0)[1:-1] & moving
     # A signal whose noise spans several steps repeats its value half as often as it changes by one
     # step in either direction.
     is_nearly_stale = (np.abs(np.nan_to_num(changes, nan=9.0)) < 1.5).all(axis=0)[1:-1] & moving
-    one_step_count = int(is_nearly_stale.sum()) - int(stale.sum())
-    return int(stale.sum()), one_step_count / max(3.0 ** len(signals) - 1.0, 1.0)
+    one_step_count = int(is_nearly_stale.sum()) - int(is_stale.sum())
+    return int(is_stale.sum()), one_step_count / max(3.0 ** len(signals) - 1.0, 1.0)
 
 
 def _count_quantisation_steps(values: Array) -> Array:

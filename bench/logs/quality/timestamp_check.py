@@ -146,10 +146,10 @@ def _check_time_scale(recording: Recording, run: Run, kind: type[Simulator]) -> 
         if x is None:
             continue
         spread = float(np.nanstd(x))
-        pull = float(np.sqrt(np.nanmean(accelerations[:, column] ** 2)))
-        if not (spread > MIN_MOTION_SHARE * sizes.get(name, 1.0) and pull > 0):
+        rms_acceleration = float(np.sqrt(np.nanmean(accelerations[:, column] ** 2)))
+        if not (spread > MIN_MOTION_SHARE * sizes.get(name, 1.0) and rms_acceleration > 0):
             continue
-        expected_seconds = (spread / pull) ** 0.5  # Equation (2).
+        expected_seconds = (spread / rms_acceleration) ** 0.5  # Equation (2).
         recorded_seconds = interval * _estimate_lag(x)
         ratio = recorded_seconds / expected_seconds
         if 0 < ratio < 1 / TIME_UNIT_RATIO_THRESHOLD:
@@ -190,8 +190,8 @@ def _compute_rest_accelerations(recording: Recording, run: Run, system: System) 
     theta = np.tile([p.nominal for p in system.parameters], (count, 1))
     default = [np.full(count, system.states[name]) for name in system.coordinates]
     columns = [
-        run.channels.get(name, usual)
-        for name, usual in zip(system.coordinates, default, strict=True)
+        run.channels.get(name, default_position)
+        for name, default_position in zip(system.coordinates, default, strict=True)
     ]
     x = np.stack(columns, axis=1)
     zeros = np.zeros((count, 1))

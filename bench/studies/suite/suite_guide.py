@@ -57,9 +57,9 @@ def choose_segments(means: pd.DataFrame) -> list[tuple[str, int]]:
     checkpoints = [int(str(k)) for k in means]
     segments, start = [], 0
     while start < len(checkpoints):
-        reach = is_near_best.iloc[:, start:].cumprod(axis=1).sum(axis=1)
-        longest = reach.index[reach == reach.max()]
-        stop = start + int(reach.max())
+        segment_lengths = is_near_best.iloc[:, start:].cumprod(axis=1).sum(axis=1)
+        longest = segment_lengths.index[segment_lengths == segment_lengths.max()]
+        stop = start + int(segment_lengths.max())
         tuner = str(means.loc[longest, checkpoints[start:stop]].mean(axis=1).idxmin())
         segments.append((tuner, checkpoints[stop - 1]))
         start = stop
