@@ -147,11 +147,15 @@ class RunRanker:
         entries = []
         for run in allowed_runs:
             linearisations = [
-                self._linearise_run(run, one, one.model.fit.theta) for one in self.known
+                self._linearise_run(run, known_model, known_model.model.fit.theta)
+                for known_model in self.known
             ]
-            if all(one is not None for one in linearisations):
+            if all(linearisation is not None for linearisation in linearisations):
                 entries.append(
-                    self._rank_run(run, [one for one in linearisations if one is not None])
+                    self._rank_run(
+                        run,
+                        [entry for entry in linearisations if entry is not None],
+                    )
                 )
         return sorted(entries, key=get_sort_key)
 

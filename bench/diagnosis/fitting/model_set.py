@@ -160,8 +160,10 @@ class ModelSet:
                 self.compute_residual(fit), self.observed_mask, freedom
             )
         effect_penalty = sum(self.get_effect_penalty(name) for name in fit.effects)
-        merit = likelihood.value - freedom * self.parameter_penalty - effect_penalty  # (1)
-        return FittedModel(fit, likelihood, merit)
+        penalised_likelihood = (
+            likelihood.value - freedom * self.parameter_penalty - effect_penalty
+        )  # (1)
+        return FittedModel(fit, likelihood, penalised_likelihood)
 
     def with_sensitivities(self, start: FitStart) -> FitStart:
         """Return the start with derivatives that are known near it, to save their computation.
@@ -202,7 +204,7 @@ class ModelSet:
         self,
         starts: Sequence[FitStart],
         noise: NoiseModel | None = None,
-        patient: bool = False,
+        is_staged: bool = False,
         race: bool = True,
     ) -> None:
         """Fit models from their starts and store them.
@@ -210,7 +212,7 @@ class ModelSet:
         Args:
             starts: starts of the fits.
             noise: noise that weights the samples; None for `self.noise`.
-            patient: whether to fit the beginnings of the runs first, as in the base fit, and
+            is_staged: whether to fit the beginnings of the runs first, as in the base fit, and
                 continue with the best models.
             race: whether to stop fits that fall far behind.
         """
@@ -218,7 +220,7 @@ class ModelSet:
         watch.report_and_check(f"refit of {_format_starts(starts)}")
         noise = noise or self.noise
         starts = [self.with_sensitivities(start) for start in starts]
-        if patient:
+        if is_staged:
             starts = self._sifted(starts, noise)
         # Sums of squares with different weights are not comparable.
         is_race = race and noise is self.noise

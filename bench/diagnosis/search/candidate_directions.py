@@ -301,9 +301,9 @@ def _make_shape_grid(
         frequencies = _frequencies(1.0 / high, 1.0 / low, travel)
         return 1.0 / frequencies
     if is_instant(parameter):
-        first, last = world.clock
+        clock_start, clock_end = world.clock
         # An event at the ends of the recording would have nothing before or after it.
-        return np.linspace(first, last, EVENT_TIME_COUNT + 2)[1:-1]
+        return np.linspace(clock_start, clock_end, EVENT_TIME_COUNT + 2)[1:-1]
     if parameter.unit == "s":
         # A decay much longer than the runs is constant within them; successive times differ by at
         # most a factor of two.

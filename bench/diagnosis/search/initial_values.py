@@ -218,11 +218,11 @@ def generate_event_times(world: RunEvaluator, name: str, c: Array) -> Iterator[A
     for i, parameter in enumerate(list_coefficients(world, name)):
         if not is_instant(parameter):
             continue
-        first, last = world.clock
+        clock_start, clock_end = world.clock
         stamps = np.unique(np.concatenate([track.scenario.times for track in world.tracks]))
         midpoints = (stamps[1:] + stamps[:-1]) / 2.0
         near_midpoints = midpoints[
-            np.abs(midpoints - c[i]) <= (last - first) / (EVENT_TIME_COUNT + 1)
+            np.abs(midpoints - c[i]) <= (clock_end - clock_start) / (EVENT_TIME_COUNT + 1)
         ]
         for instant in near_midpoints[
             :: -(-near_midpoints.size // MAX_EVENT_TIME_SUBDIVISIONS) or 1

@@ -348,7 +348,7 @@ def _over_positions(world: RunEvaluator) -> Iterator[_Family]:
     """
     system = world.simulator.system
     # A bouncing body flies freely and slides on nothing; its last coordinate is the height.
-    free, last = system.bounces, len(system.coordinates) - 1
+    is_bouncing, last_axis = system.bounces, len(system.coordinates) - 1
     for axis, name in enumerate(system.coordinates):
         if name not in world.channels:
             continue
@@ -358,13 +358,13 @@ def _over_positions(world: RunEvaluator) -> Iterator[_Family]:
         if not high > low:
             continue
         position = POSITION_VARIABLE + axis
-        if not (free and axis == last):
-            along = f"position {name}, along {system.coordinates[last]}"
-            yield _Family(along, position, AXIS_DIRECTION + last, low, high)
+        if not (is_bouncing and axis == last_axis):
+            along = f"position {name}, along {system.coordinates[last_axis]}"
+            yield _Family(along, position, AXIS_DIRECTION + last_axis, low, high)
         yield _Family(
             f"position {name}, against the motion", position, VISCOUS_DIRECTION, low, high
         )
-        if not free:
+        if not is_bouncing:
             yield _Family(f"position {name}, dry", position, DRY_FRICTION_DIRECTION, low, high)
 
 

@@ -57,7 +57,7 @@ def select_refit_starts(
     direction_set: DirectionSet,
     scores: CandidateScores,
     max_count: int,
-    patient: bool,
+    fits_all: bool,
 ) -> list[FitStart]:
     """Return starts for fits with the most promising candidates.
 
@@ -68,15 +68,15 @@ def select_refit_starts(
         direction_set: sensitivity directions of the candidates.
         scores: their scores.
         max_count: maximum number of candidates.
-        patient: whether to include all candidates, or for robots up to `MAX_REFITS_THOROUGH`.
+        fits_all: whether to include all candidates, or for robots up to `MAX_REFITS_THOROUGH`.
     """
     numbered = []
     # If scores use derivatives of the simulator, few candidates are better than their score.
     share = MIN_RELATIVE_SCORE_EXACT if world.has_linearisation else MIN_RELATIVE_SCORE
-    if patient and world.has_linearisation:
+    if fits_all and world.has_linearisation:
         max_count, share = MAX_REFITS_THOROUGH, 0.0
     # If scores are less reliable, they only order the patient fits, and exclude none.
-    is_all_wanted = patient and not world.has_linearisation
+    is_all_wanted = fits_all and not world.has_linearisation
     for i in _rank_candidates(
         scores, max_count, share, is_all_wanted, _find_simulated_scores(world, scores)
     ):
@@ -91,7 +91,7 @@ def select_refit_starts(
                 )
                 numbered.append((peak, start))
     # Patient fits begin with the first part of the runs, so starts are compared there.
-    share = FIT_HORIZONS[0].share if patient else 1.0
+    share = FIT_HORIZONS[0].share if fits_all else 1.0
     return _select_nearest_start(world, noise, numbered, share)
 
 

@@ -292,7 +292,7 @@ class ScoredModelSet(ModelSet):
             starts += [s for s in extension_starts if fits_all or self._is_new(s, latest_model)]
         if not self.world.has_linearisation or fits_all:
             if starts:
-                self.refit_models(starts, patient=fits_all)
+                self.refit_models(starts, is_staged=fits_all)
             return
         # Laws that are evaluated in every step cost most, and the laws that they contain are often
         # sufficient.

@@ -287,23 +287,23 @@ class WhiteningDesign:
             of directions with residuals (K, S).
         """
         size, runs, *_ = self._jacobian.shape
-        samples = sum(len(some) for some in residuals)
+        samples = sum(len(array) for array in residuals)
         squares = LaggedSums.zeros(samples)
         shared = LaggedSums.zeros(runs, size, samples)
         cross = LaggedSums.zeros(len(self._directions), samples)
         for place in self._places():
             # Concatenate section by section, because whole copies would double the memory.
-            parts = [self._columns(some, place) for some in residuals]
+            parts = [self._columns(array, place) for array in residuals]
             residual_columns = SegmentColumns(
                 *(np.concatenate(rows) for rows in zip(*parts, strict=True))
             )
             jacobian_columns = self._columns(self._jacobian, place)
-            some = self._columns(self._directions, place, has_neighbours=False)
+            direction_columns = self._columns(self._directions, place, has_neighbours=False)
             add_self_products(squares, residual_columns, place)
             add_cross_products(
                 select_run(shared, place.run), jacobian_columns, residual_columns, place
             )
-            add_cross_products(cross, some, residual_columns, place)
+            add_cross_products(cross, direction_columns, residual_columns, place)
         return squares, shared, cross
 
     def project_out(self, residuals: Array) -> Array:

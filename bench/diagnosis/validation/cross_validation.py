@@ -103,8 +103,8 @@ class CrossValidation:
         """
         if not np.isfinite(simulated[self.seen]).all():
             return HeldOutFit(np.full_like(simulated, np.nan), -np.inf, states)
-        merit = merit_of(self.world.observed, simulated, free)
-        return HeldOutFit(simulated, merit, states, free)
+        penalised_likelihood = merit_of(self.world.observed, simulated, free)
+        return HeldOutFit(simulated, penalised_likelihood, states, free)
 
     @cached_property
     def _folds(self) -> list[_Fold]:

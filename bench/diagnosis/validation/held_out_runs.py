@@ -236,8 +236,8 @@ class HeldOutRuns:
             return HeldOutFit(no_prediction, -np.inf, fit.states)
         # Only initial states were fitted here, so only they count as free.
         free = count_identified_states(self.world, fit, self.noise)
-        merit = merit_of(self.world.observed, fit.simulated, free)
-        return HeldOutFit(fit.simulated, merit, fit.states, free)
+        penalised_likelihood = merit_of(self.world.observed, fit.simulated, free)
+        return HeldOutFit(fit.simulated, penalised_likelihood, fit.states, free)
 
 
 def merit_of(observed: Array, simulated: Array, free: float) -> float:
