@@ -97,11 +97,11 @@ def correct_holm(p: Array) -> Array:
     It bounds the probability of any false rejection in the family. The k-th smallest p-value is
     multiplied by n + 1 - k; a corrected value is at least as large as the one before it.
     """
-    # This import takes a second, and few commands test pairs.
-    from statsmodels.stats.multitest import multipletests
-
-    corrected: Array = multipletests(p, method="holm")[1] if len(p) else np.empty(0)
-    return corrected
+    # statsmodels' `multipletests` takes a second to import and collects all garbage in each call.
+    order = np.argsort(p)
+    corrected = np.empty(len(p))
+    corrected[order] = np.maximum.accumulate(p[order] * np.arange(len(p), 0, -1))
+    return np.minimum(corrected, 1.0)
 
 
 def compute_log_errors(errors: Array, floor: float = MIN_ERROR) -> Array:

@@ -7,7 +7,7 @@ import pytest
 from bench.benchmark.statistics.error_curves import select_primary_metric
 from bench.benchmark.statistics.error_table import build_error_table
 from bench.benchmark.statistics.expected_running_time import compute_effort
-from bench.benchmark.statistics.paired_tests import compare_all_pairs
+from bench.benchmark.statistics.paired_tests import compare_all_pairs, correct_holm
 from tests.bench.statistics.test_error_table import at, runs_of, statuses_of
 from tests.bench.statistics.test_statistics import curves_of
 
@@ -51,6 +51,15 @@ def test_the_truth_decides_then_held_out_runs_then_what_was_fitted():
         found = select_primary_metric(runs)
         assert (found.metric, found.in_widths) == (metric, in_widths)
         runs[metric] = np.nan
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 40])
+def test_the_correction_for_several_tests_is_that_of_statsmodels(count):
+    multitest = pytest.importorskip("statsmodels.stats.multitest")
+    p = np.random.default_rng(count).uniform(size=count) ** 4
+    p[count // 2 :] = p[: (count + 1) // 2]  # equal p-values
+    expected = multitest.multipletests(p, method="holm")[1] if count else []
+    np.testing.assert_array_equal(correct_holm(p), expected)
 
 
 @pytest.mark.parametrize(
