@@ -81,7 +81,7 @@ def test_a_cause_is_no_broken_convention(cause, tmp_path):
 
 
 def test_an_identity_transform_is_no_difference(tmp_path, monkeypatch):
-    log = write_log(tmp_path / "log", *_seed("sign of command"))
+    log = write_log(tmp_path / "log", SEEDS["sign of both"][0], "sign of both")
     assert check(log.path).differences() != []
     monkeypatch.setattr(SignalChange, "applied", lambda change, signals: signals[change.source])
     assert check(log.path).differences() == []
@@ -102,10 +102,6 @@ def test_a_model_that_diverges_between_samples_gives_no_difference(tmp_path):
     mapped = {**valid_input.MAPPED, "time": {"column": "stamp"}}
     (tmp_path / "mapped.toml").write_bytes(valid_input.toml(mapped))
     assert check(tmp_path / "mapped.toml").differences() == []
-
-
-def _seed(broken):
-    return SEEDS[broken][0], broken
 
 
 def test_whole_turns_are_unwrapped_towards_the_command():

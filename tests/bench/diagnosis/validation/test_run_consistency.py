@@ -20,22 +20,32 @@ NOISE = 1e-3
 TIMES = np.arange(0.0, 3.0, 0.02)
 
 
-def write(folder, name, mass=2.0, drag=0.0, coulomb=0.0, seed=0, runs=3, sizes=(2.0,)):
-    """Write runs of a moving slider with held forces, drag and dry friction; return the path."""
+def slide(state, force, mass, coulomb):
+    """Return position and speed 0.02 s later, with dry friction."""
+
+    def rate(_, x):
+        return [x[1], (force - coulomb * np.tanh(x[1] / 1e-3)) / mass]
+
+    return solve_ivp(rate, (0.0, 0.02), state, rtol=1e-8, atol=1e-10, max_step=0.01).y[:, -1]
+
+
+def write(folder, name, mass=2.0, coulomb=0.0, seed=0, runs=3, sizes=(2.0,)):
+    """Write runs of a moving slider with held forces and dry friction; return the path.
+
+    Without friction the motion has a closed form; with it, SciPy integrates.
+    """
     rng, rows = np.random.default_rng(seed), ["run,t,u,x"]
     for run in range(runs):
         size = sizes[run % len(sizes)]
         u = size * np.sin(3 * TIMES + run + 0.3)
-
-        def rate(t, x, u=u):
-            force = u[min(int(t / 0.02 + 1e-9), u.size - 1)]
-            return [x[1], (force - drag * x[1] - coulomb * np.tanh(x[1] / 1e-3)) / mass]
-
-        x, state = np.empty(TIMES.size), [0.0, 0.5]
-        for i, t in enumerate(TIMES):
+        x, state = np.empty(TIMES.size), np.array([0.0, 0.5])
+        for i, force in enumerate(u):
             x[i] = state[0]
-            end = solve_ivp(rate, (t, t + 0.02), state, rtol=1e-8, atol=1e-10, max_step=0.01)
-            state = end.y[:, -1]
+            if coulomb:
+                state = slide(state, force, mass, coulomb)
+            else:
+                gain = 0.02 * force / mass
+                state = state + [0.02 * (state[1] + gain / 2), gain]
         x += NOISE * rng.standard_normal(x.size)
         rows += [f"{run},{t:.2f},{a:.6f},{b:.6f}" for t, a, b in zip(TIMES, u, x, strict=True)]
     path = folder / f"{name}.csv"
