@@ -41,14 +41,15 @@ $(STAMP): requirements.lock requirements-explain.txt pyproject.toml
 	@test -z "$(filter-out $(LARGE),$(LEFT_OUT))" || { echo "WITHOUT=$(WITHOUT): expected torch, pybullet or torch,pybullet" >&2; exit 2; }
 	$(PYTHON) -m venv $(VENV)
 ifeq ($(strip $(LEFT_OUT)),)
-	$(PIP) install -r requirements.lock
+	$(PIP) install --no-compile -r requirements.lock
 	$(PIP) install --no-deps --no-build-isolation --editable .
 else
 	$(PIP) uninstall --yes $(LEFT_OUT) 2>/dev/null
-	$(PIP) install --constraint requirements.lock -r requirements-explain.txt hatchling editables $(filter-out $(LEFT_OUT),$(LARGE))
+	$(PIP) install --no-compile --constraint requirements.lock -r requirements-explain.txt hatchling editables $(filter-out $(LEFT_OUT),$(LARGE))
 	$(PIP) install --no-deps --no-build-isolation --editable .
 endif
-	$(BIN)/python -m compileall -q bench methods sims simgap.py
+	@# pip would compile on one core. A package may have files for another version of Python.
+	$(BIN)/python -W ignore -m compileall -qq -j 0 $(VENV)/lib bench methods sims simgap.py || true
 	$(BIN)/python -m bench.diagnosis.kalman.precompile
 	$(BIN)/python -m bench.pages.precompile
 	@echo "$(strip $(LEFT_OUT))" > $@

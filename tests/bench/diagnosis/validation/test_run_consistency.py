@@ -45,7 +45,7 @@ def write(folder, name, mass=2.0, coulomb=0.0, seed=0, runs=3, sizes=(2.0,)):
                 state = slide(state, force, mass, coulomb)
             else:
                 gain = 0.02 * force / mass
-                state = state + [0.02 * (state[1] + gain / 2), gain]
+                state = np.add(state, [0.02 * (state[1] + gain / 2), gain])
         x += NOISE * rng.standard_normal(x.size)
         rows += [f"{run},{t:.2f},{a:.6f},{b:.6f}" for t, a, b in zip(TIMES, u, x, strict=True)]
     path = folder / f"{name}.csv"
