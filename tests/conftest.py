@@ -1,22 +1,18 @@
 import gc
 import os
-import re
 import signal
 from collections import Counter
 from pathlib import Path
 
 import pytest
 
+from tests.data_dependence import find_data_dependent_names
+
 PLUGINS = Path(__file__).parent / "plugins"
 
 _SHARED = Path(__file__).parents[2] / "shared"
 _BESIDE = _SHARED / "data"
 """Default folder of the real recordings, on machines that have it."""
-
-_READS_DATA = re.compile(
-    "SIMGAP_(DATA|ROBOTS)|[\"']shared[\"']|pendulum-real|robot-so101|simgap list"
-)
-"""Pattern of test files whose results may depend on the real recordings."""
 
 # Child processes inherit these values; values set by the user have priority.
 for _name, _folder in (("SIMGAP_DATA", _BESIDE), ("SIMGAP_ROBOTS", _SHARED / "robots")):
@@ -122,9 +118,10 @@ def pytest_collection_modifyitems(items):
     A slow file that starts last would keep the other workers waiting.
     """
     seconds = Counter()
-    reads = {path: bool(_READS_DATA.search(path.read_text())) for path in {i.path for i in items}}
+    reads = {path: find_data_dependent_names(path.read_text()) for path in {i.path for i in items}}
     for item in items:
-        if reads[item.path] or "recordings" in item.fixturenames:
+        name = item.originalname if item.cls is None else item.cls.__name__
+        if name in reads[item.path] or "recordings" in item.fixturenames:
             item.add_marker(pytest.mark.data)
         seconds[item.path] += _SECONDS[item.get_closest_marker("slow") is not None]
     items.sort(key=lambda item: -seconds[item.path])

@@ -11,6 +11,22 @@ from bench.logs.quality.log_quality import check_log_quality
 NOISE, MASS, INTERVAL = 1e-3, 2.0, 0.02
 
 
+def motion(begin, end, state, force, coulomb):
+    """Return position and speed as a function of time; a closed form if there is no friction."""
+    if not coulomb:
+        x, v = state
+        return lambda t: np.array(
+            [x + (t - begin) * (v + force / MASS * (t - begin) / 2), v + force / MASS * (t - begin)]
+        )
+
+    def rate(_, state):
+        return [state[1], (force - coulomb * np.tanh(state[1] / 1e-3)) / MASS]
+
+    return solve_ivp(
+        rate, (begin, end), state, rtol=1e-8, atol=1e-10, max_step=0.01, dense_output=True
+    ).sol
+
+
 def log(folder, coulomb, stamp=None, lost=0.0, drift=0.0, seed=0, seconds=6.0):
     """Write three runs with a force that changes and a position that is read at every stamp.
 
@@ -27,20 +43,13 @@ def log(folder, coulomb, stamp=None, lost=0.0, drift=0.0, seed=0, seconds=6.0):
         times = even if stamp is None else stamp(even, rng)
         u = 2.0 * np.sin(3 * times + run) + 1.0 * np.sin(7.3 * times)
 
-        def rate(_t, state, force):
-            return [state[1], (force - coulomb * np.tanh(state[1] / 1e-3)) / MASS]
-
         state, pieces = np.array([0.0, 0.5]), []
         for begin, end, force in zip(times[:-1], times[1:], u[:-1], strict=True):
-            done = solve_ivp(
-                rate, (begin, end), state, args=(force,), rtol=1e-8, atol=1e-10, max_step=0.01,
-                dense_output=True,
-            )  # fmt: skip
-            pieces.append((begin, end, done.sol))
-            state = done.y[:, -1]
+            pieces.append(motion(begin, end, state, force, coulomb))
+            state = pieces[-1](end)
         at = np.clip(times[0] + (times - times[0]) / (1.0 + drift), times[0], times[-1])
         inside = np.clip(np.searchsorted(times, at, side="right") - 1, 0, len(pieces) - 1)
-        x = np.array([pieces[i][2](t)[0] for i, t in zip(inside, at, strict=True)])
+        x = np.array([pieces[i](t)[0] for i, t in zip(inside, at, strict=True)])
         x += NOISE * rng.standard_normal(x.size)
         cells = [f"{value:.6f}" for value in x]
         for i in np.flatnonzero(rng.random(x.size) < lost):

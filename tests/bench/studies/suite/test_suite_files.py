@@ -170,6 +170,7 @@ def small_suite(tmp_path):
     return load_experiment(str(suite))
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_method_of_ones_own_is_ranked_among_the_stored_ones(tmp_path, small_suite, monkeypatch):
     reference = tmp_path / "reference"
     monkeypatch.setattr(suite_report, "REFERENCE_FOLDERS", (reference,))
@@ -203,6 +204,7 @@ def test_a_method_of_ones_own_is_ranked_among_the_stored_ones(tmp_path, small_su
     assert verify_archive(bundle.archive, lambda line: None, [str(plugin)]).is_consistent
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_cell_comes_out_again_with_its_salt(tmp_path, small_suite, monkeypatch):
     monkeypatch.setattr(suite_report, "REFERENCE_FOLDERS", ())
     for number in range(2):
