@@ -677,12 +677,14 @@ class _ExplainRun:
 
     def _identified(self, followed: FollowedRuns) -> FollowedRuns:
         """Return the runs, filtered with base parameters from a prediction-error fit."""
-        # This import is needed for robots only.
+        # These imports are needed for robots only.
         from bench.diagnosis.kalman.likelihood_fit import identify_base
+        from bench.diagnosis.prediction_error.incomplete_model import is_long
 
         world = self.fitting
         declared = {p.name: p.bounds for p in world.parameters}
-        found, wider = identify_base(world, self.noise, followed)
+        # The joints of a real robot have friction, and long recordings are those of real robots.
+        found, wider = identify_base(world, self.noise, followed, is_long(world))
         if found is not followed:
             self.identified = world.identified = found.theta[world.base]
         self._widen(wider, declared)

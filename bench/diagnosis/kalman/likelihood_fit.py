@@ -45,7 +45,7 @@ CLEAR = 2.0
 
 
 def identify_base(
-    world: RunEvaluator, noise: NoiseModel, followed: FollowedRuns
+    world: RunEvaluator, noise: NoiseModel, followed: FollowedRuns, is_resisted: bool = False
 ) -> tuple[FollowedRuns, dict[str, Bounds]]:
     """Identify the base parameters of a robot from the innovations of a filter.
 
@@ -56,6 +56,7 @@ def identify_base(
         world: the runs for fitting; ranges that do not contain an estimate are replaced.
         noise: sensor noise.
         followed: the runs, filtered with the nominal parameters.
+        is_resisted: whether friction is certain, so that the parameters are not tried without it.
 
     Returns:
         The runs, filtered with the estimates, and the new ranges by name. If the likelihood gains
@@ -70,7 +71,7 @@ def identify_base(
     limits = [range_around(world, i) for i in places]
     resisting = [(i, b) for name in _resistance(followed) for i, b in _coefficients(world, name)]
     found = []
-    for beside in ([], resisting):
+    for beside in [resisting] if is_resisted else [[], resisting]:
         own = [*places, *(i for i, _ in beside)]
         bounds = [*limits, *(one for _, one in beside)]
         tried = maximise_likelihood(followed, own, bounds, ITERATIONS, follow)
@@ -121,6 +122,7 @@ def maximise_likelihood(
     bounds: Sequence[Bounds],
     iterations: int,
     follow: Follow,
+    least_gain: float = LEAST_GAIN,
 ) -> FollowedRuns:
     """Maximise the likelihood of the innovations by Gauss-Newton steps with step halving.
 
@@ -130,6 +132,7 @@ def maximise_likelihood(
         bounds: bounds of these parameters.
         iterations: maximum number of steps.
         follow: filters the runs with other parameters; its second argument is the best filter.
+        least_gain: minimum gain in log-likelihood by a step for which another step follows.
 
     Returns:
         The runs, filtered with the likeliest parameters.
@@ -139,7 +142,7 @@ def maximise_likelihood(
         if best.world.watch.has_abandoned_fits():
             break
         step, expected = gauss_newton_step(best, places, bounds)
-        if expected < LEAST_GAIN:
+        if expected < least_gain:
             break
         gained = 0.0
         for _ in range(1 + HALVINGS):
@@ -149,7 +152,7 @@ def maximise_likelihood(
                 best = tried
                 break
             step = step / 2.0
-        if gained < LEAST_GAIN:
+        if gained < least_gain:
             break
     return best
 
@@ -168,11 +171,8 @@ def gauss_newton_step(
         The change of all parameters (P,), and the predicted gain in log-likelihood for linear
         innovations.
     """
-    innovations, target = list(places), followed.filtered.whitened
-    rows = np.stack(
-        [_derivative(followed, target, i, one) for i, one in zip(innovations, bounds, strict=True)],
-        axis=-1,
-    ).reshape(-1, len(innovations))
+    innovations = list(places)
+    rows, target = _derivatives(followed, places, bounds), followed.filtered.whitened
     gram, cross = rows.T @ rows, rows.T @ target.reshape(-1)
     scale = np.maximum(np.sqrt(np.diagonal(gram)), 1e-300)
     normal = gram / scale / scale[:, None] + RIDGE * np.eye(len(innovations))
@@ -182,6 +182,28 @@ def gauss_newton_step(
     step = np.zeros_like(followed.theta)
     step[innovations] = change
     return step, float(change @ cross - 0.5 * change @ gram @ change)
+
+
+def compute_information(
+    followed: FollowedRuns, places: Sequence[int], bounds: Sequence[Bounds]
+) -> Array:
+    """Return the Fisher information (n, n) of some parameters in the innovations.
+
+    Args:
+        followed: the runs, filtered with the present parameters.
+        places: indices of the n parameters.
+        bounds: bounds of these parameters.
+    """
+    rows = _derivatives(followed, places, bounds)
+    information: Array = rows.T @ rows
+    return information
+
+
+def _derivatives(followed: FollowedRuns, places: Sequence[int], bounds: Sequence[Bounds]) -> Array:
+    """Return minus the derivatives (R T C, n) of the whitened innovations by n parameters."""
+    target = followed.filtered.whitened
+    columns = [_derivative(followed, target, i, b) for i, b in zip(places, bounds, strict=True)]
+    return np.stack(columns, axis=-1).reshape(-1, len(places))
 
 
 def _derivative(followed: FollowedRuns, target: Array, place: int, bounds: Bounds) -> Array:

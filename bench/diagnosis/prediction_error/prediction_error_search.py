@@ -15,6 +15,9 @@ is only noise. The order is:
     5. Simulate elasticity and backlash between a drive and its links (`selection_fits`).
     6. Try one effect in place of several (`rival_sets`).
 
+If a long recording shows that the model stays incomplete, filters alone identify its effects
+(`incomplete_model`), and nothing of the above is done.
+
 `PredictionErrorSearch.fit_rivals` then fits the sets that are nearly as good, because they may be
 equivalent. All steps share filters with effects in the model (`model_filters`), columns of
 regressions (`library_columns`) and fits (`simulated_fits`).
@@ -36,7 +39,10 @@ from bench.diagnosis.prediction_error.forward_growth import (
     add_to_model,
     select_in_model,
 )
+from bench.diagnosis.prediction_error.incomplete_model import IdentifiedSet, identify_incomplete
 from bench.diagnosis.prediction_error.joint_effects import has_series
+from bench.diagnosis.prediction_error.library_columns import regression_about
+from bench.diagnosis.prediction_error.model_filters import FilteredSet
 from bench.diagnosis.prediction_error.regression_selection import null_scores, p_value_of_gain
 from bench.diagnosis.prediction_error.rival_sets import fit_rivals, fit_single_in_place
 from bench.diagnosis.prediction_error.selection_fits import (
@@ -74,10 +80,13 @@ class PredictionErrorSearch(EffectSearch):
     Attributes:
         is_form_given: whether the form of dry friction is not tested before effects are fitted.
         likely: a model that is fitted before any selection, if there is one.
+        identified: the set that filters identified in a long recording whose model stays
+            incomplete; None otherwise.
     """
 
     is_form_given: bool = False
     likely: FitStart | None = None
+    identified: IdentifiedSet | None = None
 
     @cached_property
     def _context(self) -> SearchContext:
@@ -92,6 +101,11 @@ class PredictionErrorSearch(EffectSearch):
         context, self.best_supported_model, best = self._context, self.base_model, None
         if self.likely is not None:
             best = without_idle_effects(context, fit(context, self.likely))
+        else:
+            self.identified = identify_incomplete(context)
+        if self.identified is not None:
+            self.best_supported_model = self.identified.model
+            return self.identified.model
         if best is None or not is_explained(context, best):
             best = self._search_effects()
         self.best_supported_model = best
@@ -226,8 +240,12 @@ class PredictionErrorSearch(EffectSearch):
         """Return the p-value of the best additional force and the signal it depends on."""
         if has_series(self.world, model.effects):
             return None
-        columns = self._context.columns
-        regression, _ = columns.regression(model)
+        columns, filters = self._context.columns, self._context.filters
+        if self.identified is None:
+            regression, _ = columns.regression(model)
+        else:
+            current = FilteredSet(filters.of_model(model), model.effects)
+            regression, _ = regression_about(current, columns.hats, filters.base)
         labels = {probe.effect for probe in columns.hats.probes}
         scores = null_scores(regression, labels, self.make_rng("structure", model.effects))
         return scores.p_value, scores.effects[0] if scores.effects else ""

@@ -5,6 +5,8 @@
 3. Test whether a force of any shape is missing (`bench.diagnosis.search.lack_of_fit`).
 4. Collect other effects that explain the data as well.
 5. Determine the verdict by the rules of `bench.diagnosis.search.verdict_rules`.
+
+A set that filters identified in a long recording is simulated as it is, without step 1, 2 and 4.
 """
 
 from __future__ import annotations
@@ -12,9 +14,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from bench.diagnosis.fitting.model_set import FittedModel
+from bench.diagnosis.prediction_error.incomplete_model import IdentifiedSet
 from bench.diagnosis.prediction_error.prediction_error_search import PredictionErrorSearch
 from bench.diagnosis.prediction_error.regression_selection import p_value_of_gain
-from bench.diagnosis.search.alternative_causes import AlternativeFinder
+from bench.diagnosis.search.alternative_causes import AlternativeFinder, CauseEvidence
 from bench.diagnosis.search.diagnose import DiagnosisResult, Inquiry, compute_gap_closed
 from bench.diagnosis.search.effect_search import EffectSearch
 from bench.diagnosis.search.held_out_validation import HeldOutValidation
@@ -54,6 +57,8 @@ class Confirmation(Inquiry):
         base = search.base_model
         watch.begin_question("search")
         self._model = search.run()
+        if search.identified is not None:
+            return self._answered_by_filters(search.identified)
         watch.begin_question("rivals")
         self._model = search.fit_rivals(self._model)
         size = len(self._model.effects)
@@ -86,6 +91,36 @@ class Confirmation(Inquiry):
             # Effects that leave most of the discrepancy only mimic what is missing.
             model, causes = base, ()
         return self._finding(verdict, base, model, causes, lack_of_fit)
+
+    def _answered_by_filters(self, identified: IdentifiedSet) -> DiagnosisResult:
+        """Return the result for a set that filters identified in a model that stays incomplete."""
+        search, watch, model, trial = self._robot, self._watch, identified.model, None
+        if self._held_out is not None:
+            watch.begin_question("held_out")
+            trial = self._trial = HeldOutValidation(self._held_out)
+            trial.evaluate_models([search.base_model, model])
+        watch.begin_question("structure")
+        lack_of_fit = assess_lack_of_fit(search, model)
+        watch.check_not_stopped()
+        state = DiagnosisState(
+            causes=len(model.effects),
+            closed=compute_gap_closed(search, model, lack_of_fit),
+            unexplained=True,
+            missed=trial is not None and trial.has_unexplained_gap(model, lack_of_fit),
+        )
+        causes = sorted(
+            (self._cause(name, gain) for name, gain in identified.gains.items()),
+            key=lambda cause: -cause.gain,
+        )
+        verdict = decide_verdict(state)
+        return self._finding(verdict, search.base_model, model, tuple(causes), lack_of_fit)
+
+    def _cause(self, name: str, gain: float) -> CauseEvidence:
+        """Return the evidence for an effect whose gain is that of filters."""
+        world = self._robot.world
+        count = len(world.get_coefficient_indices(name))
+        p_value = p_value_of_gain(gain, count, len(world.library))
+        return CauseEvidence(name, (), p_value, gain, name)
 
     def _measure(self) -> None:
         """Predict held-out runs with the model and its competitors, and drop unhelpful effects."""

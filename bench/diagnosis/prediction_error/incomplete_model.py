@@ -1,0 +1,276 @@
+"""Identify the model of a long recording by prediction errors alone, if it stays incomplete.
+
+A model of a real robot is never complete. Simulated over a long run without feedback, the forces
+that it lacks add up to a drift, so a fit of the simulation is biased, and every trial is slow. A
+filter attributes these forces to process noise and keeps the state near the data: its estimates are
+close to those of inverse dynamics (M. Gautier, A. Janot and P.-O. Vandanjon, IEEE Trans. Control
+Syst. Technol. 21, 428, 2013, doi:10.1109/TCST.2012.2185697).
+
+    1. Put the standard joint model and the inertia of every body into the filter's model, and
+       maximise the likelihood of the innovations.
+    2. Add effects of the library, chosen by regression of the innovations, while each pays.
+    3. Remove effects that do not pay.
+
+If the filter then lacks no force, the model may be complete, and simulation decides.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from bench.diagnosis.evaluation.coefficient_bounds import compute_coefficient_bounds
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.fitting.bound_widening import Bounds, range_around
+from bench.diagnosis.fitting.fit_state import FitStart
+from bench.diagnosis.fitting.model_set import FittedModel
+from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
+from bench.diagnosis.kalman.candidate_responses import FollowedRuns
+from bench.diagnosis.kalman.likelihood_fit import (
+    LEAST_GAIN,
+    compute_information,
+    maximise_likelihood,
+)
+from bench.diagnosis.prediction_error.effect_proposals import SearchContext
+from bench.diagnosis.prediction_error.joint_effects import has_many_shapes
+from bench.diagnosis.prediction_error.library_columns import group_coefficients, regression_about
+from bench.diagnosis.prediction_error.model_filters import FilteredSet
+from bench.diagnosis.prediction_error.selection_fits import LEAST_SHARE, MAX_IMPROVED_SIZE
+from bench.diagnosis.search.candidate_directions import CandidateDirection
+from sims.core.simulator import Array
+
+MIN_SECONDS = 8.0
+"""Minimum duration in seconds of each run of a long recording."""
+MIN_EXCESS = 100.0
+"""Minimum excess of the base model, in units of the noise, that such a model may leave.
+
+A smaller discrepancy is explained by simulation.
+"""
+MAX_JOINTS = 3
+"""Maximum number of joints; more of them have too many coefficients for finite differences."""
+TEXTBOOK_EFFECTS = ("friction.coulomb", "drag.linear", "inertia.scale")
+"""Effects that are in the model from the start, at every place that has them.
+
+The inertia of a body that moves along a straight line has no influence, and is removed.
+"""
+MAX_ADDED = 3
+"""Maximum number of effects that are added to the textbook model."""
+NEGLIGIBLE_FORCE = 0.1
+"""Maximum missing forces, as a share of those of the base model, at which no effect is added."""
+ITERATIONS = 6
+"""Maximum number of Gauss-Newton steps of a set."""
+CONVERGED_SHARE = 0.003
+"""Minimum gain by a Gauss-Newton step for which another step follows, as a share of the gain so
+far."""
+STATE_ITERATIONS = 4
+"""Maximum number of iterations for the initial states of the simulated runs."""
+
+
+class Information(NamedTuple):
+    """Fisher information of parameters.
+
+    Attributes:
+        places: indices of the n parameters in theta.
+        matrix: (n, n) information.
+    """
+
+    places: list[int]
+    matrix: Array
+
+
+@dataclass(frozen=True)
+class IdentifiedSet:
+    """A set of effects identified together with the base parameters.
+
+    Attributes:
+        model: the set, simulated with these parameters.
+        gains: loss in twice the log-likelihood of the innovations without each effect, by name.
+    """
+
+    model: FittedModel
+    gains: dict[str, float]
+
+
+def identify_incomplete(context: SearchContext) -> IdentifiedSet | None:
+    """Identify the effects and the base parameters of a long recording by prediction errors.
+
+    Args:
+        context: context of the search.
+
+    Returns:
+        The identified set; None if the runs are short or nearly explained, if no effect pays, or
+        if the set lacks no force, so that a simulation can be fitted.
+    """
+    world, filters = context.world, context.filters
+    excess = context.search.compute_excess(context.search.base_model)
+    if not is_long(world) or not excess > MIN_EXCESS or world.watch.has_abandoned_fits():
+        return None
+    world.watch.stage("identifying the joints and bodies")
+    textbook = [
+        name
+        for name in world.library
+        if name.partition("@")[0] in TEXTBOOK_EFFECTS and not name.endswith("@*")
+    ]
+    current, gains = _pruned(context, _maximised(context, filters.base, textbook))
+    for _ in range(MAX_ADDED):
+        larger = None if _is_negligible(context, current) else _with_next(context, current)
+        if larger is None:
+            break
+        current, gains = _pruned(context, larger)
+        if larger.names[-1] not in current.names:
+            break
+    if not current.names or not current.followed.lacks_force:
+        return None
+    return IdentifiedSet(_simulated(context, current), gains)
+
+
+def is_long(world: RunEvaluator) -> bool:
+    """Return whether all runs of a robot with few joints are long."""
+    few = len(world.simulator.system.coordinates) <= MAX_JOINTS
+    return few and all(run.times[-1] - run.times[0] >= MIN_SECONDS for run in world.runs)
+
+
+def _is_negligible(context: SearchContext, current: FilteredSet) -> bool:
+    """Return whether a set leaves a negligible share of the base model's missing forces."""
+    share = NEGLIGIBLE_FORCE * context.filters.base.force
+    return not current.followed.lacks_force or bool((current.followed.force < share).all())
+
+
+def _places(context: SearchContext, names: Sequence[str]) -> tuple[list[int], list[Bounds]]:
+    """Return the indices in theta and the bounds of the base parameters and of some effects."""
+    world = context.world
+    base = [i for i in world.base.tolist() if i not in context.search.frozen]
+    places, bounds = list(base), [range_around(world, i) for i in base]
+    for name in names:
+        places += world.get_coefficient_indices(name)
+        bounds += compute_coefficient_bounds(world, name)
+    return places, bounds
+
+
+def _maximised(context: SearchContext, followed: FollowedRuns, names: Sequence[str]) -> FilteredSet:
+    """Maximise the likelihood of the innovations with effects in the filter's model."""
+
+    def follow(theta: Array, best: FollowedRuns) -> FollowedRuns:
+        context.world.watch.check_not_stopped()
+        return best.with_parameters(theta)
+
+    reference = context.filters.log_likelihood(context.filters.reference)
+    least_gain = max(CONVERGED_SHARE * (followed.log_likelihood - reference), LEAST_GAIN)
+    best = maximise_likelihood(followed, *_places(context, names), ITERATIONS, follow, least_gain)
+    return FilteredSet(best, tuple(names))
+
+
+def _wald_statistics(
+    context: SearchContext, theta: Array, names: Sequence[str], information: Information
+) -> dict[str, float]:
+    """Return the loss in twice the log-likelihood without each effect of a set.
+
+    It is c' V^-1 c for the coefficients c of the effect and their covariance V.
+
+    Args:
+        context: context of the search.
+        theta: (P,) parameters of the set.
+        names: its effects.
+        information: Fisher information of the set, or of a larger one.
+    """
+    places, _ = _places(context, names)
+    rows = [information.places.index(i) for i in places]
+    covariance = np.linalg.pinv(information.matrix[np.ix_(rows, rows)], hermitian=True)
+    gains = {}
+    for name in names:
+        own_places = context.world.get_coefficient_indices(name)
+        own = [places.index(i) for i in own_places]
+        inverse = np.linalg.pinv(covariance[np.ix_(own, own)], hermitian=True)
+        c = theta[own_places]
+        gains[name] = float(c @ inverse @ c)
+    return gains
+
+
+def _min_gain(context: SearchContext, current: FilteredSet, name: str) -> float:
+    """Return the minimum gain of an effect of a set in twice the log-likelihood."""
+    filters = context.filters
+    whole = 2.0 * (current.followed.log_likelihood - filters.log_likelihood(filters.reference))
+    return max(filters.penalty(name), LEAST_SHARE * whole)
+
+
+def _pruned(context: SearchContext, current: FilteredSet) -> tuple[FilteredSet, dict[str, float]]:
+    """Remove the effects that gain too little, the least first, and maximise the likelihood again.
+
+    Returns:
+        The remaining set, and the gain of each of its effects.
+    """
+    followed, names, lost = current.followed, list(current.names), 0.0
+    places, bounds = _places(context, names)
+    information = Information(places, compute_information(followed, places, bounds))
+    min_gains = {name: _min_gain(context, current, name) for name in names}
+    while True:
+        gains = _wald_statistics(context, followed.theta, names, information)
+        idle = [name for name in names if gains[name] < min_gains[name]]
+        if not idle:
+            break
+        least = min(idle, key=lambda name: gains[name] - min_gains[name])
+        names.remove(least)
+        lost += gains[least]
+    if len(names) == len(current.names):
+        return current, gains
+    theta = followed.theta.copy()
+    for name in set(current.names) - set(names):
+        theta[context.world.slots[name]] = 0.0
+    followed = followed.with_parameters(theta)
+    # Effects without influence leave the other coefficients as they are.
+    if lost > 2.0 * LEAST_GAIN:
+        return _pruned(context, _maximised(context, followed, names))
+    return FilteredSet(followed, tuple(names)), gains
+
+
+def _with_next(context: SearchContext, current: FilteredSet) -> FilteredSet | None:
+    """Add the effect that gains most by regression, in place of the effects that it contains."""
+    world, columns = context.world, context.filters.base.columns(_probes(context))
+    regression, _ = regression_about(current, columns, current.followed)
+    gains = regression.net_gains()
+    for i, group in enumerate(regression.groups):
+        gains[i] *= group.effect not in current.names
+    best = regression.groups[int(np.argmax(gains))]
+    if not gains.max() > 0.0:
+        return None
+    name, (solution,) = best.effect, regression.solve([best])[1]
+    c = group_coefficients(world, columns.probes, best, solution)
+    contained = set(world.available_effects[name].contains)
+    theta = current.followed.theta.copy()
+    theta[world.slots[name]] = c
+    for one in contained & set(current.names):
+        theta[world.slots[one]] = 0.0
+    names = [*(one for one in current.names if one not in contained), name]
+    larger = _maximised(context, current.followed.with_parameters(theta), names)
+    gain = 2.0 * (larger.followed.log_likelihood - current.followed.log_likelihood)
+    return larger if gain > _min_gain(context, larger, name) else None
+
+
+def _probes(context: SearchContext) -> list[CandidateDirection]:
+    """Return probes of the laws that may be added: one place, few coefficients and few shapes."""
+    world = context.world
+    names = [
+        name
+        for name in world.library
+        if not name.endswith("@*")
+        and not has_many_shapes(name)
+        and len(world.get_coefficient_indices(name)) <= MAX_IMPROVED_SIZE
+    ]
+    return context.columns.probes(names)
+
+
+def _simulated(context: SearchContext, current: FilteredSet) -> FittedModel:
+    """Simulate the runs with the parameters of a filter, from fitted initial states."""
+    world, search = context.world, context.search
+    theta, states = current.followed.theta, context.filters.first_states(current.followed)
+    start = FitStart(current.names, theta, states)
+    (begun,) = TrajectoryFitter(world, search.noise, search.frozen, parameters=False).fit_models(
+        [start], STATE_ITERATIONS
+    )
+    (fit,) = TrajectoryFitter(world, search.noise, search.frozen).fit_models(
+        [replace(start, states=begun.states)], 0
+    )
+    return search.add_fit(fit)
