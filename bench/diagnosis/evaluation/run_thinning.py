@@ -15,7 +15,7 @@ from bench.diagnosis.evaluation.run_evaluator import MAX_TIME_STEP, Indices, Run
 from sims.core.simulator import Array
 from sims.recording.recording import Run
 
-MIN_SAMPLES_TO_THIN = 12_000
+MIN_SAMPLES_TO_THIN = 5_000
 """Minimum total number of samples of all runs for which they are thinned."""
 MIN_THINNED_SAMPLES = 2_000
 """Minimum total number of samples after thinning."""
