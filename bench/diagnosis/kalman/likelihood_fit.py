@@ -122,7 +122,7 @@ def maximise_likelihood(
     bounds: Sequence[Bounds],
     iterations: int,
     follow: Follow,
-    least_gain: float = LEAST_GAIN,
+    min_gain: float = LEAST_GAIN,
 ) -> FollowedRuns:
     """Maximise the likelihood of the innovations by Gauss-Newton steps with step halving.
 
@@ -132,7 +132,7 @@ def maximise_likelihood(
         bounds: bounds of these parameters.
         iterations: maximum number of steps.
         follow: filters the runs with other parameters; its second argument is the best filter.
-        least_gain: minimum gain in log-likelihood by a step for which another step follows.
+        min_gain: minimum gain in log-likelihood by a step for which another step follows.
 
     Returns:
         The runs, filtered with the likeliest parameters.
@@ -142,7 +142,7 @@ def maximise_likelihood(
         if best.world.watch.has_abandoned_fits():
             break
         step, expected = gauss_newton_step(best, places, bounds)
-        if expected < least_gain:
+        if expected < min_gain:
             break
         gained = 0.0
         for _ in range(1 + HALVINGS):
@@ -152,7 +152,7 @@ def maximise_likelihood(
                 best = tried
                 break
             step = step / 2.0
-        if gained < least_gain:
+        if gained < min_gain:
             break
     return best
 

@@ -158,8 +158,8 @@ def _maximised(context: SearchContext, followed: FollowedRuns, names: Sequence[s
         return best.with_parameters(theta)
 
     reference = context.filters.log_likelihood(context.filters.reference)
-    least_gain = max(CONVERGED_SHARE * (followed.log_likelihood - reference), LEAST_GAIN)
-    best = maximise_likelihood(followed, *_places(context, names), ITERATIONS, follow, least_gain)
+    min_gain = max(CONVERGED_SHARE * (followed.log_likelihood - reference), LEAST_GAIN)
+    best = maximise_likelihood(followed, *_places(context, names), ITERATIONS, follow, min_gain)
     return FilteredSet(best, tuple(names))
 
 
@@ -211,9 +211,9 @@ def _pruned(context: SearchContext, current: FilteredSet) -> tuple[FilteredSet, 
         idle = [name for name in names if gains[name] < min_gains[name]]
         if not idle:
             break
-        least = min(idle, key=lambda name: gains[name] - min_gains[name])
-        names.remove(least)
-        lost += gains[least]
+        weakest = min(idle, key=lambda name: gains[name] - min_gains[name])
+        names.remove(weakest)
+        lost += gains[weakest]
     if len(names) == len(current.names):
         return current, gains
     theta = followed.theta.copy()
