@@ -354,15 +354,17 @@ class RobotModel:
         Raises:
             InputError: there is no such joint; the message lists the existing ones.
         """
-        found: Joint = self._find_by_name(
+        matching_joint: Joint = self._find_by_name(
             "joint", name, {joint.name: joint for joint in self.joints}
         )
-        return found
+        return matching_joint
 
     def actuator(self, name: str) -> Actuator:
         """Return the actuator with a name; errors as in `joint`."""
-        found: Actuator = self._find_by_name("actuator", name, {a.name: a for a in self.actuators})
-        return found
+        matching_actuator: Actuator = self._find_by_name(
+            "actuator", name, {a.name: a for a in self.actuators}
+        )
+        return matching_actuator
 
     def body(self, name: str) -> Body:
         """Return the body with a name, or the body into which a link with the name is fused.
@@ -372,8 +374,8 @@ class RobotModel:
         """
         bodies = {body.name: body for body in self.bodies}
         fused = (self.aliases or {}).get(name, name)
-        found: Body = self._find_by_name("body", fused if fused in bodies else name, bodies)
-        return found
+        matching_body: Body = self._find_by_name("body", fused if fused in bodies else name, bodies)
+        return matching_body
 
     def _find_by_name(self, kind: str, name: str, elements: Mapping[str, Any]) -> Any:
         """Return an element of the robot by name.
