@@ -38,12 +38,5 @@ class MagnusLift(Force):
             c: (K, L, 1) coefficients.
             moment: state snapshot of L batch elements.
         """
-        (horizontal_coefficient, vertical_coefficient), (vx, vy, vz) = c[:, :, 0], moment.v.T
-        return np.stack(
-            [
-                -horizontal_coefficient * vz - vertical_coefficient * vy,
-                vertical_coefficient * vx,
-                horizontal_coefficient * vx,
-            ],
-            axis=1,
-        )  # (1)
+        (level, upright), (vx, vy, vz) = c[:, :, 0], moment.v.T
+        return np.stack([-level * vz - upright * vy, upright * vx, level * vx], axis=1)  # (1)
