@@ -21,6 +21,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -43,6 +44,7 @@ from bench.diagnosis.fitting.fit_state import TrajectoryFit
 from bench.diagnosis.friction_form_verdict import soft_kind
 from bench.diagnosis.identifiability import listed
 from bench.diagnosis.kalman.candidate_responses import MAX_LINEARISATIONS, FollowedRuns
+from bench.diagnosis.kalman.joint_forces import compute_joint_forces, has_joint_forces
 from bench.diagnosis.kalman.likelihood_fit import maximise_likelihood
 from bench.diagnosis.prediction_error.effect_selection import identify
 from bench.diagnosis.prediction_error.joint_effects import MANY_SHAPES
@@ -52,6 +54,7 @@ from bench.diagnosis.search.candidate_directions import first_probes
 from bench.diagnosis.search.explained_variance import DirectionGroup
 from bench.diagnosis.search.lack_of_fit import list_hat_effects
 from sims.recording.recording import Recording, Run
+from sims.robot.robot_model import RobotModel
 from sims.robot.robot_simulator import RobotSimulator
 
 LOG_LIKELIHOOD_MARGIN = 20.0
@@ -94,6 +97,15 @@ MAX_REFINED = 4
 """Maximum number of hypotheses whose offsets are refined."""
 MAX_DIFFERENCES = 3
 """Maximum number of conventions that are searched one after another."""
+MIN_WORST_RUN_SHARE = 0.15
+"""Minimum gain in the run that the log as described explains worst, as a share of the margin."""
+MAX_FORCE_ERROR_GROWTH = 0.3
+"""Maximum growth of the logarithm of the missing joint forces for which a filter is run.
+
+The log-likelihood of a filter decreases by about this number for each sample.
+"""
+NEGLIGIBLE_FORCE = 1e-6
+"""Missing force of a joint that counts as none, in N or N m."""
 MIN_REFINEMENT_GAIN = 0.1
 """Minimum gain in log-likelihood of a step of the refinement."""
 FIRST_OFFSET_STEP = 0.3
@@ -241,6 +253,8 @@ class ConventionComparison:
         # Most hypotheses already fail on the run that the log as described explains worst.
         by_run = [self._evaluate(described, recording, run) for run in range(len(self._slices))]
         worst_run = int(np.argmin(by_run))
+        min_log_likelihood = by_run[worst_run] + MIN_WORST_RUN_SHARE * LOG_LIKELIHOOD_MARGIN
+        force_error = self._force_error(described, recording, worst_run)
         scored: dict[str, tuple[float, ConventionHypothesis]] = {}
         evaluated: list[object] = []
         for hypothesis in self._generator.generate(recording, suspects):
@@ -248,7 +262,10 @@ class ConventionComparison:
             if key in evaluated:
                 continue
             evaluated.append(key)
-            if not self._evaluate(hypothesis, recording, worst_run) > by_run[worst_run]:
+            growth = self._force_error(hypothesis, recording, worst_run) - force_error
+            if growth > MAX_FORCE_ERROR_GROWTH:
+                continue
+            if not self._evaluate(hypothesis, recording, worst_run) > min_log_likelihood:
                 continue
             score = self._evaluate(hypothesis, recording)
             # For several offsets of one signal, the best one is refined.
@@ -269,6 +286,27 @@ class ConventionComparison:
         first, *others = sorted(equal, key=lambda one: one.size)
         gain = best - limit + LOG_LIKELIHOOD_MARGIN
         return ConventionDifference(first, gain, tuple(others[: MAX_NAMED - 1]))
+
+    def _force_error(
+        self, hypothesis: ConventionHypothesis, recording: Recording, run: int
+    ) -> float:
+        """Return the logarithm of the joint forces that the drives lack on the short part of a run.
+
+        The forces are computed by inverse dynamics, and the logarithms of all joints are added. If
+        the forces cannot be computed, or the hypothesis is about another quantity than positions
+        and inputs, the result is minus infinity.
+        """
+        kind: Any = self.subject.kind
+        robot: RobotModel = kind.robot
+        names = [name for name in hypothesis.changes if name not in recording.runs[0].inputs]
+        if not all(name.startswith("q.") for name in names) or not has_joint_forces(
+            robot, recording
+        ):
+            return -np.inf
+        parts = self._parts(hypothesis.applied(recording), run)
+        forces = compute_joint_forces(robot, parts, parts.runs[0])
+        squares = np.square(forces.needed - forces.driven).mean(axis=0)
+        return float(0.5 * np.log(squares + NEGLIGIBLE_FORCE**2).sum())
 
     def _uses_inputs(
         self, score: float, hypothesis: ConventionHypothesis, recording: Recording
@@ -474,7 +512,8 @@ def _log_likelihood_of_soft_friction(followed: FollowedRuns) -> float:
     regression. The result is minus infinity without such an effect.
     """
     world = followed.world
-    thetas = [theta for _, theta in soft_friction_models(followed, world.get_nominal_theta())]
+    joint = followed.joints_by_loss[0]
+    thetas = soft_friction_models(followed, world.get_nominal_theta(), joint)
     if not thetas:
         return -np.inf
     simulator = world.simulator_of(soft_kind(world.kind))

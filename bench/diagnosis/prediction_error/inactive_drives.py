@@ -32,13 +32,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.diagnosis.kalman.measured_states import track_joints
-from bench.logs.quality.noise_estimation import estimate_noise
+from bench.diagnosis.kalman.joint_forces import (
+    JointForces,
+    compute_joint_forces,
+    has_joint_forces,
+)
 from sims.core.simulator import Array, Simulator
 from sims.recording.drive_switches import (
     DriveSwitch,
@@ -48,9 +50,6 @@ from sims.recording.drive_switches import (
     switched_runs,
 )
 from sims.recording.recording import Recording, Run
-from sims.robot.dynamics.activation_filters import activation_filters
-from sims.robot.dynamics.inverse_dynamics import motion_forces
-from sims.robot.robot_model import RobotModel
 
 Mask = NDArray[np.bool_]
 
@@ -85,27 +84,6 @@ MAX_SAMPLES = 20_000
 """Maximum number of samples at which forces are computed."""
 MIN_SCALE_SHARE = 1e-3
 """Minimum of the scale s, as a share of the force that the motion requires."""
-
-
-class JointForces(NamedTuple):
-    """Forces at the D joints of a robot in the T samples of a run, (T, D) each.
-
-    Attributes:
-        needed: forces that the measured motion requires.
-        driven: forces of the model's drives at the measured motion.
-        holding: forces that hold the joints still.
-        velocity: velocities of the joints.
-    """
-
-    needed: Array
-    driven: Array
-    holding: Array
-    velocity: Array
-
-    def residuals(self, joint: int) -> Array:
-        """Return the residuals (3, T) of the hypotheses (1) at a joint."""
-        needed = self.needed[:, joint]
-        return np.stack([needed - self.driven[:, joint], needed, needed - self.holding[:, joint]])
 
 
 @dataclass(frozen=True)
@@ -257,12 +235,14 @@ def inactive_drives(recording: Recording, kind: type[Simulator]) -> list[Inactiv
         base, or if joints are coupled by equalities.
     """
     robot = getattr(kind, "robot", None)
-    if not kind.has_model or robot is None or not _is_open_chain(robot, recording):
+    if not kind.has_model or robot is None or not has_joint_forces(robot, recording):
+        return []
+    if any(run.times.size <= 3 * MIN_SAMPLES for run in recording.runs):
         return []
     total = sum(run.times.size for run in recording.runs)
     every = -(-total // MAX_SAMPLES)
     with np.errstate(all="ignore"):
-        forces = [_forces(robot, recording, run) for run in _thinned(recording, every)]
+        forces = [compute_joint_forces(robot, recording, run) for run in _thinned(recording, every)]
     driven = [a for a in robot.actuators if a.joint is not None and a.kind != "other"]
     actuators = {
         number: tuple(a.name for a in driven if a.joint == joint.name)
@@ -293,96 +273,9 @@ def inactive_drives(recording: Recording, kind: type[Simulator]) -> list[Inactiv
     ]
 
 
-def _is_open_chain(robot: RobotModel, recording: Recording) -> bool:
-    """Return whether forces can be computed from the recorded positions."""
-    recorded = recording.runs[0].channels
-    singles = all(
-        joint.has_one_coordinate and f"q.{joint.name}" in recorded for joint in robot.joints
-    )
-    long = all(run.times.size > 3 * MIN_SAMPLES for run in recording.runs)
-    return singles and long and not robot.compiled.neq and bool(robot.actuators)
-
-
 def _thinned(recording: Recording, every: int) -> list[Run]:
     """Return every k-th sample of all runs."""
     return [run.part(slice(None, None, every)) for run in recording.runs]
-
-
-def _forces(robot: RobotModel, recording: Recording, run: Run) -> JointForces:
-    """Compute the forces f, τ and g of eq. (1) of a run by MuJoCo's inverse dynamics.
-
-    Positions, velocities and accelerations are estimated from the recorded positions first.
-    """
-    model = robot.compiled
-    states = np.stack(track_joints(run.times, _readings(robot, recording, run)))
-    motion = np.transpose(states, (2, 1, 0))
-    still = np.stack([motion[0], np.zeros_like(motion[0]), np.zeros_like(motion[0])])
-    controls, activations = _controls(robot, run)
-    applied = np.zeros(motion.shape[1:])
-    for column, joint in enumerate(robot.joints):
-        name = f"force.{joint.name}"
-        if name in run.inputs:
-            applied[:, column] = _mean_input(run, name)
-    needed, driven = motion_forces(model, robot.joints, motion, controls, activations)
-    holding, _ = motion_forces(model, robot.joints, still, controls, activations)
-    names = [joint.name for joint in robot.joints]
-    for name, off in run.off.items():
-        of = robot.actuator(name).joint
-        if of is not None:
-            # Where the drive is known to be off, both hypotheses agree.
-            driven[off, names.index(of)] = 0.0
-    return JointForces(needed - applied, driven, holding - applied, motion[1])
-
-
-def _readings(robot: RobotModel, recording: Recording, run: Run) -> list[tuple[Array, Array]]:
-    """Return for each joint its recorded positions and velocities (T, 2), and their noise (2,).
-
-    A velocity that is not recorded is NaN. Noise that is not stated is estimated.
-    """
-    readings = []
-    for joint in robot.joints:
-        columns, noise = [], []
-        for name in (f"q.{joint.name}", f"qd.{joint.name}"):
-            values = run.channels.get(name, np.full(run.times.size, np.nan))
-            columns.append(values)
-            sigma = recording.noise.get(name, 0.0)
-            if not sigma > 0 and name in run.channels:
-                sigma = estimate_noise([(run.times, values)]).sigma
-            noise.append(sigma if np.isfinite(sigma) and sigma > 0 else 1e-6)
-        readings.append((np.stack(columns, axis=1), np.array(noise)))
-    return readings
-
-
-def _mean_input(run: Run, name: str) -> Array:
-    """Return an input (T,) at each sample: the mean of its values before and after the sample."""
-    values = run.inputs[name]
-    if name in run.linear:
-        return values
-    earlier = np.concatenate([values[:1], values[:-1]])
-    mean: Array = 0.5 * (values + earlier)
-    return mean
-
-
-def _controls(robot: RobotModel, run: Run) -> tuple[Array, Array]:
-    """Return the controls (T, nu) and filtered activations (T, na) of a run at its samples.
-
-    nu and na are MuJoCo's numbers of actuators and of activation states.
-    """
-    model = robot.compiled
-    controls = np.zeros((run.times.size, model.nu))
-    activations = np.zeros((run.times.size, model.na))
-    for actuator in robot.actuators:
-        name = f"u.{actuator.name}"
-        if name in run.inputs:
-            controls[:, actuator.control] = _mean_input(run, name)
-    steps = np.diff(run.times)
-    for one in activation_filters(robot):
-        taken = one.clipped(controls[:, one.actuator.control])
-        now = float(taken[0])
-        for k, kept in enumerate(np.exp(-np.append(steps, 0.0) / max(one.seconds, 1e-9)).tolist()):
-            activations[k, one.address] = now
-            now = taken[k] + kept * (now - taken[k])
-    return controls, activations
 
 
 class _Stretches:

@@ -1,0 +1,128 @@
+"""Joint forces that a measured motion requires, and those that the model's drives exert.
+
+Positions, velocities and accelerations are estimated from the readings alone (`measured_states`).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from bench.diagnosis.kalman.measured_states import track_joints
+from bench.logs.quality.noise_estimation import estimate_noise
+from sims.core.simulator import Array
+from sims.recording.recording import Recording, Run
+from sims.robot.dynamics.activation_filters import activation_filters
+from sims.robot.dynamics.inverse_dynamics import motion_forces
+from sims.robot.robot_model import RobotModel
+
+
+class JointForces(NamedTuple):
+    """Forces at the D joints of a robot in the T samples of a run, (T, D) each.
+
+    Attributes:
+        needed: forces that the measured motion requires.
+        driven: forces of the model's drives at the measured motion.
+        holding: forces that hold the joints still.
+        velocity: velocities of the joints.
+    """
+
+    needed: Array
+    driven: Array
+    holding: Array
+    velocity: Array
+
+    def residuals(self, joint: int) -> Array:
+        """Return the residuals (3, T) at a joint of a drive that is on, off, or held by a brake."""
+        needed = self.needed[:, joint]
+        return np.stack([needed - self.driven[:, joint], needed, needed - self.holding[:, joint]])
+
+
+def has_joint_forces(robot: RobotModel, recording: Recording) -> bool:
+    """Return whether joint forces can be computed from the recorded positions.
+
+    All joints must be recorded, and have one coordinate each; none is coupled by an equality.
+    """
+    recorded = recording.runs[0].channels
+    singles = all(
+        joint.has_one_coordinate and f"q.{joint.name}" in recorded for joint in robot.joints
+    )
+    return singles and not robot.compiled.neq and bool(robot.actuators)
+
+
+def compute_joint_forces(robot: RobotModel, recording: Recording, run: Run) -> JointForces:
+    """Compute the joint forces of a run by MuJoCo's inverse dynamics.
+
+    Positions, velocities and accelerations are estimated from the recorded positions first.
+    """
+    model = robot.compiled
+    states = np.stack(track_joints(run.times, _readings(robot, recording, run)))
+    motion = np.transpose(states, (2, 1, 0))
+    still = np.stack([motion[0], np.zeros_like(motion[0]), np.zeros_like(motion[0])])
+    controls, activations = _controls(robot, run)
+    applied = np.zeros(motion.shape[1:])
+    for column, joint in enumerate(robot.joints):
+        name = f"force.{joint.name}"
+        if name in run.inputs:
+            applied[:, column] = _mean_input(run, name)
+    needed, driven = motion_forces(model, robot.joints, motion, controls, activations)
+    holding, _ = motion_forces(model, robot.joints, still, controls, activations)
+    names = [joint.name for joint in robot.joints]
+    for name, off in run.off.items():
+        of = robot.actuator(name).joint
+        if of is not None:
+            # Where the drive is known to be off, both hypotheses agree.
+            driven[off, names.index(of)] = 0.0
+    return JointForces(needed - applied, driven, holding - applied, motion[1])
+
+
+def _readings(robot: RobotModel, recording: Recording, run: Run) -> list[tuple[Array, Array]]:
+    """Return for each joint its recorded positions and velocities (T, 2), and their noise (2,).
+
+    A velocity that is not recorded is NaN. Noise that is not stated is estimated.
+    """
+    readings = []
+    for joint in robot.joints:
+        columns, noise = [], []
+        for name in (f"q.{joint.name}", f"qd.{joint.name}"):
+            values = run.channels.get(name, np.full(run.times.size, np.nan))
+            columns.append(values)
+            sigma = recording.noise.get(name, 0.0)
+            if not sigma > 0 and name in run.channels:
+                sigma = estimate_noise([(run.times, values)]).sigma
+            noise.append(sigma if np.isfinite(sigma) and sigma > 0 else 1e-6)
+        readings.append((np.stack(columns, axis=1), np.array(noise)))
+    return readings
+
+
+def _mean_input(run: Run, name: str) -> Array:
+    """Return an input (T,) at each sample: the mean of its values before and after the sample."""
+    values = run.inputs[name]
+    if name in run.linear:
+        return values
+    earlier = np.concatenate([values[:1], values[:-1]])
+    mean: Array = 0.5 * (values + earlier)
+    return mean
+
+
+def _controls(robot: RobotModel, run: Run) -> tuple[Array, Array]:
+    """Return the controls (T, nu) and filtered activations (T, na) of a run at its samples.
+
+    nu and na are MuJoCo's numbers of actuators and of activation states.
+    """
+    model = robot.compiled
+    controls = np.zeros((run.times.size, model.nu))
+    activations = np.zeros((run.times.size, model.na))
+    for actuator in robot.actuators:
+        name = f"u.{actuator.name}"
+        if name in run.inputs:
+            controls[:, actuator.control] = _mean_input(run, name)
+    steps = np.diff(run.times)
+    for one in activation_filters(robot):
+        taken = one.clipped(controls[:, one.actuator.control])
+        now = float(taken[0])
+        for k, kept in enumerate(np.exp(-np.append(steps, 0.0) / max(one.seconds, 1e-9)).tolist()):
+            activations[k, one.address] = now
+            now = taken[k] + kept * (now - taken[k])
+    return controls, activations
