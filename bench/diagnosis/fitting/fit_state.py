@@ -40,10 +40,11 @@ A share of the sum of squares, `RELATIVE_CONVERGENCE_TOLERANCE` or `COARSE_SHARE
 """
 RELATIVE_CONVERGENCE_TOLERANCE = 1e-4
 """Convergence threshold as a share of the sum of squares, added to `CONVERGENCE_TOLERANCE`."""
-FINAL_CONVERGENCE_TOLERANCE = 0.002
-"""Convergence threshold of fits whose parameters are reported, in units of the noise.
+FINAL_CONVERGENCE_TOLERANCE, ROUGH_FINAL_TOLERANCE = 0.002, 0.01
+"""Convergence thresholds of fits whose parameters are reported, in units of the noise.
 
-Parameters are then within a twentieth of a standard error of the optimum.
+Parameters are then within a twentieth of a standard error of the optimum. The second threshold is
+for a cost that is not smooth: within a tenth of a standard error.
 """
 
 # The cost of a robot fit is not smooth: a joint that sticks one integration step later changes it
@@ -57,9 +58,10 @@ STAGNANT_RATIO = 0.3
 STAGNANT_SHARE = 5e-3
 """Maximum gain of a step that ends a fit far from the data, as a share of the sum of squares."""
 ROUGHNESS = 3.0
-"""Maximum predicted decrease, in units of the noise, at which a rejected step ends a rough fit.
+"""Maximum predicted decrease, in units of the noise, at which a bad step ends a rough fit.
 
-It applies to steps with derivatives of the present point.
+A bad step has derivatives of the present point, and is rejected or gains far more or less than
+predicted.
 """
 EXACT_ROUGHNESS = 1.0
 """Value that replaces `ROUGHNESS` in fits whose parameters are reported."""
@@ -124,12 +126,15 @@ class FitStart:
         theta: (P,) parameters.
         states: (R, s) initial states.
         known: derivatives that are known near the start, if any.
+        by_states: (R, T, C, s) derivatives by initial states about a model near the start; None to
+            use those that all models share.
     """
 
     effects: tuple[str, ...]
     theta: Array
     states: Array
     known: KnownJacobian | None = None
+    by_states: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -239,7 +244,7 @@ class FitState:
         A fit whose parameters are reported has only a smaller absolute part.
         """
         if self.is_final_fit:
-            return FINAL_CONVERGENCE_TOLERANCE
+            return ROUGH_FINAL_TOLERANCE if self.rough else FINAL_CONVERGENCE_TOLERANCE
         return (
             CONVERGENCE_TOLERANCE
             + (COARSE_SHARE if self._is_far(cost) else RELATIVE_CONVERGENCE_TOLERANCE) * cost
@@ -251,6 +256,10 @@ class FitState:
         The cost of such a fit changes by jumps that are larger than the remaining gain.
         """
         return self.rough and cost > FAR * self.samples
+
+    def _is_rough_at(self, decrease: float) -> bool:
+        """Return whether the cost is not smooth at the scale of a decrease."""
+        return self.rough and decrease < (EXACT_ROUGHNESS if self.is_final_fit else ROUGHNESS)
 
     def make_fit(self) -> TrajectoryFit:
         """Return the best point so far as a fitted model."""
@@ -335,6 +344,9 @@ class FitState:
         is_stagnant = ratio < STAGNANT_RATIO and decrease < STAGNANT_SHARE * cost
         if is_own_jacobian and not self.is_final_fit and is_stagnant and self._is_far(cost):
             self.is_finished = True
+        unpredicted = abs(ratio - 1.0) > JACOBIAN_REUSE_TOLERANCE
+        if own and unpredicted and self._is_rough_at(max(gained, self.predicted_decrease)):
+            self.is_finished = True
         # With derivatives of the present point the fit has converged; with others it may have.
         if decrease < self.get_tolerance(cost):
             self.mark_converged()
@@ -348,9 +360,7 @@ class FitState:
         if not self.has_own_jacobian:
             self.is_jacobian_stale = True
             return
-        if self.rough and self.predicted_decrease < (
-            EXACT_ROUGHNESS if self.is_final_fit else ROUGHNESS
-        ):
+        if self._is_rough_at(self.predicted_decrease):
             self.is_finished = True
             return
         self.damping = self.damping * INITIAL_DAMPING_GROWTH * self.growth

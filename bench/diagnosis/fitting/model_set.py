@@ -165,6 +165,10 @@ class ModelSet:
         )  # (1)
         return FittedModel(fit, likelihood, penalised_likelihood)
 
+    def make_final_start(self, model: FittedModel) -> FitStart:
+        """Return the start of a fit to final convergence; a subclass may add known derivatives."""
+        return model.fit.make_start()
+
     def with_sensitivities(self, start: FitStart) -> FitStart:
         """Return the start with derivatives that are known near it, to save their computation.
 
@@ -206,6 +210,7 @@ class ModelSet:
         noise: NoiseModel | None = None,
         is_staged: bool = False,
         race: bool = True,
+        iterations: int = MAX_ITERATIONS,
     ) -> None:
         """Fit models from their starts and store them.
 
@@ -215,6 +220,7 @@ class ModelSet:
             is_staged: whether to fit the beginnings of the runs first, as in the base fit, and
                 continue with the best models.
             race: whether to stop fits that fall far behind.
+            iterations: maximum number of steps of each fit.
         """
         watch = self.world.watch
         watch.report_and_check(f"refit of {_format_starts(starts)}")
@@ -228,24 +234,30 @@ class ModelSet:
         fitter = TrajectoryFitter(self.world, noise, self.frozen)
         watch.stage(_fitting(starts), len(starts))
         for fit in fitter.fit_models(
-            starts, MAX_ITERATIONS, race=race, lowest_cost=lowest_cost, finished=watch.advance
+            starts, iterations, race=race, lowest_cost=lowest_cost, finished=watch.advance
         ):
             self.add_fit(fit)
         # A fit that was stopped early is stored, but not evaluated.
         watch.check_not_stopped()
         self._report_best()
 
-    def fit_all(self, starts: Sequence[FitStart]) -> list[FittedModel]:
+    def fit_all(
+        self, starts: Sequence[FitStart], iterations: int = MAX_ITERATIONS
+    ) -> list[FittedModel]:
         """Fit models from their starts together, and return the best known fit of each.
 
         Unlike in `refit_models`, no fit is stopped because another one is better.
+
+        Args:
+            starts: starts of the fits.
+            iterations: maximum number of steps of each fit.
         """
-        self.refit_models(starts, race=False)
+        self.refit_models(starts, race=False, iterations=iterations)
         return [self.models[frozenset(start.effects)] for start in starts]
 
-    def fit_one(self, start: FitStart) -> FittedModel:
+    def fit_one(self, start: FitStart, iterations: int = MAX_ITERATIONS) -> FittedModel:
         """Fit a model from a start, and return the best known fit with the same effects."""
-        return self.fit_all([start])[0]
+        return self.fit_all([start], iterations)[0]
 
     def _report_best(self) -> None:
         """Report the effects of the best model, and how much they explain, to the display.
@@ -305,7 +317,7 @@ class ModelSet:
                 np.maximum(sigma, MIN_SIGMA_SHARE * self.noise.sigma), likelihood.phi
             )
             fitter = TrajectoryFitter(self.world, noise, self.frozen, exact=True)
-            (fit,) = fitter.fit_models([model.fit.make_start()], MAX_ITERATIONS)
+            (fit,) = fitter.fit_models([self.make_final_start(model)], MAX_ITERATIONS)
             if self.world.watch.has_abandoned_fits():
                 break
             refitted = self._of(replace(fit, cost=squares(fit)))

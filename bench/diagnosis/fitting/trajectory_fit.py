@@ -325,7 +325,7 @@ class TrajectoryFitter:
         # A start may have a size from a score test, or come from wider bounds.
         theta = start.theta.copy()
         theta[free] = np.clip(theta[free], low, high)
-        clipped_start = FitStart(start.effects, theta, start.states.copy(), start.known)
+        clipped_start = replace(start, theta=theta, states=start.states.copy())
         return FitState(
             point=FitPoint(clipped_start, np.empty(0), np.empty(0), np.inf),
             free=np.array(free, dtype=np.intp),
@@ -336,6 +336,7 @@ class TrajectoryFitter:
             is_final_fit=self.exact,
             rough=world.has_linearisation,
             samples=int(world.get_sample_mask(self.share).sum()),
+            by_states=start.by_states,
         )
 
     def _points(self, trials: Sequence[_TrialStep], sample_mask: Mask) -> list[FitPoint]:
