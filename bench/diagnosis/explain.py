@@ -413,6 +413,7 @@ class _ExplainRun:
         if not self.kind.has_model:
             return _Found(base, search, self._finding(search), rng)
         # This import is needed for robots only.
+        from bench.diagnosis.prediction_error.prediction_error_search import PredictionErrorSearch
         from bench.diagnosis.prediction_error.selection_fits import SoftFrictionError
 
         stiff = _Worlds(self.kind, self.fitting, self.validation)
@@ -438,6 +439,8 @@ class _ExplainRun:
         before = self.assessor.before
         self._return(stiff, before)
         again = self._search(base, rng, is_form_given=True)
+        if isinstance(search, PredictionErrorSearch) and isinstance(again, PredictionErrorSearch):
+            again.take_over(search)
         try:
             return _Found(base, again, self._finding(again), rng)
         except SoftFrictionError as error:
@@ -503,8 +506,8 @@ class _ExplainRun:
         search = self._search(base, rng)
         if isinstance(search, PredictionErrorSearch) and isinstance(before, PredictionErrorSearch):
             search.likely = likely
-            robot: Any = self.kind
-            if not robot.robot.compiled.dof_frictionloss.any():
+            # Friction of the file keeps its form unless it is a free number.
+            if not has_dry_friction(self.fitting, ()):
                 search.take_over(before)
         return _Found(base, search, self._finding(search), rng)
 
@@ -671,7 +674,8 @@ class _ExplainRun:
         for world in held_out:
             # Held-out runs are only simulated; without a filter they begin at their measured
             # values.
-            found = FollowedRuns.follow(world, world.get_nominal_theta(), self.noise)
+            theta = world.get_nominal_theta()
+            found = FollowedRuns.follow(world, theta, self.noise, max_linearisations=1)
             if found.is_sound:
                 world.follow(found)
 

@@ -338,18 +338,13 @@ def compute_applied_inputs(
             continue
         starts = np.where(is_acting, effect.times(c, starts), starts)
         end = np.where(is_acting, effect.times(c, end), end)
-    # Forwards with the values.
-    means = _average_command(runs, first, commands, starts, end, plan.has_uniform_steps)
+    # Forwards with the values. Rows that share their memory are equal.
+    uniform = plan.has_uniform_steps or end.strides[0] == 0
+    means = _average_command(runs, first, commands, starts, end, uniform)
     for effect, c, is_acting in effects:
         if isinstance(effect, Input) and effect.between:
             other_means = _average_command(
-                runs,
-                first,
-                commands,
-                starts,
-                end,
-                plan.has_uniform_steps,
-                is_other_interpolation=True,
+                runs, first, commands, starts, end, uniform, is_other_interpolation=True
             )
             means = np.where(is_acting, means + c[0] * (other_means - means), means)
     pairs = zip(runs.unique_scenarios, commands, strict=True)
@@ -408,8 +403,9 @@ def _apply_input_effects(
     Returns:
         Applied values (L, S).
     """
-    last_steps = _find_last_nonzero_step(steps)
-    values = np.take_along_axis(means, last_steps, axis=1)
+    distinct_steps = steps[:1] if steps.strides[0] == 0 else steps
+    last_steps = None if (distinct_steps > 0).all() else _find_last_nonzero_step(steps)
+    values = means.copy() if last_steps is None else np.take_along_axis(means, last_steps, axis=1)
     start = start.copy()
     for effect, c, is_acting in effects:
         assert isinstance(effect, Input)
@@ -419,7 +415,9 @@ def _apply_input_effects(
         zeros = np.zeros_like(begin)
         signal = Signal(values[elements], steps[elements], begin, ends[elements])
         result = effect.feel(coefficients, signal)
-        values[elements] = np.take_along_axis(result, last_steps[elements], axis=1)
+        if last_steps is not None:
+            result = np.take_along_axis(result, last_steps[elements], axis=1)
+        values[elements] = result
         start[elements] = effect.feel(coefficients, Signal(begin, zeros, begin, zeros))
     return values
 

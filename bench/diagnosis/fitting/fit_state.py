@@ -344,8 +344,9 @@ class FitState:
         is_stagnant = ratio < STAGNANT_RATIO and decrease < STAGNANT_SHARE * cost
         if is_own_jacobian and not self.is_final_fit and is_stagnant and self._is_far(cost):
             self.is_finished = True
-        unpredicted = abs(ratio - 1.0) > JACOBIAN_REUSE_TOLERANCE
-        if own and unpredicted and self._is_rough_at(max(gained, self.predicted_decrease)):
+        is_predicted = abs(ratio - 1.0) <= JACOBIAN_REUSE_TOLERANCE
+        largest = max(decrease, self.predicted_decrease)
+        if is_own_jacobian and not is_predicted and self._is_rough_at(largest):
             self.is_finished = True
         # With derivatives of the present point the fit has converged; with others it may have.
         if decrease < self.get_tolerance(cost):

@@ -40,6 +40,7 @@ from bench.diagnosis.search.candidate_directions import CandidateDirection
 from sims.core.effect import Effect
 from sims.core.simulator import Array
 from sims.robot.dynamics.measured_linearisation import MeasuredLinear, SingleArray, Trajectory
+from sims.robot.dynamics.run_linearisation import compute_control_changes
 from sims.robot.places.typical_forces import compute_floating_forces, compute_joint_scales
 from sims.robot.robot_simulator import RobotSimulator
 
@@ -190,7 +191,10 @@ class FollowedRuns:
         return best
 
     def with_parameters(
-        self, theta: Array, simulator: RobotSimulator | None = None, is_alike: bool = False
+        self,
+        theta: Array,
+        simulator: RobotSimulator | None = None,
+        alike: FollowedRuns | None = None,
     ) -> FollowedRuns:
         """Return the filter of a model with other parameters.
 
@@ -200,12 +204,15 @@ class FollowedRuns:
         Args:
             theta: (P,) the parameters.
             simulator: simulator to use instead of that of the world.
-            is_alike: whether the Jacobians of this filter are reused.
+            alike: filter of a similar model, whose Jacobians are reused.
         """
         linear = [
-            _linearised(self.world, theta, self.noise, run, motion, neighbour, simulator, is_alike)
+            _linearised(
+                *(self.world, theta, self.noise, run, motion, neighbour, simulator),
+                is_alike=alike is not None,
+            )
             for run, (motion, neighbour) in enumerate(
-                zip(self.trajectories, self.linear, strict=True)
+                zip(self.trajectories, (alike or self).linear, strict=True)
             )
         ]
         given = self.noise, linear, self.force, self.typical
@@ -361,9 +368,10 @@ class FollowedRuns:
         inputs = self.runs.inputs.shape[3]
         pushed = np.zeros((number, samples - 1, inputs, len(effects)), dtype=np.float32)
         readings = np.zeros((number, samples, channels, len(effects)), dtype=np.float32)
-        for run, linear in enumerate(self.linear):
+        changes = compute_control_changes(self.linear, effects)
+        for run, (linear, driven) in enumerate(zip(self.linear, changes, strict=True)):
             predicted = self.filtered.predicted[run, : linear.knots.size, : self.runs.prior.size]
-            run_pushed, run_readings = linear.added(effects, np.nan_to_num(predicted))
+            run_pushed, run_readings = linear.added(effects, np.nan_to_num(predicted), driven)
             pushed[run, : run_pushed.shape[0]] = run_pushed
             readings[run, : run_readings.shape[0]] = run_readings
         readings[~self.runs.recorded] = 0.0

@@ -57,6 +57,7 @@ class EffectProposals:
     filters: ModelFilters
     columns: LibraryColumns
     _for_base: dict[int, tuple[Proposals, Proposals]] = field(default_factory=dict)
+    _base_steps: dict[str, tuple[Array, float]] = field(default_factory=dict)
 
     def of(
         self, current: FilteredSet, max_joint_proposals: int = MAX_JOINT_PROPOSALS
@@ -91,7 +92,10 @@ class EffectProposals:
         The innovations (one-step prediction errors) of the filter with the set `current` are
         regressed on the responses to each effect.
         """
-        regression, _ = regression_about(current, self.columns.library, current.followed)
+        if current.names:
+            regression, _ = regression_about(current, self.columns.library, current.followed)
+        else:
+            regression = self.columns.base_regression
         gains = regression.net_gains()
         proposals: dict[str, Array] = {}
         for i in np.argsort(-gains, kind="stable").tolist():
@@ -141,17 +145,11 @@ class EffectProposals:
                 compute_joint_scales(world.simulator.robot).inertia[joint]
             ),
         }
-        effects = [f"{effect}@{place}" for effect in JOINT_MODEL]
-        servo = servo_input(world, joint).removeprefix("u.")
-        effects += [f"{effect}@{servo}" for effect in SERVO_MODEL]
         proposals = []
-        for name in effects:
-            if name in world.library and name not in excluded:
-                places, bounds = (
-                    world.get_coefficient_indices(name),
-                    compute_coefficient_bounds(world, name),
-                )
-                step, gain = gauss_newton_step(followed, places, bounds)
+        for name in self._effects_at(joint):
+            if name not in excluded:
+                places = world.get_coefficient_indices(name)
+                step, gain = self._gauss_newton_step(followed, name)
                 change = float(step[places[0]])
                 # If much process noise hides an effect, its typical size is tried.
                 if not gain > 0.5 * self.filters.penalty(name):
@@ -159,6 +157,44 @@ class EffectProposals:
                 proposals.append((gain, name, np.array([change])))
         proposals.sort(key=lambda one: -one[0])
         return [(name, c) for _, name, c in proposals]
+
+    def largest_gain_of_others(self, friction: str) -> float:
+        """Return the largest gain in log-likelihood by another effect where dry friction acts.
+
+        The effects are those of the joint and servo models at the same joint, alone and added to
+        the base model; the gains are those that a Gauss-Newton step predicts.
+
+        Args:
+            friction: name of the dry friction.
+        """
+        world, base = self.filters.world, self.filters.base
+        place = friction.partition("@")[2]
+        joints = len(world.simulator.system.coordinates)
+        joint = next(j for j in range(joints) if joint_name(world, j) == place)
+        others = [name for name in self._effects_at(joint) if name != friction]
+        return max((self._gauss_newton_step(base, name)[1] for name in others), default=0.0)
+
+    def _effects_at(self, joint: int) -> list[str]:
+        """Return the effects of the joint model of a joint, and of the model of its servo."""
+        world = self.filters.world
+        place, servo = joint_name(world, joint), servo_input(world, joint).removeprefix("u.")
+        names = [f"{effect}@{place}" for effect in JOINT_MODEL]
+        names += [f"{effect}@{servo}" for effect in SERVO_MODEL]
+        return [name for name in names if name in world.library]
+
+    def _gauss_newton_step(self, followed: FollowedRuns, name: str) -> tuple[Array, float]:
+        """Return the Gauss-Newton step of an effect alone, cached for the base model."""
+        if followed is self.filters.base and name in self._base_steps:
+            return self._base_steps[name]
+        world = self.filters.world
+        places, bounds = (
+            world.get_coefficient_indices(name),
+            compute_coefficient_bounds(world, name),
+        )
+        found = gauss_newton_step(followed, places, bounds)
+        if followed is self.filters.base:
+            self._base_steps[name] = found
+        return found
 
 
 @dataclass(frozen=True)

@@ -63,19 +63,21 @@ def shows_step_errors(followed: FollowedRuns) -> bool:
     return regress(followed, followed.columns([])).shows_nuisance([])
 
 
-def identify(followed: FollowedRuns, columns: Columns) -> Selected:
+def identify(followed: FollowedRuns, columns: Columns, first: Regression | None = None) -> Selected:
     """Select effects, with the process noise fitted again after each selection.
 
     Args:
         followed: the runs, without any effect.
         columns: inputs of the candidates.
+        first: regression of these runs on the columns, if it is known.
     """
     refitted, selected_before = followed, list[DirectionGroup]()
     coefficients: list[Array] = []
     result: Selected | None = None
     numerics = 0.0
     for _ in range(PASSES):
-        regression = regress(refitted, columns, selected_before, coefficients, numerics)
+        regression = first or regress(refitted, columns, selected_before, coefficients, numerics)
+        first = None
         selected = regression.pruned(selected_before) if selected_before else []
         selected = regression.select(MOST, selected)
         _, new_coefficients = regression.solve(selected)

@@ -57,8 +57,9 @@ class LibraryColumns:
 
     filters: ModelFilters
     _library: Columns | None = None
+    _base_regression: tuple[Columns, Regression] | None = None
     _hats: Columns | None = None
-    _regressions: dict[bytes, ModelRegression] = field(default_factory=dict)
+    _regressions: dict[tuple[str, ...], tuple[Array, ModelRegression]] = field(default_factory=dict)
 
     @property
     def library(self) -> Columns:
@@ -69,6 +70,14 @@ class LibraryColumns:
             world.watch.stage(f"testing {len(names)} effects", 1)
             self._library = self.filters.base.columns(self.probes(names))
         return self._library
+
+    @property
+    def base_regression(self) -> Regression:
+        """Regression of the innovations of the base model on the candidates of the library."""
+        library = self.library
+        if self._base_regression is None or self._base_regression[0] is not library:
+            self._base_regression = library, regress(self.filters.base, library)
+        return self._base_regression[1]
 
     @property
     def hats(self) -> Columns:
@@ -82,6 +91,7 @@ class LibraryColumns:
     def take_over(self, other: LibraryColumns) -> None:
         """Reuse the columns of another search of the same runs."""
         self._library, self._hats = other._library, other._hats
+        self._base_regression = other._base_regression
 
     def add(self, names: Sequence[str]) -> None:
         """Add effects to the candidates of the library."""
@@ -106,7 +116,7 @@ class LibraryColumns:
         """Select effects of the library by regression."""
         library = self.library
         self.filters.world.watch.stage("selecting effects", 1)
-        selected = identify(self.filters.base, library)
+        selected = identify(self.filters.base, library, self.base_regression)
         self.filters.numerics = selected.numerics
         return selected
 
@@ -134,14 +144,20 @@ class LibraryColumns:
     def regression(self, model: FittedModel) -> ModelRegression:
         """Return the regression with the effects of a fitted model in the filter's model.
 
-        The candidates are the library and forces of any shape.
+        The candidates are the library and forces of any shape. The derivatives by the coefficients
+        of the model are part of every set, so that a regression about nearly the same coefficients
+        gives the same gains to first order.
         """
-        key = model.fit.theta.tobytes()
-        if key not in self._regressions:
-            current = FilteredSet(self.filters.of_model(model), model.effects)
-            columns = self.library.joined(self.hats)
-            self._regressions[key] = regression_about(current, columns, self.filters.base)
-        return self._regressions[key]
+        theta, names = model.fit.theta, model.effects
+        if names in self._regressions:
+            known, regression = self._regressions[names]
+            if (np.abs(theta - known) <= RELATIVE_DIFFERENCE * np.abs(known)).all():
+                return regression
+        current = FilteredSet(self.filters.of_model(model), names)
+        columns = self.library.joined(self.hats)
+        regression = regression_about(current, columns, self.filters.base)
+        self._regressions[names] = theta, regression
+        return regression
 
     def sensitivities(self, start: FitStart) -> KnownJacobian:
         """Return the derivatives of the runs by the coefficients of a model's effects.

@@ -65,9 +65,15 @@ class ModelFilters:
     _of_sets: dict[frozenset[str], FollowedRuns] = field(default_factory=dict)
     _of_tried: dict[bytes, FollowedRuns] = field(default_factory=dict)
     _likelihoods: dict[tuple[bytes, bool], float] = field(default_factory=dict)
+    _soft_friction: dict[tuple[str, float], FitStart | None] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.world, self.noise = self.models.world, self.models.noise
+
+    def take_over(self, other: ModelFilters) -> None:
+        """Reuse the likelihoods that another search of the same models has computed."""
+        self._likelihoods = other._likelihoods
+        self._soft_friction = other._soft_friction
 
     @cached_property
     def reference(self) -> Array:
@@ -114,13 +120,17 @@ class ModelFilters:
             same_effects = self._of_sets.get(names)
             followed = (same_effects or self.base).with_parameters(model.fit.theta)
             if same_effects is None:
-                followed = followed.with_parameters(model.fit.theta, is_alike=True)
+                followed = followed.with_parameters(model.fit.theta, alike=followed)
             self._of_sets[names] = followed
             if self.numerics:
                 defects = followed.runs.defects - self.numerics * followed.runs.step_errors
                 followed = followed.refitted(replace(followed.runs, defects=defects))
             self._of_models[key] = followed
         return self._of_models[key]
+
+    def near_model(self, model: FittedModel) -> FollowedRuns:
+        """Return a filter with the effects of a fitted model, perhaps with other coefficients."""
+        return self._of_sets.get(frozenset(model.effects)) or self.of_model(model)
 
     def log_likelihood(self, theta: Array, is_soft: bool = False) -> float:
         """Return the log-likelihood of the innovations of a model.
@@ -130,6 +140,8 @@ class ModelFilters:
             is_soft: whether effects add dry friction in MuJoCo's soft form, whatever the form of
                 the search.
         """
+        if not is_soft and np.array_equal(theta, self.base.theta):
+            return self.base.log_likelihood
         key = theta.tobytes(), is_soft
         if key not in self._likelihoods:
             simulator = self._soft_simulator if is_soft else None
@@ -186,18 +198,46 @@ class ModelFilters:
         """Whether effects add dry friction in MuJoCo's soft form."""
         return has_soft_form(self.world)
 
-    @cached_property
-    def soft_friction(self) -> FitStart | None:
-        """The likeliest model of dry friction in MuJoCo's soft form; None if not in the library.
+    def soft_friction(self, name: str, sign: float) -> FitStart | None:
+        """Return the likeliest model of dry friction in MuJoCo's soft form, by filters.
 
-        It acts at the joint with the largest missing force; the likelihood is that of filters.
+        The likelihood has one maximum over the force, which is searched from the middle.
+
+        Args:
+            name: dry friction at a joint.
+            sign: 1 for more friction than in the model file, -1 for less.
+
+        Returns:
+            The model; None if friction is already soft.
         """
-        models = soft_friction_models(self.base, self.reference)
+        if (name, sign) not in self._soft_friction:
+            self._soft_friction[name, sign] = self._find_soft_friction(name, sign)
+        return self._soft_friction[name, sign]
+
+    def _find_soft_friction(self, name: str, sign: float) -> FitStart | None:
+        """Search the force of the model that `soft_friction` returns."""
+        joint = name.partition("@")[2]
+        numbers = {joint_name(self.world, j): j for j in range(self.base.force.size)}
+        models = soft_friction_models(self.base, self.reference, numbers[joint], sign)
         if not models:
             return None
-        states = self.first_states(self.base)
-        starts = [FitStart((name,), theta, states) for name, theta in models]
-        return max(starts, key=lambda start: self.log_likelihood(start.theta, is_soft=True))
+        followed: dict[int, FollowedRuns] = {}
+
+        def log_likelihood(k: int) -> float:
+            if k not in followed:
+                # Jacobians depend little on the force.
+                alike = next(iter(followed.values()), None)
+                theta = models[k]
+                followed[k] = self.base.with_parameters(theta, self._soft_simulator, alike)
+                self._likelihoods[theta.tobytes(), True] = followed[k].log_likelihood
+            return followed[k].log_likelihood
+
+        middle = len(models) // 2
+        step = 1 if log_likelihood(middle) > log_likelihood(middle - 1) else -1
+        best = middle if step > 0 else middle - 1
+        while 0 <= best + step < len(models) and log_likelihood(best + step) > log_likelihood(best):
+            best += step
+        return FitStart((name,), models[best], self.first_states(self.base))
 
     @cached_property
     def _soft_simulator(self) -> RobotSimulator:
@@ -207,8 +247,10 @@ class ModelFilters:
         return simulator
 
 
-def soft_friction_models(followed: FollowedRuns, theta: Array) -> list[tuple[str, Array]]:
-    """Return models with dry friction of several sizes at the joint with the largest missing force.
+def soft_friction_models(
+    followed: FollowedRuns, theta: Array, joint: int, sign: float = 1.0
+) -> list[Array]:
+    """Return models with dry friction of several sizes at a joint.
 
     They are for a simulator with MuJoCo's soft form. The list is empty if the library has no such
     effect, or if friction is already soft.
@@ -216,19 +258,21 @@ def soft_friction_models(followed: FollowedRuns, theta: Array) -> list[tuple[str
     Args:
         followed: the runs, without the effect.
         theta: (P,) parameters without the effect.
+        joint: index of the joint.
+        sign: 1 for more friction than in the model file, -1 for less.
 
     Returns:
-        The effect and the parameters (P,) of each model.
+        The parameters (P,) of each model, in ascending order of the size.
     """
-    world, joint = followed.world, followed.joints_by_loss[0]
+    world = followed.world
     name = f"friction.coulomb@{joint_name(world, joint)}"
     if has_soft_form(world) or name not in world.library:
         return []
     models = []
     for factor in SOFT_FACTORS:
         # The missing force of a sliding joint is about the force of its friction.
-        size = np.array([factor * float(followed.force[joint])])
+        size = np.array([sign * factor * float(followed.force[joint])])
         changed = theta.copy()
         changed[world.slots[name]] = clip_coefficients(world, name, size)
-        models.append((name, changed))
+        models.append(changed)
     return models

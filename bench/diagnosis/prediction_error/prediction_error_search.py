@@ -177,12 +177,15 @@ class PredictionErrorSearch(EffectSearch):
         return fit_rivals(self._context, best)
 
     def take_over(self, other: PredictionErrorSearch) -> None:
-        """Reuse the filter and the responses of a search with the other form of dry friction.
+        """Reuse the filter and the responses of another search of the same base model.
 
-        Both searches have the same runs, and the base model has no friction of that form.
+        Both searches have the same runs. If the form of the dry friction that effects add differs,
+        the base model has none of it.
         """
         self.world.followed = replace(other._context.filters.base, world=self.world)
         self._context.columns.take_over(other._context.columns)
+        if self.world is other.world:
+            self._context.filters.take_over(other._context.filters)
 
     def p_value_of_missing_effect(self, model: FittedModel) -> float:
         """Return the p-value of the most significant effect that a fitted model lacks.
@@ -249,6 +252,19 @@ class PredictionErrorSearch(EffectSearch):
         labels = {probe.effect for probe in columns.hats.probes}
         scores = null_scores(regression, labels, self.make_rng("structure", model.effects))
         return scores.p_value, scores.effects[0] if scores.effects else ""
+
+    def make_final_start(self, model: FittedModel) -> FitStart:
+        """Return the start of a final fit, with derivatives by initial states about the model.
+
+        The filter of the model has them already.
+        """
+        start = model.fit.make_start()
+        if not model.effects or has_series(self.world, model.effects):
+            return start
+        followed = self._context.filters.near_model(model)
+        return (
+            replace(start, by_states=followed.state_sensitivities()) if followed.is_sound else start
+        )
 
     def with_sensitivities(self, start: FitStart) -> FitStart:
         """Return a start with derivatives by its coefficients about the measured motion."""

@@ -97,9 +97,10 @@ def fit_rivals(context: SearchContext, best: FittedModel) -> FittedModel:
     has_no_fit = not best.effects or not np.isfinite(best.fit.cost)
     if has_no_fit or has_series(world, best.effects):
         return best
-    starts = []
+    starts, rivals = list[FitStart](), set[str]()
     for name in best.effects:
         for rival in _find_rivals(context, best, name):
+            rivals.add(rival.effect)
             start = in_place_of(world, best, [name], rival.effect, rival.c)
             if frozenset(start.effects) in search.models:
                 continue
@@ -110,12 +111,12 @@ def fit_rivals(context: SearchContext, best: FittedModel) -> FittedModel:
     size = len(best.effects)
     if size == 1 and context.filters.base.runs.jumps.any():
         # Fits at force limits may stop in local minima.
-        single_effects = [
-            m for m in search.models.values() if len(m.effects) == 1 and m is not best
-        ]
         laws = JOINT_MODEL + SERVO_MODEL
-        plain = [model for model in single_effects if model.effects[0].partition("@")[0] in laws]
-        refine_single_effects(context, plain)
+        plain = [name for name in rivals if name.partition("@")[0] in laws]
+        fitted = [
+            search.models[frozenset([name])] for name in plain if frozenset([name]) in search.models
+        ]
+        refine_single_effects(context, fitted)
     _fit_at_coupled_joints(context, size)
     _refine_near(context, size)
     likeliest = search.get_best(size)
@@ -164,6 +165,12 @@ def _confirm_by_filter(
         len(context.world.get_coefficient_indices(rival.effect)) <= MAX_IMPROVED_SIZE
     )
     steps = GAUSS_NEWTON_STEPS if has_few_coefficients else 0
+    # Better coefficients do not help an effect with which the filter follows the runs worse.
+    if (
+        len(start.effects) == 1
+        and filters.log_likelihood(start.theta) < filters.base.log_likelihood
+    ):
+        return None
     followed, names = filters.with_effects(start.theta, start.effects, steps)
     loss = filters.of_model(best).log_likelihood - followed.log_likelihood
     return None if 2.0 * loss > RIVAL_MARGIN else FitStart(names, followed.theta, start.states)

@@ -20,7 +20,7 @@ from bench.diagnosis.friction_form_verdict import (
     is_likelier_soft,
     with_plain_friction,
 )
-from bench.diagnosis.prediction_error.effect_proposals import SearchContext
+from bench.diagnosis.prediction_error.effect_proposals import MIN_GAIN_SHARE, SearchContext
 from bench.diagnosis.prediction_error.effect_selection import Selected
 from bench.diagnosis.prediction_error.joint_effects import (
     JOINT_MODEL,
@@ -50,6 +50,13 @@ MAX_SURPLUS = 2
 """Maximum number of consecutive effects with too little gain before a selection is cut."""
 MAX_SLOW_EFFECTS = 2
 """Maximum number of effects in a set that is fitted by simulation although this is slow."""
+FIRST_ITERATIONS = 5
+"""Maximum number of steps of the first fit of dry friction."""
+FAR_LIKELIER = 0.1
+"""Minimum lead in log-likelihood of soft dry friction over a selection that is far less likely.
+
+It is a share of the gain over the base model.
+"""
 LEAST_SHARE = 0.01
 """Minimum gain of a further effect, as a share of the gain of the set.
 
@@ -68,7 +75,7 @@ def fit_quick_selection(context: SearchContext, selected: Selected) -> FittedMod
         The fitted model, or the base model if simulation is slow and a force is still missing.
     """
     paying = without_surplus(context, selected)
-    is_slow = len(paying.groups) > MAX_SLOW_EFFECTS and _is_slow(context, paying)
+    is_slow = len(paying.groups) > MAX_SLOW_EFFECTS and _is_slow(context, paying.effects)
     if is_slow and selected.followed.lacks_force:
         return context.search.base_model
     return fit_selection(context, paying)
@@ -127,12 +134,12 @@ def without_surplus(context: SearchContext, selected: Selected) -> Selected:
     return replace(selected, groups=selected.groups[:best_count], coefficients=best_coefficients)
 
 
-def _is_slow(context: SearchContext, selected: Selected) -> bool:
-    """Return whether a set is slow to simulate.
+def _is_slow(context: SearchContext, names: Sequence[str]) -> bool:
+    """Return whether effects are slow to simulate.
 
     This is the case if forces are computed in every step, or have their own states.
     """
-    effects = [context.world.available_effects[name] for name in selected.effects]
+    effects = [context.world.available_effects[name] for name in names]
     return any(
         member.of not in MODEL_FIELD_EFFECTS
         and member.hook in ("force", "hidden")
@@ -186,13 +193,69 @@ def check_selection(context: SearchContext, selected: Selected) -> None:
         return
     friction = dry_friction_of(context, selected)
     # Stiff friction that explains the runs needs no comparison.
-    if friction.effects and is_explained(context, context.search.fit_one(friction)):
+    if friction.effects and is_explained(
+        context, context.search.fit_one(friction, FIRST_ITERATIONS)
+    ):
         return
+    soft = _soft_friction(context)
+    if soft is None:
+        return
+    softer = filters.log_likelihood(soft.theta, is_soft=True)
+    gain = softer - filters.base.log_likelihood
+    # Another effect at the joint that promises more is fitted first.
+    if not gain > max(context.proposals.largest_gain_of_others(soft.effects[0]), 0.0):
+        return
+    if _is_far_less_likely(context, selected, softer):
+        raise SoftFrictionError(soft, is_preliminary=True)
     paying = without_surplus(context, selected)
     log_likelihood = filters.log_likelihood(
         context.columns.start(paying.groups, paying.coefficients).theta
     )
     check_filter(context, log_likelihood, is_preliminary=True)
+
+
+def _soft_friction(context: SearchContext) -> FitStart | None:
+    """Return the likeliest model of soft dry friction at the joint where regression shows friction.
+
+    Returns:
+        The model; None if the gain of dry friction by regression is far below the largest gain, or
+        if friction is already soft.
+    """
+    columns, world = context.columns, context.world
+    regression = columns.base_regression
+    gains, groups = regression.gains([]), regression.groups
+    by_gain = [
+        i
+        for i in np.argsort(-gains, kind="stable").tolist()
+        if gains[i] > MIN_GAIN_SHARE * gains.max()
+        and groups[i].effect.startswith("friction.coulomb@")
+        and not groups[i].effect.endswith("@*")
+        and groups[i].effect in world.library
+    ]
+    if not by_gain:
+        return None
+    best = groups[by_gain[0]]
+    (c,) = columns.coefficients(best, regression.solve([best])[1][0])
+    return context.filters.soft_friction(best.effect, float(np.copysign(1.0, c)))
+
+
+def _is_far_less_likely(context: SearchContext, selected: Selected, log_likelihood: float) -> bool:
+    """Return whether a selection is far less likely than another model.
+
+    The likelihood of the selection is that of the regression, and that of a filter with its first
+    effect.
+
+    Args:
+        context: context of the search.
+        selected: the selection.
+        log_likelihood: log-likelihood of the other model.
+    """
+    base = context.filters.base.log_likelihood
+    limit = log_likelihood - FAR_LIKELIER * max(log_likelihood - base, 0.0)
+    if not max(base, selected.log_likelihood) < limit:
+        return False
+    first = context.columns.start(selected.groups[:1], selected.coefficients[:1])
+    return context.filters.log_likelihood(first.theta) < limit
 
 
 def check_filter(
@@ -208,7 +271,7 @@ def check_filter(
     Raises:
         SoftFrictionError: soft friction is likelier.
     """
-    soft = context.filters.soft_friction
+    soft = _soft_friction(context)
     if soft is None:
         return
     softer = context.filters.log_likelihood(soft.theta, is_soft=True)
@@ -247,6 +310,8 @@ def fit_dry_friction(context: SearchContext, selected: Selected) -> FittedModel:
     fitted_before = context.search.models.get(frozenset(friction.effects))
     if fitted_before is not None and is_explained(context, fitted_before):
         return without_idle_effects(context, fitted_before)
+    if fitted_before is not None and np.isfinite(fitted_before.fit.cost):
+        friction = fitted_before.fit.make_start()
     fitted = fit(context, friction)
     return without_idle_effects(context, fitted) if is_explained(context, fitted) else fitted
 
@@ -320,8 +385,13 @@ def fit_single_effects(context: SearchContext) -> FittedModel:
     search, filters = context.search, context.filters
     states = filters.first_states(filters.base)
     starts = context.proposals.of(filters.empty_set, len(JOINT_MODEL + SERVO_MODEL))
-    fitted = search.fit_all([replace(start, states=states) for start in starts])
-    best = max(fitted, key=lambda model: model.penalised_log_likelihood, default=search.base_model)
+    fitted, best = list[FittedModel](), search.base_model
+    for is_slow in (False, True):
+        # Slow effects are fitted only if no other effect explains the runs.
+        group = [one for one in starts if _is_slow(context, one.effects) == is_slow]
+        if group and not is_explained(context, best):
+            fitted += search.fit_all([replace(start, states=states) for start in group])
+            best = max(fitted, key=lambda model: model.penalised_log_likelihood)
     if not is_explained(context, best):
         best = higher_merit(best, refine_single_effects(context, fitted))
     if is_explained(context, best):

@@ -28,7 +28,7 @@ NO_SUBDIVISION: Array = np.array([1.0])
 """Fractions of a step that is not subdivided."""
 SINGLE_INPUT_NAME = "u"
 """Name given to an input that is evaluated separately."""
-MAX_BATCH_SIZE = 128
+MAX_BATCH_SIZE = 256
 """Maximum number of batch elements whose inputs are evaluated together."""
 
 
@@ -68,6 +68,55 @@ def _digest(times: Array, signal: Array) -> bytes:
     return digest.digest()
 
 
+class RunInputs(NamedTuple):
+    """Commands of a run, and the input effects of n batch elements.
+
+    Attributes:
+        scenario: scenario of the run.
+        commands: commanded inputs (T,) by name.
+        acting: active effects with their coefficients (K, n, 1).
+        n: number of batch elements.
+        steps: number S of steps.
+    """
+
+    scenario: Scenario
+    commands: Mapping[str, Array]
+    acting: ActiveEffects
+    n: int
+    steps: int
+
+    def cuts(self, step: float, share: float, is_changed: bool) -> Array:
+        """Return the fractions of a step at which it is divided.
+
+        Args:
+            step: step length in seconds.
+            share: share of each step over which the input is averaged.
+            is_changed: whether effects change the inputs, within a step or at its ends.
+        """
+        if share < 1.0:
+            return np.array([share, 1.0])
+        # If commands change only at step ends, the mean describes each step completely.
+        places = self._sample_places(step)
+        is_aligned = bool((np.abs(places - np.rint(places)) < STEP_COUNT_TOLERANCE).all())
+        return NO_SUBDIVISION if is_aligned and not is_changed else STEP_SUBDIVISION
+
+    def seen(self, step: float) -> Mask:
+        """Return whether a sample is at the beginning of the first step and each step end (S + 1,).
+
+        Args:
+            step: step length in seconds.
+        """
+        seen = np.zeros(self.steps + 1, dtype=bool)
+        seen[np.clip(np.rint(self._sample_places(step)).astype(np.intp), 0, self.steps)] = True
+        return seen
+
+    def _sample_places(self, step: float) -> Array:
+        """Return the times of the samples (T,) in steps."""
+        scenario = self.scenario
+        places: Array = (scenario.times - scenario.times[0] + scenario.offset) / step
+        return places
+
+
 def compute_inputs_over_steps(
     step: float,
     scenario: Scenario,
@@ -95,49 +144,74 @@ def compute_inputs_over_steps(
     Returns:
         Applied inputs (n, S) by name.
     """
-    times = scenario.times - scenario.times[0] + scenario.offset
-    # If commands change only at step ends, the mean describes each step completely.
-    places = times / step
-    aligned = bool((np.abs(places - np.rint(places)) < STEP_COUNT_TOLERANCE).all())
-    seen = np.zeros(steps + 1, dtype=bool)
-    seen[np.clip(np.rint(places).astype(np.intp), 0, steps)] = True
-    usual = NO_SUBDIVISION if aligned else STEP_SUBDIVISION
-    if share < 1.0:
-        usual = np.array([share, 1.0])
+    run = RunInputs(scenario, commands, acting, n, steps)
+    cuts, seen = run.cuts(step, share, is_changed=False), run.seen(step)
     applied_inputs: dict[str, Array] = {}
-    asked: list[_InputRequest] = []
     for name, signal in commands.items():
         earlier = scenario.before[name].tobytes() if name in scenario.before else b""
         read = name in scenario.linear, scenario.offset, earlier
-        key = step, steps, usual.tobytes(), *read, _digest(scenario.times, signal)
-        bare = _InputRequest(name, signal, np.zeros(1, dtype=np.intp), ())
-        plain = _applied_input_cache.get(
-            key, partial(_given, step, scenario, [bare], steps, seen, usual)
-        )
+        key = step, steps, cuts.tobytes(), *read, _digest(scenario.times, signal)
+        bare = _InputRequest(0, scenario, name, signal, np.zeros(1, dtype=np.intp), ())
+        plain = _applied_input_cache.get(key, partial(_given, step, [bare], steps, seen, cuts))
         applied_inputs[name] = np.repeat(plain, n, axis=0)
-        passed = tuple((e, c) for e, c in acting if isinstance(e, Input) and e.signal == name)
-        # Inputs are grouped by effects, so that the value of a batch element does not depend on
-        # others.
-        asked += [_InputRequest(name, signal, *part) for part in _by_kinds(passed, n)]
-    cuts = STEP_SUBDIVISION if usual is NO_SUBDIVISION else usual
-    for group in _groups(asked):
-        values = _given(step, scenario, group, steps, seen, cuts)
-        ends = np.cumsum([one.lanes.size for one in group])
-        for one, rows in zip(group, np.split(values, ends[:-1]), strict=True):
-            applied_inputs[one.name][one.lanes] = rows
+    for _, name, lanes, values in compute_changed_inputs(step, [run], share):
+        applied_inputs[name][lanes] = values
     return applied_inputs
+
+
+def compute_changed_inputs(
+    step: float, runs: Sequence[RunInputs], share: float = 1.0
+) -> Iterator[tuple[int, str, Places, Array]]:
+    """Compute the inputs that effects change, of several runs together.
+
+    Effects with a state are integrated step by step, and a step costs about the same for few and
+    for many batch elements.
+
+    Args:
+        step: step length in seconds.
+        runs: the runs.
+        share: as in `compute_inputs_over_steps`.
+
+    Yields:
+        Number of the run, name of the input, batch elements (L,), and their applied inputs (L, S).
+    """
+    alike: dict[tuple[int, bytes, bytes], list[_InputRequest]] = {}
+    for number, run in enumerate(runs):
+        cuts, seen = run.cuts(step, share, is_changed=True), run.seen(step)
+        requests = alike.setdefault((run.steps, cuts.tobytes(), seen.tobytes()), [])
+        for name, signal in run.commands.items():
+            passed = tuple(
+                (e, c) for e, c in run.acting if isinstance(e, Input) and e.signal == name
+            )
+            # Inputs are grouped by effects, so that the value of a batch element does not depend on
+            # others.
+            requests += [
+                _InputRequest(number, run.scenario, name, signal, *part)
+                for part in _by_kinds(passed, run.n)
+            ]
+    for (steps, cut_bytes, seen_bytes), requests in alike.items():
+        cuts, seen = np.frombuffer(cut_bytes), np.frombuffer(seen_bytes, dtype=bool)
+        for group in _groups(requests):
+            values = _given(step, group, steps, seen, cuts)
+            ends = np.cumsum([one.lanes.size for one in group])
+            for one, rows in zip(group, np.split(values, ends[:-1]), strict=True):
+                yield one.run, one.name, one.lanes, rows
 
 
 class _InputRequest(NamedTuple):
     """Request for one applied input.
 
     Attributes:
+        run: number of the run.
+        scenario: scenario of the run.
         name: name of the input.
         signal: (T,) commanded values.
         lanes: batch elements in which input effects are active.
         acting: these effects, with coefficients for the batch elements.
     """
 
+    run: int
+    scenario: Scenario
     name: str
     signal: Array
     lanes: Places
@@ -169,11 +243,7 @@ def _by_kinds(passed: ActiveEffects, n: int) -> Iterator[tuple[Places, ActiveEff
 
 
 def _groups(asked: Sequence[_InputRequest]) -> Iterator[list[_InputRequest]]:
-    """Group requests with equal sequences of effect types, at most `MAX_BATCH_SIZE` elements each.
-
-    Effects with a state are integrated step by step, and a step costs about the same for few and
-    for many batch elements.
-    """
+    """Group requests with equal types of effects, at most `MAX_BATCH_SIZE` elements each."""
     alike: dict[tuple[str, ...], list[_InputRequest]] = {}
     for one in asked:
         alike.setdefault(tuple(e.of or e.name for e, _ in one.acting), []).append(one)
@@ -193,7 +263,6 @@ def _together(asked: Sequence[_InputRequest]) -> ActiveEffects:
 
 def _given(
     step: float,
-    scenario: Scenario,
     requests: Sequence[_InputRequest],
     steps: int,
     seen: Mask,
@@ -207,7 +276,7 @@ def _given(
     """
     acting = _together(requests)
     of = np.repeat(np.arange(len(requests)), [one.lanes.size for one in requests])
-    runs = ScenarioGroups(tuple(_alone(scenario, one.name) for one in requests), of)
+    runs = ScenarioGroups(tuple(_alone(one.scenario, one.name) for one in requests), of)
     plan = _parts_of_steps(step, steps, of.size, cuts, alike=not acting)
     commands = [{SINGLE_INPUT_NAME: one.signal} for one in requests]
     values = compute_applied_inputs(plan, runs, commands, acting)[SINGLE_INPUT_NAME]

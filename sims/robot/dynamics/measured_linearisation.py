@@ -40,7 +40,11 @@ from sims.robot.dynamics.linearisation_points import (
     RobotMotion,
 )
 from sims.robot.dynamics.midpoint_state import Places, forces_are_at_step_end
-from sims.robot.dynamics.run_linearisation import EffectWithCoefficients, RunLinearisation
+from sims.robot.dynamics.run_linearisation import (
+    EffectWithCoefficients,
+    RunLinearisation,
+    compute_control_changes,
+)
 from sims.robot.dynamics.series_joints import is_series_effect
 from sims.robot.dynamics.tangent_propagation import Perturbation
 from sims.robot.floating_joints import FloatingState
@@ -301,7 +305,10 @@ class MeasuredLinear(RunLinearisation):
         return result
 
     def added(
-        self, effects: Sequence[EffectWithCoefficients], predicted: Array
+        self,
+        effects: Sequence[EffectWithCoefficients],
+        predicted: Array,
+        driven: Mapping[int, Sequence[Perturbation]] | None = None,
     ) -> tuple[SingleArray, SingleArray]:
         """Compute what candidate effects add to (3) and (4).
 
@@ -312,6 +319,8 @@ class MeasuredLinear(RunLinearisation):
         Args:
             effects: K effects with their coefficients; those in series with a joint add nothing.
             predicted: δ (T, Z) at the samples, each predicted from the preceding samples.
+            driven: changes of the controls by effects on inputs, by number of the effect; computed
+                if None.
 
         Returns:
             Mean forces and controls (T - 1, E + nu, K), which `IntervalMaps.inputs` convert to b;
@@ -322,7 +331,8 @@ class MeasuredLinear(RunLinearisation):
         inputs = quotients.forces.shape[2] + quotients.controls.shape[2]
         means = np.zeros((samples - 1, inputs, count), dtype=np.float32)
         readings = np.zeros((samples, self.observed.shape[1], count), dtype=np.float32)
-        driven = self._driven([(e, c) for e, c in effects])
+        if driven is None:
+            (driven,) = compute_control_changes([self], effects)
         for begin in range(0, count, BLOCK):
             part = range(begin, min(begin + BLOCK, count))
             changes: list[Perturbation] = []

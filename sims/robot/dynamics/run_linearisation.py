@@ -10,7 +10,11 @@ from numpy.typing import NDArray
 
 from sims.core.effect import ActiveEffects, Effect, Input, Sensor
 from sims.core.simulator import Array, Scenario
-from sims.robot.dynamics.applied_inputs import SAME_INSTANT_SHARE, compute_inputs_over_steps
+from sims.robot.dynamics.applied_inputs import (
+    SAME_INSTANT_SHARE,
+    RunInputs,
+    compute_changed_inputs,
+)
 from sims.robot.dynamics.batch_work import BatchInputs, RobotRunBatch
 from sims.robot.dynamics.linearisation_points import (
     LINEARISATION_INTERVAL_SECONDS,
@@ -199,7 +203,7 @@ class RunLinearisation:
         # The cost must not depend on earlier calls.
         self._known.clear()
         result = np.zeros((len(added), *self.observed.shape))
-        driven = self._driven(added)
+        (driven,) = compute_control_changes([self], added)
         apart = [i for i, (effect, _) in enumerate(added) if is_series_effect(effect)]
         if apart:
             result[apart] = self._simulated([added[i] for i in apart]) - self.observed
@@ -292,20 +296,8 @@ class RunLinearisation:
         rest = simulator.robot.compiled.qpos_spring[simulator.addresses.positions[joint]]
         return bool(rest == 0.0)
 
-    def _driven(self, added: Sequence[EffectWithCoefficients]) -> dict[int, list[Perturbation]]:
-        """Return the changes of controls by added input effects, by number of the effect.
-
-        Input effects act before the robot, so their changes are computed exactly and only
-        propagated to first order. `rows` lists the effects at one place each as (number,
-        effect, coefficients), one batch element for each.
-        """
-        rows: list[tuple[int, Effect, Array]] = []
-        for number, (effect, c) in enumerate(added):
-            for one, k in effect.parts(c[:, None, None]):
-                if isinstance(one, Input) and k.any():
-                    rows.append((number, one, k))
-        if not rows:
-            return {}
+    def _inputs_with(self, rows: Sequence[tuple[int, Effect, Array]]) -> RunInputs:
+        """Return the inputs of the run, with one more input effect in each batch element."""
         count = len(rows)
         acting: dict[str, tuple[Effect, Array]] = {}
         for e, c in self._work.acting:
@@ -316,23 +308,8 @@ class RunLinearisation:
                 acting[one.name] = one, np.zeros((len(k), count, 1))
             acting[one.name][1][:, lane] = k[:, 0]
         steps = len(self._motion.controls)
-        simulator = self._simulator
-        given = self._work.scenario, self._work.commands, tuple(acting.values()), count, steps
-        applied_inputs = compute_inputs_over_steps(simulator.time_step, *given)
-        instant = applied_inputs
-        if any(name.startswith("tau.") for name in self._names):
-            instant = compute_inputs_over_steps(simulator.time_step, *given, SAME_INSTANT_SHARE)
-        numbers = {f"u.{a.name}": a.control for a in simulator.robot.actuators}
-        result: dict[int, list[Perturbation]] = {}
-        for lane, (number, one, _) in enumerate(rows):
-            if one.signal not in numbers:
-                continue
-            column = numbers[one.signal]
-            series = applied_inputs[one.signal][lane] - self._motion.controls[:, column]
-            at_once = instant[one.signal][lane] - self._motion.instant[:, column]
-            change = Perturbation(number, actuator=column, series=series, instant=at_once)
-            result.setdefault(number, []).append(change)
-        return result
+        given = self._work.scenario, self._work.commands, tuple(acting.values())
+        return RunInputs(*given, count, steps)
 
     def _seen(self, states: Array, readings: Array, sensors: Sequence[ActiveEffects]) -> Array:
         """Compute observations (n, T, C) of the perturbed motion, with further sensor effects.
@@ -371,6 +348,58 @@ class RunLinearisation:
             else:
                 columns.append(apply_effects_to_readings(values, self._times, acting, self._clock))
         return np.stack(columns, axis=2)
+
+
+def compute_control_changes(
+    runs: Sequence[RunLinearisation], added: Sequence[EffectWithCoefficients]
+) -> list[dict[int, list[Perturbation]]]:
+    """Compute the changes of controls by added input effects.
+
+    Input effects act before the robot, so their changes are computed exactly and only propagated
+    to first order. `rows` lists the effects at one place each as (number, effect, coefficients),
+    one batch element for each.
+
+    Args:
+        runs: linearisations of runs of one simulator.
+        added: effects with their coefficients.
+
+    Returns:
+        For each run, the changes by number of the effect.
+    """
+    result: list[dict[int, list[Perturbation]]] = [{} for _ in runs]
+    rows: list[tuple[int, Effect, Array]] = []
+    for number, (effect, c) in enumerate(added):
+        for one, k in effect.parts(c[:, None, None]):
+            if isinstance(one, Input) and k.any():
+                rows.append((number, one, k))
+    if not rows:
+        return result
+    simulator, names = runs[0]._simulator, runs[0]._names
+    inputs = [run._inputs_with(rows) for run in runs]
+    shares = [1.0]
+    if any(name.startswith("tau.") for name in names):
+        shares.append(SAME_INSTANT_SHARE)
+    numbers = {f"u.{a.name}": a.control for a in simulator.robot.actuators}
+    series: dict[tuple[int, int], list[Array]] = {}
+    for share in shares:
+        for run, name, lanes, values in compute_changed_inputs(simulator.time_step, inputs, share):
+            for lane, row in zip(lanes.tolist(), values, strict=True):
+                if rows[lane][1].signal == name:
+                    series.setdefault((run, lane), []).append(row)
+    for (run, lane), of_shares in sorted(series.items()):
+        number, one, _ = rows[lane]
+        if one.signal not in numbers:
+            continue
+        column, motion = numbers[one.signal], runs[run]._motion
+        change = Perturbation(
+            number,
+            actuator=column,
+            series=of_shares[0] - motion.controls[:, column],
+            instant=of_shares[-1]
+            - (motion.controls, motion.instant)[len(of_shares) - 1][:, column],
+        )
+        result[run].setdefault(number, []).append(change)
+    return result
 
 
 def _on(channel: str, own: ActiveEffects, more: Sequence[ActiveEffects]) -> ActiveEffects:

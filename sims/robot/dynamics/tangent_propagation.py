@@ -120,8 +120,11 @@ class TangentModel:
         if quotients is None or quotients.states.shape[:2] != self._base.shape:
             quotients = self._quotients()
         self.quotients = quotients
-        # Accelerations and readings of the unperturbed motion.
-        self._still = at.compute_accelerations(at.acting)
+
+    @cached_property
+    def _still(self) -> tuple[Array, Array]:
+        """Accelerations (N, E) and readings (N, O) of the unperturbed motion."""
+        return self._at.compute_accelerations(self._at.acting)
 
     @property
     def placed_element_count(self) -> int:

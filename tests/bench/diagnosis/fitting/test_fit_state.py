@@ -98,12 +98,13 @@ def test_a_step_suits_that_errs_by_little_of_the_noise_or_of_what_is_left(rest, 
 
 
 @pytest.mark.parametrize(
-    ("rough", "gained", "is_finished"), [(True, 0.9, True), (True, 0.4, False), (False, 0.9, False)]
+    ("rough", "decrease", "is_finished"),
+    [(True, 0.9, True), (True, 0.4, False), (False, 0.9, False)],
 )
 def test_a_rough_fit_ends_at_gains_that_its_own_derivatives_do_not_predict(
-    rough, gained, is_finished
+    rough, decrease, is_finished
 ):
     state = problem(TRUE)
     state.rough, state.is_final_fit, state.predicted_decrease = rough, True, 0.3
-    state.accept_step(gained, 1000.0, own=True)
+    state.accept_step(decrease, 1000.0, is_own_jacobian=True)
     assert state.is_finished == is_finished

@@ -9,6 +9,7 @@ import pytest
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.logs.joined_recordings import load_joined
 from sims.robot.dynamics.measured_linearisation import MeasuredLinear, Trajectory, quintic
+from sims.robot.dynamics.run_linearisation import compute_control_changes
 from sims.robot.floating_joints import FloatingState
 
 EXAMPLE = Path(__file__).parents[4] / "examples" / "robot" / "log.csv"
@@ -26,7 +27,7 @@ EFFECTS = {
 @pytest.fixture(scope="module")
 def world():
     recording, kind = load_joined([EXAMPLE], None, None, ())
-    return RunEvaluator(kind, recording, recording.training()[:1], kind.default_engine)
+    return RunEvaluator(kind, recording, recording.training()[:2], kind.default_engine)
 
 
 def theta_of(world, name, c):
@@ -155,3 +156,29 @@ def test_a_quintic_goes_through_values_and_derivatives():
     beyond, rate = quintic(times, samples(times), np.array([0.6]))
     assert rate[0] == pytest.approx(slope[-1])
     assert beyond[0] == pytest.approx(value[-1] + 0.2 * slope[-1])
+
+
+def test_control_changes_of_several_runs_are_those_of_each_run(world):
+    half = len(world.states) // 2
+    linear = [
+        MeasuredLinear(world.simulator, world.get_nominal_theta(), track.scenario, start)
+        for track, start in zip(
+            world.tracks,
+            zip(world.guess[:, :half], world.guess[:, half:], strict=True),
+            strict=True,
+        )
+    ]
+    laws = ("input.lag@", "input.rate@")
+    names = [n for n in world.library if n.startswith(laws) and not n.endswith("@*")]
+    effects = [
+        (world.available_effects[name], np.full(len(world.get_coefficient_indices(name)), 0.02))
+        for name in names
+    ]
+    together = compute_control_changes(linear, effects)
+    assert len(effects) >= 2
+    for run, changes in zip(linear, together, strict=True):
+        (alone,) = compute_control_changes([run], effects)
+        assert alone.keys() == changes.keys()
+        for number, (change,) in alone.items():
+            (other,) = changes[number]
+            np.testing.assert_array_equal(change.series, other.series)
