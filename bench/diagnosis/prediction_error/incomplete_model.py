@@ -219,7 +219,8 @@ def _pruned(context: SearchContext, current: FilteredSet) -> tuple[FilteredSet, 
     theta = followed.theta.copy()
     for name in set(current.names) - set(names):
         theta[context.world.slots[name]] = 0.0
-    followed = followed.with_parameters(theta)
+    if not np.array_equal(theta, followed.theta):
+        followed = followed.with_parameters(theta)
     # Effects without influence leave the other coefficients as they are.
     if lost > 2.0 * LEAST_GAIN:
         return _pruned(context, _maximised(context, followed, names))
