@@ -31,12 +31,10 @@ class MuJoCoSysId(Tuner):
             # MuJoCo would look for a display in another process.
             os.environ.setdefault("MUJOCO_GL", "disable")
             sysid = importlib.import_module("mujoco.sysid")  # it has no types
-            parameters = sysid.ParameterDict()
-            parameters.add(
-                sysid.Parameter("cube", task.start, np.zeros(task.dim), np.ones(task.dim))
-            )
+            cube = sysid.ParameterDict()
+            cube.add(sysid.Parameter("cube", task.start, np.zeros(task.dim), np.ones(task.dim)))
             ask: Any = lambda x, _: ([residuals(x.reshape(task.dim, -1).T).T], None, None)  # noqa: E731
-            sysid.optimize(parameters, ask, verbose=False, output=io.StringIO())
+            sysid.optimize(cube, ask, verbose=False, output=io.StringIO())
             return "mujoco.sysid reached its tolerance"
 
         return from_callback(minimise, task.compute_finite_residuals)
