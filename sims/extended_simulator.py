@@ -373,10 +373,14 @@ def _make_subclass(
     }
     simulator: type[SystemSimulator] = type(re.sub(r"\W", "_", extended.name), (kind,), body)
     # The base class copies these from the system; replace them by the fitted ones.
-    simulator.name = extended.name
     additions = ", ".join(extended.effects) or "nothing added"
-    simulator.says = f"{extended.system} with {additions}, fitted to: {extended.title}"
-    simulator.parameters = parameters
+    fitted_attributes = {
+        "name": extended.name,
+        "says": f"{extended.system} with {additions}, fitted to: {extended.title}",
+        "parameters": parameters,
+    }
+    for name, value in fitted_attributes.items():
+        setattr(simulator, name, value)
     return simulator
 
 

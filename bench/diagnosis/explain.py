@@ -89,6 +89,8 @@ MAX_CHANNEL_SIZE_FACTOR = 1e9
 """Recorded values of at least this multiple of a channel's typical size are refused."""
 MAX_EXCESS_SHARE_WITH_RIGHT_UNITS = 0.1
 """Maximum excess over the noise, as a share of that of the base model, with right units."""
+MAX_FORCE_SHARE_AT_CONTACTS = 1.0
+"""Maximum missing force of a filter, as a share of the typical force, if the robot has contacts."""
 EXPLAINED = ("adequate", "named", "ambiguous")
 """Verdicts for which the model explains the data down to the noise."""
 RecordingSource: TypeAlias = str | Path | Recording
@@ -241,6 +243,7 @@ class _ExplainRun:
         # A free number of a robot is a number of its model file, and so a parameter of its
         # simulator.
         self.free = () if kind.has_model else tuple(options.free)
+        kind = self._with_contacts(kind)
         # This check precedes the run evaluators, which plan every step of every run.
         for odd in check_recording_plausible(self.recording, kind, force):
             say(f"{self.path}: {odd}")
@@ -269,12 +272,25 @@ class _ExplainRun:
             say(line)
         self.notes = (*self.notes, *left_out)
         self.coarse: CoarseStepFinding | None = None
+        self._filtered: FollowedRuns | None = None
         # Finer steps than the file's, and the run evaluators with the file's step if one is used.
         self.finer: Reusable[StepRefinement] | None = None
         self.file = _Worlds(self.kind, self.fitting, self.validation)
         self.found: tuple[EffectSearch, DiagnosisResult] | None = None
         self.faults: tuple[RecordingFault, ...] = ()
         self._check()
+
+    def _with_contacts(self, kind: type[SystemSimulator]) -> type[SystemSimulator]:
+        """Return the simulator of a robot with effects at the contacts of the recording."""
+        if not kind.has_model:
+            return kind
+        # These imports are needed for robots only.
+        from bench.logs.quality.pose_check import find_recorded_contacts
+        from sims.robot.robot_simulator import RobotSimulator
+
+        assert issubclass(kind, RobotSimulator)
+        contacts = find_recorded_contacts(self.recording, kind)
+        return kind.with_contacts(contacts) if contacts else kind
 
     def _enter(self, kind: type[SystemSimulator]) -> None:
         """Set up run evaluators, noise floor and validation for a simulator class.
@@ -459,6 +475,8 @@ class _ExplainRun:
         from bench.diagnosis.conventions.corrected_description import lines_of
 
         self.watch.stage("comparing conventions of log and model")
+        if self._has_contacts and self._fails_at_contacts(self._filter()):
+            return
         differences = ConventionComparison(self._units).differences()
         if not differences:
             return
@@ -534,6 +552,11 @@ class _ExplainRun:
         For a robot whose runs could be filtered, the search uses prediction errors.
         """
         if self.fitting.followed is None:
+            if self.fitting.is_in_contact:
+                # This import is needed for robots only.
+                from bench.diagnosis.kalman.contact_proposals import propose_contact_effects
+
+                propose_contact_effects(search, self._worlds())
             return diagnose(search, self.validation)
         # This import is needed for robots only.
         from bench.diagnosis.prediction_error.simulation_confirmation import Confirmation
@@ -664,9 +687,15 @@ class _ExplainRun:
 
         self.watch.stage("following the runs with the model")
         world, *held_out = self._worlds()
-        followed = FollowedRuns.follow(world, world.get_nominal_theta(), self.noise)
+        followed = self._filter()
         # Where the linear model diverges, causes are searched by simulation.
-        if not followed.is_sound:
+        if not followed.is_sound or self._fails_at_contacts(followed):
+            if self._has_contacts:
+                # This import is needed for robots only.
+                from bench.diagnosis.kalman.contact_proposals import begin_in_contact
+
+                theta = world.get_nominal_theta()
+                begin_in_contact(self._worlds(), theta, self.noise.sigma)
             return
         if self.free_numbers and self.tuner is None:
             followed = self._identified(followed)
@@ -678,6 +707,32 @@ class _ExplainRun:
             found = FollowedRuns.follow(world, theta, self.noise, max_linearisations=1)
             if found.is_sound:
                 world.follow(found)
+
+    def _fails_at_contacts(self, followed: FollowedRuns) -> bool:
+        """Return whether the linear model of a robot fails at the contacts of the recording.
+
+        The depth of a contact is smaller than the noise of most encoders, so that a model that is
+        linearised about the readings has wrong contact forces. The filter then needs a missing
+        force that is larger than all typical forces.
+        """
+        share = float((followed.force / followed.typical).max())
+        return self._has_contacts and not share <= MAX_FORCE_SHARE_AT_CONTACTS
+
+    @property
+    def _has_contacts(self) -> bool:
+        """Return whether geoms of a robot touch in the recording."""
+        robot: Any = self.kind
+        return bool(robot.robot.contacts)
+
+    def _filter(self) -> FollowedRuns:
+        """Return the runs for fitting of a robot, filtered with the numbers of the model file."""
+        # This import is needed for robots only.
+        from bench.diagnosis.kalman.candidate_responses import FollowedRuns
+
+        world = self.fitting
+        if self._filtered is None or self._filtered.world is not world:
+            self._filtered = FollowedRuns.follow(world, world.get_nominal_theta(), self.noise)
+        return self._filtered
 
     def _identified(self, followed: FollowedRuns) -> FollowedRuns:
         """Return the runs, filtered with base parameters from a prediction-error fit."""

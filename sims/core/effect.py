@@ -18,7 +18,7 @@ import numpy as np
 from sims.core.simulator import Array
 from sims.core.system import SYSTEM_KINDS, StateSnapshot, System, SystemKind
 
-PlaceKind = Literal["joint", "actuator", "body", "channel", "world", "level"]
+PlaceKind = Literal["joint", "actuator", "body", "channel", "contact", "world", "level"]
 """Kinds of places where an effect acts; `level` exists only in user-defined simulators."""
 ALL_PLACES = "*"
 """Place of an effect that acts at all places of its kind."""
@@ -137,6 +137,8 @@ class Effect(metaclass=EffectType):
         coordinate: Coordinate on which it acts; None for the system's primary one.
         signal: Input or channel on which it acts; empty for the first, or for all.
         of: Name of the registered effect of which it is a form at one place.
+        pairs: For an effect at a contact of a robot, the pairs of geoms whose contacts get
+            parameters of their own.
     """
 
     name: ClassVar[str]
@@ -153,6 +155,7 @@ class Effect(metaclass=EffectType):
     coordinate: ClassVar[int | None] = None
     signal: ClassVar[str] = ""
     of: ClassVar[str] = ""
+    pairs: ClassVar[tuple[str, ...]] = ()
 
     def parts(self, c: Array) -> ActiveEffects:
         """Return the effect as the sum of effects at one place each.

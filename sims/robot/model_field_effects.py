@@ -14,6 +14,8 @@ body:
 * (7) Loaded: a point mass m at p on a body with mass m_0, centre of mass p_0 and inertia tensor I_0
   about it gives mass m_0 + m, centre p_1 = (m_0 p_0 + m p) / (m_0 + m) and tensor
   I_0 + m_0 J(p_0 - p_1) + m J(p - p_1), with J(d) = |d|^2 1 - d d' (parallel axis theorem).
+* (8) Softened: `solref` (t, z) of a contact becomes (t (1 + c), z), or (t, z (1 + c)) for its
+  damping. In the direct form (-k, -b), k is proportional to 1 / (t z)^2 and b to 1 / t.
 """
 
 from __future__ import annotations
@@ -25,6 +27,7 @@ from typing import Any
 import numpy as np
 
 from sims.core.simulator import Array
+from sims.robot.contact_pairs import find_pair
 from sims.robot.places.observable_tilts import observable_tilts
 from sims.robot.robot_model import COUPLING_TENDON_SUFFIX, RobotModel
 
@@ -410,8 +413,32 @@ def _limit_force(fields: Fields, robot: RobotModel, place: str, c: Array) -> Non
     is_limited[limits, number] = True
 
 
+def _add_contact_friction(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
+    """Add c to the sliding friction coefficients of a pair of geoms by (1)."""
+    sliding = fields["pair_friction"][:, find_pair(robot, place), :2]
+    sliding[:] = add_to_stated(sliding, c[0][:, None])
+
+
+def _soften(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
+    """Scale the time constant of a pair of geoms by 1 + c (8)."""
+    solref, factor = fields["pair_solref"][:, find_pair(robot, place)], compute_factor(c[0])
+    direct = solref[:, 0] <= 0
+    solref[:, 0] *= np.where(direct, factor**-2, factor)
+    solref[:, 1] *= np.where(direct, 1.0 / factor, 1.0)
+
+
+def _damp(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
+    """Scale the damping ratio of a pair of geoms by 1 + c (8)."""
+    solref, factor = fields["pair_solref"][:, find_pair(robot, place)], compute_factor(c[0])
+    direct = solref[:, 0] <= 0
+    solref[:, 0] *= np.where(direct, factor**-2, 1.0)
+    solref[:, 1] *= np.where(direct, 1.0, factor)
+
+
 COUPLING_FIELD = "wrap_prm"
 """Model field of coupling coefficients, which a model without tendons lacks."""
+CONTACT_FIELDS = frozenset({"pair_friction", "pair_solref"})
+"""Model fields of pairs of geoms, which a model without elements `<pair>` lacks."""
 _SERVO = ("actuator_gainprm", "actuator_biasprm")
 
 MODEL_FIELD_EFFECTS: Mapping[str, ModelFieldEffect] = {
@@ -448,6 +475,9 @@ MODEL_FIELD_EFFECTS: Mapping[str, ModelFieldEffect] = {
     "gravity.scale": ModelFieldEffect(("opt.gravity",), _scale_gravity),
     "gravity.tilt": ModelFieldEffect(("opt.gravity",), _tilt_gravity),
     "joint.coupling": ModelFieldEffect((COUPLING_FIELD,), _set_coupling),
+    "contact.friction": ModelFieldEffect(("pair_friction",), _add_contact_friction),
+    "contact.softness": ModelFieldEffect(("pair_solref",), _soften),
+    "contact.damping": ModelFieldEffect(("pair_solref",), _damp),
     "actuator.limit": ModelFieldEffect(
         ("actuator_forcelimited", "actuator_forcerange"), _limit_force
     ),

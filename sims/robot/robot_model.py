@@ -154,6 +154,8 @@ class RobotModel:
         series: added joints in series with others (`dynamics.series_joints`): inertia about them by
             name, kg or kg m^2; only these joints are not in the model file.
         coupled: joints whose drives also drive the preceding joint (`sims.robot.coupled_drives`).
+        contacts: pairs of geoms that touch in a recording, as `contact_pairs` names them; effects
+            at these contacts are candidates.
         friction_form: form of the dry friction that effects add; friction of the file without added
             friction keeps the file's solver parameters.
         shapes: data written into compiled models whose meshes are convex hulls.
@@ -172,6 +174,7 @@ class RobotModel:
     speeds: Mapping[str, float] = field(default_factory=dict)
     series: Mapping[str, float] = field(default_factory=dict)
     coupled: tuple[str, ...] = ()
+    contacts: tuple[str, ...] = ()
     friction_form: FrictionForm = "stiff"
     shapes: CollisionShapes | None = None
     function_cache: dict[tuple[Any, ...], Any] = field(default_factory=dict, init=False, repr=False)
@@ -196,6 +199,12 @@ class RobotModel:
         # The compiled model does not depend on the form, so it is reused.
         robot.__dict__["compiled"] = self.compiled
         return robot
+
+    def with_contacts(self, contacts: tuple[str, ...]) -> RobotModel:
+        """Return the robot with the contacts at which effects are candidates."""
+        other = replace(self, contacts=contacts)
+        other.__dict__["compiled"] = self.compiled
+        return other
 
     @property
     def name(self) -> str:

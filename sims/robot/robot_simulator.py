@@ -152,6 +152,15 @@ class RobotSimulator(SystemSimulator):
         return make_robot_simulator(cls.robot.with_friction_form(form), cls.free, cls.numerics)
 
     @classmethod
+    def with_contacts(cls, contacts: tuple[str, ...]) -> type[RobotSimulator]:
+        """Make the simulator of the same robot with the contacts of a recording as candidates.
+
+        Args:
+            contacts: names of pairs of geoms (`sims.robot.contact_pairs`).
+        """
+        return make_robot_simulator(cls.robot.with_contacts(contacts), cls.free, cls.numerics)
+
+    @classmethod
     def with_half_step(cls) -> type[RobotSimulator]:
         """Make the simulator of the same robot with half the time step."""
         return cls.with_integrator_settings(
@@ -666,6 +675,7 @@ def make_robot_simulator(
     # does.
     identity_text = repr((robot.digest, tuple(free), tuple(numerics)))
     identity_text += "" if robot.friction_form == "stiff" else robot.friction_form
+    identity_text += "".join(robot.contacts)
     system = make_robot_system(robot, free)
     attributes = {
         "system": system,

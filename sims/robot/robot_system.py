@@ -20,7 +20,12 @@ from sims.robot.floating_joints import FloatingJoints
 from sims.robot.model_field_effects import MODEL_FIELD_EFFECTS
 from sims.robot.places import effect_places
 from sims.robot.places.default_excitation import LazyDefaultRecording
-from sims.robot.places.place_list import MUJOCO_EFFECT_WORDS, EffectPlace, list_places
+from sims.robot.places.place_list import (
+    MUJOCO_EFFECT_WORDS,
+    EffectPlace,
+    list_places,
+    make_contact_place,
+)
 from sims.robot.robot_model import RobotModel
 from sims.robot.state_snapshots import SingleJointSystem, SingleSlideSystem
 
@@ -150,6 +155,10 @@ class RobotSystem(System):
         effects_by_name = {placed_effect.name: placed_effect for placed_effect in cls._placed[base]}
         if name in effects_by_name:
             return effects_by_name[name]
+        if registered.at == "contact" and place and place != ALL_PLACES:
+            # The contacts of a recording are candidates, but any contact may be named.
+            spot = make_contact_place(cls.robot, place, (place,))
+            return effect_places.make_placed_effect(registered, spot)
         if not effects_by_name:
             raise InputError(f"robot {cls.name} cannot have effect {base}")
         if not place:

@@ -101,6 +101,8 @@ class RunEvaluator:
             are none.
         state_prior: (s,) standard deviations of the initial states about their guesses, if a filter
             follows the runs of a robot; else None.
+        is_in_contact: whether geoms of a robot touch, so that initial states were estimated by a
+            nonlinear filter.
         measured: for runs of a robot, states estimated from readings alone
             (`bench.diagnosis.kalman.measured_states`).
         crew: worker pool for simulations and fits; by default only this process.
@@ -181,6 +183,7 @@ class RunEvaluator:
         self.simulated: dict[tuple[str, bytes], Array] = {}
         self.followed: Any = None
         self.identified: Array | None = None
+        self.is_in_contact = False
         self.state_prior: Array | None = None
         self.measured: dict[int, Mapping[int, Array]] = {}
         self.simulations = 0
@@ -325,8 +328,11 @@ class RunEvaluator:
 
     @property
     def has_linearisation(self) -> bool:
-        """Whether the simulator provides linearised responses to small changes."""
-        return self.kind.has_model
+        """Whether the simulator provides linearised responses to small changes.
+
+        At contacts they would be wrong, and finite differences of simulated runs are used.
+        """
+        return self.kind.has_model and not self.is_in_contact
 
     def get_coefficient_indices(self, effect: str) -> range:
         """Return the indices in theta of the coefficients of an effect."""
@@ -466,6 +472,7 @@ class RunEvaluator:
         evaluator.followed, evaluator.guess = self.followed, self.guess
         evaluator.derivatives, evaluator.identified = self.derivatives, self.identified
         evaluator.state_prior = self.state_prior
+        evaluator.is_in_contact = self.is_in_contact
         self.crew.register(evaluator)
         return evaluator
 
@@ -615,6 +622,17 @@ class RunEvaluator:
         self.guess = np.where(self.known | ~is_finite, self.guess, initial_states)
         self.derivatives = filtered_runs.state_sensitivities()
         self.state_prior = filtered_runs.state_prior()
+
+    def begin_at(self, states: Array, deviations: Array) -> None:
+        """Use estimated initial states.
+
+        Args:
+            states: (R, s) initial states.
+            deviations: (s,) standard deviations of their errors.
+        """
+        self.guess = np.where(self.known, self.guess, states)
+        self.state_prior = deviations
+        self.is_in_contact = True
 
     def close(self) -> None:
         """Release the resources of the engine."""

@@ -246,6 +246,9 @@ _SIZED: Mapping[str, Callable[[str, Sequence[FittedValue]], str]] = {
     "joint.zero": _format_joint_zero,
     "joint.axis": _format_tilted_axis,
     "link.length": _format_link_length,
+    "contact.friction": _make_difference_formatter("friction coefficient"),
+    "contact.softness": _make_percentage_formatter("time constant"),
+    "contact.damping": _make_percentage_formatter("damping ratio"),
 }
 """Functions that format how wrong a value of the model file is, by effect."""
 _STEPPED = {

@@ -26,6 +26,7 @@ _AT = {
     "actuator": ("at", "actuators"),
     "body": ("of", "bodies"),
     "channel": ("in", "channels"),
+    "contact": ("of", "contacts"),
     "level": ("of", "levels"),
 }
 """Preposition before a place of each kind, and the plural of the kind."""
@@ -36,6 +37,8 @@ NUMERICS_NAMES = {
 """Names of a too coarse time step or integrator as causes; they are errors of the model file, not
 effects.
 """
+_NOUNS_AT_PLACES = {"contact.friction": "a wrong friction"}
+"""Nouns of effects that have another meaning at a place of a robot."""
 _WRONG = re.compile(r"an? (wrong|misplaced) ")
 """Pattern of nouns that name a wrong value, not a missing effect."""
 
@@ -59,7 +62,7 @@ def _format_effect_as_noun(name: str) -> str:
         # A verdict may name an effect of a plugin that is not loaded.
         return sanitise(name, 60)
     if effect.noun:
-        noun = sanitise(effect.noun, 60)
+        noun = sanitise((_NOUNS_AT_PLACES.get(base) if place else None) or effect.noun, 60)
         return noun + (
             format_places(get_place_kind(name), [place], is_parameter=is_parameter_error(name))
             if place
@@ -86,8 +89,8 @@ def get_place_kind(effect: str) -> str:
 
 def is_parameter_error(effect: str) -> bool:
     """Return whether the effect corrects a wrong value instead of adding a missing effect."""
-    base, _ = split_effect_name(effect)
-    if base in NUMERICS_NAMES:
+    base, place = split_effect_name(effect)
+    if base in NUMERICS_NAMES or (place and base in _NOUNS_AT_PLACES):
         return True
     try:
         noun = effects.get_effect(base).noun

@@ -38,7 +38,8 @@ def search_with_subsampling(search: EffectSearch) -> FittedModel:
     Raises:
         SearchStoppedError: the search had to end early.
     """
-    thinned_runs = thin_runs(search.world)
+    # Thinned runs would begin in contact without an estimate of their initial states.
+    thinned_runs = None if search.world.is_in_contact else thin_runs(search.world)
     if thinned_runs is None:
         return search.run()
     try:

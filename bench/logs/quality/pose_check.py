@@ -11,6 +11,7 @@ are the slope and the correlation.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
@@ -38,6 +39,8 @@ DEGREE_SLOPE_RANGE = (40.0, 80.0)
 """Range of slopes b of (1) which show that one of the two signals is in degrees (57.3)."""
 CHECKED_INSTANTS = 100
 """Maximum number of times of a run at which forces or contacts are evaluated."""
+MAX_CONTACTS = 12
+"""Maximum number of contacts at which effects are candidates."""
 MIN_OVERLAP_METRES = 1e-3
 """Smallest depth, in m, at which two bodies overlap; feet on the ground sink in by less."""
 MIN_OVERLAP_SHARE = 0.9
@@ -143,6 +146,30 @@ def find_contacts(
     for data in _iterate_poses(kind, positions):
         pairs |= {(int(min(pair)), int(max(pair))) for pair in data.contact.geom[: data.ncon]}
     return frozenset(pairs)
+
+
+def find_recorded_contacts(recording: Recording, kind: type[Simulator]) -> tuple[str, ...]:
+    """Return the names of the pairs of a robot's geoms that touch in the recorded poses.
+
+    Joints that are not recorded keep their initial position.
+
+    Args:
+        recording: Recording of the robot.
+        kind: Simulator class of the robot.
+
+    Returns:
+        Names of at most `MAX_CONTACTS` pairs, the most frequent ones, in alphabetical order.
+    """
+    # This import is needed for robots only.
+    from sims.robot.contact_pairs import make_pair_name
+
+    model = kind.robot.compiled  # type: ignore[attr-defined]
+    counts = Counter[str]()
+    for run in recording.training():
+        for data in _iterate_poses(kind, run.channels):
+            touching = data.contact.geom[: data.ncon][data.contact.dist[: data.ncon] <= 0.0]
+            counts.update({make_pair_name(model, pair) for pair in touching.tolist()})
+    return tuple(sorted(name for name, _ in counts.most_common(MAX_CONTACTS)))
 
 
 def find_overlaps(recording: Recording, kind: type[Simulator]) -> Iterator[QualityFinding]:

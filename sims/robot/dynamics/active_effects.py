@@ -15,9 +15,8 @@ from sims.robot.model_field_effects import MODEL_FIELD_EFFECTS
 
 def is_model_field_effect(effect: Effect) -> bool:
     """Return whether the engine writes the effect into fields of the MuJoCo model."""
-    return is_series_effect(effect) or (
-        (effect.of or effect.name) in MODEL_FIELD_EFFECTS and effect.hook in ("value", "force")
-    )
+    written = (effect.of or effect.name) in MODEL_FIELD_EFFECTS
+    return is_series_effect(effect) or (written and effect.hook in ("value", "force", "contact"))
 
 
 def changes_derived_constants(effect: Effect) -> bool:

@@ -29,6 +29,7 @@ from sims.robot.dynamics.series_joints import write_series_effects as in_series
 from sims.robot.dynamics.servo_force_limits import ForceLimits, stiff_force_limits
 from sims.robot.floating_joints import FloatingJoints, FloatingState
 from sims.robot.model_field_effects import (
+    CONTACT_FIELDS,
     COUPLING_FIELD,
     MODEL_FIELD_EFFECTS,
     get_write_order,
@@ -194,6 +195,7 @@ class MujocoBatch:
         }
         names |= set(SERIES) if robot.series else set()
         names -= set() if robot.coupled else {COUPLING_FIELD}
+        names -= set() if model.npair else CONTACT_FIELDS
         self.fields: dict[str, Any] = {name: self.batch.expand(name) for name in sorted(names)}
         self._stated = {name: values[:1].copy() for name, values in self.fields.items()}
         self._changed: set[str] = set()

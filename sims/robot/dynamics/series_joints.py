@@ -36,6 +36,7 @@ from numpy.typing import NDArray
 
 from sims.core.effect import ActiveEffects, Effect, HiddenStateEffect, SeriesElement
 from sims.core.simulator import Array
+from sims.robot.contact_pairs import add_contact_pairs, list_acting_pairs
 from sims.robot.coupled_drives import COUPLING_EFFECT, COUPLING_PLACEHOLDER, name_unnamed_elements
 from sims.robot.coupled_drives import list_coupling_places as coupled_places
 from sims.robot.coupled_drives import make_coupled_robot as coupled_robot
@@ -74,6 +75,9 @@ WRITTEN_FIELDS = (
 """Model fields that are written for joints in series."""
 USED_FIELDS = (*WRITTEN_FIELDS, "dof_invweight0")
 """Model fields that are written for joints in series, and those derived by MuJoCo that are read."""
+
+CONTACT_PAIR = "contact"
+"""Name in the list of effects in series for a pair of geoms, which needs an element `<pair>`."""
 
 Flags = NDArray[np.bool_]
 
@@ -119,6 +123,7 @@ def group_by_series_joints(acting: ActiveEffects, count: int) -> dict[SeriesJoin
     """
     lanes: dict[SeriesJoints, list[int]] = {}
     there = [(e, (c[0] > 0)[:, 0]) for e, c in acting if is_series_effect(e)]
+    touching = [(e, c) for e, c in acting if e.pairs]
     coupled = np.zeros(count, dtype=bool)
     for e, c in acting:
         if e.of == COUPLING_EFFECT:
@@ -127,6 +132,8 @@ def group_by_series_joints(acting: ActiveEffects, count: int) -> dict[SeriesJoin
         added = tuple((e.place, e.of) for e, on in there if on[lane])
         if coupled[lane]:
             added += (COUPLING_PLACEHOLDER,)
+        pairs = list_acting_pairs([(e, c[:, lane]) for e, c in touching])
+        added += tuple((pair, CONTACT_PAIR) for pair in pairs)
         lanes.setdefault(added, []).append(lane)
     return lanes
 
@@ -140,10 +147,14 @@ def add_series_joints(robot: RobotModel, added: SeriesJoints) -> RobotModel:
     Args:
         robot: robot as read from its model file.
         added: joints, each the last one of its body, with the effect in series;
-            `COUPLING_PLACEHOLDER` requests the tendons of coupled drives.
+            `COUPLING_PLACEHOLDER` requests the tendons of coupled drives, and `CONTACT_PAIR` an
+            element `<pair>`.
     """
     import mujoco
 
+    if pairs := [place for place, effect in added if effect == CONTACT_PAIR]:
+        robot = add_contact_pairs(robot, pairs)
+        added = tuple(one for one in added if one[1] != CONTACT_PAIR)
     if COUPLING_PLACEHOLDER in added:
         robot = coupled_robot(robot, dict.fromkeys(coupled_places(robot), 0.0))
         added = tuple(one for one in added if one != COUPLING_PLACEHOLDER)

@@ -18,6 +18,7 @@ from sims.core.effect import SeriesElement as Transmission
 from sims.core.freed_memory import release_free_memory
 from sims.core.simulator import Array
 from sims.extended_simulator import FittedValue
+from sims.robot.contact_pairs import add_contact_pairs
 from sims.robot.coupled_drives import COUPLING_EFFECT as COUPLED
 from sims.robot.coupled_drives import make_coupled_robot
 from sims.robot.dynamics.series_joints import (
@@ -69,6 +70,11 @@ _NOTES = {
     "begins at zero in the file; damping is a share of the critical one",
     "joint.backlash": "joint.backlash: the joint has a second one in series, which begins in the "
     "middle of its gap in the file",
+    **{
+        name: f"{name}: the pair of geoms has an element <pair>, whose parameters replace those of "
+        "both geoms"
+        for name in ("contact.damping", "contact.friction", "contact.softness")
+    },
     "joint.coupling": "joint.coupling: the joint's actuator drives a tendon, the joint with 1 and "
     "the one before it with the coefficient",
     COULOMB: "friction.coulomb: dry friction is stiff in the file (solreffriction, "
@@ -125,6 +131,7 @@ def apply_causes(
     notes = []
     couplings = {c.place: float(c.coefficients[0]) for c in fitted_causes if c.effect == COUPLED}
     robot = make_coupled_robot(robot, couplings) if couplings else robot
+    robot = add_contact_pairs(robot, [c.place for c in fitted_causes if _is_at_contact(c)])
     series = _combine_series_elements(fitted_causes)
     if series:
         notes += [KEYFRAMES_OMITTED_NOTE] if robot.compiled.nkey else []
@@ -180,6 +187,12 @@ def _find_note(robot: RobotModel, cause: FittedCause) -> str | None:
     if cause.effect == COULOMB and (robot.friction_form == "soft" or cause.coefficients[0] < 0):
         return _SOFT
     return _NOTES.get(cause.effect)
+
+
+def _is_at_contact(cause: FittedCause) -> bool:
+    """Return whether a cause is an effect at a contact of two geoms."""
+    known = cause.effect in library.list_names()
+    return known and library.get_effect(cause.effect).at == "contact"
 
 
 def _is_in_series(cause: FittedCause) -> bool:
@@ -284,20 +297,21 @@ class SpecElements:
     """The elements of a spec by their numbers in the compiled model."""
 
     def __init__(self, spec: Any, robot: RobotModel) -> None:
-        """Index the joints, bodies and actuators of a spec, which is compiled to number them."""
+        """Index the joints, bodies, actuators and pairs of a spec, after a compilation."""
         self.spec = spec
         # Elements have numbers only after compilation.
         spec.compile()
         self.joints = {joint.id: joint for joint in spec.joints}
         self.bodies = {body.id: body for body in spec.bodies}
         self.actuators = {actuator.id: actuator for actuator in spec.actuators}
+        self.pairs = {pair.id: pair for pair in spec.pairs}
         self.robot = robot
 
     def get_element(self, element: ModelElement) -> Any:
         """Return the spec's element for an element of the compiled model."""
         if element.kind == "option":
             return self.spec.option
-        of_kind = {"joint": self.joints, "actuator": self.actuators}
+        of_kind = {"joint": self.joints, "actuator": self.actuators, "pair": self.pairs}
         return of_kind.get(element.kind, self.bodies)[element.id]
 
 

@@ -11,7 +11,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-Kind = Literal["joint", "body", "frame", "actuator", "option", "compiler"]
+Kind = Literal["joint", "body", "frame", "actuator", "pair", "option", "compiler"]
 """Kinds of model elements.
 
 Kind ``frame`` is a body without its inertial: the position of its frame, and its gravity
@@ -148,6 +148,10 @@ ATTRIBUTES_BY_KIND: Mapping[Kind, tuple[MjcfAttribute, ...]] = {
         MjcfAttribute("nsample", "nsample", lambda f, where: f["actuator_history"][0, where.id, 0]),
         MjcfAttribute("interp", "interp", lambda f, where: f["actuator_history"][0, where.id, 1]),
     ),
+    "pair": (
+        MjcfAttribute("friction", "friction", _make_reader("pair_friction")),
+        MjcfAttribute("solref", "solref", _make_reader("pair_solref")),
+    ),
     "option": (
         MjcfAttribute("timestep", "timestep", lambda f, _: f["opt.timestep"][0]),
         MjcfAttribute("integrator", "integrator", lambda f, _: f["opt.integrator"][0]),
@@ -165,6 +169,7 @@ _NAMES = (
     *("actuator_dyntype", "actuator_dynprm", "actuator_gaintype", "actuator_gainprm"),
     *("actuator_biastype", "actuator_biasprm", "actuator_ctrllimited", "actuator_ctrlrange"),
     *("actuator_forcelimited", "actuator_forcerange", "actuator_delay", "actuator_history"),
+    *("pair_friction", "pair_solref"),
 )
 
 FLAG_ATTRIBUTES = frozenset({"ctrllimited", "forcelimited"})
@@ -201,7 +206,8 @@ def get_field_address(model: Any, element: ModelElement) -> FieldAddress:
 def list_elements(model: Any) -> list[ModelElement]:
     """List the elements of a model whose attributes can be written.
 
-    They are joints with one coordinate, bodies, actuators with one control, and the options.
+    They are joints with one coordinate, bodies, actuators with one control, pairs of geoms, and the
+    options.
     """
     import mujoco
 
@@ -217,6 +223,7 @@ def list_elements(model: Any) -> list[ModelElement]:
         i for i in range(len(model.actuator_ctrlnum)) if int(model.actuator_ctrlnum[i]) == 1
     ]
     elements += [ModelElement("actuator", i) for i in scalar_actuators]
+    elements += [ModelElement("pair", i) for i in range(model.npair)]
     return [*elements, ModelElement("option", 0)]
 
 

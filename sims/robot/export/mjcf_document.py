@@ -100,7 +100,23 @@ class MjcfDocument:
         tags_by_element |= {ModelElement("joint", i): tag for i, tag in enumerate(joints)}
         tags_by_element |= {ModelElement("actuator", i): tag for i, tag in enumerate(actuators)}
         _compare_with_model(tags_by_element, model, (len(bodies) + 1, len(joints), len(actuators)))
-        return tags_by_element
+        pairs = zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)
+        numbers = {
+            frozenset(str(model.geom(geom).name) for geom in geoms): i
+            for i, geoms in enumerate(pairs)
+        }
+        return tags_by_element | {
+            ModelElement("pair", numbers[geoms]): tag
+            for geoms, tag in self.find_pairs().items()
+            if geoms in numbers
+        }
+
+    def find_pairs(self) -> dict[frozenset[str], XmlElement]:
+        """Return the elements `<pair>` by the names of their two geoms."""
+        return {
+            frozenset((tag.attributes.get("geom1", ""), tag.attributes.get("geom2", ""))): tag
+            for tag in self.find_elements("contact", "pair")
+        }
 
     def _collect_bodies(
         self, tag: XmlElement, bodies: list[XmlElement], joints: list[XmlElement]

@@ -79,6 +79,9 @@ class MjcfWriter:
             if statement.values:
                 self._keep_masses()
             self._write_inertial(self.tags[element], statement, comments)
+        elif element.kind == "pair":
+            _add_comments(self.tags[element], comments)
+            self.tags[element].new |= format_attributes(statement.values)
         else:
             tag = self.tags[element]
             _add_comments(tag, comments)

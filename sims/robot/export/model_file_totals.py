@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sims.core.effect import Effect
+from sims.robot.contact_pairs import add_contact_pairs, find_pair
 from sims.robot.export.mjcf_attributes import Fields, copy_model_fields
 from sims.robot.model_field_effects import MODEL_FIELD_EFFECTS, get_write_order
 from sims.robot.robot_model import RobotModel
@@ -61,6 +62,20 @@ def _get_force_limit(f: Fields, robot: RobotModel, place: str) -> Sequence[float
     return [f["actuator_forcerange"][0, number, 1]] if is_limited else [np.inf]
 
 
+def _solref(index: int) -> Read:
+    """Return a reader of the time constant (0) or damping ratio (1) of a contact.
+
+    It is infinite, thus no number of the file, if the file states stiffness and damping.
+    """
+
+    def read(f: Fields, robot: RobotModel, place: str) -> Sequence[float]:
+        """Return the number of the contact in a list of one."""
+        values = f["pair_solref"][0, find_pair(robot, place)]
+        return [values[index] if values[0] > 0 else np.inf]
+
+    return read
+
+
 class Reading(NamedTuple):
     """How a number is read from the model fields, and its unit.
 
@@ -91,6 +106,11 @@ _TOTALS: Mapping[str, Reading] = {
     "inertia.scale": Reading(
         lambda f, r, place: [np.max(f["body_inertia"][0, r.body(place).id])], "kg*m^2"
     ),
+    "contact.damping": Reading(_solref(1)),
+    "contact.friction": Reading(
+        lambda f, r, place: [f["pair_friction"][0, find_pair(r, place), 0]]
+    ),
+    "contact.softness": Reading(_solref(0), "s"),
     "joint.zero": Reading(
         lambda f, r, place: [f["qpos0"][0, r.joint(place).position]],
     ),
@@ -120,6 +140,7 @@ def totals(robot: RobotModel, fitted: Fitted) -> list[list[Total | None]]:
     Returns:
         For each effect, one entry per coefficient; None if the file has no such number.
     """
+    robot = add_contact_pairs(robot, [e.place for e, _ in fitted if e.at == "contact"])
     file_fields, changed_fields = (
         copy_model_fields(robot.compiled),
         copy_model_fields(robot.compiled),

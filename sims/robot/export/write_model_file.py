@@ -102,24 +102,27 @@ def write_model_files(
 
 
 def render_with_series_joints(applied: ModifiedModel) -> bytes:
-    """Render the model file with joints in series, tendons of coupled drives, and a fixed base.
+    """Render the model file with elements that causes add, and a fixed base.
+
+    These elements are joints in series, tendons of coupled drives, and pairs of geoms.
 
     Args:
         applied: model with the causes applied.
 
     Raises:
-        NotEditableError: the text does not contain a required joint or actuator.
+        NotEditableError: the text does not contain a required joint, actuator or geom.
     """
     robot = applied.robot
     text = robot.path.read_bytes()
     fixed = robot.engine_table.get("fix_base", False)
-    if not robot.series and not robot.coupled and not fixed:
+    if not robot.series and not robot.coupled and not fixed and not robot.spec.pairs:
         return text
     document = MjcfDocument(text, robot.path)
     if fixed:
         _fix_base(document)
     if robot.coupled:
         _write_couplings(document, applied)
+    _add_pairs(document, robot)
     tags = {tag.attributes.get("name"): tag for tag in document.walk() if tag.name == "joint"}
     for second in (joint for joint in robot.spec.joints if joint.name in robot.series):
         first = tags.get(second.name.rpartition("_")[0])
@@ -163,6 +166,29 @@ def _write_couplings(document: MjcfDocument, applied: ModifiedModel) -> None:
         for actuator in (a for a in robot.actuators if a.joint == name):
             tags[actuator.id].removed |= {"joint", "jointinparent"}
             tags[actuator.id].new["tendon"] = f"{name}{COUPLING_TENDON_SUFFIX}"
+
+
+def _add_pairs(document: MjcfDocument, robot: RobotModel) -> None:
+    """Write the elements `<pair>` of a robot that the text lacks.
+
+    Raises:
+        NotEditableError: a geom has no name in the text.
+    """
+    stated = document.find_pairs()
+    names = {tag.attributes.get("name") for tag in document.walk() if tag.name == "geom"}
+    for pair in robot.spec.pairs:
+        geoms = [pair.geomname1, pair.geomname2]
+        if frozenset(geoms) in stated:
+            continue
+        if not set(geoms) <= names:
+            raise NotEditableError(f"a geom of the contact {pair.name} has no name in its text")
+        attributes = {"name": pair.name, "geom1": geoms[0], "geom2": geoms[1]}
+        attributes["condim"] = str(pair.condim)
+        for name in ("friction", "solref", "solimp"):
+            attributes[name] = format_numbers(tuple(getattr(pair, name)))
+        attributes |= {name: format_number(getattr(pair, name)) for name in ("margin", "gap")}
+        text = " ".join(f'{name}="{value}"' for name, value in attributes.items())
+        document.root.within.append(([], f"<contact><pair {text}/></contact>"))
 
 
 def _render_series_joint(second: Any) -> str:

@@ -39,6 +39,9 @@ SHARED_COEFFICIENT_EFFECTS = frozenset(
 """Families with one coefficient for all places, such as delays."""
 EFFECTS_WITHOUT_FAMILY = frozenset(
     {
+        "contact.damping",
+        "contact.friction",
+        "contact.softness",
         "force.periodic",
         "force.ripple",
         "input.power",
@@ -60,6 +63,8 @@ EFFECTS_WITHOUT_FAMILY = frozenset(
     }
 )
 """Effects without a family, since their shape parameters differ between places."""
+EFFECTS_WITH_TOTAL = frozenset({"contact.friction", "gravity.compensation"})
+"""Effects, in addition to those at joints, whose coefficient is a difference from the file."""
 SHARED_ACTUATOR_EFFECTS = frozenset({"supply.sag"})
 """Effects at actuators that the actuators may share, such as a battery; one number of the world."""
 POSITION_SENSOR_EFFECTS = frozenset({"sensor.slip"})
@@ -71,6 +76,8 @@ HIDDEN_STATE_SHAPE_COUNT = 6
 
 It is small since each value requires an integration over time.
 """
+CONTACT_FRICTION = "the friction coefficient of the contact is not that of the model file"
+"""Description of the friction of a contact; that of the library describes impacts of a ball."""
 MAX_PAYLOAD_SHARE = 0.5
 """Largest plausible payload, as a share of the mass of all moving bodies."""
 MIN_LOAD_FREQUENCY = 15.0
@@ -94,7 +101,9 @@ def make_placed_effect(effect: type[Effect], effect_place: EffectPlace) -> type[
     observable_coefficients = [c for c in effect.coefficients if tilts is None or c.name in tilts]
     coefficients = [_adapt_to_place(effect, c, effect_place) for c in observable_coefficients]
     changed: dict[str, Any] = {"coordinate": effect_place.coordinate, "signal": effect_place.signal}
-    changed["says"] = f"{effect.says} (at {effect_place.words})"
+    says = CONTACT_FRICTION if effect.name == "contact.friction" else effect.says
+    changed["says"] = f"{says} (at {effect_place.words})"
+    changed["pairs"] = effect_place.pairs
     if issubclass(effect, Force):
         changed["force"] = _force_of(effect)
     elif issubclass(effect, Friction):
@@ -346,7 +355,7 @@ def _adapt_to_place(effect: type[Effect], c: Coefficient, effect_place: EffectPl
     Ranges of forces are scaled with the typical force of the joint. If the file specifies a
     value, the coefficient is a difference from it, limited so that the total is not negative.
     """
-    i = 2 if effect_place.kind == "hinge" else 1
+    i = 0 if effect.at == "contact" else 2 if effect_place.kind == "hinge" else 1
     unit, (low, high) = c.units[i], c.plausible[i]
     lower_limit = c.least
     if c.of.startswith(("input", "error")):
@@ -366,7 +375,7 @@ def _adapt_to_place(effect: type[Effect], c: Coefficient, effect_place: EffectPl
     if c.of == "give":
         high = 1.0 / (effect_place.inertia * MIN_LOAD_FREQUENCY**2)
     upper_limit = c.most
-    has_total = effect.at == "joint" or effect.name == "gravity.compensation"
+    has_total = effect.at == "joint" or effect.name in EFFECTS_WITH_TOTAL
     file_value = effect_place.stated.get(effect.name) if has_total else None
     if file_value is not None:
         # The total must not be negative, so the difference can at most remove the value of the
@@ -376,12 +385,13 @@ def _adapt_to_place(effect: type[Effect], c: Coefficient, effect_place: EffectPl
     if effect.name == "payload" and c.name == "mass":
         high = MAX_PAYLOAD_SHARE * effect_place.mass
     if c.name in effect_place.limits.get(effect.name, {}):
-        lower_limit, upper_limit = effect_place.limits[effect.name][c.name]
+        lower_limit, highest = effect_place.limits[effect.name][c.name]
+        upper_limit = highest if np.isfinite(highest) else None
         if effect.name == "payload":
             begin, end = effect_place.limits["mass.offset"][c.name]
             low, high = (begin, end) if begin < end else (low, high)
-        elif lower_limit < upper_limit:
-            low, high = max(low, lower_limit), min(high, upper_limit)
+        elif lower_limit < highest:
+            low, high = max(low, lower_limit), min(high, highest)
     return replace(
         c, units=(unit,) * 3, plausible=((low, high),) * 3, least=lower_limit, most=upper_limit
     )

@@ -1,6 +1,6 @@
 """List the places of a robot where effects may act, and what its model file specifies there.
 
-Places are joints, actuators, bodies and channels.
+Places are joints, actuators, bodies, channels and contacts of two geoms.
 """
 
 from __future__ import annotations
@@ -11,6 +11,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sims.robot.contact_pairs import (
+    find_pair_geoms,
+    get_geom_name,
+    read_contact_parameters,
+)
 from sims.robot.coupled_drives import list_coupling_places as coupled_places
 from sims.robot.places.centre_of_mass_limits import observable_axes, reach
 from sims.robot.places.observable_tilts import observable_tilts
@@ -34,6 +39,9 @@ MUJOCO_EFFECT_WORDS = {
 }
 """MuJoCo's words for numbers of a model file, and the effects that change them."""
 
+MAX_REDUCTION = 0.99
+"""Largest reduction of the time constant of a contact, as a share of it."""
+
 STANDARD_GRAVITY = 9.81
 """Acceleration of gravity in m/s^2, which gives the typical weight of a mass."""
 
@@ -42,7 +50,7 @@ class EffectPlace(NamedTuple):
     """A place at which an effect may act.
 
     Attributes:
-        name: name of the joint, actuator, body or channel.
+        name: name of the joint, actuator, body, channel or pair of geoms.
         kind: kind of the coordinate whose units apply: hinge or slide.
         coordinate: index of the coordinate; None if there is none.
         signal: name of the input or channel; empty for a joint or body.
@@ -61,6 +69,7 @@ class EffectPlace(NamedTuple):
         mass: for a body, the mass in kg of all moving bodies.
         tilts: for a joint, the axes of its body's frame about which a tilt of its axis shows in the
             motion.
+        pairs: for a contact, the pairs of geoms whose contacts get parameters of their own.
     """
 
     name: str
@@ -78,12 +87,13 @@ class EffectPlace(NamedTuple):
     limits: Mapping[str, Mapping[str, tuple[float, float]]] = MappingProxyType({})
     mass: float = 0.0
     tilts: tuple[str, ...] = ()
+    pairs: tuple[str, ...] = ()
 
 
 def list_places(
     robot: RobotModel, channels: Sequence[tuple[str, str]]
 ) -> dict[str, list[EffectPlace]]:
-    """List the places of a robot by kind: joint, actuator, body, channel.
+    """List the places of a robot by kind: joint, actuator, body, channel, contact.
 
     A place is where an effect can act. Each has the units and the typical sizes that scale the
     plausible ranges of effects, and what the model file states there.
@@ -95,7 +105,9 @@ def list_places(
     from sims.robot.places.typical_forces import coefficient_scales
 
     sizes = coefficient_scales(robot)
-    places: dict[str, list[EffectPlace]] = {"joint": [], "actuator": [], "body": [], "channel": []}
+    kinds = ("joint", "actuator", "body", "channel")
+    places: dict[str, list[EffectPlace]] = {kind: [] for kind in kinds}
+    places["contact"] = [make_contact_place(robot, pair, robot.contacts) for pair in robot.contacts]
     numbers: dict[str, int] = {}
     mass = sum(body.mass for body in robot.bodies)
     may_be_coupled = coupled_places(robot)
@@ -172,6 +184,41 @@ def list_places(
             EffectPlace(name, kind, coordinate, name, unit, size, 1.0, {}, description)
         )
     return places
+
+
+def make_contact_place(robot: RobotModel, pair: str, pairs: tuple[str, ...]) -> EffectPlace:
+    """Make the place of a contact.
+
+    Args:
+        robot: robot with the geoms.
+        pair: name of the pair of geoms.
+        pairs: pairs whose contacts get parameters of their own in the same model.
+
+    Raises:
+        InputError: there are no such geoms.
+    """
+    import mujoco
+
+    friction, solref = read_contact_parameters(robot, pair)
+    option = robot.compiled.opt
+    least = -MAX_REDUCTION
+    if not option.disableflags & mujoco.mjtDisableBit.mjDSBL_REFSAFE and solref[0] > 0:
+        # MuJoCo uses no smaller time constant than two time steps.
+        least = max(least, min(2.0 * option.timestep / float(solref[0]) - 1.0, 0.0))
+    names = [get_geom_name(robot.compiled, geom) for geom in find_pair_geoms(robot, pair)]
+    return EffectPlace(
+        pair,
+        "hinge",
+        None,
+        "",
+        "1",
+        1.0,
+        1.0,
+        {"contact.friction": friction},
+        f"the contact of {names[0]} and {names[1]}",
+        limits={"contact.softness": {"coefficient": (least, np.inf)}},
+        pairs=pairs,
+    )
 
 
 def _make_actuator_place(

@@ -1,0 +1,210 @@
+"""Initial states of a robot with contacts, estimated by a nonlinear filter and smoother.
+
+A contact force depends on the depth of the contact, which is smaller than the noise of most
+encoders. A model that is linearised about measured positions therefore has wrong forces. Here the
+model itself decides about depth and sliding: a cubature Kalman filter (I. Arasaratnam, S. Haykin,
+IEEE Trans. Autom. Control 54(6), 1254, 2009, doi:10.1109/TAC.2009.2019800) propagates 2 n points
+
+    x_j = m +- sqrt(n) S e_j,    P = S S'                                                      (1)
+
+of the augmented state of n components (positions, velocities and a force at each joint that is
+constant between two samples) through the engine, and takes mean and covariance of the results.
+Readings are linear in the state, so that the update is that of Kalman. The smoother of Rauch, Tung
+and Striebel uses the cross-covariance C of the points before and after an interval,
+
+    m_s[i] = m[i] + D (m_s[i+1] - m-[i+1]),    D = C inv(P-[i+1])                              (2)
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.kalman.measured_states import measured_states
+from sims.core.simulator import Array
+from sims.robot.dynamics.active_effects import (
+    is_evaluated_per_step,
+    select_model_field_effects,
+    slice_active_effects,
+)
+from sims.robot.dynamics.batch_work import RobotRunBatch
+from sims.robot.floating_joints import FloatingState
+from sims.robot.mujoco_messages import capture_mujoco_warnings
+from sims.robot.places.typical_forces import compute_joint_scales
+from sims.robot.robot_simulator import LINEARISATION_BATCH_SIZE, RobotSimulator
+
+FORCE_SHARES = (0.001, 0.01, 0.1, 1.0)
+"""Standard deviations of the missing force that are tried, as shares of a typical force."""
+POSITION_PRIOR = 1e-2
+"""Standard deviation of the first positions about their guess, rad or m."""
+SMALLEST_VARIANCE = 1e-18
+"""Variance added to each component of the state, so that its covariance has a square root."""
+
+
+class FirstStates(NamedTuple):
+    """Positions and velocities of D joints at the first samples of R runs.
+
+    Attributes:
+        states: (R, 2 D) smoothed states.
+        deviations: (2 D,) their standard deviations, RMS over the runs.
+    """
+
+    states: Array
+    deviations: Array
+
+
+def estimate_first_states(world: RunEvaluator, theta: Array, sigma: Array) -> FirstStates | None:
+    """Estimate the first states of all runs of a robot with contacts.
+
+    Args:
+        world: the runs.
+        theta: (P,) parameters of the model.
+        sigma: (C,) standard deviation of the noise of each channel.
+
+    Returns:
+        First states with the likeliest missing force of each run; None if the robot has states in
+        addition to joints with one coordinate, or if the filter diverges.
+    """
+    simulator = world.simulator
+    assert isinstance(simulator, RobotSimulator)
+    robot, acting = simulator.robot, simulator.get_active_effects(theta[None])
+    joints = len(simulator.addresses.positions)
+    is_stepwise = any(is_evaluated_per_step(effect) for effect, _ in acting)
+    if robot.compiled.na or len(robot.joints) != joints or is_stepwise or robot.series:
+        return None
+    typical = compute_joint_scales(robot).force
+    states, variances = [], []
+    for number in range(len(world.tracks)):
+        run = _Run(world, simulator, theta, sigma, number)
+        tried = [run.smoothed(share * typical) for share in FORCE_SHARES]
+        best = max(tried, key=lambda one: one.log_likelihood)
+        states.append(best.mean)
+        variances.append(np.diag(best.covariance))
+    found = FirstStates(np.array(states), np.sqrt(np.mean(variances, axis=0)))
+    return found if all(np.isfinite(part).all() for part in found) else None
+
+
+class _Smoothed(NamedTuple):
+    """Result of one run: log-likelihood, and mean and covariance of the first state."""
+
+    log_likelihood: float
+    mean: Array
+    covariance: Array
+
+
+class _Run:
+    """One run of a robot, for the cubature filter."""
+
+    def __init__(
+        self, world: RunEvaluator, simulator: RobotSimulator, theta: Array, sigma: Array, run: int
+    ) -> None:
+        """Compute the inputs over all steps, and find the recorded components of the state."""
+        track = world.tracks[run]
+        self._start = world.guess[run]
+        acting = simulator.get_active_effects(theta[None])
+        joints = len(simulator.addresses.positions)
+        work = RobotRunBatch(
+            track.scenario,
+            simulator.run_inputs(track.scenario),
+            acting,
+            self._start[None, :joints],
+            self._start[None, joints:],
+        )
+        speeds = list(measured_states(world, sigma, run).values())
+        fastest = max((float(np.abs(s[:, 1]).max()) for s in speeds), default=1.0)
+        self._prior = np.repeat([POSITION_PRIOR, fastest], joints)
+        times = work.times
+        steps = simulator.count_steps(times) + 1
+        self._given = simulator.compute_controls(work, steps)
+        self._knots = np.rint(times / simulator.time_step).astype(np.intp)
+        self._bench = simulator.make_linearisation_batch(acting)
+        written = slice_active_effects(select_model_field_effects(acting), np.zeros(1, np.intp))
+        self._acting = tuple(
+            (effect, np.repeat(c, self._bench.count, axis=1)) for effect, c in written
+        )
+        states = [*simulator.system.coordinates, *simulator.system.rates]
+        self._columns = [i for i, name in enumerate(world.channels) if name in states]
+        self._rows = [states.index(world.channels[i]) for i in self._columns]
+        self._observed = track.observed[:, self._columns]
+        self._variances = np.square(sigma[self._columns])
+
+    def smoothed(self, force: Array) -> _Smoothed:
+        """Filter and smooth the run.
+
+        Args:
+            force: (D,) standard deviations of the missing forces.
+        """
+        size, joints = self._start.size, force.size
+        mean, covariance = self._start.copy(), np.diag(np.square(self._prior))
+        count = size + joints
+        points = np.sqrt(count) * np.concatenate([np.eye(count), -np.eye(count)])
+        log_likelihood = 0.0
+        intervals: list[tuple[Array, ...]] = []
+        with np.errstate(all="ignore"), capture_mujoco_warnings():
+            self._bench.write_effects(self._acting)
+            for i, (begin, end) in enumerate(zip(self._knots, self._knots[1:], strict=False)):
+                gained, mean, covariance = self._updated(i, mean, covariance)
+                log_likelihood += gained
+                root = np.linalg.cholesky(covariance + SMALLEST_VARIANCE * np.eye(size))
+                moved = points[:, :size] @ root.T  # (1)
+                ends = self._advanced(mean + moved, points[:, size:] * force, int(begin), int(end))
+                if not np.isfinite(ends).all():
+                    return _Smoothed(-np.inf, self._start, covariance)
+                predicted = ends.mean(axis=0)
+                spread = (ends - predicted).T @ (ends - predicted) / len(ends)
+                spread += SMALLEST_VARIANCE * np.eye(size)
+                crossed = moved.T @ (ends - predicted) / len(ends)
+                intervals.append((mean, covariance, predicted, spread, crossed))
+                mean, covariance = predicted, spread
+            gained, mean, covariance = self._updated(self._knots.size - 1, mean, covariance)
+        for before, own, predicted, spread, crossed in reversed(intervals):
+            gain = np.linalg.solve(spread, crossed.T).T  # (2)
+            mean = before + gain @ (mean - predicted)
+            covariance = own + gain @ (covariance - spread) @ gain.T
+        return _Smoothed(log_likelihood + gained, mean, covariance)
+
+    def _updated(self, i: int, mean: Array, covariance: Array) -> tuple[float, Array, Array]:
+        """Update mean and covariance by the readings of sample i (Kalman).
+
+        Returns:
+            Log-likelihood of the readings, mean, and covariance.
+        """
+        there = np.isfinite(self._observed[i])
+        rows = np.array(self._rows)[there]
+        if not rows.size:
+            return 0.0, mean, covariance
+        residual = self._observed[i][there] - mean[rows]
+        spread = covariance[np.ix_(rows, rows)] + np.diag(self._variances[there])
+        gain = np.linalg.solve(spread, covariance[rows]).T
+        _, size = np.linalg.slogdet(spread)
+        log_likelihood = -0.5 * float(residual @ np.linalg.solve(spread, residual) + size)
+        after = covariance - gain @ covariance[rows]
+        return log_likelihood, mean + gain @ residual, 0.5 * (after + after.T)
+
+    def _advanced(self, states: Array, forces: Array, begin: int, end: int) -> Array:
+        """Step states (n, 2 D) with additional forces (n, D) through the engine.
+
+        Returns:
+            (n, 2 D) states at the end.
+        """
+        joints, bench = forces.shape[1], self._bench
+        result = states.copy()
+        if end == begin:
+            return result
+        places, dofs = bench.places.positions, bench.places.velocities
+        for first in range(0, len(states), LINEARISATION_BATCH_SIZE):
+            part = slice(first, first + LINEARISATION_BATCH_SIZE)
+            own = states[part]
+            n = len(own)
+            afloat = FloatingState(np.zeros((n, 0)), np.zeros((n, 0)))
+            bench.set_initial_state(own[:, :joints], own[:, joints:], afloat)
+            pushed = np.repeat(self._given.forces[:, begin:end], n, axis=0)
+            pushed[:, :, dofs] += forces[part, None]
+            controls = np.repeat(self._given.controls[:, begin:end], n, axis=0)
+            done = bench.step(controls, pushed, ["qpos", "qvel"])
+            result[part, :joints] = done["qpos"][:, -1, places]
+            result[part, joints:] = done["qvel"][:, -1, dofs]
+            result[part][bench.failed] = np.nan
+        return result

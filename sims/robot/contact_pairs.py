@@ -1,0 +1,167 @@
+"""Pairs of geoms that touch, as elements `<pair>` of a robot's model.
+
+A contact has the parameters of both geoms in combination. An element `<pair>` replaces them for one
+pair, so that friction and softness of a pair can be changed without changing other contacts of its
+geoms. The combined parameters are those of MuJoCo (documentation, "Computation", contact
+parameters): of the geom with the higher priority; otherwise the larger friction coefficients and
+dimension, and `solref` and `solimp` as a mean with the weights `solmix`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sims.core.effect import Effect
+from sims.core.simulator import Array, make_unknown_name_error
+from sims.robot.mujoco_messages import capture_mujoco_warnings
+from sims.robot.robot_model import RobotModel, cache_per_robot
+
+PAIR_SEPARATOR = "/"
+"""Separator of the names of two geoms in the name of a pair, such as ``floor/foot``."""
+UNNAMED_PREFIX = "simgap."
+"""Prefix of the names that are given to unnamed geoms, such as ``simgap.geom3``."""
+MIN_MIX = 1e-15
+"""Weight `solmix` below which a geom has no weight (MuJoCo's mjMINVAL)."""
+
+
+class ContactParameters(NamedTuple):
+    """Combined parameters of a contact: those of an element `<pair>`."""
+
+    condim: int
+    friction: Array
+    solref: Array
+    solimp: Array
+    margin: float
+    gap: float
+
+
+def get_geom_name(model: Any, geom: int) -> str:
+    """Return the name of a geom; such as ``geom3`` if it has none."""
+    return str(model.geom(geom).name).removeprefix(UNNAMED_PREFIX) or f"geom{geom}"
+
+
+def make_pair_name(model: Any, geoms: Collection[int]) -> str:
+    """Return the name of a pair of geoms of the whole model, the smaller number first."""
+    return PAIR_SEPARATOR.join(get_geom_name(model, geom) for geom in sorted(geoms))
+
+
+def find_pair_geoms(robot: RobotModel, pair: str) -> tuple[int, int]:
+    """Return the numbers of the two geoms of a pair.
+
+    Raises:
+        InputError: there are no such geoms; the message lists the existing ones.
+    """
+    model = robot.compiled
+    numbers = {get_geom_name(model, geom): geom for geom in range(model.ngeom)}
+    # The name of a geom may contain the separator.
+    parts = pair.split(PAIR_SEPARATOR)
+    for count in range(1, len(parts)):
+        names = (PAIR_SEPARATOR.join(part) for part in (parts[:count], parts[count:]))
+        one, other = (numbers.get(name) for name in names)
+        if one is not None and other is not None:
+            return one, other
+    unknown = next((name for name in parts if name not in numbers), pair)
+    raise make_unknown_name_error(f"geom of {robot.path.name}", unknown, list(numbers) or ["none"])
+
+
+def combine_contact_parameters(model: Any, geoms: tuple[int, int]) -> ContactParameters:
+    """Return the parameters that MuJoCo gives to a contact of two geoms."""
+    one, other = geoms
+    rows = list(geoms)
+    margin, gap = float(model.geom_margin[rows].sum()), float(model.geom_gap[rows].sum())
+    priority = model.geom_priority[rows]
+    mixes = np.maximum(model.geom_solmix[rows], 0.0)
+    if priority[0] != priority[1]:
+        rows = [one if priority[0] > priority[1] else other]
+        weights = np.ones(1)
+    elif (mixes < MIN_MIX).all():
+        weights = np.full(2, 0.5)
+    else:
+        weights = np.where(mixes < MIN_MIX, 0.0, mixes) / mixes[mixes >= MIN_MIX].sum()
+    solref = model.geom_solref[rows]
+    direct = (solref[:, 0] <= 0).any()
+    sliding, torsional, rolling = model.geom_friction[rows].max(axis=0)
+    return ContactParameters(
+        int(model.geom_condim[rows].max()),
+        np.array([sliding, sliding, torsional, rolling, rolling]),
+        solref.min(axis=0) if direct else weights @ solref,
+        weights @ model.geom_solimp[rows],
+        margin,
+        gap,
+    )
+
+
+@cache_per_robot
+def find_pair(robot: RobotModel, pair: str) -> int:
+    """Return the number of the element `<pair>` of two geoms.
+
+    Args:
+        robot: robot of `add_contact_pairs`.
+        pair: name of the pair.
+    """
+    model, geoms = robot.compiled, set(find_pair_geoms(robot, pair))
+    return next(
+        i
+        for i in range(model.npair)
+        if {int(model.pair_geom1[i]), int(model.pair_geom2[i])} == geoms
+    )
+
+
+def has_pair(robot: RobotModel, geoms: Collection[int]) -> bool:
+    """Return whether the model has an element `<pair>` of two geoms."""
+    model = robot.compiled
+    pairs = zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)
+    return set(geoms) in [set(one) for one in pairs]
+
+
+def read_contact_parameters(robot: RobotModel, pair: str) -> tuple[float, Array]:
+    """Return the sliding friction coefficient and `solref` of a pair in the model file."""
+    geoms = find_pair_geoms(robot, pair)
+    if has_pair(robot, geoms):
+        number = find_pair(robot, pair)
+        model = robot.compiled
+        return float(model.pair_friction[number, 0]), model.pair_solref[number]
+    found = combine_contact_parameters(robot.compiled, geoms)
+    return float(found.friction[0]), found.solref
+
+
+def add_contact_pairs(robot: RobotModel, pairs: Collection[str]) -> RobotModel:
+    """Add elements `<pair>` to a robot, with the parameters that the contacts have already.
+
+    Args:
+        robot: robot, whose elements keep their names and numbers.
+        pairs: names of the pairs; those with an element are left out.
+    """
+    model = robot.compiled
+    wanted = [find_pair_geoms(robot, pair) for pair in sorted(set(pairs))]
+    wanted = [geoms for geoms in wanted if not has_pair(robot, geoms)]
+    if not wanted:
+        return robot
+    spec = robot.spec.copy()
+    if not all(geom.name for geom in spec.geoms):
+        # Elements have numbers only after compilation.
+        with capture_mujoco_warnings():
+            spec.compile()
+        for geom, number in [(geom, geom.id) for geom in spec.geoms]:
+            geom.name = geom.name or f"{UNNAMED_PREFIX}geom{number}"
+    for geoms in wanted:
+        found = combine_contact_parameters(model, geoms)
+        names = [
+            model.geom(geom).name or UNNAMED_PREFIX + get_geom_name(model, geom) for geom in geoms
+        ]
+        spec.add_pair(
+            name=make_pair_name(model, geoms),
+            geomname1=names[0],
+            geomname2=names[1],
+            **found._asdict(),
+        )
+    return replace(robot, spec=spec)
+
+
+def list_acting_pairs(acting: Iterable[tuple[Effect, Array]]) -> list[str]:
+    """List the pairs of geoms that the model needs for effects at contacts."""
+    return sorted({pair for effect, c in acting if c.any() for pair in effect.pairs})
