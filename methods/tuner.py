@@ -351,6 +351,5 @@ def from_callback(
         worker.join(timeout=_THREAD_TIMEOUT_SECONDS)
         if worker.is_alive():
             raise RuntimeError(
-                "the optimiser swallowed the exception that ends its run; "
-                "its thread cannot be stopped"
+                "the optimiser caught the exception that ends its run; its thread cannot be stopped"
             )

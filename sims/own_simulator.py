@@ -60,17 +60,17 @@ class OwnSimulatorSystem(System):
         effects on impacts and hidden-state effects are not possible.
         """
         if issubclass(effect, Contact):
-            return "an own simulator does not say when it strikes something"
+            return "an own simulator does not report contacts"
         if issubclass(effect, Level) and cls.simulator.put is OwnSimulator.put:
             return "its levels cannot be set (it has no method put)"
         if issubclass(effect, HiddenStateEffect):
-            return "an own simulator takes forces and no states beside its own"
+            return "an own simulator takes forces, but no additional states"
         if not issubclass(effect, Force | Friction):
             return ""
         if cls.simulator.apply_force is OwnSimulator.apply_force:
             return "it takes no forces (it has no method apply_force)"
         if issubclass(effect, Friction) and cls.simulator.inertia is OwnSimulator.inertia:
-            return "it does not say its inertia (it has no method inertia)"
+            return "it does not define its inertia (it has no method inertia)"
         try:
             _ask(effect, cls)
         except _NotDeclaredError as reason:
@@ -79,15 +79,15 @@ class OwnSimulatorSystem(System):
 
     def mass(self, theta: Array, constants: Mapping[str, Array]) -> Array:
         """Raise an error, because the mass is unknown outside the simulator."""
-        raise _NotDeclaredError("it does not say its mass")
+        raise _NotDeclaredError("it does not define its mass")
 
     def weight(self, moment: StateSnapshot) -> Array:
         """Raise an error, because gravity is unknown outside the simulator."""
-        raise _NotDeclaredError("it does not say what gravity does to it")
+        raise _NotDeclaredError("it does not define the effect of gravity")
 
     def drive(self, moment: StateSnapshot) -> Array:
         """Raise an error, because the effect of inputs is unknown outside the simulator."""
-        raise _NotDeclaredError("it does not say what its inputs do to it")
+        raise _NotDeclaredError("it does not define the effect of its inputs")
 
     def observe(
         self, x: Array, v: Array, a: Array, constants: Mapping[str, Array]
@@ -185,8 +185,8 @@ class OwnSimulator(SystemSimulator):
         # Otherwise a user's `self.engine = ...` would break the base class far from its cause.
         if name in _TAKEN and name in self.__dict__:
             raise InputError(
-                f"simulator {self.name}: the attribute '{name}' is the base class's; name yours"
-                " otherwise"
+                f"simulator {self.name}: the attribute '{name}' belongs to the base class;"
+                " rename yours"
             )
         super().__setattr__(name, value)
 

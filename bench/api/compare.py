@@ -383,7 +383,7 @@ class ComparisonResult:
 
     def _read_csv_table(self, name: str) -> pd.DataFrame:
         """Read a table file of a bounce shot or of a study of two comparisons."""
-        remedy = f"simgap plot {self.folder} writes it again"
+        remedy = f"write it again with simgap plot {self.folder}"
         path = self.folder / f"{name}.csv"
         columns = (
             _SHOT_TABLE_COLUMNS if self.experiment.shot else _MISSPECIFICATION_TABLE_COLUMNS

@@ -74,10 +74,10 @@ def datasheet(recording: Sources, options: DatasheetOptions) -> DataSheet:
     )
     if extended.kind is None or kind.name != extended.kind.name:
         raise InputError(
-            f"{loaded.path}: expected a recording of {extended.system}, as what was explained; "
+            f"{loaded.path}: expected a recording of {extended.system}, as for the explanation; "
             f"found one of {kind.name}"
         )
-    options.say("computing what these data would have shown")
+    options.say("computing detection limits")
     return build_datasheet(loaded, extended, verdict, options.joint, options.name)
 
 
@@ -116,9 +116,9 @@ def _check_verdict(verdict: Verdict) -> Verdict:
         texts.append(candidate.effect)
         numbers += [candidate.p_value, candidate.heldout_gain or 0.0]
     if not all(isinstance(text, str) for text in texts) or verdict.verdict not in VERDICT_MEANINGS:
-        raise ValueError("a name is no text")
+        raise ValueError("a name is not text")
     if not all(isinstance(number, int | float) for number in numbers):
-        raise ValueError("a number is none")
+        raise ValueError("a number is not a number")
     return verdict
 
 

@@ -52,9 +52,9 @@ class NextRecording:
             return [*lines, *_format_discrimination(design)]
         factor = math.exp(min(design.gain, 50.0))
         benefit = (
-            f"it shrinks the joint confidence region of all numbers by a factor of {factor:.3g}"
+            f"it shrinks the joint confidence region of all parameters by a factor of {factor:.3g}"
         )
-        return [*lines, f"no question is open: {benefit}"]
+        return [*lines, f"no causes need to be distinguished: {benefit}"]
 
     @check_arguments
     def write(self, path: str | Path) -> None:
@@ -88,22 +88,23 @@ def _format_discrimination(design: NextRunDesign) -> list[str]:
             for name in design.distinguished_effects
         ]
         lines.append(
-            f"it distinguishes {design.effect} from {', '.join(distances)}; in brackets the "
-            "distance of the motions in units of the noise, after all numbers are fitted again"
+            f"it distinguishes {design.effect} from {', '.join(distances)}; in brackets: "
+            "distance between the predictions in noise standard deviations, with all parameters "
+            "refitted"
         )
     remaining = [name for name in discrimination if name not in design.distinguished_effects]
     if remaining:
         lines.append(f"no run of this kind distinguishes it from {', '.join(remaining)}")
     best = max((discrimination[name] for name in remaining), default=0.0)
     if best > 0 and (repeats := math.ceil(DISCRIMINATION_THRESHOLD / best)) <= MAX_REPEATS:
-        lines.append(f"recorded {repeats} times, it would distinguish it from one more of these")
+        lines.append(f"{repeats} recordings of it would distinguish one more of these")
     if design.settles_all:
-        lines.append("all open questions are then answered")
+        lines.append("all equivalent causes are then distinguished")
     other_groups = [
         group for group in design.groups if len(group) > 1 and design.effect not in group
     ]
     lines += [
-        f"if the cause is one of {', '.join(group)}, it does not distinguish these"
+        f"if the cause is one of {', '.join(group)}, this run does not distinguish them"
         for group in other_groups
     ]
     return lines

@@ -153,7 +153,7 @@ def default_experiment(simulator: str) -> str:
         return fitting[0]
     hint = f"choose one with --experiment: {', '.join(fitting)}"
     if not fitting:
-        hint = "none of the project tunes it; give a TOML file with --experiment FILE"
+        hint = "no built-in experiment tunes it; give a TOML file with --experiment FILE"
     raise InputError(f"simulator {simulator}: expected an experiment that tunes it; {hint}")
 
 

@@ -311,8 +311,8 @@ def draw_shots_figure(
         axis.set_xlabel("distance [m]")
     axes[0, 0].legend(loc="upper right", fontsize=8, frameon=False)
     note = (
-        "Above a usual shot, of those that the untuned simulator missed if any; "
-        "below the worst of the tuned."
+        "Top: a typical shot, one that the untuned simulator missed if there is one. "
+        "Bottom: the worst shot of the tuned simulator."
     )
     figure.suptitle("Planned in the simulator, flown in the world", fontsize=11)
     figure.supxlabel(textwrap.fill(note, 140), fontsize=7.5)

@@ -383,6 +383,8 @@ def _plan_shot(
     plan = plan_shot_in_model(model, settings, scene, radius)
     if not plan.is_found and model.status in ("done", "converged"):
         return replace(
-            model, status="no plan", reason="the model reaches the hoop's plane from no height"
+            model,
+            status="no plan",
+            reason="the model does not reach the hoop's plane from any height",
         )
     return replace(model, height=plan.height, margin=plan.rim_margin)

@@ -28,7 +28,7 @@ from sims.core.simulator import InputError
 
 SHOTS_FOLDER = "shots"
 """Name of the folder of finished shots, in the folder of a study."""
-_REMEDY = "damaged; delete it, and resume to make it again"
+_REMEDY = "damaged; delete it, and resume to repeat it"
 _NUMBERS = ("height", "margin", "restitution", "seconds")
 """Numbers of a model that may be missing."""
 

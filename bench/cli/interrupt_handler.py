@@ -39,7 +39,7 @@ class InterruptHandler:
     def _announce_early_end(self, *_: object) -> None:
         self._asked = True
         signal.signal(signal.SIGINT, signal.default_int_handler)
-        self._say("ending with what there is; Ctrl-C again ends at once")
+        self._say("stopping with the results so far; Ctrl-C again stops at once")
 
 
 def _print_line(text: str) -> None:

@@ -105,7 +105,7 @@ COMMANDS = (
     Command(
         "import",
         "import_logs:add_import_arguments",
-        "describe a robot's logs where they are, so that every command can read them",
+        "write a description of a robot's logs, so that every command can read them",
         "simgap import log.csv --model arm.xml --out arm.toml",
     ),
     Command(
@@ -117,13 +117,13 @@ COMMANDS = (
     Command(
         "explain",
         "explain:add_explain_arguments",
-        "find what a simulation gets wrong on a recording, and the cause",
+        "find where a simulation differs from a recording, and the cause",
         "simgap explain swing.csv --out results/swing",
     ),
     Command(
         "design",
         "design:add_design_arguments",
-        "design the next recording, which answers the questions that remain open",
+        "design the next recording, which distinguishes equivalent causes",
         "simgap design swing.csv --seconds 4 --out next.csv",
     ),
     Command(
@@ -177,7 +177,7 @@ COMMANDS = (
     Command(
         "completion",
         "completion:add_completion_arguments",
-        "print a script by which a shell completes simgap's commands",
+        "print a shell script that completes simgap's commands",
         "simgap completion bash > ~/.local/share/bash-completion/completions/simgap",
     ),
 )
@@ -255,9 +255,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stderr.close()
         return EXIT_OK
     except KeyboardInterrupt:
-        printer.print_error(
-            "interrupted", "interrupted before there was a result", EXIT_INTERRUPTED
-        )
+        printer.print_error("interrupted", "interrupted before the first result", EXIT_INTERRUPTED)
         return EXIT_INTERRUPTED
     except Exception as error:
         printer.print_error("internal", f"{type(error).__name__}: {error}", EXIT_PROBLEMS_FOUND)

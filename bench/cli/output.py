@@ -32,8 +32,7 @@ EXIT_INTERRUPTED = 130
 """Exit code of a command that was interrupted, by the convention of shells."""
 EXIT_CODES = {
     EXIT_OK: "done",
-    EXIT_PROBLEMS_FOUND: "done, but a run, a check or a claim failed, or a condition was met that "
-    "an option names",
+    EXIT_PROBLEMS_FOUND: "done, but a run or a check failed, or the condition of an option was met",
     EXIT_ERROR: "an error in the input, described in one line; no incomplete results are left",
     EXIT_INTERRUPTED: "interrupted; finished results are kept",
 }

@@ -20,7 +20,7 @@ TICK = 0.5
 """Interval of the timer that updates the display between two events, in seconds."""
 HINT_AFTER = 20.0
 """Elapsed time after which `HINT` is printed, in seconds."""
-HINT = "add --budget 60 to stop after a minute with the best answer so far"
+HINT = "add --budget 60 to stop after a minute with the best result so far"
 LEAST_SHARE = 0.02
 """Minimum share of the search that must be done before the remaining time is estimated."""
 OVERDUE = 0.5

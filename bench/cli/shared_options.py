@@ -119,7 +119,8 @@ def add_force_option(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--force",
         action="store_true",
-        help="start even if it needs more than this machine has, or if the data are implausible",
+        help="start even if this machine has too little memory, disk or time, or if the data are "
+        "implausible",
     )
 
 

@@ -83,7 +83,7 @@ def check_global_random_state(look: str) -> Iterator[None]:
     ]
     check(
         not changed_generators,
-        "global random state left alone",
+        "global random state unchanged",
         f"changed: {', '.join(changed_generators)}",
         look,
     )

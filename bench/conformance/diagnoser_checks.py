@@ -242,7 +242,10 @@ def check_same_answer_again(kind: type[Diagnoser]) -> None:
 def check_leaves_the_recording_alone(kind: type[Diagnoser]) -> None:
     """Check that neither the arrays nor the files of the recording are changed."""
     check(
-        not _diagnose_cached(kind).changed, "the recording as it was", "another one", kind.__name__
+        not _diagnose_cached(kind).changed,
+        "the recording unchanged",
+        "a different one",
+        kind.__name__,
     )
 
 

@@ -76,7 +76,7 @@ def _make_simulator_with_effect(
     if effect.name not in registered_names or effects.get_effect(effect.name) is not effect:
         if effect.name in registered_names:
             raise CheckError(
-                f"expected a name of its own; found {effect.name}; see {effect.__name__}.name"
+                f"expected a unique name; found {effect.name}; see {effect.__name__}.name"
             )
         effects.register_effect(effect)
     return host(engine=_choose_engine(host), effects=[effect.name])
@@ -137,7 +137,7 @@ def check_declaration_is_complete(effect: type[Effect]) -> None:
     has_host = any(True for _ in _find_supporting_systems(effect)) or bool(
         list_effect_places(effect)
     )
-    check(has_host, "a registered system or a robot that can have it", "none", location)
+    check(has_host, "a registered system or robot that supports it", "none", location)
 
 
 def check_contribution_is_nothing_at_zero(effect: type[Effect]) -> NotApplicable | None:
@@ -259,7 +259,7 @@ def check_lanes_are_independent(effect: type[Effect]) -> NotApplicable | None:
         )
         check(
             is_bitwise_equal(batch_result, single_results),
-            "the same bits alone and among others",
+            "bitwise equal results alone and in a batch",
             "others",
             effect.__name__,
         )
@@ -279,10 +279,10 @@ def check_impossible_hosts_are_refused(effect: type[Effect]) -> NotApplicable | 
         raise CheckError(
             f"expected {host.name} to refuse it; found that it did not; see {effect.__name__}.needs"
         )
-    return None if impossible else NotApplicable("every registered system can have it")
+    return None if impossible else NotApplicable("every registered system supports it")
 
 
-NO_SUPPORTING_SYSTEM = NotApplicable("no registered system can have it")
+NO_SUPPORTING_SYSTEM = NotApplicable("no registered system supports it")
 
 EFFECT_CHECKS: tuple[Check, ...] = (
     check_declaration_is_complete,

@@ -52,12 +52,12 @@ def check_same_run_when_sealed(kind: type[Tuner]) -> NotApplicable | None:
     )
     check(
         sandboxed_trace.status == local_trace.status,
-        f"the end {local_trace.status} when sealed",
+        f"the status {local_trace.status} when isolated",
         end_text,
         location,
     )
     is_same = np.array_equal(sandboxed_trace.proposals, local_trace.proposals)
-    check(is_same, "the same run when sealed", "another one", location)
+    check(is_same, "the same run when isolated", "another one", location)
     return None
 
 

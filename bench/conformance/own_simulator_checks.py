@@ -50,7 +50,7 @@ def check_hooks_have_the_declared_shapes(kind: type[Simulator]) -> NotApplicable
     heavy = user_class.inertia is not OwnSimulator.inertia
     hook = "apply_force" if forced else "inertia"
     if forced or heavy:
-        expected = f"the attributes coordinates and rates beside {hook}"
+        expected = f"the attributes coordinates and rates with {hook}"
         check(bool(user_class.coordinates), expected, "none", user_class.__name__)
     simulator = user_class()
     names = [c.name for c in simulator.channels]
@@ -108,7 +108,7 @@ def check_step_goes_on_by_its_seconds(kind: type[Simulator]) -> NotApplicable | 
     if not has_moved.any():
         return NotApplicable("nothing moves")
     ratio = float(np.min(np.abs(half_change[has_moved] / full_change[has_moved])))
-    expected = f"{2 * _FEW} steps of time_step / 2 to lead as far as {_FEW} of time_step"
+    expected = f"{2 * _FEW} steps of time_step / 2 to reach the same state as {_FEW} of time_step"
     location = f"{user_class.__name__}.step: the engine must step by `seconds`"
     check(ratio < _FARTHER, expected, f"{ratio:.2g} times as far", location)
     return None
@@ -173,7 +173,7 @@ def check_forces_act(kind: type[Simulator]) -> NotApplicable | None:
             location,
         )
         is_restored = is_bitwise_equal(unforced, _simulate_motion(simulator, None))
-        reset = f"{user_class.__name__}.reset: it must take away a force that was applied"
+        reset = f"{user_class.__name__}.reset: it must remove a force that was applied"
         check(is_restored, "the same run after one with forces", "another", reset)
         velocity = np.abs(forced - unforced)[:, len(user_class.coordinates) + place]
         has_grown = 0.0 < velocity[1] * _GROWN < velocity[_LATER]

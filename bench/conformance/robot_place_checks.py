@@ -130,7 +130,7 @@ def check_it_acts_at_its_place_alone(effect: type[Effect]) -> NotApplicable | No
         )
         check(
             bool((observations != base_observations).any()) == is_observable,
-            "a change where it is seen",
+            "a change in the channels it affects",
             "none",
             location,
         )
@@ -143,7 +143,7 @@ def check_it_acts_at_its_place_alone(effect: type[Effect]) -> NotApplicable | No
                     observations[:, :, other_channels] == base_observations[:, :, other_channels]
                 ).all()
             )
-            check(is_same, "other channels left alone", "changes", location)
+            check(is_same, "other channels unchanged", "changes", location)
         for part, coefficients in effect_class().parts(
             np.ones((len(effect_class.coefficients), 2, 1))
         ):
@@ -151,7 +151,7 @@ def check_it_acts_at_its_place_alone(effect: type[Effect]) -> NotApplicable | No
     are_disjoint = len(
         {changed_fields for changed_fields in fields_by_part.values() if changed_fields}
     ) == sum(map(bool, fields_by_part.values()))
-    check(are_disjoint, "each place to be touched by one alone", fields_by_part, effect.__name__)
+    check(are_disjoint, "each place to be changed by one effect only", fields_by_part, effect.__name__)
     return None if classes else NO_PLACE
 
 
@@ -176,7 +176,7 @@ def check_family_is_the_sum_of_its_members(effect: type[Effect]) -> NotApplicabl
                 effect_class.simulate(theta, make_scenario()),
                 members_simulator.simulate(each, make_scenario()),
             ),
-            "the motion of all members together",
+            "the motion of all members of the family together",
             "another",
             family.name,
         )
@@ -207,7 +207,12 @@ def check_lanes_of_a_robot_are_independent(effect: type[Effect]) -> NotApplicabl
     is_same = is_bitwise_equal(batch_result, single_results) and is_bitwise_equal(
         batch_result, np.ascontiguousarray(reversed_result)
     )
-    check(is_same, "the same bits alone, among others and in any order", "others", effect.__name__)
+    check(
+        is_same,
+        "bitwise equal results alone, in a batch and in any order",
+        "others",
+        effect.__name__,
+    )
     return None if classes else NO_PLACE
 
 

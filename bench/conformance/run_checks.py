@@ -196,7 +196,7 @@ def _run_all_checks(kind: str, name: str, plugins: Sequence[str]) -> Iterator[tu
             if failed_check is not None:
                 line = f"{_LEFT_OUT}needs '{title_of(failed_check)}'"
             elif lost_workers == 2 or (lost_workers and check in _MULTIPROCESS_CHECKS):
-                line = f"{_LEFT_OUT}the process of other checks died, or had to be killed"
+                line = f"{_LEFT_OUT}the process of other checks ended or was killed"
             elif check in _MULTIPROCESS_CHECKS:
                 # This check runs the subject in this process too; earlier checks have shown that
                 # this is safe.
@@ -221,5 +221,5 @@ def _format_check_end(end: Any) -> str:
     if isinstance(end, InputError):
         return str(end)
     if isinstance(end, Exception):
-        return f"expected to survive; found {type(end).__name__}: {end}; see where it says"
+        return f"expected the process to survive; found {type(end).__name__}: {end}; see its output"
     return str(end)

@@ -134,7 +134,7 @@ def check_same_proposal_gives_the_same_bits(kind: type[Simulator]) -> None:
     simulator.simulate(_draw_points(simulator, 2, seed=9), longer_run)
     compare(simulator.simulate(points.copy(), run), "after a run with other inputs")
     single_results = [simulator.simulate(point[None].copy(), run) for point in points[::-1]]
-    compare(np.concatenate(single_results[::-1]), "one by one as all together")
+    compare(np.concatenate(single_results[::-1]), "one by one as in one batch")
     compare(new_simulator.simulate(points.copy(), run), "in a new simulator")
     simulator.close()
     compare(simulator.simulate(points.copy(), run), "after close()")
@@ -148,7 +148,7 @@ def _describe_first_difference(kind: type[Simulator], expected: Array, observati
         return f"shape {observations.shape} in place of {expected.shape}"
     is_different = (expected != observations) & ~(np.isnan(expected) & np.isnan(observations))
     if not is_different.any():
-        return "zeros of another sign"
+        return "zeros of the opposite sign"
     lane, sample, channel = min(np.argwhere(is_different).tolist(), key=lambda index: index[1])
     expected_value, found_value = (
         expected[lane, sample, channel],
@@ -169,7 +169,7 @@ def check_arguments_are_not_changed(kind: type[Simulator]) -> None:
     simulator.simulate(points, scenario)
     check(
         is_bitwise_equal(points_before, points) and is_bitwise_equal(times, scenario.times),
-        "arguments as they were",
+        "unchanged arguments",
         "changed ones",
         kind.__name__,
     )
@@ -184,10 +184,15 @@ def check_parameters_that_are_not_numbers_spoil_only_their_lane(kind: type[Simul
     # The middle element has neighbours on both sides.
     points[1] = np.nan
     observations = simulator.simulate(points, _make_scenario(kind))
-    check(bool(np.isnan(observations[1]).all()), "a lane of NaN", observations[1][:2], location)
+    check(
+        bool(np.isnan(observations[1]).all()),
+        "a batch element of NaN",
+        observations[1][:2],
+        location,
+    )
     check(
         is_bitwise_equal(expected_observations[[0, 2]], observations[[0, 2]]),
-        "neighbours as they were",
+        "unchanged other elements",
         "others",
         location,
     )
@@ -210,7 +215,7 @@ def check_every_parameter_shows(kind: type[Simulator]) -> None:
     for parameter, lane in zip(simulator.parameters, observations[1:], strict=True):
         check(
             not np.array_equal(lane, observations[0]),
-            f"parameter {parameter.name} to change something",
+            f"parameter {parameter.name} to change the observations",
             "nothing",
             kind.__name__,
         )
@@ -231,7 +236,8 @@ def check_initial_states_show(kind: type[Simulator]) -> NotApplicable | None:
         changed_scenario = Scenario(run.times, {name: changed_value}, run.inputs)
         check(
             not np.array_equal(observations, simulator.simulate(theta, changed_scenario)),
-            f"initial state {name} = {changed_value:g} in place of {value:g} to change something",
+            f"initial state {name} = {changed_value:g} in place of {value:g} to change the "
+            "observations",
             "the same observation",
             f"{kind.__name__}.reset" if hasattr(kind, "reset") else kind.__name__,
         )
@@ -285,7 +291,7 @@ def check_chosen_channels_are_the_same_columns(kind: type[Simulator]) -> NotAppl
     )
     check(
         is_same,
-        "the same columns in the order asked for",
+        "the same columns in the requested order",
         "others",
         f"{kind.__name__}: self.columns",
     )

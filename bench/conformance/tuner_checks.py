@@ -141,7 +141,7 @@ def check_arguments_are_not_changed(kind: type[Tuner]) -> None:
     changed = [a.shape for a, b in zip(arrays, copies, strict=True) if not is_bitwise_equal(a, b)]
     check(
         not changed,
-        "arguments as they were",
+        "unchanged arguments",
         f"changed arrays of shapes {changed}",
         f"{kind.__name__}.tune",
     )
@@ -211,7 +211,7 @@ def check_runs_do_not_touch_each_other(kind: type[Tuner]) -> None:
     is_same = is_bitwise_equal(reused.proposals, fresh_trace.proposals)
     check(
         is_same,
-        "nothing kept from run to run",
+        "no state kept between runs",
         "a different run",
         f"what {kind.__name__}.tune keeps in self",
     )
@@ -227,7 +227,7 @@ def check_global_random_state_is_left_alone(kind: type[Tuner]) -> None:
 def check_stochastic_is_declared(kind: type[Tuner]) -> NotApplicable | None:
     """Check that a tuner declared as not stochastic gives the same run for every seed."""
     if kind.stochastic:
-        return NotApplicable("it says that it uses chance")
+        return NotApplicable("it declares that it is random")
     tuner = make_trained_tuner(kind, 2)
     is_same = is_bitwise_equal(
         run_tuner(tuner, 2, 15, seed=1).proposals, run_tuner(tuner, 2, 15, seed=2).proposals

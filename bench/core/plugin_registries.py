@@ -188,4 +188,4 @@ def _format_plugin_error(error: BaseException) -> str:
     try:
         return str(error)
     except Exception:
-        return "without words"
+        return "without a message"

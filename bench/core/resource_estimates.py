@@ -83,7 +83,7 @@ class ResourceNeed:
             if required > available:
                 return f"{format_bytes(required)} {unit}, where there are {format_bytes(available)}"
         if self.files > machine.files:
-            return f"{self.files:.3g} files, where there is room for {machine.files:.3g}"
+            return f"{self.files:.3g} files, where there is space for {machine.files:.3g}"
         if self.steps > MAX_STEPS_PER_SIMULATION:
             return (
                 f"{self.steps:.3g} steps in one simulation, "
@@ -91,7 +91,7 @@ class ResourceNeed:
             )
         if self.seconds > MAX_TOTAL_SECONDS:
             longest_text = _format_long_duration(MAX_TOTAL_SECONDS)
-            return f"{_format_long_duration(self.seconds)}, where {longest_text} are the most"
+            return f"{_format_long_duration(self.seconds)}, where {longest_text} are allowed"
         return ""
 
 

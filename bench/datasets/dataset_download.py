@@ -141,7 +141,9 @@ def _download_content(url: str, data_set: DataSet, file: SourceFile, advance: Ad
     Raises:
         InputError: The file cannot be downloaded.
     """
-    remedy = f"get it elsewhere and give its folder with `{data_set.command} --from FOLDER`"
+    remedy = (
+        f"download it by other means and give its folder with `{data_set.command} --from FOLDER`"
+    )
     request = urllib.request.Request(url, headers={"User-Agent": f"simgap/{__version__}"})
     content = b""
     try:

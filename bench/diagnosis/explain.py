@@ -75,7 +75,7 @@ SOFT_FRICTION = (
     "it fits better than stiff friction"
 )
 """Message to the user when dry friction changes to the soft form."""
-STIFF_FRICTION = "soft dry friction leaves a gap all the same: stiff friction is used"
+STIFF_FRICTION = "soft dry friction does not close the gap either: stiff friction is used"
 """Message to the user when dry friction changes back to the stiff form."""
 if TYPE_CHECKING:
     from bench.diagnosis.evaluation.integrator_check import StepRefinement
@@ -685,7 +685,7 @@ class _ExplainRun:
         # This import is needed for robots only.
         from bench.diagnosis.kalman.candidate_responses import FollowedRuns
 
-        self.watch.stage("following the runs with the model")
+        self.watch.stage("computing prediction errors")
         world, *held_out = self._worlds()
         followed = self._filter()
         # Where the linear model diverges, causes are searched by simulation.
@@ -819,7 +819,10 @@ class _ExplainRun:
             names = ", ".join(
                 self.fitting.parameters[i].name for i in sorted(kept.unidentified_parameters)
             )
-            self.say(f"frozen, as the recording cannot fix it beside the others: {names}")
+            self.say(
+                "kept at the nominal value, because the recording does not identify it "
+                f"together with the others: {names}"
+            )
         return kept
 
     def _stepped(self, base: BaseFit) -> BaseFit:
@@ -859,7 +862,9 @@ class _ExplainRun:
     def _use_finer(self, fine: StepRefinement, gain: float, base: BaseFit, file: _Worlds) -> None:
         """Record that the file's own step is too coarse; the finer step is in use already."""
         numerics = fine.numerics
-        self.say(f"stepped more finely: {numerics.integrator}, {numerics.timestep:g} s")
+        self.say(
+            f"simulated with a smaller time step: {numerics.integrator}, {numerics.timestep:g} s"
+        )
         self.coarse, self.file = CoarseStepFinding(fine, gain), file
         self.assessor = replace(self.assessor, before=self._before(base, file.validation))
 
@@ -888,7 +893,9 @@ class _ExplainRun:
             before = self.assessor.before
             self._return(self.file)
             if not is_finer_model_better(self._best(search, finding), found):
-                self.say("the model file's own step explains the data as well: it is used")
+                self.say(
+                    "the time step of the model file explains the data equally well: it is used"
+                )
                 self.coarse = None
                 base = BaseFit(search.base_model.fit, search.frozen)
                 return self._answered(fit_base_model(self.fitting, self.noise, self._nearby(base)))
@@ -969,10 +976,11 @@ class _ExplainRun:
             return InputError(f"{self.path}: {self.faults[0].says}")
         if self.watch.has_abandoned_fits():
             return InputError(
-                f"{self.path}: the search was ended before a fit could follow the recording"
+                f"{self.path}: the search was stopped before the first fit of the recording was "
+                "finished"
             )
         return InputError(
-            f"{self.path}: the simulation fails wherever a fit begins; "
+            f"{self.path}: the simulation fails at every starting point of the fit; "
             "check constants, units, inputs and initial states"
         )
 

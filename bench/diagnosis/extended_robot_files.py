@@ -48,7 +48,9 @@ def build_robot_files(extended: ExtendedSimulator) -> ExtendedRobotFiles:
         check_written_files(kind.robot, causes, written_files)
     except RuntimeError as error:
         # An error here must not discard the result of minutes of search.
-        return ExtendedRobotFiles({}, (f"no model file is written, by a fault of simgap: {error}",))
+        return ExtendedRobotFiles(
+            {}, (f"no model file is written because of an internal error of simgap: {error}",)
+        )
     try:
         before = kind.robot.path.read_text(encoding="utf-8", errors="replace")
     except OSError:

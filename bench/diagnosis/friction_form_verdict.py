@@ -20,7 +20,7 @@ from sims.core.effect import Effect, Friction, members_of
 from sims.core.simulator import Array
 from sims.system_simulator import SystemSimulator
 
-_HOLDS = ", and smaller forces do not start it"
+_HOLDS = ", and smaller forces do not start motion"
 """Part of the description of Coulomb friction that does not hold for the soft form, which creeps.
 """
 

@@ -25,6 +25,7 @@ from typing import Literal
 
 import numpy as np
 
+from bench.core.unit_text import format_unit
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.fit_state import TrajectoryFit
@@ -303,30 +304,38 @@ def format_identifiability(
     lines += [f"  {_format_parameter(number)}" for number in numbers if number.free]
     causes = {level: [n for n in numbers if not n.free and n.word == level] for level in _WORDS}
     counts = [f"{len(members)} {level}" for level, members in causes.items()]
-    lines.append(f"causes, each by itself, surest first: {', '.join(counts)}")
+    lines.append(f"causes, each considered alone, smallest uncertainty first: {', '.join(counts)}")
     # A limit has no interval, and follows the causes that have one.
     identifiable = sorted(causes["identifiable"], key=lambda number: bool(np.isnan(number.half)))
     lines += [f"  {_format_parameter(number)}" for number in identifiable[:max_count]]
     for level, members in (
-        ("identifiable too", identifiable[max_count:]),
+        ("also identifiable", identifiable[max_count:]),
         *list(causes.items())[1:],
     ):
         if members:
             lines.append(f"  {level}: {listed(_count_effects(members), max_count)}")
     if any(len(members) > max_count for members in causes.values()):
-        lines.append("  every cause with its number: the same command with --json")
+        lines.append("  all causes with their intervals: the same command with --json")
     return lines
 
 
 def _format_parameter(number: ParameterIdentifiability) -> str:
     """Format one parameter with its level, interval, range and confounded parameters."""
-    interval_text = f"±{number.half:.2g} {number.unit}" if np.isfinite(number.half) else "untouched"
+    interval_text = (
+        f"±{number.half:.2g} {format_unit(number.unit)}".rstrip()
+        if np.isfinite(number.half)
+        else "no "
+    )
+    "influence"
     if np.isnan(number.half):
-        interval_text = "a limit within reach"
+        interval_text = "a limit inside the range of the data"
     confounder_text = listed([f"{name} ({corr:.3f})" for name, corr in number.mixed], 2)
-    confounding_note = f"; mixed up with {confounder_text}" if confounder_text else ""
+    confounding_note = f"; confounded with {confounder_text}" if confounder_text else ""
     span = f"{number.low:.3g} to {number.high:.3g}"
-    return f"{number.word:16s} {number.name}: {interval_text} of {span}{confounding_note}"
+    return (
+        f"{number.word:16s} {number.name}: {interval_text} (plausible range "
+        f"{span}){confounding_note}"
+    )
 
 
 def _count_effects(numbers: Sequence[ParameterIdentifiability]) -> list[str]:

@@ -61,7 +61,7 @@ def check_identifiability(
         base = fit_base_model(world, noise)
         if not np.isfinite(base.fit.cost):
             raise InputError(
-                f"{recording.path}: the simulation fails wherever a fit begins; "
+                f"{recording.path}: the simulation fails at every starting point of the fit; "
                 "check constants, units, inputs and initial states"
             )
         numbers = assess_identifiability(

@@ -306,8 +306,8 @@ class DiagnosisReportDataBuilder:
         # Lack of fit is either a residual with a pattern, or one that is only too large.
         if p_value < STRUCTURE_P_VALUE_THRESHOLD:
             return (
-                f"the residual has structure (p-value {p_value:.2g}) "
-                "that the sensor's noise does not have"
+                "the residual has structure that sensor noise does not explain "
+                f"(p-value {p_value:.2g})"
             )
         return "the residual exceeds the stated noise of the sensors"
 

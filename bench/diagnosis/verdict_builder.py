@@ -516,10 +516,12 @@ def _propose_identifying_run(unidentified: tuple[str, ...]) -> DiscriminatingRun
     """Propose how to identify parameters that the data do not identify."""
     has_several = len(unidentified) > 1
     condition_text = (
-        "they act differently from each other" if has_several else "it makes a difference"
+        "their influences differ" if has_several else "it changes the motion"
     )
     names = " and ".join(unidentified)
-    return DiscriminatingRun(f"Measure {names} apart, or record runs in which {condition_text}")
+    return DiscriminatingRun(
+        f"Measure {names} separately, or record runs in which {condition_text}"
+    )
 
 
 def _build_held_out_result(gain: HeldOutGain, unit: str) -> HeldOutResult:

@@ -38,7 +38,7 @@ class AnswerStore:
         except OSError:
             self._file.close()
             raise InputError(
-                f"{folder}: another simgap is at work there; wait for it, or end it"
+                f"{folder}: another simgap process uses this folder; wait for it, or end it"
             ) from None
         self._end_last_line()
         self.answered = read_answers(folder)

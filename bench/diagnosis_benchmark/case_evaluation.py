@@ -266,7 +266,7 @@ def _validate_answer(message: Any, limits: AnswerLimits) -> dict[str, Any]:
     """
     simulations, seconds = int(message["simulations"]), float(message["processor_seconds"])
     if not 0 <= simulations <= limits.simulations or not 0 <= seconds < 1e9:
-        raise ProtocolError("it said what it cannot have used")
+        raise ProtocolError("it reported an impossible number of simulations")
     if skipped := str(message.get("skipped", ""))[:_REASON]:
         empty_answer = {"answer": None, "simulations": 0, "processor_seconds": 0.0}
         return {**empty_answer, "skipped": skipped}
@@ -344,7 +344,7 @@ def train_isolated(
         message = child.receive(MAX_STATE_BYTES, deadline)
         try:
             if message.kind != b"L":
-                raise ProtocolError("it learned nothing")
+                raise ProtocolError("it has no training result")
             trained_arrays = unpack_arrays(message.body)
             used_simulations = int(trained_arrays.pop("simulations")[0])
         except (ProtocolError, KeyError, ValueError) as error:

@@ -62,7 +62,7 @@ def draw_confusion_matrices(rows: pd.DataFrame, order: Sequence[str], title: str
         figure,
         f"{len(cases)} recordings with nothing hidden, one effect of at least one noise or a "
         "foreign cause. Per cent of a row. Black frames: right. A cause that is found alone or in "
-        "a set of at most two counts as its family, else the leading name does.",
+        "a set of at most two counts as its family, otherwise the first named cause counts.",
         letters=16,
     )
     return figure

@@ -19,10 +19,10 @@ OUTCOME_STYLES = (
     ("right", style.BLACK, "named, alone"),
     ("set", style.BLUE, "in a set"),
     ("class", style.SKY_BLUE, "an equivalent one"),
-    ("extra", style.ORANGE, "named, and another beside it"),
+    ("extra", style.ORANGE, "named, with another one"),
     ("wrong", style.VERMILION, "something else named"),
-    ("unnamed", style.NOISE_BAND_GREY, "seen, not named"),
-    ("missed", style.RECORDED_PART_GREY, "not seen"),
+    ("unnamed", style.NOISE_BAND_GREY, "detected, not named"),
+    ("missed", style.RECORDED_PART_GREY, "not detected"),
     ("undecided", style.RECORDED_PART_GREY, "unidentifiable"),
     ("failed", style.PURPLE, "no answer"),
 )
@@ -114,7 +114,7 @@ def draw_power(frame: pd.DataFrame, order: Sequence[str], title: str) -> Figure:
     for axis, metric, metric_title in zip(
         axes[0],
         ("named", "seen"),
-        ("named (set of at most two)", "something is seen"),
+        ("named (set of at most two)", "gap detected"),
         strict=True,
     ):
         part = frame[frame["metric"] == metric]
@@ -154,8 +154,8 @@ def draw_power(frame: pd.DataFrame, order: Sequence[str], title: str) -> Figure:
     )
     style.add_caption(
         figure,
-        f"Recordings with one hidden effect: {case_counts} noises. Bars: 95 % (Wilson). Who alarms "
-        "always sees everything: see false alarms.",
+        f"Recordings with one hidden effect: {case_counts} noises. Bars: 95 % (Wilson). Compare "
+        "with the false alarms: a diagnoser that always alarms detects everything.",
         letters=16,
     )
     return figure
@@ -256,8 +256,8 @@ def draw_p_value_calibration(frame: pd.DataFrame, order: Sequence[str], title: s
     case_count = int(frame["of"].max())
     style.add_caption(
         figure,
-        f"Up to {case_count} recordings with nothing hidden. Dashes: a p value that is one. Below: "
-        "too careful; above: it alarms too often. Bars: 95 % (Clopper-Pearson).",
+        f"Up to {case_count} recordings with nothing hidden. Dashes: calibrated p-values. Below: "
+        "conservative; above: too many alarms. Bars: 95 % (Clopper-Pearson).",
         letters=16,
     )
     return figure
@@ -308,7 +308,7 @@ def draw_cost(costs: pd.DataFrame, table: pd.DataFrame, order: Sequence[str], ti
     figure.suptitle(title, fontsize=11)
     training_simulations = {n: int(costs_by_diagnoser[n]["training_simulations"]) for n in order}
     training_text = "; ".join(
-        f"{name} has learned from {count:,} simulations before".replace(",", " ")
+        f"{name} was trained with {count:,} simulations".replace(",", " ")
         for name, count in training_simulations.items()
         if count
     )

@@ -79,7 +79,7 @@ def write_report(study: ReportableDiagnosisStudy, print_line: Callable[[str], No
         return 0
     rows = select_fully_answered_cases(all_rows, order)
     if rows.empty:
-        print_line("no question has been put to every diagnoser yet")
+        print_line("no case has been given to every diagnoser yet")
         return 0
     training = read_training_costs(study.folder)
     write_atomically(study.folder / ANSWERS_TABLE_FILE, format_csv(rows))
@@ -107,7 +107,7 @@ def write_report(study: ReportableDiagnosisStudy, print_line: Callable[[str], No
     for line in format_summary(tables, order):
         print_line(line)
     for name, reason, count in summarise_unsupported(left_out):
-        print_line(f"{name} does not support {count} of the questions: {reason}")
+        print_line(f"{name} does not support {count} of the cases: {reason}")
     answered_count, planned_count = rows["question"].nunique(), len(study.cases)
     undetectable_count = sum(not answer["item"] for answer in study.answers.values())
     print_line(

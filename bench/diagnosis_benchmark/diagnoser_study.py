@@ -499,8 +499,8 @@ def _register_stub(name: str, trusted: bool) -> None:
     registered = diagnosers.snapshot().get(name)
     if not trusted and registered is not None:
         raise InputError(
-            f"diagnoser {name}: class {kind.__qualname__} is in this process, where the truths "
-            "are: put it into a plugin file, or trust the diagnosers (--trust)"
+            f"diagnoser {name}: class {kind.__qualname__} is in this process, which has the "
+            "true causes: put it into a plugin file, or use --trust"
         )
 
 

@@ -118,7 +118,7 @@ def read_table(folder: Path, name: str) -> pd.DataFrame:
         InputError: the file does not exist or is damaged.
     """
     path = folder / f"{name}.csv"
-    remedy = f"simgap plot {folder} writes it again"
+    remedy = f"write it again with simgap plot {folder}"
     table: pd.DataFrame = CsvTable(path, TABLE_COLUMNS[name], remedy).table.to_pandas()
     return table
 

@@ -126,18 +126,17 @@ def compute_heights_by_scale(
             )
         factor = fallen
         method = (
-            f"scaled by the fall (gravity {DEFAULT_GRAVITY:g} m/s^2; "
-            "a drag would be taken for scale)"
+            f"scaled by the fall (gravity {DEFAULT_GRAVITY:g} m/s^2; drag would bias the scale)"
         )
         # Without a diameter, assume the radius that a level camera would give.
         ball = diameter / 2 if diameter else factor
     else:
         factor = ball = diameter / 2
-        method = "scaled by the ball's diameter, as for a camera that looks level"
+        method = "scaled by the ball's diameter, for a horizontal camera"
         if fallen is not None and abs(fallen / factor - 1) > _DIFFER:
             notes.append(
-                f"the fall says {fallen / factor - 1:+.0%} for all heights: the camera looks down "
-                "or up, or gravity is not 9.81 m/s^2; the scale 'fall' uses the fall"
+                f"the fall says {fallen / factor - 1:+.0%} for all heights: the camera is tilted, "
+                "or gravity is not 9.81 m/s^2; the scale 'fall' uses the fall"
             )
     return BallHeights(ball + factor * (ground - q), ball, method, tuple(notes))  # Equation (2).
 

@@ -48,8 +48,8 @@ class FrameDescription:
         for name in ("units", "constants", "description"):
             if getattr(self, name):
                 raise InputError(
-                    f"{name}: expected only with a DataFrame; {recording} has a description, "
-                    "which states them"
+                    f"{name}: expected only with a DataFrame; {recording} has a description "
+                    "that states them"
                 )
 
 
@@ -93,7 +93,7 @@ def _get_simulator_class(name: str, meta: Mapping[str, Any]) -> type[Simulator]:
     system = meta.get("system")
     if not isinstance(system, str):
         raise InputError(
-            f"{name}: expected what it is a recording of: system='NAME' or model='robot.xml'; "
+            f"{name}: expected a system or model: system='NAME' or model='robot.xml'; "
             f"systems are {', '.join(simulators.names())}"
         )
     try:

@@ -107,7 +107,7 @@ def track_film(
     notes = [*film.notes, *track.notes, *heights.notes]
     if first > track.visible_frames[0]:
         until = f"the ball is held until {track.times[first]:.2f} s"
-        notes.append(f"{until}; what is before that is left out")
+        notes.append(f"{until}; earlier frames are left out")
     noise = _estimate_height_noise(track, heights, part)
 
     # The recording and its figures are published together, so that none exists without the others.

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from bench.core.plugin_registries import make_robot_simulator, simulators
+from bench.core.unit_text import format_unit
 from bench.logs.signal_statistics import (
     compute_run_statistics,
     compute_signal_statistics,
@@ -30,8 +31,8 @@ _MOST_RUNS = 40
 _MOST_NAMES = 12
 """Maximum number of runs that are named in one line."""
 _CAVEAT = (
-    "estimated: from second and third differences, white noise assumed; coloured noise makes it "
-    "too small, motion that is fast against the sampling too large"
+    "estimated: from second and third differences, white noise assumed; it is too small "
+    "for coloured noise, and too large if the motion is fast compared with the sampling"
 )
 _RUN_HEAD = (
     "run",
@@ -150,7 +151,8 @@ def format_summary(recording: Recording, kind: type[Simulator]) -> Iterator[str]
     yield recording.title
     # A single run is divided into two parts with the same name.
     run_count = len({run.name for run in runs})
-    held_out_text = "its last third held out" if run_count < len(runs) else f"{held_out} held out"
+    held_out_text = "its last third is held out" if run_count < len(runs) else f"{held_out} held "
+    "out"
     if recording.folds():
         held_out_text = "each left out in turn"
     size = (
@@ -204,7 +206,7 @@ def _iterate_signal_rows(recording: Recording, kind: type[Simulator]) -> Iterato
         yield (
             statistics.name,
             role,
-            statistics.unit,
+            format_unit(statistics.unit) or "1",
             f"{statistics.low:.4g}",
             f"{statistics.high:.4g}",
             f"{statistics.missing:.1%}" if statistics.missing else "0",
@@ -233,7 +235,7 @@ def _format_constant(recording: Recording, name: str, default: float, unit: str)
     runs_by_value: dict[float, list[str]] = {}
     for run in recording.runs:
         runs_by_value.setdefault(run.constants.get(name, common_value), []).append(run.name)
-    unit = "" if unit == "1" else f" {unit}"
+    unit = f" {format_unit(unit)}".rstrip()
     if len(runs_by_value) > 1:
         parts = [
             f"{value:g}{unit} in {_format_run_names(runs)}" for value, runs in runs_by_value.items()

@@ -63,12 +63,15 @@ def _list_missing_signals(recording: Recording, robot: RobotModel) -> Iterator[s
     run = recording.runs[0]
     missing_commands = [f"u.{a.name}" for a in robot.actuators if f"u.{a.name}" not in run.inputs]
     if missing_commands:
-        yield f"not in the log, and taken for zero: {', '.join(missing_commands)}"
+        yield f"not in the log, assumed to be zero: {', '.join(missing_commands)}"
     joints = [joint.name for joint in robot.joints if joint.has_one_coordinate]
     unseen = [name for name in joints if f"q.{name}" not in run.channels]
     if unseen:
         joint_names = ", ".join(unseen)
-        yield f"positions that are not in the log, and begin as the file states them: {joint_names}"
+        yield (
+            "positions that are not in the log, with initial values from the model file: "
+            f"{joint_names}"
+        )
 
 
 def _list_exceeded_ranges(recording: Recording, robot: RobotModel) -> Iterator[str]:

@@ -76,8 +76,8 @@ def segment_recording(
     floats = kind.has_model and bool(robot.system.afloat)
     if floats and seconds is not None:
         raise InputError(
-            f"{recording.path}: expected no --pieces: bodies of {recording.system} float, and "
-            "nothing says where they are when a piece begins; leave it out"
+            f"{recording.path}: expected no --pieces: {recording.system} has a floating base, "
+            "whose pose at the start of a piece is not known; leave it out"
         )
     budget = np.inf if whole or not kind.has_model else _compute_affordable_seconds(kind)
     segments: list[Run] = []
@@ -103,8 +103,10 @@ def segment_recording(
         return SegmentedRecording(recording, "")
     summary = " and ".join(notes)
     left_out = budget < max(sum(map(_compute_duration, recording.training())), 0.0)
-    origin_note = " from all over it (--whole takes all)" if left_out and not whole else ""
-    note = f"of the recording {summary} were looked at{origin_note}"
+    origin_note = (
+        " from the whole recording (--whole uses all of it)" if left_out and not whole else ""
+    )
+    note = f"of the recording {summary} were used{origin_note}"
     return SegmentedRecording(replace(recording, runs=tuple(segments)), note)
 
 

@@ -261,7 +261,7 @@ class _RecordingSimulation:
         if issubclass(self.kind, SystemSimulator):
             return self.kind(values, observe, engine=self.engine, fixed=self.effects)
         if self.effects or self.engine:
-            raise InputError(f"simulator {self.name} takes neither effects nor an engine")
+            raise InputError(f"simulator {self.name} supports neither effects nor engines")
         return self.kind(values, observe)
 
     def _build_scenario(self, number: int) -> Scenario:

@@ -81,8 +81,10 @@ def draw_bias_figure(systems: Sequence[StudyResult], table: pd.DataFrame) -> Fig
         panel.set_title(f"{study.name}: {parameter}\n{_lacks(study)}", fontsize=9)
         panel.set_xlabel("mean signed error [training widths]", fontsize=8)
     caption = (
-        "The parameter that least squares gets most wrong in the simulator as it is. Point: mean "
-        f"over {_targets(systems)} of the recommendation after the whole budget less the truth. "
+        "The parameter with the largest error of least squares in the simulator as it is. Point: "
+        "mean "
+        f"over {_targets(systems)} of the recommendation after the whole budget minus the true "
+        "value. "
         "Bar: 95 % bootstrap interval. Left and right of zero: too small, too large."
     )
     return _finished(figure, panels[0], "Bias of a parameter where an effect is missing", caption)
@@ -141,7 +143,7 @@ def draw_rank_slope_figure(
         "τ: Kendall's between the mean ranks in the two simulators; p: that mean ranks differ as "
         "much where the simulators are exchanged at random target by target."
     )
-    figure.suptitle("Does the ranking of tuners change when the model is mended?", fontsize=11)
+    figure.suptitle("Does the ranking of tuners change with a corrected model?", fontsize=11)
     add_caption(figure, caption, letters=15)
     return figure
 

@@ -54,7 +54,7 @@ def write_report(study: ReportableMisspecificationStudy, print_line: PrintLine) 
         else None
     )
     if scores is None or not scores.targets():
-        print_line(f"{experiment.name}: no target has been met in both simulators yet")
+        print_line(f"{experiment.name}: no target has results in both simulators yet")
         return failed
     _written(folder, [scores], print_line, is_joint=False)
     return failed
@@ -190,7 +190,10 @@ def _explained(scores: misspecification_scores.StudyScores, folder: Path) -> str
     path = folder / VERDICT_FILE
     answer = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
     causes = ", ".join(str(c["effect"]) for c in answer.get("causes", ())) or "nothing"
-    return f"{scores.name}: the world has {world}; explain says {answer.get('verdict')}: {causes}"
+    return (
+        f"{scores.name}: the true system has {world}; explain reports {answer.get('verdict')}: "
+        f"{causes}"
+    )
 
 
 def _table(scores: misspecification_scores.StudyScores, lines: pd.DataFrame) -> str:
@@ -256,7 +259,7 @@ def _together(ranked: pd.DataFrame, metric: str) -> str:
     head = f"mean rank over {len(joint.ranked[PLAIN])} systems by {quantity}, tau {joint.tau:.2f}"
     tests = "; ".join(
         f"{model}: Friedman p {joint.friedman[model]:.2g}, "
-        f"{joint.distinct_tuner_pairs[model]} pairs apart (Nemenyi)"
+        f"{joint.distinct_tuner_pairs[model]} significantly different pairs (Nemenyi)"
         for model in MODEL_LABELS
     )
     return f"{head}\n{mean_ranks.to_string(float_format=lambda value: f'{value:.1f}')}\n{tests}"

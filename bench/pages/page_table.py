@@ -73,7 +73,7 @@ class Table:
             ValueError: `index` is True.
         """
         if index:
-            raise ValueError("expected index=False, since a table has no index")
+            raise ValueError("expected index=False, since the table has no index")
         text = StringIO()
         writer = csv.writer(text, lineterminator="\n")
         writer.writerow(self._columns)

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from math import floor, isfinite, log10
 
-SUPERSCRIPT_DIGITS = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
-"""Translation of digits and minus sign to superscripts."""
+from bench.core.unit_text import SUPERSCRIPT_DIGITS
+
 _SMALL = 1e-3
 """Magnitude below which numbers are written with a power of ten."""
 _LARGE = 1e5

@@ -276,7 +276,7 @@ def verify_archive(
             _format_result(doubts, archive, print_line)
             return ArchiveVerification(description, doubts, [], None)
         print_line(
-            f"{MANIFEST_FILE}: every file is there and has its SHA-256, and there is no other"
+            f"{MANIFEST_FILE}: every listed file exists with its SHA-256, and there are no others"
         )
         if description["kind"] == "explanation":
             explained = _verify_extended_model(unpacked.folder, print_line)
@@ -309,7 +309,7 @@ def _format_result(
 ) -> None:
     """Print the doubts (numbers that do not follow from others), at most 20 of them."""
     for doubt in doubts[:20]:
-        print_line(f"DOES NOT FOLLOW  {folder}/{doubt}")
+        print_line(f"NOT REPRODUCED  {folder}/{doubt}")
     if len(doubts) > 20:
         print_line(f"and {len(doubts) - 20} more")
 
@@ -331,7 +331,7 @@ def verify_explanation(folder: Path, print_line: PrintLine) -> ExplanationVerifi
 def _verify_extended_model(folder: Path, print_line: PrintLine) -> ExplanationVerification:
     """Check that the verdict and the extended model of an explanation agree.
 
-    The verdict must follow its schema, the extended model must load and have the same numbers, and
+    The verdict must follow its schema, the extended model must load and have the same values, and
     its errors on the recording are computed again if the recording is there. A failed check is a
     doubt; a check that is not possible here, for example without the robot's model file, is listed
     as unchecked.
@@ -349,7 +349,7 @@ def _verify_extended_model(folder: Path, print_line: PrintLine) -> ExplanationVe
     verdict = _read_verdict(folder, verification)
     if verdict is None:
         return verification
-    note(f"{VERDICT_FILE}: of the form of schema verdict: {verdict.verdict}")
+    note(f"{VERDICT_FILE}: valid for the JSON schema verdict: {verdict.verdict}")
     try:
         extended, _, _ = open_extended(folder / EXTENDED_MODEL_FILE, simulators.get)
     except InputError as error:
@@ -364,13 +364,15 @@ def _verify_extended_model(folder: Path, print_line: PrintLine) -> ExplanationVe
     note(f"{EXTENDED_MODEL_FILE}: loads as a simulator of {extended.system or extended.name}")
     verification.doubts.extend(_find_differing_numbers(verdict, extended))
     if not verification.doubts:
-        note(f"{VERDICT_FILE} and {EXTENDED_MODEL_FILE} have the same numbers")
+        note(f"{VERDICT_FILE} and {EXTENDED_MODEL_FILE} have the same values")
     _score_extended_model(folder, verdict, verification, note)
     for line in verification.unchecked:
         print_line(f"not checked: {line}")
     if not verification.doubts:
         print_line(
-            "all of it follows" if not verification.unchecked else "what could be checked follows"
+            "all results are reproducible"
+            if not verification.unchecked
+            else "all results that could be checked are reproducible"
         )
     return verification
 
@@ -423,7 +425,7 @@ def _score_extended_model(
     stated_error = verdict.heldout.rmse_extended if verdict.heldout else None
     tables = sorted((folder / _RECORDINGS_FOLDER).glob("*.csv"))
     if stated_error is None:
-        verification.unchecked.append("held-out error: the verdict states none")
+        verification.unchecked.append("held-out error: the verdict does not state one")
         return
     if len(tables) != 1:
         location = f"{len(tables)} recordings are" if tables else "the recording is not"
@@ -460,8 +462,8 @@ def _score_extended_model(
     )
     if not math.isclose(stated_error, repeated_error, rel_tol=_ERROR_TOLERANCE):
         difference = (
-            f"rmse_extended on held-out runs: {stated_error:.6g}, scored again {repeated_error:.6g}"
+            f"rmse_extended on held-out runs: {stated_error:.6g}, recomputed {repeated_error:.6g}"
         )
         verification.doubts.append(VerificationFailure(VERDICT_FILE, 0, difference))
         return
-    note(f"{VERDICT_FILE}: rmse_extended on held-out runs comes out again: {repeated_error:.6g}")
+    note(f"{VERDICT_FILE}: rmse_extended on held-out runs is reproduced: {repeated_error:.6g}")

@@ -93,7 +93,7 @@ def load_side(folder: Path, metric: str | None = None) -> ComparisonSide:
         raise InputError(f"{folder}: holds no runs")
     name = metric or select_primary_metric(stored.runs).metric
     if name not in stored.runs or stored.runs[name].isna().all():
-        raise InputError(f"{folder}: has no {name}, by which the other is decided")
+        raise InputError(f"{folder}: has no {name}, which the other comparison is ranked by")
     runs = stored.runs[stored.runs[name].notna()]
     curves = RunRowTable(runs, stored.statuses, stored.experiment.budget).build_curves(name)
     columns = [c for c in runs if str(c).startswith(_TARGET_KEY_COLUMNS)]
@@ -296,7 +296,7 @@ class ComparisonDiff:
         notes = []
         error_table = self.errors
         if not len(error_table):
-            return ["no range and tuner is in both"]
+            return ["no range and tuner is in both comparisons"]
         if not error_table["paired"].any():
             notes.append("no target is in both (each salt draws its own): not paired")
         elif not error_table["paired"].all():
@@ -307,7 +307,7 @@ class ComparisonDiff:
         )
         if min_p_value * len(error_table) > FAMILYWISE_ERROR_RATE:
             notes.append(
-                f"no difference could be significant: with {error_table['targets'].max()} targets "
+                f"no difference can be significant: with {error_table['targets'].max()} targets "
                 f"a p-value is at least {min_p_value:.2g}, and {len(error_table)} lines are "
                 "compared"
             )
@@ -362,11 +362,11 @@ class ComparisonDiff:
         yield from format_columns(rows)
         if len(lines) > len(listed):
             count = len(lines) - len(listed)
-            yield f"({count} more lines differ by chance at most; --json has all)"
+            yield f"({count} more lines without a significant difference; --json has all)"
         yield from self._format_status_changes()
         for name, tuners in self.unshared_tuners.items():
             if tuners:
-                yield f"in {name} alone: {', '.join(tuners)}"
+                yield f"only in {name}: {', '.join(tuners)}"
         for section in ("configuration", "environment"):
             if document[section]:
                 yield f"{section}, a -> b"

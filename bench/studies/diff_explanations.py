@@ -170,7 +170,7 @@ class ExplanationDiff:
         Raises:
             InputError: always.
         """
-        raise InputError("--fail-on worse: is for comparisons; of explanations take change")
+        raise InputError("--fail-on worse: only for comparisons; for explanations use change")
 
     def _list_held_out_errors(self) -> list[dict[str, Any]]:
         """List errors on held-out runs and the closed gap of both explanations; None if missing."""
@@ -204,12 +204,12 @@ class ExplanationDiff:
         """Notes on limitations of the comparison."""
         notes = []
         if not (self.a.environment and self.b.environment):
-            notes.append("of an older explanation settings and versions are not known")
+            notes.append("settings and versions of the older explanation are not known")
         units = [each.verdict.heldout.unit for each in (self.a, self.b) if each.verdict.heldout]
         if len(set(units)) > 1:
             notes.append(f"held-out errors are in {units[0]} and in {units[1]}")
         if self.a.verdict.system != self.b.verdict.system:
-            notes.append(f"of two systems: {self.a.verdict.system} and {self.b.verdict.system}")
+            notes.append(f"different systems: {self.a.verdict.system} and {self.b.verdict.system}")
         return notes
 
     def to_document(self) -> dict[str, Any]:

@@ -108,7 +108,7 @@ def verify_comparison(
     configuration = read_configuration(folder)
     experiment = configuration.experiment
     if (folder / SEGMENTS_FOLDER).exists():
-        raise InputError(f"{folder}: not finished, and its salt not revealed; resume it first")
+        raise InputError(f"{folder}: not finished, so its salt is not revealed; resume it first")
     if experiment.shot:
         raise InputError(f"{folder}: expected a comparison, found a bounce shot")
     if experiment.calibration:
@@ -133,11 +133,11 @@ def verify_comparison(
         problem.close()
     doubts += _verify_tables(folder, stored, note)
     for doubt in doubts[:20]:
-        print_line(f"DOES NOT FOLLOW  {folder}/{doubt}")
+        print_line(f"NOT REPRODUCED  {folder}/{doubt}")
     if len(doubts) > 20:
         print_line(f"and {len(doubts) - 20} more")
     if not doubts:
-        print_line("all of it follows")
+        print_line("all results are reproducible")
     return VerificationResult(folder, tuple(checks), tuple(doubts))
 
 
@@ -147,7 +147,7 @@ def _describe_salt(experiment: Experiment) -> str:
     Only a salt whose hash was published before the first run proves that nobody knew the targets.
     """
     if not experiment.salt_sha256:
-        return f"{CONFIGURATION_FILE}: a public salt: everybody could draw the targets beforehand"
+        return f"{CONFIGURATION_FILE}: a public salt: anyone could draw the targets beforehand"
     return (
         f"{CONFIGURATION_FILE}: the salt has the SHA-256 that was committed, "
         f"{experiment.salt_sha256[:12]}"
@@ -290,7 +290,7 @@ def _verify_tables(
     """Verify that table.csv follows from the rows, and return the failures."""
     path = folder / "table.csv"
     if not path.exists():
-        print_line("table.csv: none; simgap plot writes it")
+        print_line("table.csv: not found; write it with simgap plot")
         return []
     stored_table = pd.read_csv(path, keep_default_na=True)
     expected = build_tables(stored)["table"]
@@ -327,5 +327,5 @@ def _verify_tables(
             place = int(np.argmin(is_equal))
             message = f"{column}: expected {a[place]}, found {b[place]}"
             failures.append(VerificationFailure(path.name, int(lines[place]) + 2, message))
-    print_line(f"table.csv: {len(stored_table)} rows made again from runs.parquet")
+    print_line(f"table.csv: {len(stored_table)} rows recomputed from runs.parquet")
     return failures

@@ -198,7 +198,7 @@ class InputFeatures:
                     f"array {name}: expected finite numbers of shape {shape}, found {array.shape}"
                 )
         if not sizes["inputs"][0] + sum(sizes["told"]):
-            raise ValueError("expected a network that reads something, found one without inputs")
+            raise ValueError("expected a network with inputs, found one without")
         chosen_numbers, centre, gain, *scenario_arrays = (
             remaining_arrays.pop(name) for name in names
         )

@@ -191,8 +191,8 @@ class ObservationFeatures:
         chosen_numbers = self.chosen.astype(np.intp)
         if chosen_numbers.max() >= rows.shape[1]:
             raise ValueError(
-                f"the network reads number {chosen_numbers.max()} of an observation, "
-                f"this one gives {rows.shape[1]}; "
+                f"the network reads entry {chosen_numbers.max()} of an observation, "
+                f"this one has {rows.shape[1]}; "
                 "train on observations of the same runs and channels"
             )
         centred = rows[:, chosen_numbers] - self.centre

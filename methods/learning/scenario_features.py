@@ -112,8 +112,8 @@ class ScenarioFeatures:
         numbers = self.compute(observations, lengths, scene)
         if len(scene.initial) != self.initial or numbers.shape[1] != len(self.centre):
             raise ValueError(
-                f"the network is told {len(self.centre)} numbers of a scenario, "
-                f"this one gives {numbers.shape[1]}; "
+                f"the network expects {len(self.centre)} numbers of a scenario, "
+                f"this one has {numbers.shape[1]}; "
                 "train on scenarios with the same inputs and channels"
             )
         is_varying = self.spread > 0

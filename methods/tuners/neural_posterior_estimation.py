@@ -204,7 +204,7 @@ class NeuralPosteriorEstimation(Tuner):
         yield Proposal(mean, recommend=mean)
         for point in draws:
             yield point[None]
-        return "its draws are used up"
+        return "all posterior samples are used"
 
 
 def _to_tensor(array: Array) -> Any:

@@ -213,18 +213,18 @@ class Effect(metaclass=EffectType):
         reason = {
             "": "",
             "input": "" if system.inputs else "it has no input",
-            "ground": "" if system.bounces else "it meets no ground",
+            "ground": "" if system.bounces else "it has no contact with a ground",
             # A bouncing body flies freely: dry friction and springs would act against nothing.
             "guide": "it flies freely" if system.bounces else "",
-            "joint": "" if _is_joint(system) else "it is not one joint alone",
+            "joint": "" if _is_joint(system) else "it is not a single joint",
             "servo": "" if system_class.servo else "it has no servo that follows a set point",
             "gravity": "" if heavy else "it states no gravity",
-            "push": "" if says_push else "it does not say what horizontal acceleration does",
+            "push": "" if says_push else "it does not define the effect of horizontal acceleration",
             "space": "" if in_space else "it does not move in three dimensions",
             "model": ""
             if system_class.has_model
             else "it has no model file whose numbers may be wrong",
-            "level": "" if system_class.levels else "it names no level that could spill over",
+            "level": "" if system_class.levels else "it declares no level that could overflow",
         }[cls.needs]
         undefined = "" if cls.on(system) else f"it is not defined for a {system.kind} system"
         return reason or undefined or system.refuses(cls)

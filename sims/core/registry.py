@@ -93,7 +93,7 @@ class Registry(Generic[T]):
             part = self._load_entry_point(name)
         else:
             error = make_unknown_name_error(self.kind, name, self.names())
-            raise InputError(f"{error}; one of your own needs its file: --plugin FILE.py")
+            raise InputError(f"{error}; for one of your own, give its file: --plugin FILE.py")
         # Checked each time, because a package may be installed while a notebook is open.
         requires = getattr(part, "requires", ())
         missing = [package for package in requires if importlib.util.find_spec(package) is None]

@@ -36,7 +36,7 @@ class SimulationCounter:
         """
         if self.limit is not None and self.used + count > self.limit:
             raise SimulationBudgetExceededError(
-                f"{self.used + count} simulations asked for, {self.limit} are allowed"
+                f"{self.used + count} simulations requested, {self.limit} are allowed"
             )
         self.used += count
 

@@ -35,7 +35,7 @@ class SpeedDependentRestitution(Contact):
 
     name = "restitution.speed"
     noun = "speed-dependent restitution"
-    says = "how well it bounces depends on the speed of the impact"
+    says = "the restitution depends on the speed of the impact"
     source = "K. L. Johnson, Contact Mechanics (1985), chapter 11, doi:10.1017/CBO9781139171731"
     needs = "ground"
     coefficients = (Coefficient("coefficient", ("1", "1", None), _POWER),)
@@ -61,7 +61,7 @@ class ContactFriction(Contact):
 
     name = "contact.friction"
     noun = "friction at impacts"
-    says = "the ground slows it along its surface at each impact"
+    says = "at each impact, friction reduces the speed along the surface"
     source = "R. M. Brach, Mechanical Impact Dynamics: Rigid Body Collisions (1991)"
     needs = "ground"
     at = "contact"

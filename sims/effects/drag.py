@@ -69,7 +69,7 @@ class Wind(Force):
 
     name = "wind"
     noun = "wind"
-    says = "moving air drags along what is in it"
+    says = "moving air exerts drag on the body"
     needs, contains, source = "push", ("drag.quadratic",), _FLUIDS
     coefficients = (
         Coefficient("drag", ("1/m", "N*s^2/m^2", None), ((0, 0.3), (0, 5), (0, 0))),

@@ -41,7 +41,7 @@ class ForceBias(Force):
 
     name = "force.bias"
     noun = "a constant force"
-    says = "a constant force pushes one way"
+    says = "a constant force acts in one direction"
     source = "J. R. Taylor, Classical Mechanics (2005), section 1.4"
     coefficients = (Coefficient("coefficient", _USUAL, ((-2, 2), (-5, 5), (-0.5, 0.5))),)
 
@@ -60,7 +60,7 @@ class ForceRipple(Force):
 
     name = "force.ripple"
     noun = "a force periodic in position"
-    says = "a force comes and goes with position, as the cogging of a motor"
+    says = "a force varies periodically with position, such as motor cogging"
     needs, source = "guide", _COGGING
     coefficients = (
         Coefficient("sine", _USUAL, _RIPPLE),
@@ -85,7 +85,7 @@ class PeriodicForce(Force):
 
     name = "force.periodic"
     noun = "a force periodic in time"
-    says = "a force comes and goes with time, as of something that vibrates nearby"
+    says = "a force varies periodically with time, such as from a vibration"
     source = "L. D. Landau, E. M. Lifshitz, Mechanics (1976), section 22"
     coefficients = (
         Coefficient("sine", _USUAL, ((-2, 2), (-5, 5), (-0.5, 0.5))),

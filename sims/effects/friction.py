@@ -80,7 +80,7 @@ class CoulombFriction(Friction):
 
     name = "friction.coulomb"
     noun = "Coulomb friction"
-    says = "a constant friction opposes motion, and smaller forces do not start it"
+    says = "a constant friction opposes motion, and smaller forces do not start motion"
     source = _SURVEY
     needs = "guide"
     coefficients = (Coefficient("coefficient", _USUAL, _DRY),)
@@ -100,7 +100,7 @@ class StribeckFriction(Friction):
 
     name = "friction.stribeck"
     noun = "Stribeck friction"
-    says = "friction is greatest at rest and falls as motion picks up"
+    says = "friction is greatest at rest and decreases with speed"
     needs, contains, source = "guide", ("friction.coulomb",), _SURVEY
     coefficients = (
         Coefficient("coulomb", _USUAL, _DRY),
@@ -123,7 +123,7 @@ class LoadFriction(Friction):
 
     name = "friction.load"
     noun = "load-dependent friction"
-    says = "friction grows with the load that the drive carries"
+    says = "friction increases with the load of the drive"
     source = _SERVOS + "M3"
     needs = "input"
     coefficients = (_LOAD,)
@@ -146,7 +146,7 @@ class DirectionalLoadFriction(Friction):
 
     name = "friction.load_direction"
     noun = "load-dependent friction by direction"
-    says = "friction differs by whether the motor drives the load or the load drives the motor"
+    says = "friction differs between the motor driving the load and the load driving the motor"
     needs, contains, source = "input", ("friction.load",), _SERVOS + "M5"
     coefficients = (replace(_LOAD, name="motor"), replace(_LOAD, name="external"))
 
@@ -165,8 +165,8 @@ class QuadraticLoadFriction(Friction):
     """Load-dependent friction with a term quadratic in the force transmitted by the gears."""
 
     name = "friction.load_quadratic"
-    noun = "friction that grows with load and its square"
-    says = "friction grows with the load that the drive carries, the more the larger it is"
+    noun = "friction that increases with load and its square"
+    says = "friction increases with the drive's load and with the square of the load"
     needs, contains, source = "input", ("friction.load",), _SERVOS + "M6"
     coefficients = (_LOAD, Coefficient("quadratic", *_SQUARE))
 
@@ -186,7 +186,7 @@ class PositionFriction(Friction):
 
     name = "friction.position"
     noun = "friction that varies over the joint"
-    says = "friction is greater in some positions than in others, and repeats with position"
+    says = "friction varies periodically with position"
     needs, contains, source = "guide", ("friction.coulomb",), _PLACE
     coefficients = (Coefficient("least", _USUAL, _DRY), *_OVER)
 
@@ -206,8 +206,11 @@ class WarmingFriction(Friction):
     """Additional dry and viscous friction of a cold joint, which decays as the joint warms."""
 
     name = "friction.warming"
-    noun = "friction that falls as the joint warms"
-    says = "a joint that is cold at the start of a run rubs more, and less and less as it warms"
+    noun = "friction that decreases as the joint warms"
+    says = (
+        "friction is higher at the start of a run, when the joint is cold, and decreases as it "
+        "warms"
+    )
     needs, contains, source = "guide", ("friction.coulomb", "drag.linear"), _WARM
     coefficients = _COLD
 
@@ -229,7 +232,7 @@ class DirectionalViscousFriction(Force):
 
     name = "friction.direction"
     noun = "friction that differs by direction"
-    says = "motion is resisted more one way than the other"
+    says = "friction is larger in one direction than in the other"
     source = "A. Janot, M. Gautier, M. Brunot, Nonlinear System Identification Benchmarks (2019)"
     needs, contains = "guide", ("drag.linear",)
     coefficients = tuple(Coefficient(f"viscous{way}", _VISCOUS, _DAMPED) for way in "+-")

@@ -37,7 +37,7 @@ class FrictionHysteresis(HiddenStateEffect):
 
     name = "friction.hysteresis"
     noun = "friction with hysteresis"
-    says = "friction builds up over a small way after each reversal, and gives that way back"
+    says = "friction builds up over a small distance after each reversal, like a spring"
     source = "P. R. Dahl, AIAA Journal 14(12), 1675 (1976), doi:10.2514/3.61511"
     needs, contains = "joint", ("friction.coulomb",)
     coefficients = _DAHL

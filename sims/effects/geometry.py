@@ -42,7 +42,7 @@ class JointZeroOffset(ModelValueEffect):
 
     name = "joint.zero"
     noun = "a wrong joint zero"
-    says = "the joint's zero, of its command and its encoder alike, is not that of the model file"
+    says = "the zero position of the joint, for command and encoder, differs from the model file"
     source = _CALIBRATION
     at = "joint"
     coefficients = (
@@ -55,7 +55,7 @@ class JointAxisTilt(ModelValueEffect):
 
     name = "joint.axis"
     noun = "a wrong joint axis"
-    says = "the axis of the joint points in another direction than the model file says"
+    says = "the joint axis has a different direction than in the model file"
     source = _CALIBRATION
     at = "joint"
     coefficients = tuple(
@@ -68,7 +68,7 @@ class LinkLengthScale(ModelValueEffect):
 
     name = "link.length"
     noun = "a wrong link length"
-    says = "the distance of the body from its parent is not that of the model file"
+    says = "the distance of the body from its parent differs from the model file"
     source = _CALIBRATION
     at = "body"
     coefficients = (
@@ -83,7 +83,7 @@ class PayloadMass(ModelValueEffect):
 
     name = "payload"
     noun = "a payload"
-    says = "the body carries a mass that is not in the model file"
+    says = "the body carries an additional mass that is not in the model file"
     source = "W. Khalil, E. Dombre, Modeling, Identification and Control of Robots (2002), ch. 12"
     at = "body"
     coefficients = (

@@ -23,7 +23,7 @@ class GravityScale(Force):
 
     name = "gravity.scale"
     noun = "a correction of gravity"
-    says = "gravity acts more strongly or weakly than its stated value"
+    says = "gravity is stronger or weaker than the stated value"
     source = "J. R. Taylor, Classical Mechanics (2005), section 1.4"
     needs, at = "gravity", "world"
     coefficients = (Coefficient("coefficient", _PURE, _FIFTH),)
@@ -43,7 +43,7 @@ class GravityTilt(Force):
 
     name = "gravity.tilt"
     noun = "a tilt of gravity"
-    says = "the ground is not level: gravity also pulls sideways"
+    says = "the ground is not level: gravity has a horizontal component"
     source = "J. R. Taylor, Classical Mechanics (2005), section 1.4"
     needs, at = "push", "world"
     coefficients = (
@@ -66,7 +66,7 @@ class GravityCompensation(ModelValueEffect):
 
     name = "gravity.compensation"
     noun = "gravity compensation"
-    says = "a share of the body's weight is carried, such as by a counterweight or the controller"
+    says = "part of the body's weight is compensated, such as by a counterweight or the controller"
     source = "V. Arakelian, Gravity compensation in robotics, Advanced Robotics 30(2), 79 (2016)"
     at = "body"
     coefficients = (Coefficient("coefficient", _PURE, ((0, 1), (0, 1), (0, 1))),)  # (3)

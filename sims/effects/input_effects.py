@@ -63,8 +63,11 @@ class InputHold(Input):
     """Command held instead of interpolated between samples, or vice versa; a mixture for c < 1."""
 
     name = "input.hold"
-    noun = "an input read the other way between samples"
-    says = "between two samples the input goes straight instead of holding, or holds instead"
+    noun = "a different interpolation of the input"
+    says = (
+        "between samples, the input is interpolated instead of held, or held instead of "
+        "interpolated"
+    )
     source = "K. J. Astrom, B. Wittenmark, Computer-Controlled Systems (1997), chapter 7"
     coefficients = (Coefficient("coefficient", _PURE, ((0, 1), (0, 1), (0, 1))),)
     between = True  # (0), applied where means over steps are computed: `sims.engines.time_grid`
@@ -75,7 +78,7 @@ class InputGain(Input):
 
     name = "input.gain"
     noun = "an input gain"
-    says = "the input acts more strongly or weakly than commanded"
+    says = "the input is larger or smaller than commanded"
     source = _FEEDBACK
     coefficients = (Coefficient("coefficient", _PURE, _SHARE),)
 
@@ -113,7 +116,9 @@ class InputDelay(Input):
 
     name = "input.delay"
     noun = "an input delay"
-    says = "the input acts later than commanded, or its stamps are late where it is negative"
+    says = (
+        "the input acts later than commanded; a negative value means that its time stamps are late"
+    )
     source = _FEEDBACK
     coefficients = (Coefficient("coefficient", _TIME, (_DELAY, _DELAY, _DELAY)),)
 
@@ -132,7 +137,7 @@ class InputLag(Input):
 
     name = "input.lag"
     noun = "an input lag"
-    says = "the input builds up gradually instead of at once"
+    says = "the input follows its command with a first-order lag"
     source = _FEEDBACK
     coefficients = (Coefficient("coefficient", _TIME, ((0, 0.5), (0, 0.5), (0, 0.5))),)
 
@@ -174,7 +179,7 @@ class InputSaturation(Input):
 
     name = "input.saturation"
     noun = "input saturation"
-    says = "the input is cut off at a limit"
+    says = "the input is clipped at a limit"
     source = _NONLINEAR
     coefficients = (Coefficient("coefficient", _FORCE_UNITS, _LIMIT, of="input"),)
 
@@ -196,7 +201,7 @@ class InputBacklash(Input):
 
     name = "backlash"
     noun = "backlash"
-    says = "there is play: after a reversal the input acts only once the play is used up"
+    says = "after a reversal, the input acts only when the backlash is crossed"
     source = _PLAY
     coefficients = (Coefficient("coefficient", _FORCE_UNITS, _WIDTH, of="input"),)
 
@@ -216,7 +221,7 @@ class InputPower(Input):
 
     name = "input.power"
     noun = "a power of the input"
-    says = "what acts goes with a power of the input, as a propeller's thrust with its square"
+    says = "the force is proportional to a power of the input, such as a propeller's thrust"
     source = "R. Mahony, V. Kumar, P. Corke, IEEE Robot. Autom. Mag. 19(3), 20 (2012), equation 6"
     needs, contains = "input", ("input.gain",)
     coefficients = (Coefficient("gain", _PURE, _SCALE), Coefficient("power", _PURE, _EXPONENT))
@@ -237,8 +242,8 @@ class InputRateLimit(Input):
     """Input with a rate of at most c per second; a limit of zero is no limit."""
 
     name = "input.rate"
-    noun = "a limit of the input's rate"
-    says = "the input follows commands no faster than a limit"
+    noun = "a rate limit of the input"
+    says = "the rate of change of the input is limited"
     source = _NONLINEAR
     coefficients = (Coefficient("coefficient", _PER_SECOND, _SLEW, of="input/s"),)
 

@@ -24,7 +24,7 @@ class MagnusLift(Force):
 
     name = "lift.magnus"
     noun = "Magnus lift"
-    says = "spin makes it swerve, across its direction of flight"
+    says = "spin causes a force perpendicular to the direction of flight"
     needs, source = "space", _SPINNING
     coefficients = (
         Coefficient("coefficient", _FLYING, _EITHER_WAY),

@@ -46,7 +46,7 @@ class CentreOfMassOffset(ModelValueEffect):
 
     name = "mass.offset"
     noun = "a misplaced centre of mass"
-    says = "the body's centre of mass is elsewhere than the model file says"
+    says = "the body's centre of mass differs from the model file"
     source = _IDENTIFICATION + ", chapter 12"
     at = "body"
     coefficients = tuple(Coefficient(axis, _LENGTH, _TENTH) for axis in "xyz")
@@ -57,7 +57,7 @@ class InertiaScale(ModelValueEffect):
 
     name = "inertia.scale"
     noun = "a wrong inertia"
-    says = "the body turns more or less readily than the model file says"
+    says = "the body's moment of inertia differs from the model file"
     source = _IDENTIFICATION + ", chapter 12"
     at = "body"
     coefficients = (Coefficient("coefficient", _PURE, _HALF, least=_LEAST),)
@@ -68,7 +68,7 @@ class ArmatureOffset(ModelValueEffect):
 
     name = "inertia.armature"
     noun = "a wrong armature"
-    says = "the rotor's inertia, as the joint feels it, is not what the model file says"
+    says = "the rotor inertia, reflected to the joint, differs from the model file"
     source = _IDENTIFICATION + ", section 9.4"
     at = "joint"
     coefficients = (
@@ -81,7 +81,7 @@ class ActuatorStiffnessScale(ModelValueEffect):
 
     name = "actuator.stiffness"
     noun = "a wrong servo stiffness"
-    says = "the servo pulls towards its command more strongly or weakly than the model file says"
+    says = "the servo's proportional gain differs from the model file"
     source = "K. J. Astrom, R. M. Murray, Feedback Systems (2008), chapter 10"
     at = "actuator"
     coefficients = (Coefficient("coefficient", _PURE, _HALF, least=_LEAST),)
@@ -92,7 +92,7 @@ class ActuatorDampingScale(ModelValueEffect):
 
     name = "actuator.damping"
     noun = "a wrong servo damping"
-    says = "the servo damps its motion more strongly or weakly than the model file says"
+    says = "the servo's damping gain differs from the model file"
     source = "K. J. Astrom, R. M. Murray, Feedback Systems (2008), chapter 10"
     at = "actuator"
     coefficients = (Coefficient("coefficient", _PURE, _HALF, least=_LEAST),)
@@ -102,8 +102,8 @@ class ActuatorForceLimit(ModelValueEffect):
     """Force of the actuator limited to c in both directions; zero is the limit of the file."""
 
     name = "actuator.limit"
-    noun = "a limit of the actuator's force"
-    says = "the actuator gives no more than a certain force"
+    noun = "a force limit of the actuator"
+    says = "the force of the actuator is limited"
     source = "H. K. Khalil, Nonlinear Systems (2002), section 1.2"
     at = "actuator"
     coefficients = (

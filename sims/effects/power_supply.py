@@ -41,8 +41,8 @@ class SupplySag(Force):
     """Reduction of the drive's force by the voltage drop of the supply."""
 
     name = "supply.sag"
-    noun = "a supply that sags"
-    says = "the supply's voltage falls with what the drive draws, so that large forces fall short"
+    noun = "a supply voltage drop"
+    says = "the supply voltage drops with the current, which reduces large forces"
     source = "R. Krishnan, Electric Motor Drives (2001), chapter 2: a source with resistance"
     at = "actuator"
     needs = "input"
@@ -64,8 +64,8 @@ class SupplyBrakingLoss(Force):
     """Reduction of the drive's force where it acts against the motion."""
 
     name = "supply.braking"
-    noun = "a drive that hardly brakes"
-    says = "the drive falls short of its force where it acts against the motion"
+    noun = "a drive with weak braking"
+    says = "the drive exerts less than its commanded force when it brakes the motion"
     source = "R. Krishnan, Electric Motor Drives (2001), chapter 4: choppers of one quadrant"
     at = "actuator"
     needs = "input"

@@ -68,7 +68,7 @@ class SensorGain(Sensor):
 
     name = "sensor.gain"
     noun = "a sensor gain"
-    says = "the sensor shows too much or too little, in proportion"
+    says = "the sensor reading is too large or too small by a constant factor"
     source = _VOCABULARY + ", 4.12"
     coefficients = (Coefficient("coefficient", _PURE, _FIFTH, least=_LEAST_GAIN, most=_MOST_GAIN),)
 
@@ -87,7 +87,7 @@ class SensorBias(Sensor):
 
     name = "sensor.bias"
     noun = "a sensor bias"
-    says = "the sensor's zero is off"
+    says = "the sensor has a constant offset"
     source = _VOCABULARY + ", 4.20"
     coefficients = (_OFF,)
 
@@ -106,7 +106,7 @@ class SensorDelay(Sensor):
 
     name = "sensor.delay"
     noun = "a sensor delay"
-    says = "the sensor shows what was the case a while ago"
+    says = "the sensor reading is late by a constant time"
     source = "K. J. Astrom, R. M. Murray, Feedback Systems (2008)"
     coefficients = (Coefficient("coefficient", _TIME, ((0, 0.2), (0, 0.2), (0, 0.2))),)
 
@@ -125,7 +125,7 @@ class SensorLag(Sensor):
 
     name = "sensor.lag"
     noun = "a sensor lag"
-    says = "the sensor follows gradually instead of at once"
+    says = "the sensor reading follows with a first-order lag"
     source = _VOCABULARY + ", 4.23"
     filters = True  # the lag evolves between samples, so every step is needed
     coefficients = (Coefficient("coefficient", _TIME, ((0, 0.2), (0, 0.2), (0, 0.2))),)
@@ -146,7 +146,7 @@ class SensorDrift(Sensor):
 
     name = "sensor.drift"
     noun = "a sensor drift"
-    says = "the sensor's zero drifts steadily"
+    says = "the sensor's offset changes linearly with time"
     source = _VOCABULARY + ", 4.21"
     coefficients = (Coefficient("coefficient", _SPEED, _DRIFT, of="reading/s"),)
 
@@ -165,7 +165,7 @@ class EncoderEccentricity(Sensor):
 
     name = "sensor.eccentricity"
     noun = "an eccentric encoder"
-    says = "the encoder is off its axis, so that its error comes once a turn"
+    says = "the encoder is eccentric, so its error repeats once per turn"
     source = "X.-D. Lu et al., CIRP Annals 59(1), 529 (2010), introduction"
     needs = "guide"
     coefficients = tuple(Coefficient(of, _ANGLE, _OFF_AXIS) for of in ("sine", "cosine"))
@@ -186,7 +186,7 @@ class EncoderSlip(Sensor):
 
     name = "sensor.slip"
     noun = "an encoder that slipped"
-    says = "the encoder slipped at an instant, and is off by the same amount from then on"
+    says = "the encoder slipped once during the recording and has a constant offset from then on"
     source = "M. Basseville, I. V. Nikiforov, Detection of Abrupt Changes (1993), chapter 2"
     needs = "guide"
     contains = ("sensor.bias",)

@@ -39,7 +39,7 @@ class ServoDeadBand(Force):
 
     name = "servo.deadband"
     noun = "a dead zone of the servo"
-    says = "the servo does nothing about small errors"
+    says = "the servo does not respond to small errors"
     source = "H. K. Khalil, Nonlinear Systems (2002), section 1.2"
     at = "actuator"
     needs = "servo"
@@ -61,7 +61,7 @@ class ServoDerivativeAction(Input):
 
     name = "servo.derivative"
     noun = "a D term on the error"
-    says = "the servo's D term acts on the error, so that it also follows the set point's rate"
+    says = "the servo's D term acts on the error, so it also responds to the set point's rate"
     source = "K. J. Astrom, R. M. Murray, Feedback Systems (2008), section 10.5"
     needs = "servo"
     coefficients = (Coefficient("coefficient", _TIME, ((0, 0.2), (0, 0.2), (0, 0.2))),)

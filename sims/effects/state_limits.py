@@ -48,7 +48,7 @@ class LevelOverflow(Level):
 
     name = "state.overflow"
     noun = "an overflow"
-    says = "a level cannot rise above a rim, what is too much spills over and is lost"
+    says = "a level cannot rise above a rim; the excess overflows and is lost"
     source = "M. Schoukens, J. P. Noel, IFAC-PapersOnLine 50(1), 446 (2017)"
     coefficients = (Coefficient("coefficient", _LEVEL, _TYPICAL, of="level"),)
 
@@ -67,7 +67,7 @@ class EndStop(Force):
 
     name = "state.limit"
     noun = "an end stop"
-    says = "it meets a stop, which lets it go no further and takes some of its speed"
+    says = "it hits an end stop, which limits its position and absorbs some of its speed"
     needs, source, sharp = "guide", _CONTACT, True
     coefficients = _STOP
 

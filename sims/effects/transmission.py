@@ -173,7 +173,7 @@ class JointFlexibility(DrivenLoad):
     """Spring with a damper between the drive and its load."""
 
     name, noun = "joint.flexibility", "a flexible transmission"
-    says = "what the drive carries hangs on it by a spring, and swings"
+    says = "the load is connected to the drive by a spring, and oscillates"
     source, coefficients, between = _ELASTIC, _SPRUNG, _SPRING
 
     def compute_static_deflection(self, c: Array, fall: Array) -> Array:
@@ -201,7 +201,7 @@ class JointCoupling(ModelValueEffect):
     """Coupled drive of a joint that also turns the previous joint, c times as much."""
 
     name, noun = "joint.coupling", "a coupled drive"
-    says = "the joint's drive also acts on the joint before it, as where motors share an axis"
+    says = "the joint's drive also acts on the previous joint, such as in a coupled wrist"
     source, at = _WRIST, "joint"
     coefficients = (Coefficient("coefficient", _PURE, ((-1, 1), (-1, 1), (-1, 1))),)  # (5)
 
@@ -209,8 +209,8 @@ class JointCoupling(ModelValueEffect):
 class JointBacklash(DrivenLoad):
     """Backlash between the drive and its load: no force is transmitted between the flanks."""
 
-    name, noun = "joint.backlash", "play in the transmission"
-    says = "there is a gap between the drive and what it carries, which knocks from flank to flank"
+    name, noun = "joint.backlash", "backlash in the transmission"
+    says = "there is backlash between the drive and its load"
     source, coefficients, between = _PLAY, _GAPPED, _FLANKS
     share, fastest = 1, CONTACT_FREQUENCY
 

@@ -173,7 +173,7 @@ class Table:
             if not name:
                 raise InputError(f"{self.path}, row 1: column {place + 1} has no name")
             if name in header[:place]:
-                raise InputError(f"{self.path}, row 1: column {format_value(name)} stands twice")
+                raise InputError(f"{self.path}, row 1: column {format_value(name)} is given twice")
         for name in self.wanted:
             if name not in header:
                 raise InputError(
@@ -269,7 +269,7 @@ class Table:
                 self.fault(
                     begin,
                     "run",
-                    f"run {format_value(name)} goes on after another began; "
+                    f"run {format_value(name)} continues after another run began; "
                     "expected its rows together",
                 )
             part = {c: make_read_only(columns[c][begin:end]) for c in self.wanted[2:]}

@@ -135,7 +135,7 @@ def check_switches(
         if switch.column in used_columns:
             raise InputError(
                 f"{location}: expected a column that says when the drive is on, found "
-                f"{switch.column}, which is a channel or input; name a column of its own"
+                f"{switch.column}, which is a channel or input; name a separate column"
             )
 
 

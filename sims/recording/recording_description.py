@@ -552,7 +552,7 @@ def _read_extra_columns(
     for name, entry in extra_tables.items():
         if name in used_names:
             remedy = "declare it as channel or input"
-            raise InputError(f"{path}: extra.{name}: is a column of its own right; {remedy}")
+            raise InputError(f"{path}: extra.{name}: is declared as a column already; {remedy}")
         unit = entry.get("unit") if isinstance(entry, dict) else None
         if not isinstance(unit, str):
             raise make_error(path, f"extra {name}", 'a table with unit = "TEXT"', entry)
@@ -593,7 +593,7 @@ def _read_run(path: Path, name: str, value: Any, declared: DeclaredSignals) -> R
     constants = _read_constants(path, f"{location}.constants", table.get("constants", {}), declared)
     direct_constants = {key: number for key, number in table.items() if key in constant_names}
     for repeated_name in constants.keys() & direct_constants.keys():
-        raise InputError(f"{path}: {location}: constant {repeated_name} stands twice")
+        raise InputError(f"{path}: {location}: constant {repeated_name} is given twice")
     constants |= _read_constants(path, location, direct_constants, declared)
     _check_constants_possible(path, location, constants, declared)
     states = [*declared.states, *getattr(_get_system(declared), "activations", ())]

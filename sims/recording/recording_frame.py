@@ -67,7 +67,7 @@ def with_index(path: Path, frame: Frame) -> Any:
         if not isinstance(name, str):
             raise InputError(f"{path}: column {format_value(name)}: expected a name, found no text")
         if name in names[:place]:
-            raise InputError(f"{path}: column {format_value(name)} stands twice")
+            raise InputError(f"{path}: column {format_value(name)} is given twice")
     return indexed_frame
 
 

@@ -84,7 +84,7 @@ class RobotReference:
 
         robot = read_robot(self.path, actuators=self.actuators, engine=self.engine)
         if self.digest is not None and robot.digest != self.digest:
-            remedy = "put that one back, or explain the recording anew"
+            remedy = "restore that file, or explain the recording again"
             raise InputError(f"model file {self.path} is not the one that was fitted; {remedy}")
         numerics = IntegratorSettings(
             **{**read_integrator_settings(robot)._asdict(), **self.numerics}

@@ -30,8 +30,9 @@ from sims.robot.robot_model import RobotModel
 from sims.robot.state_snapshots import SingleJointSystem, SingleSlideSystem
 
 INTEGRATES = (
-    "the actuator integrates its control (dyntype integrator), and no recording says where its "
-    "integral begins; expected a position servo, whose input is the integral"
+    "the actuator integrates its control (dyntype integrator), and the initial value of its "
+    "integral "
+    "is not recorded; expected a position servo, whose input is the integral"
 )
 """Reason why a recording cannot contain the control of an integrator actuator."""
 
@@ -360,7 +361,7 @@ def _list_channels(robot: RobotModel) -> tuple[Channel, ...]:
         Channel(f"qd.{j.name}", f"{j.unit}/s", says=f"velocity of joint {j.name}") for j in joints
     ]
     channels += [
-        Channel(f"tau.{j.name}", j.force_unit, says=f"what actuators exert on joint {j.name}")
+        Channel(f"tau.{j.name}", j.force_unit, says=f"actuator force at joint {j.name}")
         for j in joints
     ]
     channels += [Channel(f"s.{s.name}", s.unit, says=f"sensor {s.name}") for s in robot.sensors]

@@ -31,7 +31,7 @@ class BallSystem(System):
             "1",
             0.5,
             (0.0, 1.0),
-            says="share of the impact speed with which the ball leaves the ground",
+            says="ratio of rebound speed to impact speed (coefficient of restitution)",
         ),
     )
     constants = (

@@ -50,7 +50,8 @@ class ShotSystem(System):
             "1",
             0.5,
             (0.0, 1.0),
-            says="share of the normal speed with which the ball leaves the incline",
+            says="ratio of normal rebound speed to normal impact speed (coefficient of "
+            "restitution)",
         ),
     )
     constants = (
@@ -58,7 +59,7 @@ class ShotSystem(System):
             "drop_height",
             "m",
             1.5,
-            "how far the centre falls until the ball touches the incline",
+            "fall height of the centre until the ball touches the incline",
             positive=True,
             limits=LENGTH_RANGE,
         ),
@@ -89,7 +90,7 @@ class ShotSystem(System):
         ),
     )
     channels = (
-        Channel("x", "m", says="centre, horizontally from where it was let go"),
+        Channel("x", "m", says="centre, horizontal distance from the release point"),
         Channel("y", "m", says="centre, across x"),
         Channel(
             "z", "m", says="height of the centre above the point of the incline below the release"

@@ -112,7 +112,7 @@ class ServoSystem(System):
         DerivedQuantity(
             "back-EMF damping",
             "N*m*s/rad",
-            "what the driven motor's own voltage takes off its torque",
+            "torque reduction by the back-EMF of the driven motor",
             lambda k: k["torque_constant"] ** 2 / k["resistance"],
         ),
         DerivedQuantity(

@@ -45,7 +45,9 @@ class SliderSystem(System):
         Without a load, the effects of `LOAD_DEPENDENT_EFFECTS` would be equivalent to
         `friction.load`.
         """
-        return "nothing works against its drive" if effect.name in LOAD_DEPENDENT_EFFECTS else ""
+        return (
+            "it has no load that opposes its drive" if effect.name in LOAD_DEPENDENT_EFFECTS else ""
+        )
 
     def mass(self, theta: Array, constants: Mapping[str, Array]) -> Array:
         """Return the mass (L, 1) in kg.

@@ -314,8 +314,7 @@ def _make_track(
     missing_count = int(np.isnan(u).sum())
     if missing_count:
         notes.append(
-            f"{missing_count} of {len(times)} frames show no ball that could be measured; "
-            "their cells are empty"
+            f"{missing_count} of {len(times)} frames show no measurable ball; their cells are empty"
         )
     noise = np.nan
     if len(times) > _WINDOW:

@@ -177,7 +177,7 @@ class VideoFile:
             if not len(file.streams):
                 raise InputError(f"{self.path}: {_describe_unreadable_file(self.path)}")
             file.close()
-            raise InputError(f"{self.path}: expected a video, found a file without moving pictures")
+            raise InputError(f"{self.path}: expected a video, found a file without a video stream")
         return file
 
     def _decode_frames(self, file: Any) -> Iterator[tuple[float, RgbImage | None]]:
@@ -210,8 +210,7 @@ class VideoFile:
         """
         if not count:
             raise InputError(
-                f"{self.path}: no frame of it can be read; "
-                "the file is damaged or breaks off too early"
+                f"{self.path}: no frame of it can be read; the file is damaged or truncated"
             )
         if is_broken or count < stated_count:
             total_text = f" of {stated_count}" if stated_count > count else ""
@@ -239,6 +238,6 @@ def _describe_unreadable_file(path: Path) -> str:
         return "expected a video, found an empty file"
     # These bytes begin an MP4 file, whose index may be at its end.
     if start[4:8] == b"ftyp":
-        return "breaks off before its index, so no frame can be found; copy the whole file again"
+        return "is truncated before its index, so no frame can be read; copy the whole file again"
     text = all(32 <= byte < 127 or byte in b"\t\r\n" for byte in start)
     return f"expected a video, found {'a text file' if text else 'something else'}"

@@ -43,7 +43,7 @@ COASTS = {
     STIFF: (4.3, 0.1), DAMP: (2.0, 0.1), BRAKE: (0.98, 0.02), DRY: (0.15, 0.01),
     LATE: (0.0255, 1e-3), MOST: (1.4, 0.05), DRAG: (0.1, 0.01),
 }  # fmt: skip
-"""Initial values and scales of a fit of a drive that hardly brakes.
+"""Initial values and scales of a fit of a drive with weak braking.
 
 They are the result of a manual CMA-ES search with a plain model of one joint, from values that a
 servo might have.

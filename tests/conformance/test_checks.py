@@ -488,7 +488,7 @@ def test_simulator_check_rejects_its_broken_subject_and_no_sound_one(check):
         (KeepsForces, "check_forces_act", "the same run after one with forces"),
         (IgnoresPut, "check_levels_can_be_set", r"after put\(heat\)"),
         (WarmStarted, "check_same_proposal_gives_the_same_bits", "in place of"),
-        (Clobbers, "check_arguments_are_not_changed", "arguments as they were"),
+        (Clobbers, "check_arguments_are_not_changed", "unchanged arguments"),
         (WrongShape, "check_observations_have_the_declared_shape", "observations of shape"),
         (
             Raises,

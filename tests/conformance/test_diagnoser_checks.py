@@ -87,8 +87,8 @@ REJECTED = [
     (checks.check_names_what_there_is, NamesTheWind, "names of case.library"),
     (checks.check_names_what_there_is, NamesTwice, "each effect once"),
     (checks.check_same_answer_again, ChangesItsMind, "the same answer again"),
-    (checks.check_leaves_the_recording_alone, Overwrites, "the recording as it was"),
-    (checks.check_leaves_global_chance_alone, Seeds, "global random state left alone"),
+    (checks.check_leaves_the_recording_alone, Overwrites, "the recording unchanged"),
+    (checks.check_leaves_global_chance_alone, Seeds, "global random state unchanged"),
     (checks.check_keeps_to_its_budget, Spends, "at most 40 simulations"),
     (checks.check_learns_within_its_budget, LearnsTexts, "arrays of numbers"),
 ]

@@ -381,7 +381,7 @@ def test_only_an_element_that_needs_too_many_steps_is_abandoned():
 
 @pytest.mark.parametrize("kind", [Slider, Pendulum])
 def test_a_force_that_jumps_at_rest_is_no_fast_decay(kind):
-    """With a drive that hardly brakes, a run stays below four times the planned number of steps."""
+    """With a drive with weak braking, a run stays below four times the planned number of steps."""
     times = np.arange(60) / 50
     run = Scenario(times, {}, {"u": 0.05 * np.sign(np.sin(7 * times + 0.2))})
     theta = [1.0] if kind is Slider else [0.003]

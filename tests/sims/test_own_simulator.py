@@ -203,11 +203,11 @@ class Light(Block):
     ("kind", "effect", "reason"),
     [
         (Mute, "drag.linear", "system mute cannot have effect drag.linear: it takes no forces"),
-        (Light, "friction.coulomb", "it does not say its inertia"),
-        (Block, "gravity.scale", "it does not say what gravity does to it"),
-        (Block, "friction.load", "it does not say what its inputs do to it"),
-        (Block, "gravity.tilt", "it does not say what horizontal acceleration does"),
-        (Block, "restitution.speed", "it meets no ground"),
+        (Light, "friction.coulomb", "it does not define its inertia"),
+        (Block, "gravity.scale", "it does not define the effect of gravity"),
+        (Block, "friction.load", "it does not define the effect of its inputs"),
+        (Block, "gravity.tilt", "it does not define the effect of horizontal acceleration"),
+        (Block, "restitution.speed", "it has no contact with a ground"),
     ],
 )
 def test_what_it_cannot_have_says_why(kind, effect, reason):

@@ -210,8 +210,8 @@ def make_ert_chart(view: ComparisonView) -> ComparisonChart:
 def make_cost_chart(view: ComparisonView) -> ComparisonChart:
     """Make the chart of seconds per target by the cost of a simulation, with the winners."""
     x_axis, y_axis = (
-        Axis("seconds that one simulation takes", "log"),
-        Axis("seconds for one target", "log"),
+        Axis("seconds per simulation", "log"),
+        Axis("seconds per target", "log"),
     )
     parts, panels = [], []
     for level in view.levels:
@@ -239,9 +239,9 @@ def make_cost_chart(view: ComparisonView) -> ComparisonChart:
 
 def make_amortisation_chart(view: ComparisonView) -> ComparisonChart:
     """Make the chart of the number of targets from which on a training pays."""
-    y_axis = Axis("targets from which on the training pays", "log", ends=(0.1, 1e5))
+    y_axis = Axis("number of targets at which training breaks even", "log", ends=(0.1, 1e5))
     rules = (
-        ReferenceLine(AT_ONCE, "at once: the search never reaches the error"),
+        ReferenceLine(AT_ONCE, "at once: the untrained tuner never reaches the error"),
         ReferenceLine(NEVER, "never: not within 10 000 targets"),
     )
     parts, panels = [], []

@@ -72,12 +72,14 @@ _LAYOUTS = {
     "distance": _Layout(f"{MEDIAN_LINE_CAPTION} n: number of targets."),
     "runtime": _Layout("{thresholds}"),
     "cost": _Layout(
-        "To reach an error of {level:.2g} for good: ERT × seconds of a simulation + seconds of "
+        "To reach an error of {level:.2g} and stay below it: ERT × seconds of a simulation + "
+        "seconds of "
         f"the tuner as measured; training shared by {TARGETS_PER_TRAINING} targets. "
         "The strip names the tuner that needs the least time."
     ),
     "amortisation": _Layout(
-        "To reach an error of {level:.2g} for good. A mark: from this number of targets on, the "
+        "To reach an error of {level:.2g} and stay below it. A mark: from this number of targets "
+        "on, the "
         "training and the expected simulations (ERT) of the trained tuner are fewer than those of "
         "the tuner that searches. At once: the search never reaches the error. Never: not within "
         "10 000 targets. Bar: 95 % bootstrap interval over targets.",

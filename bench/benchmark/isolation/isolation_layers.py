@@ -21,14 +21,14 @@ from bench.benchmark.isolation import linux_syscalls, seccomp_filter
 from bench.benchmark.isolation.memory_limit import limit_memory
 
 ISOLATION_LAYERS = {
-    "process": "the tuner has a process of its own, with a task and a pipe and nothing else",
+    "process": "the tuner runs in its own process, which gets only its task and a pipe",
     "files": "it reads Python and its packages, and no results or recordings (Landlock)",
-    "disk": "it writes to an empty folder in memory that is gone with it (tmpfs)",
-    "network": "it reaches no network",
-    "processes": "it sees no other process, and what it starts dies with it (process namespace)",
-    "calls": "it starts no process, looks into none, and mounts nothing (seccomp)",
-    "memory": "nobody reads the harness's memory (user namespace, not dumpable)",
-    "names": "it shares no memory, queue or semaphore by name (IPC namespace)",
+    "disk": "it writes only to a temporary folder in memory, deleted at its end (tmpfs)",
+    "network": "it has no network access",
+    "processes": "it sees no other process, and its child processes end with it (PID namespace)",
+    "calls": "it cannot start or trace a process, nor mount a file system (seccomp)",
+    "memory": "it cannot read the memory of the harness (user namespace, not dumpable)",
+    "names": "it has no access to named shared memory, queues or semaphores (IPC namespace)",
 }
 """Isolation layers with what each one does, in the order of listings."""
 

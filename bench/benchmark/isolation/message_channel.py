@@ -72,7 +72,7 @@ class Message(NamedTuple):
             ProtocolError: its size is not that of an array.
         """
         if len(self.body) % 8:
-            raise ProtocolError("it sent half a number")
+            raise ProtocolError("it sent an incomplete number")
         return np.frombuffer(self.body, dtype="<f8").astype(np.float64)
 
     def to_document(self, limit: int = MAX_TEXT_BYTES) -> Any:
@@ -89,7 +89,7 @@ class Message(NamedTuple):
         try:
             return json.loads(bytes(self.body))
         except (ValueError, RecursionError):
-            raise ProtocolError("it sent what is no JSON") from None
+            raise ProtocolError("it sent invalid JSON") from None
 
     def to_text(self) -> str:
         """Return the body as printable text."""
@@ -202,7 +202,7 @@ class MessageChannel:
         if length > limit:
             raise ProtocolError(f"it sent {length} bytes at once, {limit} are allowed")
         if received > _HEAD.size + length:
-            raise ProtocolError("it spoke without having been asked")
+            raise ProtocolError("it sent a message without a request")
         received -= _HEAD.size
         if _HEAD.size + length > _BUFFER:
             return Message(kind, flags, size, self._read_long_body(received, length, deadline))
@@ -274,9 +274,9 @@ def unpack_arrays(body: memoryview) -> dict[str, NDArray[Any]]:
             array, offset = _read_array(payload, offset, kind, shape)
             arrays[_check_array_name(name)] = array
     except (ValueError, TypeError, KeyError, RecursionError):
-        raise ProtocolError("it sent what are no arrays") from None
+        raise ProtocolError("it sent invalid arrays") from None
     if offset != len(payload) or not len(arrays) == len(descriptions) <= _ARRAYS:
-        raise ProtocolError("it sent more or less than the arrays that it names")
+        raise ProtocolError("its message does not match the arrays that it lists")
     return arrays
 
 

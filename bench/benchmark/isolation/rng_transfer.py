@@ -29,4 +29,4 @@ def decode_rng_state(text: NDArray[Any]) -> dict[str, Any]:
             return dict(state)
     except (ValueError, TypeError, LookupError, OverflowError, RecursionError):
         pass
-    raise ValueError("no state of a random stream")
+    raise ValueError("not the state of a random generator")

@@ -206,7 +206,7 @@ class IsolatedSteps:
             raise self._child.fail_with_protocol_error(str(error)) from None
         recommends = message.flags == 1
         if message.kind != b"A" or not n or numbers.size != (n + recommends) * dim:
-            raise self._child.fail_with_protocol_error("it asked for nothing")
+            raise self._child.fail_with_protocol_error("it requested no points")
         self._waits = True
         if recommends:
             return Proposal(numbers[dim:].reshape(n, dim), numbers[:dim])

@@ -119,7 +119,7 @@ class ForkServerClient:
             fork_server.send_request(self._link, {**request, "modules": missing}, descriptors)
         except OSError:
             self.close()
-            raise KilledExternallyError("the process that starts tuners is gone") from None
+            raise KilledExternallyError("the fork server has ended") from None
         self._loaded.update(missing)
 
     @property
@@ -365,7 +365,7 @@ class IsolatedProcess:
         """
         # An answer sent before its question would seem to take no time.
         if self.channel.has_data:
-            raise self.fail_with_protocol_error("it spoke without having been asked")
+            raise self.fail_with_protocol_error("it sent a message without a request")
         try:
             self.channel.send(kind, *parts, deadline=deadline, **head)
         except TimeoutError:
@@ -377,7 +377,9 @@ class IsolatedProcess:
     def fail_with_protocol_error(self, violation: str) -> RunEndedError:
         """End a process that violated the protocol, and return the error to raise."""
         self.end()
-        return RunEndedError("crashed", f"the tuner's process broke the pipe: {violation}")
+        return RunEndedError(
+            "crashed", f"the tuner's process violated the message protocol: {violation}"
+        )
 
     def _make_exit_error(self) -> RunEndedError | KilledExternallyError:
         """Return the error for a process that has closed its pipe, after waiting for its exit code.

@@ -118,7 +118,7 @@ def _handle_message(channel: MessageChannel, message: Message, tuner: Tuner | No
         tuner = load_class(description)(**description["options"])
         channel.send(b"K")
     elif tuner is None:
-        raise RuntimeError("asked before there was a tuner")
+        raise RuntimeError("a request came before the tuner was built")
     elif message.kind == b"L":
         tuner.restore(unpack_arrays(message.body))
         channel.send(b"K")
@@ -162,7 +162,7 @@ def _load_plugin_file(path: str) -> Any:
     stem = os.path.splitext(os.path.basename(path))[0]
     spec = importlib.util.spec_from_file_location(f"simgap_plugin_{stem}", path)
     if spec is None or spec.loader is None:
-        raise ImportError(f"{path}: no Python file")
+        raise ImportError(f"{path}: not a Python file")
     module = importlib.util.module_from_spec(spec)
     # Dataclasses look up their module when they are made.
     sys.modules[spec.name] = module

@@ -67,7 +67,7 @@ def _check_sweep_values(path: Path, key: str, values: Sequence[Any]) -> None:
     texts = [_format_swept_value(path, key, value) for value in values]
     for text in texts:
         if texts.count(text) > 1:  # two experiments would share one folder
-            raise InputError(f"{path}: {key}: {text} stands twice")
+            raise InputError(f"{path}: {key}: {text} is given twice")
 
 
 def _format_swept_value(path: Path, key: str, value: Any) -> str:
@@ -79,7 +79,7 @@ def _format_swept_value(path: Path, key: str, value: Any) -> str:
         InputError: the value is a table.
     """
     if isinstance(value, dict):
-        raise make_error(path, key, "texts, numbers, bools or lists of them", value)
+        raise make_error(path, key, "strings, numbers, booleans or lists of them", value)
     if isinstance(value, list | tuple):
         return "_".join(_format_swept_value(path, key, item) for item in value)
     if isinstance(value, bool):  # as TOML writes it
@@ -96,7 +96,7 @@ def _insert_value(path: Path, document: dict[str, Any], key: str, value: Any) ->
     while (name := _get_first_key(table, remaining_key)) != remaining_key:
         table, remaining_key = table.setdefault(name, {}), remaining_key[len(name) + 1 :]
         if not isinstance(table, dict):
-            raise InputError(f"{path}: sweep.{key}: {name} is no table, and has nothing in it")
+            raise InputError(f"{path}: sweep.{key}: {name} is not a table, so it has no entries")
     table[remaining_key] = value
 
 

@@ -135,4 +135,6 @@ def find_recording(path: str) -> Path:
     folder = os.environ.get("SIMGAP_DATA")
     places = f"in {folder} (SIMGAP_DATA)" if folder else "here (SIMGAP_DATA is not set)"
     remedy = "set SIMGAP_DATA to the folder of recordings"
-    raise InputError(f"recording {path}: no such file {places} or beside the experiment; {remedy}")
+    raise InputError(
+        f"recording {path}: no such file {places} or next to the experiment's file; {remedy}"
+    )

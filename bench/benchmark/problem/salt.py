@@ -54,7 +54,8 @@ def check_commitment(subject: str, salt: str, committed: str) -> None:
         )
     if committed and salt and compute_commitment(salt) != committed:
         raise InputError(
-            f"{subject}: its salt has SHA-256 {compute_commitment(salt)}, committed was "
+            f"{subject}: its salt has SHA-256 {compute_commitment(salt)}, expected the "
+            f"committed "
             f"{committed}; one of the two was changed"
         )
 

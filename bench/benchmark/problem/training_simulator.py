@@ -126,7 +126,7 @@ class CountedTrainingSimulator:
         requested_total = self.used + len(points)
         if requested_total > self.budget:
             raise BudgetExceededError(
-                f"{requested_total} training simulations asked, {self.budget} allowed"
+                f"{requested_total} training simulations requested, {self.budget} allowed"
             )
         self.used = requested_total
         scenarios = self._problem.draw_scenarios(rng)

@@ -59,7 +59,7 @@ def parse_entries(path: Path, value: Any) -> tuple[TunerEntry, ...]:
         # Tables and figures distinguish tuners by label; TOML keys cannot occur twice, list items
         # can.
         if entry.label in [listed_entry.label for listed_entry in entries]:
-            problem = f"{entry.label} stands twice; give one of them a label"
+            problem = f"{entry.label} is listed twice; give one of them a label"
             raise InputError(f"{path}: tuners: {problem}")
         entries.append(entry)
     return tuple(entries)

@@ -68,7 +68,9 @@ class TuningProblem:
         """
         if experiment.sweep:
             swept = ", ".join(experiment.sweep)
-            remedy = "run those that bench.benchmark.problem.experiment.expand_sweep gives"
+            remedy = (
+                "run the experiments that bench.benchmark.problem.experiment.expand_sweep returns"
+            )
             raise InputError(f"experiment {experiment.name}: sweeps over {swept}; {remedy}")
         if experiment.experiments:
             experiment_names = ", ".join(experiment.experiments)

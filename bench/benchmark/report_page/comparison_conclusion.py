@@ -76,7 +76,7 @@ def _conclude_range(view: ComparisonView, kind: str) -> str:
     """
     standings, title = headline.standings(view.statistics, kind), _format_title(view, kind)
     if not standings:
-        return f"{title}: no target has an error that decides."
+        return f"{title}: the errors on the targets do not decide."
     last = standings[-1]
     # The wording of the first one explains the format of the others.
     first = [

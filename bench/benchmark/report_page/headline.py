@@ -177,7 +177,7 @@ def too_few(statistics: ComparisonStatistics, kind: str) -> str:
     targets = int(ranked.max())
     return (
         f"{targets} target{'s' * (targets != 1)} cannot decide between {comparison_count + 1} "
-        f"tuners: it takes at least {required_targets} (--targets {required_targets})."
+        f"tuners: at least {required_targets} are needed (--targets {required_targets})."
     )
 
 

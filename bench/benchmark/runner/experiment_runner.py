@@ -458,7 +458,7 @@ def _store_result(results: ExperimentRun, index: int, outcome: RunOutcome | Exce
     problem, job = results.problem, results.plan[index]
     # Every run gets rows and a status, because a failure is a result too.
     if isinstance(outcome, TimeoutError):
-        reason = f"killed past its limit of {problem.experiment.timeout:g} s"
+        reason = f"killed after its limit of {problem.experiment.timeout:g} s"
         outcome = make_unfinished_outcome(problem, job.target, "timeout", reason)
     elif isinstance(outcome, WorkerDiedError):
         outcome = make_unfinished_outcome(problem, job.target, "crashed", str(outcome))

@@ -59,7 +59,9 @@ def train_remotely(
                 return unpack_arrays(message.body)
             _handle_message(child, message, grounds, watch)
         except ProtocolError as error:
-            raise RunEndedError("crashed", f"the tuner's process broke the pipe: {error}") from None
+            raise RunEndedError(
+                "crashed", f"the tuner's process violated the message protocol: {error}"
+            ) from None
 
 
 def _handle_message(
@@ -86,7 +88,7 @@ def _handle_message(
             grounds.append(callback.ground)
         _serve_simulation(child, message, grounds[message.flags & 1])
     else:
-        raise ProtocolError("it sent what nobody asked for")
+        raise ProtocolError("it sent a message of an unexpected kind")
 
 
 def _parse_progress(document: Any) -> tuple[str, int, int, float, float]:

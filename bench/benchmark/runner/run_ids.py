@@ -131,7 +131,7 @@ def check_unchanged(folder: Path, initial: dict[str, str], present: dict[str, st
     for hash_name, hashed in present.items():
         if initial.get(hash_name) != hashed:
             raise InputError(
-                f"{folder}: its {hash_name} changed since it was begun ({initial.get(hash_name)} "
+                f"{folder}: its {hash_name} changed since it was started ({initial.get(hash_name)} "
                 f"then, {hashed} now); all runs need the same configuration: restore it, or start "
                 "a new comparison"
             )

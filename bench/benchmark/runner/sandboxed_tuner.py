@@ -65,8 +65,8 @@ def list_active_isolation_layers() -> tuple[str, ...]:
         return retry_if_killed(_find_active_layers)
     except RunEndedError as ended:
         raise InputError(
-            f"no tuner can have a process of its own here: {ended}; mend that, or give --trust for "
-            "tuners that you know"
+            f"tuners cannot run in a process of their own here: {ended}; repair that, or use "
+            "--trust for tuners that you trust"
         ) from None
 
 

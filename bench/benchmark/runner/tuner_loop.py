@@ -302,7 +302,7 @@ def _close_generator(steps: TunerRun | None) -> str:
     try:
         steps.close()
     except RunEndedError as ended:
-        return ended.reason or "the tuner did not close what it holds"
+        return ended.reason or "the tuner did not release its resources"
     except KilledExternallyError:
         raise
     except Exception:

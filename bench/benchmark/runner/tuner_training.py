@@ -47,11 +47,11 @@ _COST_ARRAY = "__simulations_and_seconds__"
 """Name of the array with the cost of the training: simulations and seconds."""
 _KEY = "__key__"
 """Name of the array with the training key."""
-_REMEDY = "delete it to have it trained again"
+_REMEDY = "delete it to train again"
 """Advice for a file that cannot be used; it is never repaired silently."""
 
 
-NOT_REPRODUCIBLE_REASON = "it was killed, and asked for other simulations when it was made again"
+NOT_REPRODUCIBLE_REASON = "it was killed, and the repeated training requested other simulations"
 """Reason of a run or training that was not reproducible after a kill."""
 
 
@@ -336,7 +336,7 @@ def _train_isolated(
     reserved = {"file", "allow_pickle", _COST_ARRAY, _KEY} & set(state)
     if reserved:
         raise RunEndedError(
-            "crashed", f"the tuner learned what cannot be kept by the names {reserved}"
+            "crashed", f"the tuner's state has arrays with the reserved names {reserved}"
         )
     return state
 

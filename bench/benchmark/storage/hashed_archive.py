@@ -172,7 +172,7 @@ def _check_entries(archive: Path, packed: zipfile.ZipFile) -> list[zipfile.ZipIn
     if total > MAX_UNPACKED_BYTES or (total > _HARMLESS and total > MAX_COMPRESSION_RATIO * size):
         raise _make_refusal(archive, f"it would unpack from {size} bytes to {total}")
     if packed.comment or min((e.header_offset for e in entries), default=0) > 0:
-        raise _make_refusal(archive, "there is something in it beside its files")
+        raise _make_refusal(archive, "it contains data that belong to no file")
     return entries
 
 
@@ -186,9 +186,9 @@ def _find_entry_error(entry: zipfile.ZipInfo) -> str:
     parts = name.split("/")
     # If the two stored names of an entry differ, programs would unpack it to different paths.
     if name != entry.orig_filename or "\\" in name or ":" in name or not name.isprintable():
-        return "is no plain path"
+        return "is not a plain path"
     if len(name) > _LONGEST or any(part in ("", ".", "..") for part in parts):
-        return "leads out of its folder, or is none"
+        return "is not a path inside its folder"
     if kind not in (0, stat.S_IFREG) or entry.is_dir():
         return "is a link, a folder or a device; expected a file"
     if entry.flag_bits & _ENCRYPTED:
@@ -254,7 +254,9 @@ def _unpack_file(
         for block in _read_blocks(source):
             size += len(block)
             if size > entry.file_size:
-                raise _make_refusal(archive, f"{entry.filename!r} holds more than it says")
+                raise _make_refusal(
+                    archive, f"{entry.filename!r} has more bytes than its entry states"
+                )
             digest.update(block)
             target.write(block)
     return size, digest.hexdigest()

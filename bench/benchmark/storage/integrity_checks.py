@@ -93,7 +93,7 @@ def check_files(
     raise_for_first_bad_row(
         trainings.duplicated(["tuner", "seed"]),
         training.make_error,
-        lambda _: "tuner and seed: expected every training once, found one again",
+        lambda _: "tuner and seed: expected every training once, found one twice",
     )
     return CheckedFiles(
         runs, statuses, trainings, _read_identifiability_table(folder, experiment, remedy)
@@ -108,7 +108,7 @@ def get_remedy(folder: Path, *, under_way: bool) -> str:
         under_way: Whether its segments still exist.
     """
     if under_way:  # The segments contain everything.
-        return f"simgap compare --resume {folder} writes it again"
+        return f"write it again with simgap compare --resume {folder}"
     return "restore the file, or start a new comparison"
 
 
@@ -120,7 +120,7 @@ def check_table(folder: Path) -> None:
     """
     path = folder / "table.csv"
     if path.exists():
-        CsvTable(path, ERROR_TABLE_COLUMNS, f"simgap plot {folder} writes it again")
+        CsvTable(path, ERROR_TABLE_COLUMNS, f"write it again with simgap plot {folder}")
 
 
 def _read_identifiability_table(
@@ -168,7 +168,7 @@ def check_statuses(statuses: pd.DataFrame, experiment: Experiment, fault: RowErr
     raise_for_first_bad_row(
         statuses["run"].duplicated(),
         fault,
-        lambda row: f"run: expected every run once, found {statuses['run'].iloc[row]} again",
+        lambda row: f"run: expected every run once, found {statuses['run'].iloc[row]} twice",
     )
     check_known(statuses["tuner"], list_tuner_labels(experiment), "tuner", fault)
     check_known(statuses["simulator"], [experiment.simulator], "simulator", fault)
@@ -212,8 +212,8 @@ def check_statuses(statuses: pd.DataFrame, experiment: Experiment, fault: RowErr
         (statuses["status"] == "done") & (simulations != budget),
         fault,
         lambda row: (
-            f"simulations: expected {budget.iloc[row]} of a run that is done, "
-            f"found {simulations.iloc[row]}"
+            f"simulations: expected {budget.iloc[row]} as the run is done, found "
+            f"{simulations.iloc[row]}"
         ),
     )
 

@@ -34,7 +34,7 @@ _HEAD = struct.Struct(">4sII")
 """Head of a record: mark, length of the content, checksum of the content."""
 _MARK = b"run\n"
 """Mark at the beginning of a record."""
-SEGMENT_REMEDY = "restore it, or delete it and resume the comparison: its runs are made again"
+SEGMENT_REMEDY = "restore it, or delete it and resume the comparison: the runs are repeated"
 """Advice for a damaged segment."""
 _PLACE = ColumnSpec("place in the plan", int, low=0, high=2.0**31)
 

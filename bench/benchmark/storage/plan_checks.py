@@ -61,7 +61,7 @@ def check_plan(plan: Sequence[str], experiment: Experiment, path: Path, remedy: 
     plan_table = pd.DataFrame(rows, columns=["run", "tuner", "target", "seed"])
     names = plan_table["run"]
     raise_for_first_bad_row(
-        names.duplicated(), at, lambda row: f"expected every run once, found {names[row]} again"
+        names.duplicated(), at, lambda row: f"expected every run once, found {names[row]} twice"
     )
     check_known(plan_table["tuner"], list_tuner_labels(experiment), "tuner", at)
     check_known(plan_table["target"], list_target_names(experiment), "target", at)

@@ -210,9 +210,9 @@ def _read_reference(name: str, folder: Path) -> ReferenceResult:
         origin = {key: str(environment[key]) for key in ("simgap", "started")}
         revision = str(environment.get("fingerprint", {}).get("code", ""))
     except (OSError, ValueError, KeyError, AttributeError, TypeError) as error:
-        expected = "expected what a comparison writes"
+        expected = "expected the results of a comparison"
         raise InputError(f"{path}: {expected}, found {get_first_line(error)}") from None
-    table = CsvTable(folder / _TABLE, _COLUMNS, f"simgap plot {folder} writes it again").table
+    table = CsvTable(folder / _TABLE, _COLUMNS, f"write it again with simgap plot {folder}").table
     document = read_toml(folder / CONFIGURATION_FILE)
     return ReferenceResult(name, folder, table.to_pandas(), document, **origin, revision=revision)
 

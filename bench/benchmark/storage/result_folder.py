@@ -284,7 +284,8 @@ def read_comparison(folder: Path, columns: Sequence[str] | None = None) -> Store
     # The study was killed before its first results were written, so nothing is damaged.
     if not path.exists() and under_way:
         raise InputError(
-            f"{folder}: not finished, and nothing written yet; resume it to make the rest"
+            f"{folder}: not finished, and no tables are written yet; resume it to run what is "
+            "missing"
         )
     plan = read_plan(folder) if under_way else None
     files = check_files(folder, experiment, under_way=under_way, plan=plan)

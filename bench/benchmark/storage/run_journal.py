@@ -244,6 +244,6 @@ def _lock_folder(path: Path) -> IO[str]:
     except OSError:
         file.close()
         raise InputError(
-            f"{path.parent.parent}: another simgap is at work there; wait for it, or end it"
+            f"{path.parent.parent}: another simgap process uses this folder; wait for it, or end it"
         ) from None
     return file

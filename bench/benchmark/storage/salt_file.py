@@ -35,8 +35,8 @@ def draw_salt_if_needed(experiment: Experiment, salt: str | None) -> tuple[Exper
     """
     if experiment.salt and salt not in (None, experiment.salt):
         raise InputError(
-            f"experiment {experiment.name}: has a salt of its own, which is public; leave out the "
-            "other, or take it from the experiment"
+            f"experiment {experiment.name}: states a public salt; leave out the salt, or "
+            "remove it from the experiment"
         )
     if experiment.salt or salt == PUBLIC_SALT:
         return experiment.chosen(salt=experiment.salt or PUBLIC_SALT, salt_sha256=""), None

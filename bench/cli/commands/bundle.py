@@ -14,7 +14,7 @@ def add_bundle_arguments(parser: argparse.ArgumentParser) -> None:
         "run",
         metavar="RUN",
         type=parse_path,
-        help="the folder of a finished comparison, or what `simgap explain` has written",
+        help="the folder of a finished comparison, or the output folder of `simgap explain`",
     )
     parser.add_argument(
         "--with",
@@ -23,8 +23,8 @@ def add_bundle_arguments(parser: argparse.ArgumentParser) -> None:
         type=parse_path,
         action="append",
         default=[],
-        help="of an explanation: a recording that goes with it, with its .toml, so that its "
-        "held-out error can be checked",
+        help="for an explanation: a recording to include, with its .toml, so that the held-out "
+        "error can be checked",
     )
     parser.add_argument(
         "--out",
@@ -54,6 +54,6 @@ def _run_bundle(options: argparse.Namespace, print_line: PrintLine) -> CommandRe
     print_line(f"SHA-256 {document['sha256']}")
     for line in archived.left_out:
         print_line(f"left out: {line}")
-    print_line(f"to make it again: {archived.command}")
+    print_line(f"to reproduce it: {archived.command}")
     print_line(f"to check it: simgap verify {archived.archive}")
     return CommandResult(document)

@@ -154,7 +154,7 @@ def _report_missing(study: Study, outcome: StudyOutcome, resume: str) -> int:
     reason = "interrupted" if outcome.interrupted else outcome.stopped or "stopped"
     unit, ended = study.status().what.rsplit(" ", 1)  # For example: runs finished.
     for line in (
-        f"{reason}; {outcome.finished} of {outcome.planned} {unit} are {ended} and kept",
+        f"{reason}; {outcome.finished} of {outcome.planned} {unit} are {ended} and stored",
         f"to finish: {resume}",
     ):
         print(f"simgap: {line}", file=sys.stderr)

@@ -30,8 +30,8 @@ def add_datasheet_arguments(parser: argparse.ArgumentParser) -> None:
         dest="explained",
         metavar="FOLDER",
         type=parse_path,
-        help="what `simgap explain` has written for these logs (default: they are explained now, "
-        "into the folder explained in --out)",
+        help="output folder of `simgap explain` for these logs (default: run explain now and write "
+        "its results into the folder explained in --out)",
     )
     add_pdf(parser)
     add_plugin_option(parser, "systems")
@@ -63,7 +63,7 @@ def _run_datasheet(options: argparse.Namespace, print_line: PrintLine) -> Comman
             # The explanation took minutes, so it is written even if the data sheet fails.
             explained.write(options.out / "explained", pdf=options.pdf)
             settings["explained"] = explained
-        display.finish("computing what these data would have shown")
+        display.finish("computing detection limits")
         data_sheet = datasheet(options.recordings, **settings)
     paths = data_sheet.write(options.out)
     for line in data_sheet.lines():

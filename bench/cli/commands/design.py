@@ -21,7 +21,7 @@ def add_design_arguments(parser: argparse.ArgumentParser) -> None:
     add_recordings_argument(parser, "the existing recordings, as for `simgap explain`")
     add_out_option(
         parser,
-        "file of commands to write, a new one: t in s and a column for each input",
+        "new file for the commands: t in s and a column for each input",
         "NAME.csv",
         required=True,
     )

@@ -21,7 +21,7 @@ def add_diff_arguments(parser: argparse.ArgumentParser) -> None:
             name,
             metavar=name.upper(),
             type=parse_path,
-            help="the folder of a comparison, or what `simgap explain` has written",
+            help="the folder of a comparison, or the output folder of `simgap explain`",
         )
     parser.add_argument(
         "--out",
@@ -80,6 +80,7 @@ def _compare_folders(a: Path, b: Path) -> ComparisonDiff | ExplanationDiff:
     if any(is_explanation):
         explanation, comparison = (a, b) if is_explanation[0] else (b, a)
         raise InputError(
-            f"expected two of one kind: {explanation} is an explanation, {comparison} is none"
+            f"expected two comparisons or two explanations: {explanation} is an explanation, "
+            f"{comparison} is not"
         )
     return diff_comparisons.diff_comparisons(a, b)

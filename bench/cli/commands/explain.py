@@ -29,6 +29,14 @@ from bench.cli.shared_options import (
 
 _FIGURE_SUFFIXES = (".html", ".png", ".pdf")
 """File extensions of figures and reports, which are not listed one by one."""
+_FILE_LABELS = {
+    "report.html": "report",
+    "extended.toml": "simulator",
+    "extended.xml": "MJCF",
+    "extended.urdf": "URDF",
+    "apart.csv": "consistency",
+}
+"""Labels of result files on the terminal, where the stem of the name does not say the content."""
 
 _RESULT_RELEVANT_OPTIONS = (
     "system", "model", "engine", "free", "tuner", "seed", "budget", "whole", "pieces", "thorough",
@@ -106,7 +114,9 @@ def _run_explain(options: argparse.Namespace, print_line: PrintLine) -> CommandR
     from sims.core.simulator import InputError
 
     if options.cluster and not options.each:
-        raise InputError("--cluster: expected --each beside it, as it is for many recordings")
+        raise InputError(
+            "--cluster: expected together with --each, since it distributes many recordings"
+        )
     if options.ranges and options.each:
         raise InputError(
             "--ranges: not possible together with --each; explain the recordings together, or one "
@@ -140,10 +150,10 @@ def _run_explain(options: argparse.Namespace, print_line: PrintLine) -> CommandR
     left_out = explanation.ranges.left_out if options.ranges else ()
     for line in (*explanation.unsaid, *left_out):
         print_line(line)
-    print_line(f"\nreport  {paths[-1]}")
-    for path in paths:
+    print_line(f"\n{_FILE_LABELS['report.html']:11} {paths[-1]}")
+    for path in paths[:-1]:
         if path.suffix not in _FIGURE_SUFFIXES:
-            print_line(f"{path.stem:7} {path}")
+            print_line(f"{_FILE_LABELS.get(path.name, path.stem):11} {path}")
     cutoff = explanation.answer.cut
     document = {
         "verdict": explanation.answer.to_document(),

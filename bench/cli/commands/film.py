@@ -45,7 +45,7 @@ def add_track_arguments(parser: argparse.ArgumentParser) -> None:
         "video",
         metavar="VIDEO",
         type=parse_path,
-        help="a film of one dropped ball by a camera that stands",
+        help="a film of one dropped ball by a fixed camera",
     )
     parser.add_argument(
         "--out",
@@ -63,8 +63,8 @@ def add_track_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--scale",
         choices=("camera", "diameter", "fall"),
-        help="where metres come from (default: VIDEO.camera.toml if there, else the diameter if "
-        "given, else the fall)",
+        help="source of the scale in metres (default: VIDEO.camera.toml if it exists, else the "
+        "diameter if given, else the fall)",
     )
     add_pdf(parser)
     parser.set_defaults(command=run_track)

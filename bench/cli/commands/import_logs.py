@@ -49,14 +49,14 @@ def _run_import(options: argparse.Namespace, print_line: PrintLine) -> CommandRe
 
     result = import_logs(**collect_options(options, ImportRequest))
     print_line(
-        f"{options.out}: {len(result.guessed)} guesses, each marked there; nothing was copied"
+        f"{options.out}: {len(result.guessed)} guesses, each marked in the file; nothing was copied"
     )
     for line in result.checks:
         print_line(f"check: {line}")
     for line in result.guessed:
         print_line(f"guess: {line}")
     for line in result.untold:
-        print_line(f"not told: {line}")
+        print_line(f"not known: {line}")
     print_line(f"next: simgap inspect {options.out}")
     return CommandResult(
         {

@@ -27,7 +27,7 @@ def add_plot_arguments(plot: argparse.ArgumentParser) -> None:
         "--out",
         metavar="DIR",
         type=parse_path,
-        help="folder for what several comparisons give together",
+        help="folder for the joint results of several comparisons",
     )
     plot.add_argument(
         "--behind",
@@ -77,7 +77,7 @@ def _run_plot(options: argparse.Namespace, print_line: PrintLine) -> CommandResu
                 reference.find_mismatches(open_study(part).configuration.experiment)
         return _report_again(options.runs[0], references, print_line)
     if not options.out:
-        raise InputError("several comparisons give one result: name a folder for it with --out DIR")
+        raise InputError("several comparisons have a joint result: give its folder with --out DIR")
     from bench.benchmark.comparison import Comparison
     from bench.benchmark.multi_problem import compare_across_problems
 

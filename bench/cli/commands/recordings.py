@@ -125,7 +125,7 @@ def add_inspect_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--fix-base",
         action="store_true",
-        help="for a robot whose model file floats: fix it in the pose of the file",
+        help="for a robot with a floating base: fix the base in the pose of the model file",
     )
     add_out_option(parser, "folder of the figure (default: results/inspect)")
     parser.add_argument(
@@ -327,8 +327,8 @@ def _find_differing_conventions(
         differences = ConventionComparison(Subject(kind, recording, None)).differences()
     if options.fix and not differences:
         raise InputError(
-            f"{options.recording}: expected conventions that differ from those of the model file, "
-            "found none; leave --fix out"
+            f"{options.recording}: the conventions agree with those of the model file, so that "
+            "nothing has to be corrected; leave --fix out"
         )
     if not differences:
         return [], []

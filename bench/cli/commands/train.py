@@ -47,7 +47,7 @@ def add_train_arguments(parser: argparse.ArgumentParser) -> None:
         help="trainings, each from its own seed (default: all)",
     )
     parser.add_argument(
-        "--again", action="store_true", help="train although there are weights, and replace them"
+        "--again", action="store_true", help="train even if weights exist, and replace them"
     )
     parser.add_argument(
         "--out",
@@ -124,6 +124,6 @@ def _run_train(options: argparse.Namespace, print_line: PrintLine) -> CommandRes
     budget = f" --training-budget {options.budget}" if options.budget else ""
     trust = " --trust" if options.trust else ""
     command = f"simgap compare {options.experiment or experiment.name}{budget}{trust}"
-    print_line(f"found by: {command}")
+    print_line(f"used by: {command}")
     document = {"tuner": entry.label, "experiment": experiment.name, "found_by": command}
     return CommandResult({**document, "trainings": trained, "files": files})

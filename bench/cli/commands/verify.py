@@ -18,7 +18,7 @@ def add_verify_arguments(verify: argparse.ArgumentParser) -> None:
         "`simgap bundle`",
     )
     verify.add_argument(
-        "--all", action="store_true", help="make every simulation again, and not a share of them"
+        "--all", action="store_true", help="repeat every simulation instead of a sample of them"
     )
     add_plugin_option(verify, "simulators")
     verify.set_defaults(command=_run_verify)

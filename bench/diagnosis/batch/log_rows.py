@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from bench.diagnosis.report.wording import append_unit
 from bench.pages.csv_text import csv_text
 
 LOGS_TABLE_FILE = "logs.csv"
@@ -77,9 +78,8 @@ def summarise_causes(rows: Sequence[LogResult]) -> list[str]:
         for name, first in coefficients[0].items():
             values = [c[name]["value"] for c in coefficients if name in c]
             label = "" if name == "coefficient" else f"{name} "
-            unit = "" if first["unit"] == "1" else f" {first['unit']}"
             low, high = min(values), max(values)
             span = f"{low:.4g}" if low == high else f"{low:.4g} to {high:.4g}"
-            numbers.append(f"{label}{span}{unit}")
+            numbers.append(f"{label}{append_unit(span, first['unit'])}")
         lines.append(f"{effects}: in {len(coefficients)} of {len(rows)} logs, {', '.join(numbers)}")
     return lines

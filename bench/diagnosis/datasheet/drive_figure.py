@@ -233,7 +233,7 @@ def _draw_effects_not_shown(
         if row.number is None:
             confounding = format_confounding(row)
             limit_text = format_detection_limit(row) + (
-                f" (mixed up with {confounding})" if confounding and row.detection_limit else ""
+                f" (confounded with {confounding})" if confounding and row.detection_limit else ""
             )
             lines = textwrap.wrap(limit_text, letters)
             rows.append((format_short_name(row), lines))
@@ -252,9 +252,9 @@ def _draw_effects_not_shown(
             limit_text = "\n".join(lines)
             figure.text(x + beside_name, y, limit_text, va="top", fontsize=size, linespacing=1.25)
             y -= line * len(lines)
-    heading = "Not shown by these data, and how small a number they would have shown (95 %)"
+    heading = "Not detected in these data, with the detection limit (95 %)"
     figure.text(_MARGIN, table_top + 0.018, heading, weight="bold", va="top")
-    text = "Limits and gaps show from the size given on. Made by simgap datasheet."
+    text = "Limits and backlash are detectable from the given size on. Made by simgap datasheet."
     figure.text(_MARGIN, 0.028, text, fontsize=6, color=style.CAPTION_GREY, va="top")
     return table_top + 0.02
 
@@ -262,14 +262,20 @@ def _draw_effects_not_shown(
 def _draw_diagram_text(figure: Figure, diagram: DriveDiagram, x: float, y: float) -> None:
     """Draw the description of the diagram next to it."""
     unit = diagram.unit
-    lines = [f"starts without a load at {append_unit(format_number(diagram.breakaway), unit)}"]
+    lines = [
+        f"starts to move without load at {append_unit(format_number(diagram.breakaway), unit)}"
+    ]
     load = append_unit(format_number(diagram.backdrive), unit)
     is_backdrivable = np.isfinite(diagram.backdrive)
-    lines.append(f"without power a load of {load} turns it" if is_backdrivable else "locks itself")
+    lines.append(
+        f"without power, a load of {load} back-drives it" if is_backdrivable else "self-locking"
+    )
     laws = sanitise(", ".join(diagram.laws), 100)
     lines.append(f"laws: {laws or 'none, no friction at rest'}")
     if diagram.without:
-        lines.append(f"not in it, with a state of its own: {', '.join(diagram.without)}")
+        lines.append(
+            f"not included, because they have an internal state: {', '.join(diagram.without)}"
+        )
     text = "\n".join(part for line in lines for part in textwrap.wrap(line, 34))
     figure.text(x, y, text, va="top", linespacing=1.4, fontsize=7.5)
 

@@ -79,7 +79,7 @@ def _describe_rest_forces(diagram: DriveDiagram) -> str:
     else:
         text += "Without power, no load moves it: it is self-locking."
     if diagram.without:
-        text += f" Not included, because they have a state: {', '.join(diagram.without)}."
+        text += f" Not included, because they have an internal state: {', '.join(diagram.without)}."
     return text
 
 

@@ -98,13 +98,12 @@ class SheetContent:
         rest_diagram = self.rest
         if rest_diagram.laws and rest_diagram.breakaway > 0:
             force = append_unit(format_number(rest_diagram.breakaway), rest_diagram.unit)
-            friction_text = (
-                f"At rest, dry friction holds against up to {force} ({joined(rest_diagram.laws)})"
-            )
+            friction_text = f"At rest, dry friction holds loads up to {force} ({joined(rest_diagram.laws)})"
         else:
-            friction_text = "No law of friction was found that holds it at rest"
+            friction_text = "No friction law was found that holds it at rest"
         return (
-            f"There is no drive: {reason}. So this sheet has no drive and back-drive diagram, and "
+            f"There is no drive: {reason}. Therefore this sheet has no drive and back-drive "
+            "diagram, and "
             "no numbers of a drive; the table shows the other effects on the joint. "
             f"{friction_text}."
         )
@@ -138,9 +137,9 @@ class SheetContent:
         if unnamed_count > 0:
             absent_names = [
                 *absent_names,
-                f"{unnamed_count} more (the sheet says how small each could be)",
+                f"{unnamed_count} more (the sheet gives the detection limit of each)",
             ]
         lines.append(
-            f"not shown by these data: {sanitise(joined(absent_names), 2000) or 'nothing'}"
+            f"not detected in these data: {sanitise(joined(absent_names), 2000) or 'nothing'}"
         )
         return lines

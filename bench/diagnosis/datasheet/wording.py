@@ -15,7 +15,7 @@ from bench.diagnosis.report.wording import (
 )
 
 UNJUDGED_P_VALUE = 0.05
-"""P-value above which a cause is on the sheet only because the search ended before it was judged.
+"""P-value above which a cause is on the sheet only because the search ended before it was tested.
 """
 
 
@@ -74,7 +74,7 @@ def format_evidence(row: SheetRow, is_short: bool = False) -> str:
             else "not identified by these data"
         )
     is_judged = row.p_value is None or row.p_value <= UNJUDGED_P_VALUE
-    unjudged_text = "not judged" if is_short else "the search ended before it was judged"
+    unjudged_text = "not tested" if is_short else "the search ended before it was tested"
     parts = [format_p_value(row.p_value) if is_judged else unjudged_text]
     if row.share is not None:
         closed_share = format_percent(row.share)
@@ -95,7 +95,7 @@ def format_detection_limit(row: SheetRow) -> str:
         return "none: the data do not depend on it"
     size = format_number(detection_limit.size, 2)
     if detection_limit.vague:
-        return append_unit(f"± {size}", row.unit) + ", more than any plausible value"
+        return append_unit(f"± {size}", row.unit) + ", larger than any plausible value"
     if detection_limit.limit:
         return append_unit(f"none {detection_limit.limit} {size}", row.unit)
     if detection_limit.is_nonzero_if_fitted:
@@ -103,7 +103,7 @@ def format_detection_limit(row: SheetRow) -> str:
             append_unit(
                 f"{format_number(detection_limit.estimate_if_fitted, 2)} ± {size}", row.unit
             )
-            + ", not named"
+            + ", not diagnosed"
         )
     return append_unit(f"0 ± {size}", row.unit)
 

@@ -672,7 +672,7 @@ def _make_freed_parameter(name: str, simulator: SystemSimulator, recording: Reco
     # value.
     if value == 0 or any(name in run.constants for run in recording.runs):
         raise InputError(
-            f"free constant {name}: expected one that is not zero and the same in every run"
+            f"free constant {name}: expected a value that is not zero and equal in all runs"
         )
     # Sorted, because a constant may be negative.
     low, high = sorted((value / FREED_CONSTANT_RANGE_FACTOR, value * FREED_CONSTANT_RANGE_FACTOR))

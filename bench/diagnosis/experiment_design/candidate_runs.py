@@ -228,9 +228,9 @@ class RigModel:
         """
         if plan.driven_inputs:
             input_text = plan.driven_inputs[0] if len(plan.driven_inputs) == 1 else "all inputs"
-            text = f"{input_text}: {plan.form}, {plan.size:g} times as large as so far"
+            text = f"{input_text}: {plan.form}, {plan.size:g} times the recorded amplitude"
         else:
-            text = "let it go"
+            text = "release"
         if plan.level:
             medians = [f"{name} = {np.median(inputs[name]):.3g}" for name in plan.driven_inputs]
             text += f", about {', '.join(medians)}"
@@ -259,7 +259,7 @@ COMMAND_FORMS: Mapping[str, str] = {
     "square wave of 4 Hz": "square:1:4",
     "ramps up and down": "",
     "holds": "",
-    "a push, then let go": "",
+    "a push, then zero input": "",
 }
 """Signal specifications of unit size, by name of the form.
 
@@ -280,7 +280,7 @@ def _compute_command(form: str, times: Array, step: float, rng: np.random.Genera
         # Levels alternate with a large change each time, so that friction becomes visible.
         levels = np.array([0.0, 1.0, -1.0, 0.5, -0.5, 0.25])
         return levels[np.minimum((share * HOLD_LEVEL_COUNT).astype(np.intp), HOLD_LEVEL_COUNT - 1)]
-    if form == "a push, then let go":
+    if form == "a push, then zero input":
         return np.where(share < RELEASE_SHARE, 1.0, 0.0)
     seconds = float(times[-1])
     # In Hz. The slow frequency has one cycle in the run, but is 0.1 to 0.5 Hz. The fast one has at

@@ -125,8 +125,9 @@ def propose_discriminating_run(
             largest_discrimination,
         )
     description += (
-        f": there {model_effects} and {competing_effects} differ by "
-        f"{largest_discrimination:.3g} times the noise"
+        f": in it the predictions with {model_effects} and {competing_effects} differ by "
+        f"{largest_discrimination:.3g} times "
+        "the noise"
     )
     return DiscriminatingRun(description, change, largest_discrimination)
 
@@ -173,15 +174,15 @@ def _explain_no_run(
     advice = "measure one of the causes directly"
     # Another sensor may measure a difference where these sensors agree.
     if unrecorded:
-        advice = f"record {unrecorded} besides"
+        advice = f"also record {unrecorded}"
     if is_limited:
         return (
-            "No run of this kind within the limits of the model file would tell "
+            "No run of this kind within the limits of the model file would distinguish "
             f"{model_effects} from {competing_effects}; {advice}, "
-            "or let simgap design search for other commands"
+            "or search for other commands with simgap design"
         )
     return (
-        f"No run of this kind would tell {model_effects} from {competing_effects}: "
+        f"No run of this kind would distinguish {model_effects} from {competing_effects}: "
         f"their predictions agree within the noise; {advice}"
     )
 

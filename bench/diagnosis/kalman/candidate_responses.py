@@ -256,7 +256,7 @@ class FollowedRuns:
         known: FollowedRuns | None = world.followed
         if known is not None and known.world is world and np.array_equal(known.theta, theta):
             return known
-        world.watch.stage("following the runs with the model", 1)
+        world.watch.stage("computing prediction errors", 1)
         assert isinstance(world.simulator, RobotSimulator)
         # With another step size, the motion at the ends of the steps is not known.
         has_same_step = known is not None and known.step == world.simulator.time_step

@@ -163,7 +163,7 @@ def try_one_more(context: SearchContext, current: FilteredSet) -> list[FilteredS
         The larger sets, the likeliest first; empty if no effect gains.
     """
     watch, filters = context.world.watch, context.filters
-    watch.stage("testing effects in the model one by one", MAX_REGRESSION_PROPOSALS)
+    watch.stage("testing the effects of the model one by one", MAX_REGRESSION_PROPOSALS)
     larger_sets = []
     for start in context.proposals.of(current):
         larger_sets.append(filters.with_effects(start.theta, start.effects, 0))

@@ -153,8 +153,8 @@ def without_inactive_drives(recording: Recording, kind: type[Simulator]) -> Reco
         lines = " and ".join(switch.line for switch in switches)
         description = recording.path.with_suffix(".toml").name
         notes += [
-            f"{text}, and the motion needs no force of it: the drive is taken to be off; state it "
-            f"in {description}: {lines}"
+            f"{text}, and the motion shows no force of it: the drive is assumed to be off; state "
+            f"it in {description}: {lines}"
             for text in said
         ]
     pairs = zip(runs, left_out, strict=True)
@@ -176,14 +176,15 @@ def _message(
     joints = ", ".join(drive.joint for drive in drives)
     where = spans_of_runs(recording.runs, left_out)
     noun = "joint" if len(drives) == 1 else "joints"
-    does = "the joints stand still" if drives[0].is_held else "the motion needs no force of them"
+    does = "the joints stand still" if drives[0].is_held else "the motion shows no force of them"
     column = _changing_column(recording, drives)
     near = f"; column {column} changes there" if column else ""
     name = drives[0].actuators[0]
     line = DriveSwitch(name, "COLUMN", True).line
     return (
-        f"the drives of {noun} {joints} do nothing in some samples, which are left out ({where}): "
-        f"{does}, whatever is commanded{near}; if a column says when a drive is on, state it: "
+        f"the drives of {noun} {joints} exert no force in some samples, which are excluded "
+        f"({where}): "
+        f"{does}, whatever the command is{near}; if a column says when a drive is on, state it: "
         f"{line}"
     )
 

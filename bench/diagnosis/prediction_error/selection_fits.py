@@ -160,7 +160,7 @@ def select_with_shapes(context: SearchContext, selected: Selected) -> Selected:
     many_shaped = [n for n in world.library if has_many_shapes(n) and acts_at(world, n, joints)]
     if not many_shaped:
         return selected
-    world.watch.stage(f"testing {len(many_shaped)} effects with many shapes", 1)
+    world.watch.stage(f"testing {len(many_shaped)} effects with several coefficients", 1)
     context.columns.add(many_shaped)
     return context.columns.select()
 
@@ -443,7 +443,7 @@ def fit_series_effects(context: SearchContext, selected: Selected) -> FittedMode
     probes = context.columns.probes([name for name in names if acts_at(world, name, joints)])
     if not probes:
         return search.base_model
-    world.watch.stage("testing elasticity and play between drives and links", len(probes))
+    world.watch.stage("testing elasticity and backlash between drives and links", len(probes))
     starts = []
     for probe in probes:
         theta = context.filters.theta_with(probe.effect, probe.coefficients)

@@ -2,7 +2,7 @@
 
 1. Fit the selected set and its rivals to whole simulated runs.
 2. Remove effects that make predictions of held-out runs worse.
-3. Test whether a force of any shape is missing (`bench.diagnosis.search.lack_of_fit`).
+3. Test whether an unmodelled force is missing (`bench.diagnosis.search.lack_of_fit`).
 4. Collect other effects that explain the data as well.
 5. Determine the verdict by the rules of `bench.diagnosis.search.verdict_rules`.
 

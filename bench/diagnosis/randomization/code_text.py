@@ -70,8 +70,9 @@ def list_heading(extended: ExtendedSimulator, framework: str, left_out: Iterable
     return [
         f"Domain randomisation for {framework}, written by simgap explain --ranges: robot "
         f"{model}, recording {extended.title}.",
-        "Each range is the 95 % interval of a number of the model file with the causes that were "
-        "found: how well this recording determines it, not how robots of one kind differ.",
+        "Each range is the 95 % interval of a number of the model file with the causes found. "
+        "It states how well this recording determines the number, not how robots of one type "
+        "differ.",
         *(f"Left out: {line}." for line in left_out),
     ]
 

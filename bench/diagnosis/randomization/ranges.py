@@ -130,7 +130,7 @@ def randomization_ranges(answer: Verdict, extended: ExtendedSimulator) -> Random
 
     unambiguous_effects = {cause.effect for cause in answer.causes if not cause.alternatives}
     left_out = [
-        f"{cause.effect} is not in the ranges: these data cannot tell it from "
+        f"{cause.effect} is not in the ranges: these data cannot distinguish it from "
         f"{joined(cause.alternatives, 'or')}"
         for cause in answer.causes
         if cause.alternatives

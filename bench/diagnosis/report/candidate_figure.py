@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-FOUND, ALIKE, NOT_NEEDED = "found", "found, but cannot be told apart", "not needed"
+FOUND, ALIKE, NOT_NEEDED = "found", "found, but not distinguishable", "not needed"
 """Status texts of candidates, as returned by `get_candidate_status`."""
 LINE_LENGTH = 44
 """Maximum number of characters per line of a candidate's name."""
@@ -265,7 +265,7 @@ def _format_notes(report: DiagnosisReportData, candidates: Sequence[Candidate]) 
     elif report.held_out is not None:
         counts += f"; held out: {_format_split_size(report.held_out)}"
     notes = [f"{counts}."]
-    p_value_note = "p: probability of such a score by chance"
+    p_value_note = "p: p-value of the score"
     certain_p_values = [c.p_value for c in candidates if c.p_value <= CERTAIN]
     chance_p_values = [c.p_value for c in candidates if _is_chance(report, c)]
     if certain_p_values:

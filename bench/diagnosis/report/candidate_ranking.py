@@ -40,7 +40,7 @@ def get_candidate_status(report: DiagnosisReportData, effect: str) -> str:
     """
     for cause in report.verdict.causes:
         if effect in (cause.effect, *cause.alternatives):
-            return "found, but cannot be told apart" if cause.alternatives else "found"
+            return "found, but not distinguishable" if cause.alternatives else "found"
     return "not needed"
 
 

@@ -114,8 +114,8 @@ def _format_inconsistency(spread: ParameterConsistency, effects: Sequence[str]) 
     text = (
         f"{_get_number_name(spread)} differs between {_pluralise_group(spread.by)}, "
         f"{_format_span(spread)} "
-        f"({format_p_value(spread.p_value)}): for a new run it is known to "
-        f"±{format_number(Z95 * spread.prediction_sigma)}, not to "
+        f"({format_p_value(spread.p_value)}): for a new run its 95 % interval is "
+        f"±{format_number(Z95 * spread.prediction_sigma)}, not "
         f"±{format_number(Z95 * spread.error)}"
     )
     covariate = spread.trend_covariate
@@ -154,7 +154,7 @@ def _format_drifts(after: Sequence[ParameterConsistency]) -> Iterator[str]:
         yield f"{_get_number_name(spread)} {direction} from log to log by {change}"
     if not drifting:
         count = len(logs[0].group_estimates)
-        yield f"no number drifts over the {count} logs, in the order given"
+        yield f"no number changes steadily over the {count} logs, in the order given"
 
 
 def _get_trend_direction(spread: ParameterConsistency) -> str:

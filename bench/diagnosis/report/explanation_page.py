@@ -74,9 +74,9 @@ _BADGES = {
     "adequate": "adequate: no gap found",
     "named": "named: the cause is found",
     "ambiguous": "ambiguous: one of several causes",
-    "partial": "partial: a cause is found, and something remains",
+    "partial": "partial: a cause is found, but the residual still has structure",
     "unknown": "unknown: a gap, but no known cause",
-    "unidentifiable": "unidentifiable: the data do not suffice",
+    "unidentifiable": "unidentifiable: the data do not identify the parameters",
 }
 """Short text of every verdict."""
 _STOPPED_EARLY = {
@@ -187,7 +187,7 @@ def _format_badge(report: DiagnosisReportData) -> str:
     """
     verdict = report.verdict
     if verdict.recording_faults:
-        return "unknown: a unit or a sign of the recording is wrong"
+        return "unknown: the recording has a wrong unit or sign"
     if verdict.cut is not None:
         return _STOPPED_EARLY[verdict.verdict]
     if verdict.has_open_numbers:

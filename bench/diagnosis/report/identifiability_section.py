@@ -46,7 +46,7 @@ _LEGEND: Mapping[str, str] = {
     "found": "named by the verdict",
     "set": "explains the data as well as a named cause",
     "identifiable": "can be identified",
-    "weak": "only roughly",
+    "weak": "weakly identifiable",
     "not identifiable": "not visible in these data",
 }
 _KINDS = {"joint": "joints", "actuator": "actuators", "body": "bodies", "channel": "channels"}

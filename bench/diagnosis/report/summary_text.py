@@ -61,7 +61,7 @@ MAX_PERCENT_SHIFT = 10.0
 """Relative change of a parameter above which it is not reported in percent."""
 MAX_NAMED_CHANNELS = 6
 """Maximum number of channels that a sentence names."""
-PERFECT_MODEL_NOTE = "with a perfect model the sensor's noise would leave"
+PERFECT_MODEL_NOTE = "the sensor noise alone would give"
 MIN_REPORTED_SHIFT = 0.05
 """Minimum relative change of a parameter that is reported as absorption if its interval is unknown.
 """
@@ -138,7 +138,7 @@ def format_headline(report: DiagnosisReportData) -> str:
         return _format_early_stop_headline(report.verdict)
     # A cause is reported as lacking only if the verdict supports it.
     if verdict == "adequate":
-        return "Nothing is missing from the simulation that these data can show."
+        return "These data show no effect that the simulation lacks."
     if verdict == "unidentifiable":
         parameters = joined(list_unidentified_parameters(report))
         return (
@@ -442,7 +442,7 @@ def format_detectable_gap(report: DiagnosisReportData) -> str:
         amount = append_unit(format_number(size, 2), channel.unit)
         share = f"{format_number(size / channel.sigma, 2)} of its noise"
         parts.append(f"{amount} in {sanitise(channel.name, 30)} ({share})")
-    return f"A gap of up to {joined(parts)} RMS could still hide in the noise." if parts else ""
+    return f"Noise could conceal a gap of up to {joined(parts)} RMS." if parts else ""
 
 
 def _select_worst_of_each_kind(

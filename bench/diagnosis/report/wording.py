@@ -6,7 +6,7 @@ import re
 from collections.abc import Sequence
 
 # All text functions of explain's pages are imported from this module, including the shared ones.
-from bench.pages.text_format import SUPERSCRIPT_DIGITS
+from bench.core import unit_text
 from bench.pages.text_format import format_estimate as format_estimate
 from bench.pages.text_format import format_number as format_number
 from bench.pages.text_format import format_p_value as format_p_value
@@ -139,9 +139,9 @@ def format_sentence(text: object) -> str:
 
 
 def format_unit(unit: str) -> str:
-    """Format a unit for print, such as ``kg·m²``; empty for a pure number."""
+    """Format a unit from a file for print, such as ``kg·m²``; empty for a pure number."""
     power = r"(?:\^|\*\*)(-?\d+)"
-    text = re.sub(power, lambda match: match[1].translate(SUPERSCRIPT_DIGITS), sanitise(unit, 60))
+    text = re.sub(power, lambda match: unit_text.format_unit(sanitise(unit, 60))
     return "" if text == "1" else text.replace("*", "·")
 
 

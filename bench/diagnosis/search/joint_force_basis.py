@@ -27,7 +27,7 @@ class JointHatForce(Force):
     """A force within an interval of time, position or speed of one joint."""
 
     name = "probe.joint_hat"
-    says = "a force acts over a stretch of time, position or speed"
+    says = "a force acts in an interval of time, position or speed"
     source = "this module"
     of = "probe.joint_hat"
     coefficients = tuple(

@@ -81,7 +81,7 @@ class HatForce(Force):
     """
 
     name = "probe.hat"
-    says = "a force acts over a stretch of time, position or speed"
+    says = "a force acts in an interval of time, position or speed"
     source = "this module"
     coefficients = tuple(
         Coefficient(name, ("1", "1", "1"), ((-1, 1), (-1, 1), (-1, 1)))
@@ -162,7 +162,7 @@ def assess_lack_of_fit(models: ModelSet, model: FittedModel) -> LackOfFitResult:
     size_result = assess_residual_size(models, model)
     if not any(probe.name in world.slots for probe in (HatForce, JointHatForce)):
         return size_result
-    world.watch.report_and_check("a force of any shape")
+    world.watch.report_and_check("an unmodelled force")
     force_test = models.force_of_any_shape(model)
     level = get_structure_threshold(bool(is_noise_stated.all()))
     # The linear innovations test decides if it finds no force; otherwise the force is simulated.
@@ -199,7 +199,7 @@ def assess_lack_of_fit(models: ModelSet, model: FittedModel) -> LackOfFitResult:
 
 
 def assess_residual_size(models: ModelSet, model: FittedModel) -> LackOfFitResult:
-    """Test only the size of the residual, without a force of any shape.
+    """Test only the size of the residual, without an unmodelled force.
 
     Args:
         models: the models of the recording.

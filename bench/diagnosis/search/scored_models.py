@@ -189,7 +189,7 @@ class ScoredModelSet(ModelSet):
             )
         if calls:
             max_effects = max(len(missing_effects) for _, missing_effects, *_ in calls)
-            further_text = f" beside {len(calls)} models" if len(calls) > 1 else ""
+            further_text = f" in addition to {len(calls)} models" if len(calls) > 1 else ""
             self.world.watch.stage(f"testing {max_effects} effects{further_text}", len(calls))
         scans = {}
         for number, scan in self.world.crew.map_unordered(self.world, _scan_model, calls):
@@ -204,7 +204,7 @@ class ScoredModelSet(ModelSet):
     def _look(self, model: FittedModel) -> None:
         """Report to the user that a model is scored now, and stop if the search has to end."""
         model_text = " + ".join(model.effects) or "the base model"
-        self.world.watch.report_and_check(f"scores of the library about {model_text}")
+        self.world.watch.report_and_check(f"scores of the effect library at {model_text}")
 
     def _make_room(self, kept_keys: Sequence[frozenset[str]]) -> None:
         """Remove the oldest stored directions until `DIRECTION_CACHE_BYTES` is not exceeded.

@@ -18,12 +18,12 @@ from sims.core.simulator import Array
 VerdictName = Literal["adequate", "named", "ambiguous", "partial", "unknown", "unidentifiable"]
 
 VERDICT_MEANINGS: Mapping[VerdictName, str] = {
-    "adequate": "nothing is missing that these data can show",
+    "adequate": "these data show no missing effect",
     "named": "one cause, or several jointly, explains the gap",
-    "ambiguous": "causes that these data cannot tell apart explain the gap",
-    "partial": "the causes are real, and something besides them is missing",
-    "unknown": "something is missing that no effect of the library explains",
-    "unidentifiable": "the data do not fix the parameters of the model without any cause",
+    "ambiguous": "several causes explain the gap equally well",
+    "partial": "the causes are significant, but the residual still has structure",
+    "unknown": "there is a gap that no effect of the library explains",
+    "unidentifiable": "the data do not identify the parameters of the model without causes",
 }
 """Meaning of each verdict, in one sentence."""
 
@@ -63,18 +63,18 @@ MIN_GAP_CLOSED = 0.7
 UNSEEN_EFFECT_EXCESS = 0.5
 """Minimum excess on held-out runs that shows something the fitted runs do not."""
 EARLY_STOP_MEANINGS: Mapping[VerdictName, str] = {
-    "partial": "the causes are real, and what else is missing was not asked to the end",
-    "unknown": "the search was ended before it could say what is missing",
+    "partial": "the causes are significant; the search stopped before testing for further causes",
+    "unknown": "the search stopped before it identified a cause",
 }
 """Meaning of each verdict of a search that ended early; such a search has no other verdicts."""
-OPEN: str = "a cause is found, but a number of it lies at a bound or has no finite interval"
+OPEN: str = "a cause is found, but one of its coefficients is at a bound or has no finite interval"
 """Meaning of `partial` if a coefficient of a cause is at a bound or has no finite interval."""
 BORDERING: str = (
-    "a cause is found, but a base parameter ends at a bound of its range, "
-    "and the cause may stand for a value beyond it"
+    "a cause is found, but a base parameter is at a bound of its range, "
+    "and the cause may compensate for a value beyond it"
 )
 """Meaning of `partial` if a base parameter is at a bound of its range."""
-FAULTY: str = "the recording states a unit or a sign wrongly; correct it before causes are searched"
+FAULTY: str = "the recording states a wrong unit or sign; correct it and run again"
 """Meaning of `unknown` for a recording with a wrong unit or sign."""
 REQUIRED_QUESTIONS: Collection[str] = frozenset({"structure", "alternatives"})
 """Questions that need not be answered for a cause to be accepted."""

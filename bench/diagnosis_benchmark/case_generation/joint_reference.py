@@ -627,7 +627,7 @@ def _integrate_segment(joint: JointDynamics, state: Array, instants: Array, stat
         if last > first:
             states[first:last] = solution(instants[first:last]).T[:, :2] if solution else state[:2]
         time, state = reached, end_state
-    raise RuntimeError("it never gets through: too many standstills")
+    raise RuntimeError("no solution: the joint stops too often")
 
 
 def _integrate_until_stop(joint: JointDynamics, start: float, state: Array) -> SegmentResult:

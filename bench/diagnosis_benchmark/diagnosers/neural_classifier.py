@@ -64,7 +64,11 @@ class NeuralClassifier(Diagnoser):
 
     def cannot(self, kind: type[SystemSimulator]) -> str:
         """Reject robots: the training precedes the case, so their model file is not available."""
-        return "nobody knows a robot's file before it is asked" if kind.has_model else ""
+        return (
+            "it cannot be trained for a robot whose model file is not known beforehand"
+            if kind.has_model
+            else ""
+        )
 
     def train(self, lesson: DiagnoserTrainingTask) -> Mapping[str, Array]:
         """Simulate recordings until the budget is used up, and train the network.

@@ -163,9 +163,9 @@ def write_warnings(data: DiagnoserReportData) -> Iterator[str]:
         each = ", ".join(f"{sanitise(name, 60)} {count}" for name, count in counts.items())
         yield f"Without an answer (crashed, too late or too costly): {each}."
     for name, reason, count in summarise_unsupported(data.left_out):
-        yield f"{sanitise(name, 60)} does not support {count} of the questions: {reason}."
+        yield f"{sanitise(name, 60)} does not support {count} of the cases: {reason}."
     for name, reason in data.skipped.items():
-        yield f"{sanitise(name, 60)} was not asked: {reason}"
+        yield f"{sanitise(name, 60)} was not run: {reason}"
 
 
 def summarise_unsupported(left_out: pd.DataFrame) -> list[tuple[str, str, int]]:

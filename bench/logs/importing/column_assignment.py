@@ -117,7 +117,7 @@ class ColumnAssigner:
             )
         ):
             self._result.checks.append(
-                "positions lie within -100 to 100: they are taken for degrees and may be LeRobot's "
+                "positions lie within -100 to 100: they are read as degrees, but may be LeRobot's "
                 f"normalised positions; {UNIT_REMEDY}"
             )
 
@@ -143,7 +143,7 @@ class ColumnAssigner:
         if self.normalised is not None:
             scale = self.normalised.scale_of(column.name, column.values, joint)
             if scale is None:
-                reason = f"is normalised, and nothing says the range of {joint.name}"
+                reason = f"is normalised, and the range of {joint.name} is not known"
                 self._result.leave_out(column, reason)
                 return None
             unit, (gain, offset) = scale
@@ -199,7 +199,7 @@ class ColumnAssigner:
                 self._signals.added_servos[name] = joint
         else:
             self._result.leave_out(
-                column, f"asks for a {quantity} of {joint.name}, which no actuator takes"
+                column, f"commands a {quantity} of {joint.name}, but no actuator has this command"
             )
 
     def _assign_command(
@@ -287,7 +287,7 @@ class ColumnAssigner:
             if len(candidates) > 1 and len(measured) != 1:
                 continue
             ((column, joint, placement),) = measured if len(candidates) > 1 else candidates
-            origin = ", measured, as nothing commands it"
+            origin = ", measured, because no column has its command"
             self._assign_force(column, joint, name, placement, origin)
 
     # -- other columns
@@ -313,18 +313,16 @@ class ColumnAssigner:
         ]
         if not undriven_actuators and (signals.inputs or signals.robot.actuators):
             return
-        text = "the model has no input, so that nothing drives it"
+        text = "the model has no input, so no actuator drives it"
         table = f"force.{signals.joints[0].name}"
         if undriven_actuators:
             names = ", ".join(actuator.name for actuator in undriven_actuators[:MAX_NAMES])
-            text = f"actuators without an input: {names}; their commands are taken for 0"
+            text = f"actuators without an input: {names}; their commands are assumed to be 0"
             table = f"u.{undriven_actuators[0].name}"
         candidates = [
             c.name for c in self._select_by_role("command", "force") if not self._is_used(c)
         ]
-        candidates_text = (
-            f"columns that may be it: {', '.join(candidates[:6])}; " if candidates else ""
-        )
+        candidates_text = f"possible columns: {', '.join(candidates[:6])}; " if candidates else ""
         self._result.checks.append(
             f'{text}; {candidates_text}add [inputs."{table}"] with file, column and unit'
         )

@@ -170,17 +170,19 @@ class DescriptionWriter:
             for _, u, q in samples
             if np.isfinite(q).any()
         )
-        gains = f"of one of {frequency:.3g} rad/s and {damping:.2g} of critical damping"
+        gains = f"for {frequency:.3g} rad/s and a damping ratio of {damping:.2g}"
         if is_moved:
-            origin = "as it follows its command" if response else "as of any hobby servo"
+            origin = "as it follows its command" if response else "typical of a hobby servo"
             self._result.guessed.append(
                 f"gains of the servo of {joint.name}: {gains}, {origin}; free"
             )
         else:
             self._result.checks.append(
                 f"gains of the servo of {joint.name}: the log does not move this joint and cannot "
-                f"show them; kp = {kp:.4g} and kv = {kv:.4g} ({gains}) only hold it and are not "
-                f"fitted; state those of the drive in [actuators.{toml_key(name)}], or import a "
+                f"show them; kp = {kp:.4g} and kv = {kv:.4g} ({gains}) only hold its position "
+                "and are "
+                f"not fitted; state those of the drive in [actuators.{toml_key(name)}], or "
+                "import a "
                 "log that moves the joint"
             )
         return _AddedServo(name, joint, kp, kv, is_moved)

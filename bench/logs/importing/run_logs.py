@@ -229,8 +229,8 @@ class RunLogs:
                 steps = np.diff(columns[0].values)
                 interval = float(np.median(steps[steps > 0]))
                 error = InputError(
-                    f"{log.path}, column {columns[0].name}: stamps {interval:g} apart are no log's "
-                    "in s, ms, us or ns"
+                    f"{log.path}, column {columns[0].name}: stamps {interval:g} apart are not "
+                    "plausible in s, ms, us or ns"
                 )
             else:
                 error = InputError(

@@ -52,8 +52,8 @@ def thin(recording: Recording, kind: type[Simulator]) -> tuple[Recording, str]:
         return recording, ""
     runs = tuple(_thin_run(run, stride) for run in recording.runs)
     note = (
-        f"sampled at {rate:.4g} Hz, faster than it moves: each sample of {stride} is used, "
-        "and the mean of the inputs between them"
+        f"sampled at {rate:.4g} Hz, much faster than the motion: one sample in {stride} is "
+        "used, and the mean of the inputs between them"
     )
     return replace(recording, runs=runs), note
 

@@ -152,11 +152,11 @@ def _assign_kind(
             if column_guessing.is_constant(column.values):
                 reason = "never changes"
             elif comparison is None:
-                reason = f"{joint.name} hardly moves, which tells nothing about its unit"
+                reason = f"{joint.name} hardly moves, so its unit cannot be inferred"
         elif delay is not None:
             reason = (
                 f"is {delay.samples:.2g} samples {delay.direction_word} the derivative of "
-                f"{source}, filtered or stamped at another time"
+                f"{source}, filtered or stamped at a different time"
             )
         elif stated_unit and unit != stated_unit:
             reason = f"is in {stated_unit} by its name and in {unit} by {source}"

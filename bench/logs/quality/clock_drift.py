@@ -102,7 +102,8 @@ def check_clock_drift(recording: Recording, kind: type[Simulator]) -> Iterator[Q
         "drift",
         f"the sensors' clock runs {1e6 * abs(drift):.3g} ppm (±{2e6 * error:.2g}) {word} against "
         "the commands'",
-        "stamp both by one clock; explain's clock.skew finds and removes it",
+        "stamp both with one clock; the effect clock.skew of simgap explain estimates and "
+        "removes it",
     )
 
 

@@ -44,5 +44,7 @@ def find_missing_base_poses(recording: Recording, kind: type[Simulator]) -> Iter
             missing_text = (
                 f"where {joint} begins; state [runs.{run.name}.initial], of {', '.join(states)}"
             )
-            missing_text = f"{missing_text} (what is left out is as in the model file, at rest)"
-        yield Anomaly(f"run {run.name}: nothing says {missing_text}", True)
+            missing_text = (
+                f"{missing_text} (states that are left out are as in the model file, at rest)"
+            )
+        yield Anomaly(f"run {run.name}: the log does not state {missing_text}", True)

@@ -207,8 +207,8 @@ def find_overlaps(recording: Recording, kind: type[Simulator]) -> Iterator[Quali
             yield QualityFinding(
                 "overlap",
                 f"bodies {body} and {other_body} overlap by up to {1e3 * max(values):.3g} mm in "
-                f"{len(values) / count:.0%} of the recorded poses, so that a contact pushes them "
-                "apart all the time",
+                f"{len(values) / count:.0%} of the recorded poses, so that a contact force "
+                "always acts between them",
                 f"{remedy} in {robot.path.name}",
             )
 

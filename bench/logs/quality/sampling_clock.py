@@ -62,16 +62,16 @@ def check_intervals(recording: Recording) -> Iterator[QualityFinding]:
         yield QualityFinding(
             "clock",
             f"intervals vary by {max(jitters):.0%} of one (1 sigma) in {format_names(jittered)}",
-            "every sample is simulated at its own stamp, so let the stamps be those of measuring "
-            "and not of writing",
+            "every sample is simulated at its own stamp, so use the times of measurement as "
+            "stamps, not the times of writing",
         )
     if sample_count and lost_count > LOST_SAMPLE_SHARE_THRESHOLD * sample_count:
         yield QualityFinding(
             "clock",
             f"{lost_count} samples ({lost_count / sample_count:.1%}) are lost in "
             f"{format_names(lossy)}",
-            "nothing is filled in, but a command that changed in between is not known: log "
-            "commands in a file of their own, or at a lower rate",
+            "nothing is interpolated, but commands in the gaps are not known: log commands "
+            "in a separate file, or at a lower rate",
         )
 
 
@@ -120,7 +120,7 @@ def check_repeated_samples(recording: Recording) -> Iterator[QualityFinding]:
             "clock",
             f"{repeated_count} samples ({repeated_count / sample_count:.1%}) repeat the one before "
             f"in every channel while it moves, in {format_names(runs)}",
-            "leave these rows out: a value that is old by an interval passes for a delay",
+            "leave these rows out: a value that is one interval old looks like a delay",
         )
 
 

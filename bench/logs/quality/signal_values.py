@@ -53,16 +53,16 @@ def check_quantisation(recording: Recording, kind: type[Simulator]) -> Iterator[
         if step and stated_noise is not None and stated_noise < rounding / 2:
             yield QualityFinding(
                 "quantisation",
-                f"{channel.name} goes in steps of {step:.3g} {unit}, whose rounding alone is "
-                f"{rounding:.2g} {unit}, and the noise stated is {stated_noise:.2g}",
+                f"{channel.name} has steps of {step:.3g} {unit}, whose rounding error alone is "
+                f"{rounding:.2g} {unit}, but the stated noise is {stated_noise:.2g}",
                 f"state noise = {rounding:.2g} or more",
             )
         elif step > QUANTISATION_SHARE_THRESHOLD * spread > 0:
             yield QualityFinding(
                 "quantisation",
-                f"{channel.name} goes in steps of {step:.3g} {unit}, {step / spread:.0%} of its "
-                "range",
-                "move further, or read a finer sensor: what is smaller than a step is hardly seen",
+                f"{channel.name} has steps of {step:.3g} {unit}, {step / spread:.0%} of its range",
+                "use a larger motion or a finer sensor: changes smaller than a step are hardly "
+                "visible",
             )
 
 
@@ -94,8 +94,8 @@ def check_saturation(recording: Recording, kind: type[Simulator]) -> Iterator[Qu
                     "saturation",
                     f"{channel.name} stays at its {word} value, {sign * end:.4g} {channel.unit}, "
                     f"in {flat / total:.1%} of the samples",
-                    "a sensor or a joint at its end shows nothing: leave these samples empty, or "
-                    "keep clear of the end",
+                    "a sensor or joint at its limit carries no information: leave these samples "
+                    "empty, or stay away from the limit",
                 )
     yield from _find_saturated_commands(recording, kind)
 
@@ -119,7 +119,7 @@ def _find_saturated_commands(
                 "saturation",
                 f"{name} is at or beyond its range, {low:.4g} to {high:.4g}, in {share:.1%} of "
                 "the samples",
-                "beyond it a command does nothing more: command less, or correct the range",
+                "a larger command has no further effect: reduce the command, or correct the range",
             )
 
 
@@ -154,13 +154,14 @@ def check_standstill(recording: Recording, kind: type[Simulator]) -> Iterator[Qu
         yield QualityFinding(
             "stillness",
             f"{format_names(still_channels)} never moves",
-            "nothing that acts in its motion shows: move it, or leave its joint out",
+            "its dynamics cannot be identified: move it, or leave its joint out",
         )
     if seldom_moving:
         yield QualityFinding(
             "stillness",
-            f"{format_names(seldom_moving)} of the samples stand still",
-            "friction, damping and inertia show in motion alone: move more of the time",
+            f"{format_names(seldom_moving)} of the samples are at rest",
+            "friction, damping and inertia are visible only in motion: move during more of the "
+            "recording",
         )
 
 

@@ -118,7 +118,7 @@ def _check_gap(run: Run) -> Anomaly | None:
     gap_text = f"{gap:.4g} s without a sample from t = {run.times[place]:.6g} s on"
     sampled_text = f"in a run that has samples for {sampled_seconds:.4g} s"
     return Anomaly(
-        f"run {run.name}: {gap_text}, {sampled_text}; divide it there into two runs", True
+        f"run {run.name}: {gap_text}, {sampled_text}; split it there into two runs", True
     )
 
 

@@ -241,8 +241,7 @@ def _check_pair(runs: Sequence[Run], position: str, rate: str) -> Iterator[Quali
     if abs(correlation) < MIN_CORRELATION:
         yield QualityFinding(
             "contradiction",
-            f"{rate} has little to do with the derivative of {position} "
-            f"(correlation {correlation:.2f})",
+            f"{rate} does not match the derivative of {position} (correlation {correlation:.2f})",
             "is it of another joint? correct the columns, or leave it out",
         )
         return
@@ -251,10 +250,10 @@ def _check_pair(runs: Sequence[Run], position: str, rate: str) -> Iterator[Quali
     inverse_slope = float(dq @ dq) / float(dq @ s)
     residual = dq - slope * s
     error = float(np.sqrt(residual @ residual / max(dq.size - 1, 1) / (s @ s)))
-    size = f"{position} goes {slope:.3g} times as far as {rate} adds up to"
+    size = f"{position} moves {slope:.3g} times as far as the integral of {rate}"
     threshold = max(SLOPE_ERROR_THRESHOLD, SIGNIFICANCE_SIGMAS * error)
     if slope < 0:
-        yield QualityFinding("contradiction", size, f"a sign is wrong: turn that of {rate}")
+        yield QualityFinding("contradiction", size, f"a sign is wrong: reverse the sign of {rate}")
     elif slope > 1.0 + threshold or inverse_slope < 1.0 - threshold:
         yield QualityFinding("contradiction", size, _recommend_correction(abs(np.log(slope)), rate))
     elif (delay := comparison.delay()) is not None:
@@ -262,7 +261,7 @@ def _check_pair(runs: Sequence[Run], position: str, rate: str) -> Iterator[Quali
             "contradiction",
             f"{rate} is {1e3 * abs(delay.seconds):.2g} ms (±{2e3 * delay.error:.1g}, "
             f"{delay.samples:.2g} samples) {delay.direction_word} the derivative of {position}",
-            "it is filtered, or stamped at another time: trust the position, or leave it out",
+            "it is filtered, or stamped at a different time: use the position, or leave it out",
         )
 
 

@@ -141,14 +141,19 @@ def describe_losses(tables: SuiteTables) -> Iterator[str]:
             losses = tables.find_losses(tuner, k, LOSS_FACTOR)
             count = len(tables.curves)
             if losses.empty:
-                yield f"{tuner} loses in none of {count} cells after {k} simulations."
+                yield (
+                    f"{tuner} is not significantly worse in any of {count} cells after {k} "
+                    "simulations."
+                )
                 continue
             examples = ", ".join(
                 f"{row.cell} ({row.winner}, {_format_ratio(float(row.ratio))})"  # type: ignore[arg-type]
                 for row in losses.itertuples()
             )
-            cells = f"{len(losses)} of {count} cells"
-            yield f"{tuner} loses in {cells} after {k} simulations: {examples}."
+            yield (
+                f"{tuner} is significantly worse in {len(losses)} of {count} cells after {k} "
+                f"simulations: {examples}."
+            )
 
 
 def _format_ratio(ratio: float) -> str:

@@ -84,7 +84,7 @@ def build_kernel(offsets: Mapping[str, int] | None = None) -> bytes:
     if process.returncode:
         error_lines = process.stderr.decode(errors="replace").strip().splitlines()
         raise llvm_code.CodeNotLoadableError(
-            error_lines[-1] if error_lines else f"its compiler ended: {process.returncode}"
+            error_lines[-1] if error_lines else f"its compiler failed: {process.returncode}"
         )
     return process.stdout
 

@@ -34,4 +34,4 @@ def convert_read_errors(path: Path, kind: str, hint: str = "") -> Iterator[None]
 
 def make_memory_error(path: Path) -> InputError:
     """Make the error for a file whose content seems too large; a damaged one may state any size."""
-    return InputError(f"{path}: the file is damaged, or its content does not fit into the memory")
+    return InputError(f"{path}: the file is damaged, or its content does not fit into memory")

@@ -184,7 +184,7 @@ def _find_uneven_row(path: Path, layout: Layout) -> InputError | None:
             reference = f"as in the header, row {layout.header}" if layout.header else "as above"
             remedy = "correct or delete this row"
             if filled < layout.width and line >= _find_last_line(path, layout):
-                remedy = "the log was cut off there: delete this row"
+                remedy = "the log is truncated there: delete this row"
             return InputError(
                 f"{path}, row {line}: expected {layout.width} cells {reference}, found {filled}; "
                 f"{remedy}"

@@ -234,7 +234,7 @@ class _Tracing:
     def _nodes(values: Any) -> list[Any]:
         """Return the nodes of a traced value; the shape of a hidden state may have changed."""
         if not hasattr(values, "nodes"):
-            raise NotTraceableError("it gives numbers that hang on nothing")
+            raise NotTraceableError("its result does not depend on its arguments")
         return collect_nodes(values)
 
 

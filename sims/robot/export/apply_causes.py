@@ -66,10 +66,11 @@ GEOMETRY_EFFECTS = frozenset({"joint.axis", "link.length"})
 """Effects that change attributes in the frame of the element around theirs."""
 
 _NOTES = {
-    "joint.flexibility": "joint.flexibility: the joint has a second one in series, whose position "
-    "begins at zero in the file; damping is a share of the critical one",
-    "joint.backlash": "joint.backlash: the joint has a second one in series, which begins in the "
-    "middle of its gap in the file",
+    "joint.flexibility": "joint.flexibility: the joint is followed by a second joint in series, "
+    "whose "
+    "initial position in the file is zero; damping is given as a damping ratio",
+    "joint.backlash": "joint.backlash: the joint is followed by a second joint in series, whose "
+    "initial position in the file is the middle of the backlash",
     **{
         name: f"{name}: the pair of geoms has an element <pair>, whose parameters replace those of "
         "both geoms"
@@ -78,7 +79,7 @@ _NOTES = {
     "joint.coupling": "joint.coupling: the joint's actuator drives a tendon, the joint with 1 and "
     "the one before it with the coefficient",
     COULOMB: "friction.coulomb: dry friction is stiff in the file (solreffriction, "
-    "solimpfriction), or it would creep",
+    "solimpfriction), so that the joint does not creep",
 }
 """Notes about effects that a file contains."""
 _SOFT = (
@@ -232,7 +233,7 @@ def _write_cause(
     if is_gravity_compensated(cause.effect, cause.numbers):
         for body in robot.bodies:
             target_values["body_gravcomp"][0, body.id] = 1.0
-        return "+gravity is compensated: the bodies have gravcomp = 1, and gravity is as it was"
+        return "+gravity is compensated: the bodies have gravcomp = 1, and gravity is unchanged"
     if cause.effect in GEOMETRY_EFFECTS and _is_in_frame(robot, cause):
         return "its element is within a <frame>, or made by another element"
     if cause.effect in MODEL_FIELD_EFFECTS:

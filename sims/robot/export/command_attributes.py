@@ -122,7 +122,7 @@ def _write_input_gain(fields: Fields, robot: RobotModel, cause: FittedCause) -> 
     if not scaled:
         return _NOT_LINEAR
     if 1.0 + a < MIN_GAIN_FACTOR:
-        return "a factor of zero or less cannot be stated by a control range"
+        return "a control range cannot express a factor of zero or less"
     low, high = actuator.limits()
     actuator.limit(low / (1.0 + a), high / (1.0 + a))  # (2)
     actuator.gain[0] *= 1.0 + a  # (1)
@@ -175,7 +175,7 @@ def _write_delay(fields: Fields, robot: RobotModel, cause: FittedCause) -> Unsta
     if delay == 0:
         return None
     if delay < 0:
-        return "a control cannot act before it is set"
+        return "a negative delay is not possible"
     if fields["actuator_delay"][0, actuator.id] > 0:
         return "the file states a delay already"
     fields["actuator_delay"][0, actuator.id] = delay

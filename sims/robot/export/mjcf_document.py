@@ -201,8 +201,8 @@ class MjcfDocument:
             self._prepare_includes(inner.root)
             name = tag.attributes["file"]
             if inner.root.has_changes:
-                tag.before = [f"from here: {name}, with changes"]
-                tag.text = inner.inner_text() + f"<!-- to here: {name} -->".encode()
+                tag.before = [f"start of {name}, with changes"]
+                tag.text = inner.inner_text() + f"<!-- end of {name} -->".encode()
             else:
                 tag.new["file"] = str((self.path.parent / name).resolve())
 

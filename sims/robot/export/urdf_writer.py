@@ -82,7 +82,7 @@ class UrdfWriter:
         Args:
             lines: lines for the comment at the top of the file.
         """
-        origin_text = f", with what was found in {self.recording}" if self.recording else ""
+        origin_text = f", with the causes found in {self.recording}" if self.recording else ""
         comment = format_heading([f"{self.robot.path.name}{origin_text}", *lines])
         self.markup.root.within.insert(0, ([comment], ""))
         return self.markup.to_text().decode()

@@ -309,7 +309,7 @@ class MjcfEditor:
 
     def _format_heading(self) -> str:
         """Format the comment at the top: the origin of the file, and notes."""
-        origin_text = f", with what was found in {self.recording}" if self.recording else ""
+        origin_text = f", with the causes found in {self.recording}" if self.recording else ""
         return format_heading([f"{self.robot.path.name}{origin_text}", *self.applied.notes])
 
 

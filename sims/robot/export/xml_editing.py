@@ -93,7 +93,7 @@ class XmlText:
         try:
             self._parser.Parse(text, True)
         except expat.ExpatError as error:
-            raise NotEditableError(f"{path.name} is no XML in UTF-8 ({error})") from None
+            raise NotEditableError(f"{path.name} is not XML in UTF-8 ({error})") from None
         # Inserted lines end like those of the file.
         self._newline = b"\r\n" if b"\r\n" in text else b"\n"
 

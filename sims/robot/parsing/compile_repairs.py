@@ -140,7 +140,9 @@ class CompileRepairs:
         )
         for has_children, names in self.massless.items():
             childless_note = (
-                "" if has_children else ", and nothing hangs on them, so their joints mean little"
+                ""
+                if has_children
+                else ", and carry no other bodies, so their joints have little effect"
             )
             notes.append(
                 f"move without a mass{childless_note}; {repair_text}: {format_name_list(names)}"

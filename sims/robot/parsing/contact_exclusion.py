@@ -54,7 +54,7 @@ def exclude_spurious_contacts(spec: Any, model: Any) -> list[str]:
     notes = []
     if base_children:
         listing = format_name_list([names[i] for i in base_children])
-        notes.append(f"no contacts between the fixed base and what hangs on it: {listing}")
+        notes.append(f"no contacts between the fixed base and the bodies attached to it: {listing}")
     if overlapping_pairs:
         names[0] = "the base"
         pairs = [

@@ -43,7 +43,7 @@ class OmittedShapes:
             raise InputError(
                 f"{self.source}: mesh {truncate_text(label)} {reason}, and the mass of body "
                 f"{truncate_text(body.name)} would follow from it; "
-                "mend the mesh, or state the body's <inertial>"
+                "repair the mesh, or state the body's <inertial>"
             )
         group = self.touching if geom.contype or geom.conaffinity else self.seen
         group.setdefault(reason, []).append(label)
@@ -59,7 +59,7 @@ class OmittedShapes:
         ]
         for reason, labels in self.seen.items():
             notes.append(
-                f"left out, only seen, since the file {reason}: {format_name_list(labels)}"
+                f"visual meshes left out, since the file {reason}: {format_name_list(labels)}"
             )
         return notes
 

@@ -159,7 +159,7 @@ def _read_attached_model(files: ModelFileReader, element: Element) -> None:
     if not is_file(path):
         raise files.make_error(element, f"the attached model {truncate_text(name)} is absent")
     if path.resolve() in files.included:
-        raise files.make_error(element, f"{truncate_text(name)} holds itself")
+        raise files.make_error(element, f"{truncate_text(name)} includes itself")
     _check_sizes(files, parse_tree(files, path), 1.0)
     # MuJoCo opens the attached model before the spec knows its folder, so the path must be
     # absolute.

@@ -30,7 +30,7 @@ from sims.robot.robot_model import Format, RobotModel
 FORMAT_BY_ROOT: Mapping[str, Format] = {"mujoco": "mjcf", "robot": "urdf"}
 """Formats of model files, by the name of the root element."""
 NO_ACTUATORS_NOTE = (
-    "no actuators: nothing drives it unless a recording's [actuators.NAME] adds some"
+    "no actuators: it is passive unless the [actuators.NAME] of a recording add some"
 )
 CHECKED_MODEL_FIELDS = (
     "body_mass", "body_inertia", "body_pos", "body_ipos", "jnt_pos", "jnt_axis",
@@ -152,7 +152,7 @@ def _check_model(files: ModelFileReader, model: Any) -> None:
         InputError: nothing moves, the time step is out of range, or a number is huge or not finite.
     """
     if model.njnt == 0:
-        raise InputError(f"{files.path}: it has no joint that moves")
+        raise InputError(f"{files.path}: it has no movable joint")
     step = float(model.opt.timestep)
     if not added_actuators.SHORTEST <= step <= added_actuators.LONGEST:
         span = f"{added_actuators.SHORTEST:g} to {added_actuators.LONGEST:g} s"
@@ -206,4 +206,8 @@ def _make_alias_note(aliases: Mapping[str, str]) -> list[str]:
         groups.setdefault(name, []).append(alias)
     body_notes = [f"{format_name_list(names)} of {body}" for body, names in groups.items()]
     listing = format_name_list(body_notes, separator="; ")
-    return [f"links on fixed joints are part of what carries them: {listing}"] if body_notes else []
+    return (
+        [f"links on fixed joints are merged into their parent links: {listing}"]
+        if body_notes
+        else []
+    )

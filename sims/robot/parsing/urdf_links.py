@@ -109,7 +109,7 @@ def _format_repair_notes(
     if point_masses:
         min_moment = f"{inertia_repair.MIN_MOMENT:g} kg m^2"
         notes.append(
-            f"a mass and no moments of inertia, so a point ({min_moment}): "
+            f"a mass and no moments of inertia, so it is a point mass ({min_moment}): "
             f"{format_name_list(point_masses)}"
         )
     if raised_links:

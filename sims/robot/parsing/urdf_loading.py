@@ -94,7 +94,7 @@ def _remove_unread_elements(root: Element) -> list[str]:
     )
     root[:] = [child for child in root if child.tag in READ_ELEMENTS]
     unread_tags = format_name_list([f"<{tag}>" for tag in tags])
-    return [f"not read, since MuJoCo knows no such thing: {unread_tags}"] if tags else []
+    return [f"ignored, since MuJoCo has no equivalent: {unread_tags}"] if tags else []
 
 
 def _collect_links(files: ModelFileReader, root: Element) -> dict[str, Element]:
@@ -183,7 +183,8 @@ def _find_parent_links(
                 )
         if child in parents:
             raise files.make_error(
-                joint, f"link {truncate_text(child)} hangs on two joints; a loop needs an MJCF"
+                joint,
+                f"link {truncate_text(child)} has two parent joints; a closed loop needs an MJCF",
             )
         parents[child] = (parent, joint)
     for name in links:
@@ -191,7 +192,7 @@ def _find_parent_links(
         while ancestor in parents:
             ancestor, steps = parents[ancestor][0], steps + 1
             if steps > len(links):
-                raise files.make_error(links[name], f"link {truncate_text(name)} hangs on itself")
+                raise files.make_error(links[name], f"link {truncate_text(name)} is its own parent")
     return parents
 
 

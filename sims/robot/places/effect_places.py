@@ -169,7 +169,7 @@ def make_shared_effects(
     coefficients = [_adapt_to_place(effect, c, combined_place) for c in effect.coefficients]
     changed: dict[str, Any] = {
         "at": "world",
-        "says": f"{effect.says} (of one supply that all drives share)",
+        "says": f"{effect.says} (of the common supply of all drives)",
         "force": _force_of_all(effect, [cast(int, joint) for joint in joints]),
     }
     yield _create_placed_effect(effect, effect.name, "", coefficients, changed)

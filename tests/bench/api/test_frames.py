@@ -109,7 +109,7 @@ def test_index_names_clocks_and_other_columns(frame):
 @pytest.mark.parametrize(
     ("change", "words", "message"),
     [
-        (lambda f: f, {}, "DataFrame: expected what it is a recording of: system='NAME' or"),
+        (lambda f: f, {}, "DataFrame: expected a system or model: system='NAME' or"),
         (lambda f: f, {"system": "pendulm"}, "did you mean pendulum?"),
         (
             lambda f: f,

@@ -93,7 +93,7 @@ def test_the_account_says_what_was_found(folder, capsys, monkeypatch):
     told = capsys.readouterr()
     assert "The simulation lacks linear drag" in told.out
     (made,) = (folder / "results").iterdir()
-    assert f"report  results/{made.name}/report.html" in told.out
+    assert f"report      results/{made.name}/report.html" in told.out
     again, first = (
         json.loads((part / "verdict.json").read_text()) for part in (made, folder / "out")
     )
@@ -253,7 +253,7 @@ def test_ctrl_c_ends_with_what_there_is_and_is_an_interrupt(folder, capsys, tmp_
     assert found["cut"]["by"] == "interrupt"
     told = capsys.readouterr()
     assert "The search was stopped by an interrupt" in told.out
-    assert "simgap: ending with what there is; Ctrl-C again ends at once" in told.err
+    assert "simgap: stopping with the results so far; Ctrl-C again stops at once" in told.err
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
@@ -262,7 +262,7 @@ def test_ctrl_c_twice_ends_at_once_and_writes_nothing(folder, capsys, tmp_path, 
     out = tmp_path / "out"
     assert main(["explain", str(folder / "swing.csv"), "--out", str(out)]) == 130
     assert not out.exists()
-    assert "interrupted before there was a result" in capsys.readouterr().err
+    assert "interrupted before the first result" in capsys.readouterr().err
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 

@@ -332,6 +332,6 @@ def test_ctrl_c_on_a_terminal_leaves_whole_lines(command):
     terminal = Terminal()
     terminal.write(written.replace("\r\n", "\n"))
     screen = terminal.screen()
-    assert screen[0] == "simgap: ending with what there is; Ctrl-C again ends at once"
+    assert screen[0] == "simgap: stopping with the results so far; Ctrl-C again stops at once"
     assert screen[1] == "pendulum, simulated"
     assert "The search was stopped by an interrupt" in " ".join(screen)

@@ -209,7 +209,7 @@ def test_broken_weights_are_refused_with_one_line(experiment, cache, capsys, spo
     assert said.startswith(f"simgap: {path}: ")
     assert len(said.splitlines()) == 1
     assert "expected" in said
-    assert said.endswith("delete it to have it trained again")
+    assert said.endswith("delete it to train again")
     with pytest.raises(WeightsError):
         load_trained_tuner(entry, path)
     if spoil is truncated:
@@ -310,5 +310,5 @@ def test_an_interrupted_training_leaves_nothing(experiment, tmp_path, cache):
     process.send_signal(signal.SIGINT)
     _, error = process.communicate(timeout=30)
     assert process.returncode == 130
-    assert error.strip().endswith("simgap: interrupted before there was a result")
+    assert error.strip().endswith("simgap: interrupted before the first result")
     assert not cache.exists() or not list(cache.iterdir())

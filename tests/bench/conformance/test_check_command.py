@@ -41,7 +41,7 @@ def test_sound_plugin_tuner_passes_every_check(tmp_path, capsys):
     assert code == 0, said
     assert said.count("ok    ") == 14
     assert (
-        "-       stochastic is declared\n        not applicable: it says that it uses chance"
+        "-       stochastic is declared\n        not applicable: it declares that it is random"
         in said
     )
     assert (
@@ -60,7 +60,8 @@ def test_sound_plugin_tuner_passes_every_check(tmp_path, capsys):
         ("chaos_raise", "found crashed: Traceback"),
         (
             "chaos_exit",
-            "expected to survive; found WorkerDiedError: the worker process exited with code 7",
+            "expected the process to survive; found WorkerDiedError: the worker process exited "
+            "with code 7",
         ),
         ("chaos_hang", "expected an end within 2 s; found none"),
         ("chaos_nan", "found diverged: the tuner gave proposals that are not finite"),

@@ -42,7 +42,7 @@ DRAG = {
 TILT = {
     "effect": "gravity.tilt",
     "alternatives": [],
-    "says": "the ground is not level: gravity also pulls sideways",
+    "says": "the ground is not level: gravity has a horizontal component",
     "coefficients": {"x": {"value": 0.031, "unit": "1", "low": 0.028, "high": 0.034}},
     "p_value": 3e-5,
 }

@@ -114,7 +114,7 @@ BAD = {
     "nothing said": (
         TOML, 3, False,
         r"run 0: nothing says where base begins; state \[runs\.0\.initial\], of q\.base\.x, .*, "
-        r"qd\.base\.wz \(what is left out is as in the model file, at rest\), or insist",
+        r"qd\.base\.wz \(states that are left out are as in the model file, at rest\), or insist",
     ),
     "one run without": (
         TOML + STATED.partition("[runs.2")[0], 3, False,

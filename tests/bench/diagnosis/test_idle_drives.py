@@ -77,7 +77,7 @@ def test_the_planted_damping_is_found(tmp_path, given):
     notes = {
         "key": "actuator drive exerts nothing where enabled is 0: run 1, 1.1 to 2.59 s",
         "column": 'state it in log.toml: [actuators.drive] enable = "enabled"',
-        "nothing": "the drives of joint hinge do nothing in some samples, which are left out",
+        "nothing": "the drives of joint hinge exert no force in some samples, which are excluded",
     }
     assert sum(notes[given] in line for line in lines) == 1
     # The note follows the headline and precedes the first coefficient.

@@ -157,7 +157,7 @@ def test_what_is_no_result_is_left_out_and_said(arm):
     found = explanation_of(arm, effects, alternatives=["drag.quadratic@elbow"])
     assert found.ranges.ranges == ()
     assert found.ranges.left_out == (
-        "drag.linear@elbow is not in the ranges: these data cannot tell it from "
+        "drag.linear@elbow is not in the ranges: these data cannot distinguish it from "
         "drag.quadratic@elbow",
         "friction.coulomb@elbow is not in the ranges: its value, 9 N*m, lies at the upper bound of "
         "its range",

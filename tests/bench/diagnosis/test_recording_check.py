@@ -82,7 +82,7 @@ def test_what_is_mixed_up_is_named(tmp_path, capsys):
     assert gain.word == "not identifiable"
     assert main(["inspect", str(path), "--check", "--out", str(tmp_path / "out")]) == 0
     said = capsys.readouterr().out
-    assert "mixed up with" in said
+    assert "confounded with" in said
     assert re.search(r"\n  not identifiable: .*input\.gain", said)
 
 

@@ -44,7 +44,7 @@ def test_a_batch_beyond_the_budget_is_refused_as_a_whole():
     tally.reset(10)
     tally.count(8)
     with pytest.raises(
-        SimulationBudgetExceededError, match="11 simulations asked for, 10 are allowed"
+        SimulationBudgetExceededError, match="11 simulations requested, 10 are allowed"
     ):
         tally.count(3)
     assert tally.used == 8

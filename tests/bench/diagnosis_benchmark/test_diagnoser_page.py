@@ -116,7 +116,7 @@ def test_the_page_has_all_charts_and_tables_without_errors(opened):
     for name in ("numbers", "against", "taken", "prices", "by", "answers"):
         assert grid(opened, name), name
     assert "results/a <b>" in opened.text("#making")
-    assert "<i>sparse</i> was not asked: no such package" in opened.text("main")
+    assert "<i>sparse</i> was not run: no such package" in opened.text("main")
     assert opened.barriers() == []
     assert opened.complaints == []
 

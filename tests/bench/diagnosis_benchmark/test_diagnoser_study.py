@@ -115,8 +115,8 @@ def test_failed_answers_stay_in_the_table_and_stop_no_other(made):
     assert rows["hangs"]["status"] == "timeout"
     assert rows["crashes"]["status"] == "crashed"
     assert rows["crashes"]["reason"] == "RuntimeError: no idea"
-    assert "simulations asked for, 60 are allowed" in rows["spends"]["reason"]
-    assert "cannot have used" in rows["lies"]["reason"]
+    assert "simulations requested, 60 are allowed" in rows["spends"]["reason"]
+    assert "impossible number of simulations" in rows["lies"]["reason"]
     assert {rows[name]["outcome"] for name in ("hangs", "crashes", "spends", "lies")} == {"failed"}
     clean = {row["diagnoser"]: row for row in items(out) if row["kind"] == "clean"}
     assert clean["hangs"]["alarm"] == "True"  # a missing answer is not reliable
@@ -158,8 +158,7 @@ def test_cases_a_diagnoser_does_not_support_count_nowhere(tmp_path, capsys):
     given = ["--plugin", str(PLUGIN), "--out", str(out), "--jobs", "0"]
     assert main(["compare", str(path), *given]) == 0
     assert (
-        "declines does not support 2 of the questions: it knows no sliders"
-        in capsys.readouterr().out
+        "declines does not support 2 of the cases: it knows no sliders" in capsys.readouterr().out
     )
     run = simgap.ComparisonResult(out)
     rows = run.runs.set_index("diagnoser")
@@ -169,7 +168,7 @@ def test_cases_a_diagnoser_does_not_support_count_nowhere(tmp_path, capsys):
     assert counted["fifteen", "false alarms"] == 1
     assert "declines" not in set(run.tables["failures"]["diagnoser"])
     page = (out / "report.html").read_text(encoding="utf-8")
-    assert "declines does not support 2 of the questions: it knows no sliders." in page
+    assert "declines does not support 2 of the cases: it knows no sliders." in page
 
 
 @pytest.mark.slow
@@ -256,7 +255,7 @@ def test_an_unknown_diagnoser_is_refused(tmp_path, capsys):
 
 def test_two_studies_in_one_folder_are_refused(tmp_path):
     held = AnswerStore(tmp_path)
-    with pytest.raises(InputError, match="another simgap is at work there"):
+    with pytest.raises(InputError, match="another simgap process uses this folder"):
         AnswerStore(tmp_path)
     held.close()
     AnswerStore(tmp_path).close()

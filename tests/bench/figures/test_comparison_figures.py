@@ -61,7 +61,7 @@ def test_what_a_comparison_lacks_is_not_drawn(missing, changes):
         ("misfit", 2, "RMSE of z [m], median"),
         ("distance", 3, "After 12 simulations"),
         ("runtime", 2, "share of (run, threshold) pairs reached"),
-        ("cost", 2, "seconds for one target"),
+        ("cost", 2, "seconds per target"),
         ("amortisation", 2, "tuner that searches"),
         ("spectra", 2, "what the data identify"),
         ("directions", 6, "RMSE of z [m], unseen scenarios, median"),

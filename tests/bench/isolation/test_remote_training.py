@@ -136,15 +136,15 @@ def test_what_the_stand_in_says_of_itself(experiment, tmp_path):
 @pytest.mark.parametrize(
     ("name", "says"),
     [
-        ("counter", "40 training simulations asked, 20 allowed"),
+        ("counter", "40 training simulations requested, 20 allowed"),
         ("fence", "inside the training range"),
         ("not-inside", "inside the training range"),
-        ("streams", "no state of a random stream"),
+        ("streams", "not the state of a random generator"),
         ("huge", "bytes at once"),
-        ("names", "no arrays"),
-        ("keyword", "cannot be kept by the names"),
+        ("names", "invalid arrays"),
+        ("keyword", "reserved names"),
         ("pickles", "expected numbers, found object"),
-        ("watched", "what nobody asked for"),
+        ("watched", "a message of an unexpected kind"),
     ],
 )
 def test_a_training_that_cheats_fails_and_leaves_no_weights(name, says, experiment, cache):
@@ -183,7 +183,7 @@ def test_a_training_that_is_made_again_after_a_kill_must_ask_for_the_same(experi
     monkeypatch.setattr(
         "bench.benchmark.runner.tuner_training.compute_digest", lambda *_, **__: str(next(drawn))
     )
-    with pytest.raises(RunEndedError, match="asked for other simulations"):
+    with pytest.raises(RunEndedError, match="requested other simulations"):
         train_or_load(experiment, lesson("school"), anew=True)
 
 

@@ -78,7 +78,7 @@ def test_a_run_that_is_made_again_after_a_kill_must_ask_for_the_same(name, monke
         np.testing.assert_array_equal(trace.proposals, undisturbed.proposals)
     else:
         assert (trace.status, Killing.calls) == ("crashed", 2)
-        assert "asked for other simulations" in trace.reason
+        assert "requested other simulations" in trace.reason
 
 
 def test_tuners_die_with_their_nursery_and_another_is_begun():

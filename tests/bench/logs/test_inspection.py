@@ -66,7 +66,9 @@ def test_summary_says_what_is_there(odd):
 def test_a_single_run_is_one_although_its_end_is_held_out(tmp_path):
     write(Wish("pendulum", runs=1), tmp_path / "a.csv")
     said = lines(tmp_path / "a.csv")
-    assert said[1].endswith("system pendulum, 1 run (its last third held out), 400 samples, 3.98 s")
+    assert said[1].endswith(
+        "system pendulum, 1 run (its last third is held out), 400 samples, 3.98 s"
+    )
     assert [line.split()[:4] for line in said[4:6]] == [
         ["1", "fitting", "266", "2.65"],
         ["1", "held", "out", "134"],

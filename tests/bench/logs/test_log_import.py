@@ -121,7 +121,8 @@ def test_what_cannot_be_is_left_out_and_said(arm, tmp_path):
 FAULTS = {
     "nothing": ({"a.csv": "t,heat\n0,20\n0.1,21\n0.2,20\n"}, r"no column is a joint's position"),
     "no stamps": ({"a.csv": "q1,q2\n0,0\n1,1\n0,0\n"}, r"no column increases from row to row"),
-    "no rate": ({"a.csv": "t,q1\n0,0\n0.00001,1\n0.00002,0\n"}, r"stamps 1e-05 apart are no log's"),
+    "no rate": ({"a.csv": "t,q1\n0,0\n0.00001,1\n0.00002,0\n"}, r"stamps 1e-05 apart are not "
+    "plausible"),
     "two clocks": (
         {"a.csv": "t,q1\n0,0\n0.1,1\n0.2,0\n", "b.csv": "time,u1\n0,0\n100,1\n200,0\n"},
         r"its stamps are called time \(ms\), those of the files before t \(s\)",

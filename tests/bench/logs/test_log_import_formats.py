@@ -255,7 +255,7 @@ def test_a_desired_position_is_no_torque(tmp_path):
         assert inputs(out) == {}
         (check,) = made.checks
         assert check.startswith("actuators without an input: m_yaw, m_lift, m_bend; their commands")
-        assert f"columns that may be it: {word}_yaw" in check
+        assert f"possible columns: {word}_yaw" in check
 
 
 @pytest.mark.parametrize(
@@ -290,7 +290,7 @@ def test_torques_drive_what_nothing_commands(drive, name, word, tmp_path):
     columns |= {word.format(j): 7 * COMMANDS[:, k] for k, j in enumerate(JOINTS)}
     made = simgap.import_logs([table(tmp_path / "log.csv", columns)], arm, tmp_path / "log.toml")
     assert made.checks == []
-    assert "measured, as nothing commands it" in "\n".join(made.guessed)
+    assert "measured, because no column has its command" in "\n".join(made.guessed)
     np.testing.assert_allclose(
         inputs(tmp_path / "log.toml")[name.format("bend")], 7 * COMMANDS[:, 2], atol=1e-6
     )
@@ -308,7 +308,7 @@ def test_of_several_torques_the_measured_one_drives_else_none(tmp_path):
     made = simgap.import_logs([table(tmp_path / "o.csv", columns)], arm, tmp_path / "o.toml")
     assert inputs(tmp_path / "o.toml") == {}
     (check,) = made.checks
-    assert "nothing drives it; columns that may be it: yaw_tau_con, lift_tau_con" in check
+    assert "nothing drives it; possible columns: yaw_tau_con, lift_tau_con" in check
 
 
 def test_a_model_without_an_input_is_said(tmp_path):
@@ -317,8 +317,8 @@ def test_a_model_without_an_input_is_said(tmp_path):
     columns |= {f"{j}_current": COMMANDS[:, k] for k, j in enumerate(JOINTS)}
     made = simgap.import_logs([table(tmp_path / "log.csv", columns)], arm, tmp_path / "log.toml")
     (check,) = made.checks
-    assert check.startswith("the model has no input, so that nothing drives it; columns that may")
-    assert "columns that may be it: yaw_current, lift_current, bend_current" in check
+    assert check.startswith("the model has no input, so no actuator drives it; columns that may")
+    assert "possible columns: yaw_current, lift_current, bend_current" in check
 
 
 def test_a_temperature_is_no_angle_and_a_current_position_no_current(arm, tmp_path):
@@ -488,7 +488,7 @@ def test_positions_of_lerobot_may_be_normalised_and_it_is_said(arm, tmp_path, ca
     out = tmp_path / "log.toml"
     assert main(["import", str(folder), "--model", str(arm), "--out", str(out)]) == 0
     (line,) = (one for one in capsys.readouterr().out.splitlines() if one.startswith("check: "))
-    assert line.startswith("check: positions lie within -100 to 100: they are taken for degrees")
+    assert line.startswith("check: positions lie within -100 to 100: they are read as degrees")
     assert "--calibration FILE" in line
     odd = check_recording_plausible(*load_recording(out))
     assert any(text.startswith("positions of a LeRobot dataset are taken for") for text in odd)

@@ -92,7 +92,7 @@ def test_inspect_says_what_is_odd_about_a_robots_log(odd_log, tmp_path, capsys):
     assert main(["inspect", str(odd_log), "--out", str(tmp_path / "figures")]) == 0
     said = capsys.readouterr().out
     assert "(MJCF): 2 joints, 2 actuators, 2 moving bodies; implicitfast at 5 ms" in said
-    assert "odd: not in the log, and taken for zero: u.m_shoulder" in said
+    assert "odd: not in the log, assumed to be zero: u.m_shoulder" in said
     assert "begin as the file states them: elbow" in said
     assert "q.shoulder goes from -30 to 29.72 rad in runs 1, 2, and swinging.xml" in said
     assert "u.s_elbow goes from 0 to 1.9 in runs 1, 2, and swinging.xml states -0.5 to 0.9" in said
@@ -113,7 +113,7 @@ def test_mends_of_a_model_are_said(tmp_path, capsys):
     (tmp_path / "r.urdf").write_text(urdf)
     assert main(["list", "places", "--model", str(tmp_path / "r.urdf")]) == 0
     said = capsys.readouterr().out
-    assert "note: not read, since MuJoCo knows no such thing: <transmission>" in said
+    assert "note: ignored, since MuJoCo has no equivalent: <transmission>" in said
     assert "hinge, effort 5 N*m" in said
     words = said.partition("MuJoCo's words: ")[2]
     assert "damping" in words

@@ -133,7 +133,7 @@ def test_a_simulator_without_engines_is_a_system_too(tmp_path, spring):
     np.testing.assert_allclose(
         made.recording.runs[0].channels["x"], np.exp(-0.2 * t) * np.cos(3.5 * t), rtol=1e-12
     )
-    with pytest.raises(InputError, match="simulator spring takes neither effects nor an engine"):
+    with pytest.raises(InputError, match="simulator spring supports neither effects nor engines"):
         simulate_recording(Wish("spring", effects=["drag.linear=1"]))
 
 

@@ -132,7 +132,7 @@ def test_the_first_screen_says_who_wins_and_shows_it(opened):
     rows = opened.page.locator(".conclusion tbody tr").all_inner_texts()
     assert [row.split()[:2] for row in rows] == [[k, "tunenet"] for k in ("1", "3", "10", "12")]
     few, failed = opened.text("p.warning").replace("\xa0", " ").split(". ", 1)
-    assert few == "3 targets cannot decide between 2 tuners: it takes at least 6 (--targets 6)"
+    assert few == "3 targets cannot decide between 2 tuners: at least 6 are needed (--targets 6)"
     assert failed == "2 of 12 runs failed (17 %): reasons."
 
 
@@ -154,7 +154,7 @@ def test_too_few_targets_are_said_in_one_sentence_and_the_best_is_named_all_the_
     (said,), few = write_conclusion(held.view), warnings(held)
     assert said.endswith("after 12 simulations: not decided: random.")
     assert few.startswith("4 targets cannot decide between 2 tuners")
-    assert "it takes at least 6 (--targets 6)." in few
+    assert "at least 6 are needed (--targets 6)." in few
     assert best_table(held).count("<strong>tunenet</strong>") == 4
 
 

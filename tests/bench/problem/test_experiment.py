@@ -116,7 +116,7 @@ def test_tuners_may_be_a_list_of_names_and_of_tables_that_name_one():
         ("random", "tuners: expected a list of names or a table for each tuner, found 'random'"),
         (["random", 3], r"tuners\[1\]: expected a name or a table, found 3"),
         ([{"seeds": 1}], r"tuners\[0\]: expected a table with tuner = \"NAME\", found"),
-        (["random", "random"], "tuners: random stands twice; give one of them a label"),
+        (["random", "random"], "tuners: random is listed twice; give one of them a label"),
         ([{"tuner": "random", "budget": 0}], r"tuners\[0\].budget: expected at least 1, found 0"),
         (
             [{"tuner": "random", "option": {}}],
@@ -189,7 +189,7 @@ def test_a_sweep_names_entries_whose_names_have_dots():
         ({"budget": 3}, "mine.toml: sweep.budget: expected a list, found 3"),
         ({"budget": []}, "mine.toml: sweep.budget: expected at least one value"),
         ({"budget": [3, "x"]}, "mine.toml: budget: expected a whole number, found 'x'"),
-        ({"budget": [3, 3]}, "mine.toml: sweep.budget: 3 stands twice"),
+        ({"budget": [3, 3]}, "mine.toml: sweep.budget: 3 is given twice"),
         ({"budget": [0]}, "mine.toml: .*budget must be at least 1"),
         ({"budget.x": [1]}, "mine.toml: sweep.budget.x: budget is no table"),
         ({"sampling.rat": [1]}, r"unknown entry of \[sampling\] in mine.toml 'rat'"),

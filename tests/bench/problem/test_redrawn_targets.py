@@ -90,7 +90,7 @@ def test_diverging_targets_are_drawn_again_and_counted(exploding, tmp_path):
     other = pd.read_parquet(tmp_path / "b" / "runs.parquet")
     np.testing.assert_array_equal(other["true_rate"], runs["true_rate"])
     verified = simgap("verify", tmp_path / "a")
-    assert "all of it follows" in verified.stdout
+    assert "all results are reproducible" in verified.stdout
     assert "Warning" not in verified.stderr
 
 

@@ -21,12 +21,12 @@ def test_every_simulation_counts_and_none_beyond_the_budget_is_made(practice):
     for points, used in ((4, 4), (1, 5), (3, 8)):
         assert practice.simulate(rng, practice.sample(rng, points)).shape == (points, 60, 1)
         assert practice.used == used
-    with pytest.raises(BudgetExceededError, match="11 training simulations asked, 10 allowed"):
+    with pytest.raises(BudgetExceededError, match="11 training simulations requested, 10 allowed"):
         practice.simulate(rng, practice.sample(rng, 3))
     assert practice.used == 8, "refused whole"
     practice.simulate(rng, practice.sample(rng, 2))
     assert practice.used == 10
-    with pytest.raises(BudgetExceededError, match="11 training simulations asked"):
+    with pytest.raises(BudgetExceededError, match="11 training simulations requested"):
         practice.simulate(rng, practice.sample(rng, 1))
 
 

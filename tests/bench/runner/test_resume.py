@@ -68,7 +68,7 @@ def begun(experiment, plugins, folder):
     return folder
 
 
-def refused(folder, what, words="its {} changed since it was begun"):
+def refused(folder, what, words="its {} changed since it was started"):
     """Check that resuming is refused with one line and changes no file of the folder."""
     before = {p: p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
     with pytest.raises(InputError, match=words.format(what)) as caught:

@@ -176,7 +176,7 @@ def test_results_of_one_that_is_under_way_are_written_again_by_resuming(folders,
     (folder / STATUS_CSV).write_bytes(b"\xff")
     code, told = COMMANDS["plot"](folder)
     assert (code, told.count("\n")) == (2, 1)
-    assert f"simgap compare --resume {folder} writes it again" in told
+    assert f"write it again with simgap compare --resume {folder}" in told
     assert main(["status", str(folder)]) == 1, "its results are not written"
     assert "12 of 12 runs finished\n" in capsys.readouterr().out
     comparison = Comparison.resume(folder)
@@ -239,7 +239,11 @@ def test_a_damaged_table_is_found_where_all_is_checked(folders, tmp_path):
     folder = damaged(folders, "done", lambda _: None, tmp_path)
     (folder / "table.csv").write_text("experiment,tuner\nx,y\n")
     assert len(read_comparison(folder).statuses) == 12, "plot writes it again"
-    with pytest.raises(InputError, match=r"table.csv: columns: .* simgap plot .* writes it again"):
+    with pytest.raises(
+        InputError,
+        match=r"table.csv: columns: .* write it again with simgap "
+        "plot ",
+    ):
         read_checked_comparison(folder)
 
 

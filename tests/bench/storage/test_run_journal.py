@@ -116,7 +116,7 @@ def test_killed_between_the_part_and_the_deletion_of_its_journal_doubles_nothing
 
 def test_two_processes_never_write_one_folder(tmp_path):
     journal = RunJournal(tmp_path)
-    with pytest.raises(InputError, match="another simgap is at work"):
+    with pytest.raises(InputError, match="another simgap process uses"):
         RunJournal(tmp_path)
     journal.close()
     RunJournal(tmp_path).close()

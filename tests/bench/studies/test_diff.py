@@ -235,8 +235,8 @@ def test_another_verdict_or_cause_is_a_change(tmp_path, capsys):
 def test_two_kinds_and_what_is_damaged_are_refused(run, tmp_path, capsys):
     a = explained(tmp_path / "a")
     code, found = differ(a, run, capsys)
-    assert (code, "two of one kind" in found["error"]["message"]) == (2, True)
+    assert (code, "two comparisons or two explanations" in found["error"]["message"]) == (2, True)
     code, found = differ(a, explained(tmp_path / "b", causes=3), capsys)
     assert (code, "expected a verdict" in found["error"]["message"]) == (2, True)
     code, found = differ(a, a, capsys, "--fail-on", "worse")
-    assert (code, "of explanations take change" in found["error"]["message"]) == (2, True)
+    assert (code, "for explanations use change" in found["error"]["message"]) == (2, True)

@@ -53,7 +53,7 @@ def test_what_was_made_follows(sound, capsys):
     assert "the salt has the SHA-256 that was committed" in said
     assert "4 targets drawn again, 48 rows compared" in said
     assert "48 of 48 rows simulated again" in said
-    assert said.endswith("all of it follows\n")
+    assert said.endswith("all results are reproducible\n")
     held = read_configuration(sound).experiment
     assert (held.salt, held.trusted) == (SECRET, False)
     assert set(pd.read_csv(sound / "table.csv")["salt"]) == {"secret"}
@@ -172,7 +172,7 @@ def test_a_salt_beside_the_experiments_own_is_refused(tmp_path, capsys):
     (tmp_path / "e.toml").write_text(tomli_w.dumps(SPRING))
     command = ["compare", str(tmp_path / "e.toml"), *PLUGIN, "--out", str(tmp_path / "out")]
     assert main([*command, "--salt", "another"]) == 2
-    assert "has a salt of its own, which is public" in capsys.readouterr().err
+    assert "states a public salt" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 

@@ -153,7 +153,7 @@ class _Course:
             if event > now:
                 self._decide(event)
             now = event
-        raise RuntimeError("it never gets through: too many standstills")
+        raise RuntimeError("no solution: the joint stops too often")
 
     def _first_event(self, now, end, tried):
         """Return the time of the first event, and move the state there; None without an event."""

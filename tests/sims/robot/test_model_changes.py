@@ -117,7 +117,7 @@ def test_a_constant_force_is_a_spring_or_a_bias(place: str, force: float, tmp_pa
     [
         ("backlash@m_elbow", "no such element"),
         ("sensor.bias@q.elbow", "does not state sensor errors"),
-        ("input.delay@m_elbow", "before it is set"),
+        ("input.delay@m_elbow", "negative delay"),
         ("input.gain@m_spin", "a factor of zero or less"),
     ],
 )

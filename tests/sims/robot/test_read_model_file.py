@@ -86,7 +86,7 @@ def test_notes_of_a_urdf(write):
         "held to the world, as MuJoCo does with a URDF's root: base",
         "effort limits clamp what actuators exert (N m or N): pivot 12",
         "links on fixed joints are part of what carries them: base of world; plate, bob of rod",
-        "no actuators: nothing drives it unless a recording's [actuators.NAME] adds some",
+        "no actuators: it is passive unless the [actuators.NAME] of a recording add some",
     )
 
 

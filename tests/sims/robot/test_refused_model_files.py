@@ -37,7 +37,7 @@ CASES = {
     "<mujoco>" * 500: ":1: elements more than 400 deep",
     '<?xml version="1.0" encoding="klingon"?><mujoco/>': (": not XML: unknown encoding: klingon"),
     # MJCF
-    mjcf(body=""): ": it has no joint that moves",
+    mjcf(body=""): ": it has no movable joint",
     mjcf('<include file="no.xml"/>'): ":2: the included file no.xml is absent",
     mjcf("<include/>"): ":2: an include states no file",
     mjcf('<include file="robot.xml"/>'): (
@@ -82,7 +82,7 @@ CASES = {
         ":1: joint j states no child link"
     ),
     robot(link("a"), link("b"), joint("j", "a", "b"), joint("k", "a", "b")): (
-        ":1: link b hangs on two joints; a loop needs an MJCF"
+        ":1: link b has two parent joints; a closed loop needs an MJCF"
     ),
     robot(link("a"), link("b"), joint("j", "a", "b"), joint("k", "b", "a")): (
         ":1: link a hangs on itself"

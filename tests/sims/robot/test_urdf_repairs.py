@@ -35,7 +35,7 @@ def test_nothing_is_said_where_nothing_is_mended(mended):
 
 def test_a_point_mass(mended):
     robot, notes = mended(one(inertia=""))
-    assert notes == ["a mass and no moments of inertia, so a point (1e-09 kg m^2): arm"]
+    assert notes == ["a mass and no moments of inertia, so it is a point mass (1e-09 kg m^2): arm"]
     assert moments(robot) == pytest.approx([1e-9] * 3)
     assert robot.bodies[0].mass == 1
 
@@ -84,7 +84,7 @@ def robot_text(*links):
 def test_a_last_link_without_a_mass_is_said_to_mean_little(mended):
     _, notes = mended(robot_text(link("base", None), link("arm"), link("tip", None)))
     assert notes == [
-        "move without a mass, and nothing hangs on them, so their joints mean little; given "
+        "move without a mass, and carry no other bodies, so their joints have little effect; given "
         "1e-06 kg and moments of 1e-09 kg m^2: tip"
     ]
 
@@ -197,7 +197,7 @@ def test_names_with_other_characters_stay(mended):
 
 def test_what_is_not_read_is_said(mended):
     _, notes = mended(one().replace("</robot>", "<gazebo/><transmission/><gazebo/></robot>"))
-    assert notes == ["not read, since MuJoCo knows no such thing: <gazebo>, <transmission>"]
+    assert notes == ["ignored, since MuJoCo has no equivalent: <gazebo>, <transmission>"]
 
 
 def test_what_is_stated_twice(mended):

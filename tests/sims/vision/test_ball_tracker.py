@@ -154,7 +154,7 @@ def test_frames_without_the_ball_stay_missing():
     found = track_ball([(t, f) for t, f in zip(TIMES, scene.render_frames(points), strict=True)])
     assert not np.isfinite(found.u[hidden]).any()
     assert np.isfinite(found.u[~hidden]).sum() >= 35
-    assert any("show no ball" in note for note in found.notes)
+    assert any("show no measurable ball" in note for note in found.notes)
 
 
 def test_a_film_without_a_ball_is_one_line():

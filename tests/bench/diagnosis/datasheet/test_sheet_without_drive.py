@@ -47,7 +47,7 @@ def test_there_is_no_drive_and_no_diagram_in_any_file(swing: Path) -> None:
         assert name not in quantities
     page = (swing / "sheet" / "sheet.html").read_text()
     assert "There is no drive: the log has no input." in page
-    assert "At rest, dry friction holds against up to 0.00" in page
+    assert "At rest, dry friction holds loads up to 0.00" in page
     for words in ("Motor", "moves forward", "force of the motor", "Drive and back-drive"):
         assert words not in page
 

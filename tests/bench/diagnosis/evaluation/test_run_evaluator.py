@@ -118,7 +118,7 @@ def test_only_what_sticks_by_itself_has_the_narrow_range_of_dry_friction():
         ),
         (
             ["gravity"],
-            "free constant gravity: expected one that is not zero and the same in every run",
+            "free constant gravity: expected a value that is not zero and equal in all runs",
         ),
     ],
 )

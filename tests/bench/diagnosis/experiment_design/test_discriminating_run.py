@@ -74,7 +74,7 @@ def test_equal_models_are_not_told_apart_by_any_run():
     found = propose_discriminating_run(search, model, model)
     assert found.apart == 0
     assert found.change == {}
-    assert found.says.startswith("No run of this kind would tell")
+    assert found.says.startswith("No run of this kind would distinguish")
     assert found.says.endswith("measure one of the causes directly")
 
 

@@ -131,7 +131,7 @@ def test_commands_have_their_form_their_level_and_their_rate(servo):
     assert np.abs(np.diff(ramp)).max() == pytest.approx(8.0 * most / 199, rel=0.01)
     _, holds = goal(RunPlan(("goal",), "holds"))
     assert np.unique(holds / most).round(9).tolist() == [-1.0, -0.5, 0.0, 0.25, 0.5, 1.0]
-    times, push = goal(RunPlan(("goal",), "a push, then let go", level=0.5))
+    times, push = goal(RunPlan(("goal",), "a push, then zero input", level=0.5))
     assert push[times > 1.0] == pytest.approx(0.5 * most)
     assert push[0] == pytest.approx(1.5 * most)
     coarse, _ = goal(RunPlan(("goal",), "holds", hold_factor=4))

@@ -123,7 +123,7 @@ def test_a_servo_that_is_switched_off_is_found_and_its_samples_are_left_out(tmp_
     assert left.runs[1].before["u.s1"].size
     assert left.runs[3].times[-1] < 2.0
     (note,) = left.notes
-    assert "the drives of joint shoulder do nothing in some samples, which are left out" in note
+    assert "the drives of joint shoulder exert no force in some samples, which are excluded" in note
     assert '[actuators.s1] enable = "COLUMN"' in note
     assert "\n" not in note
 
@@ -181,7 +181,7 @@ def test_an_emergency_stop_with_brakes_is_found(tmp_path):
     assert times_of(recording, drives[0].masks[0], 0) == pytest.approx((1.5, 3.0), abs=0.05)
     left = without_inactive_drives(recording, kind)
     assert [round(float(run.times[-1]), 1) for run in left.runs] == [1.4, 3.0, 1.9]
-    assert "the joints stand still, whatever is commanded" in left.notes[0]
+    assert "the joints stand stillwhatever the command is" in left.notes[0]
 
 
 @pytest.mark.parametrize(

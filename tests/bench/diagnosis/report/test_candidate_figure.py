@@ -73,7 +73,7 @@ def test_a_place_stands_in_full_with_its_effect():
     drawn = candidates_figure(robot_story(causes=(), candidates=[row(one, 300.0)]))
     (name,) = labels(drawn)
     assert name.replace("\n", " ").replace("_ ", "_") == (
-        "friction that grows with load and its square "
+        "friction that increases with load and its square "
         "at left_arm_shoulder_lift_joint_of_the_upper_body"
     )
 

@@ -178,6 +178,6 @@ def test_the_standing_of_a_candidate():
     ]
     told = story("ambiguous")
     assert {get_candidate_status(told, n) for n in ("drag.linear", "friction.coulomb")} == {
-        "found, but cannot be told apart"
+        "found, but not distinguishable"
     }
     assert get_candidate_status(told, "my.plugin") == "not needed"

@@ -199,7 +199,7 @@ def test_sets_that_cannot_be_told_apart_come_with_reason_and_experiment(figures)
     assert text.count("Release it from 1.5 rad instead of 0.5 rad") >= 2
     assert text.index("What to do next") < text.rindex("Release it from 1.5 rad")
     drag = cells(render_report(story("ambiguous"), figures), "linear drag")
-    assert drag[5:7] == ["found, but cannot be told apart", "linear drag or Coulomb friction"]
+    assert drag[5:7] == ["found, but not distinguishable", "linear drag or Coulomb friction"]
 
 
 def test_after_is_not_shown_where_nothing_was_found(figures):

@@ -216,8 +216,8 @@ def test_the_account_says_numbers_at_their_places():
 
 
 def test_what_an_effect_does_is_said_without_its_place():
-    assert strip_place("the sensor's zero is off (at channel q.elbow)") == (
-        "the sensor's zero is off"
+    assert strip_place("the sensor has a constant offset (at channel q.elbow)") == (
+        "the sensor has a constant offset"
     )
     assert strip_place("it pulls (as a spring) back") == "it pulls (as a spring) back"
 

@@ -40,7 +40,7 @@ def test_the_labels_of_a_robot_say_what_is_there_in_full():
     drawn = draw_figure(robot_story(causes=(warms,)), "robot")
     assert unreadable(drawn) == []
     words = " ".join(text.get_text() for axes in drawn.axes for text in axes.texts)
-    assert "friction that falls as the joint warms" in words.replace("\n", " ")
+    assert "friction that decreases as the joint warms" in words.replace("\n", " ")
 
 
 def test_what_is_too_long_for_any_figure_is_shortened_and_stays_inside():

@@ -128,7 +128,7 @@ def test_what_is_missing_makes_a_number_move(tmp_path, capsys):
     said = " ".join(capsys.readouterr().out.split())
     assert "lacks Coulomb friction" in said
     assert "instead of friction.coulomb, its value would differ between logs" in said
-    assert "no number drifts over the 3 logs, in the order given" in said.lower()
+    assert "no number changes steadily over the 3 logs, in the order given" in said.lower()
     with (out / "apart.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     friction = [r for r in rows if r["number"] == "friction.coulomb" and r["by"] == "log"]
