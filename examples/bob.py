@@ -11,7 +11,7 @@ MODEL = """<mujoco><option integrator="Euler" gravity="0 0 0"/><worldbody><body>
 
 
 class Bob(OwnSimulator):
-    name, says, requires = "bob", "a weight that hangs on a spring", ("mujoco",)
+    name, says, requires = "bob", "a weight on a spring", ("mujoco",)
     parameters = (
         Parameter("stiffness", "N/m", 20.0, (1.0, 100.0), (10.0, 40.0)),
         Parameter("damping", "N*s/m", 0.05, (0.0, 1.0), (0.0, 0.2)),

@@ -91,7 +91,7 @@ class FittedValue:
 
     @property
     def is_result(self) -> bool:
-        """Whether the data determine the number.
+        """True if the data determine the number.
 
         This is the case if it has an interval, or if it is zero at its lower bound, such as the
         coefficient of a friction that does not exist.

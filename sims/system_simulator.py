@@ -61,7 +61,7 @@ class SystemSimulator(Simulator):
     system: ClassVar[type[System]]
     default_engine: ClassVar[str] = "batch"
     own_engine: ClassVar[bool] = False
-    """Whether the simulator steps itself, so that no engine can be chosen."""
+    """True if the simulator steps itself, so that no engine can be chosen."""
 
     def __init__(
         self,

@@ -128,7 +128,7 @@ class DesignOptions(ExplainOptions):
 def design(recording: Sources, options: DesignOptions) -> NextRecording:
     """Design the next recording by simulation, within the limits of joints and commands.
 
-    The commands distinguish causes that the existing runs cannot tell apart, or reduce the
+    The commands distinguish causes that the existing runs do not distinguish, or reduce the
     uncertainty of the estimated numbers.
 
     Args:

@@ -311,7 +311,7 @@ class Comparison:
 
     @property
     def _under_way(self) -> bool:
-        """Whether the comparison is unfinished: its journal is deleted when all is written."""
+        """True if the comparison is unfinished: its journal is deleted when all is written."""
         return (self.folder / SEGMENTS_FOLDER).exists()
 
     def report(self, print_line: PrintLine) -> int:

@@ -181,7 +181,7 @@ class ComparisonCollection:
 
     @property
     def has_enough_problems(self) -> bool:
-        """Whether there are enough problems and tuners for Friedman's and Nemenyi's tests."""
+        """True if there are enough problems and tuners for Friedman's and Nemenyi's tests."""
         return (
             len(self.mean_ranks) >= MIN_PROBLEMS_FOR_RANKS
             and len(self.tuners) >= _MIN_TUNERS_FRIEDMAN
@@ -245,7 +245,7 @@ class ComparisonCollection:
 
     @property
     def has_trusted_runs(self) -> bool:
-        """Whether tuners ran without isolation in any of the comparisons."""
+        """True if tuners ran without isolation in any of the comparisons."""
         return any(part.experiment.trusted for part in self.parts)
 
     def _add_trusted_column(self, frame: pd.DataFrame) -> pd.DataFrame:

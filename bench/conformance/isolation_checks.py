@@ -33,7 +33,7 @@ def check_same_run_when_sealed(kind: type[Tuner]) -> NotApplicable | None:
     local_trace = run_tuner(make_trained_tuner(kind, 2), 2, _BUDGET, _SEED)
     state = make_trained_tuner(kind, 2).state() if kind.learned else None
     task, _ = make_task(2, _BUDGET)
-    location = f"{kind.__name__}: what needs files, the network or processes; docs/sealing.md"
+    location = f"{kind.__name__}: what needs files, the network or processes; docs/isolation.md"
     try:
         with start_isolated_tuner(tuned, _SEED, "run", state=state) as tuner:
             words = np.array([_SEED], dtype=np.uint32)

@@ -54,7 +54,7 @@ class SuiteResult(NamedTuple):
 
     @property
     def has_passed(self) -> bool:
-        """Whether no check failed."""
+        """True if no check failed."""
         return all(_get_outcome(line) != "failed" for line in self.lines.values())
 
     def to_document(self) -> dict[str, Any]:

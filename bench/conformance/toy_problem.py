@@ -117,7 +117,7 @@ def make_task(dim: int, budget: int, seed: int = 0) -> tuple[Task, Array]:
         The task, and its true parameters (dim,) inside the training range.
     """
     rng = np.random.default_rng(seed)
-    # Away from the bounds, where a tuner that clips would hit the truth by clipping.
+    # Away from the bounds, where a tuner that clips would find the true parameters by clipping.
     truth, start = rng.uniform(0.3, 0.7, size=(2, dim))
     observed = simulate_toy_problem(truth[None])[0]
     training = np.array([[TRAINING_RANGE_LOW] * dim, [TRAINING_RANGE_HIGH] * dim])

@@ -1,4 +1,4 @@
-"""Result rows: one row per answer with its case, truth, answer and grade."""
+"""Result rows: one row per answer with its case, true causes, answer and grade."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def build_answer_row(
 
     Args:
         question: name of the case.
-        item: the case with its truth.
+        item: the case with its true causes.
         stored_answer: stored answer of one diagnoser, with its status, reason and cost.
 
     Returns:

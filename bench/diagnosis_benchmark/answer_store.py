@@ -10,7 +10,7 @@ from typing import IO, Any
 from sims.core.simulator import InputError
 
 ANSWERS_FILE = "answers.jsonl"
-"""File of the answers. It also contains the truth of every case, where no diagnoser can read it."""
+"""File of the answers. It contains the true causes too; no diagnoser can read it."""
 
 
 class AnswerStore:

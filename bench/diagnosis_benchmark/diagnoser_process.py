@@ -2,7 +2,7 @@
 
 The harness cannot trust anything from this process once the code of a plugin has run in it. The
 simulations are counted in this process, so a malicious plugin could change their number. It cannot
-obtain the truth, because no process of a diagnoser ever contains it.
+obtain the true causes, because no process of a diagnoser ever contains them.
 """
 
 from __future__ import annotations

@@ -295,8 +295,8 @@ class _EvaluationRun:
         open_questions = [q for q in self._shuffle_cases() if self._list_unanswered(q)]
         if not open_questions:
             return
-        # The truths are in the memory of this process, and a diagnoser's process may run as the
-        # same user.
+        # The true causes are in the memory of this process, and a diagnoser's process may run as
+        # the same user.
         trusted = self._experiment.trusted
         with nullcontext() if trusted else not_dumpable(), pool or make_pool(jobs) as workers:
             evaluated, training_costs = self._train_diagnosers(workers)

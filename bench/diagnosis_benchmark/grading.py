@@ -1,4 +1,4 @@
-"""Grade an answer against the hidden truth of its case.
+"""Grade an answer against the true causes of its case.
 
 An answer is a dictionary as `explain` writes it (DESIGN §6).
 
@@ -39,13 +39,13 @@ class Grade:
 
     Attributes:
         outcome: see this module.
-        set_size: number of effects in the set that contains the truth (the larger of two); 0 if
-            none does.
+        set_size: number of effects in the set that contains the true cause (the larger of two); 0
+            if none does.
         class_size: number of effects in that set, with effects that are equivalent in any data
             counted as one.
         named: named causes, alternatives separated by bars: ``drag.linear|wind + force.bias``.
         covered: for each coefficient or parameter of a correct answer, whether the 95 % interval
-            contains the truth; None if the interval is open.
+            contains the true value; None if the interval is open.
     """
 
     outcome: str
@@ -56,12 +56,12 @@ class Grade:
 
     @property
     def is_correct(self) -> bool:
-        """Whether the cause is named alone or in a set of at most `MAX_SET_SIZE` effects."""
+        """True if the cause is named alone or in a set of at most `MAX_SET_SIZE` effects."""
         return self.outcome == "right" or (self.outcome == "set" and self.set_size <= MAX_SET_SIZE)
 
     @property
     def is_correct_up_to_equivalence(self) -> bool:
-        """Whether the cause is named alone or in a small set, equivalent effects counted once."""
+        """True if the cause is named alone or in a small set, equivalent effects counted once."""
         return self.outcome == "right" or (
             self.outcome in ("set", "class") and self.class_size <= MAX_SET_SIZE
         )

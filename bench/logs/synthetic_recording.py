@@ -1,4 +1,4 @@
-"""Simulate recordings with known truth, for tests and trials.
+"""Simulate recordings with known parameters, for tests.
 
 The recording contains only what a real one would; the true parameters go to a separate file, so
 that a blind test stays blind.
@@ -125,7 +125,7 @@ class SimulatedRecording:
 
     @check_arguments
     def write(self, path: str | Path) -> list[Path]:
-        """Write the table, its description and its truth, either all three or none.
+        """Write the table, its description and its true parameters: all three or none.
 
         Args:
             path: Path ``NAME.csv``; NAME.toml and NAME.truth.toml are written in the same folder.
@@ -163,7 +163,7 @@ def _make_truth_path(table_path: Path) -> Path:
 
 
 def simulate_recording(options: SimulationSpec) -> SimulatedRecording:
-    """Simulate a recording with known truth; nothing is written before `write` is called.
+    """Simulate a recording with known parameters; nothing is written before `write` is called.
 
     Args:
         options: Specification; `simgap.simulate` takes its attributes as arguments, all but

@@ -199,8 +199,8 @@ class MisspecificationStudy:
 
             comparison = Comparison.begin(prepare_study(plan, self.plugins, folder, jobs, secret))
         if comparison.results is not None:
-            # The folder of the other simulator contains the same truths, so it must be inaccessible
-            # too.
+            # The folder of the other simulator contains the same true parameters, so it must be
+            # inaccessible too.
             hidden_paths = (str(self.folder.resolve()), *comparison.results.hidden_paths)
             comparison.results.hidden_paths = hidden_paths
         return comparison

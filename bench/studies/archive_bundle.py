@@ -237,7 +237,7 @@ class ArchiveVerification(NamedTuple):
 
     @property
     def is_consistent(self) -> bool:
-        """Whether there is no verification failure."""
+        """True if there is no verification failure."""
         has_no_doubts = not self.doubts and all(each.is_consistent for each in self.comparisons)
         return has_no_doubts and not (self.explanation and self.explanation.doubts)
 

@@ -1,10 +1,10 @@
 """Compare two tuner comparisons: which errors differ significantly.
 
-If both comparisons have the same targets (the same truth and start; names are not sufficient,
-because every salt draws its own targets), errors are compared target by target: Wilcoxon's
-signed-rank test of the logarithms of the mean over the common seeds. Otherwise the targets are two
-samples, and the test is that of H. B. Mann, D. R. Whitney, Ann. Math. Stat. 18, 50, 1947. Holm's
-correction is over all lines.
+If both comparisons have the same targets (the same true parameters and start; names are not
+sufficient, because every salt draws its own targets), errors are compared target by target:
+Wilcoxon's signed-rank test of the logarithms of the mean over the common seeds. Otherwise the
+targets are two samples, and the test is that of H. B. Mann, D. R. Whitney, Ann. Math. Stat. 18, 50,
+1947. Holm's correction is over all lines.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from sims.core.simulator import Array, InputError
 COMPARED_SIMULATION_COUNTS = (3, 10)
 """Numbers of simulations at which errors are compared, in addition to the last common one."""
 _TARGET_KEY_COLUMNS = ("true_", "recommendation_")
-"""Prefixes of the columns that identify a target: its truth, and the start of its runs."""
+"""Prefixes of the columns that identify a target: its true parameters and its start."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class ComparisonSide:
         folder: its folder.
         stored: its stored runs.
         curves: its error curves by the compared metric.
-        targets: truth and start by name of the target.
+        targets: true parameters and start by name of the target.
     """
 
     folder: Path
@@ -206,7 +206,7 @@ class ComparisonDiff:
 
     @cached_property
     def shared_targets(self) -> set[str]:
-        """Targets that both comparisons have, with the same truth and the same start."""
+        """Targets that both comparisons have, with the same true parameters and the same start."""
         a, b = self.a.targets, self.b.targets
         if list(a.columns) != list(b.columns):
             return set()
@@ -247,14 +247,14 @@ class ComparisonDiff:
 
     @property
     def has_changed(self) -> bool:
-        """Whether an error differs significantly, or the fraction of failed runs differs."""
+        """True if an error differs significantly, or the fraction of failed runs differs."""
         return bool(len(self._select_significant_errors())) or any(
             a != b for a, b in self._compute_failure_shares()
         )
 
     @property
     def is_worse(self) -> bool:
-        """Whether an error has grown significantly, or the fraction of failed runs has grown."""
+        """True if an error has grown significantly, or the fraction of failed runs has grown."""
         significant_errors = self._select_significant_errors()
         has_grown = bool(len(significant_errors) and (significant_errors["ratio"] > 1).any())
         return has_grown or any(b > a for a, b in self._compute_failure_shares())

@@ -152,7 +152,7 @@ class ExplanationDiff:
 
     @property
     def has_changed(self) -> bool:
-        """Whether verdict or causes differ, or a number differs significantly."""
+        """True if verdict or causes differ, or a number differs significantly."""
         has_other_verdict = self.a.verdict.verdict != self.b.verdict.verdict
         has_other_numbers = any(row["significant"] for rows in self.numbers for row in rows)
         has_other_causes = any(

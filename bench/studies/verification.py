@@ -70,7 +70,7 @@ class VerificationResult(NamedTuple):
 
     @property
     def is_consistent(self) -> bool:
-        """Whether there is no verification failure."""
+        """True if there is no verification failure."""
         return not self.doubts
 
     def to_document(self) -> dict[str, Any]:
@@ -194,7 +194,7 @@ def _verify_runs_table(
 def _verify_errors(
     problem: TuningProblem, target: Target, rows: pd.DataFrame
 ) -> Iterator[VerificationFailure]:
-    """Yield rows of a target whose errors do not follow from its truth."""
+    """Yield rows of a target whose errors do not follow from its true parameters."""
     if target.truth is None:
         return
     names = [parameter.name for parameter in problem.cube.parameters]

@@ -43,7 +43,7 @@ class HistoryTransformerDesign:
         blocks: number of blocks of attention and layers.
         published: True to learn the next point of a randomised binary search, as a linear function
             of h; False to learn the target's parameters, by (5).
-        relative: each squared error is weighted by 1 / (|e - truth|^2 + relative^2), in half
+        relative: each squared error is weighted by 1 / (|e - target|^2 + relative^2), in half
             widths.
         rate: initial learning rate; it decreases along a cosine.
         weight_decay: factor of the squared norm of the weights in the loss.

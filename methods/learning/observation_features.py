@@ -1,4 +1,4 @@
-"""What the networks of TuneNet and its regressor see of an observation.
+"""Inputs of the networks of TuneNet and its regressor from an observation.
 
 Pure numpy, so that tuning needs no torch. An observation (T, C) becomes a row of numbers in three
 steps: each run is resampled to a fixed number of points (RESAMPLE in Algorithm 1, arXiv

@@ -217,7 +217,7 @@ class PairTuner(Tuner):
     stochastic: ClassVar[bool] = False
     learned: ClassVar[bool] = True
     is_single_input: ClassVar[bool] = False
-    """Whether the network has a single input, the target; see `pair_network.train`."""
+    """True if the network has a single input, the target; see `pair_network.train`."""
 
     _fitted: NoiseMatchedNetworks[TrainedPairNetwork] | None = None
 

@@ -74,7 +74,7 @@ class ScenarioFeatures:
 
     @property
     def has_varying_inputs(self) -> bool:
-        """Whether inputs vary between scenarios, so that response coefficients are computed."""
+        """True if inputs vary between scenarios, so that response coefficients are computed."""
         return self.initial < len(self.centre)
 
     def compute(self, observations: Array, lengths: tuple[int, ...], scene: ScenarioInfo) -> Array:

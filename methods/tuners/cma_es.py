@@ -6,7 +6,7 @@ Auger, N. Hansen, A restart CMA evolution strategy with increasing population si
 doi:10.1109/CEC.2005.1554902.
 
 pycma does the mathematics: points x = m + sigma N(0, C), and from those of the lowest losses a new
-mean m, step size sigma and covariance C. Here it is asked, told, and started again.
+mean m, step size sigma and covariance C. Here the ask-and-tell loop restarts it.
 """
 
 from __future__ import annotations

@@ -50,7 +50,8 @@ class EntropySearch(Tuner):
         everywhere: candidates all over the cube.
         nearby: candidates around the best point seen and the minimiser of the process's mean.
         process: kernel and priors of the Gaussian process.
-        refit: with many simulations, the process's hyper-parameters are fitted anew after so many.
+        refit: with many simulations, the process's hyper-parameters are refitted after this number
+            of simulations.
     """
 
     requires = ("scipy",)

@@ -442,7 +442,7 @@ class Input(Effect):
     at: ClassVar[PlaceKind] = "actuator"
     needs = "input"
     between: ClassVar[bool] = False
-    """Whether its first coefficient is the share of the opposite interpolation between samples.
+    """True if its first coefficient is the share of the opposite interpolation between samples.
 
     That is linear interpolation for an input that is stated to be held, and the reverse.
     """
@@ -472,7 +472,7 @@ class Sensor(Effect):
     hook = "sensor"
     at: ClassVar[PlaceKind] = "channel"
     filters: ClassVar[bool] = False
-    """Whether `read` needs every step of the integration instead of the samples only."""
+    """True if `read` needs every step of the integration instead of the samples only."""
 
     def times(self, c: Array, t: Array) -> Array:  # noqa: ARG002
         """Return the times (L, T) at which the system is really sampled.

@@ -247,7 +247,7 @@ def read_meta(table: Path) -> tuple[Path, dict[str, Any]]:
         missing = True
     if missing:
         # The message refers to the file that the user named.
-        require_file(table, "a recording, NAME.csv with NAME.toml beside it")
+        require_file(table, "a recording, NAME.csv with NAME.toml next to it")
         raise InputError(
             f"{description}: no such file; expected the description of {table.name}: its system or "
             "model, its channels and their units"

@@ -50,7 +50,7 @@ class Joint:
 
     @property
     def has_one_coordinate(self) -> bool:
-        """Whether the joint has one coordinate."""
+        """True if the joint has one coordinate."""
         return self.motion is not None
 
     @property

@@ -321,7 +321,7 @@ class RobotSimulator(SystemSimulator):
 
     @cached_property
     def _drives(self) -> bool:
-        """Whether drive forces are recorded."""
+        """True if drive forces are recorded."""
         return any(c.name.startswith("tau.") for c in self.channels)
 
     @cached_property

@@ -22,7 +22,7 @@ from collections.abc import Callable, Mapping
 from sims.engines.adapters import bullet_world
 
 OPEN_LOOP = True
-"""Whether the torque depends on the input alone."""
+"""True if the torque depends on the input alone."""
 LENGTH_REDUCTION_FACTOR = 1000.0
 """Factor k of equation (2), by which the body is heavier and its arm is shorter."""
 

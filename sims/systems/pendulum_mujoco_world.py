@@ -15,7 +15,7 @@ from sims.systems.pendulum_bullet_world import gravity  # same torque as in Bull
 __all__ = ["OPEN_LOOP", "gravity", "load", "model"]
 
 OPEN_LOOP = True
-"""Whether the torque depends on the input alone."""
+"""True if the torque depends on the input alone."""
 LENGTH_REDUCTION_FACTOR = 1000.0
 """Factor by which the body is heavier and its arm is shorter than in the system."""
 _TINY = 1e-14

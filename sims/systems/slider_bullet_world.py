@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from sims.engines.adapters import bullet_world
 
 OPEN_LOOP = True
-"""Whether the force depends on the input alone."""
+"""True if the force depends on the input alone."""
 
 
 def build(client: int, constants: Mapping[str, float]) -> int:  # noqa: ARG001

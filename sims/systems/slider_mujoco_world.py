@@ -13,7 +13,7 @@ from sims.systems.slider_bullet_world import gravity  # same force as in Bullet
 __all__ = ["OPEN_LOOP", "gravity", "load", "model"]
 
 OPEN_LOOP = True
-"""Whether the force depends on the input alone."""
+"""True if the force depends on the input alone."""
 
 
 def model(constants: Mapping[str, float]) -> str:  # noqa: ARG001

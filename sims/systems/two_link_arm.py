@@ -19,7 +19,7 @@ section II.1):
 Dry friction is Bullet's
 joint motor with the friction as its limit and standstill as its goal: a constraint of both joints
 at once, which holds what pulls less. It cannot change sides within a step, so a step in which a
-joint that rubs comes to rest or turns round is taken again in small parts.
+joint with friction comes to rest or turns round is taken again in small parts.
 """
 
 from __future__ import annotations
@@ -252,7 +252,7 @@ class TwoLinkArm(OwnSimulator):
 
 
 def _turns(rate_before: float, middle: float, rate_after: float) -> bool:
-    """Whether a joint that moved has come to rest or turned round, from its rates in rad/s."""
+    """True if a joint that moved has come to rest or turned round, from its rates in rad/s."""
     if abs(rate_before) <= _REST_SPEED:
         return False
     return min(middle * rate_before, rate_after * rate_before) < _REST_SPEED * abs(rate_before)

@@ -111,7 +111,7 @@ class FilmedBall(Simulator):
             tracks = [
                 _track_film(camera, radius, positions, scenario.times) for positions in places
             ]
-            rows = np.array(tracks).reshape(places.shape[:2])  # also where there are no lanes
+            rows = np.array(tracks).reshape(places.shape[:2])  # also for an empty batch
             heights = np.full_like(rows, np.nan)
         else:
             middles, _ = camera.project_sphere(places, radius)

@@ -17,7 +17,7 @@ _RADIUS_RATIO_RANGE = (0.65, 1.55)
 _LEAST = 3
 """Minimum number of frames of a path; shorter ones are noise."""
 _CHANCE = 0.5
-"""Fraction of the rays that agree on a circle by chance."""
+"""Fraction of the rays that agree on a circle at random."""
 _MEMORY = 20
 """Number of frames over which the colour of a path is averaged."""
 _COLOUR_TOLERANCE = 25.0

@@ -30,8 +30,8 @@ _MAX_SHOWN_SIGMA = 1e4
 _LEAST_SHARE = 0.05
 """Minimum share of a parameter in a direction that is written."""
 _WHERE = {
-    "in": "truth in training range",
-    "wide": "truth in bounds",
+    "in": "true parameters in training range",
+    "wide": "true parameters in bounds",
     "real": "recording, at nominal values",
 }
 _MARKS = (("o", BLUE), ("^", VERMILION))
@@ -55,7 +55,7 @@ def draw_spectra_figure(experiment: Experiment, table: pd.DataFrame) -> Figure:
     _draw_direction_shares(axes[0, 1], table, names)
     figure.suptitle(f"{experiment.title or experiment.name}: what the data identify", fontsize=11)
     is_real = set(table["range"]) == {"real"}
-    evaluation_point = "the nominal parameters" if is_real else "each target's truth"
+    evaluation_point = "the nominal parameters" if is_real else "each target's true parameters"
     caption = (
         f"From the Fisher information at {evaluation_point} (Cramér–Rao bound). "
         f"Stiff: 1 sigma below {STIFF_SIGMA_THRESHOLD:g} of the training width (dashed). "

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 IS_LINUX = sys.platform.startswith("linux")
-"""Whether this system is Linux, which these restrictions need."""
+"""True if this system is Linux, which these restrictions need."""
 
 CLONE_NEWUSER = 0x10000000
 """CLONE_NEWUSER: new user namespace, with capabilities inside it only."""

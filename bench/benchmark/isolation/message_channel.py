@@ -130,7 +130,7 @@ class MessageChannel:
 
     @property
     def has_data(self) -> bool:
-        """Whether there is data to read."""
+        """True if there is data to read."""
         return any(event & select.POLLIN for _, event in self._incoming.poll(0))
 
     def send(

@@ -124,7 +124,7 @@ class ForkServerClient:
 
     @property
     def is_alive(self) -> bool:
-        """Whether the fork server can start another process."""
+        """True if the fork server can start another process."""
         return self._process.poll() is None
 
     def start_process(
@@ -236,7 +236,7 @@ class IsolatedProcess:
 
     Attributes:
         channel: message channel to the process.
-        seals: names of the active isolation layers, once the process is ready.
+        seals: Names of the active isolation layers, once the process is ready.
     """
 
     def __init__(
@@ -253,7 +253,7 @@ class IsolatedProcess:
 
     @property
     def is_alive(self) -> bool:
-        """Whether the process has not been ended."""
+        """True if the process has not been ended."""
         return self._open
 
     def wait_until_ready(self) -> None:

@@ -159,9 +159,9 @@ class Experiment:
         budget: simulations on one target.
         negligible_error: error below which tuners count as equal when they are ranked and tested,
             as a share of the training range (the unit of `param_error`); on a recording, where no
-            truth is known, the same share above the smallest error that any tuner reached. The
-            shipped experiments state a tenth of a percent, or the standard error that their noise
-            leaves where that is larger.
+            true parameters are known, the same share above the smallest error that any tuner
+            reached. The shipped experiments state a tenth of a percent, or the standard error that
+            their noise leaves where that is larger.
         same_targets_as: another experiment whose targets are met; its own where empty.
         training_budget: simulations that a learned tuner may train with.
         timeout: seconds a run may take.
@@ -186,7 +186,7 @@ class Experiment:
             simulated targets.
         identifiability: whether to find what the data of each simulated target identify, where
             there are several parameters (`problem.fisher_information`): two simulations a
-            parameter and target, beside all budgets.
+            parameter and target, in addition to all budgets.
         recording: the measured data, for range real.
         calibration: where tuners are compared twice, in the simulator as it is and in the one that
             explain extends from such a recording (`bench.misspecification`).
@@ -197,7 +197,7 @@ class Experiment:
             those of an answer, and there are no tuners.
         isolation: run: every run of a tuner has a fresh process; tuner: all runs of a tuner with
             one seed that a worker makes share one.
-        trusted: tuners run in the harness's own processes, where nothing is out of their reach;
+        trusted: tuners run in the harness's own processes, where they can read everything;
             tables and figures say so.
         salt: what targets are drawn from; empty for a secret one, fresh for each comparison and
             revealed at its end; ``public`` for the targets that everybody can draw; any other text

@@ -230,7 +230,7 @@ class TuningProblem:
 
     @property
     def has_several_parameters(self) -> bool:
-        """Whether to compute identifiability: it is requested, and there are several parameters."""
+        """True if identifiability is requested and there are several parameters."""
         return self.cube.dim > 1 and self.experiment.identifiability
 
     def compute_spectrum(self, target: Target) -> InformationSpectrum | None:

@@ -1,6 +1,6 @@
 """Run one tuner on one target: exact budget, statuses and recommendations.
 
-This module has no access to the true parameters. It gets a sealed task and a function that
+This module has no access to the true parameters. It gets a task and a function that
 simulates. Scoring against the true parameters happens later, in another process
 (`bench.benchmark.runner.experiment_runner`).
 """
@@ -131,7 +131,7 @@ class _RunRecord:
 
     @property
     def diverged(self) -> bool:
-        """Whether points were simulated and none of them has a finite loss."""
+        """True if points were simulated and none of them has a finite loss."""
         return self.used > 0 and self._best_loss == np.inf
 
     def recommend(self, recommendation: Array) -> None:

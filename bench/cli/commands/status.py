@@ -60,7 +60,7 @@ def _print_isolation_layers(print_line: PrintLine) -> list[JsonDocument]:
     from bench.benchmark.runner.sandboxed_tuner import list_active_isolation_layers
 
     active_layers = list_active_isolation_layers()
-    print_line("isolation layers of a tuner's process on this machine (docs/sealing.md)")
+    print_line("isolation layers of a tuner's process on this machine (docs/isolation.md)")
     for name, description in ISOLATION_LAYERS.items():
         print_line(
             f"  {name:10} {'active' if name in active_layers else 'NOT AVAILABLE':14} {description}"

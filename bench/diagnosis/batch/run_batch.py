@@ -155,7 +155,7 @@ def _load_previous_results(out: Path, logs: Sequence[BatchLog]) -> dict[str, Log
     try:
         stored_results = [LogResult(**row) for row in json.loads(path.read_text())]
     except (OSError, ValueError, TypeError):
-        raise InputError(f"{path}: is none of simgap's; name another folder") from None
+        raise InputError(f"{path}: was not written by simgap; name another folder") from None
     by_name = {row.log: row for row in stored_results}
     unchanged = {log.name: by_name[log.name] for log in logs if log.name in by_name}
     digests = {log.name: log.digest for log in logs}

@@ -328,7 +328,7 @@ class RunEvaluator:
 
     @property
     def has_linearisation(self) -> bool:
-        """Whether the simulator provides linearised responses to small changes.
+        """True if the simulator provides linearised responses to small changes.
 
         At contacts they would be wrong, and finite differences of simulated runs are used.
         """
@@ -495,7 +495,7 @@ class RunEvaluator:
 
     @property
     def is_cheap_to_split(self) -> bool:
-        """Whether splitting a batch into several calls costs no time, as with compiled steps."""
+        """True if splitting a batch into several calls costs no time, as with compiled steps."""
         return self.kind.has_model or self.engine == "batch"
 
     def _scenarios(self, theta: Array, runs: Indices, share: float) -> list[Scenario]:

@@ -228,7 +228,7 @@ class FitState:
 
     @property
     def needs_own_states(self) -> bool:
-        """Whether the derivatives by initial states that all models share are not good enough.
+        """True if the derivatives by initial states that all models share are not good enough.
 
         This is the case if the model is near the data, but its derivatives by parameters had to be
         recomputed several times.

@@ -311,13 +311,13 @@ class FollowedRuns:
 
     @property
     def missing_forces(self) -> Mask:
-        """Whether the model lacks a force (E,), so that the filter needs process noise there."""
+        """True if the model lacks a force (E,), so that the filter needs process noise there."""
         mask: Mask = self.losses_without_force > MIN_LOSS_WITHOUT_FORCE
         return mask
 
     @property
     def lacks_force(self) -> bool:
-        """Whether the model lacks a force at any coordinate."""
+        """True if the model lacks a force at any coordinate."""
         return bool(self.missing_forces.any())
 
     @property
@@ -459,7 +459,7 @@ class FollowedRuns:
 
     @property
     def is_sound(self) -> bool:
-        """Whether the filter follows the runs: its innovations have the expected size."""
+        """True if the filter follows the runs: its innovations have the expected size."""
         with np.errstate(all="ignore"):
             size = float(np.square(self.filtered.whitened).sum()) / max(self.runs.recorded.sum(), 1)
         return bool(size < UNSOUND)

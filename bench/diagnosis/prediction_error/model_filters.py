@@ -195,7 +195,7 @@ class ModelFilters:
 
     @property
     def is_soft(self) -> bool:
-        """Whether effects add dry friction in MuJoCo's soft form."""
+        """True if effects add dry friction in MuJoCo's soft form."""
         return has_soft_form(self.world)
 
     def soft_friction(self, name: str, sign: float) -> FitStart | None:

@@ -36,7 +36,7 @@ from bench.diagnosis.prediction_error.simulated_fits import (
 from sims.core.simulator import Array
 
 MAX_RIVALS = 5
-"""Maximum number of rivals of each effect that are fitted by simulation."""
+"""Maximum number of competing models of each effect that are fitted by simulation."""
 ALIKE_SHARE = 0.5
 """Minimum gain of an effect at the same joint that is tried as a replacement.
 
@@ -154,9 +154,9 @@ def _find_rivals(context: SearchContext, model: FittedModel, name: str) -> list[
 def _confirm_by_filter(
     context: SearchContext, best: FittedModel, rival: _Rival, start: FitStart
 ) -> FitStart | None:
-    """Return a start with a rival that a filter confirms, else None.
+    """Return a start with a competing model that a filter confirms, else None.
 
-    A filter is used only if the rival is far behind by the regression, which is linear.
+    A filter is used only if the competing model is far behind by the regression, which is linear.
     """
     if rival.behind <= RIVAL_MARGIN:
         return start

@@ -1,6 +1,6 @@
 """Confirm by simulation what prediction errors select, and determine the verdict.
 
-1. Fit the selected set and its rivals to whole simulated runs.
+1. Fit the selected set and its competing models to whole simulated runs.
 2. Remove effects that make predictions of held-out runs worse.
 3. Test whether an unmodelled force is missing (`bench.diagnosis.search.lack_of_fit`).
 4. Collect other effects that explain the data as well.
@@ -28,7 +28,7 @@ from bench.diagnosis.validation.held_out_runs import Validation
 MIMICRY = 0.5
 """Minimum share of the discrepancy that reported effects remove if the cause is unknown."""
 NEAR = 15.0
-"""Maximum distance in twice the log-likelihood of rivals that are evaluated on held-out runs."""
+"""Maximum distance in twice the log-likelihood of models that are evaluated on held-out runs."""
 
 
 class Confirmation(Inquiry):
@@ -64,8 +64,8 @@ class Confirmation(Inquiry):
         size = len(self._model.effects)
         self._measure()
         if 0 < len(self._model.effects) < size:
-            # The rivals of the remaining effects were fitted together with the removed ones, so fit
-            # them again.
+            # The competing models of the remaining effects were fitted together with the removed
+            # ones, so fit them again.
             self._model = search.fit_rivals(self._model)
             self._measure()
         watch.begin_question("structure")

@@ -100,7 +100,7 @@ class RandomizationRanges(NamedTuple):
 
     Attributes:
         ranges: Ranges in the order of the causes.
-        left_out: What is left out and why, one line each.
+        left_out: Omitted ranges with the reason, one line each.
     """
 
     ranges: tuple[RandomizationRange, ...]

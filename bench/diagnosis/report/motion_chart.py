@@ -60,7 +60,7 @@ class ShownRun(NamedTuple):
 
 
 class MotionTable(NamedTuple):
-    """Table of the chart, with its runs and what was left out.
+    """Table of the chart, with its runs and the number of omitted runs.
 
     Attributes:
         frame: Table with one row per sample, as text.

@@ -1,9 +1,9 @@
 """Diagnose a recording: search for causes, validate them on held-out runs, and select a verdict.
 
 The questions are asked in order. Does anything move? Do the data determine the base parameters?
-Which effects does the search find, and are they better than their rivals? Do held-out runs confirm
-them? Which alternatives explain the data as well? Does the residual have structure? The thresholds
-are in `bench.diagnosis.search.verdict_rules`.
+Which effects does the search find, and are they better than their competing models? Do held-out
+runs confirm them? Which alternatives explain the data as well? Does the residual have structure?
+The thresholds are in `bench.diagnosis.search.verdict_rules`.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Refit the model found by the search and its close rivals to convergence.
+"""Refit the model found by the search and its close competing models to convergence.
 
 The search tests few candidates about each model, and stops fits that fall behind. A diagnosed cause
 must be compared with all rivals, each at its own optimum.
@@ -16,13 +16,13 @@ from bench.diagnosis.search.effect_search import EffectSearch
 from bench.diagnosis.search.lack_of_fit import assess_lack_of_fit
 
 MAX_COMPETITOR_DISTANCE = 30.0
-"""Maximum difference in twice the log-likelihood (merit) of rivals that are refitted."""
+"""Maximum difference in twice the log-likelihood (merit) of competing models that are refitted."""
 MAX_COMPETITOR_EXCESS_RATIO = 1.5
-"""Maximum excess of rivals that are refitted, as a multiple of the excess of the model."""
+"""Maximum excess of refitted competing models, as a multiple of the excess of the model."""
 
 
 def refine_best_model(search: EffectSearch, model: FittedModel) -> FittedModel:
-    """Refit a model and its promising rivals of the same size to convergence.
+    """Refit a model and its promising competing models of the same size to convergence.
 
     If the residual is noise, generalised least squares is used. If it has structure, ordinary least
     squares is used, because the structure is not noise and would distort the fit.
@@ -45,8 +45,8 @@ def refine_best_model(search: EffectSearch, model: FittedModel) -> FittedModel:
     submodels = list_submodels(search, model)
     noise = _estimate_model_noise(search, model)
     compared_models = [model]
-    # With structure in the residual, merit only compares how well models mimic it, so no rival
-    # replaces the model.
+    # With structure in the residual, merit only compares how well models mimic it, so no competing
+    # model replaces the model.
     if noise is not None:
         compared_models = [
             m
@@ -92,7 +92,7 @@ def _differs_in_one(model: FittedModel, other_model: FittedModel) -> bool:
 def _make_swapped_start(
     search: EffectSearch, model: FittedModel, other_model: FittedModel
 ) -> FitStart:
-    """Return a start for a rival in which all shared effects have the values of the model.
+    """Return a start for a competing model, with all shared effects at the values of the model.
 
     A law with several coefficients converges to slightly different values each time, which would
     make equivalent models look different.

@@ -1,7 +1,7 @@
 """Search of long recordings on thinned runs first, confirmed on all samples.
 
-The model found and its close rivals are fitted to all samples. The search is repeated on all
-samples only if these show more than the thinned runs did.
+The model found and its close competing models are fitted to all samples. The search is repeated on
+all samples only if these show more than the thinned runs did.
 """
 
 from __future__ import annotations

@@ -303,8 +303,8 @@ def decide_early_stop_verdict(
     """Return the verdict of a search that ended early, which claims only what was tested.
 
     If a question is open, the verdict is neither adequate nor named. Causes are accepted if they
-    were compared with their rivals and on held-out runs; otherwise they are listed, but not
-    accepted.
+    were compared with their competing models and on held-out runs; otherwise they are listed, but
+    not accepted.
 
     Args:
         causes: number of causes found.

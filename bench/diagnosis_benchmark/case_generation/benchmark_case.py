@@ -1,4 +1,4 @@
-"""Benchmark case: recipe of a recording with a hidden cause, and its truth."""
+"""Benchmark case: recipe of a recording with a hidden cause, and its true causes."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """Sampling of cases for ball, pendulum and slider.
 
 `draw_case` chooses what is hidden and how strongly. `write_case` writes the recording and, in a
-separate file, the truth. Everything that is drawn follows from the name of the case; a case is a
-recipe without data.
+separate file, the true causes. Everything that is drawn follows from the name of the case; a case
+is a recipe without data.
 """
 
 from __future__ import annotations

@@ -120,7 +120,7 @@ class RecordingConditions:
 
     @property
     def is_driven(self) -> bool:
-        """Whether there is an input."""
+        """True if there is an input."""
         return bool(self.scenarios[0].inputs)
 
     def make_true_system(

@@ -88,7 +88,7 @@ class MachineDynamics(ABC):
 
     @property
     def has_dry_friction(self) -> NDArray[np.bool_]:
-        """Whether each joint has dry friction, (N,)."""
+        """True if each joint has dry friction, (N,)."""
         rubs = (self.dry > 0) | (self.extra > 0)
         if self.patch:
             rubs[self.patch[0]] = True

@@ -128,7 +128,7 @@ def _count_stale_samples(run: Run) -> tuple[int, float]:
     """Count samples that repeat the previous one during fast motion.
 
     Returns:
-        The count, and the count expected by chance.
+        The count, and its expected value under the null hypothesis.
     """
     signals = [values for values in run.channels.values() if np.isfinite(values).sum() > 3]
     if not signals or run.times.size < 4:

@@ -84,7 +84,7 @@ def check_recording_plausible(
 
 
 def odd_logs(recording: Recording) -> Iterator[Anomaly]:
-    """Yield what was left out of a recording's logs, and units that they do not state."""
+    """Yield the omissions from a recording's logs, and units that they do not state."""
     yield from (Anomaly(note, False) for note in recording.notes)
     yield from may_be_normalised(recording)
 

@@ -34,7 +34,7 @@ class TracedArray(NDArrayOperatorsMixin):
     Args:
         graph: graph that contains the nodes.
         nodes: array of any shape with dtype object.
-        mask: whether it contains truth values.
+        mask: whether it contains Booleans.
     """
 
     def __init__(self, graph: ExpressionGraph, nodes: Any, mask: bool = False) -> None:
@@ -241,7 +241,7 @@ def _apply_elementwise(graph: ExpressionGraph, name: str, args: Sequence[Any]) -
     name = OPERATION_ALIASES.get(name, name)
     masks = [isinstance(arg, TracedArray) and arg.mask for arg in args]
     if all(masks) and name not in BOOLEAN_OPERATIONS:
-        raise NotTraceableError(f"numpy.{name} of truth values is not traced")
+        raise NotTraceableError(f"numpy.{name} of Booleans is not traced")
     node_arrays = [to_node_array(_to_nodes(graph, arg)) for arg in args]
     return TracedArray(
         graph, apply_elementwise(graph, name, node_arrays), name in BOOLEAN_OPERATIONS

@@ -55,7 +55,7 @@ class JointBody(Protocol):
     """Body on one hinge or guide in an engine."""
 
     open_loop: bool
-    """Whether the system's drive depends on its inputs alone."""
+    """True if the system's drive depends on its inputs alone."""
 
     def reset_world(self, constants: dict[str, float]) -> None:
         """Prepare the world for a rollout with these constants."""

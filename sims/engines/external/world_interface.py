@@ -26,7 +26,7 @@ class JointWorldModule(Protocol):
     """World module of a one-coordinate system: a body on one hinge or guide."""
 
     OPEN_LOOP: bool
-    """Whether the drive depends on the inputs alone.
+    """True if the drive depends on the inputs alone.
 
     If True, the engine runs on its own while the inputs are constant.
     """

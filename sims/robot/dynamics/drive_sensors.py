@@ -108,7 +108,7 @@ class DriveSensorModel:
         readings[lanes[:, None, None], np.arange(steps)[:, None], columns] = shown
 
     def _by_control(self, actuator: Actuator) -> Array:
-        """Return the immediate joint force per unit of an actuator's control, (LANES,)."""
+        """Return the immediate joint force per unit of an actuator's control, (N,)."""
         gear = float(self.robot.compiled.actuator_gear[actuator.id, 0])
         gain: Array = self.batch.fields["actuator_gainprm"][:, actuator.id, 0]
         direct = actuator.kind in ("motor", "position", "velocity")

@@ -147,12 +147,12 @@ class LinearisationPoints:
 
     @property
     def reads_drives(self) -> bool:
-        """Whether any output is a drive force."""
+        """True if any output is a drive force."""
         return bool((self._drives >= 0).any())
 
     @property
     def reads_others(self) -> bool:
-        """Whether any output is not a drive force."""
+        """True if any output is not a drive force."""
         return bool((self._drives < 0).any())
 
     def step_displaced(

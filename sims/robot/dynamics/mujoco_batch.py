@@ -142,7 +142,7 @@ class MujocoBatch:
     """Batch of simulations of a robot.
 
     Attributes:
-        fields: present model fields of the batch elements, (LANES, ...) by name.
+        fields: present model fields of the batch elements, (N, ...) by name.
         batch: the mujoco.batch.Batch.
         places: addresses of the joints of the robot's file.
         second: addresses of the joints in series with them.
@@ -217,7 +217,7 @@ class MujocoBatch:
         return int(self.model.nbuffer + sum(values.nbytes for values in own))
 
     def write_effects(self, acting: ActiveEffects) -> None:
-        """Write model-field effects, with coefficients (K, LANES, 1), into the batch's fields."""
+        """Write model-field effects, with coefficients (K, N, 1), into the batch's fields."""
         for name in self._changed:
             self.fields[name][...] = self._stated[name]
         was_derived = any(self._derives(name) for name in self._changed)
@@ -460,7 +460,7 @@ class MujocoBatch:
             places: addresses of D joints.
 
         Returns:
-            (LANES, D) stiffness; zero for joints without a position servo.
+            (N, D) stiffness; zero for joints without a position servo.
         """
         robot = self.robot
         result = np.zeros((self.count, len(places.velocities)))

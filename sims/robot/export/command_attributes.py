@@ -64,12 +64,12 @@ class _Actuator:
 
     @property
     def linear(self) -> bool:
-        """Whether the force is a gain times one control (possibly filtered) plus a bias."""
+        """True if the force is a gain times one control (possibly filtered) plus a bias."""
         return self.single and (self.direct or self.filtered) and self.fixed and self.steady
 
     @property
     def steady(self) -> bool:
-        """Whether the bias has a constant term, or can be given one."""
+        """True if the bias has a constant term, or can be given one."""
         import mujoco
 
         kinds = (int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE))
@@ -77,7 +77,7 @@ class _Actuator:
 
     @property
     def filtered(self) -> bool:
-        """Whether a linear filter without limits precedes the actuator."""
+        """True if a linear filter without limits precedes the actuator."""
         import mujoco
 
         kinds = (int(mujoco.mjtDyn.mjDYN_FILTER), int(mujoco.mjtDyn.mjDYN_FILTEREXACT))

@@ -54,7 +54,7 @@ class XmlElement:
 
     @property
     def has_changes(self) -> bool:
-        """Whether the element or any of its descendants has changes."""
+        """True if the element or any of its descendants has changes."""
         has_tag_changes = self.new or self.removed or self.renamed or self.before or self.after
         has_content_changes = self.within or self.inserted or self.text is not None
         return bool(has_tag_changes or has_content_changes) or any(

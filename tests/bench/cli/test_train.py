@@ -233,7 +233,7 @@ def test_broken_weights_are_refused_with_one_line(experiment, cache, capsys, spo
         ),
         (
             ["tunenet", "bounce-shot"],
-            "simulator bounce-shot: expected an experiment that tunes it; none of the project",
+            "simulator bounce-shot: expected an experiment that tunes it; no built-in experiment",
         ),
     ],
 )
@@ -266,7 +266,7 @@ def test_the_default_experiment_is_printed_and_finds_the_weights(tmp_path, capsy
     assert main(["train", *words]) == 0
     said = capsys.readouterr().out.splitlines()
     assert said[0] == "experiment: ball-drop"
-    assert said[-1] == "found by: simgap compare ball-drop --training-budget 40"
+    assert said[-1] == "used by: simgap compare ball-drop --training-budget 40"
     assert (tmp_path / "out" / "loss.csv").is_file()
 
 
