@@ -56,7 +56,7 @@ def imports():
     return {module: graph.find_modules_directly_imported_by(module) for module in graph.modules}
 
 
-def test_the_rooms_of_the_harness_are_these():
+def test_the_packages_of_the_harness_are_listed():
     there = {p.stem for p in (ROOT / "bench").iterdir() if p.suffix == ".py" or p.is_dir()}
     assert there - {"__init__", "__pycache__"} == ROOMS
 

@@ -27,7 +27,7 @@ def python(code, cwd, **environment):
     )
 
 
-def test_every_name_is_there_and_means_what_type_checkers_are_told():
+def test_every_name_exists_with_the_type_of_its_stub():
     tree = ast.parse((ROOT / "simgap.pyi").read_text())
     imports = [n for n in tree.body if isinstance(n, ast.ImportFrom)]
     told = {alias.name: n.module for n in imports for alias in n.names}
@@ -75,7 +75,7 @@ def test_what_hides_a_package_is_named_in_one_line(name, kind, tmp_path):
     assert (said.returncode, said.stderr) == (2, f"simgap: error: {wanted}\n")
 
 
-def test_a_script_beside_a_file_that_hides_a_package_is_refused(tmp_path):
+def test_a_script_next_to_a_file_that_hides_a_package_is_refused(tmp_path):
     """Python searches the folder of the script first, not the working directory."""
     (tmp_path / "sims.py").write_text("")
     (tmp_path / "mine.py").write_text("import simgap")

@@ -188,7 +188,7 @@ def explained(tmp_path_factory):
     return folder
 
 
-def test_the_truth_of_a_simulated_recording(explained):
+def test_the_parameters_of_a_simulated_recording(explained):
     assert list(read_toml(explained / "swing.truth.toml")) == told("### `NAME.truth.toml`")
 
 

@@ -75,7 +75,7 @@ def test_its_run_ends_in_the_status_that_it_deserves(statuses, held, name):
     assert not set(status["reason"]) & set("\0\x1b\r")
 
 
-def test_rivals_have_the_same_rows_to_the_last_bit_with_and_without_them(met, tmp_path):
+def test_other_tuners_have_the_same_rows_with_and_without_them(met, tmp_path):
     made = attack_arena.compared(
         tmp_path, RIVALS, (), ("--salt", attack_arena.SALT),
         targets=1, seeds=1, timeout=1.5, training_budget=20,
@@ -86,7 +86,7 @@ def test_rivals_have_the_same_rows_to_the_last_bit_with_and_without_them(met, tm
     pd.testing.assert_frame_equal(among, apart, check_exact=True)
 
 
-def test_nothing_outlives_them_and_nothing_is_spoilt(met):
+def test_nothing_outlives_them_and_nothing_is_damaged(met):
     assert attack_arena.left(met) == ([], [])
     weights = met / "cache" / "x.npz"
     assert weights.read_bytes() == b"of another"

@@ -141,7 +141,7 @@ def test_every_run_of_a_cheater_has_a_status_and_its_rows(met):
     assert (cheaters["simulations"] == 12).all()
 
 
-def test_rivals_have_the_same_rows_to_the_last_bit_with_and_without_cheaters(met, alone):
+def test_other_tuners_have_the_same_rows_with_and_without_cheaters(met, alone):
     among, apart = (
         attack_arena.rows(attack_arena.stored(f).runs, attack_arena.RIVALS) for f in (met, alone)
     )

@@ -28,7 +28,7 @@ REFUSED = (
 
 
 @pytest.mark.parametrize("line", [line for line in SOUND if not any(r in line for r in REFUSED)])
-def test_what_is_not_spoilt_is_taken(ready, tmp_path, line):
+def test_undamaged_files_are_accepted(ready, tmp_path, line):
     _, there = ready
     files = {**files_of_arguments(), "worldly.toml": valid_input.toml(valid_input.WORLDLY)}
     for path in there["film"].iterdir():

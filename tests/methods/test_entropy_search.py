@@ -24,7 +24,9 @@ def bowl(centre: float) -> GaussianProcess:
 
 
 @pytest.mark.parametrize("truth", [0.0, 0.3, 0.77])
-def test_probability_of_the_minimiser_sums_to_one_and_peaks_at_the_truth(truth: float) -> None:
+def test_probability_of_the_minimiser_sums_to_one_and_peaks_at_the_minimum(
+    truth: float,
+) -> None:
     grid = np.linspace(0.0, 1.0, 101)[:, None]
     p = compute_minimiser_probability(bowl(truth), grid, 400, np.random.default_rng(0))
     assert p.sum() == pytest.approx(1.0, abs=1e-12)

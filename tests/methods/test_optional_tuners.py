@@ -61,7 +61,7 @@ def npe():
 
 
 @needs_sbi
-def test_the_posterior_knows_the_truth_and_how_well(npe):
+def test_the_posterior_is_centred_and_calibrated(npe):
     off, inside = [], 0
     for seed in range(10):
         trace, truth = run(npe, Toy(), seed, budget=60)

@@ -136,7 +136,7 @@ def test_two_parameters_three_runs_two_channels(two):
     assert error[10] < 1e-7
 
 
-def test_missing_samples_leave_the_truth_where_it_was(two):
+def test_missing_samples_do_not_move_the_optimum(two):
     def spoil(observed):
         observed[10:20] = np.nan
         observed[60:120, 1] = np.nan  # one channel of one run is missing completely

@@ -50,7 +50,7 @@ def tree(tmp_path):
 
 
 @pytest.mark.slow
-def test_killed_survived_and_broken_are_told_apart_and_the_file_is_put_back(tree):
+def test_killed_survived_and_broken_are_distinguished_and_the_file_is_put_back(tree):
     ends = [
         tried(ADD, tree),
         tried(replace(ADD, tests=("test_sums.py::test_nothing",)), tree),

@@ -10,7 +10,7 @@ def names(folder):
     return sorted(path.name for path in folder.iterdir())
 
 
-def test_a_file_is_replaced_whole_and_nothing_stays_beside_it(tmp_path):
+def test_a_file_is_replaced_whole_and_nothing_stays_next_to_it(tmp_path):
     path = tmp_path / "a.txt"
     path.write_text("old")
     atomic_files.write_atomically(path, "π")

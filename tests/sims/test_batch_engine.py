@@ -40,7 +40,7 @@ def force_program(request, monkeypatch):
     ("system", "position", "rate"),
     [("ball", 5e-7, 0), ("pendulum", 5e-4, 1e-3), ("slider", 1e-5, 5e-5), ("servo", 2e-5, 0)],
 )
-def test_agrees_with_scipy_on_fifty_random_lanes(system, position, rate):
+def test_agrees_with_scipy_on_fifty_random_elements(system, position, rate):
     worst = np.max([errors(system, seed) for seed in range(50)], axis=0)
     tolerance = {"ball": [position] * 3, "servo": [position]}.get(system, [position, rate])
     assert (worst < tolerance).all(), worst
@@ -128,7 +128,7 @@ def test_bounces_die_out_and_the_ball_rests_and_glides(fixed):
     )
 
 
-def test_every_lane_may_bounce_many_times_within_one_step():
+def test_every_element_may_bounce_many_times_within_one_step():
     times = np.array([0.0, 4.0])
     theta = np.linspace(0.3, 0.9, 13)[:, None]
     scenario = Scenario(times, {"z": 2.0})
@@ -233,7 +233,7 @@ def test_friction_in_two_dimensions_follows_the_direction_of_motion():
 
 
 @pytest.mark.parametrize("system", list(SIMULATORS))
-def test_a_lane_depends_on_itself_alone(system):
+def test_an_element_depends_on_itself_alone(system):
     cls, rng = SIMULATORS[system], np.random.default_rng(5)
     names = [*FORCES[system], "sensor.delay", "clock.skew", "sensor.lag"]
     if system != "ball":
@@ -343,7 +343,7 @@ def test_stiff_servo_stays_stable_at_the_corner_of_its_bounds():
     np.testing.assert_allclose(coarse, fine, atol=2e-5)
 
 
-def test_one_sample_and_no_lanes():
+def test_one_sample_and_no_elements():
     pendulum = Pendulum(engine="batch")
     assert pendulum.simulate(
         np.array([[3e-3]]), Scenario(np.array([1.0]), {"q": 0.2})

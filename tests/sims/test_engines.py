@@ -248,7 +248,7 @@ def test_any_effect_runs_on_any_engine(engine, fresh_registries):
 
 
 @pytest.mark.parametrize(("system", "engine", "settings"), BUILDS)
-def test_lanes_do_not_depend_on_their_neighbours(system, engine, settings):
+def test_elements_do_not_depend_on_their_neighbours(system, engine, settings):
     kind = SIMULATORS[system]
     simulator, run, theta = (
         kind(engine=engine, **settings),
@@ -262,7 +262,7 @@ def test_lanes_do_not_depend_on_their_neighbours(system, engine, settings):
 
 
 @pytest.mark.parametrize(("system", "engine", "settings"), BUILDS)
-def test_lanes_of_different_runs_come_out_as_alone(system, engine, settings):
+def test_elements_of_different_runs_come_out_as_alone(system, engine, settings):
     kind = SIMULATORS[system]
     simulator, theta = kind(engine=engine, **settings), theta_for(kind, 3)
     runs = [Scenario(np.arange(n) * dt) for n, dt in ((60, 0.02), (40, 0.013), (1, 1.0))]
@@ -278,7 +278,7 @@ def test_lanes_of_different_runs_come_out_as_alone(system, engine, settings):
 
 @pytest.mark.parametrize(("system", "engine", "settings"), BUILDS)
 @pytest.mark.parametrize("broken", [np.nan, np.inf])
-def test_non_finite_parameters_give_nan_lanes(system, engine, settings, broken):
+def test_non_finite_parameters_give_nan_elements(system, engine, settings, broken):
     kind = SIMULATORS[system]
     simulator, run, theta = (
         kind(engine=engine, **settings),

@@ -86,7 +86,7 @@ def test_what_was_read_alone_does_not_know_its_simulator(path):
         read_extended(path).simulator()
 
 
-def test_a_class_is_told_by_what_was_fitted(path):
+def test_a_class_is_described_by_its_fit(path):
     kind = load_extended(path, simulators.get)
     assert kind.source_digest == load_extended(path, simulators.get).source_digest
     drag = {"drag.linear": {"coefficient": FittedValue(8e-4, "N*m*s/rad", None, None)}}

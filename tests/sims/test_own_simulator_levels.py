@@ -46,7 +46,7 @@ def level(times, start, tap):
     return end + (start - end) * np.exp(-DRAIN * times)
 
 
-def test_a_tub_fills_to_its_rim_stays_there_and_drains_from_it():
+def test_a_tank_fills_to_its_rim_stays_there_and_drains_from_it():
     tub = FirstOrderTank(fixed={"state.overflow": RIM})
     (seen,) = tub.simulate(THETA, Scenario(TIMES, {"level": 0.2}, {"tap": TAP}))[:, :, 0]
     filled = np.minimum(level(TIMES, 0.2, 0.6), RIM)

@@ -52,7 +52,7 @@ def test_a_gap_costs_only_its_own_steps():
     np.testing.assert_allclose(plan.ends[0, 8:10], [0.09, 0.09], rtol=1e-15)
 
 
-def test_lanes_of_unequal_rate_and_length_do_not_share_steps():
+def test_elements_of_unequal_rate_and_length_do_not_share_steps():
     plan = planned([0.0, 0.01, 0.02], [0.0, 0.03])
     assert plan.steps_per_sample == 1
     np.testing.assert_allclose(plan.steps, [[0.01, 0.01, 0.0], [0.01, 0.01, 0.01]], atol=1e-15)
@@ -60,7 +60,7 @@ def test_lanes_of_unequal_rate_and_length_do_not_share_steps():
     np.testing.assert_allclose(plan.ends, [[0.01, 0.02, 0.02], [0.01, 0.02, 0.03]], rtol=1e-12)
 
 
-def test_effects_on_time_move_the_instants_of_their_lanes_only():
+def test_effects_on_time_move_the_instants_of_their_elements_only():
     times = [0.0, 0.01, 0.02, 0.03]
     plan = planned(times, times, times, acting=((Late(), coefficients(0.015, 0.0, -0.005)),))
     kept = np.concatenate(
@@ -181,7 +181,7 @@ def test_scenarios_with_the_same_content_are_one_run():
     assert runs.scenario_index.tolist() == [0, 0, 1]
 
 
-def test_lanes_of_unequal_length_end_in_nan():
+def test_elements_of_unequal_length_end_in_nan():
     slider = Slider(engine="batch")
     runs = [Scenario(np.arange(n) / 10, {"v": 1.0}) for n in (3, 5)]
     seen = slider.simulate_batch(np.ones((3, 1)), [runs[0], runs[1], runs[0]])
@@ -190,7 +190,7 @@ def test_lanes_of_unequal_length_end_in_nan():
     assert np.isnan(seen[[0, 2], 3:]).all()
 
 
-def test_initial_states_may_be_given_lane_by_lane():
+def test_initial_states_may_be_given_by_element():
     slider, scenario = Slider(engine="batch"), Scenario(np.array([0.0, 0.5]), {"x": 9.0, "v": 2.0})
     seen = slider.simulate_batch(np.ones((2, 1)), [scenario] * 2, {"x": np.array([1.0, 3.0])})
     np.testing.assert_allclose(seen[:, :, 0], [[1.0, 2.0], [3.0, 4.0]], rtol=1e-13)

@@ -154,6 +154,6 @@ def test_an_effect_that_cannot_be_imported_is_left_out_and_says_why(monkeypatch)
     assert "wind.broken" not in list_effects_for(simulators.get("ball").system)
 
 
-def test_a_skipped_part_is_told_from_worker_to_parent_whole():
+def test_a_skipped_part_is_reported_by_the_worker_completely():
     error = pickle.loads(pickle.dumps(PartUnavailableError("tuner", "npe", "needs sbi")))
     assert (str(error), error.reason) == ("tuner npe cannot be used here: needs sbi", "needs sbi")

@@ -170,7 +170,7 @@ def test_a_single_run_holds_its_last_third_out(tmp_path):
     assert found.story.held_out.times[0][0] == pytest.approx(2.0)
 
 
-def test_a_free_swing_does_not_fix_gravity_and_length_besides(tmp_path):
+def test_a_free_swing_does_not_identify_gravity_and_length_too(tmp_path):
     path = table(tmp_path, swings(), noise=NOISE)
     found = explained(path, free=("gravity", "length"))
     assert found.verdict == "unidentifiable"
@@ -311,7 +311,7 @@ def test_what_only_tables_need_is_not_loaded():
     assert printed.stdout.split() == ["False", "False"], printed.stderr
 
 
-def test_a_mass_beyond_its_declared_range_is_fitted_and_told(tmp_path):
+def test_a_mass_beyond_its_declared_range_is_fitted_and_reported(tmp_path):
     """The slide has 95 kg, above the system's limit of 10 kg; no gain must replace the mass."""
     rng, mass, step = np.random.default_rng(0), 95.0, 0.01
     times, lines = step * np.arange(200), ["run,t,u,x"]

@@ -54,7 +54,7 @@ def test_shown_as_text_it_is_three_lines(named):
     assert repr(adequate) == "adequate: quiet"
 
 
-def test_what_cannot_be_told_apart_is_shown_together():
+def test_what_cannot_be_distinguished_is_shown_together():
     shown = repr(explanation_of(story("ambiguous")))
     assert "drag.linear or friction.coulomb: coefficient" in shown
 
@@ -81,7 +81,7 @@ def test_shown_in_a_notebook_it_is_the_report_in_a_frame(named):
     assert all(b64decode(picture).startswith(b"\x89PNG") for picture in pictures)
 
 
-def test_its_report_is_that_of_the_folder_but_for_the_files_beside_it(named, tmp_path):
+def test_its_report_is_that_of_the_folder_but_for_the_files_next_to_it(named, tmp_path):
     page = unescape(re.search('srcdoc="([^"]*)"', named._repr_html_())[1])
     written = named.write(tmp_path)[-1].read_text(encoding="utf-8")
     # Only the page in the folder contains a command that names a file of the folder.

@@ -113,7 +113,7 @@ def judged(fitted, held_out, left=NOTHING, base_error=1.0):
         ({}, {}, False),
     ],
 )
-def test_a_score_that_no_simulation_bears_out_is_no_finding(fitted, held_out, refuted):
+def test_a_score_that_no_simulation_confirms_is_no_finding(fitted, held_out, refuted):
     assert judged(fitted, held_out) is refuted
 
 

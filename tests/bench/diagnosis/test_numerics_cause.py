@@ -133,7 +133,7 @@ def test_data_made_with_the_files_own_step_are_not_explained_by_another(tmp_path
 
 
 @pytest.mark.slow
-def test_a_coarse_step_is_found_beside_a_cause(tmp_path):
+def test_a_coarse_step_is_found_with_a_cause(tmp_path):
     answer = explain(log(tmp_path, DAMPED, divide=4, integrator="RK4")).answer
     step, cause = answer.causes
     assert step.effect == "numerics.integrator"

@@ -50,7 +50,7 @@ def test_what_is_free_in_the_description_is_fitted(log):
 
 
 @pytest.mark.slow
-def test_a_number_that_is_mixed_up_is_frozen_and_said(log):
+def test_a_confounded_number_is_fixed_and_reported(log):
     said = []
     found = explain(log("damping@*", "mass@*", "inertia.armature@*"), say=said.append)
     assert found.verdict == "adequate"

@@ -72,7 +72,7 @@ def test_a_motion_that_does_not_happen_fixes_nothing(tmp_path, capsys):
     assert "  not identifiable mass: " in said
 
 
-def test_what_is_mixed_up_is_named(tmp_path, capsys):
+def test_confounded_numbers_are_named(tmp_path, capsys):
     path = recorded(tmp_path)
     by_name = {number.name: dict(number.mixed) for number in check_identifiability(path)}
     assert by_name["input.delay"]["input.hold"] > 0.99

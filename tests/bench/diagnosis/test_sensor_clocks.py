@@ -88,7 +88,7 @@ def test_a_clock_hides_no_cause_and_makes_none(tmp_path, clock, coulomb):
 
 
 @pytest.mark.parametrize("clock", CLOCKS)
-def test_the_census_says_what_the_clock_does(tmp_path, clock):
+def test_the_quality_check_describes_the_clock(tmp_path, clock):
     long = 40.0 if "drift" in clock else 6.0
     found = list(
         check_log_quality(*load_recording(log(tmp_path, 0.0, seconds=long, **CLOCKS[clock])))
@@ -103,7 +103,7 @@ def test_the_census_says_what_the_clock_does(tmp_path, clock):
         assert ("are lost" in line) == ("rows" in clock)
 
 
-def test_a_slip_in_the_only_run_is_named_at_its_stamp_and_borne_out_by_what_follows(tmp_path):
+def test_a_slip_in_the_only_run_is_named_at_its_stamp_and_confirmed_by_later_samples(tmp_path):
     """The log of a pendulum has stamps from 100 s on; its last third is held out."""
     times, mass, length, inertia = np.arange(0.0, 5.0, 0.02), 0.15, 0.1, 3.3e-3
 

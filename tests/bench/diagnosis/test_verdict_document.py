@@ -96,7 +96,7 @@ def test_it_cannot_be_changed():
         TURN.verdict = "named"
 
 
-def test_a_number_of_a_model_file_stands_beside_its_total():
+def test_a_number_of_a_model_file_stands_next_to_its_total():
     friction = FittedValue(-0.05, "N*m", -0.06, -0.04, stated=0.2, total=0.15)
     assert (
         format_fitted_value(friction)

@@ -201,7 +201,7 @@ def test_a_case_is_restored_from_its_json():
     assert render_recording(item) != render_recording(draw_case("clean", "servo", 6))
 
 
-def test_a_family_beside_one_of_its_places_is_one_answer():
+def test_a_family_with_one_of_its_places_is_one_answer():
     item = draw_case("clean", "arm2", 5)
     names = ["friction.coulomb@*", "friction.coulomb@elbow", "friction.stribeck@elbow"]
 

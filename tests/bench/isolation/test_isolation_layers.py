@@ -140,7 +140,7 @@ def test_it_sees_no_other_process():
     assert told("import os\nos.getppid()") == "0"
 
 
-def test_it_has_no_rights_beside_its_own():
+def test_it_has_no_additional_rights():
     assert "CapEff:\\t0000000000000000\\n" in told("open('/proc/self/status').read()")
     assert "NoNewPrivs:\\t1\\n" in told("open('/proc/self/status').read()")
 
@@ -186,7 +186,7 @@ def test_its_memory_is_counted_whatever_it_is_of(code):
     assert "Error" not in told(code)
 
 
-def test_the_seals_that_hold_are_listed_in_their_order():
+def test_the_active_isolation_layers_are_listed_in_order():
     from bench.benchmark.isolation.isolation_layers import ISOLATION_LAYERS
 
     seals = held()

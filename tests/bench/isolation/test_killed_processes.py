@@ -117,7 +117,7 @@ def test_what_is_killed_is_made_again_with_the_same_result(slow, what):
 
 
 @pytest.mark.parametrize("kills", [2, 3])
-def test_a_look_at_the_seals_is_begun_again_as_often_as_a_run(monkeypatch, kills):
+def test_a_check_of_the_isolation_is_repeated_as_often_as_a_run(monkeypatch, kills):
     ends = iter([KilledExternallyError("killed")] * kills + [("process",)])
 
     def looked():

@@ -185,7 +185,7 @@ told = st.one_of(
 
 @settings(max_examples=200, deadline=None, derandomize=True)
 @given(told, st.binary(max_size=64))
-def test_whatever_is_told_of_arrays_gives_arrays_or_is_foul(says, rest):
+def test_any_description_of_arrays_gives_arrays_or_an_error(says, rest):
     import json
 
     try:
@@ -227,7 +227,7 @@ def test_arrays_come_out_as_they_went_in(data):
         b'{"a": 1}\n',
     ],
 )
-def test_arrays_that_are_none_are_foul(says):
+def test_invalid_arrays_are_an_error(says):
     with pytest.raises(ProtocolError):
         unpack_arrays(body(says, bytes(16)))
 

@@ -46,7 +46,7 @@ class Learned(Tuner):
         return {"mean": self.learned_mean}
 
 
-def test_a_sealed_training_gives_the_weights_of_a_trusted_one_bit_for_bit(experiment):
+def test_an_isolated_training_gives_the_weights_of_a_trusted_one_bit_for_bit(experiment):
     sealed = train_or_load(experiment, lesson("school"))
     tuners.register(Learned)
     entry = lesson("school").entry
@@ -73,7 +73,7 @@ class Watch:
         self.told.append(told)
 
 
-def test_who_looks_on_is_told_and_changes_nothing(experiment, tmp_path, monkeypatch):
+def test_a_callback_is_informed_and_changes_nothing(experiment, tmp_path, monkeypatch):
     from bench.benchmark.problem.tuning_problem import TuningProblem
 
     path = tmp_path / "watched.py"
@@ -153,7 +153,7 @@ def test_a_training_that_cheats_fails_and_leaves_no_weights(name, says, experime
     assert not list(cache.glob("*")) if cache.exists() else True
 
 
-def test_weights_that_a_trusted_tuner_learned_are_not_those_of_a_sealed_one(experiment):
+def test_weights_of_a_trusted_tuner_are_not_those_of_an_isolated_one(experiment):
     from bench.benchmark.runner.tuner_training import compute_training_key
 
     entry = lesson("school").entry
@@ -187,7 +187,7 @@ def test_a_training_that_is_made_again_after_a_kill_must_ask_for_the_same(experi
         train_or_load(experiment, lesson("school"), anew=True)
 
 
-def test_an_installed_tuner_of_another_package_is_sealed_too(tmp_path, monkeypatch):
+def test_an_installed_tuner_of_another_package_is_isolated_too(tmp_path, monkeypatch):
     from importlib import metadata
 
     from bench.benchmark.runner.experiment_runner import prepare_experiment, run_experiment

@@ -81,7 +81,7 @@ def test_a_run_that_is_made_again_after_a_kill_must_ask_for_the_same(name, monke
         assert "requested other simulations" in trace.reason
 
 
-def test_tuners_die_with_their_nursery_and_another_is_begun():
+def test_tuners_end_with_their_fork_server_and_another_is_started():
     made = experiment("remembering", isolation="tuner")
     outcome(made)
     (tuner,) = below([psutil.Process()], "tuner")

@@ -189,7 +189,7 @@ def test_numbers_of_joints_are_no_guess(tmp_path):
     assert not any("order of joints" in line for line in made.checks)
 
 
-def test_an_order_is_told_by_the_distance_of_positions_from_commands():
+def test_an_order_is_found_by_the_distance_of_positions_from_commands():
     u, q = COMMANDS.T, POSITIONS.T
     assert order_of_commands(u, q) is None
     assert order_of_commands(u, q[[1, 2, 0]]) == [2, 0, 1]

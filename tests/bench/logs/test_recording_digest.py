@@ -76,7 +76,7 @@ def test_the_end_of_a_large_file_counts(log):
     assert compute_recording_digest(log) != before
 
 
-def test_a_model_named_beside_the_logs_counts(log):
+def test_a_model_named_next_to_the_logs_counts(log):
     def digest():
         (one,) = list_logs([log], Path("out"), {"model": log.parent / "other.xml"})
         return one.digest

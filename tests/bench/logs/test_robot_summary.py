@@ -64,7 +64,7 @@ def test_one_coefficient_of_a_family_is_that_of_every_place(tmp_path):
     assert np.abs(same - one).max() > 1e-4
 
 
-def test_a_wish_names_a_system_or_a_model(tmp_path):
+def test_a_specification_names_a_system_or_a_model(tmp_path):
     with pytest.raises(InputError, match="found neither"):
         simulate_recording(SimulationSpec())
     with pytest.raises(InputError, match="found both"):
@@ -105,7 +105,7 @@ def test_inspect_says_nothing_odd_of_a_sound_log(tmp_path, capsys):
     assert "odd:" not in capsys.readouterr().out
 
 
-def test_mends_of_a_model_are_said(tmp_path, capsys):
+def test_repairs_of_a_model_are_reported(tmp_path, capsys):
     urdf = """<robot name="r"><link name="base"/><link name="arm"><inertial><mass value="1"/>
     <inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial></link>
     <joint name="j" type="continuous"><parent link="base"/><child link="arm"/><axis xyz="0 1 0"/>

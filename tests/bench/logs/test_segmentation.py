@@ -106,7 +106,7 @@ def test_many_short_runs_are_all_there(kind):
 
 
 @pytest.mark.slow
-def test_explain_says_it_and_is_told_to_take_the_whole(tmp_path, monkeypatch):
+def test_explain_reports_it_and_an_option_takes_the_whole(tmp_path, monkeypatch):
     """In a clean log of the pendulum, no effect is missing, with segments or with the whole log."""
     from tests.bench.diagnosis.test_parameter_freezing import DAMPING, MODEL
 

@@ -58,7 +58,7 @@ def test_the_command_of_the_readme_just_works(tmp_path, capsys, monkeypatch):
         assert resting.std() == pytest.approx(0.005, rel=0.2)
 
 
-def test_the_recording_does_not_tell_the_truth(tmp_path):
+def test_the_recording_does_not_contain_its_parameters(tmp_path):
     write(Wish("ball", ["restitution=0.7654"], ["drag.quadratic=0.0123"]), tmp_path / "a.csv")
     description = (tmp_path / "a.toml").read_text()
     assert not any(
@@ -76,7 +76,7 @@ def test_the_same_seed_gives_the_same_bytes_and_another_does_not(tmp_path):
     assert read["a"] == read["b"] != read["c"]
 
 
-def test_draws_do_not_depend_on_what_else_is_asked():
+def test_draws_do_not_depend_on_further_requests():
     few = simulate_recording(Wish("ball", runs=2, noise=["0.01"], seconds=0.3)).recording
     many = simulate_recording(
         Wish("ball", runs=3, noise=["0.01"], seconds=0.3, effects=["drag.linear=0"])

@@ -113,7 +113,7 @@ def test_the_extension_was_found_on_a_recording_that_tells_nothing_of_the_target
     assert not drawn & met
 
 
-def test_the_recordings_truth_is_none_of_the_targets(tmp_path):
+def test_the_parameters_of_the_recording_differ_from_all_targets(tmp_path):
     made = write_calibration_recording(small(), "secret", tmp_path / "a.csv")
     again = write_calibration_recording(small(), "secret", tmp_path / "b.csv")
     other = write_calibration_recording(small(), "another", tmp_path / "c.csv")

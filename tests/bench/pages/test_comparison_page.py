@@ -215,7 +215,7 @@ def test_what_is_missing_or_failed_is_said():
 
 
 @pytest.mark.parametrize("name", ["table", "ert", "pairs", "who_wins", "break_even"])
-def test_a_table_is_saved_as_it_lies_beside_the_page(opened, shown, name):
+def test_a_table_is_saved_as_it_is_next_to_the_page(opened, shown, name):
     grids = {"table": "numbers", "ert": "times", "pairs": "against", "who_wins": "winners"}
     grid = opened.page.locator(f"#{grids.get(name, 'even')}")
     saved = opened.saved(grid.get_by_role("button", name="save as CSV").click)

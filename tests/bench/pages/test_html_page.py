@@ -374,7 +374,7 @@ def test_one_stretch_of_time_is_zoomed_in_every_panel_and_the_vertical_axis_foll
     assert page.locator("#motion canvas").nth(3).screenshot() != before
 
 
-def test_at_the_cursor_stands_what_is_to_be_told_in_both_units(opened):
+def test_the_tooltip_has_the_values_in_both_units(opened):
     panel = opened.page.locator("#motion .panel").nth(3)
     panel.focus()
     for _ in range(3):

@@ -23,7 +23,7 @@ PLAIN = TunerEntry("tunenet", "tunenet")
 RANDOMISED = TunerEntry("tunenet-randomised", "tunenet", randomised=True)
 
 
-def test_coefficients_are_drawn_in_their_range_or_are_none():
+def test_coefficients_are_drawn_in_their_range_or_missing():
     drawn = RandomisedSimulator(TuningProblem(SHOT)).draw_coefficients(
         np.random.default_rng(1), 4000
     )
@@ -51,7 +51,7 @@ def test_the_effect_acts_on_each_simulation_with_its_own_coefficient():
     assert problem.simulated == 24, "counted like any others"
 
 
-def test_practice_counts_and_fences_as_before():
+def test_the_training_simulator_counts_and_limits_as_before():
     problem = TuningProblem(SHOT)
     ground = CountedTrainingSimulator(problem, 10, RandomisedSimulator(problem))
     rng = np.random.default_rng(3)

@@ -227,7 +227,7 @@ def test_every_shipped_experiment_has_tags():
 RECORDED = SPRING | {"ranges": ["real"], "recording": {"path": "logs/swing.csv"}}
 
 
-def test_a_recording_is_looked_for_in_its_folder_and_beside_the_experiment(tmp_path, monkeypatch):
+def test_a_recording_is_looked_for_in_its_folder_and_next_to_the_experiment(tmp_path, monkeypatch):
     monkeypatch.delenv("SIMGAP_DATA", raising=False)
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "xdg"))
     beside, data = tmp_path / "mine" / "logs", tmp_path / "data" / "logs"

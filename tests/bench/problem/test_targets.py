@@ -59,7 +59,7 @@ def test_a_comparison_meets_the_targets_of_another_and_searches_them_in_its_own_
 
 
 @pytest.mark.parametrize(("kind", "low", "high"), [("in", 2.0, 4.0), ("wide", 1.0, 5.0)])
-def test_start_and_truth_are_drawn_evenly_from_their_range(kind, low, high, spring):
+def test_start_and_true_parameters_are_drawn_evenly_from_their_range(kind, low, high, spring):
     problem = TuningProblem(spring_experiment())
     drawn = [problem.draw_target(kind, i) for i in range(200)]
     for rates in (
@@ -115,7 +115,7 @@ def test_held_out_runs_are_the_worlds_and_not_the_tuned_simulators():
     np.testing.assert_allclose(columns["param_error"], away / NARROW, rtol=1e-6)
 
 
-def test_held_out_runs_of_an_equal_world_are_predicted_at_the_truth():
+def test_held_out_runs_of_an_equal_world_are_predicted_at_the_true_parameters():
     results = prepare_experiment(slider(world={}))
     run_experiment(results, jobs=0)
     (columns,) = results.run_sink.columns.values()

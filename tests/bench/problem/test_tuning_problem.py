@@ -19,7 +19,7 @@ from bench.benchmark.runner.worker_tasks import RunRequest, execute_run
         pytest.param("arm-swing", 2, 120, 0.01, marks=pytest.mark.slow),
     ],
 )
-def test_truth_is_recovered_as_closely_as_the_noise_allows(name, index, budget, predicts):
+def test_true_parameters_are_recovered_up_to_the_noise(name, index, budget, predicts):
     experiment = load_experiment(name)
     problem = TuningProblem(experiment)
     target = problem.draw_target("in", index)

@@ -126,7 +126,7 @@ def test_plugin_file_is_part_of_the_names_wherever_it_lies(tmp_path):
     assert names[0] == names[2]
 
 
-def test_plugin_files_of_one_name_in_two_folders_are_told_apart(tmp_path):
+def test_plugin_files_of_one_name_in_two_folders_are_distinguished(tmp_path):
     for step, folder in enumerate(("a", "b")):
         (tmp_path / folder).mkdir()
         text = PLUGIN.format(step=step).replace('"mine"', f'"mine_{folder}"')

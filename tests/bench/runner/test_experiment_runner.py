@@ -104,7 +104,7 @@ def test_every_end_has_its_status_and_keeps_its_rows(two_workers):
     ).all()
 
 
-def test_pairing_all_tuners_share_target_start_and_truth(two_workers):
+def test_pairing_all_tuners_share_target_start_and_true_parameters(two_workers):
     rows = frame(two_workers)
     first = rows[rows["k"] == 0].groupby("target")
     assert (first["true_rate"].nunique() == 1).all()
@@ -142,7 +142,7 @@ def test_obs_error_is_the_rmse_of_the_recommended_simulation(two_workers):
         assert row["obs_error"] == pytest.approx(rmse, rel=1e-9)
 
 
-def test_tuner_that_searches_everything_for_the_truth_finds_none():
+def test_tuner_that_searches_everything_finds_no_true_parameters():
     once = {"targets": 1, "seeds": 1, "ranges": ["in"]}
     target = prepare_experiment(spring_experiment(**once)).problem.draw_targets()[0]
     cube = prepare_experiment(spring_experiment(**once)).problem.cube
@@ -159,7 +159,7 @@ def test_tuner_that_searches_everything_for_the_truth_finds_none():
     assert set(places) == set(range(len(seen))), "all that was observed, and no truth"
 
 
-def test_snooping_would_find_a_truth_that_is_there():
+def test_snooping_would_find_true_parameters_that_are_there():
     from tests.plugins.awkward import walk
 
     numbers = set()

@@ -138,7 +138,7 @@ def test_interrupt_ends_it_and_what_was_finished_is_kept(tmp_path, monkeypatch):
     ]  # fmt: skip
 
 
-def test_exit_and_what_is_raised_beside_the_loop_are_results_of_their_call(capsys):
+def test_exit_and_exceptions_outside_the_loop_are_results_of_their_call(capsys):
     def leave():
         sys.exit(3)
 
@@ -168,7 +168,7 @@ def test_class_of_a_notebook_is_refused_for_workers_before_anything_is_written(
         run_experiment(prepare_experiment(experiment), PLUGIN_FILES, jobs=1)
 
 
-def test_simulator_of_a_notebook_is_refused_too_and_a_redefined_one_is_not_remembered(monkeypatch):
+def test_simulator_of_a_notebook_is_refused_too_and_a_redefined_one_is_not_cached(monkeypatch):
     from bench.core.plugin_registries import simulators
 
     spring = simulators.get("spring")

@@ -37,7 +37,7 @@ def compared(log, tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_the_truth_is_recovered_from_the_log(compared):
+def test_the_true_parameters_are_recovered_from_the_log(compared):
     runs = pd.read_parquet(compared / "runs.parquet")
     ends = runs.sort_values("k").groupby("tuner").last()
     for name, value in TRUTH.items():
@@ -54,7 +54,7 @@ def test_the_truth_is_recovered_from_the_log(compared):
 
 
 @pytest.mark.slow
-def test_what_the_log_can_fix_stands_beside_the_errors(compared):
+def test_identifiable_numbers_are_next_to_the_errors(compared):
     table = pd.read_csv(compared / "identifiability.csv")
     assert list(table["target"]) == ["real-000"] * 2, "all starts have one log"
     assert table["stiff"].all()

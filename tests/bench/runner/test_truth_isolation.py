@@ -49,7 +49,7 @@ def test_errors_of_isolation_say_so_and_others_do_not(tmp_path, capsys):
     )
 
 
-def test_a_trusted_tuner_is_told_nothing_of_isolation(tmp_path, capsys, monkeypatch):
+def test_a_trusted_tuner_gets_no_message_about_isolation(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     tuners, plugin = ["reads_here", "keeps_log"], PLUGINS / "isolated.py"
     said, reasons = compared(tmp_path, capsys, tuners, plugin, "--trust")
@@ -77,7 +77,7 @@ def test_slow_imports_are_measured_and_a_shared_process_suggested(
         )
 
 
-def test_a_plugin_that_reads_a_file_when_it_is_imported_is_told_why_it_cannot(tmp_path, capsys):
+def test_a_plugin_that_reads_a_file_on_import_is_refused_with_the_reason(tmp_path, capsys):
     need("files")
     plugin = tmp_path / "reads.py"
     (tmp_path / "weights.txt").write_text("1")

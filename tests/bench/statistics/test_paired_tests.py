@@ -41,7 +41,7 @@ def test_targets_are_those_of_their_names_in_whichever_order_their_runs_ended():
     assert (line["a_better"], line["effect"], line["p_value"]) == (0.5, 0.0, 1.0)
 
 
-def test_the_truth_decides_then_held_out_runs_then_what_was_fitted():
+def test_true_parameters_decide_then_held_out_runs_then_fitted_runs():
     runs = pd.DataFrame({"param_error": [0.1, 0.2], "heldout_error": 0.3, "obs_error": 0.4})
     for metric, in_widths in (
         ("param_error", True),

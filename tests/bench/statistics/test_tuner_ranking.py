@@ -119,7 +119,7 @@ def test_the_best_of_equal_tuners_is_rarely_called_worse():
     assert excluded <= 5 + 2 * 2.2
 
 
-def test_a_covered_curve_is_told_up_to_where_it_coincides():
+def test_a_covered_curve_is_listed_up_to_where_it_coincides():
     points = [0, 1, 2, 3, 5]
     below = pd.Series([1, 0.1, 0.01, 0.009, 0.008], index=points)
     above = pd.Series([1, 0.1, 0.01, 1e-4, 1e-6], index=points)

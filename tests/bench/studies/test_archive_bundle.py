@@ -161,7 +161,7 @@ def test_a_file_that_is_changed_added_or_missing_is_named(
     assert found["comparisons"] == []
 
 
-def test_a_forger_who_mends_the_manifest_is_found_out_by_the_rows(compared, tmp_path, capsys):
+def test_a_forged_manifest_is_detected_by_the_rows(compared, tmp_path, capsys):
     files = content(compared)
     table = files["run/table.csv"].decode().splitlines()
     cells = table[1].split(",")
@@ -189,7 +189,7 @@ def word(verdict):
     ("change", "says"),
     [(coefficient, "drag.linear coefficient"), (held_out, "recomputed"), (word, "proven")],
 )
-def test_a_verdict_that_was_made_better_is_found_out(told, tmp_path, capsys, change, says):
+def test_an_improved_verdict_is_detected(told, tmp_path, capsys, change, says):
     files = content(told)
     verdict = json.loads(files["told/verdict.json"])
     change(verdict)
@@ -199,7 +199,7 @@ def test_a_verdict_that_was_made_better_is_found_out(told, tmp_path, capsys, cha
     assert any(says in doubt["says"] for doubt in found["explanation"]["doubts"])
 
 
-def test_another_recording_than_the_one_that_was_explained_is_found_out(told, tmp_path, capsys):
+def test_another_recording_than_the_explained_one_is_detected(told, tmp_path, capsys):
     files = content(told)
     rows = files["told/recordings/swing.csv"].decode()
     files["told/recordings/swing.csv"] = rows.replace("0.0", "0.1", 1).encode()
@@ -298,7 +298,7 @@ def test_an_archive_with_more_or_less_around_it_is_refused(
         (lambda f: f.update({"other/a.txt": b"a"}), "one folder with manifest.json in it"),
     ],
 )
-def test_a_manifest_that_is_none_is_refused(compared, tmp_path, capsys, change, says):
+def test_an_invalid_manifest_is_refused(compared, tmp_path, capsys, change, says):
     files = content(compared)
     change(files)
     code, found = verified(packed(tmp_path / "a.zip", files), capsys)

@@ -165,7 +165,7 @@ def test_configuration_and_environment_that_changed_are_named(run, tmp_path, cap
     )  # fmt: skip
 
 
-def test_the_table_is_written_once_and_faults_are_told(run, tmp_path, capsys):
+def test_the_table_is_written_once_and_errors_are_reported(run, tmp_path, capsys):
     other, out = copied(run, tmp_path, scaled(1.1)), tmp_path / "out.csv"
     _, found = differ(run, other, capsys, "--out", str(out))
     rows = pd.read_csv(out)

@@ -168,7 +168,7 @@ def test_a_folder_whose_salt_is_gone_is_not_resumed(sound, tmp_path, capsys):
         assert SECRET not in said
 
 
-def test_a_salt_beside_the_experiments_own_is_refused(tmp_path, capsys):
+def test_a_salt_in_addition_to_the_experiments_own_is_refused(tmp_path, capsys):
     (tmp_path / "e.toml").write_text(tomli_w.dumps(SPRING))
     command = ["compare", str(tmp_path / "e.toml"), *PLUGIN, "--out", str(tmp_path / "out")]
     assert main([*command, "--salt", "another"]) == 2
@@ -176,7 +176,7 @@ def test_a_salt_beside_the_experiments_own_is_refused(tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
-def test_seals_of_this_machine_and_of_a_folder_are_said(sound, capsys):
+def test_isolation_of_this_machine_and_of_a_folder_is_printed(sound, capsys):
     assert main(["status"]) == 0
     said = capsys.readouterr().out
     assert "process    active" in said

@@ -330,7 +330,7 @@ def test_friction_with_teeth_lags_by_half_a_tooth():
     assert teeth.push(0.8, [1.0]) == pytest.approx(0.3 * np.sin(2 * np.pi * 2.0))
 
 
-def test_a_binding_range_rubs_only_within_it():
+def test_a_binding_range_has_friction_only_within_it():
     world = World(roller(), foreign=Binding(0, 0.5, 3.0, 0.5))
     start = Run(STAMPS, {"m_axle": 0 * STAMPS}, np.zeros(1), np.array([2.0]))
     v = world.move(start, STAMPS).v[:, 0]

@@ -102,7 +102,7 @@ def test_each_run_has_its_own_and_a_short_one_none():
 
 
 @pytest.mark.slow
-def test_a_network_that_is_told_the_inputs_beats_one_that_is_not(told, blind):
+def test_a_network_that_reads_the_inputs_beats_one_that_does_not(told, blind):
     knows, guesses = errors(told, Driven()), errors(blind, Driven())
     assert knows[1] < 0.02 < guesses[1] / 2
     assert knows[3] < 1e-3 < guesses[3] / 5
@@ -117,7 +117,7 @@ def test_so_does_the_regressor():
     assert knows < 0.02 < guesses / 2
 
 
-def test_missing_samples_leave_the_truth_where_it_was(told):
+def test_missing_samples_do_not_move_the_optimum(told):
     def spoil(observed):
         observed[30:40] = np.nan
 

@@ -80,7 +80,7 @@ def test_what_helps_the_drive_is_not_transmitted():
     assert limit("friction.load_direction", helped, 0.3, 0.1) == pytest.approx(0.2 * WEIGHT)
 
 
-def test_a_joint_that_warms_lets_go_of_what_it_rubbed():
+def test_a_joint_that_warms_loses_friction():
     times, mass, time = np.arange(0, 4, 0.01), 1.5, 0.8
     cold = -np.expm1(-times / time)
     _, v = slide(times, {"friction.warming": (0.9, 0.0, time)}, mass, v=2.0)

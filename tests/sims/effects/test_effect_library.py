@@ -174,7 +174,7 @@ def test_what_does_not_fit_says_why(name, system, reason):
 
 @pytest.mark.parametrize("count", [1, 5])
 @pytest.mark.parametrize(("name", "system"), PAIRS)
-def test_zero_gives_nothing_and_shapes_are_those_of_the_lanes(name, system, count):
+def test_zero_gives_nothing_and_shapes_are_those_of_the_elements(name, system, count):
     effect = effects.get_effect(name)()
     rng = np.random.default_rng(7)
     size = len(SYSTEMS[system].coordinates)

@@ -129,7 +129,7 @@ def test_contact_friction_is_its_coefficient():
     assert effect.friction(lanes(-0.3)).tolist() == [[0.0]]
 
 
-def test_lanes_keep_to_themselves():
+def test_elements_do_not_influence_each_other():
     c = np.array([[[0.1], [0.2], [0.0]]])
     now = moment("slider", [[0.0]] * 3, [[1.0], [2.0], [3.0]])
     assert effects.get_effect("drag.quadratic")().force(c, now).tolist() == [[-0.1], [-0.8], [0.0]]

@@ -275,7 +275,7 @@ def test_friction_by_direction_decays_at_the_rate_of_its_way(way, rate):
     assert x == pytest.approx(3.0 * way * 2.0 / rate * -np.expm1(-rate / 2.0 * times), abs=1e-6)
 
 
-def test_what_rubs_one_way_alone_lets_a_spring_swing_back_freely():
+def test_friction_in_one_direction_lets_a_spring_swing_back_freely():
     """Half of each swing is damped, the other half conserves energy: amplitude falls once a
     period.
     """
@@ -335,7 +335,7 @@ def test_an_end_stop_without_loss_gives_back_what_it_takes(side):
 
 @pytest.mark.parametrize("stiffness", [300.0, 3000.0])
 @pytest.mark.parametrize(("loss", "speed"), [(0.05, 0.4), (0.5, 0.8), (1.5, 0.8)])
-def test_what_an_end_stop_gives_back_hangs_on_loss_and_speed_alone(stiffness, loss, speed):
+def test_the_rebound_of_an_end_stop_depends_on_loss_and_speed_alone(stiffness, loss, speed):
     """The rebound speed follows from w dw / (1 + a w) = -F dd / m on the way in and out.
 
     log((1 + a w) / (1 - a w')) = a (w + w'), with the rebound speed w'; for small a w, w' = w (1 -

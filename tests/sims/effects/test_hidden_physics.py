@@ -75,7 +75,7 @@ def test_surfaces_that_yield_take_the_work_of_their_curve():
     np.testing.assert_allclose(MASS * v**2 / 2, push * x - rubbed, rtol=2e-5, atol=1e-6)
 
 
-def test_what_yields_little_rubs_as_dry_friction_does():
+def test_stiff_hysteresis_acts_as_dry_friction():
     pulses = np.where(TIMES % 0.8 < 0.4, 3.0, -3.0)
     dry, _ = slide({"friction.coulomb": 0.7}, pulses)
     yielding, _ = slide({"friction.hysteresis": (0.7, 1e-4)}, pulses)
@@ -107,7 +107,7 @@ def test_what_is_off_changes_no_bit(off):
     np.testing.assert_array_equal(with_it, without)
 
 
-def test_lanes_with_and_without_a_state_are_each_as_alone():
+def test_elements_with_and_without_a_state_are_each_as_alone():
     names = ("joint.flexibility", "friction.hysteresis", "friction.coulomb")
     simulator = Slider(engine="batch", effects=names)
     run = Scenario(TIMES, {"x": 0.0, "v": 0.3}, {"u": np.sin(5 * TIMES)})
@@ -122,7 +122,7 @@ def test_lanes_with_and_without_a_state_are_each_as_alone():
     assert len({seen[-1, 0] for seen in together}) == 4
 
 
-def test_inertia_is_what_is_left_to_the_drives_side():
+def test_inertia_is_that_of_the_drive_side():
     from sims.effects.friction_hysteresis import FrictionHysteresis
     from sims.effects.transmission import JointFlexibility
 

@@ -116,7 +116,7 @@ def test_sensor_lag_of_a_jump_within_a_step_settles_as_an_exponential():
 
 
 @pytest.mark.parametrize("name", ["input.lag", "sensor.lag"])
-def test_lags_stand_still_while_a_lane_waits(name):
+def test_lags_stand_still_while_an_element_waits(name):
     steps = np.array([0.1, 0.1, 0.0, 0.0])
     felt = through(name, 0.05, [1.0, 1.0, 1.0, 1.0], steps)
     assert np.isfinite(felt).all()
@@ -128,7 +128,7 @@ def test_lags_stand_still_while_a_lane_waits(name):
     "name",
     ["input.lag", "sensor.lag", "input.deadband", "backlash", "input.saturation", "servo.profile"],
 )
-def test_lanes_that_are_off_keep_every_bit_beside_lanes_that_are_on(name):
+def test_elements_that_are_off_keep_every_bit_next_to_elements_that_are_on(name):
     effect = effects.get_effect(name)()
     given = signal(np.random.default_rng(5).normal(size=(3, 40)))
     change = effect.feel if effect.hook == "input" else effect.read
@@ -187,7 +187,7 @@ def test_a_motion_profile_follows_what_asks_for_less_and_falls_behind_what_asks_
     assert np.abs(beyond[500:]).max() > 0.05
 
 
-def test_a_motion_profile_stands_still_while_a_lane_waits():
+def test_a_motion_profile_stands_still_while_an_element_waits():
     steps = np.array([0.1, 0.1, 0.0, 0.0, 0.1])
     went = through("servo.profile", 2.0, np.ones(5), steps)
     assert went == pytest.approx([0.01 / 3, 0.07 / 3, 0.04, 0.04, 0.19 / 3])

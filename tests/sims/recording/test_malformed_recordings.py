@@ -243,14 +243,14 @@ GOOD_TABLE, GOOD_TOML = table(HEADER, ROWS).encode(), tomli_w.dumps(TOML).encode
 seen: Counter[str] = Counter()
 
 
-def test_unspoilt_it_is_sound(folder):
+def test_undamaged_it_is_valid(folder):
     assert outcome(folder, GOOD_TABLE, GOOD_TOML).startswith("('swing', {'mass': 1.5}, {'q': 0.01}")
 
 
 @pytest.mark.slow
 @SETTINGS
 @given(data=spoilt_tables())
-def test_spoilt_tables(folder, monkeypatch, data):
+def test_damaged_tables(folder, monkeypatch, data):
     monkeypatch.setattr("sims.recording.csv_table.MIN_FAST_PARSE_BYTES", 1 << 20)
     slow = outcome(folder, data, GOOD_TOML)
     monkeypatch.setattr("sims.recording.csv_table.MIN_FAST_PARSE_BYTES", 0)
@@ -261,7 +261,7 @@ def test_spoilt_tables(folder, monkeypatch, data):
 @pytest.mark.slow
 @settings(SETTINGS, max_examples=EXAMPLES // 2)
 @given(data=spoilt_descriptions())
-def test_spoilt_descriptions(folder, data):
+def test_damaged_descriptions(folder, data):
     outcome(folder, GOOD_TABLE, data)
 
 
@@ -274,9 +274,9 @@ def test_files_of_anything(folder, data, text):
     outcome(folder, GOOD_TABLE, text.encode("utf-8", "replace"))
 
 
-def test_most_of_the_spoilt_tables_were_spoilt():
+def test_most_of_the_damaged_tables_are_invalid():
     if not seen:
-        pytest.skip("needs test_spoilt_tables before it")
+        pytest.skip("needs test_damaged_tables before it")
     assert seen.total() >= EXAMPLES
     assert seen["refused"] > 0.6 * seen.total()
     assert seen["sound"] > 0.01 * seen.total()

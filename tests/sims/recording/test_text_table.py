@@ -72,7 +72,7 @@ def test_a_row_of_units_is_no_row_of_numbers(tmp_path):
     assert rows(log) == [list(row) for row in ROWS]
 
 
-def test_thousands_are_told_from_decimals(tmp_path):
+def test_thousands_are_distinguished_from_decimals(tmp_path):
     log = read(tmp_path, "t;q\n999,5;1,5\n1.000,5;2,25\n1.001,5;3\n")
     assert log.get_column("t").tolist() == [999.5, 1000.5, 1001.5]
     log = read(tmp_path, 't,q\n"1,000.5",1\n"1,001.5",2\n')
@@ -106,7 +106,7 @@ def test_columns_that_pandas_numbered_have_a_header(head, tmp_path):
     assert {"0", "1", "2"} <= set(log.list_columns())
 
 
-def test_numbers_are_called_by_the_names_beside_them_row_by_row(tmp_path):
+def test_numbers_have_the_names_next_to_them_row_by_row(tmp_path):
     head = "%time,field.name0,field.name1,field.position0,field.position1,field.velocity0\n"
     text = head + "1,knee,hip,0.5,0.25,3\n2,hip,knee,0.125,0.75,4\n"
     log = read(tmp_path, text)

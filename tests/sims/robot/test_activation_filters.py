@@ -111,7 +111,7 @@ def test_commands_before_a_run_set_its_first_activation():
     assert simulated(kind, scenario) == pytest.approx(angles[40:], abs=1e-9)
 
 
-def test_lanes_of_one_command_keep_their_own_activations():
+def test_elements_of_one_command_keep_their_own_activations():
     kind = simulator(POSITION)
     scenarios = [Scenario(TIMES, {"act.m": a}, {"u.m": COMMAND}) for a in (0.0, 0.5)]
     lanes = kind(observe=["q.hinge"]).simulate_batch(np.empty((2, 0)), scenarios)

@@ -41,7 +41,7 @@ def acting(lanes):
 
 @pytest.mark.parametrize("share", [1.0, 1e-6])
 @pytest.mark.parametrize("offset", [0.0, 0.0031])
-def test_what_a_lane_feels_does_not_hang_on_its_company_nor_on_other_drives(offset, share):
+def test_applied_inputs_do_not_depend_on_other_elements_or_drives(offset, share):
     earlier = {"u.m_elbow": np.array([[-0.3, -0.1], [0.4, 0.2]])}
     run = Scenario(TIMES, {}, WAY, offset=offset, before=earlier, linear=frozenset({"u.m_elbow"}))
 

@@ -116,7 +116,7 @@ class Changing(Plain):
         (Changing, "other numbers"),
     ],
 )
-def test_what_does_not_trace_is_told_once_and_asked_by_numpy(
+def test_untraceable_effects_are_reported_once_and_evaluated_by_numpy(
     arm, effect, says, capsys, monkeypatch
 ):
     elbow = next(spot for spot in arm.system.places["joint"] if spot.name == "elbow")

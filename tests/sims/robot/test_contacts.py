@@ -77,7 +77,7 @@ PILE = """<mujoco>{size}<worldbody><geom type="plane" size="3 3 0.1"/>
 
 
 @pytest.mark.parametrize("memory", [6, 20, 30])
-def test_a_lane_whose_contacts_do_not_fit_in_its_arena_has_failed(tmp_path, memory):
+def test_an_element_whose_contacts_do_not_fit_in_its_arena_has_failed(tmp_path, memory):
     boxes = "".join(
         f'<geom type="box" size="0.05 0.05 0.02" pos="{0.12 * k} 0 0"/>' for k in range(12)
     )

@@ -80,7 +80,7 @@ def test_the_motion_is_that_without_the_actuator(name, integrator):
     assert np.abs(expected - plain(kind, off=np.zeros_like(OFF))[0]).max() > 0.01
 
 
-def test_lanes_of_runs_switch_at_their_own_times_and_forget_it_afterwards():
+def test_elements_of_runs_switch_at_their_own_times_only():
     kind = simulator()
     masks = [OFF, TIMES > 0.3, np.zeros_like(OFF)]
     scenarios = [Scenario(TIMES, {}, COMMANDS, off={"m": mask}) for mask in masks]

@@ -256,7 +256,7 @@ def test_a_cubic_is_read_exactly_and_ends_of_steps_to_the_bit():
     assert linear[0, 0] == pytest.approx(0.75 * values[0, 0] + 0.25 * values[0, 1])
 
 
-def test_sensors_follow_each_other_in_the_lanes_where_they_act(arm):
+def test_sensors_follow_each_other_in_the_elements_where_they_act(arm):
     ends = STEP * np.arange(11)
     values = np.repeat(cubic(ends)[None], 3, axis=0)
     slopes = np.repeat((2.0 - 6.0 * ends + 120.0 * ends**2)[None], 3, axis=0)

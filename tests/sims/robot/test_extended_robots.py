@@ -208,7 +208,7 @@ def test_a_step_that_was_found_is_kept(model, path, kind, tmp_path):
     assert changed["numerics.integrator"]["integrator"].value == 3
 
 
-def test_two_models_are_told_apart(model, path, kind, tmp_path):
+def test_two_models_are_distinguished(model, path, kind, tmp_path):
     first = load_extended(path, simulators.get)
     write_extended(replace(model, robot=replace(model.robot, numerics={"timestep": 0.001})), path)
     assert load_extended(path, simulators.get).source_digest != first.source_digest

@@ -122,7 +122,7 @@ def test_a_move_and_the_way_back_agree():
         np.testing.assert_allclose(moves, 0.3 * np.eye(6)[[number] * 5], atol=1e-12)
 
 
-def test_a_turn_that_is_none_is_refused():
+def test_an_invalid_turn_is_refused():
     simulator, scenario = moving(SATELLITE, "q.boom", "u.m_boom", {"q.base.qw": 0.0})
     with pytest.raises(InputError, match=r"q\.base\.qw, .*: expected a quaternion, found zeros"):
         simulator.simulate(np.zeros((1, len(simulator.parameters))), scenario)

@@ -57,7 +57,7 @@ def test_a_broken_effect_of_a_user_is_left_out_alone(tmp_path, fresh_registries)
     assert "joint.slack@*" not in found or "shoulder" not in found["joint.slack@*"].places
 
 
-def test_lanes_of_a_model_that_does_not_compile_are_nan_and_the_others_are_simulated(
+def test_elements_of_a_model_that_does_not_compile_are_nan_and_the_others_are_simulated(
     kind, capsys, monkeypatch
 ):
     # The single check is disabled, since combinations of elements in series may fail to compile.

@@ -30,7 +30,7 @@ def one(value: float) -> dict[str, FittedValue]:
 @pytest.mark.parametrize(
     ("effect", "place", "c"), [one for one in STATED if one[0] != COUPLING_PLACEHOLDER[1]]
 )
-def test_a_cause_is_what_it_is_in_a_lane(
+def test_a_cause_is_the_same_in_a_batch_element(
     effect: str, place: str, c: tuple[float, ...], tmp_path: Path
 ) -> None:
     """The compiled model of a cause has the same fields as a batch element with the effect."""

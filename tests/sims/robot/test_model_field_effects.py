@@ -110,7 +110,7 @@ def moved(batch: Batch) -> Any:
 
 
 @pytest.mark.parametrize(("effect", "place", "c"), STATED)
-def test_a_lane_moves_as_the_file_that_states_it(
+def test_an_element_moves_as_the_file_that_states_it(
     effect: str, place: str, c: tuple[float, ...], tmp_path: Path
 ) -> None:
     """An element with a coefficient moves as a model whose file has the value; the element next to
@@ -127,7 +127,7 @@ def test_a_lane_moves_as_the_file_that_states_it(
     assert np.abs(stated[0] - plain[0]).max() > 1e-5
 
 
-def test_friction_is_stiff_in_the_lanes_where_it_acts_alone(tmp_path: Path) -> None:
+def test_friction_is_stiff_in_the_elements_where_it_acts_alone(tmp_path: Path) -> None:
     """With friction in the file, an element with a zero coefficient moves as the file, although
     another element has more friction.
     """

@@ -60,7 +60,7 @@ def test_its_elbow_stops_where_dry_friction_stops_it():
 
 
 @pytest.mark.parametrize(("torque", "moves"), [(0.0299, False), (0.0301, True)])
-def test_its_elbow_sticks_until_it_is_pushed_harder_than_it_rubs(torque, moves):
+def test_its_elbow_sticks_until_the_force_exceeds_its_friction(torque, moves):
     arm = make_log.Arm(gravity=0.0, friction=0.03)
     positions = arm.simulate(np.zeros(4), np.tile([0.0, torque], (50, 1)))
     assert np.any(positions) == moves

@@ -78,7 +78,7 @@ def test_a_pendulum_swings_as_its_equation_says_wherever_samples_lie(jitter):
     np.testing.assert_allclose(seen[:, 1], expected[:, 1], rtol=0, atol=1e-4 if jitter else 1e-8)
 
 
-def test_a_command_is_held_and_felt_as_its_mean_over_a_step():
+def test_a_command_is_held_and_applied_as_its_mean_over_a_step():
     times = np.arange(0, 0.3, 0.0137)
     u = np.sin(40 * times)
     seen = one(pendulum(), Scenario(times, {"q.hinge": 0.3}, {"u.motor": u}))
@@ -250,7 +250,7 @@ def test_forces_and_sensors_are_those_of_the_instant(integrator):
     assert np.ptp(seen[:, np.arange(13) != 10], axis=0).min() > 0, "it stays in its plane"
 
 
-def test_a_lane_that_explodes_is_nan_and_leaves_the_others(capfd, tmp_path, monkeypatch):
+def test_an_element_that_explodes_is_nan_and_leaves_the_others(capfd, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     kind = arm()
     simulator = kind(observe=JOINTS, effects=["spring.cubic@elbow", "force.ripple@shoulder"])
@@ -263,7 +263,7 @@ def test_a_lane_that_explodes_is_nan_and_leaves_the_others(capfd, tmp_path, monk
     assert not list(tmp_path.iterdir()), "MuJoCo writes no log"
 
 
-def test_lanes_give_the_same_bits_in_any_order_and_company():
+def test_elements_have_the_same_bits_in_any_order_and_batch():
     kind = arm()
     names = [
         "friction.coulomb@*", "friction.stribeck@elbow", "mass.scale@fore", "force.periodic@spin",

@@ -123,7 +123,7 @@ PENDULUM = """
         (["joint.backlash@axle", "joint.flexibility@axle"], [0.01, 0.003, 0.05]),
     ],
 )
-def test_links_hang_on_their_springs_and_flanks_when_a_run_begins(effects, c):
+def test_links_load_their_springs_and_flanks_when_a_run_begins(effects, c):
     """A servo that holds the weight of the link keeps it at rest."""
     held = {"u.m_axle": np.full(TIMES.size, -9.81 * 0.3 / 60.0)}
     seen = moved(made(PENDULUM), effects, c, Scenario(TIMES, {}, held))

@@ -53,7 +53,7 @@ def test_other_servos_have_none(settings):
     assert abs(measured) < 0.1 * STEP**2 * LIMIT / INERTIA
 
 
-def test_a_joint_that_hangs_on_another_moves_it_as_well():
+def test_a_coupled_joint_moves_the_other_as_well():
     text = """
     <mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody>
     <body><joint name="a" axis="0 0 1"/><geom type="capsule" size=".05" fromto="0 0 0 .4 0 0"/>

@@ -11,7 +11,7 @@ TIMES = np.arange(40) / 100.0
 SCENARIO = Scenario(TIMES, {"q.elbow": 0.4}, {"u.m_elbow": np.sin(9.0 * TIMES)})
 
 
-def test_a_lane_alone_moves_as_among_many_and_pays_for_itself_alone(tmp_path):
+def test_a_single_element_moves_as_in_a_batch_and_costs_no_more(tmp_path):
     (tmp_path / "arm.xml").write_text(ARM)
     kind = make_robot_simulator(tmp_path / "arm.xml", free=["damping@*", "mass@fore"])
     simulator = kind(observe=["q.shoulder", "q.elbow"])

@@ -107,7 +107,7 @@ def test_the_tangent_is_what_each_small_change_makes(integrator):
 
 
 @pytest.mark.parametrize("name", ["supply.sag@m_elbow", "friction.load@elbow"])
-def test_what_hangs_on_the_drive_moves_with_the_servo(name):
+def test_the_load_of_the_drive_moves_with_the_servo(name):
     """The linearisation includes a weak drive's response; with a fixed drive force the error would
     be 7 to 10 %.
     """

@@ -27,7 +27,7 @@ def moments(robot, name="arm"):
     return sorted(robot.compiled.body(name).inertia)
 
 
-def test_nothing_is_said_where_nothing_is_mended(mended):
+def test_nothing_is_reported_where_nothing_is_repaired(mended):
     robot, notes = mended(one())
     assert notes == []
     assert robot.joints[0].range == (-1, 1)
@@ -266,7 +266,7 @@ def test_meshes_enter_the_digest(write):
     assert read_robot(path).digest != before
 
 
-def test_the_base_does_not_collide_with_what_hangs_on_it(mended):
+def test_the_base_does_not_collide_with_its_children(mended):
     parts = [link("base", None, shape=ball(0.5)), link("arm", shape=ball(0.5))]
     robot_, notes = mended(robot(*parts, joint("j", "base", "arm")))
     assert notes == ["no contacts between the fixed base and what hangs on it: arm"]
@@ -305,7 +305,7 @@ def test_blank_lines_and_zeros_around_the_file_are_let_pass(write, tmp_path):
     assert len(read_robot(path).joints) == 1
 
 
-def test_a_joint_may_hang_on_a_world_that_is_no_link(mended):
+def test_a_joint_may_have_a_parent_world_that_is_no_link(mended):
     robot_, notes = mended(
         robot(
             link("base"),

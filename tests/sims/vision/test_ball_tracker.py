@@ -41,7 +41,7 @@ def upright(z):
 
 
 @pytest.mark.parametrize("seed", [3, 8, 12])
-def test_centres_are_within_half_a_pixel_of_the_truth_after_compression(seed, tmp_path):
+def test_centres_are_within_half_a_pixel_of_the_true_centre_after_compression(seed, tmp_path):
     camera, scene = stage(seed)
     points = upright(fall())
     write_video(tmp_path / "drop.mp4", scene.render_frames(points), TIMES, scene.look.crf)

@@ -44,7 +44,7 @@ def test_the_arc_finds_the_ball_where_its_shadow_spoils_a_side(seed):
     )
 
 
-def test_no_circle_is_none():
+def test_no_circle_gives_no_detection():
     line = np.stack([np.arange(36.0), np.zeros(36)], axis=1)
     assert circle_fit.fit_circle(line, None) is None
     assert circle_fit.fit_arc(np.ones((36, 2))) is None

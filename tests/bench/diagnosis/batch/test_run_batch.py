@@ -109,7 +109,7 @@ def test_a_log_that_cannot_be_explained_costs_no_other_and_what_is_there_stays(l
     assert (out / "day0" / "verdict.json").stat().st_mtime_ns != stamps[0]
 
 
-def test_what_is_none_of_its_own_is_left_alone(logs, tmp_path, capsys):
+def test_foreign_files_are_not_changed(logs, tmp_path, capsys):
     out = tmp_path / "out"
     out.mkdir()
     (out / "logs.json").write_text('{"mine": 1}')

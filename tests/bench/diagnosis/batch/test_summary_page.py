@@ -132,7 +132,7 @@ def test_nothing_explained_yet_is_a_page_too(tmp_path):
     assert "<figure" not in html
 
 
-def test_no_number_beside_a_chart_is_cut_off(browser, tmp_path):
+def test_no_number_next_to_a_chart_is_cut_off(browser, tmp_path):
     small = [
         LogResult(f"day{k}", "d", "named", (cause(-1.2345e-6 * (1 + 0.01 * k)),)) for k in range(3)
     ]

@@ -165,7 +165,7 @@ def test_a_scale_is_applied_to_the_column_and_its_noise(tmp_path):
         ({"u.m_elbow": -1}, '[inputs."u.m_elbow"] scale = -1'),
     ],
 )
-def test_a_robot_that_lacks_a_friction_too_is_told_its_wrong_unit(factors, line):
+def test_a_wrong_unit_is_reported_although_a_friction_is_missing_too(factors, line):
     recording, kind = load_joined([ARM], None, None, ())
     subject = Subject(kind, recording, None)
     found = fault_of(recording=subject.rescaled(factors), kind=kind)

@@ -100,7 +100,7 @@ def test_what_the_data_resolve_is_what_least_squares_says(sheet: DataSheet) -> N
     assert mean < reach.size < 30 * mean
 
 
-def test_drag_cannot_be_told_from_the_motors_own(sheet: DataSheet) -> None:
+def test_drag_cannot_be_distinguished_from_that_of_the_motor(sheet: DataSheet) -> None:
     """Any drag c fits the data if kt and R keep kt / R and kt^2 / R + c constant."""
     reach = row(sheet, "drag.linear").detection_limit
     assert reach is not None
@@ -179,7 +179,7 @@ def test_faults_are_one_line(log: Path, explained: Explanation, tmp_path: Path) 
     ("key", "value"),
     [("p_value", "x"), ("effect", 3), ("alternatives", 1), ("coefficients", []), ("verdict", "so")],
 )
-def test_a_spoilt_verdict_is_refused(
+def test_a_damaged_verdict_is_refused(
     log: Path, explained: Explanation, tmp_path: Path, key: str, value: object
 ) -> None:
     document = explained.answer.to_document()
@@ -202,7 +202,7 @@ def test_numbers_that_a_model_does_not_state_are_nominal(
     assert build_mjcf(bare, tmp_path).contents["model.xml"].count("frictionloss") == 0
 
 
-def test_a_joint_that_is_none_is_refused_before_the_search(
+def test_an_unknown_joint_is_refused_before_the_search(
     log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "sheet"

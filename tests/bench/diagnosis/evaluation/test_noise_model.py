@@ -19,7 +19,7 @@ from tests.bench.diagnosis.explained_samples import (
 
 
 @pytest.mark.parametrize("phi", [0.0, 0.4, 0.9, -0.3])
-def test_whitening_makes_noise_that_remembers_independent_and_of_variance_one(phi):
+def test_whitening_makes_autocorrelated_noise_independent_and_of_variance_one(phi):
     noise = NoiseModel(np.array([0.3, 7.0]), np.full(2, phi))
     made = correlated(np.random.default_rng(1), phi, noise.sigma, (40, 500, 2))
     white = whiten(made, everything(made), noise)
@@ -144,7 +144,7 @@ def test_the_portmanteau_test_is_that_of_ljung_and_box(phi, wave):
     assert both == pytest.approx(2 * chance, rel=1e-6, abs=0)
 
 
-def test_first_order_noise_is_told_from_structure_that_is_as_large():
+def test_first_order_noise_is_distinguished_from_structure_of_equal_size():
     seen = np.ones((4, 300, 2), dtype=bool)
     chances = {"noise": [], "structure": []}
     for seed in range(40):

@@ -30,7 +30,7 @@ def test_a_vector_holds_parameters_constants_set_free_and_coefficients():
     )
 
 
-def test_lanes_are_what_the_simulator_gives():
+def test_cached_elements_equal_the_simulation():
     made = []
     # The runs differ in length and sampling rate.
     for q, rate, samples in ((1.0, 50, 40), (0.4, 80, 90)):

@@ -17,7 +17,7 @@ def asked(cache, keys, made):
     return out[:, 0, 0].tolist(), [keys[place] for place in new]
 
 
-def test_a_lane_is_simulated_once_and_given_whenever_it_is_asked_for():
+def test_an_element_is_simulated_once_and_then_cached():
     cache = LaneCache()
     assert asked(cache, [b"a", b"b", b"a"], {b"a": 1.0, b"b": 2.0}) == ([1, 2, 1], [b"a", b"b"])
     # The other value of "a" shows that it is not simulated again.

@@ -58,7 +58,7 @@ def test_surrogates_of_few_samples_are_those_samples():
     assert set(np.abs(few).ravel()) <= {1.0, 2.0, 3.0}
 
 
-def test_what_a_fit_leaves_of_surrogates_remembers_as_much_as_what_it_left_of_the_noise():
+def test_residuals_of_surrogates_are_as_autocorrelated_as_those_of_the_noise():
     """Removing an offset and a slope from runs of 60 samples reduces the autocorrelation."""
     times = np.linspace(-1.0, 1.0, 60)
     absorbed, _ = np.linalg.qr(np.stack([np.ones(60), times], axis=1))

@@ -99,7 +99,7 @@ def test_little_work_starts_nobody(monkeypatch):
             assert {process for _, process in results} == {os.getpid()}
 
 
-def test_beside_a_thread_nobody_is_forked(monkeypatch):
+def test_no_process_is_forked_while_a_thread_runs(monkeypatch):
     monkeypatch.setattr(crews, "can_fork", can_fork)
     done = threading.Event()
     thread = threading.Thread(target=done.wait)

@@ -68,7 +68,7 @@ def test_the_run_that_differs_most_is_proposed_and_does_tell_them_apart(free):
     assert apart == pytest.approx(found.apart, rel=0.05)
 
 
-def test_equal_models_are_not_told_apart_by_any_run():
+def test_equal_models_are_not_distinguished_by_any_run():
     made = small_swing()
     search, model, _ = rivals(made, [0.003, 0.02], ("drag.linear", "drag.quadratic"))
     found = propose_discriminating_run(search, model, model)

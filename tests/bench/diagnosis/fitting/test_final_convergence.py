@@ -87,7 +87,7 @@ def test_a_model_that_cannot_be_simulated_stays_as_it_is(there):
     assert search.fit_to_convergence(lost) is lost
 
 
-def test_what_is_left_over_and_is_no_noise_does_not_pull_it_away(there):
+def test_a_residual_that_is_no_noise_does_not_bias_it(there):
     """A drift that no effect explains must not bias the converged fit.
 
     With AR(1) noise weighting, a smooth residual of the whole drift and a drag of zero would fit

@@ -90,7 +90,7 @@ def test_known_derivatives_follow_the_parameters_that_they_are_by():
     ("rest", "left", "suits"),
     [(0.09, 0.0, True), (0.11, 1.0, False), (0.6, 11.0, False), (0.6, 13.0, True)],
 )
-def test_a_step_suits_that_errs_by_little_of_the_noise_or_of_what_is_left(rest, left, suits):
+def test_a_step_suits_whose_error_is_small_against_the_noise_or_the_residual(rest, left, suits):
     own = IntegratorSettings(0.002, "Euler")
     fine = StepRefinement(object, own, own._replace(timestep=0.001), 5.0, rest)
     assert MAX_CORRECTED_ERROR == 0.1

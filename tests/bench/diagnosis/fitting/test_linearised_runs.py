@@ -67,7 +67,7 @@ def test_what_is_held_or_damped_forgets_and_what_swings_or_creeps_does_not(
     )
 
 
-def test_a_lane_that_was_simulated_is_not_simulated_again(tmp_path):
+def test_a_simulated_element_is_not_simulated_again(tmp_path):
     there = world(tmp_path, ARM.format(damping=0.4, drive=SERVO))
     theta = np.tile(there.get_nominal_theta(), (3, 1))
     runs = np.array([0, 1, 0])

@@ -111,7 +111,7 @@ def test_a_search_goes_over_pieces_unless_the_motion_forgets_how_it_began(
     assert bool(asked) is cuts
 
 
-def test_rivals_that_were_not_nominated_are_asked_before_a_cause_is_named(monkeypatch):
+def test_competitors_that_were_not_selected_are_tested_before_a_cause_is_named(monkeypatch):
     for module in (effect_search, model_moves):
         monkeypatch.setattr(module, "MAX_REFITTED_CANDIDATES", 1)
     dragged = Pendulum(effects=["drag.quadratic"])

@@ -58,14 +58,14 @@ def answer(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_a_mass_is_identified_beside_friction_that_the_file_lacks(answer):
+def test_a_mass_is_identified_with_friction_that_the_file_lacks(answer):
     """Without friction in the model, the fitted mass would be ten times too large."""
     assert answer.verdict == "named"
     assert answer.parameters["mass.scale@carriage"].value == pytest.approx(MASS / 100 - 1, abs=0.01)
 
 
 @pytest.mark.slow
-def test_the_friction_is_found_beside_it(answer):
+def test_the_friction_is_found_with_it(answer):
     causes = {cause.effect: cause for cause in answer.causes}
     assert set(causes) == {"friction.coulomb@screw", "drag.linear@screw"}
     numbers = {name: cause.coefficients["coefficient"].value for name, cause in causes.items()}

@@ -28,7 +28,7 @@ def test_soft_friction_is_named_alone_in_its_form():
 
 
 @pytest.mark.slow
-def test_damping_beside_a_stiff_servo_that_saturates():
+def test_damping_with_a_stiff_servo_that_saturates():
     verdict = answer("drag_stiff_servo_saturates")
     (cause,) = verdict.causes
     assert (verdict.verdict, cause.effect) == ("named", "drag.linear@elbow")
@@ -41,7 +41,7 @@ def test_a_four_bar_without_a_cause_is_adequate():
 
 
 @pytest.mark.slow
-def test_what_acts_alike_is_told_after_a_cause_that_does_not_hold_is_removed():
+def test_equivalent_effects_are_reported_after_a_rejected_cause_is_removed():
     """The servo's damping is equivalent to the joint's, since its force limit is not reached."""
     verdict = answer("friction_and_drag_one_joint")
     assert verdict.verdict == "ambiguous"

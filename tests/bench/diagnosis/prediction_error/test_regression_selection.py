@@ -51,7 +51,7 @@ def test_coefficients_that_must_not_be_negative_are_held_at_zero(rows):
     assert rss == pytest.approx(2.0 * expected.cost, rel=1e-8)
 
 
-def test_gains_beside_a_set_are_those_of_fits(rows):
+def test_gains_in_addition_to_a_set_are_those_of_fits(rows):
     target = rows @ np.array([1.0, 0.5, 0.0, 0.3, 0.0, 0.0]) + noise()
     groups = singles()
     regression = regression_of(rows, target, groups)

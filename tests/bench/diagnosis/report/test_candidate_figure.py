@@ -87,7 +87,7 @@ def test_a_p_value_is_printed_once_where_it_distinguishes_nothing():
     assert most[0][1] == 1, "no text stands twice"
 
 
-def test_p_values_near_the_threshold_stand_beside_their_bars_and_chance_is_white():
+def test_p_values_near_the_threshold_are_next_to_their_bars_and_others_are_white():
     rows = (
         row("drag.linear", 300.0),
         row("drag.quadratic", 20.0, p_value=0.012),

@@ -154,7 +154,7 @@ def test_figures_are_embedded_with_alternatives_that_say_what_they_show(figures)
     assert "linear drag 812" in candidates
 
 
-def test_numbers_are_those_of_the_story(figures):
+def test_numbers_are_those_of_the_report_data(figures):
     told = story(causes=[DRAG, TILT])
     html = render_report(told, figures)
     text = Reader(html).text
@@ -190,7 +190,7 @@ def test_errors_of_channels_are_recomputed_from_the_runs(figures):
     assert np.isnan(compute_channel_errors(empty)).all()
 
 
-def test_sets_that_cannot_be_told_apart_come_with_reason_and_experiment(figures):
+def test_sets_that_cannot_be_distinguished_come_with_reason_and_experiment(figures):
     text = Reader(render_report(story("ambiguous"), figures)).text
     assert (
         "linear drag (score 812, held-out gain 0.9) and Coulomb friction "
@@ -383,7 +383,7 @@ def test_where_nobody_knows_there_is_no_word_of_it(figures):
     )
 
 
-def test_of_a_tracked_film_the_picture_of_its_track_stands_beside_the_curves(figures, tmp_path):
+def test_the_track_of_a_film_is_drawn_next_to_the_curves(figures, tmp_path):
     png = b"\x89PNG\r\n\x1a\n-a track"
     html = render_report(story(track=png), figures)
     found = re.search(r'src="data:image/png;base64,([^"]+)" alt="The scene of the film', html)

@@ -145,7 +145,7 @@ def test_a_headline_of_a_set_names_all_of_it():
     )
 
 
-def test_what_else_remains_is_lacking_although_a_number_is_wrong():
+def test_a_further_effect_is_missing_although_a_number_is_wrong():
     said = format_headline(robot_story("partial", [HEAVY]))
     assert said.startswith("The mass of body elbow_link is 12 % larger than the model file says, ")
     assert said.endswith("and the simulation lacks something else that no known cause explains.")
@@ -167,7 +167,7 @@ OTHER = cause(
 )
 
 
-def test_how_a_robot_is_stepped_is_wrong_and_what_mends_it_is_said():
+def test_a_wrong_step_of_a_robot_is_reported_with_its_correction():
     told = robot_story(causes=[SHORTER])
     assert format_headline(told) == (
         "The time step of the model file is too long: a time step of 0.0005 s follows the "

@@ -178,7 +178,7 @@ def test_a_set_of_places_is_one_sentence():
     )
 
 
-def test_the_robot_comes_first_and_is_told_to_those_who_do_not_see_it():
+def test_the_robot_comes_first_and_has_an_alternative_text():
     html = render_report(robot_story(causes=[EVERYWHERE]), FIGURES)
     first = html.index("<img")
     alternative = html[first : html.index(">", first)]

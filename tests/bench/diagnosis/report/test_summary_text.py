@@ -76,7 +76,7 @@ def test_several_causes_are_named_together():
     assert "gravity has a horizontal component" in text(told)
 
 
-def test_an_ambiguous_cause_beside_a_certain_one():
+def test_an_ambiguous_cause_with_a_certain_one():
     told = story("ambiguous", causes=[EITHER, TILT])
     expected = (
         "The simulation lacks a tilt of gravity, and linear drag or Coulomb friction: "
@@ -85,7 +85,7 @@ def test_an_ambiguous_cause_beside_a_certain_one():
     assert format_headline(told) == expected
 
 
-def test_a_partial_verdict_keeps_what_cannot_be_told_apart():
+def test_a_partial_verdict_keeps_what_cannot_be_distinguished():
     assert "linear drag or Coulomb friction, and something else" in format_headline(
         story("partial", causes=[EITHER])
     )
@@ -95,13 +95,13 @@ def test_the_gain_of_a_partial_verdict_is_that_of_the_named_cause():
     assert format_gain(story("partial")).startswith("Linear drag closes 90 % of the gap")
 
 
-def test_unidentifiable_says_which_parameters_the_analysis_found_vague():
+def test_unidentifiable_names_the_unidentified_parameters():
     assert format_headline(
         story("unidentifiable", unidentified_parameters=("mass", "inertia"))
     ).startswith("These data do not identify mass and inertia:")
 
 
-def test_the_gain_is_told_with_its_interval_and_units():
+def test_the_gain_is_reported_with_its_interval_and_units():
     said = format_gain(story())
     assert "closes 90 % of the gap (85 to 94 %)" in said
     assert "0.37 rad before and 0.045 rad after" in said
@@ -302,7 +302,7 @@ def test_every_registered_effect_has_a_noun():
 CUT = {"by": "budget", "during": "refit of drag.linear and 3 more", "not_asked": ["rivals"]}
 
 
-def test_an_early_end_is_told_before_anything_else():
+def test_an_early_end_is_reported_before_anything_else():
     told = text(story("unknown", cut=CUT, causes=[DRAG]))
     assert "The search stopped before it could say what the simulation lacks; best" in told
     assert "by its time budget; last step: refit of drag.linear and 3 more. Not" in told

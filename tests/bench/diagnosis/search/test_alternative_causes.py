@@ -52,7 +52,7 @@ def test_the_refit_or_the_best_score_may_see_that_it_is_no_chance(monkeypatch, l
     assert evidence(monkeypatch, luck=luck, best=best).p_value == pytest.approx(p_value, abs=1e-12)
 
 
-def test_a_rival_with_plausible_coefficients_is_preferred(monkeypatch):
+def test_a_competitor_with_plausible_coefficients_is_preferred(monkeypatch):
     assert evidence(monkeypatch, plausible="bc").preferred == "b"
 
 
@@ -107,7 +107,7 @@ def test_what_contains_a_place_or_law_that_does_as_well_is_no_answer(
 
 
 @pytest.mark.parametrize(("least", "alternatives"), [(-1.0, ("b",)), (0.1, ())])
-def test_what_one_of_two_signs_gains_by_chance_is_no_reason_about_a_robot(
+def test_the_null_gain_of_one_of_two_signs_does_not_count_for_a_robot(
     least, alternatives, monkeypatch
 ):
     """Only an effect with shape parameters keeps its penalty."""

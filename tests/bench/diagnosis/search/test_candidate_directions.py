@@ -147,7 +147,7 @@ def test_what_dies_away_is_tried_at_times_that_the_runs_can_show(swing):
     assert len(times) == 4
 
 
-def test_what_modifies_an_effect_is_tried_beside_it():
+def test_what_modifies_an_effect_is_tried_with_it():
     search, model = searched(
         recording(
             "ball", runs=1, seconds=0.8, rate=50, noise=["0.005"], initial=["z=4", "vx=1", "vy=0.5"]
@@ -180,7 +180,7 @@ def test_an_effect_added_to_a_model_is_simulated_with_what_the_model_has(swing):
     np.testing.assert_allclose((changed[1] - fit.simulated)[..., q], 0.25, atol=1e-4)
 
 
-def test_a_change_that_explodes_is_none_and_multiplies_without_a_warning(swing, monkeypatch):
+def test_a_diverging_change_counts_as_zero_and_multiplies_without_a_warning(swing, monkeypatch):
     there, fit = swing
 
     def exploding(world, at, added):

@@ -40,7 +40,7 @@ def test_nobody_closes_more_than_the_gap_and_of_none_nothing():
     assert share(0.1, 0.05) == share(0.09, 0.09) == 0.0
 
 
-def test_what_is_left_without_structure_is_noise_and_may_be_more_than_was_estimated():
+def test_a_residual_without_structure_is_noise_and_may_exceed_the_estimate():
     assert share(0.5, 0.2, structure=False, own=0.2) == pytest.approx(1.0)
     assert share(0.5, 0.2, structure=True, own=0.2) == pytest.approx(0.75)
     assert share(0.5, 0.2, structure=False, own=0.01) == pytest.approx(0.75), "no less than stated"

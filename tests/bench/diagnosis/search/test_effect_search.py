@@ -108,7 +108,7 @@ def test_a_gain_counts_less_what_luck_gives_its_effects(monkeypatch):
         (1.31, False, 0.009, False),
     ],
 )
-def test_what_is_left_may_be_noise_up_to_the_floor_or_if_it_forgets(
+def test_the_residual_may_be_noise_up_to_the_floor_or_if_its_correlation_decays(
     monkeypatch, sigma, stated, chance, quiet
 ):
     monkeypatch.setattr(

@@ -9,7 +9,7 @@ from tests.bench.diagnosis.search.search_models import held_out, model, search_o
 BASE, A, B, BOTH = model(), model("a"), model("b"), model("a", "b")
 
 
-def test_excess_is_what_is_left_over_the_noise():
+def test_excess_is_the_residual_above_the_noise():
     trial = HeldOutValidation(*held_out({(): 3.0}))
     assert trial.compute_excess(()) == pytest.approx(2.0)
     assert trial.compute_excess((), np.array([1.5])) == pytest.approx(1.0)
@@ -52,7 +52,7 @@ def test_what_held_out_runs_hardly_show_is_decided_by_the_fitted_ones(fitted, le
 
 
 @pytest.mark.parametrize(("structure", "missed"), [(True, True), (False, False)])
-def test_what_is_left_is_noise_where_it_has_no_structure(structure, missed):
+def test_the_residual_is_noise_where_it_has_no_structure(structure, missed):
     trial = HeldOutValidation(*held_out({(): 9.0, ("a",): 2.0}))
     loud = model("a")
     loud.likelihood.sigma[:] = 2.0
@@ -80,7 +80,7 @@ A_B, A_C, A_B_C, B_C = model("a", "b"), model("a", "c"), model("a", "b", "c"), m
         ({"a": 9.0, "bc": 1.0}, {"a": 9.0, "bc": 1.0}, "a"),
     ],
 )
-def test_a_fuller_account_is_taken_that_held_out_runs_bear_out(fitted, unseen, stands):
+def test_a_larger_model_is_taken_that_held_out_runs_confirm(fitted, unseen, stands):
     """The parameters give the excess by effects; for all other models it is large."""
     models = [BASE, A, B, model("c"), A_B, A_C, B_C, A_B_C]
     left = {m.effects: fitted.get("".join(m.effects), 20.0) for m in models}

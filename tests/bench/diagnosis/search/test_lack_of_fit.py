@@ -83,7 +83,7 @@ def test_clean_recordings_are_quiet():
     np.testing.assert_allclose(np.mean(excess, axis=0), 1.0, atol=0.02)
 
 
-def test_noise_that_is_louder_than_stated_is_structure():
+def test_noise_that_is_larger_than_stated_is_structure():
     made = recorded(Pendulum(), [3.3e-3], SWINGS, TIMES, (0.003, 0.02), seed=3)
     quiet, loud = (
         searched(made, sigma, extra=[HatForce]) for sigma in ((0.003, 0.02), (0.002, 0.02))
@@ -103,7 +103,7 @@ def test_noise_that_is_louder_than_stated_is_structure():
 
 
 @pytest.mark.parametrize(("phi", "samples"), [(0.0, 1.0), (0.6, 0.64 / 1.36), (-0.6, 0.64 / 1.36)])
-def test_noise_that_remembers_is_known_less_well(phi, samples):
+def test_autocorrelated_noise_is_estimated_less_precisely(phi, samples):
     """AR(1) noise reduces the effective number of samples (Bartlett's formula)."""
     models = SimpleNamespace(observed_mask=np.ones((2, 100, 1), dtype=bool))
     model = SimpleNamespace(likelihood=SimpleNamespace(phi=np.array([phi])))

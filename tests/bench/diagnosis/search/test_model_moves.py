@@ -72,7 +72,7 @@ def test_a_law_whose_time_the_data_do_not_show_gives_way_to_the_sum_of_its_parts
         np.testing.assert_allclose(c, truth[name], rtol=0.05)
 
 
-def test_what_is_far_from_the_data_is_told_by_the_shorter_account(monkeypatch):
+def test_data_far_from_the_model_are_explained_by_the_smaller_model(monkeypatch):
     """With lack of fit, likelihoods mislead: a richer law must reduce the residual clearly."""
     made = search({"friction.coulomb": 0.7, "force.bias": 0.4})
     model = fitted(made, ("friction.stribeck",), {"friction.stribeck": (0.5, 0.5, 0.2)})

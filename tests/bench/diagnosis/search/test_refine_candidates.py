@@ -15,7 +15,7 @@ from bench.diagnosis.search.refine_candidates import (
 from tests.bench.diagnosis.search.search_models import model, search_of
 
 
-def test_rivals_are_near_by_merit_or_by_what_they_leave():
+def test_competitors_are_near_by_likelihood_or_by_their_residual():
     best = model("a", merit=100.0)
     by_merit = model("b", merit=100.0 - 0.9 * MAX_COMPETITOR_DISTANCE)
     by_excess, far = model("c"), model("d")
@@ -31,7 +31,7 @@ def test_rivals_are_near_by_merit_or_by_what_they_leave():
 
 
 @pytest.mark.parametrize(("structure", "stands"), [(False, "b"), (True, "a")])
-def test_a_rival_that_is_better_fitted_to_the_end_stands_unless_structure_is_left(
+def test_a_competitor_that_is_better_after_convergence_stays_unless_structure_remains(
     monkeypatch, structure, stands
 ):
     base, best = model(), model("a", merit=100.0)
@@ -60,7 +60,7 @@ def test_a_rival_that_is_better_fitted_to_the_end_stands_unless_structure_is_lef
         assert np.array_equal(noise.sigma, [1.0])
 
 
-def test_a_rival_of_a_pair_is_fitted_from_what_the_pair_shares_with_it_as_well(monkeypatch):
+def test_a_competitor_of_a_pair_also_starts_from_the_shared_effects(monkeypatch):
     """Fits of a law with many parameters end in different optima.
 
     A difference of 10.4 in twice the log-likelihood once hid that a command bias and a force bias

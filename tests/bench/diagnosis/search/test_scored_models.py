@@ -33,7 +33,7 @@ def test_directions_are_simulated_anew_where_a_model_has_moved(moved, anew):
     )
 
 
-def test_what_was_scored_about_the_base_model_is_told_when_a_better_fit_has_taken_its_place():
+def test_scores_at_the_base_model_are_reported_after_a_better_fit_replaced_it():
     recorded = recording("slider", noise=["0.01"], observe=["x"], runs=2, seconds=2.0, rate=50.0)
     search, base = searched(recorded, 0.01, candidates=["friction.coulomb", "spring.linear"])
     assert search.base_scores is None
@@ -45,7 +45,7 @@ def test_what_was_scored_about_the_base_model_is_told_when_a_better_fit_has_take
     assert search.base_scores is scores
 
 
-def test_scores_of_a_model_do_not_hang_on_what_was_scored_before():
+def test_scores_of_a_model_do_not_depend_on_earlier_scores():
     recorded = recording(
         "slider", effects=["friction.coulomb=0.1"], noise=["0.01"], observe=["x"], runs=2, rate=50.0
     )

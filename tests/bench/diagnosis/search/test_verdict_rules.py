@@ -61,13 +61,13 @@ def test_estimated_noise_is_exceeded_sevenfold_whatever_the_error():
 
 
 @pytest.mark.parametrize(("stated", "chance"), [(True, 1e-3), (False, 1e-4)])
-def test_a_force_of_any_shape_is_structure_below_a_chance(stated, chance):
+def test_an_unmodelled_force_is_structure_below_a_p_value(stated, chance):
     level = verdict_rules.get_structure_threshold(stated)
     assert verdict_rules.has_structure(0.99 * chance, level, ())
     assert not verdict_rules.has_structure(1.01 * chance, level, ())
 
 
-def test_a_loud_channel_is_structure_although_no_force_would_help():
+def test_a_channel_above_the_noise_is_structure_although_no_force_explains_it():
     assert verdict_rules.has_structure(1.0, verdict_rules.STRUCTURE_P_VALUE_THRESHOLD, ("q",))
 
 
@@ -85,7 +85,7 @@ def test_an_effect_helps_held_out_runs_by_merit_alone_near_the_noise():
     )
 
 
-def test_far_from_the_noise_it_takes_a_tenth_off_the_excess_besides():
+def test_far_from_the_noise_it_also_reduces_the_excess_by_a_tenth():
     assert not verdict_rules.improves_held_out((10.0, 99.0), (0.51, 0.51))
     assert verdict_rules.improves_held_out((10.0, 99.0), (2.0, 1.79))
     assert not verdict_rules.improves_held_out((10.0, 99.0), (2.0, 1.81))
@@ -118,7 +118,7 @@ def test_causes_explain_the_gap_that_close_seven_tenths_of_it():
     assert not verdict_rules.explains_gap(0.699)
 
 
-def test_held_out_runs_are_missed_by_what_is_left_or_by_what_is_not_gone():
+def test_the_error_on_held_out_runs_follows_from_the_residual_or_the_remaining_gap():
     assert not verdict_rules.misses_held_out_gap(0.49, 0.49), "nothing was there to be closed"
     assert verdict_rules.misses_held_out_gap(0.51, 0.51)
     assert verdict_rules.misses_held_out_gap(0.49, 0.5), "worse than before"

@@ -133,7 +133,7 @@ def test_missing_samples_do_not_count():
 
 
 @pytest.mark.parametrize("phi", [0.0, 0.7])
-def test_intervals_cover_the_truth(phi):
+def test_intervals_cover_the_true_parameters(phi):
     """Check 95 % intervals of mass and drag on 60 recordings of a driven slider."""
     times, rng, held = np.arange(120) / 60, np.random.default_rng(20), []
     push = np.where(np.sin(5 * times) > 0, 1.0, -1.0)
@@ -242,7 +242,7 @@ def test_what_the_data_do_not_bound_has_no_interval():
     assert np.isnan(compute_intervals(search, model)[1][1:]).all()
 
 
-def test_intervals_follow_what_is_left_and_not_what_was_stated():
+def test_intervals_follow_the_residual_and_not_the_stated_noise():
     made = recording(runs=2, seconds=0.8, rate=50, noise=["q=0.003", "qd=0.02"], seed=3)
     widths = []
     for factor in (1.0, 3.0):

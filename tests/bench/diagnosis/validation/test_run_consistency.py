@@ -105,7 +105,7 @@ def test_a_mass_that_grows_from_day_to_day(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_groups_disagree_by_chance_as_often_as_they_say(tmp_path):
+def test_the_p_value_of_disagreeing_groups_is_calibrated(tmp_path):
     chances = []
     for seed in range(12):
         found = explain(write(tmp_path, "log", seed=100 + seed, runs=4))
