@@ -237,20 +237,16 @@ def _describe_best_tuners(view: ComparisonView) -> list[str]:
         range_text = f"{headline.WHERE[kind]}, {headline.targets_text(statistics, kind)}"
         lines = [f"\nbest tuners, {range_text} ({label}; {headline.floor_text(statistics)})"]
         for verdicts in headline.standings(statistics, kind):
-            lines += _format_standing(verdicts)
+            lines += _format_ranking(verdicts)
         lines += [headline.failed_runs(statistics, kind)]
         lines += [headline.too_few(statistics, kind) or headline.how_decided(statistics, kind)]
         texts.append("\n".join(line for line in lines if line))
     return texts
 
 
-def _format_standing(verdicts: headline.Standing) -> list[str]:
+def _format_ranking(verdicts: headline.Standing) -> list[str]:
     """Format the lines of one number of simulations; verdicts without tuners are left out."""
-    best = (
-        f"{', '.join(verdicts.best)} ({verdicts.error})"
-        if verdicts.best
-        else "none: every run failed"
-    )
+    best = f"{', '.join(verdicts.best)} ({verdicts.error})" if verdicts.best else "none: every run failed"
     parts = {
         "best": best,
         "worse": ", ".join(verdicts.worse),

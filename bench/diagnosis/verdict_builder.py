@@ -515,9 +515,7 @@ def _compute_rmse(world: RunEvaluator, simulated: Array, channels: list[int]) ->
 def _propose_identifying_run(unidentified: tuple[str, ...]) -> DiscriminatingRun:
     """Propose how to identify parameters that the data do not identify."""
     has_several = len(unidentified) > 1
-    condition_text = (
-        "their influences differ" if has_several else "it changes the motion"
-    )
+    condition_text = "their influences differ" if has_several else "it changes the motion"
     names = " and ".join(unidentified)
     return DiscriminatingRun(
         f"Measure {names} separately, or record runs in which {condition_text}"

@@ -98,7 +98,9 @@ class SheetContent:
         rest_diagram = self.rest
         if rest_diagram.laws and rest_diagram.breakaway > 0:
             force = append_unit(format_number(rest_diagram.breakaway), rest_diagram.unit)
-            friction_text = f"At rest, dry friction holds loads up to {force} ({joined(rest_diagram.laws)})"
+            friction_text = (
+                f"At rest, dry friction holds loads up to {force} ({joined(rest_diagram.laws)})"
+            )
         else:
             friction_text = "No friction law was found that holds it at rest"
         return (

@@ -140,9 +140,7 @@ def format_sentence(text: object) -> str:
 
 def format_unit(unit: str) -> str:
     """Format a unit from a file for print, such as ``kg·m²``; empty for a pure number."""
-    power = r"(?:\^|\*\*)(-?\d+)"
-    text = re.sub(power, lambda match: unit_text.format_unit(sanitise(unit, 60))
-    return "" if text == "1" else text.replace("*", "·")
+    return unit_text.format_unit(sanitise(unit, 60))
 
 
 def format_label(name: str, unit: str, max_length: int = 30) -> str:
