@@ -246,7 +246,11 @@ def _describe_best_tuners(view: ComparisonView) -> list[str]:
 
 def _format_ranking(verdicts: headline.Standing) -> list[str]:
     """Format the lines of one number of simulations; verdicts without tuners are left out."""
-    best = f"{', '.join(verdicts.best)} ({verdicts.error})" if verdicts.best else "none: every run failed"
+    best = (
+        f"{', '.join(verdicts.best)} ({verdicts.error})"
+        if verdicts.best
+        else "none: every run failed"
+    )
     parts = {
         "best": best,
         "worse": ", ".join(verdicts.worse),

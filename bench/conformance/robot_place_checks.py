@@ -151,7 +151,9 @@ def check_it_acts_at_its_place_alone(effect: type[Effect]) -> NotApplicable | No
     are_disjoint = len(
         {changed_fields for changed_fields in fields_by_part.values() if changed_fields}
     ) == sum(map(bool, fields_by_part.values()))
-    check(are_disjoint, "each place to be changed by one effect only", fields_by_part, effect.__name__)
+    check(
+        are_disjoint, "each place to be changed by one effect only", fields_by_part, effect.__name__
+    )
     return None if classes else NO_PLACE
 
 
