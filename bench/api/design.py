@@ -116,8 +116,8 @@ class DesignOptions(ExplainOptions):
 
     Attributes:
         seconds: Duration of the next run in seconds.
-        longest: Maximum duration in seconds, if `seconds` does not settle the open questions
-            (default: five times).
+        longest: Maximum duration in seconds, if a run of `seconds` does not distinguish all causes
+            (default: five times `seconds`).
     """
 
     seconds: Seconds = 4.0

@@ -312,7 +312,7 @@ def build_parser(only: str | None = "") -> _Parser:
     codes = "\n".join(f"  {code:<4} {meaning}" for code, meaning in EXIT_CODES.items())
     parser = _Parser(
         prog="simgap",
-        description="Compare methods that tune simulator parameters; find what tuning cannot fix.",
+        description="Compare methods that tune simulator parameters; diagnose model errors.",
         epilog=f"exit codes:\n{codes}\n\nexample: simgap explain swing.csv",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

@@ -30,14 +30,15 @@ class ExplainOptions(FrameDescription):
         seed: Seed of all random numbers: surrogate data and bootstrap.
         free: Constants to estimate together with the parameters; for a robot, numbers of its model
             file, as damping@* or mass@forearm.
-        fix_base: For a robot whose model file floats: fix it in the pose of the file, as on a
-            stand; keyframes are left out.
+        fix_base: For a robot with a floating base: fix the base in the pose of the model file;
+            keyframes are left out.
         tuner: Name of a tuner that finds the starting point of the base fit (default: a grid).
         budget: Time limit of the search in seconds; at the limit it ends with the results so far,
             as after Ctrl-C (default: no limit).
         jobs: Number of worker processes; the answer does not depend on it (default: one for each
             core).
-        whole: Use all samples of a long recording of a robot (default: segments from all over it).
+        whole: Use all samples of a long recording of a robot (default: segments
+            distributed over it).
         pieces: Cut runs into segments of this many seconds, each with its own initial state, for
             motion that drifts or is unstable.
         thorough: If causes are found and a residual remains, search for further causes that

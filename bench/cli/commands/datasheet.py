@@ -23,7 +23,7 @@ def add_datasheet_arguments(parser: argparse.ArgumentParser) -> None:
     from bench.api.datasheet import DatasheetOptions
 
     add_recordings_argument(parser, "the logs, as for `simgap explain`")
-    add_out_option(parser, "folder to write, a new one", required=True)
+    add_out_option(parser, "new folder for the data sheet", required=True)
     add_options(parser, DatasheetOptions)
     parser.add_argument(
         "--from",

@@ -27,7 +27,7 @@ def add_diff_arguments(parser: argparse.ArgumentParser) -> None:
         "--out",
         metavar="FILE.csv",
         type=parse_path,
-        help="write the numbers as a table, a new file",
+        help="new file for the numbers as a table",
     )
     parser.add_argument(
         "--fail-on",

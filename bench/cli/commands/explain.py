@@ -55,7 +55,7 @@ def add_explain_arguments(parser: argparse.ArgumentParser) -> None:
         "system, in the order of time, are explained together, and each separately",
     )
     add_options(parser, ExplainOptions, free={"default": ""})
-    add_out_option(parser, "folder to write (default: a new one below results/)")
+    add_out_option(parser, "folder for the results (default: a new one below results/)")
     parser.add_argument(
         "--each",
         action="store_true",

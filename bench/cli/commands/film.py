@@ -22,9 +22,9 @@ def add_film_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILM.mp4",
         type=parse_path,
         required=True,
-        help="video to write, a new one",
+        help="new file for the video",
     )
-    parser.add_argument("--run", metavar="NAME", help="which run (default: the first)")
+    parser.add_argument("--run", metavar="NAME", help="name of the run (default: the first)")
     parser.add_argument(
         "--size", metavar="PX", type=int, default=100, help="width and height (default: 100)"
     )
@@ -52,13 +52,13 @@ def add_track_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="NAME.csv",
         type=parse_path,
         required=True,
-        help="recording to write, a new one",
+        help="new file for the recording",
     )
     parser.add_argument(
         "--ball-diameter", metavar="M", type=float, help="the ball's diameter in metres"
     )
     parser.add_argument(
-        "--fps", metavar="F", type=float, help="frames a second (default: the file's time stamps)"
+        "--fps", metavar="F", type=float, help="frames per second (default: the file's time stamps)"
     )
     parser.add_argument(
         "--scale",

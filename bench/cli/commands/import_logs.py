@@ -27,7 +27,7 @@ def add_import_arguments(parser: argparse.ArgumentParser) -> None:
         required=True,
         help="model file of the robot, MJCF or URDF",
     )
-    add_out_option(parser, "file to write, a new one", "NAME.toml", required=True)
+    add_out_option(parser, "new file for the description", "NAME.toml", required=True)
     add_options(parser, ImportOptions)
     parser.set_defaults(command=_run_import)
 

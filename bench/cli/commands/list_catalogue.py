@@ -21,8 +21,8 @@ def add_list_arguments(listing: argparse.ArgumentParser) -> None:
         nargs="?",
         help="which list (default, with --json: all but the last)",
     )
-    add_model_option(listing, "whose places are listed: an MJCF or URDF")
-    add_plugin_option(listing, "of them")
+    add_model_option(listing, "model file (MJCF or URDF) whose places are listed")
+    add_plugin_option(listing, "entries")
     listing.set_defaults(command=_run_list)
 
 

@@ -108,7 +108,7 @@ def add_simulate_arguments(parser: argparse.ArgumentParser) -> None:
             f"--{name}", action=_ValuesAction, nargs="+", default=[], metavar=metavar, help=text
         )
     add_options(parser, SimulationSpec, runs={"type": parse_positive_int})
-    add_out_option(parser, "file to write, a new one", "FILE.csv", required=True)
+    add_out_option(parser, "new file for the recording", "FILE.csv", required=True)
     add_plugin_option(parser, "systems")
     parser.set_defaults(command=_run_simulate)
 
@@ -250,7 +250,7 @@ def _run_inspect(options: argparse.Namespace, print_line: PrintLine) -> CommandR
     for line in (
         *robot_lines,
         *format_summary(recording, kind),
-        *(f"odd: {text}" for text in warnings_to_print),
+        *(f"warning: {text}" for text in warnings_to_print),
         *(f"finding: {finding.text_line}" for finding in findings),
         *(f"convention: {difference.description}" for difference in differences),
         *(f"    set {line}" for line in settings_to_fix),

@@ -38,7 +38,7 @@ def add_train_arguments(parser: argparse.ArgumentParser) -> None:
         "--budget",
         type=parse_positive_int,
         metavar="N",
-        help="simulations to learn from (default: its own)",
+        help="number of training simulations (default: that of the tuner)",
     )
     parser.add_argument(
         "--seeds",
@@ -56,7 +56,7 @@ def add_train_arguments(parser: argparse.ArgumentParser) -> None:
         help="folder of losses (default: below results/train)",
     )
     add_pdf(parser)
-    add_plugin_option(parser, "of them")
+    add_plugin_option(parser, "tuners and simulators")
     add_trust_option(parser)
     add_force_option(parser)
     parser.set_defaults(command=_run_train)

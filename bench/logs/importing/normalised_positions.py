@@ -157,7 +157,7 @@ def may_be_normalised(recording: Recording) -> Iterator[Anomaly]:
     largest = max((float(np.nanmax(np.abs(v), initial=0.0)) for v in values), default=np.inf)
     if np.degrees(largest) <= MAX_NORMALISED:
         yield Anomaly(
-            "positions of a LeRobot dataset are taken for degrees and lie within -100 to 100, as "
+            "positions of a LeRobot dataset are read as degrees and lie within -100 to 100, as "
             f"normalised ones do; {UNIT_REMEDY} (scale = 1 in the description)",
             False,
         )

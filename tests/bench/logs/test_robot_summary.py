@@ -92,7 +92,7 @@ def test_inspect_says_what_is_odd_about_a_robots_log(odd_log, tmp_path, capsys):
     assert main(["inspect", str(odd_log), "--out", str(tmp_path / "figures")]) == 0
     said = capsys.readouterr().out
     assert "(MJCF): 2 joints, 2 actuators, 2 moving bodies; implicitfast at 5 ms" in said
-    assert "odd: not in the log, assumed to be zero: u.m_shoulder" in said
+    assert "warning: not in the log, assumed to be zero: u.m_shoulder" in said
     assert "begin as the file states them: elbow" in said
     assert "q.shoulder goes from -30 to 29.72 rad in runs 1, 2, and swinging.xml" in said
     assert "u.s_elbow goes from 0 to 1.9 in runs 1, 2, and swinging.xml states -0.5 to 0.9" in said
@@ -102,7 +102,7 @@ def test_inspect_says_nothing_odd_of_a_sound_log(tmp_path, capsys):
     made = simulate_recording(SimulationSpec(model=written(tmp_path), noise=1e-3, **SHORT))
     made.write(tmp_path / "log.csv")
     assert main(["inspect", str(tmp_path / "log.csv"), "--out", str(tmp_path / "figures")]) == 0
-    assert "odd:" not in capsys.readouterr().out
+    assert "warning:" not in capsys.readouterr().out
 
 
 def test_repairs_of_a_model_are_reported(tmp_path, capsys):
