@@ -253,7 +253,7 @@ _SIZED: Mapping[str, Callable[[str, Sequence[FittedValue]], str]] = {
 """Functions that format how wrong a value of the model file is, by effect."""
 _STEPPED = {
     "numerics.step": "the time step of the model file is too long",
-    "numerics.integrator": "the integrator of the model file does not follow the motion",
+    "numerics.integrator": "the integrator of the model file is not accurate enough",
 }
 """Description of a too coarse time step or integrator of the model file; the cause names the
 correction.

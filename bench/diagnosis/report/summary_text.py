@@ -117,7 +117,7 @@ def format_details(report: DiagnosisReportData) -> Iterator[str]:
     ):
         yield "Agreement between runs: " + " ".join(format_consistency(report))
     if report.lack_of_fit:
-        yield "What remains: " + " ".join(format_sentence(text) for text in report.lack_of_fit)
+        yield "Residual: " + " ".join(format_sentence(text) for text in report.lack_of_fit)
     # For an ambiguous verdict, the experiment directly follows the headline.
     if verdict != "ambiguous" and (next_run := format_next_run(report)):
         yield f"Next experiment: {next_run}"
@@ -160,7 +160,7 @@ def format_headline(report: DiagnosisReportData) -> str:
         bound_text = f"parameter {sanitise(name, 60)} ends at {end}, {value}"
         return (
             f"The simulation {format_lacking(causes)}, but {bound_text}: "
-            "the cause may stand for a value beyond it."
+            "the cause may compensate for a value beyond it."
         )
     if verdict == "partial":
         remainder = "something else that no known cause explains"
@@ -235,7 +235,7 @@ def _format_early_stop_headline(verdict: Verdict) -> str:
         return (
             f"The simulation {lacking_text}; the search stopped before testing for further causes."
         )
-    no_result = "The search stopped before it could say what the simulation lacks"
+    no_result = "The search stopped before it identified what the simulation lacks"
     if not verdict.causes:
         return f"{no_result}."
     return f"{no_result}; best candidate so far: {format_causes(verdict.causes)}."

@@ -32,7 +32,7 @@ _AT = {
 """Preposition before a place of each kind, and the plural of the kind."""
 NUMERICS_NAMES = {
     "numerics.step": "too long a time step",
-    "numerics.integrator": "an integrator that does not follow the motion",
+    "numerics.integrator": "an inaccurate integrator",
 }
 """Names of a too coarse time step or integrator as causes; they are errors of the model file, not
 effects.

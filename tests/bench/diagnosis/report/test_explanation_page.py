@@ -242,7 +242,7 @@ def test_gaps_in_what_is_known_do_not_break_the_page():
         why=(),
     )
     reader = Reader(render_report(bare, {}))
-    assert "No candidate was tried." in reader.text
+    assert "No candidate was tested." in reader.text
     assert "img" not in reader.tags
     nothing = {
         **HELD_OUT,

@@ -304,11 +304,11 @@ CUT = {"by": "budget", "during": "refit of drag.linear and 3 more", "not_asked":
 
 def test_an_early_end_is_reported_before_anything_else():
     told = text(story("unknown", cut=CUT, causes=[DRAG]))
-    assert "The search stopped before it could say what the simulation lacks; best" in told
+    assert "The search stopped before it identified what the simulation lacks; best" in told
     assert "by its time budget; last step: refit of drag.linear and 3 more. Not" in told
     assert "none of the 6 known causes" not in told, "they were not all asked"
     told = text(story("unknown", cut={**CUT, "by": "interrupt"}))
-    assert "before it could say what the simulation lacks. The search was stopped by an in" in told
+    assert "before it identified what the simulation lacks. The search was stopped by an in" in told
     told = text(story("partial", cut={**CUT, "not_asked": ["structure"]}))
     assert "lacks linear drag; the search stopped before testing for further causes." in told
     assert "something else that no known cause explains" not in told
