@@ -491,7 +491,9 @@ def test_positions_of_lerobot_may_be_normalised_and_it_is_said(arm, tmp_path, ca
     assert line.startswith("check: positions lie within -100 to 100: they are read as degrees")
     assert "--calibration FILE" in line
     odd = check_recording_plausible(*load_recording(out))
-    assert any(text.startswith("positions of a LeRobot dataset are read for") for text in odd)
+    assert any(
+        text.startswith("positions of a LeRobot dataset are read as degrees") for text in odd
+    )
 
 
 @pytest.mark.parametrize("where", ["", "set/meta/calibration.json", "set/arm.json", "arm.json"])
