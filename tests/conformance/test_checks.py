@@ -469,7 +469,7 @@ def test_simulator_check_rejects_its_broken_subject_and_no_sound_one(check):
         (
             ForcesWithoutCoordinates,
             "check_hooks_have_the_declared_shapes",
-            "coordinates and rates beside apply_force; found none",
+            "coordinates and rates with apply_force; found none",
         ),
         (
             KeepsHeat,

@@ -245,7 +245,7 @@ def test_faulty_declarations_are_one_line():
         seen = {"x": value, "v": 0.0, "charge": 0.0}
         with pytest.raises(InputError, match=r"observe\(\), x: expected a number, " + message):
             declared(observe=lambda self, seen=seen: seen)().simulate(np.array([[1.0]]), PUSHED)
-    with pytest.raises(InputError, match="the attribute 'engine' is the base class's"):
+    with pytest.raises(InputError, match="the attribute 'engine' belongs to the base class"):
         declared(reset=lambda self, *_: setattr(self, "engine", 1))().simulate(
             np.array([[1.0]]), PUSHED
         )

@@ -59,7 +59,7 @@ class OmittedShapes:
         ]
         for reason, labels in self.seen.items():
             notes.append(
-                f"visual meshes left out, since the file {reason}: {format_name_list(labels)}"
+                f"visual elements left out, since the file {reason}: {format_name_list(labels)}"
             )
         return notes
 

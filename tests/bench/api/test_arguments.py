@@ -151,7 +151,7 @@ def test_the_file_that_was_named_is_the_one_that_is_missing(read, tmp_path, monk
     with pytest.raises(InputError) as error:
         read("nope.csv")
     assert str(error.value) == (
-        "nope.csv: no such file; expected a recording, NAME.csv with NAME.toml beside it; "
+        "nope.csv: no such file; expected a recording, NAME.csv with NAME.toml next to it; "
         "did you mean noise.csv?"
     )
     with pytest.raises(InputError, match=r"^noise.toml: no such file; expected the description of"):

@@ -473,7 +473,7 @@ def test_interrupted_it_is_resumed_with_its_own_plugins_and_what_changed_is_refu
     with monkeypatch.context() as patch:
         patch.setattr("bench.benchmark.runner.run_ids.hash_source_folders", lambda *_: "0123456789")
         assert resumed() == 2
-    assert "its code changed since it was begun" in capsys.readouterr().err
+    assert "its code changed since it was started" in capsys.readouterr().err
     for registry in REGISTRIES:
         registry.restore({})
     assert resumed("--allow-failures") == 0, "the plugin is known from the folder"

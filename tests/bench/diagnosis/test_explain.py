@@ -88,7 +88,7 @@ def test_a_recording_in_which_nothing_changes_says_so(tmp_path, place):
     assert found.verdict == "unidentifiable"
     assert found.story.unidentified_parameters == ("inertia",)
     assert found.answer.next_experiment.says == (
-        "Measure inertia apart, or record runs in which it changes the motion"
+        "Measure inertia separately, or record runs in which it changes the motion"
     )
 
 
@@ -177,7 +177,7 @@ def test_a_free_swing_does_not_identify_gravity_and_length_too(tmp_path):
     assert set(found.story.unidentified_parameters) >= {"gravity", "length"}
     says = found.answer.next_experiment.says
     assert says.startswith("Measure ")
-    assert says.endswith("apart, or record runs in which their influences differ")
+    assert says.endswith("separately, or record runs in which their influences differ")
     for name in ("gravity", "length"):
         assert found.answer.parameters[name].low is None
     one = explained(path, free=("gravity",))

@@ -118,7 +118,7 @@ def test_a_fault_in_a_file_costs_the_file_alone(arm, monkeypatch):
     files, said, _, _ = build_robot_files(extended_of(arm, effects=FRICTION))
     assert files == {}
     assert said == (
-        "no model file is written, by a fault of simgap: "
+        "no model file is written because of an internal error of simgap: "
         "extended.xml differs from the intended model: dof_damping",
     )
 

@@ -113,16 +113,18 @@ SINGLE = TOML.partition("[runs")[0]
 BAD = {
     "nothing said": (
         TOML, 3, False,
-        r"run 0: nothing says where base begins; state \[runs\.0\.initial\], of q\.base\.x, .*, "
+        r"run 0: the log does not state where base begins; state \[runs\.0\.initial\], of "
+        r"q\.base\.x, .*, "
         r"qd\.base\.wz \(states that are left out are as in the model file, at rest\), or insist",
     ),
     "one run without": (
         TOML + STATED.partition("[runs.2")[0], 3, False,
-        r"run 2: nothing says where base begins; state \[runs\.2\.initial\]",
+        r"run 2: the log does not state where base begins; state \[runs\.2\.initial\]",
     ),
     "a single run": (
         SINGLE + STATED.partition("[runs.1")[0], 1, False,
-        r"run 0: nothing says where base is when the last third of a single run begins; record",
+        r"run 0: the log does not state where base is when the last third of a single run "
+        "begins; record",
     ),
     "a channel": (
         TOML + STATED + TURNING.replace("extra", "channels"), 3, True,

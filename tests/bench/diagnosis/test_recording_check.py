@@ -103,7 +103,7 @@ def test_of_many_causes_the_surest_are_listed_and_the_others_counted(tmp_path):
     assert f"{len(sure)} identifiable" in lines[2]
     # Each line has an interval, and they are sorted by width.
     assert all("identifiable     " in line and "±" in line for line in lines[3:6])
-    assert lines[6].startswith("  identifiable too: ")
+    assert lines[6].startswith("  also identifiable: ")
     assert lines[6].endswith(" more")
     assert lines[-1].endswith("the same command with --json")
     assert len("\n".join(lines)) < 1500

@@ -134,7 +134,7 @@ def test_a_check_of_the_isolation_is_repeated_as_often_as_a_run(monkeypatch, kil
         assert look() == ("process",)
     else:
         with pytest.raises(
-            InputError, match=r"a process of its own here: killed, 3 times; .*--trust"
+            InputError, match=r"a process of their own here: killed, 3 times; .*--trust"
         ):
             look()
 

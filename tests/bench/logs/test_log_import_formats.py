@@ -268,7 +268,7 @@ def test_a_desired_position_is_no_torque(tmp_path):
             "position_target_{}",
             "is a desired position of yaw, and m_yaw takes a velocity",
         ),
-        ("", "desired_velocity_{}", "asks for a velocity of yaw, which no actuator takes"),
+        ("", "desired_velocity_{}", "commands a velocity of yaw, but no actuator has this command"),
     ],
 )
 def test_a_command_of_another_kind_is_left_out(drive, word, line, tmp_path):
@@ -308,7 +308,7 @@ def test_of_several_torques_the_measured_one_drives_else_none(tmp_path):
     made = simgap.import_logs([table(tmp_path / "o.csv", columns)], arm, tmp_path / "o.toml")
     assert inputs(tmp_path / "o.toml") == {}
     (check,) = made.checks
-    assert "nothing drives it; possible columns: yaw_tau_con, lift_tau_con" in check
+    assert "no actuator drives it; possible columns: yaw_tau_con, lift_tau_con" in check
 
 
 def test_a_model_without_an_input_is_said(tmp_path):
@@ -317,7 +317,7 @@ def test_a_model_without_an_input_is_said(tmp_path):
     columns |= {f"{j}_current": COMMANDS[:, k] for k, j in enumerate(JOINTS)}
     made = simgap.import_logs([table(tmp_path / "log.csv", columns)], arm, tmp_path / "log.toml")
     (check,) = made.checks
-    assert check.startswith("the model has no input, so no actuator drives it; columns that may")
+    assert check.startswith("the model has no input, so no actuator drives it; possible columns")
     assert "possible columns: yaw_current, lift_current, bend_current" in check
 
 

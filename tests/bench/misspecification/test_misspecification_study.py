@@ -152,7 +152,8 @@ def test_what_is_complete_is_taken_up_and_nothing_is_made_again(folder):
 
 def test_it_is_reported_in_words_tables_and_figures(folder, capsys):
     said = (folder / "said.txt").read_text()
-    assert "the world has restitution.speed -0.1; explain says named: restitution.speed" in said
+    found = "the true system has restitution.speed -0.1; explain reports named: restitution.speed"
+    assert found in said
     assert "Kendall's tau" in said
     for name in ("bias", "prediction", "ranks"):
         assert (folder / "figures" / f"{name}.png").stat().st_size > 5000

@@ -193,7 +193,10 @@ def test_a_sweep_names_entries_whose_names_have_dots():
         ({"budget": [0]}, "mine.toml: .*budget must be at least 1"),
         ({"budget.x": [1]}, "mine.toml: sweep.budget.x: budget is no table"),
         ({"sampling.rat": [1]}, r"unknown entry of \[sampling\] in mine.toml 'rat'"),
-        ({"sampling": [{"rate": 1}]}, "sweep.sampling: expected texts, numbers, bools or lists"),
+        (
+            {"sampling": [{"rate": 1}]},
+            "sweep.sampling: expected strings, numbers, booleans or lists",
+        ),
     ],
 )
 def test_faults_in_a_sweep_are_one_line_that_names_the_file(sweep, message):
@@ -202,7 +205,11 @@ def test_faults_in_a_sweep_are_one_line_that_names_the_file(sweep, message):
 
 
 def test_what_is_not_expanded_is_not_run(spring):
-    with pytest.raises(InputError, match=r"spring-test: sweeps over budget; run those that"):
+    with pytest.raises(
+        InputError,
+        match=r"spring-test: sweeps over budget; run the experiments "
+        "that",
+    ):
         TuningProblem(spring_experiment(sweep={"budget": [3]}))
 
 

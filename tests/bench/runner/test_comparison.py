@@ -125,14 +125,14 @@ def test_what_changed_is_refused_by_name(finished_folder, tmp_path, capsys, monk
         (folder / "experiment.toml").write_text(change)
         assert main(["compare", "--resume", str(folder)]) == 2
         error = capsys.readouterr().err
-        assert "its configuration changed since it was begun" in error
+        assert "its configuration changed since it was started" in error
         assert error.count("\n") == 1
     (folder / "experiment.toml").write_text(text)
     monkeypatch.setattr(
         "bench.benchmark.runner.run_ids.hash_source_folders", lambda *_: "0123456789"
     )
     assert main(["compare", "--resume", str(folder)]) == 2
-    assert "its code changed since it was begun" in capsys.readouterr().err
+    assert "its code changed since it was started" in capsys.readouterr().err
     monkeypatch.undo()
     assert main(["compare", "--resume", str(folder), "--budget", "5"]) == 2
     assert "leave out budget" in capsys.readouterr().err

@@ -67,7 +67,7 @@ def test_a_finished_comparison_is_taken_up_and_one_of_another_file_is_not(compar
     assert main(["compare", "--resume", str(compared), "--jobs", "1"]) == 0
     written(log.parent, SWINGING.replace('mass="0.8"', 'mass="0.81"'))
     assert main(["compare", "--resume", str(compared)]) == 2
-    assert "its model file changed since it was begun" in capsys.readouterr().err
+    assert "its model file changed since it was started" in capsys.readouterr().err
     written(log.parent)
 
 

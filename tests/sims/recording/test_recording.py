@@ -127,7 +127,7 @@ def test_without_marks_a_single_run_loses_its_last_third(tmp_path):
             CSV.replace("x,u", "x,u,v").replace("\n1,", "\n1,0,"),
             "column 'v' is not declared; log.toml declares u, x",
         ),
-        (CSV + "1,2,3,4\n", "row 7, column run: run '1' goes on after another began"),
+        (CSV + "1,2,3,4\n", "row 7, column run: run '1' continues after another run began"),
         (CSV + ",2,3,4\n,3,3,4\n", "row 7, column run: expected the name of a run, found none"),
         (CSV + "c,2,3,4\n", "row 7, column run: run 'c' has one row; expected at least two"),
         (CSV + "c,2,,4\nc,3,,4\n", "row 7, column x: run 'c' has no sample of any channel"),

@@ -144,7 +144,7 @@ FAULTS = {
                         r"header, row 1, found 2; correct or delete this row"),
     "a row too long": ("# a\nt,q1\n0,1\n1,2,3\n2,3\n", r"row 4: expected 2 cells as in the header, "
                        r"row 2, found 3; correct or delete this row"),
-    "a last row cut off": ("t,q1,q2\n0,1,2\n1,2,3\n2,3", r"row 4: .*found 2; the log was cut off "
+    "a last row cut off": ("t,q1,q2\n0,1,2\n1,2,3\n2,3", r"row 4: .*found 2; the log is truncated "
                            r"there: delete this row"),
     "a footer": ("t,q1\n0,1\n1,2\nend of log\n", r"row 4: expected 2 cells"),
     "a cell": ("# a\nt,q1\n0,1\n1,2\n\n2,x\n3,4\n", r"row 6, column q1: expected a number, found "

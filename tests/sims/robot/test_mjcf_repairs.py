@@ -14,7 +14,7 @@ def mjcf(asset="", inside=INERTIAL, geom='type="mesh" mesh="m"'):
 
 
 ABSENT = "shapes left out, and their contacts, since their file is absent: no.stl"
-SEEN = "left out, only seen, since the file is absent: no.stl"
+SEEN = "visual elements left out, since the file is absent: no.stl"
 CASES = {
     "touching": (mjcf(MESH), ABSENT, 2),
     "seen": (mjcf(MESH, geom='type="mesh" mesh="m" contype="0" conaffinity="0"'), SEEN, 2),
@@ -53,7 +53,7 @@ def test_absent_pictures_and_height_fields_are_left_out(write):
     robot = read_robot(write(text.replace('<body name="b">', ground)))
     assert robot.notes == (
         "shapes left out, and their contacts, since their file is absent: h.png",
-        "left out, only seen, since the file is absent: t.png, s.png",
+        "visual elements left out, since the file is absent: t.png, s.png",
         NO_ACTUATORS_NOTE,
     )
     assert robot.compiled.ngeom == 1
@@ -164,7 +164,7 @@ def test_a_picture_that_mujoco_refuses(write):
     robot = read_robot(path)
     note, _ = robot.notes
     assert note.startswith(
-        "left out, only seen, since the file is refused by MuJoCo (error decoding"
+        "visual elements left out, since the file is refused by MuJoCo (error decoding"
     )
     assert robot.compiled.ngeom == 1
 

@@ -85,7 +85,8 @@ def test_notes_of_a_urdf(write):
     assert read_robot(write(SWING)).notes == (
         "held to the world, as MuJoCo does with a URDF's root: base",
         "effort limits clamp what actuators exert (N m or N): pivot 12",
-        "links on fixed joints are part of what carries them: base of world; plate, bob of rod",
+        "links on fixed joints are merged into their parent links: base of world; plate, bob of "
+        "rod",
         "no actuators: it is passive unless the [actuators.NAME] of a recording add some",
     )
 

@@ -49,7 +49,7 @@ CASES = {
     mjcf('<option timestep="-1"/>'): ": option timestep: expected 1e-09 to 1 s, found -1",
     mjcf(body=BODY.replace("</world", '<body name="b"/></world')): ":2: repeated name 'b' in body",
     mjcf(ASSET, OF_MESH): (
-        ": mesh no.stl is absent, and the mass of body b would follow from it; mend the mesh, or "
+        ": mesh no.stl is absent, and the mass of body b would follow from it; repair the mesh, or "
         "state the body's <inertial>"
     ),
     mjcf(
@@ -85,7 +85,7 @@ CASES = {
         ":1: link b has two parent joints; a closed loop needs an MJCF"
     ),
     robot(link("a"), link("b"), joint("j", "a", "b"), joint("k", "b", "a")): (
-        ":1: link a hangs on itself"
+        ":1: link a is its own parent"
     ),
     one(mass=-1): ":1: link arm: its mass is -1 kg",
     one(mass="heavy"): ":1: link arm: its mass is nan kg",

@@ -9,7 +9,7 @@ import pytest
 from sims.robot.parsing.read_model_file import NO_ACTUATORS_NOTE, read_robot
 from tests.sims.robot.sample_urdfs import TETRAHEDRON, ball, joint, link, mesh, one, robot
 
-FUSED = "links on fixed joints are part of what carries them: base of world"
+FUSED = "links on fixed joints are merged into their parent links: base of world"
 
 
 @pytest.fixture
@@ -105,7 +105,7 @@ def test_chains_of_fixed_links_are_aliases(mended):
     assert robot_.aliases == {"base": "world", "foot": "world", "wrist": "arm", "tip": "arm"}
     assert robot_.body("tip").mass == 3
     assert robot_.notes[-2] == (
-        "links on fixed joints are part of what carries them: base, foot of world; "
+        "links on fixed joints are merged into their parent links: base, foot of world; "
         "wrist, tip of arm"
     )
 
@@ -269,7 +269,7 @@ def test_meshes_enter_the_digest(write):
 def test_the_base_does_not_collide_with_its_children(mended):
     parts = [link("base", None, shape=ball(0.5)), link("arm", shape=ball(0.5))]
     robot_, notes = mended(robot(*parts, joint("j", "base", "arm")))
-    assert notes == ["no contacts between the fixed base and what hangs on it: arm"]
+    assert notes == ["no contacts between the fixed base and the bodies attached to it: arm"]
     assert robot_.compiled.nexclude == 1
 
 

@@ -113,7 +113,7 @@ def test_what_is_known_is_narrowed(tmp_path, capsys):
     out = tmp_path / "next.csv"
     assert main(["design", str(path), "--out", str(out), "--seconds", "3"]) == 0
     said = capsys.readouterr().out
-    assert "no question is open: it shrinks" in said
+    assert "no causes need to be distinguished: it shrinks" in said
     factor = float(said.split("factor of ")[1].split()[0])
     columns = np.genfromtxt(out, delimiter=",", names=True)
     assert columns.dtype.names == ("t", "u")

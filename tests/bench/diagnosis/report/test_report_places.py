@@ -177,8 +177,7 @@ def test_a_wrong_step_of_a_robot_is_reported_with_its_correction():
     assert "Too long a time step (numerics.step): time step 5×10⁻⁴ s; p" in text
     both = robot_story(causes=[OTHER, RUB])
     assert format_headline(both) == (
-        "The simulation lacks Coulomb friction at joint elbow, and has an integrator that does "
-        "not follow the motion."
+        "The simulation lacks Coulomb friction at joint elbow, and has an inaccurate integrator."
     )
     assert "(numerics.integrator): p = 1×10⁻⁹." in " ".join(format_summary(both))
     assert not list_place_marks(told)
