@@ -324,9 +324,8 @@ def _format_parameter(number: ParameterIdentifiability) -> str:
     interval_text = (
         f"±{number.half:.2g} {format_unit(number.unit)}".rstrip()
         if np.isfinite(number.half)
-        else "no "
+        else "no influence"
     )
-    "influence"
     if np.isnan(number.half):
         interval_text = "a limit inside the range of the data"
     confounder_text = listed([f"{name} ({corr:.3f})" for name, corr in number.mixed], 2)

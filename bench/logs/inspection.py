@@ -151,8 +151,9 @@ def format_summary(recording: Recording, kind: type[Simulator]) -> Iterator[str]
     yield recording.title
     # A single run is divided into two parts with the same name.
     run_count = len({run.name for run in runs})
-    held_out_text = "its last third is held out" if run_count < len(runs) else f"{held_out} held "
-    "out"
+    held_out_text = f"{held_out} held out"
+    if run_count < len(runs):
+        held_out_text = "its last third is held out"
     if recording.folds():
         held_out_text = "each left out in turn"
     size = (

@@ -191,7 +191,7 @@ def test_a_sweep_names_entries_whose_names_have_dots():
         ({"budget": [3, "x"]}, "mine.toml: budget: expected a whole number, found 'x'"),
         ({"budget": [3, 3]}, "mine.toml: sweep.budget: 3 is given twice"),
         ({"budget": [0]}, "mine.toml: .*budget must be at least 1"),
-        ({"budget.x": [1]}, "mine.toml: sweep.budget.x: budget is no table"),
+        ({"budget.x": [1]}, "mine.toml: sweep.budget.x: budget is not a table"),
         ({"sampling.rat": [1]}, r"unknown entry of \[sampling\] in mine.toml 'rat'"),
         (
             {"sampling": [{"rate": 1}]},
@@ -270,5 +270,5 @@ def test_a_recording_that_is_missing_says_what_to_set(tmp_path, monkeypatch):
     with pytest.raises(InputError, match=r"SIMGAP_DATA is not set.*; set SIMGAP_DATA to the folde"):
         find_recording("swing/recording.csv")
     monkeypatch.setenv("SIMGAP_DATA", "/elsewhere")
-    with pytest.raises(InputError, match=r"no such file in /elsewhere \(SIMGAP_DATA\) or beside"):
+    with pytest.raises(InputError, match=r"no such file in /elsewhere \(SIMGAP_DATA\) or next to"):
         find_recording("swing/recording.csv")

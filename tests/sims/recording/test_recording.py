@@ -121,7 +121,7 @@ def test_without_marks_a_single_run_loses_its_last_third(tmp_path):
         (CSV.replace("0.1", "1e999"), "row 3, column x: expected a finite number, found '1e999'"),
         (CSV.replace("0.1", '"0.1'), "row 6: not a CSV table: unexpected end of data"),
         (CSV.replace("0.1", "a\x1b[31m"), r"found 'a\\x1b\[31m'"),
-        (CSV.replace("run,t,x,u", "run,t,x,x"), "row 1: column 'x' stands twice"),
+        (CSV.replace("run,t,x,u", "run,t,x,x"), "row 1: column 'x' is given twice"),
         (CSV.replace("run,t,x,u", "run,t,x,"), "row 1: column 4 has no name"),
         (
             CSV.replace("x,u", "x,u,v").replace("\n1,", "\n1,0,"),
@@ -189,7 +189,7 @@ def test_faulty_table_is_one_line_that_says_where(tmp_path, csv, message):
         (TOML.replace("2.0", "true"), "constants.mass: expected a number, found True"),
         (
             TOML + "[runs.b]\nmass = 1\nconstants = {mass = 2}\n",
-            "runs.b: constant mass stands twice",
+            "runs.b: constant mass is given twice",
         ),
         (TOML + "[runs.b]\nmass = 0\n", "runs.b.mass: expected more than 0 kg, found 0"),
         (
