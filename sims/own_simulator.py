@@ -245,7 +245,7 @@ class OwnSimulator(SystemSimulator):
         """Set some levels to new values and continue from there; other states stay (optional)."""
         raise NotImplementedError
 
-    def _engine(self, name: str | None, settings: Mapping[str, Any]) -> Engine:
+    def _make_engine(self, name: str | None, settings: Mapping[str, Any]) -> Engine:
         """Return the engine that calls the user's `step`, with the given or declared time step.
 
         Raises:

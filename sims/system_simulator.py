@@ -76,7 +76,7 @@ class SystemSimulator(Simulator):
         """Create engine and effects, and append the effects' coefficients to the parameters."""
         super().__init__(constants, observe)
         self._declared = self.system()
-        self.engine = self._engine(engine, settings)
+        self.engine = self._make_engine(engine, settings)
         _check_effect_types(effects, fixed)
         self.effects = [self._effect(effect) for effect in effects]
         self.fixed = [
@@ -116,7 +116,7 @@ class SystemSimulator(Simulator):
         cls.inputs = system.inputs
         cls.states = system.states
 
-    def _engine(self, name: str | None, settings: Mapping[str, Any]) -> Engine:
+    def _make_engine(self, name: str | None, settings: Mapping[str, Any]) -> Engine:
         return make_engine(name or self.default_engine, self.system, settings)
 
     def _effect(self, named: str | type[Effect]) -> Effect:
@@ -182,9 +182,9 @@ class SystemSimulator(Simulator):
         if not len(theta):
             return np.empty((0, 0, len(self.channels)))
         SIMULATION_COUNTER.count(len(theta))
-        return self._simulated(theta, scenarios, initial or {})
+        return self._simulate_observations(theta, scenarios, initial or {})
 
-    def _simulated(
+    def _simulate_observations(
         self, theta: Array, scenarios: Sequence[Scenario], initial: Mapping[str, Array]
     ) -> Array:
         """Simulate a batch of at least one element, from inputs to sensors.
@@ -200,7 +200,7 @@ class SystemSimulator(Simulator):
         Returns:
             (L, T, C) observations; NaN after the end of shorter runs and for failed elements.
         """
-        active_effects = self._acting(theta)
+        active_effects = self._make_active_effects(theta)
         runs = group_scenarios(scenarios)
         commands = [self.run_inputs(s) for s in runs.unique_scenarios]
         with np.errstate(all="ignore"):  # batch elements that overflow become NaN
@@ -255,7 +255,7 @@ class SystemSimulator(Simulator):
         """Release the resources of the engine."""
         self.engine.close()
 
-    def _acting(self, theta: Array) -> ActiveEffects:
+    def _make_active_effects(self, theta: Array) -> ActiveEffects:
         """Return the effects with their coefficients (K, L, 1): tuned ones, then fixed ones.
 
         Coefficients that the system does not have, or that were not given, are zero.

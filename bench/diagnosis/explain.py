@@ -264,7 +264,7 @@ class _ExplainRun:
         self.wider: dict[str, tuple[Bounds, Bounds]] = {}
         # Base parameters of a robot, identified by prediction errors; starting values of the fit.
         self.identified: Array | None = None
-        self._enter(kind)
+        self._set_up(kind)
         left_out = [
             f"{effect} is not tested: {why}" for effect, why in kind.system.left_out.items()
         ]
@@ -278,7 +278,7 @@ class _ExplainRun:
         self.file = _Worlds(self.kind, self.fitting, self.validation)
         self.found: tuple[EffectSearch, DiagnosisResult] | None = None
         self.faults: tuple[RecordingFault, ...] = ()
-        self._check()
+        self._check_recording()
 
     def _with_contacts(self, kind: type[SystemSimulator]) -> type[SystemSimulator]:
         """Return the simulator of a robot with effects at the contacts of the recording."""
@@ -292,63 +292,65 @@ class _ExplainRun:
         contacts = find_recorded_contacts(self.recording, kind)
         return kind.with_contacts(contacts) if contacts else kind
 
-    def _enter(self, kind: type[SystemSimulator]) -> None:
+    def _set_up(self, kind: type[SystemSimulator]) -> None:
         """Set up run evaluators, noise floor and validation for a simulator class.
 
         It is called again if a finer time step or another friction model replaces the simulator.
         """
-        before = self._followed()
-        self.fitting = self._world(kind, self.recording.training())
+        before = self._list_filtered_runs()
+        self.fitting = self._build_run_evaluator(kind, self.recording.training())
         self.floor: NoiseFloor = compute_noise_floor(self.fitting, self.recording)
         # The noise is white at first: each likelihood estimates its autocorrelation.
         self.noise = NoiseModel(self.floor.sigma, np.zeros(len(self.floor.sigma)))
         self.kind = kind
-        self.validation = self._validation(kind)
-        self.assessor = self._assessor()
-        for known, world in zip(before, self._worlds(), strict=False):
+        self.validation = self._prepare_validation(kind)
+        self.assessor = self._create_verdict_builder()
+        for known, evaluator in zip(before, self._list_run_evaluators(), strict=False):
             # The initial states of the runs depend little on the time step.
-            world.follow(known)
+            evaluator.follow(known)
 
-    def _worlds(self) -> list[RunEvaluator]:
+    def _list_run_evaluators(self) -> list[RunEvaluator]:
         """Return the run evaluators of the runs for fitting and of the held-out runs."""
         validation = self.validation
-        held_out = validation.world if isinstance(validation, HeldOutRuns) else None
+        held_out = validation.evaluator if isinstance(validation, HeldOutRuns) else None
         return [self.fitting] if held_out is None else [self.fitting, held_out]
 
-    def _followed(self) -> list[FollowedRuns]:
+    def _list_filtered_runs(self) -> list[FollowedRuns]:
         """Return the filtered runs of a robot, if there are any."""
         if not hasattr(self, "fitting"):
             return []
-        return [w.followed for w in self._worlds() if w.followed is not None]
+        return [w.followed for w in self._list_run_evaluators() if w.followed is not None]
 
-    def _validation(self, kind: type[SystemSimulator]) -> Validation | None:
+    def _prepare_validation(self, kind: type[SystemSimulator]) -> Validation | None:
         """Prepare the validation: on held-out runs, or by cross-validation of few runs."""
         if held_out := self.recording.held_out():
             # The same effects at the same indices give a parameter vector the same meaning here.
-            return HeldOutRuns(self._world(kind, held_out), self.noise)
+            return HeldOutRuns(self._build_run_evaluator(kind, held_out), self.noise)
         if len(self.recording.folds()) > 1:
             return CrossValidation(self.fitting, self.noise)
         return None
 
-    def _assessor(self) -> VerdictBuilder:
+    def _create_verdict_builder(self) -> VerdictBuilder:
         """Create the builder of the verdict from the present run evaluators."""
         given = self.recording, self.fitting, self.validation, self.floor, self.engine
         return VerdictBuilder(*given)
 
-    def _world(self, kind: type[SystemSimulator], runs: Sequence[Run]) -> RunEvaluator:
+    def _build_run_evaluator(
+        self, kind: type[SystemSimulator], runs: Sequence[Run]
+    ) -> RunEvaluator:
         """Build a run evaluator of some runs that shares the search control and the worker pool.
 
         It also has the widened bounds and the identified parameters of the base model found so far.
         """
-        world = RunEvaluator(
+        evaluator = RunEvaluator(
             kind, self.recording, runs, self.engine, list_hat_effects(kind), self.free
         )
-        world.watch = self.watch
-        world.crew = self.crew
-        self.crew.register(world)
-        use_bounds(world, {name: bounds for name, (_, bounds) in self.wider.items()})
-        world.identified = self.identified
-        return world
+        evaluator.watch = self.watch
+        evaluator.crew = self.crew
+        self.crew.register(evaluator)
+        use_bounds(evaluator, {name: bounds for name, (_, bounds) in self.wider.items()})
+        evaluator.identified = self.identified
+        return evaluator
 
     def _takes_no_effects(self) -> InputError:
         """Return the error for a simulator to which no effects can be added."""
@@ -357,17 +359,17 @@ class _ExplainRun:
             "so nothing can be missing from it"
         )
 
-    def _check(self) -> None:
+    def _check_recording(self) -> None:
         """Refuse a recording that is too short, or whose values are far too large.
 
         Raises:
             InputError: It has too few samples for its parameters and initial states, or the values
                 of a channel are so large that its unit must be wrong.
         """
-        world = self.fitting
+        evaluator = self.fitting
         # With fewer samples than unknowns every model fits exactly, and no gap would be visible.
-        samples = int(np.isfinite(world.observed).sum())
-        unknowns = world.base.size + int((~world.known).sum())
+        samples = int(np.isfinite(evaluator.observed).sum())
+        unknowns = evaluator.base.size + int((~evaluator.known).sum())
         if samples < MIN_SAMPLES_PER_UNKNOWN * unknowns + MIN_EXTRA_SAMPLES:
             least = int(MIN_SAMPLES_PER_UNKNOWN * unknowns) + MIN_EXTRA_SAMPLES
             raise InputError(
@@ -377,8 +379,8 @@ class _ExplainRun:
         # Values that are too large by orders of magnitude have a wrong unit; no fit could follow
         # them.
         measuring = self.assessor.held_out_evaluator
-        parts = [part.observed for part in (world, measuring) if part is not None]
-        for c, channel in enumerate(world.simulator.channels):
+        parts = [part.observed for part in (evaluator, measuring) if part is not None]
+        for c, channel in enumerate(evaluator.simulator.channels):
             largest = max(float(np.nanmax(np.abs(part[..., c]), initial=0.0)) for part in parts)
             if largest >= MAX_CHANNEL_SIZE_FACTOR * channel.scale:
                 raise InputError(
@@ -397,10 +399,10 @@ class _ExplainRun:
         """
         self._refuse_broken_conventions()
         self.watch.stage(STAGES["base_fit"])
-        base = self._base()
+        base = self._fit_base()
         if not np.isfinite(base.fit.simulated[np.isfinite(self.fitting.observed)]).all():
-            raise self._fails()
-        found = self._searched(base)
+            raise self._make_simulation_error()
+        found = self._search_with_friction_forms(base)
         found = self._with_better_step(found.search, found.finding) or found
         base, search, finding, rng = found
         self.watch.stage("measuring the gain")
@@ -415,26 +417,26 @@ class _ExplainRun:
         story = DiagnosisReportDataBuilder(
             self.assessor, search, base, finding, notes
         ).build_report_data(verdict)
-        return Explanation(verdict, story, self._extended(search, finding))
+        return Explanation(verdict, story, self._build_extended_simulator(search, finding))
 
-    def _searched(self, base: BaseFit) -> _Found:
+    def _search_with_friction_forms(self, base: BaseFit) -> _Found:
         """Search for causes; repeat with MuJoCo's soft dry friction if the data support that form.
 
         Dry friction of a robot is either a stiff limit (the search's own effects) or MuJoCo's soft
         constraint. A search ends with `SoftFrictionError` if it finds the soft form likelier.
         """
         # Surrogates and bootstrap share one random stream, so that a seed gives the same result.
-        rng = self._rng()
-        search = self._search(base, rng)
+        rng = self._make_rng()
+        search = self._create_search(base, rng)
         if not self.kind.has_model:
-            return _Found(base, search, self._finding(search), rng)
+            return _Found(base, search, self._find_causes(search), rng)
         # This import is needed for robots only.
         from bench.diagnosis.prediction_error.prediction_error_search import PredictionErrorSearch
         from bench.diagnosis.prediction_error.selection_fits import SoftFrictionError
 
         stiff = _Worlds(self.kind, self.fitting, self.validation)
         try:
-            found = _Found(base, search, self._finding(search), rng)
+            found = _Found(base, search, self._find_causes(search), rng)
             # A search does not select dry friction that is a free number.
             is_free = has_dry_friction(self.fitting, ())
             done = self.watch.has_abandoned_fits() or bool(self.faults) or not is_free
@@ -453,12 +455,12 @@ class _ExplainRun:
                 return soft
         self.say(STIFF_FRICTION)
         before = self.assessor.before
-        self._return(stiff, before)
-        again = self._search(base, rng, is_form_given=True)
+        self._restore_evaluators(stiff, before)
+        again = self._create_search(base, rng, is_form_given=True)
         if isinstance(search, PredictionErrorSearch) and isinstance(again, PredictionErrorSearch):
             again.take_over(search)
         try:
-            return _Found(base, again, self._finding(again), rng)
+            return _Found(base, again, self._find_causes(again), rng)
         except SoftFrictionError as error:
             return self._searched_soft(base, search, error.start)
 
@@ -477,7 +479,7 @@ class _ExplainRun:
         self.watch.stage("comparing conventions of log and model")
         if self._has_contacts and self._fails_at_contacts(self._filter()):
             return
-        differences = ConventionComparison(self._units).differences()
+        differences = ConventionComparison(self._unit_check_subject).differences()
         if not differences:
             return
         remedy = "correct these signals"
@@ -485,7 +487,8 @@ class _ExplainRun:
             _, meta = read_meta(self.recording.path)
             lines = "; ".join(lines_of(meta, self.kind, differences))
             remedy = (
-                f"set {lines} in {self._units.file}, or write a corrected description: "
+                f"set {lines} in {self._unit_check_subject.file}, "
+                "or write a corrected description: "
                 f"simgap inspect {self.path.name} --fix NAME.toml"
             )
         what = "; ".join(one.description for one in differences)
@@ -514,39 +517,41 @@ class _ExplainRun:
 
         self.say(SOFT_FRICTION)
         held_out = self.assessor.before
-        self._enter(soft_kind(self.kind))
+        self._set_up(soft_kind(self.kind))
         self.assessor = replace(self.assessor, before=held_out)
         fitter = TrajectoryFitter(self.fitting, self.noise, base.fixed_parameters)
         start = replace(base.fit.make_start(), states=self.fitting.guess)
         (fit,) = fitter.fit_models([start], FINAL_ITERATIONS)
         base = self._without_step(replace(base, fit=fit))
-        rng = self._rng()
-        search = self._search(base, rng)
+        rng = self._make_rng()
+        search = self._create_search(base, rng)
         if isinstance(search, PredictionErrorSearch) and isinstance(before, PredictionErrorSearch):
             search.likely = likely
             # Friction of the file keeps its form unless it is a free number.
             if not has_dry_friction(self.fitting, ()):
                 search.take_over(before)
-        return _Found(base, search, self._finding(search), rng)
+        return _Found(base, search, self._find_causes(search), rng)
 
-    def _answered(self, base: BaseFit) -> _Found:
+    def _search_from_settled_base(self, base: BaseFit) -> _Found:
         """Freeze and correct a base model that was fitted with another step, and search again."""
-        return self._searched(self._settled(base))
+        return self._search_with_friction_forms(self._settle_base(base))
 
-    def _finding(self, search: EffectSearch) -> DiagnosisResult:
+    def _find_causes(self, search: EffectSearch) -> DiagnosisResult:
         """Return the finding; without causes if the recording has a wrong unit or sign.
 
         Every cause would only imitate the wrong unit or sign.
         """
         base = search.base_model
         if not self.faults:
-            finding = self.assessor.judged(search, self._named(search))
-            self.faults = self._imitated(search, finding) or self._unexplained(search, finding)
+            finding = self.assessor.judged(search, self._search_and_decide(search))
+            self.faults = self._check_units_imitated_by_causes(
+                search, finding
+            ) or self._check_units_of_unexplained(search, finding)
             if not self.faults:
                 return finding
         return DiagnosisResult("unknown", base, base, (), assess_lack_of_fit(search, base))
 
-    def _named(self, search: EffectSearch) -> DiagnosisResult:
+    def _search_and_decide(self, search: EffectSearch) -> DiagnosisResult:
         """Run the search and select a verdict.
 
         For a robot whose runs could be filtered, the search uses prediction errors.
@@ -556,14 +561,14 @@ class _ExplainRun:
                 # This import is needed for robots only.
                 from bench.diagnosis.kalman.contact_proposals import propose_contact_effects
 
-                propose_contact_effects(search, self._worlds())
+                propose_contact_effects(search, self._list_run_evaluators())
             return diagnose(search, self.validation)
         # This import is needed for robots only.
         from bench.diagnosis.prediction_error.simulation_confirmation import Confirmation
 
         return answer(Confirmation(search, self.validation))
 
-    def _unexplained(
+    def _check_units_of_unexplained(
         self, search: EffectSearch, finding: DiagnosisResult
     ) -> tuple[RecordingFault, ...]:
         """Test for a wrong unit or sign of a robot's recording, if no effect explains the residual.
@@ -580,21 +585,21 @@ class _ExplainRun:
         if left < MAX_EXCESS_SHARE_WITH_RIGHT_UNITS * before:
             return ()
         base = BaseFit(search.base_model.fit, frozenset(search.frozen))
-        fault = wrong_units(self._units, self.fitting, self.noise, base)
+        fault = wrong_units(self._unit_check_subject, self.fitting, self.noise, base)
         return () if fault is None else (fault,)
 
-    def _imitated(
+    def _check_units_imitated_by_causes(
         self, search: EffectSearch, finding: DiagnosisResult
     ) -> tuple[RecordingFault, ...]:
         """Return wrong units and signs that the diagnosed causes imitate."""
         found = [
-            recognised(self._units, self.fitting, cause, search.base_model.fit)
+            recognised(self._unit_check_subject, self.fitting, cause, search.base_model.fit)
             for cause in self.assessor.causes(search, finding)
         ]
         return tuple(fault for fault in found if fault is not None)
 
     @property
-    def _units(self) -> Subject:
+    def _unit_check_subject(self) -> Subject:
         """Input of the unit check."""
         return Subject(self.kind, self.recording, self.engine, self.free)
 
@@ -625,7 +630,9 @@ class _ExplainRun:
                 return design_next_run(search, finding.model, rivals, seconds, longest)
         return design_next_run(search, finding.model, (), seconds, longest)
 
-    def _search(self, base: BaseFit, rng: np.random.Generator, **attributes: Any) -> EffectSearch:
+    def _create_search(
+        self, base: BaseFit, rng: np.random.Generator, **attributes: Any
+    ) -> EffectSearch:
         """Create a search that starts from the base fit.
 
         It is a prediction-error search if the runs of a robot could be filtered, because it needs
@@ -645,22 +652,22 @@ class _ExplainRun:
         search.add_fit(base.fit)
         return search
 
-    def _base(self) -> BaseFit:
+    def _fit_base(self) -> BaseFit:
         """Fit the base model; for a robot with the time step that the data support.
 
         This is the step of the model file or a finer one.
         """
         if self.kind.has_model:
-            self._follow()
-        base = fit_base_model(self.fitting, self.noise, self._given())
+            self._filter_runs()
+        base = fit_base_model(self.fitting, self.noise, self._get_given_starts())
         if self._asks_units_late:
-            return self._prepared(base)
+            return self._prepare_robot_base(base)
         if not self.watch.has_abandoned_fits():
-            fault = wrong_units(self._units, self.fitting, self.noise, base)
+            fault = wrong_units(self._unit_check_subject, self.fitting, self.noise, base)
             self.faults = (fault,) if fault is not None else ()
         if self.faults:
             return base
-        return self._prepared(base) if self.kind.has_model else self._within_range(base)
+        return self._prepare_robot_base(base) if self.kind.has_model else self._within_range(base)
 
     @property
     def _asks_units_late(self) -> bool:
@@ -676,7 +683,7 @@ class _ExplainRun:
         """Return whether the base model has parameters."""
         return bool(self.fitting.base.size)
 
-    def _follow(self) -> None:
+    def _filter_runs(self) -> None:
         """Filter the runs of a robot with the present model (Kalman filter and smoother).
 
         The filter provides initial states and starting values of free parameters. If the linearised
@@ -686,7 +693,7 @@ class _ExplainRun:
         from bench.diagnosis.kalman.candidate_responses import FollowedRuns
 
         self.watch.stage("computing prediction errors")
-        world, *held_out = self._worlds()
+        evaluator, *held_out = self._list_run_evaluators()
         followed = self._filter()
         # Where the linear model diverges, causes are searched by simulation.
         if not followed.is_sound or self._fails_at_contacts(followed):
@@ -694,19 +701,19 @@ class _ExplainRun:
                 # This import is needed for robots only.
                 from bench.diagnosis.kalman.contact_proposals import begin_in_contact
 
-                theta = world.get_nominal_theta()
-                begin_in_contact(self._worlds(), theta, self.noise.sigma)
+                theta = evaluator.get_nominal_theta()
+                begin_in_contact(self._list_run_evaluators(), theta, self.noise.sigma)
             return
         if self.free_numbers and self.tuner is None:
-            followed = self._identified(followed)
-        world.follow(followed)
-        for world in held_out:
+            followed = self._filter_with_fitted_parameters(followed)
+        evaluator.follow(followed)
+        for evaluator in held_out:
             # Held-out runs are only simulated; without a filter they begin at their measured
             # values.
-            theta = world.get_nominal_theta()
-            found = FollowedRuns.follow(world, theta, self.noise, max_linearisations=1)
+            theta = evaluator.get_nominal_theta()
+            found = FollowedRuns.follow(evaluator, theta, self.noise, max_linearisations=1)
             if found.is_sound:
-                world.follow(found)
+                evaluator.follow(found)
 
     def _fails_at_contacts(self, followed: FollowedRuns) -> bool:
         """Return whether the linear model of a robot fails at the contacts of the recording.
@@ -729,42 +736,44 @@ class _ExplainRun:
         # This import is needed for robots only.
         from bench.diagnosis.kalman.candidate_responses import FollowedRuns
 
-        world = self.fitting
-        if self._filtered is None or self._filtered.world is not world:
-            self._filtered = FollowedRuns.follow(world, world.get_nominal_theta(), self.noise)
+        evaluator = self.fitting
+        if self._filtered is None or self._filtered.evaluator is not evaluator:
+            self._filtered = FollowedRuns.follow(
+                evaluator, evaluator.get_nominal_theta(), self.noise
+            )
         return self._filtered
 
-    def _identified(self, followed: FollowedRuns) -> FollowedRuns:
+    def _filter_with_fitted_parameters(self, followed: FollowedRuns) -> FollowedRuns:
         """Return the runs, filtered with base parameters from a prediction-error fit."""
         # These imports are needed for robots only.
         from bench.diagnosis.kalman.likelihood_fit import identify_base
         from bench.diagnosis.prediction_error.incomplete_model import is_long
 
-        world = self.fitting
-        declared = {p.name: p.bounds for p in world.parameters}
+        evaluator = self.fitting
+        declared = {p.name: p.bounds for p in evaluator.parameters}
         # The joints of a real robot have friction, and long recordings are those of real robots.
-        found, wider = identify_base(world, self.noise, followed, is_long(world))
+        found, wider = identify_base(evaluator, self.noise, followed, is_long(evaluator))
         if found is not followed:
-            self.identified = world.identified = found.theta[world.base]
-        self._widen(wider, declared)
+            self.identified = evaluator.identified = found.theta[evaluator.base]
+        self._widen_ranges(wider, declared)
         return found
 
-    def _widen(self, found: Mapping[str, Bounds], declared: Mapping[str, Bounds]) -> None:
+    def _widen_ranges(self, found: Mapping[str, Bounds], declared: Mapping[str, Bounds]) -> None:
         """Report the wider ranges of base parameters, and use them for all runs."""
-        for world in self._worlds()[1:]:
-            use_bounds(world, found)
+        for evaluator in self._list_run_evaluators()[1:]:
+            use_bounds(evaluator, found)
         for parameter, (low, high) in found.items():
             self.say(f"{parameter} ends at a bound of its range: widened to {low:g} to {high:g}")
         self.wider |= {one: (declared[one], bounds) for one, bounds in found.items()}
 
-    def _prepared(self, base: BaseFit) -> BaseFit:
+    def _prepare_robot_base(self, base: BaseFit) -> BaseFit:
         """Return the base model of a robot with the step that the data support.
 
         Free numbers that the data cannot identify are frozen.
         """
         if self._shows_steps(base):
-            base = self._stepped(base)
-        return self._settled(base)
+            base = self._choose_base_step(base)
+        return self._settle_base(base)
 
     def _shows_steps(self, base: BaseFit) -> bool:
         """Return whether the recording shows the discretisation error of the engine's steps."""
@@ -790,9 +799,9 @@ class _ExplainRun:
             return base
         return correct_discretisation(self.fitting, self.noise, base)
 
-    def _settled(self, base: BaseFit) -> BaseFit:
+    def _settle_base(self, base: BaseFit) -> BaseFit:
         """Widen ranges, freeze unidentified numbers and correct the step error of a base model."""
-        base = self._frozen(self._within_range(base))
+        base = self._freeze_unidentified(self._within_range(base))
         # The choice of the step precedes this correction, which hides the discretisation error.
         return self._without_step(base)
 
@@ -801,10 +810,10 @@ class _ExplainRun:
         declared = {p.name: p.bounds for p in self.fitting.parameters}
         declared |= {name: bounds for name, (bounds, _) in self.wider.items()}
         base, found = fit_wider(self.fitting, self.noise, base)
-        self._widen(found, declared)
+        self._widen_ranges(found, declared)
         return base
 
-    def _frozen(self, base: BaseFit) -> BaseFit:
+    def _freeze_unidentified(self, base: BaseFit) -> BaseFit:
         """Freeze free numbers of a robot that the data cannot identify.
 
         A system has few parameters, and would have no result without them; there the verdict
@@ -813,7 +822,7 @@ class _ExplainRun:
         if self.watch.has_abandoned_fits() or not np.isfinite(base.fit.cost):
             return base
         kept = freeze_unidentified_parameters(
-            self.fitting, self.noise, base, lambda base: self._search(base, self._rng())
+            self.fitting, self.noise, base, lambda base: self._create_search(base, self._make_rng())
         )
         if kept.unidentified_parameters:
             names = ", ".join(
@@ -825,7 +834,7 @@ class _ExplainRun:
             )
         return kept
 
-    def _stepped(self, base: BaseFit) -> BaseFit:
+    def _choose_base_step(self, base: BaseFit) -> BaseFit:
         """Choose the step of the base model: the file's own, or a finer one.
 
         A finer step is used if it alone closes a large part of the gap. The run evaluators of the
@@ -836,18 +845,18 @@ class _ExplainRun:
 
         self.finer = Reusable(find_step_refinements(self.fitting, self.noise))
         file = _Worlds(self.kind, self.fitting, self.validation)
-        value, left = self._judged(base)
+        value, left = self._rate_base(base)
         gap = left - 1.0
         for fine in self.finer:
             # A finer step leaves a smaller residual; a step that is too coarse for it is not tried.
             if not fine.is_accurate_enough(left):
                 continue
-            self._enter(fine.kind)
+            self._set_up(fine.kind)
             if self.fitting.followed is None:
                 # A model that diverges with the file's step may be filtered with a finer one.
-                self._follow()
-            other = fit_base_model(self.fitting, self.noise, self._nearby(base))
-            reached, left = self._judged(other)
+                self._filter_runs()
+            other = fit_base_model(self.fitting, self.noise, self._get_nearby_starts(base))
+            reached, left = self._rate_base(other)
             if not is_finer_step_better(reached - value, gap, left - 1.0):
                 # Another missing effect may affect both models: they are compared again with it.
                 if fine.is_accurate_enough(0.0):
@@ -856,7 +865,7 @@ class _ExplainRun:
             elif fine.is_accurate_enough(left):
                 self._use_finer(fine, reached - value, base, file)
                 return other
-        self._return(file)
+        self._restore_evaluators(file)
         return base
 
     def _use_finer(self, fine: StepRefinement, gain: float, base: BaseFit, file: _Worlds) -> None:
@@ -866,7 +875,9 @@ class _ExplainRun:
             f"simulated with a smaller time step: {numerics.integrator}, {numerics.timestep:g} s"
         )
         self.coarse, self.file = CoarseStepFinding(fine, gain), file
-        self.assessor = replace(self.assessor, before=self._before(base, file.validation))
+        self.assessor = replace(
+            self.assessor, before=self._predict_with_file_step(base, file.validation)
+        )
 
     def _with_better_step(self, search: EffectSearch, finding: DiagnosisResult) -> _Found | None:
         """Return the result with another step, if that explains the data better; otherwise None.
@@ -891,30 +902,34 @@ class _ExplainRun:
         here = _Worlds(self.kind, self.fitting, self.validation)
         if self.coarse is not None:
             before = self.assessor.before
-            self._return(self.file)
-            if not is_finer_model_better(self._best(search, finding), found):
+            self._restore_evaluators(self.file)
+            if not is_finer_model_better(self._rate_best_subset(search, finding), found):
                 self.say(
                     "the time step of the model file explains the data equally well: it is used"
                 )
                 self.coarse = None
                 base = BaseFit(search.base_model.fit, search.frozen)
-                return self._answered(fit_base_model(self.fitting, self.noise, self._nearby(base)))
-            self._return(here, before)
+                return self._search_from_settled_base(
+                    fit_base_model(self.fitting, self.noise, self._get_nearby_starts(base))
+                )
+            self._restore_evaluators(here, before)
             return None
         fine = next((one for one in self.finer or () if one.is_accurate_enough(0.0)), None)
         if fine is None:
             return None
-        self._enter(fine.kind)
-        best = self._best(search, finding)
+        self._set_up(fine.kind)
+        best = self._rate_best_subset(search, finding)
         if not is_finer_model_better(found, best):
-            self._return(here)
+            self._restore_evaluators(here)
             return None
         base = BaseFit(search.base_model.fit, search.frozen)
-        other = fit_base_model(self.fitting, self.noise, self._nearby(base))
+        other = fit_base_model(self.fitting, self.noise, self._get_nearby_starts(base))
         self._use_finer(fine, best[0] - found[0], base, here)
-        return self._answered(other)
+        return self._search_from_settled_base(other)
 
-    def _best(self, search: EffectSearch, finding: DiagnosisResult) -> tuple[float, float]:
+    def _rate_best_subset(
+        self, search: EffectSearch, finding: DiagnosisResult
+    ) -> tuple[float, float]:
         """Fit all subsets of a finding's effects with the present step, and rate the best model.
 
         Returns:
@@ -932,45 +947,47 @@ class _ExplainRun:
         fits = TrajectoryFitter(self.fitting, self.noise, search.frozen).fit_models(
             starts, MAX_ITERATIONS
         )
-        models = self._search(BaseFit(search.base_model.fit, search.frozen), self._rng())
+        models = self._create_search(
+            BaseFit(search.base_model.fit, search.frozen), self._make_rng()
+        )
         best = max(
             (models.add_fit(one) for one in fits), key=lambda model: model.penalised_log_likelihood
         )
         return best.penalised_log_likelihood, models.compute_excess(best)
 
-    def _nearby(self, base: BaseFit) -> Array | None:
+    def _get_nearby_starts(self, base: BaseFit) -> Array | None:
         """Return starting values for a fit with another step; None for the default starts.
 
         A different step changes the best parameters only a little, so the fit needs no other
         starts, unless the fit with the previous step failed.
         """
         if not np.isfinite(base.fit.cost) or self.identified is not None:
-            return self._given()
+            return self._get_given_starts()
         nearby: Array = base.fit.theta[self.fitting.base]
         return nearby
 
-    def _before(self, base: BaseFit, validation: Validation | None) -> Array | None:
+    def _predict_with_file_step(self, base: BaseFit, validation: Validation | None) -> Array | None:
         """Predict the held-out runs with the file's own step; None without validation."""
         if validation is None:
             return None
         return validation.validate([base.fit])[0].simulated
 
-    def _return(self, worlds: _Worlds, before: Array | None = None) -> None:
+    def _restore_evaluators(self, evaluators: _Worlds, before: Array | None = None) -> None:
         """Return to run evaluators that were in use before."""
-        self.kind, self.fitting, self.validation = worlds
-        self.assessor = replace(self._assessor(), before=before)
+        self.kind, self.fitting, self.validation = evaluators
+        self.assessor = replace(self._create_verdict_builder(), before=before)
 
-    def _judged(self, base: BaseFit) -> tuple[float, float]:
+    def _rate_base(self, base: BaseFit) -> tuple[float, float]:
         """Return twice the log-likelihood and the RMS residual, in noise units, of a base model."""
-        found = self._search(base, self._rng())
+        found = self._create_search(base, self._make_rng())
         return float(found.base_model.likelihood.value), 1.0 + found.compute_excess(
             found.base_model
         )
 
-    def _rng(self) -> np.random.Generator:
+    def _make_rng(self) -> np.random.Generator:
         return make_rng("explain", self.recording.system, self.seed)
 
-    def _fails(self) -> InputError:
+    def _make_simulation_error(self) -> InputError:
         """Return the error that explains why nothing could be simulated."""
         if self.faults:
             return InputError(f"{self.path}: {self.faults[0].says}")
@@ -984,7 +1001,7 @@ class _ExplainRun:
             "check constants, units, inputs and initial states"
         )
 
-    def _given(self) -> Array | None:
+    def _get_given_starts(self) -> Array | None:
         """Return starting values of the base parameters; None for the default starts.
 
         They come from a registered tuner, or are those identified by prediction errors.
@@ -996,26 +1013,28 @@ class _ExplainRun:
 
         return find_start_with_tuner(self.tuner, self.fitting, self.noise, self.seed)
 
-    def _extended(self, search: EffectSearch, finding: DiagnosisResult) -> ExtendedSimulator:
+    def _build_extended_simulator(
+        self, search: EffectSearch, finding: DiagnosisResult
+    ) -> ExtendedSimulator:
         """Build the extended simulator: the base simulator with fitted values and found effects.
 
         `own` has the fitted base parameters, `freed` the constants fitted like parameters, and
         `added` the coefficients of each found effect, all by name.
         """
-        world, numbers = (
+        evaluator, numbers = (
             self.fitting,
             self.assessor.collect_parameter_estimates(search, finding.model),
         )
-        own = {p.name: numbers[i] for i, p in enumerate(world.parameters[: world.own])}
+        own = {p.name: numbers[i] for i, p in enumerate(evaluator.parameters[: evaluator.own])}
         # A freed constant becomes a constant of the extended simulator, with its fitted value.
-        freed = {p.name: numbers[world.own + i].value for i, p in enumerate(world.freed)}
+        freed = {p.name: numbers[evaluator.own + i].value for i, p in enumerate(evaluator.freed)}
         added = {}
         # The simulator's order keeps the file independent of the order of the search.
-        for effect, slot in world.slots.items():
+        for effect, slot in evaluator.slots.items():
             if effect not in finding.model.effects:
                 continue
-            coefficients = world.available_effects[effect].on(world.simulator.system)
-            places = range(*slot.indices(len(world.parameters)))
+            coefficients = evaluator.available_effects[effect].on(evaluator.simulator.system)
+            places = range(*slot.indices(len(evaluator.parameters)))
             added[effect] = {
                 coefficient.name: numbers[place]
                 for coefficient, place in zip(coefficients, places, strict=True)
@@ -1028,7 +1047,7 @@ class _ExplainRun:
             own,
             added,
             {**self.recording.constants, **freed},
-            world.channels,
+            evaluator.channels,
             self.kind,
             extend.get_robot_reference(self.kind),
         )

@@ -32,53 +32,53 @@ def soft_kind(kind: type[SystemSimulator]) -> type[SystemSimulator]:
     return soft_simulator
 
 
-def has_dry_friction(world: RunEvaluator, names: Iterable[str]) -> bool:
+def has_dry_friction(evaluator: RunEvaluator, names: Iterable[str]) -> bool:
     """Return whether effects or freed numbers of a robot contain dry friction.
 
     Only then the form of dry friction matters.
 
     Args:
-        world: Run evaluator; its simulator may be a robot.
+        evaluator: Run evaluator; its simulator may be a robot.
         names: Names of effects.
     """
-    robot: Any = world.kind
+    robot: Any = evaluator.kind
     if not robot.has_model:
         return False
     freed_effects: list[type[Effect]] = list(robot.system.freed_effects)
-    plain_names = [plain_friction(world, name) for name in names]
-    effects = [*(type(world.available_effects[name]) for name in plain_names), *freed_effects]
+    plain_names = [plain_friction(evaluator, name) for name in names]
+    effects = [*(type(evaluator.available_effects[name]) for name in plain_names), *freed_effects]
     return any(_is_dry_friction(effect) for effect in effects)
 
 
-def has_soft_form(world: RunEvaluator) -> bool:
+def has_soft_form(evaluator: RunEvaluator) -> bool:
     """Return whether the effects of a robot add dry friction in MuJoCo's soft form."""
-    robot: Any = world.kind
+    robot: Any = evaluator.kind
     return bool(robot.has_model and robot.robot.friction_form == "soft")
 
 
-def form_of(world: RunEvaluator, name: str) -> str | None:
+def form_of(evaluator: RunEvaluator, name: str) -> str | None:
     """Return ``soft`` for dry friction in MuJoCo's soft form, and None for other effects.
 
     Args:
-        world: Run evaluator with the effect.
+        evaluator: Run evaluator with the effect.
         name: Name of the effect.
     """
-    is_soft = has_soft_form(world) and _is_dry_friction(type(world.available_effects[name]))
+    is_soft = has_soft_form(evaluator) and _is_dry_friction(type(evaluator.available_effects[name]))
     return "soft" if is_soft else None
 
 
-def with_solver_parameters(world: RunEvaluator, name: str, description: str) -> str:
+def with_solver_parameters(evaluator: RunEvaluator, name: str, description: str) -> str:
     """Add the soft form to the description of an effect, before the place in brackets at its end.
 
     For example ``..., in MuJoCo's soft form (solreffriction 0.02 1) (at joint elbow)``.
 
     Args:
-        world: Run evaluator with the effect.
+        evaluator: Run evaluator with the effect.
         name: Name of the effect.
         description: Description of the effect.
     """
-    robot: Any = world.kind
-    effect = type(world.available_effects[name])
+    robot: Any = evaluator.kind
+    effect = type(evaluator.available_effects[name])
     members = members_of(effect)
     joints = [joint for joint in robot.robot.joints if joint.has_one_coordinate]
     places = [member.coordinate for member in members if member.coordinate is not None]
@@ -100,9 +100,9 @@ def is_likelier_soft(models: ModelSet, model: FittedModel, margin: float) -> boo
         model: One of these models, fitted.
         margin: Minimum gain in twice the log-likelihood.
     """
-    if not has_dry_friction(models.world, model.effects) or has_soft_form(models.world):
+    if not has_dry_friction(models.evaluator, model.effects) or has_soft_form(models.evaluator):
         return False
-    soft_world = models.world.with_kind(soft_kind(models.world.kind))
+    soft_world = models.evaluator.with_kind(soft_kind(models.evaluator.kind))
     try:
         return choose_friction_form(models, model, soft_world, margin) is not None
     finally:
@@ -133,23 +133,25 @@ def choose_friction_form(
     return refitted_model if gain >= margin else None
 
 
-def _refit_in(world: RunEvaluator, models: ModelSet, model: FittedModel) -> FittedModel:
-    """Fit the effects of a model with `world`, which has the other form of dry friction.
+def _refit_in(evaluator: RunEvaluator, models: ModelSet, model: FittedModel) -> FittedModel:
+    """Fit the effects of a model with `evaluator`, which has the other form of dry friction.
 
     Both forms can then be compared by their likelihoods.
     """
-    names, theta = with_plain_friction(models.world, model.effects, model.fit.theta)
+    names, theta = with_plain_friction(models.evaluator, model.effects, model.fit.theta)
     # The random numbers of these models do not affect the result.
     other_models = ModelSet(
-        world, models.noise, models.frozen, make_rng("friction form"), models.stated
+        evaluator, models.noise, models.frozen, make_rng("friction form"), models.stated
     )
     refitted_model = other_models.fit_one(FitStart(names, theta, model.fit.states))
-    if models.world.correction is None:
+    if models.evaluator.correction is None:
         return refitted_model
     # Both forms are compared without the discretisation error of the integrator.
     from bench.diagnosis.fitting.linearised_runs import correct_discretisation
 
-    correct_discretisation(world, models.noise, refitted_model.fit.theta, refitted_model.fit.states)
+    correct_discretisation(
+        evaluator, models.noise, refitted_model.fit.theta, refitted_model.fit.states
+    )
     other_models.models.clear()
     return other_models.fit_one(refitted_model.fit.make_start())
 
@@ -160,28 +162,28 @@ def _is_dry_friction(effect: type[Effect]) -> bool:
     return issubclass(effect, Friction) or any(isinstance(member, Friction) for member in members)
 
 
-def plain_friction(world: RunEvaluator, name: str) -> str:
+def plain_friction(evaluator: RunEvaluator, name: str) -> str:
     """Return the dry friction that an effect with a state contains, or else the effect itself.
 
     Args:
-        world: Run evaluator with the effect.
+        evaluator: Run evaluator with the effect.
         name: Name of the effect.
     """
-    effect = world.available_effects[name]
+    effect = evaluator.available_effects[name]
     if effect.hook != "hidden":
         return name
-    contained = [n for n in effect.contains if n in world.available_effects]
-    friction = [n for n in contained if _is_dry_friction(type(world.available_effects[n]))]
+    contained = [n for n in effect.contains if n in evaluator.available_effects]
+    friction = [n for n in contained if _is_dry_friction(type(evaluator.available_effects[n]))]
     return friction[0] if friction else name
 
 
 def with_plain_friction(
-    world: RunEvaluator, names: Iterable[str], theta: Array
+    evaluator: RunEvaluator, names: Iterable[str], theta: Array
 ) -> tuple[tuple[str, ...], Array]:
     """Replace effects with a state by the dry friction that they contain.
 
     Args:
-        world: Run evaluator of the runs.
+        evaluator: Run evaluator of the runs.
         names: Names of the effects of a model.
         theta: (P,) parameters of the model.
 
@@ -190,12 +192,12 @@ def with_plain_friction(
     """
     theta, plain_names = theta.copy(), dict[str, None]()
     for name in names:
-        friction = plain_friction(world, name)
+        friction = plain_friction(evaluator, name)
         plain_names[friction] = None
         if friction != name:
             # The first coefficient of both effects is the limit of the friction force.
-            theta[world.get_coefficient_indices(friction)[0]] += theta[
-                world.get_coefficient_indices(name)[0]
+            theta[evaluator.get_coefficient_indices(friction)[0]] += theta[
+                evaluator.get_coefficient_indices(name)[0]
             ]
-            theta[world.get_coefficient_indices(name)] = 0.0
+            theta[evaluator.get_coefficient_indices(name)] = 0.0
     return tuple(plain_names), theta

@@ -77,7 +77,7 @@ class ParameterIdentifiability:
 
 
 def assess_identifiability(
-    world: RunEvaluator,
+    evaluator: RunEvaluator,
     noise: NoiseModel,
     fit: TrajectoryFit,
     direction_set: DirectionSet | None = None,
@@ -85,7 +85,7 @@ def assess_identifiability(
     """Assess the identifiability of every free parameter and of every cause.
 
     Args:
-        world: Run evaluator of the runs.
+        evaluator: Run evaluator of the runs.
         noise: Noise of each channel.
         fit: Fit with its derivatives; the linearisation point.
         direction_set: Sensitivity directions of the causes at this point, if they are known.
@@ -95,10 +95,12 @@ def assess_identifiability(
     """
     if direction_set is None:
         names = [
-            name for name in world.library if world.available_effects[name].place != ALL_PLACES
+            name
+            for name in evaluator.library
+            if evaluator.available_effects[name].place != ALL_PLACES
         ]
-        direction_set = compute_directions(world, fit, names)
-    return _Identified(world, noise, fit, direction_set).numbers()
+        direction_set = compute_directions(evaluator, fit, names)
+    return _Identified(evaluator, noise, fit, direction_set).numbers()
 
 
 class _Identified:
@@ -106,7 +108,7 @@ class _Identified:
 
     def __init__(
         self,
-        world: RunEvaluator,
+        evaluator: RunEvaluator,
         noise: NoiseModel,
         fit: TrajectoryFit,
         direction_set: DirectionSet,
@@ -117,15 +119,15 @@ class _Identified:
         the number of samples times channels of a run. `parameters` (R · n, q) has those by the q
         free parameters, without the part that a change of the initial states can reproduce.
         """
-        self.world, self.noise, self.fit, self.found = world, noise, fit, direction_set
-        self.seen = np.isfinite(world.observed)
+        self.evaluator, self.noise, self.fit, self.found = evaluator, noise, fit, direction_set
+        self.seen = np.isfinite(evaluator.observed)
         q = fit.free.size
         jacobian = np.where(self.seen[..., None], fit.jacobian, 0.0)
         jacobian /= noise.sigma[:, None]
         runs = len(jacobian)
         flat = jacobian.reshape(runs, -1, jacobian.shape[3])
         # A known initial state is not fitted, so nothing is projected out for it.
-        self.states = flat[..., q:] * ~world.known[:, None, :]
+        self.states = flat[..., q:] * ~evaluator.known[:, None, :]
         self.parameters = self._project_out_states(flat[..., :q])
 
     def numbers(self) -> tuple[ParameterIdentifiability, ...]:
@@ -137,7 +139,7 @@ class _Identified:
     def _project_out_states(self, columns: Array) -> Array:
         """Project the initial states of each run out of columns (R, n, k); return (N, k)."""
         b = self.states
-        precision = np.diag(compute_state_prior(self.world) ** -2.0)
+        precision = np.diag(compute_state_prior(self.evaluator) ** -2.0)
         normal = np.matmul(b.transpose(0, 2, 1), b) + precision
         inner = np.linalg.solve(normal, np.matmul(b.transpose(0, 2, 1), columns))
         projected: Array = columns - np.matmul(b, inner)
@@ -159,13 +161,15 @@ class _Identified:
         covariance[places] = inverse / np.outer(scale[is_sensitive], scale[is_sensitive])
         numbers = []
         for i, place in enumerate(self.fit.free.tolist()):
-            parameter = self.world.parameters[place]
+            parameter = self.evaluator.parameters[place]
             sd = np.sqrt(max(float(covariance[i, i]), 0.0))
             confounders = []
             for j, other_place in enumerate(self.fit.free.tolist()):
                 if i != j and np.isfinite(covariance[i, j]) and is_sensitive[i] and is_sensitive[j]:
                     corr = covariance[i, j] / np.sqrt(covariance[i, i] * covariance[j, j])
-                    confounders.append((self.world.parameters[other_place].name, float(abs(corr))))
+                    confounders.append(
+                        (self.evaluator.parameters[other_place].name, float(abs(corr)))
+                    )
             low, high = parameter.bounds
             numbers.append(
                 _classify_parameter(
@@ -173,8 +177,8 @@ class _Identified:
                 )
             )
         # The fit has frozen parameters to which the runs are insensitive.
-        for place in sorted(set(self.world.base.tolist()) - set(self.fit.free.tolist())):
-            parameter = self.world.parameters[place]
+        for place in sorted(set(self.evaluator.base.tolist()) - set(self.fit.free.tolist())):
+            parameter = self.evaluator.parameters[place]
             numbers.append(
                 _classify_parameter(
                     parameter.name, True, parameter.unit, np.inf, parameter.bounds, ()
@@ -189,14 +193,14 @@ class _Identified:
         (k,) has the norm of each direction, in units of the noise, after the part that the
         parameters can reproduce is projected out.
         """
-        world = self.world
+        evaluator = self.evaluator
         probes = [
             p
             for p in self.found.candidates
-            if world.available_effects[p.effect].place != ALL_PLACES
+            if evaluator.available_effects[p.effect].place != ALL_PLACES
         ]
         is_at_one_place = [
-            world.available_effects[p.effect].place != ALL_PLACES for p in self.found.candidates
+            evaluator.available_effects[p.effect].place != ALL_PLACES for p in self.found.candidates
         ]
         values = self.found.responses[..., is_at_one_place]
         scaled_responses = np.where(self.seen[..., None], values, 0.0)
@@ -221,7 +225,7 @@ class _Identified:
         correlations = np.abs(units.T @ units)
         numbers = []
         for row, ((name, place), k) in zip(correlations, best.items(), strict=True):
-            parameter = world.parameters[world.get_coefficient_indices(name)[place]]
+            parameter = evaluator.parameters[evaluator.get_coefficient_indices(name)[place]]
             probe = probes[k]
             half_width = Z95 / powers[k] if powers[k] > 0 else np.inf
             confounders = [

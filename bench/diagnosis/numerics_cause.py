@@ -98,11 +98,11 @@ def add_numerics_cause(verdict: Verdict, coarse: CoarseStepFinding) -> Verdict:
         verdict: Verdict on the remaining causes.
         coarse: Finding that the file's step is too coarse.
     """
-    causes = (*_causes(coarse), *verdict.causes)
+    causes = (*_list_numerics_causes(coarse), *verdict.causes)
     return replace(verdict, verdict=_WITH.get(verdict.verdict, verdict.verdict), causes=causes)
 
 
-def _causes(coarse: CoarseStepFinding) -> list[Cause]:
+def _list_numerics_causes(coarse: CoarseStepFinding) -> list[Cause]:
     """Return the integrator and the time step as causes if they differ from the model file.
 
     Their p-value is that of the gain in twice the log-likelihood by Wilks' theorem, exp(-gain / 2)

@@ -22,7 +22,7 @@ MAX_REFITS = 4
 
 
 def freeze_unidentified_parameters(
-    world: RunEvaluator,
+    evaluator: RunEvaluator,
     noise: NoiseModel,
     base: BaseFit,
     searching: Callable[[BaseFit], EffectSearch],
@@ -30,7 +30,7 @@ def freeze_unidentified_parameters(
     """Freeze at the nominal value all free numbers that the data cannot identify.
 
     Args:
-        world: Run evaluator of the runs.
+        evaluator: Run evaluator of the runs.
         noise: Noise of each channel.
         base: Fitted base model.
         searching: Function that begins a search from a base model, which gives its covariance.
@@ -41,21 +41,23 @@ def freeze_unidentified_parameters(
     for iteration in range(MAX_REFITS):
         search = searching(base)
         unidentified = find_unidentified_parameters(search, search.base_model)
-        places = [i for i in world.base.tolist() if world.parameters[i].name in unidentified]
+        places = [
+            i for i in evaluator.base.tolist() if evaluator.parameters[i].name in unidentified
+        ]
         if not places:
             break
         # `unidentified` is sorted by the width of the intervals.
-        places.sort(key=lambda i: unidentified.index(world.parameters[i].name))
+        places.sort(key=lambda i: unidentified.index(evaluator.parameters[i].name))
         frozen_places = places if iteration == MAX_REFITS - 1 else places[: (len(places) + 1) // 2]
         theta = base.fit.theta.copy()
-        theta[frozen_places] = world.get_nominal_theta()[frozen_places]
+        theta[frozen_places] = evaluator.get_nominal_theta()[frozen_places]
         base = replace(
             base, unidentified_parameters=base.unidentified_parameters | frozenset(frozen_places)
         )
         start = replace(base.fit.make_start(), theta=theta)
         base = replace(
             base,
-            fit=TrajectoryFitter(world, noise, base.fixed_parameters).fit_models(
+            fit=TrajectoryFitter(evaluator, noise, base.fixed_parameters).fit_models(
                 [start], FINAL_ITERATIONS
             )[0],
         )

@@ -53,19 +53,19 @@ def check_identifiability(
     engine = kind.default_engine if kind.own_engine else "batch"
     constants = () if kind.has_model else tuple(free)
     with closing(ForkedWorkerPool(jobs)) as worker_pool:
-        world = RunEvaluator(kind, recording, recording.training(), engine, (), constants)
-        world.crew = worker_pool
-        worker_pool.register(world)
-        floor = compute_noise_floor(world, recording)
+        evaluator = RunEvaluator(kind, recording, recording.training(), engine, (), constants)
+        evaluator.crew = worker_pool
+        worker_pool.register(evaluator)
+        floor = compute_noise_floor(evaluator, recording)
         noise = NoiseModel(floor.sigma, np.zeros(len(floor.sigma)))
-        base = fit_base_model(world, noise)
+        base = fit_base_model(evaluator, noise)
         if not np.isfinite(base.fit.cost):
             raise InputError(
                 f"{recording.path}: the simulation fails at every starting point of the fit; "
                 "check constants, units, inputs and initial states"
             )
         numbers = assess_identifiability(
-            world, noise, compute_central_jacobian(world, base.fit, noise)
+            evaluator, noise, compute_central_jacobian(evaluator, base.fit, noise)
         )
-        world.close()
+        evaluator.close()
     return numbers

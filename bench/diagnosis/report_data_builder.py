@@ -60,7 +60,7 @@ class DiagnosisReportDataBuilder:
 
     def build_report_data(self, verdict: Verdict) -> DiagnosisReportData:
         """Collect everything that text, figures and page of a report need, for a verdict."""
-        world = self.assessor.fitting_evaluator
+        evaluator = self.assessor.fitting_evaluator
         recording = self.assessor.recording
         before = self.finding.base.fit.simulated
         after = self.finding.model.fit.simulated
@@ -73,18 +73,18 @@ class DiagnosisReportDataBuilder:
             recording.path,
             verdict,
             self._list_channels(sigma),
-            residual_analysis.build_data_split(world, before, after),
+            residual_analysis.build_data_split(evaluator, before, after),
             held_out,
             (
-                *residual_analysis.compute_gap_locations(world, before, after, sigma),
+                *residual_analysis.compute_gap_locations(evaluator, before, after, sigma),
                 *held_out_places,
             ),
-            tuple(residual_analysis.compute_residual_profiles(world, before, after, sigma)),
+            tuple(residual_analysis.compute_residual_profiles(evaluator, before, after, sigma)),
             tuple(self._list_parameter_changes()),
             () if verdict.recording_faults else tuple(self._list_unexplained()),
             () if verdict.recording_faults else tuple(self._list_verdict_reasons()),
             self.finding.unidentified_parameters,
-            residual_analysis.get_robot(world),
+            residual_analysis.get_robot(evaluator),
             identifiability=self._assess_identifiability(),
             consistency=ConsistencySummary()
             if verdict.recording_faults
@@ -141,7 +141,7 @@ class DiagnosisReportDataBuilder:
             if not related_effects & set(model.effects)
             and np.isfinite(model.penalised_log_likelihood)
             # A trend of a coefficient is only visible in effects with a single coefficient.
-            and len(self.search.world.get_coefficient_indices(model.effects[0])) == 1
+            and len(self.search.evaluator.get_coefficient_indices(model.effects[0])) == 1
         ]
         if not other_models:
             return ()
@@ -160,11 +160,11 @@ class DiagnosisReportDataBuilder:
         scan = self.search.cached_scans.get(key) or self.search.superseded_scans.get(key)
         directions = self.search.directions_known()
         if directions is not None:
-            return assess_identifiability(self.search.world, self.search.noise, *directions)
+            return assess_identifiability(self.search.evaluator, self.search.noise, *directions)
         if scan is None:
             return ()
         return assess_identifiability(
-            self.search.world, self.search.noise, scan.at, scan.directions
+            self.search.evaluator, self.search.noise, scan.at, scan.directions
         )
 
     @property
@@ -179,20 +179,20 @@ class DiagnosisReportDataBuilder:
 
     def _summarise_held_out(self, sigma: Array) -> tuple[DataSplit | None, list[GapLocation]]:
         """Return the held-out runs and their gap locations; None and empty if not measured."""
-        world = self.assessor.held_out_evaluator
+        evaluator = self.assessor.held_out_evaluator
         held_out_fits = self.finding.held_out_fits
         names = self.finding.model.effects
         # If the data do not identify the base model, it is not validated on held-out runs.
-        if world is None or held_out_fits is None or names not in held_out_fits:
+        if evaluator is None or held_out_fits is None or names not in held_out_fits:
             return None, []
         before = held_out_fits[()].simulated
         after = held_out_fits[names].simulated
         places = residual_analysis.compute_gap_locations(
-            world, before, after, sigma, f" ({self._how_validated})"
+            evaluator, before, after, sigma, f" ({self._how_validated})"
         )
         # Channels and phases are reported for the fitted runs only; held-out gaps by run.
         runs = [place for place in places if place.kind == "run"]
-        return residual_analysis.build_data_split(world, before, after), runs
+        return residual_analysis.build_data_split(evaluator, before, after), runs
 
     def _list_channels(self, sigma: Array) -> tuple[ChannelInfo, ...]:
         """Return name, unit and noise of each channel.
@@ -218,11 +218,11 @@ class DiagnosisReportDataBuilder:
         A parameter is marked if the data do not determine it, so that it was kept at its nominal
         value.
         """
-        world = self.assessor.fitting_evaluator
+        evaluator = self.assessor.fitting_evaluator
         before = self.assessor.collect_parameter_estimates(self.search, self.finding.base)
         after = self.assessor.collect_parameter_estimates(self.search, self.finding.model)
-        for i in world.base.tolist():
-            parameter = world.parameters[i]
+        for i in evaluator.base.tolist():
+            parameter = evaluator.parameters[i]
             is_free = i not in self.base.fixed_parameters
             yield ParameterChange(
                 parameter.name,
@@ -236,19 +236,23 @@ class DiagnosisReportDataBuilder:
 
     def _list_unexplained(self) -> Iterator[str]:
         """Yield sentences on what the extended model does not explain, and further notes."""
-        world = self.assessor.fitting_evaluator
+        evaluator = self.assessor.fitting_evaluator
         lack_of_fit = self.finding.lack_of_fit
         for channel in lack_of_fit.channels_above_noise:
-            times = lack_of_fit.excess[world.channels.index(channel)]
+            times = lack_of_fit.excess[evaluator.channels.index(channel)]
             yield f"the residual of channel {channel} is {times:.3g} times its noise"
         # Without a result of the test for unmodelled forces there is no dependence to report.
         if lack_of_fit.has_structure and lack_of_fit.where:
             yield f"the residual behaves like a force that depends on {lack_of_fit.where}"
-        insensitive = [world.parameters[i].name for i in sorted(self.base.insensitive_parameters)]
+        insensitive = [
+            evaluator.parameters[i].name for i in sorted(self.base.insensitive_parameters)
+        ]
         if insensitive:
             names = ", ".join(insensitive)
             yield f"the data do not depend on {names}: kept at the nominal value"
-        unidentified = [world.parameters[i].name for i in sorted(self.base.unidentified_parameters)]
+        unidentified = [
+            evaluator.parameters[i].name for i in sorted(self.base.unidentified_parameters)
+        ]
         if unidentified:
             names = ", ".join(unidentified)
             yield (

@@ -33,33 +33,33 @@ IMPACT_MARGIN_SAMPLES = 2
 """Number of samples before and after an impact that belong to it."""
 
 
-def build_data_split(world: RunEvaluator, before: Array, after: Array) -> DataSplit:
+def build_data_split(evaluator: RunEvaluator, before: Array, after: Array) -> DataSplit:
     """Return the runs of a run evaluator with two simulations of them.
 
     Args:
-        world: Run evaluator of the runs.
+        evaluator: Run evaluator of the runs.
         before: (R, T, C) simulated by the base model.
         after: (R, T, C) simulated by the extended model.
     """
-    names = tuple(track.name for track in world.tracks)
-    times = tuple(track.scenario.times for track in world.tracks)
-    return DataSplit(names, times, world.observed, before, after)
+    names = tuple(track.name for track in evaluator.tracks)
+    times = tuple(track.scenario.times for track in evaluator.tracks)
+    return DataSplit(names, times, evaluator.observed, before, after)
 
 
 def compute_gap_locations(
-    world: RunEvaluator, before: Array, after: Array, sigma: Array, mark: str = ""
+    evaluator: RunEvaluator, before: Array, after: Array, sigma: Array, mark: str = ""
 ) -> list[GapLocation]:
     """Compute the RMS residual in units of the noise, by run, channel and phase.
 
     Args:
-        world: Run evaluator of the runs.
+        evaluator: Run evaluator of the runs.
         before: (R, T, C) simulated by the base model.
         after: (R, T, C) simulated by the extended model.
         sigma: (C,) noise of each channel.
         mark: Text that is appended to the names of runs.
     """
-    parts = _list_parts(world, after, mark)
-    residuals = [(world.observed - simulated) / sigma for simulated in (before, after)]
+    parts = _list_parts(evaluator, after, mark)
+    residuals = [(evaluator.observed - simulated) / sigma for simulated in (before, after)]
     locations = []
     for kind, label, mask in parts:
         # A run or phase without samples has no RMS.
@@ -74,40 +74,42 @@ def compute_gap_locations(
     return locations
 
 
-def _list_parts(world: RunEvaluator, simulated: Array, mark: str) -> list[tuple[str, str, Mask]]:
+def _list_parts(
+    evaluator: RunEvaluator, simulated: Array, mark: str
+) -> list[tuple[str, str, Mask]]:
     """List the parts of the data for which the residual is reported: runs, channels and phases.
 
     Each has its kind, its label and the mask (R, T, C) of its samples. `mark` is appended to the
     names of runs. `simulated` (R, T, C) determines the phases of the motion.
     """
-    observed_mask = np.isfinite(world.observed)
+    observed_mask = np.isfinite(evaluator.observed)
     runs, _, channels = observed_mask.shape
     parts: list[tuple[str, str, Mask]] = []
-    for r, track in enumerate(world.tracks):
+    for r, track in enumerate(evaluator.tracks):
         is_run = np.arange(runs) == r
         mask = observed_mask & is_run[:, None, None]
         parts.append(("run", track.name + mark, mask))
-    for c, name in enumerate(world.channels):
+    for c, name in enumerate(evaluator.channels):
         is_channel = np.arange(channels) == c
         parts.append(("channel", name, observed_mask & is_channel))
     # Phases come from the simulation, because noise of a measured speed would cause false ones.
-    for phase, phase_mask in detect_phases(world, simulated).items():
+    for phase, phase_mask in detect_phases(evaluator, simulated).items():
         parts.append(("phase", phase, observed_mask & phase_mask[:, :, None]))
     return parts
 
 
-def detect_phases(world: RunEvaluator, simulated: Array) -> dict[str, Mask]:
+def detect_phases(evaluator: RunEvaluator, simulated: Array) -> dict[str, Mask]:
     """Detect phases of the motion as masks (R, T).
 
     They are flight, impact and at rest for a system that bounces; motion, reversal and at rest for
     others; and saturated input.
 
     Args:
-        world: Run evaluator of the runs.
+        evaluator: Run evaluator of the runs.
         simulated: (R, T, C) simulated motion.
     """
-    system = world.simulator.system
-    speed = compute_speeds(world, simulated)
+    system = evaluator.simulator.system
+    speed = compute_speeds(evaluator, simulated)
     if speed is None:
         return {}
     # The lower limit avoids a division by zero if nothing moves; then all is at rest.
@@ -115,33 +117,35 @@ def detect_phases(world: RunEvaluator, simulated: Array) -> dict[str, Mask]:
     # A reversal is slow for a moment too, so only a lasting state counts as rest.
     is_at_rest = _find_lasting_stretches(speed < REST_SPEED_SHARE * largest)
     if system.bounces:
-        impact = _find_impacts(world, simulated) & ~is_at_rest
+        impact = _find_impacts(evaluator, simulated) & ~is_at_rest
         masks = {"flight": ~impact & ~is_at_rest, "impact": impact, "at rest": is_at_rest}
     else:
         reversal = (speed < REVERSAL_SPEED_SHARE * largest) & ~is_at_rest
         masks = {"motion": ~reversal & ~is_at_rest, "reversal": reversal, "at rest": is_at_rest}
     # This phase may overlap with the others, because an input can saturate in each of them.
-    saturated = _find_saturation(world)
+    saturated = _find_saturation(evaluator)
     if saturated.any():
         masks["saturated input"] = saturated
     return masks
 
 
-def compute_speeds(world: RunEvaluator, simulated: Array) -> Array | None:
+def compute_speeds(evaluator: RunEvaluator, simulated: Array) -> Array | None:
     """Compute the speed (R, T) of the simulated motion along the recorded coordinates.
 
     Args:
-        world: Run evaluator of the runs.
+        evaluator: Run evaluator of the runs.
         simulated: (R, T, C) simulated motion.
 
     Returns:
         Speed, 0 after the end of a run; None without recorded coordinates.
     """
     squares = np.zeros(simulated.shape[:2])
-    recorded_coordinates = [n for n in world.simulator.system.coordinates if n in world.channels]
+    recorded_coordinates = [
+        n for n in evaluator.simulator.system.coordinates if n in evaluator.channels
+    ]
     for name in recorded_coordinates:
-        values = simulated[:, :, world.channels.index(name)]
-        for r, track in enumerate(world.tracks):
+        values = simulated[:, :, evaluator.channels.index(name)]
+        for r, track in enumerate(evaluator.tracks):
             size = len(track.observed)
             # A single sample has no slope.
             if size > 1:
@@ -162,13 +166,13 @@ def _find_lasting_stretches(mask: Mask) -> Mask:
     return lasting
 
 
-def _find_impacts(world: RunEvaluator, simulated: Array) -> Mask:
+def _find_impacts(evaluator: RunEvaluator, simulated: Array) -> Mask:
     """Return the mask (R, T) of the samples around each minimum of the simulated height."""
-    name = world.simulator.system.coordinates[-1]
+    name = evaluator.simulator.system.coordinates[-1]
     mask = np.zeros(simulated.shape[:2], dtype=bool)
-    if name not in world.channels:
+    if name not in evaluator.channels:
         return mask
-    height = simulated[:, :, world.channels.index(name)]
+    height = simulated[:, :, evaluator.channels.index(name)]
     # After the end of a shorter run heights are NaN, which are never lowest points.
     previous_heights, heights, next_heights = height[:, :-2], height[:, 1:-1], height[:, 2:]
     with np.errstate(invalid="ignore"):
@@ -180,13 +184,13 @@ def _find_impacts(world: RunEvaluator, simulated: Array) -> Mask:
     return mask
 
 
-def _find_saturation(world: RunEvaluator) -> Mask:
+def _find_saturation(evaluator: RunEvaluator) -> Mask:
     """Return the mask (R, T) of samples at which the first input stays near its largest magnitude.
 
     It is empty for an input that is there most of the time, such as a square wave.
     """
-    mask = np.zeros(world.observed.shape[:2], dtype=bool)
-    for r, track in enumerate(world.tracks):
+    mask = np.zeros(evaluator.observed.shape[:2], dtype=bool)
+    for r, track in enumerate(evaluator.tracks):
         for signal in list(track.scenario.inputs.values())[:1]:
             size = np.abs(signal)
             largest = max(float(size.max()), 1e-300)
@@ -197,7 +201,7 @@ def _find_saturation(world: RunEvaluator) -> Mask:
 
 
 def compute_residual_profiles(
-    world: RunEvaluator, before: Array, after: Array, sigma: Array
+    evaluator: RunEvaluator, before: Array, after: Array, sigma: Array
 ) -> list[ResidualProfile]:
     """Compute the profiles of the residual against time, position, speed and inputs.
 
@@ -205,20 +209,20 @@ def compute_residual_profiles(
     gap, against the variables of its joint.
 
     Args:
-        world: Run evaluator of the runs.
+        evaluator: Run evaluator of the runs.
         before: (R, T, C) simulated by the base model.
         after: (R, T, C) simulated by the extended model.
         sigma: (C,) noise of each channel.
     """
-    name = world.simulator.system.reading(world.channels)
-    variables = _iterate_variables(world, after)
-    if get_robot(world) is not None:
-        name = _find_largest_residual_channel(world, before, sigma)
-        variables = _iterate_joint_variables(world, after, name)
-    c = world.channels.index(name)
+    name = evaluator.simulator.system.reading(evaluator.channels)
+    variables = _iterate_variables(evaluator, after)
+    if get_robot(evaluator) is not None:
+        name = _find_largest_residual_channel(evaluator, before, sigma)
+        variables = _iterate_joint_variables(evaluator, after, name)
+    c = evaluator.channels.index(name)
     profiles = []
     for variable, unit, values in variables:
-        is_finite = np.isfinite(world.observed[:, :, c]) & np.isfinite(values)
+        is_finite = np.isfinite(evaluator.observed[:, :, c]) & np.isfinite(values)
         variable_values = values[is_finite]
         edges = _compute_bin_edges(variable_values)
         if edges is None:
@@ -231,7 +235,7 @@ def compute_residual_profiles(
         with np.errstate(invalid="ignore", divide="ignore"):
             means = []
             for simulated in (before, after):
-                residual = (world.observed - simulated)[:, :, c][is_finite]
+                residual = (evaluator.observed - simulated)[:, :, c][is_finite]
                 means.append(np.bincount(bins, residual, PROFILE_BIN_COUNT) / counts)
             error = sigma[c] / np.sqrt(counts)
         error[counts == 0] = np.nan
@@ -240,20 +244,20 @@ def compute_residual_profiles(
     return profiles
 
 
-def get_robot(world: RunEvaluator) -> RobotModel | None:
+def get_robot(evaluator: RunEvaluator) -> RobotModel | None:
     """Return the robot of a recording; None for other systems."""
-    robot: RobotModel | None = getattr(world.kind.system, "robot", None)
+    robot: RobotModel | None = getattr(evaluator.kind.system, "robot", None)
     return robot
 
 
-def _find_largest_residual_channel(world: RunEvaluator, before: Array, sigma: Array) -> str:
+def _find_largest_residual_channel(evaluator: RunEvaluator, before: Array, sigma: Array) -> str:
     """Return the channel with the largest residual in units of its noise."""
-    squares = np.square((world.observed - before) / sigma)
+    squares = np.square((evaluator.observed - before) / sigma)
     sizes = []
-    for c in range(len(world.channels)):
+    for c in range(len(evaluator.channels)):
         channel_squares = squares[:, :, c][np.isfinite(squares[:, :, c])]
         sizes.append(float(channel_squares.mean()) if channel_squares.size else 0.0)
-    return world.channels[int(np.argmax(sizes))]
+    return evaluator.channels[int(np.argmax(sizes))]
 
 
 def _compute_bin_edges(values: Array) -> Array | None:
@@ -267,42 +271,44 @@ def _compute_bin_edges(values: Array) -> Array | None:
     return edges if edges[-1] > edges[0] else None
 
 
-def _iterate_variables(world: RunEvaluator, simulated: Array) -> Iterator[tuple[str, str, Array]]:
+def _iterate_variables(
+    evaluator: RunEvaluator, simulated: Array
+) -> Iterator[tuple[str, str, Array]]:
     """Yield the variables of residual profiles, each with name, unit and values (R, T).
 
     They are the time, the position, the speed, and each recorded input.
     """
-    times = _compute_run_times(world)
+    times = _compute_run_times(evaluator)
     yield "time", "s", times
-    system = world.simulator.system
-    units = {channel.name: channel.unit for channel in world.kind.channels}
+    system = evaluator.simulator.system
+    units = {channel.name: channel.unit for channel in evaluator.kind.channels}
     primary = system.coordinates[system.primary] if system.coordinates else ""
     # The simulated position is used, because the noise of a measured one is part of the residual.
-    if primary in world.channels:
-        position = simulated[:, :, world.channels.index(primary)]
+    if primary in evaluator.channels:
+        position = simulated[:, :, evaluator.channels.index(primary)]
         yield "position", units[primary], position
-    speed = compute_speeds(world, simulated)
+    speed = compute_speeds(evaluator, simulated)
     if speed is not None:
         unit = f"{units.get(primary, 'm')}/s"
         yield "speed", unit, np.where(np.isfinite(times), speed, np.nan)
-    yield from _iterate_inputs(world, [channel.name for channel in world.kind.inputs])
+    yield from _iterate_inputs(evaluator, [channel.name for channel in evaluator.kind.inputs])
 
 
-def _compute_run_times(world: RunEvaluator) -> Array:
+def _compute_run_times(evaluator: RunEvaluator) -> Array:
     """Return the time (R, T) in seconds since the start of each run, whatever its clock."""
-    times = np.full(world.observed.shape[:2], np.nan)
-    for r, track in enumerate(world.tracks):
+    times = np.full(evaluator.observed.shape[:2], np.nan)
+    for r, track in enumerate(evaluator.tracks):
         times[r, : len(track.observed)] = track.scenario.times - track.scenario.times[0]
     return times
 
 
 def _iterate_inputs(
-    world: RunEvaluator, names: Collection[str]
+    evaluator: RunEvaluator, names: Collection[str]
 ) -> Iterator[tuple[str, str, Array]]:
     """Yield name, unit and values (R, T) of the recorded inputs with these names."""
-    for channel in world.kind.inputs:
-        values = np.full(world.observed.shape[:2], np.nan)
-        for r, track in enumerate(world.tracks):
+    for channel in evaluator.kind.inputs:
+        values = np.full(evaluator.observed.shape[:2], np.nan)
+        for r, track in enumerate(evaluator.tracks):
             signal = track.scenario.inputs.get(channel.name)
             if signal is not None and channel.name in names:
                 values[r, : len(track.observed)] = signal
@@ -311,32 +317,32 @@ def _iterate_inputs(
 
 
 def _iterate_joint_variables(
-    world: RunEvaluator, simulated: Array, channel: str
+    evaluator: RunEvaluator, simulated: Array, channel: str
 ) -> Iterator[tuple[str, str, Array]]:
     """Yield the variables for residual profiles of a joint's channel: name, unit and values (R, T).
 
     The velocity has its sign, because friction acts against it.
     """
-    times = _compute_run_times(world)
+    times = _compute_run_times(evaluator)
     yield "time", "s", times
-    robot = get_robot(world)
+    robot = get_robot(evaluator)
     joints = robot.joints if robot is not None else ()
     joint = next((j for j in joints if j.name == channel.partition(".")[2]), None)
     if robot is None or joint is None:
         return
     position, rate = f"q.{joint.name}", f"qd.{joint.name}"
     unit = joint.unit
-    if position in world.channels:
-        values = simulated[:, :, world.channels.index(position)]
+    if position in evaluator.channels:
+        values = simulated[:, :, evaluator.channels.index(position)]
         yield f"position of {joint.name}", unit, values
         slopes = np.full_like(values, np.nan)
-        for r, track in enumerate(world.tracks):
+        for r, track in enumerate(evaluator.tracks):
             size = len(track.observed)
             if size > 1:
                 slopes[r, :size] = np.gradient(values[r, :size], track.scenario.times)
         yield f"velocity of {joint.name}", f"{unit}/s", slopes
-    elif rate in world.channels:
-        values = simulated[:, :, world.channels.index(rate)]
+    elif rate in evaluator.channels:
+        values = simulated[:, :, evaluator.channels.index(rate)]
         yield f"velocity of {joint.name}", f"{unit}/s", values
     drives = [f"u.{a.name}" for a in robot.actuators if a.joint == joint.name]
-    yield from _iterate_inputs(world, [*drives, f"force.{joint.name}"])
+    yield from _iterate_inputs(evaluator, [*drives, f"force.{joint.name}"])

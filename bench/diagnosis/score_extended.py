@@ -76,19 +76,19 @@ def score_model(
     check_recording_plausible(data, kind, force)
     check_recording_size(data, kind(engine=engine), force)
     # Only the effects in the file are needed; the others are not part of the model.
-    world = RunEvaluator(
+    evaluator = RunEvaluator(
         kind,
         data,
         runs,
         engine,
         candidates=list(extended.effects),
     )
-    sigma = compute_noise_floor(world, data).sigma
-    squares = _compute_squared_errors(world, _simulate_runs(world, extended, sigma))
-    world.close()
+    sigma = compute_noise_floor(evaluator, data).sigma
+    squares = _compute_squared_errors(evaluator, _simulate_runs(evaluator, extended, sigma))
+    evaluator.close()
     if not np.isfinite(squares).all():
         raise InputError(f"{path}: the simulation failed with the parameters of {model}")
-    return _summarise_errors(world, squares, sigma)
+    return _summarise_errors(evaluator, squares, sigma)
 
 
 def _check_plugin(model: Path) -> None:
@@ -159,54 +159,54 @@ def _check_channels(
             raise make_unknown_name_error(f"channel of {recording}", channel, recorded_channels)
 
 
-def build_theta(world: RunEvaluator, extended: ExtendedSimulator) -> Array:
+def build_theta(evaluator: RunEvaluator, extended: ExtendedSimulator) -> Array:
     """Build the parameter vector (P,) of an extended simulator; missing numbers are nominal.
 
     Args:
-        world: Run evaluator with the effects of the extended simulator.
+        evaluator: Run evaluator with the effects of the extended simulator.
         extended: Extended simulator.
     """
     # Missing parameters are nominal, and missing coefficients are off.
-    theta = world.get_nominal_theta()
-    base_parameters = world.parameters[: world.own]
+    theta = evaluator.get_nominal_theta()
+    base_parameters = evaluator.parameters[: evaluator.own]
     for place, parameter in enumerate(base_parameters):
         if parameter.name in extended.parameters:
             number = extended.parameters[parameter.name]
             theta[place] = number.value
     for name, numbers in extended.effects.items():
-        coefficients = world.available_effects[name].on(world.simulator.system)
-        places = world.get_coefficient_indices(name)
+        coefficients = evaluator.available_effects[name].on(evaluator.simulator.system)
+        places = evaluator.get_coefficient_indices(name)
         for place, coefficient in zip(places, coefficients, strict=True):
             if coefficient.name in numbers:
                 theta[place] = numbers[coefficient.name].value
     return theta
 
 
-def _simulate_runs(world: RunEvaluator, extended: ExtendedSimulator, sigma: Array) -> Array:
+def _simulate_runs(evaluator: RunEvaluator, extended: ExtendedSimulator, sigma: Array) -> Array:
     """Simulate the runs (R, T, C) with the model's numbers, from fitted initial states."""
     white = np.zeros(len(sigma))
-    runs = HeldOutRuns(world, NoiseModel(sigma, white))
-    (prediction,) = runs.fit_initial_states([build_theta(world, extended)])
+    runs = HeldOutRuns(evaluator, NoiseModel(sigma, white))
+    (prediction,) = runs.fit_initial_states([build_theta(evaluator, extended)])
     return prediction.simulated
 
 
-def _compute_squared_errors(world: RunEvaluator, simulated: Array) -> Array:
+def _compute_squared_errors(evaluator: RunEvaluator, simulated: Array) -> Array:
     """Compute the squared errors (R, T, C); zero where no sample was observed."""
-    observed_mask = np.isfinite(world.observed)
-    errors = world.observed - simulated
+    observed_mask = np.isfinite(evaluator.observed)
+    errors = evaluator.observed - simulated
     squares: Array = np.where(observed_mask, np.square(errors), 0.0)
     return squares
 
 
-def _summarise_errors(world: RunEvaluator, squares: Array, sigma: Array) -> dict[str, Any]:
+def _summarise_errors(evaluator: RunEvaluator, squares: Array, sigma: Array) -> dict[str, Any]:
     """Summarise the RMS error of each channel, and that of all in units of the noise.
 
     `squares` (R, T, C) has the squared errors, zero where no sample exists; `sigma` (C,) the noise.
     """
-    observed_mask = np.isfinite(world.observed)
+    observed_mask = np.isfinite(evaluator.observed)
     counts = observed_mask.sum(axis=(0, 1))
     rmse = {}
-    for c, name in enumerate(world.channels):
+    for c, name in enumerate(evaluator.channels):
         # A channel without samples has no error.
         if counts[c]:
             total = squares[:, :, c].sum()
@@ -214,11 +214,11 @@ def _summarise_errors(world: RunEvaluator, squares: Array, sigma: Array) -> dict
     # Errors of different channels can be added in units of their noise.
     normalised_squares = squares / np.square(sigma)
     normalised = np.sqrt(normalised_squares.sum() / counts.sum())
-    channels = world.simulator.channels
+    channels = evaluator.simulator.channels
     return {
         "rmse": rmse,
         "normalised_rmse": float(normalised),
-        "runs": len(world.runs),
+        "runs": len(evaluator.runs),
         "samples": int(observed_mask.any(axis=2).sum()),
         "units": {channel.name: channel.unit for channel in channels},
     }

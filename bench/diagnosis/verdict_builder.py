@@ -70,7 +70,7 @@ class VerdictBuilder:
     @property
     def held_out_evaluator(self) -> RunEvaluator | None:
         """Return the runs that the validation predicts; all runs if it is cross-validation."""
-        return None if self.validation is None else self.validation.world
+        return None if self.validation is None else self.validation.evaluator
 
     @property
     def _by_stretches(self) -> bool:
@@ -92,12 +92,12 @@ class VerdictBuilder:
             rng: Random generator of the bootstrap.
             started: Value of `time.perf_counter` at the start of the diagnosis.
         """
-        world = self.fitting_evaluator
+        evaluator = self.fitting_evaluator
         numbers = self.collect_parameter_estimates(search, finding.model)
         causes = self.causes(search, finding)
-        parameters = {world.parameters[i].name: numbers[i] for i in world.base.tolist()}
+        parameters = {evaluator.parameters[i].name: numbers[i] for i in evaluator.base.tolist()}
         # Simulations for the proposal of an experiment are not part of the answer.
-        simulations = world.simulations
+        simulations = evaluator.simulations
         if self.validation is not None:
             simulations += self.validation.simulations
         heldout = self._measure_held_out_gain(finding, rng)
@@ -218,31 +218,31 @@ class VerdictBuilder:
 
         An effect that acts at all places is divided into its members.
         """
-        world, kind = self.fitting_evaluator, cast(Any, self.fitting_evaluator.kind)
+        evaluator, kind = self.fitting_evaluator, cast(Any, self.fitting_evaluator.kind)
         # The free numbers of the user come first, in the order of their effects.
-        places = iter(range(world.own))
+        places = iter(range(evaluator.own))
         for effect in kind.system.freed_effects:
             yield effect, [next(places) for _ in effect.coefficients]
         for name in model.effects:
-            effect = world.available_effects[name]
+            effect = evaluator.available_effects[name]
             members = members_of(effect)
-            places = iter(world.get_coefficient_indices(name))
+            places = iter(evaluator.get_coefficient_indices(name))
             # A family with one coefficient for all places changes no number of the file.
             if sum(len(member.coefficients) for member in members) == len(
-                world.get_coefficient_indices(name)
+                evaluator.get_coefficient_indices(name)
             ):
                 for member in members:
                     yield type(member), [next(places) for _ in member.coefficients]
 
     def _get_bounds(self, model: FittedModel) -> dict[int, tuple[float, float]]:
         """Return the bounds of each fitted number, by index in the parameter vector."""
-        world = self.fitting_evaluator
-        ranges = {i: world.parameters[i].bounds for i in world.base.tolist()}
+        evaluator = self.fitting_evaluator
+        ranges = {i: evaluator.parameters[i].bounds for i in evaluator.base.tolist()}
         for name in model.effects:
             ranges |= dict(
                 zip(
-                    world.get_coefficient_indices(name),
-                    compute_coefficient_bounds(world, name),
+                    evaluator.get_coefficient_indices(name),
+                    compute_coefficient_bounds(evaluator, name),
                     strict=True,
                 )
             )
@@ -335,23 +335,23 @@ class VerdictBuilder:
 
         `numbers` has the fitted values by their index in the parameter vector.
         """
-        world = self.fitting_evaluator
+        evaluator = self.fitting_evaluator
         # The coefficients of an effect are contiguous in the parameter vector, in the effect's
         # order.
-        effect = world.available_effects[evidence.effect]
-        coefficients = effect.on(world.simulator.system)
-        places = range(*world.slots[evidence.effect].indices(len(world.parameters)))
+        effect = evaluator.available_effects[evidence.effect]
+        coefficients = effect.on(evaluator.simulator.system)
+        places = range(*evaluator.slots[evidence.effect].indices(len(evaluator.parameters)))
         # A coefficient that cannot be observed is fixed at zero and is not a result.
         by_name = {
             c.name: numbers[i]
             for c, i in zip(coefficients, places, strict=True)
             if c.least is None or c.least != c.most
         }
-        form = form_of(world, evidence.effect)
+        form = form_of(evaluator, evidence.effect)
         description = effect.says
         if form is not None:
-            description = with_solver_parameters(world, evidence.effect, description)
-        if world.kind.has_model and is_gravity_compensated(evidence.effect, by_name):
+            description = with_solver_parameters(evaluator, evidence.effect, description)
+        if evaluator.kind.has_model and is_gravity_compensated(evidence.effect, by_name):
             description = GRAVITY_COMPENSATED
         return Cause(
             evidence.effect, evidence.alternatives, description, by_name, evidence.p_value, form
@@ -359,11 +359,11 @@ class VerdictBuilder:
 
     def _list_counted_channels(self) -> list[int]:
         """List the channels with the same unit as the channel that sensor effects act on."""
-        world = self.fitting_evaluator
-        units = [channel.unit for channel in world.simulator.channels]
-        reading = world.simulator.system.reading(world.channels)
+        evaluator = self.fitting_evaluator
+        units = [channel.unit for channel in evaluator.simulator.channels]
+        reading = evaluator.simulator.system.reading(evaluator.channels)
         # Errors of different units cannot be added.
-        unit = units[world.channels.index(reading)]
+        unit = units[evaluator.channels.index(reading)]
         return [c for c, channel_unit in enumerate(units) if channel_unit == unit]
 
     def _compute_noise_floor(self, finding: DiagnosisResult) -> float:
@@ -430,7 +430,7 @@ class VerdictBuilder:
                 np.clip(estimate_tail_p_value(scores.null_scores, beyond_chance), 0.0, 1.0)
             )
             share = self._get_closed_share(finding, (effect,))
-            slot = search.world.slots[effect]
+            slot = search.evaluator.slots[effect]
             score -= search.parameter_penalty * (slot.stop - slot.start - 1)
             rows.append(Candidate(effect, max(score, 0.0), p_value, share))
         return tuple(sorted(rows, key=lambda row: -row.score))
@@ -505,10 +505,10 @@ class VerdictBuilder:
         return None
 
 
-def _compute_rmse(world: RunEvaluator, simulated: Array, channels: list[int]) -> float:
+def _compute_rmse(evaluator: RunEvaluator, simulated: Array, channels: list[int]) -> float:
     """Compute the RMS error over the channels that count, in their unit."""
-    observed_mask = np.isfinite(world.observed)[..., channels]
-    error = (world.observed - simulated)[..., channels][observed_mask]
+    observed_mask = np.isfinite(evaluator.observed)[..., channels]
+    error = (evaluator.observed - simulated)[..., channels][observed_mask]
     return float(np.sqrt(np.square(error).mean()))
 
 

@@ -113,7 +113,7 @@ class RobotSimulator(SystemSimulator):
         self.addresses = JointAddresses(self.robot)
         self._floating = FloatingJoints.from_robot(self.robot)
 
-    def _engine(self, name: str | None, settings: Mapping[str, Any]) -> Engine:
+    def _make_engine(self, name: str | None, settings: Mapping[str, Any]) -> Engine:
         """Return MuJoCo as the engine, with checked settings of the time step and the integrator.
 
         Other engines are refused, since a model file describes a robot for MuJoCo.
@@ -172,7 +172,7 @@ class RobotSimulator(SystemSimulator):
         """Step length in seconds."""
         return self.engine.largest_step
 
-    def _acting(self, theta: Array) -> ActiveEffects:
+    def _make_active_effects(self, theta: Array) -> ActiveEffects:
         """Return active effects (`SystemSimulator`): free parameters first, families expanded."""
         acting: list[tuple[Effect, Array]] = []
         place = 0
@@ -180,7 +180,7 @@ class RobotSimulator(SystemSimulator):
             count = len(effect.coefficients)
             acting.append((effect, theta[:, place : place + count].T[:, :, None]))
             place += count
-        acting += super()._acting(theta)
+        acting += super()._make_active_effects(theta)
         parts = [part for effect, c in acting if c.any() for part in effect.parts(c)]
         return tuple((effect, c) for effect, c in parts if c.any())
 
@@ -193,24 +193,24 @@ class RobotSimulator(SystemSimulator):
         Returns:
             Effects with their coefficients (K, L, 1).
         """
-        return self._acting(theta)
+        return self._make_active_effects(theta)
 
-    def _simulated(
+    def _simulate_observations(
         self, theta: Array, scenarios: Sequence[Scenario], initial: Mapping[str, Array]
     ) -> Array:
         """Simulate observations, see `SystemSimulator`."""
-        acting = self._acting(theta)
+        acting = self._make_active_effects(theta)
         runs = group_scenarios(scenarios, by_initial=True)
         commands = [self.run_inputs(s) for s in runs.unique_scenarios]
         _, x, v = self._known(scenarios, initial)
-        return self._lanes(acting, runs, commands, x, v)
+        return self._simulate_elements(acting, runs, commands, x, v)
 
     def simulate_observations(self, batch: RobotRunBatch) -> Array:
         """Simulate observations (n, T, C) of the batch elements of one run."""
         runs = ScenarioGroups((batch.scenario,), np.zeros(len(batch.x), dtype=np.intp))
-        return self._lanes(batch.acting, runs, [batch.commands], batch.x, batch.v)
+        return self._simulate_elements(batch.acting, runs, [batch.commands], batch.x, batch.v)
 
-    def _lanes(
+    def _simulate_elements(
         self,
         acting: ActiveEffects,
         runs: ScenarioGroups,
@@ -225,7 +225,7 @@ class RobotSimulator(SystemSimulator):
         is_stepwise = find_active_elements(acting, len(x), is_evaluated_per_step)
         # A diverging batch element becomes NaN, so floating-point warnings are suppressed.
         with np.errstate(all="ignore"), capture_mujoco_warnings():
-            for series, kind, lanes in _alike(acting, derived, is_stepwise):
+            for series, kind, lanes in _group_alike_elements(acting, derived, is_stepwise):
                 # Batch elements are sorted by run, so that data common to a run are computed once.
                 lanes = lanes[np.argsort(runs.scenario_index[lanes], kind="stable")]
                 for part in np.array_split(lanes, max(-(-lanes.size // BATCH_SIZE), 1)):
@@ -241,7 +241,7 @@ class RobotSimulator(SystemSimulator):
                     ]
                     bits = bool(kind & 1), bool(kind & 2)
                     try:
-                        run_observations = self._simulate(
+                        run_observations = self._simulate_run_batch(
                             run_batches, slice_active_effects(acting, part), *bits, series
                         )
                     except RefusedModelError:
@@ -256,7 +256,7 @@ class RobotSimulator(SystemSimulator):
         result += 0.0
         return result
 
-    def _simulate(
+    def _simulate_run_batch(
         self,
         run_batches: Sequence[RobotRunBatch],
         acting: ActiveEffects,
@@ -286,8 +286,8 @@ class RobotSimulator(SystemSimulator):
         inputs = BatchInputs.concatenate(run_inputs)
         x = np.concatenate([batch.x for batch in run_batches])
         v = np.concatenate([batch.v for batch in run_batches])
-        result = self._stepped(
-            BatchStart(x, v, acting, self._afloat(run_batches)),
+        result = self._simulate_steps(
+            BatchStart(x, v, acting, self._get_floating_states(run_batches)),
             inputs,
             derived,
             is_stepwise,
@@ -297,11 +297,13 @@ class RobotSimulator(SystemSimulator):
         first = 0
         for batch, size in zip(run_batches, sizes, strict=True):
             run_lanes = slice(first, first + len(batch.x))
-            observations.append(self._shown(result.select(run_lanes), batch, batch.times, size))
+            observations.append(
+                self._compute_observations(result.select(run_lanes), batch, batch.times, size)
+            )
             first += len(batch.x)
         return observations
 
-    def _afloat(self, run_batches: Sequence[RobotRunBatch]) -> FloatingState:
+    def _get_floating_states(self, run_batches: Sequence[RobotRunBatch]) -> FloatingState:
         """Return the initial states of floating bodies for all batch elements."""
         initial_states = [self.get_floating_start(batch) for batch in run_batches]
         sizes = [len(batch.x) for batch in run_batches]
@@ -320,12 +322,12 @@ class RobotSimulator(SystemSimulator):
         return max(int(np.ceil(times[-1] / self.time_step - STEP_COUNT_TOLERANCE)), 1)
 
     @cached_property
-    def _drives(self) -> bool:
+    def _records_drive_forces(self) -> bool:
         """True if drive forces are recorded."""
         return any(c.name.startswith("tau.") for c in self.channels)
 
     @cached_property
-    def _rated(self) -> frozenset[int]:
+    def _rate_controlled_actuators(self) -> frozenset[int]:
         """Actuators whose second control is the rate of their command."""
         return frozenset(
             a.id for a in self.robot.actuators if a.name in self.robot.rate_controlled_actuators
@@ -350,21 +352,21 @@ class RobotSimulator(SystemSimulator):
         applied_inputs = compute_inputs_over_steps(*of_run)
         instant = (
             compute_inputs_over_steps(*of_run, SAME_INSTANT_SHARE)
-            if self._drives
+            if self._records_drive_forces
             else applied_inputs
         )
         step_starts: Array = self.time_step * np.arange(float(steps))
         model = self.robot.compiled
         controls = np.zeros((n, steps, model.nu))
         forces = np.zeros((n, steps, model.nv))
-        instant_controls = np.zeros_like(controls) if self._drives else controls
+        instant_controls = np.zeros_like(controls) if self._records_drive_forces else controls
         for actuator in self.robot.actuators:
             name = f"u.{actuator.name}"
             controls[:, :, actuator.control] = applied_inputs[name]
-            if self._drives:
+            if self._records_drive_forces:
                 instant_controls[:, :, actuator.control] = instant[name]
             # A derivative gain on the error's rate needs the rate of the command.
-            if actuator.id in self._rated:
+            if actuator.id in self._rate_controlled_actuators:
                 rate = (
                     np.diff(applied_inputs[name], axis=1, prepend=applied_inputs[name][:, :1])
                     / self.time_step
@@ -385,7 +387,7 @@ class RobotSimulator(SystemSimulator):
                 activation_filter, batch, filter_controls
             )
             # The servo's effective set point is the activation instead of the command.
-            activations = self._activations(
+            activations = self._integrate_activations(
                 activation_filter,
                 filter_controls,
                 initial_activations[:, activation_filter.address],
@@ -434,12 +436,12 @@ class RobotSimulator(SystemSimulator):
             self.time_step, scenario, commands, batch.acting, n, steps
         )
         earlier_controls = applied_inputs[f"u.{activation_filter.actuator.name}"]
-        last_activation: Array = self._activations(
+        last_activation: Array = self._integrate_activations(
             activation_filter, earlier_controls, activation_filter.clipped(earlier_controls[:, 0])
         )[:, -1]
         return last_activation
 
-    def _activations(
+    def _integrate_activations(
         self, activation_filter: ActivationFilter, controls: Array, initial_activations: Array
     ) -> Array:
         """Integrate an activation filter over the steps, as MuJoCo's integrator does.
@@ -472,7 +474,7 @@ class RobotSimulator(SystemSimulator):
             acting: effects active in the motion.
         """
         (series,) = group_by_series_joints(acting, 1)
-        return self._bench(True, LINEARISATION_BATCH_SIZE, series)
+        return self._get_batch(True, LINEARISATION_BATCH_SIZE, series)
 
     def half_steps(self, acting: ActiveEffects = ()) -> MujocoBatch:
         """Return the batch of `make_linearisation_batch` with half the time step."""
@@ -501,10 +503,10 @@ class RobotSimulator(SystemSimulator):
         derived = bool(find_active_elements(batch.acting, n, changes_derived_constants).any())
         is_stepwise = bool(find_active_elements(batch.acting, n, is_evaluated_per_step).any())
         (series,) = group_by_series_joints(batch.acting, n)
-        start = BatchStart(batch.x, batch.v, batch.acting, self._afloat([batch]))
-        return self._stepped(start, inputs, derived, is_stepwise, extra_fields, series)
+        start = BatchStart(batch.x, batch.v, batch.acting, self._get_floating_states([batch]))
+        return self._simulate_steps(start, inputs, derived, is_stepwise, extra_fields, series)
 
-    def _stepped(
+    def _simulate_steps(
         self,
         start: BatchStart,
         inputs: BatchInputs,
@@ -529,7 +531,7 @@ class RobotSimulator(SystemSimulator):
         n = len(start.x)
         # A single simulation uses a small batch, so that constants need not be derived for a whole
         # one.
-        bench = self._bench(derived, 1 if n == 1 else BATCH_SIZE, series)
+        bench = self._get_batch(derived, 1 if n == 1 else BATCH_SIZE, series)
         places, second = bench.places, bench.second
         bench.write_effects(
             pad_coefficients(select_model_field_effects(start.acting), n, bench.count)
@@ -568,7 +570,7 @@ class RobotSimulator(SystemSimulator):
             [start.v[:, None], recorded_fields["qvel"][:, :, places.velocities]], axis=1
         )
         x[bench.failed] = np.nan
-        if self._drives:
+        if self._records_drive_forces:
             sensor_model = DriveSensorModel(self.robot, self.robotic, bench, inputs, self.time_step)
             sensor_model.shift_to_step_begin(recorded_fields["sensordata"])
             sensor_model.add_drive_effects(recorded_fields["sensordata"], x, v, start.acting)
@@ -589,14 +591,14 @@ class RobotSimulator(SystemSimulator):
             (second_states[0], second_states[1]),
         )
 
-    def _bench(self, derived: bool, count: int, series: SeriesJoints = ()) -> MujocoBatch:
+    def _get_batch(self, derived: bool, count: int, series: SeriesJoints = ()) -> MujocoBatch:
         """Return the batch for this time step and integrator, from the robot's cache."""
         engine = self.engine
         assert isinstance(engine, RobotEngine)
         settings = engine.numerics.to_model_options()
         return bench_cache(self.robot).bench(series, derived, count, settings)
 
-    def _shown(
+    def _compute_observations(
         self, result_of_batch: BatchResult, batch: RobotRunBatch, times: Array, steps: int
     ) -> Array:
         """Compute the recorded observations (n, T, C) of one run, including sensor effects.
@@ -609,7 +611,7 @@ class RobotSimulator(SystemSimulator):
         """
         columns = []
         for channel in self.channels:
-            values, slopes = self._signal(result_of_batch, channel.name, steps)
+            values, slopes = self._get_channel_values(result_of_batch, channel.name, steps)
             sensors = tuple(
                 (e, c)
                 for e, c in batch.acting
@@ -621,7 +623,9 @@ class RobotSimulator(SystemSimulator):
         result[result_of_batch.failed] = np.nan
         return result
 
-    def _signal(self, result: BatchResult, name: str, steps: int) -> tuple[Array, Array | None]:
+    def _get_channel_values(
+        self, result: BatchResult, name: str, steps: int
+    ) -> tuple[Array, Array | None]:
         """Return the values (n, S + 1) of a channel at all steps, and their slopes if known."""
         kind, _, element_name = name.partition(".")
         steps_of_run = slice(steps + 1)
@@ -636,11 +640,11 @@ class RobotSimulator(SystemSimulator):
         """Return the column in MuJoCo's sensor data of a channel that is not a state."""
         kind, _, element_name = channel.partition(".")
         if kind == "tau":
-            return self._bench(False, 1).drives[element_name]
+            return self._get_batch(False, 1).drives[element_name]
         return next(s for s in self.robot.sensors if s.name == element_name).address
 
 
-def _alike(
+def _group_alike_elements(
     acting: ActiveEffects, derived: Mask, is_stepwise: Mask
 ) -> Iterator[tuple[SeriesJoints, int, Places]]:
     """Group batch elements that can be simulated together.

@@ -41,7 +41,7 @@ class Meter:
     def __init__(self):
         self.longest = self.all = 0.0
         self.rounds = 0
-        self.usual = ForkedWorkerPool._shared
+        self.usual = ForkedWorkerPool._distribute
 
     def __enter__(self):
         meter = self
@@ -56,11 +56,11 @@ class Meter:
             meter.longest += max(spent.values())
             meter.all += sum(spent.values())
 
-        ForkedWorkerPool._shared = shared
+        ForkedWorkerPool._distribute = shared
         return self
 
     def __exit__(self, *_):
-        ForkedWorkerPool._shared = self.usual
+        ForkedWorkerPool._distribute = self.usual
 
 
 def timed(world, task, *item):

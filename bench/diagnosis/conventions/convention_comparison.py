@@ -181,7 +181,7 @@ class ConventionComparison:
         described = corrected = self.subject.recording
         differences: list[ConventionDifference] = []
         for _ in range(MAX_DIFFERENCES):
-            suspects = self._suspects(self._follow(self._parts(corrected)))
+            suspects = self._list_suspect_joints(self._filter_runs(self._select_parts(corrected)))
             best = self._best_hypothesis(corrected, suspects) if suspects else None
             if best is None:
                 break
@@ -190,8 +190,8 @@ class ConventionComparison:
         if not differences:
             return []
         hypotheses = [difference.hypothesis for difference in differences]
-        parts = self._parts(corrected)
-        explained = _log_likelihood(self._follow(parts)) + _log_scales(hypotheses, parts)
+        parts = self._select_parts(corrected)
+        explained = _log_likelihood(self._filter_runs(parts)) + _log_scales(hypotheses, parts)
         causes = self._log_likelihood_of_causes(corrected)
         if explained < causes + CAUSES_MARGIN:
             return []
@@ -202,7 +202,7 @@ class ConventionComparison:
         if not self._removes_missing_force(described, corrected):
             return []
         before, after = (
-            _log_likelihood(self._follow(difference))
+            _log_likelihood(self._filter_runs(difference))
             for difference in _equally_long(described, corrected)
         )
         after += _log_scales(hypotheses, corrected)
@@ -218,10 +218,10 @@ class ConventionComparison:
 
         It is infinite if the filter diverges.
         """
-        followed = self._follow(self._parts(recording))
+        followed = self._filter_runs(self._select_parts(recording))
         return float((followed.force / followed.typical).max()) if followed.is_sound else np.inf
 
-    def _suspects(self, followed: FollowedRuns) -> list[JointSignals]:
+    def _list_suspect_joints(self, followed: FollowedRuns) -> list[JointSignals]:
         """Return the joints at which the filter needs a large missing force.
 
         A wrong sign, unit or joint order shows as such a force. If the filter diverges, all joints
@@ -249,9 +249,12 @@ class ConventionComparison:
         Return None if none exceeds that of the log as described by `LOG_LIKELIHOOD_MARGIN`.
         """
         described = ConventionHypothesis("")
-        limit = self._evaluate(described, recording) + LOG_LIKELIHOOD_MARGIN
+        limit = self._compute_log_likelihood(described, recording) + LOG_LIKELIHOOD_MARGIN
         # Most hypotheses already fail on the run that the log as described explains worst.
-        by_run = [self._evaluate(described, recording, run) for run in range(len(self._slices))]
+        by_run = [
+            self._compute_log_likelihood(described, recording, run)
+            for run in range(len(self._part_slices))
+        ]
         worst_run = int(np.argmin(by_run))
         min_log_likelihood = by_run[worst_run] + MIN_WORST_RUN_SHARE * LOG_LIKELIHOOD_MARGIN
         force_error = self._force_error(described, recording, worst_run)
@@ -265,15 +268,18 @@ class ConventionComparison:
             growth = self._force_error(hypothesis, recording, worst_run) - force_error
             if growth > MAX_FORCE_ERROR_GROWTH:
                 continue
-            if not self._evaluate(hypothesis, recording, worst_run) > min_log_likelihood:
+            if (
+                not self._compute_log_likelihood(hypothesis, recording, worst_run)
+                > min_log_likelihood
+            ):
                 continue
-            score = self._evaluate(hypothesis, recording)
+            score = self._compute_log_likelihood(hypothesis, recording)
             # For several offsets of one signal, the best one is refined.
             known = scored.get(hypothesis.description, (limit, hypothesis))
             if score > known[0]:
                 scored[hypothesis.description] = score, hypothesis
         ahead = sorted(scored.values(), key=lambda pair: -pair[0])
-        refined = [self._refine(*pair, recording) for pair in ahead[:MAX_REFINED]]
+        refined = [self._refine_offset(*pair, recording) for pair in ahead[:MAX_REFINED]]
         clear = [
             (score, one)
             for score, one in (*refined, *ahead[MAX_REFINED:])
@@ -303,7 +309,7 @@ class ConventionComparison:
             robot, recording
         ):
             return -np.inf
-        parts = self._parts(hypothesis.applied(recording), run)
+        parts = self._select_parts(hypothesis.applied(recording), run)
         forces = compute_joint_forces(robot, parts, parts.runs[0])
         squares = np.square(forces.needed - forces.driven).mean(axis=0)
         return float(0.5 * np.log(squares + NEGLIGIBLE_FORCE**2).sum())
@@ -321,10 +327,10 @@ class ConventionComparison:
         if not changes or not scales_inputs:
             return True
         off = {name: replace(c, scale=OFF_FACTOR * c.scale) for name, c in changes.items()}
-        without = self._evaluate(replace(hypothesis, changes=off), recording)
+        without = self._compute_log_likelihood(replace(hypothesis, changes=off), recording)
         return score > without + LOG_LIKELIHOOD_MARGIN
 
-    def _refine(
+    def _refine_offset(
         self, score: float, hypothesis: ConventionHypothesis, recording: Recording
     ) -> tuple[float, ConventionHypothesis]:
         """Improve the offset of a hypothesis by a pattern search.
@@ -338,7 +344,7 @@ class ConventionComparison:
         while step > OFFSET_ACCURACY:
             for signed in (step, -step):
                 moved = hypothesis.with_offset_step(signed)
-                moved_score = self._evaluate(moved, recording)
+                moved_score = self._compute_log_likelihood(moved, recording)
                 if moved_score > score + MIN_REFINEMENT_GAIN:
                     score, hypothesis = moved_score, moved
                     break
@@ -347,7 +353,7 @@ class ConventionComparison:
         offset = max(abs(change.offset) for change in hypothesis.changes.values())
         return (score if offset > MIN_OFFSET else -np.inf), hypothesis
 
-    def _evaluate(
+    def _compute_log_likelihood(
         self, hypothesis: ConventionHypothesis, recording: Recording, run: int | None = None
     ) -> float:
         """Return the log-likelihood (1) on the short parts of a recording.
@@ -358,23 +364,23 @@ class ConventionComparison:
             run: Number of the only run; None for all runs with parts.
         """
         self.evaluations += 1
-        parts = self._parts(hypothesis.applied(recording), run)
-        followed = self._follow(parts, max_linearisations=1)
+        parts = self._select_parts(hypothesis.applied(recording), run)
+        followed = self._filter_runs(parts, max_linearisations=1)
         return _log_likelihood(followed) + _log_scales([hypothesis], parts)
 
-    def _follow(
+    def _filter_runs(
         self, recording: Recording, max_linearisations: int = MAX_LINEARISATIONS
     ) -> FollowedRuns:
         """Filter the runs for fitting with the parameters of the model file (Kalman filter)."""
-        world = self.subject.world(recording)
+        evaluator = self.subject.evaluator(recording)
         followed = FollowedRuns.follow(
-            world,
-            world.get_nominal_theta(),
-            _white_noise(world, recording),
+            evaluator,
+            evaluator.get_nominal_theta(),
+            _white_noise(evaluator, recording),
             None,
             max_linearisations=max_linearisations,
         )
-        world.close()
+        evaluator.close()
         return followed
 
     def _log_likelihood_of_causes(self, corrected: Recording) -> float:
@@ -389,38 +395,40 @@ class ConventionComparison:
             corrected: Recording with its conventions corrected.
         """
         subject = self.subject
-        parts = self._parts(subject.recording)
-        world = RunEvaluator(
+        parts = self._select_parts(subject.recording)
+        evaluator = RunEvaluator(
             subject.kind, parts, parts.training(), subject.engine, list_hat_effects(subject.kind)
         )
         followed = FollowedRuns.follow(
-            world, world.get_nominal_theta(), _white_noise(world, parts), None
+            evaluator, evaluator.get_nominal_theta(), _white_noise(evaluator, parts), None
         )
         if not followed.is_sound:
-            world.close()
+            evaluator.close()
             return -np.inf
         left_out = MANY_SHAPES | CONVENTION_EFFECTS
-        names = [name for name in world.library if name.partition("@")[0] not in left_out]
-        base = _unfitted(world)
-        probes = [probe for name in names for probe in first_probes(world, base, name)]
+        names = [name for name in evaluator.library if name.partition("@")[0] not in left_out]
+        base = _make_unfitted_start(evaluator)
+        probes = [probe for name in names for probe in first_probes(evaluator, base, name)]
         selected = identify(followed, followed.columns(probes))
         samples = int(followed.runs.recorded.sum())
         best, penalty = followed.log_likelihood, 0.0
         for count, group in enumerate(selected.groups, start=1):
             penalty += 0.5 * len(group.column_indices) * math.log(samples) + math.log(len(names))
             groups = selected.groups[:count]
-            theta = world.get_nominal_theta()
+            theta = evaluator.get_nominal_theta()
             for one, numbers in zip(groups, selected.regression.solve(groups)[1], strict=True):
-                theta[world.slots[one.effect]] = group_coefficients(world, probes, one, numbers)
+                theta[evaluator.slots[one.effect]] = group_coefficients(
+                    evaluator, probes, one, numbers
+                )
             fitted = _with_best_coefficients(followed.with_parameters(theta), groups)
             best = max(best, fitted.log_likelihood - penalty)
         best = max(best, _log_likelihood_of_soft_friction(followed))
-        world.close()
+        evaluator.close()
         if self._largest_missing_force(corrected) < LARGE_MISSING_FORCE:
             return best
         return max(best, selected.log_likelihood - penalty)
 
-    def _parts(self, recording: Recording, run: int | None = None) -> Recording:
+    def _select_parts(self, recording: Recording, run: int | None = None) -> Recording:
         """Return the parts of some training runs with the largest movement.
 
         Args:
@@ -428,12 +436,13 @@ class ConventionComparison:
             run: Number of the only run; None for all runs with parts.
         """
         parts = [
-            run.part(part) for run, part in zip(recording.training(), self._slices, strict=False)
+            run.part(part)
+            for run, part in zip(recording.training(), self._part_slices, strict=False)
         ]
         return replace(recording, runs=tuple(parts if run is None else parts[run : run + 1]))
 
     @cached_property
-    def _slices(self) -> list[slice]:
+    def _part_slices(self) -> list[slice]:
         """Samples of the parts of the runs.
 
         If a joint is not recorded, only the beginning of a run has a known pose.
@@ -473,17 +482,17 @@ def _log_scales(hypotheses: Sequence[ConventionHypothesis], recording: Recording
     return result
 
 
-def _white_noise(world: RunEvaluator, recording: Recording) -> NoiseModel:
+def _white_noise(evaluator: RunEvaluator, recording: Recording) -> NoiseModel:
     """Return the noise floor of the channels as noise without autocorrelation."""
-    sigma = compute_noise_floor(world, recording).sigma
+    sigma = compute_noise_floor(evaluator, recording).sigma
     return NoiseModel(sigma, np.zeros(len(sigma)))
 
 
-def _unfitted(world: RunEvaluator) -> TrajectoryFit:
+def _make_unfitted_start(evaluator: RunEvaluator) -> TrajectoryFit:
     """Return the model file's numbers as a fit, the starting point of candidate directions."""
     empty = np.zeros(0)
     return TrajectoryFit(
-        (), world.get_nominal_theta(), world.guess, np.zeros(0, np.intp), empty, empty, 0.0
+        (), evaluator.get_nominal_theta(), evaluator.guess, np.zeros(0, np.intp), empty, empty, 0.0
     )
 
 
@@ -494,12 +503,12 @@ def _with_best_coefficients(
 
     `groups` names the effects; their present coefficients are those of the filter.
     """
-    world = followed.world
+    evaluator = followed.evaluator
     names = [group.effect for group in groups]
     return maximise_likelihood(
         followed,
-        [place for name in names for place in world.get_coefficient_indices(name)],
-        [bounds for name in names for bounds in compute_coefficient_bounds(world, name)],
+        [place for name in names for place in evaluator.get_coefficient_indices(name)],
+        [bounds for name in names for bounds in compute_coefficient_bounds(evaluator, name)],
         GAUSS_NEWTON_STEPS,
         lambda theta, best: best.with_parameters(theta),
     )
@@ -511,12 +520,12 @@ def _log_likelihood_of_soft_friction(followed: FollowedRuns) -> float:
     The friction acts at the joint with the largest missing force, and is not part of the
     regression. The result is minus infinity without such an effect.
     """
-    world = followed.world
+    evaluator = followed.evaluator
     joint = followed.joints_by_loss[0]
-    thetas = soft_friction_models(followed, world.get_nominal_theta(), joint)
+    thetas = soft_friction_models(followed, evaluator.get_nominal_theta(), joint)
     if not thetas:
         return -np.inf
-    simulator = world.simulator_of(soft_kind(world.kind))
+    simulator = evaluator.simulator_of(soft_kind(evaluator.kind))
     assert isinstance(simulator, RobotSimulator)
     likelihoods = [followed.with_parameters(theta, simulator).log_likelihood for theta in thetas]
     simulator.close()

@@ -131,7 +131,7 @@ class ConventionHypothesis:
             before=before,
             initial={} if self.changes else run.initial,
         )
-        return _advanced(result, self.late) if self.late else result
+        return _advance_inputs(result, self.late) if self.late else result
 
     def with_offset_step(self, step: float) -> ConventionHypothesis:
         """Return the hypothesis with a step in rad added to its offsets."""
@@ -142,7 +142,7 @@ class ConventionHypothesis:
         return replace(self, changes=changes)
 
 
-def _advanced(run: Run, late: float) -> Run:
+def _advance_inputs(run: Run, late: float) -> Run:
     """Return a run with its inputs earlier by a delay in s; without its end, whose inputs are lost.
 
     Samples are moved instead of the offset of the time stamps, because a part of a run contains no
@@ -234,15 +234,15 @@ class HypothesisGenerator:
         """
         suspects = [joint for joint in suspects if joint.channels]
         for joint in suspects:
-            yield from _signs(joint)
-            yield from _zeros(joint, recording)
+            yield from _generate_signs(joint)
+            yield from _generate_zeros(joint, recording)
             for name in dict.fromkeys((*joint.channels.values(), *joint.inputs)):
-                yield from _units([self._signals[name]], recording)
-        yield from _wraps(suspects, recording)
-        yield from _orders(self.joints, recording, suspects)
+                yield from _generate_units([self._signals[name]], recording)
+        yield from _generate_wraps(suspects, recording)
+        yield from _generate_orders(self.joints, recording, suspects)
         if 2 * len(suspects) >= len(self.joints):
             yield from self._units_of_log(recording)
-            yield from self._normalised()
+            yield from self._generate_normalised()
         yield from _late_commands(recording)
 
     def _units_of_log(self, recording: Recording) -> Iterator[ConventionHypothesis]:
@@ -250,18 +250,18 @@ class HypothesisGenerator:
 
         They are tried together only if the description states the same unit for all of them.
         """
-        positions = self._channels("q")
+        positions = self._list_channels("q")
         commands = [name for joint in self.joints for name in joint.servo_inputs]
-        groups = positions, commands, [*positions, *commands], self._channels("qd")
-        for names in (*groups, self._channels("tau")):
+        groups = positions, commands, [*positions, *commands], self._list_channels("qd")
+        for names in (*groups, self._list_channels("tau")):
             signals = [self._signals[name] for name in names]
             if len({(s.si, s.stated, s.gain) for s in signals}) == 1:
-                yield from _units(signals, recording)
+                yield from _generate_units(signals, recording)
 
-    def _channels(self, quantity: str) -> list[str]:
+    def _list_channels(self, quantity: str) -> list[str]:
         return [joint.channels[quantity] for joint in self.joints if quantity in joint.channels]
 
-    def _normalised(self) -> Iterator[ConventionHypothesis]:
+    def _generate_normalised(self) -> Iterator[ConventionHypothesis]:
         """Yield hypotheses that positions and commands are shares of the range of each joint.
 
         The shares are in percent, from 0 or from -100 to 100, as LeRobot records them.
@@ -284,7 +284,7 @@ class HypothesisGenerator:
             )
 
 
-def _signs(joint: JointSignals) -> Iterator[ConventionHypothesis]:
+def _generate_signs(joint: JointSignals) -> Iterator[ConventionHypothesis]:
     """Yield hypotheses of a reversed sign at a joint.
 
     They are: position with velocity, command, velocity alone, torque alone, and the whole axis.
@@ -303,7 +303,7 @@ def _signs(joint: JointSignals) -> Iterator[ConventionHypothesis]:
         yield ConventionHypothesis(text, {name: SignalChange(name, -1.0) for name in names})
 
 
-def _zeros(joint: JointSignals, recording: Recording) -> Iterator[ConventionHypothesis]:
+def _generate_zeros(joint: JointSignals, recording: Recording) -> Iterator[ConventionHypothesis]:
     """Yield hypotheses that a hinge is counted from another zero, in position or also in command.
 
     With a servo, the mean difference of command and position is the likely offset of the position.
@@ -329,7 +329,9 @@ def _zeros(joint: JointSignals, recording: Recording) -> Iterator[ConventionHypo
             yield ConventionHypothesis(text, changes, has_free_offset=True)
 
 
-def _wraps(joints: Sequence[JointSignals], recording: Recording) -> Iterator[ConventionHypothesis]:
+def _generate_wraps(
+    joints: Sequence[JointSignals], recording: Recording
+) -> Iterator[ConventionHypothesis]:
     """Yield hypotheses that recorded angles jump by whole turns, which have to be added again."""
     for joint in joints:
         name = joint.channels.get("q")
@@ -349,7 +351,7 @@ def _largest_jump(values: Array) -> float:
     return float(np.abs(np.diff(values[np.isfinite(values)])).max(initial=0.0))
 
 
-def _orders(
+def _generate_orders(
     joints: Sequence[JointSignals], recording: Recording, suspects: Sequence[JointSignals]
 ) -> Iterator[ConventionHypothesis]:
     """Yield other orders of the joints: of channels, of commands, and of both.
@@ -404,7 +406,9 @@ def _order_of_commands(joints: Sequence[JointSignals], recording: Recording) -> 
     return dict(enumerate(least_order(costs)))
 
 
-def _units(signals: Sequence[Signal], recording: Recording) -> Iterator[ConventionHypothesis]:
+def _generate_units(
+    signals: Sequence[Signal], recording: Recording
+) -> Iterator[ConventionHypothesis]:
     """Yield hypotheses of another unit for signals that share a unit.
 
     If all values of an angle are integers, encoder ticks are tried as well.

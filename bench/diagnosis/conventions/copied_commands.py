@@ -68,31 +68,33 @@ def _likely_column(recording: Recording, channel: str) -> str:
     except InputError:  # A recording in memory has no description.
         return UNKNOWN_COLUMN
     tables = [table for kind in ("channels", "inputs") for table in meta.get(kind, {}).values()]
-    used = [column for table in tables if isinstance(table, dict) for column in _columns(table)]
+    used = [
+        column for table in tables if isinstance(table, dict) for column in _list_columns(table)
+    ]
     own = meta.get("channels", {}).get(channel, {})
-    name = (_columns(own) or [channel])[0]
+    name = (_list_columns(own) or [channel])[0]
     best, best_correlation = UNKNOWN_COLUMN, MIN_CORRELATION
-    for log in _logs(description):
+    for log in _iterate_logs(description):
         if name not in log.list_columns():
             continue
         y = log.get_column(name)
         for column in log.list_columns():
             if column in (*used, name):
                 continue
-            correlation = _correlation(log.get_column(column), y)
+            correlation = _compute_correlation(log.get_column(column), y)
             if correlation > best_correlation:
                 best, best_correlation = column, correlation
         break
     return best
 
 
-def _columns(table: dict[str, Any]) -> list[str]:
+def _list_columns(table: dict[str, Any]) -> list[str]:
     """Return the columns that the table of a signal names."""
     column = table.get("column", [])
     return [column] if isinstance(column, str) else list(column)
 
 
-def _logs(description: Path) -> Iterator[LogFile]:
+def _iterate_logs(description: Path) -> Iterator[LogFile]:
     """Yield the logs of a description that can be read."""
     for path in list_mapped_files(description):
         try:
@@ -101,7 +103,7 @@ def _logs(description: Path) -> Iterator[LogFile]:
             continue
 
 
-def _correlation(u: Array, y: Array) -> float:
+def _compute_correlation(u: Array, y: Array) -> float:
     """Return the correlation of two columns; 0 if they are equal, or one does not change."""
     if u.shape != y.shape or np.array_equal(u, y, equal_nan=True):
         return 0.0

@@ -46,16 +46,16 @@ def corrected(
             before = copy.deepcopy(result[kind])
             for name, change in hypothesis.changes.items():
                 if name in before:
-                    own = _moved(before, name, change)
-                    result[kind][name] = _changed(own, units[kind][name], change, hypothesis)
+                    own = _move_to_column(before, name, change)
+                    result[kind][name] = _change_scale(own, units[kind][name], change, hypothesis)
         if hypothesis.late:
             time = dict(result.get("time", {}))
-            time["offset"] = _rounded(float(time.get("offset", 0.0)) - hypothesis.late)
+            time["offset"] = _round_value(float(time.get("offset", 0.0)) - hypothesis.late)
             result["time"] = time
     return result
 
 
-def _moved(
+def _move_to_column(
     tables: Mapping[str, Mapping[str, Any]], name: str, change: SignalChange
 ) -> dict[str, Any]:
     """Return the description table of a signal after its values were taken from another column.
@@ -73,7 +73,7 @@ def _moved(
     return table
 
 
-def _changed(
+def _change_scale(
     table: dict[str, Any], si: str, change: SignalChange, hypothesis: ConventionHypothesis
 ) -> dict[str, Any]:
     """Return the table of a signal with another unit, scale or offset.
@@ -88,15 +88,15 @@ def _changed(
         return table
     k, b = float(table.get("scale", 1.0)), float(table.get("offset", 0.0))
     if factor != 1.0:
-        table["scale"] = _rounded(factor * k)
+        table["scale"] = _round_value(factor * k)
     if offset or b:
-        table["offset"] = _rounded(factor * b + offset / gain)
+        table["offset"] = _round_value(factor * b + offset / gain)
     if change.unwrap:
         table["unwrap"] = change.command or True
     return table
 
 
-def _rounded(value: float) -> float:
+def _round_value(value: float) -> float:
     return float(f"{value:.9g}")
 
 
@@ -119,13 +119,13 @@ def lines_of(
             table = after[kind][name]
             was = before[kind][name]
             own = [key for key in SHOWN if key in table and table[key] != was.get(key)]
-            keys = [f"{key} = {_shown(table[key])}" for key in own]
+            keys = [f"{key} = {_format_value(table[key])}" for key in own]
             yield f"[{kind}.{toml_key(name)}] {', '.join(keys)}"
     if any(one.hypothesis.late for one in differences):
         yield f"[time] offset = {after['time']['offset']:.9g}"
 
 
-def _shown(value: Any) -> str:
+def _format_value(value: Any) -> str:
     if isinstance(value, bool):
         return str(value).lower()
     return toml_text(value) if isinstance(value, str) else f"{value:.9g}"

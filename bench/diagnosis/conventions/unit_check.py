@@ -180,7 +180,7 @@ class Hypothesis:
     def factors(self) -> dict[str, float]:
         """Return the factors by which the SI values have to be multiplied, by signal."""
         pairs = zip(self.signals, self.units, strict=True)
-        return {s.name: self.scale * _gain(s, unit) / s.gain for s, unit in pairs}
+        return {s.name: self.scale * _get_unit_gain(s, unit) / s.gain for s, unit in pairs}
 
     def fault(self, file: str, before: float | None, after: float | None) -> RecordingFault:
         """Describe the hypothesis as a fault of the recording, with the lines to change.
@@ -194,23 +194,25 @@ class Hypothesis:
         lines = []
         for signal, unit in zip(self.signals, self.units, strict=True):
             keys = [f'unit = "{unit}"'] * (unit != signal.stated)
-            keys += [f"scale = {self._scale(signal):.9g}"] * (self._scale(signal) != 1.0)
+            keys += [f"scale = {self._get_corrected_scale(signal):.9g}"] * (
+                self._get_corrected_scale(signal) != 1.0
+            )
             lines.append(f"[{signal.kind}.{toml_key(signal.name)}] {', '.join(keys)}")
         return RecordingFault(
             tuple(signal.name for signal in self.signals),
             factors[self.signals[0].name],
             self.units[0] if self.units[0] != self.signals[0].stated else None,
-            self._sentence(file, factors),
+            self._format_correction(file, factors),
             tuple(lines),
             before,
             after,
         )
 
-    def _scale(self, signal: Signal) -> float:
+    def _get_corrected_scale(self, signal: Signal) -> float:
         """Return the key `scale` of a signal's table, including a factor already specified."""
         return self.scale * signal.scale
 
-    def _sentence(self, file: str, factors: Mapping[str, float]) -> str:
+    def _format_correction(self, file: str, factors: Mapping[str, float]) -> str:
         """Write what seems wrong with a unit, sign or scale, and how the user corrects it.
 
         `file` is the name of the description file. `factors` has, by signal name, the factor by
@@ -219,7 +221,7 @@ class Hypothesis:
         first, unit = self.signals[0], self.units[0]
         names = listed([signal.said for signal in self.signals], _NAMED)
         table = f"[{first.kind}.{first.name}]" if len(self.signals) == 1 else "the tables of each"
-        scale = f"set scale = {self._scale(first):.9g} in {table} of {file}"
+        scale = f"set scale = {self._get_corrected_scale(first):.9g} in {table} of {file}"
         if unit == first.stated and self.scale == -1.0:
             return f"The sign of {names} looks reversed: {scale}"
         if unit == first.stated:
@@ -276,10 +278,10 @@ class Subject:
         """Return the recording with signals multiplied by factors."""
         recording = self.recording
         noise = {n: abs(factors.get(n, 1.0)) * s for n, s in recording.noise.items()}
-        runs = tuple(_rescaled(run, factors) for run in recording.runs)
+        runs = tuple(_rescale_run(run, factors) for run in recording.runs)
         return replace(recording, noise=noise, runs=runs)
 
-    def world(self, recording: Recording) -> RunEvaluator:
+    def evaluator(self, recording: Recording) -> RunEvaluator:
         """Return a run evaluator of a recording's runs for fitting, without any effects."""
         return RunEvaluator(
             self.kind, recording, recording.training(), self.engine, (), self.free, candidates=()
@@ -287,41 +289,41 @@ class Subject:
 
 
 def wrong_units(
-    subject: Subject, world: RunEvaluator, noise: NoiseModel, base: BaseFit
+    subject: Subject, evaluator: RunEvaluator, noise: NoiseModel, base: BaseFit
 ) -> RecordingFault | None:
     """Find the wrong unit or sign that explains nearly all of the misfit of the base model.
 
     Args:
         subject: Recording and simulator to check.
-        world: Run evaluator of the runs for fitting.
+        evaluator: Run evaluator of the runs for fitting.
         noise: Noise of each channel.
         base: Fitted base model.
 
     Returns:
         The fault; None if there is none, or no channel has a gross misfit.
     """
-    is_recorded = np.isfinite(world.observed)
-    residual = np.where(is_recorded, world.observed - base.fit.simulated, 0.0)
-    shares = _shares(world, residual, noise)
+    is_recorded = np.isfinite(evaluator.observed)
+    residual = np.where(is_recorded, evaluator.observed - base.fit.simulated, 0.0)
+    shares = _compute_residual_shares(evaluator, residual, noise)
     if not (shares > GROSS).any():
         return None
-    before = _rms(residual, is_recorded, noise)
+    before = _compute_residual_rms(residual, is_recorded, noise)
     known = before if np.isfinite(before) else None
-    signals = subject.signals(world.channels)
-    hypotheses = list(_hypotheses(signals, _suspected_parts(world, shares)))
+    signals = subject.signals(evaluator.channels)
+    hypotheses = list(_generate_hypotheses(signals, _suspected_parts(evaluator, shares)))
     excess = REMAINING * (before - 1.0)
     accepted: list[tuple[Hypothesis, float]] = []
     others: list[str] = []
-    for hypothesis in _promising(subject, hypotheses):
+    for hypothesis in _select_promising(subject, hypotheses):
         after, missed = _fit_rescaled(subject, hypothesis.factors())
         if after - 1.0 > excess or missed > FOLLOWED:
             continue
-        distinction = _distinction(subject, hypothesis, after, int(is_recorded.sum()))
+        distinction = _test_distinctness(subject, hypothesis, after, int(is_recorded.sum()))
         if distinction == "sharp":
             accepted.append((hypothesis, after))
         elif distinction == "absorbed":
             accepted.append((hypothesis, after))
-            others += [_BEYOND.format(name) for name in _parameters_at_bounds(world, base.fit)]
+            others += [_BEYOND.format(name) for name in _parameters_at_bounds(evaluator, base.fit)]
     if not accepted:
         return None
     # Among hypotheses that fit equally well, the simplest is preferred.
@@ -338,7 +340,7 @@ def wrong_units(
 
 
 def recognised(
-    subject: Subject, world: RunEvaluator, cause: Cause, base: TrajectoryFit
+    subject: Subject, evaluator: RunEvaluator, cause: Cause, base: TrajectoryFit
 ) -> RecordingFault | None:
     """Find the wrong unit or sign that a fitted gain of a sensor or an input imitates.
 
@@ -346,7 +348,7 @@ def recognised(
 
     Args:
         subject: Recording and simulator to check.
-        world: Run evaluator of the runs for fitting.
+        evaluator: Run evaluator of the runs for fitting.
         cause: Diagnosed cause.
         base: Fit of the base model; the gain may compensate for a parameter at a bound.
 
@@ -358,10 +360,12 @@ def recognised(
         return None
     (coefficient,) = cause.coefficients.values()
     gain = 1.0 + coefficient.value
-    signal_name = world.available_effects[cause.effect].signal
+    signal_name = evaluator.available_effects[cause.effect].signal
     kind = "channels" if effect == "sensor.gain" else "inputs"
-    signals = [s for s in subject.signals(world.channels) if s.kind == kind]
-    default_name = world.simulator.system.reading(world.channels) if kind == "channels" else ""
+    signals = [s for s in subject.signals(evaluator.channels) if s.kind == kind]
+    default_name = (
+        evaluator.simulator.system.reading(evaluator.channels) if kind == "channels" else ""
+    )
     signal = next(
         (s for s in signals if s.name == (signal_name or default_name)),
         signals[0] if signals else None,
@@ -374,7 +378,7 @@ def recognised(
         wanted = hypothesis.factors()[signal.name]
         if wanted * factor > 0 and abs(math.log(wanted / factor)) < CLOSE:
             alternatives = tuple(
-                _BEYOND.format(name) for name in _parameters_at_bounds(world, base)
+                _BEYOND.format(name) for name in _parameters_at_bounds(evaluator, base)
             )
             return replace(hypothesis.fault(subject.file, None, None), alternatives=alternatives)
     if kind == "channels" and abs(gain) <= IGNORED:
@@ -383,18 +387,20 @@ def recognised(
             f"{coefficient.value:.4g}), which is not an answer: check the unit, the column and the "
             f"sign of {signal.said} in {subject.file}"
         )
-        alternatives = tuple(_BEYOND.format(name) for name in _parameters_at_bounds(world, base))
+        alternatives = tuple(
+            _BEYOND.format(name) for name in _parameters_at_bounds(evaluator, base)
+        )
         return RecordingFault((signal.name,), factor, None, message, (), None, None, alternatives)
     return None
 
 
-def _gain(signal: Signal, unit: str) -> float:
+def _get_unit_gain(signal: Signal, unit: str) -> float:
     if unit == signal.stated:
         return signal.gain
     return signal.scale * UNITS[signal.si][unit]
 
 
-def _rescaled(run: Run, factors: Mapping[str, float]) -> Run:
+def _rescale_run(run: Run, factors: Mapping[str, float]) -> Run:
     """Return the run with each signal named in `factors` multiplied by its factor.
 
     `run.before` has pairs of time stamps and values recorded before the run; only the values are
@@ -410,25 +416,27 @@ def _rescaled(run: Run, factors: Mapping[str, float]) -> Run:
     return replace(run, channels=scaled(run.channels), inputs=scaled(run.inputs), before=before)
 
 
-def _parameters_at_bounds(world: RunEvaluator, fit: TrajectoryFit) -> list[str]:
+def _parameters_at_bounds(evaluator: RunEvaluator, fit: TrajectoryFit) -> list[str]:
     """List the names of parameters whose value in the base fit is at a bound of their range."""
     names = []
     for index in fit.free.tolist():
-        parameter = world.parameters[index]
+        parameter = evaluator.parameters[index]
         if bound_of(float(fit.theta[index]), *parameter.bounds) is not None:
             names.append(parameter.name)
     return names
 
 
-def _shares(world: RunEvaluator, residual: Array, noise: NoiseModel) -> Array:
+def _compute_residual_shares(evaluator: RunEvaluator, residual: Array, noise: NoiseModel) -> Array:
     """Compute the RMS residual beyond the noise, as a share of each channel's deviation (C,).
 
     It is 0 for a channel that does not move beyond its noise.
     """
     shares = []
     for c, sigma in enumerate(noise.sigma.tolist()):
-        is_recorded = np.isfinite(world.observed[..., c])
-        deviation = float(np.std(world.observed[..., c][is_recorded])) if is_recorded.any() else 0.0
+        is_recorded = np.isfinite(evaluator.observed[..., c])
+        deviation = (
+            float(np.std(evaluator.observed[..., c][is_recorded])) if is_recorded.any() else 0.0
+        )
         # A failed simulation counts as an infinite residual.
         mean_square = float(np.mean(np.nan_to_num(residual[..., c][is_recorded], nan=np.inf) ** 2))
         excess = max(mean_square - sigma**2, 0.0) ** 0.5
@@ -436,25 +444,27 @@ def _shares(world: RunEvaluator, residual: Array, noise: NoiseModel) -> Array:
     return np.array(shares)
 
 
-def _rms(residual: Array, is_recorded: Any, noise: NoiseModel) -> float:
+def _compute_residual_rms(residual: Array, is_recorded: Any, noise: NoiseModel) -> float:
     """Return the RMS of a residual (R, T, C) over its samples, in units of the noise."""
     scaled = (residual / noise.sigma)[is_recorded]
     rms = float(np.sqrt(np.mean(np.square(scaled)))) if scaled.size else 0.0
     return rms if np.isfinite(rms) else np.inf
 
 
-def _suspected_parts(world: RunEvaluator, shares: Array) -> frozenset[str] | None:
+def _suspected_parts(evaluator: RunEvaluator, shares: Array) -> frozenset[str] | None:
     """Return the joints and actuators of a robot to check; None for other systems: check all."""
-    if not world.kind.has_model:
+    if not evaluator.kind.has_model:
         return None
     worst = np.argsort(-shares)[:WORST].tolist()
-    joints = {world.channels[c].partition(".")[2] for c in worst}
-    robot: Any = world.kind
+    joints = {evaluator.channels[c].partition(".")[2] for c in worst}
+    robot: Any = evaluator.kind
     drives = {a.name for a in robot.robot.actuators if a.joint in joints}
     return frozenset(joints | drives)
 
 
-def _hypotheses(signals: Sequence[Signal], suspects: frozenset[str] | None) -> Iterator[Hypothesis]:
+def _generate_hypotheses(
+    signals: Sequence[Signal], suspects: frozenset[str] | None
+) -> Iterator[Hypothesis]:
     """Yield all hypotheses.
 
     They concern single signals, all signals with one unit, logs in one system of units, and joints
@@ -519,7 +529,7 @@ def _reversed_joints(
             yield Hypothesis(tuple(joint_signals), tuple(s.stated for s in joint_signals), -1.0)
 
 
-def _promising(subject: Subject, hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
+def _select_promising(subject: Subject, hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
     """Select the hypotheses that fit best from the starts of the base fit.
 
     They are screened by the beginning of the runs, where wrong parameters matter least, and then by
@@ -533,16 +543,18 @@ def _promising(subject: Subject, hypotheses: Sequence[Hypothesis]) -> list[Hypot
         """
         scores = []
         for one in those:
-            world, noise = _world(subject, one.factors())
-            scores.append(misfit_of_starts(world, noise, share))
-            world.close()
+            evaluator, noise = _build_rescaled_evaluator(subject, one.factors())
+            scores.append(misfit_of_starts(evaluator, noise, share))
+            evaluator.close()
         return [those[i] for i in np.argsort(scores, kind="stable").tolist()]
 
     screened = best(hypotheses, BEGINNING)[:SCREENED]
     return list(dict.fromkeys([*screened[:TRIED], *best(screened, 1.0)[:TRIED]]))
 
 
-def _world(subject: Subject, factors: Mapping[str, float]) -> tuple[RunEvaluator, NoiseModel]:
+def _build_rescaled_evaluator(
+    subject: Subject, factors: Mapping[str, float]
+) -> tuple[RunEvaluator, NoiseModel]:
     """Build the run evaluator of the rescaled recording, and white noise at its noise floor.
 
     Args:
@@ -554,9 +566,9 @@ def _world(subject: Subject, factors: Mapping[str, float]) -> tuple[RunEvaluator
         (C,) of each channel and no autocorrelation.
     """
     recording = subject.rescaled(factors)
-    world = subject.world(recording)
-    sigma = compute_noise_floor(world, recording).sigma
-    return world, NoiseModel(sigma, np.zeros(len(sigma)))
+    evaluator = subject.evaluator(recording)
+    sigma = compute_noise_floor(evaluator, recording).sigma
+    return evaluator, NoiseModel(sigma, np.zeros(len(sigma)))
 
 
 def _fit_rescaled(subject: Subject, factors: Mapping[str, float]) -> tuple[float, float]:
@@ -565,15 +577,17 @@ def _fit_rescaled(subject: Subject, factors: Mapping[str, float]) -> tuple[float
     Returns:
         RMS residual in units of the noise, and the largest share of a channel's deviation.
     """
-    world, noise = _world(subject, factors)
-    fit = fit_base_model(world, noise).fit
-    is_recorded = np.isfinite(world.observed)
-    residual = np.where(is_recorded, world.observed - fit.simulated, 0.0)
-    world.close()
-    return _rms(residual, is_recorded, noise), float(_shares(world, residual, noise).max())
+    evaluator, noise = _build_rescaled_evaluator(subject, factors)
+    fit = fit_base_model(evaluator, noise).fit
+    is_recorded = np.isfinite(evaluator.observed)
+    residual = np.where(is_recorded, evaluator.observed - fit.simulated, 0.0)
+    evaluator.close()
+    return _compute_residual_rms(residual, is_recorded, noise), float(
+        _compute_residual_shares(evaluator, residual, noise).max()
+    )
 
 
-def _distinction(
+def _test_distinctness(
     subject: Subject, hypothesis: Hypothesis, after: float, samples: int
 ) -> Literal["sharp", "absorbed", "none"]:
     """Test whether a hypothesis is distinct from nearby factors, the second half of (1).

@@ -163,7 +163,7 @@ def _is_stop(effect: Effect | type[Effect]) -> bool:
     return effect.coefficients[0].of == "stop"
 
 
-def _is_recorded(world: RunEvaluator, effect: str) -> bool:
+def _is_recorded(evaluator: RunEvaluator, effect: str) -> bool:
     """Return whether the signal that an effect acts on was recorded."""
-    run = world.runs[0]
-    return world.available_effects[effect].signal in {*run.channels, *run.inputs}
+    run = evaluator.runs[0]
+    return evaluator.available_effects[effect].signal in {*run.channels, *run.inputs}

@@ -224,7 +224,7 @@ class _Shown:
 
     def __init__(
         self,
-        world: RunEvaluator,
+        evaluator: RunEvaluator,
         noise: NoiseModel,
         fit: TrajectoryFit,
         direction_set: DirectionSet,
@@ -239,16 +239,16 @@ class _Shown:
         information of eq. (1) that remains, and `leaning` (K,) the estimate after one Gauss-Newton
         step from zero, eq. (2).
         """
-        self.world, self.found = world, direction_set
+        self.evaluator, self.found = evaluator, direction_set
         self.q = fit.free.size
         self.places = fit.free.tolist()
-        self.free = tuple(world.parameters[i].name for i in fit.free.tolist())
+        self.free = tuple(evaluator.parameters[i].name for i in fit.free.tolist())
         parameter_columns, state_columns = fit.jacobian[..., : self.q], fit.jacobian[..., self.q :]
         columns = np.concatenate(
             [parameter_columns, direction_set.responses, residual[..., None], state_columns], axis=3
         )
         fisher_blocks = compute_fisher_blocks_from_jacobian(
-            world, columns, columns.shape[3] - state_columns.shape[3], noise
+            evaluator, columns, columns.shape[3] - state_columns.shape[3], noise
         )
         own_sum = fisher_blocks.own.sum(axis=0)
         self.left, _ = compute_schur_complement(own_sum, fisher_blocks.cross, fisher_blocks.inner)
@@ -289,7 +289,9 @@ class _Shown:
         return DetectionLimits(self.free, self.covariance, detection_limits, prediction_half_widths)
 
     def _get_coefficient_name(self, effect: str, place: int) -> str:
-        return self.world.available_effects[effect].on(self.world.simulator.system)[place].name
+        return (
+            self.evaluator.available_effects[effect].on(self.evaluator.simulator.system)[place].name
+        )
 
     def _compute_proportional_limit(self, k: int) -> DetectionLimit:
         """Return the detection limit of direction k, whose effect is proportional to its size.
@@ -299,7 +301,7 @@ class _Shown:
         """
         power = self.powers[k]
         size = Z95 / np.sqrt(power) if power > 0 else np.inf
-        parameter = self.world.parameters[self._get_coefficient_index(self.found.candidates[k])]
+        parameter = self.evaluator.parameters[self._get_coefficient_index(self.found.candidates[k])]
         low, high = parameter.bounds
         # The interval exceeds all plausible values, so the data say nothing about the coefficient.
         if 2.0 * size > MAX_INTERVAL_WIDTH * (high - low):
@@ -311,7 +313,7 @@ class _Shown:
         )
 
     def _get_coefficient_index(self, probe: CandidateDirection) -> int:
-        return self.world.get_coefficient_indices(probe.effect)[probe.place]
+        return self.evaluator.get_coefficient_indices(probe.effect)[probe.place]
 
     def _list_confounded_parameters(self, k: int) -> tuple[str, ...]:
         """Return the parameters of the model that together have nearly the same influence."""
@@ -331,10 +333,10 @@ class _Shown:
 
         The simpler effect may be in the model or not.
         """
-        simpler_effects = set(self.world.available_effects[name].contains)
+        simpler_effects = set(self.evaluator.available_effects[name].contains)
         other_columns = [self.q + j for (effect, _), j in best.items() if effect in simpler_effects]
-        for effect in simpler_effects & set(self.world.slots):
-            effect_places = self.world.get_coefficient_indices(effect)
+        for effect in simpler_effects & set(self.evaluator.slots):
+            effect_places = self.evaluator.get_coefficient_indices(effect)
             other_columns += [j for j, place in enumerate(self.places) if place in effect_places]
         i = self.q + k
         for j in other_columns:

@@ -51,7 +51,7 @@ Bound = Literal["low", "high"]
 """End of a range that a value lies at."""
 
 
-def compute_coefficient_bounds(world: RunEvaluator, name: str) -> list[tuple[float, float]]:
+def compute_coefficient_bounds(evaluator: RunEvaluator, name: str) -> list[tuple[float, float]]:
     """Return the range in which a fit may move each coefficient of an effect.
 
     A plausible range ranks causes, and values outside it are reported, but it does not override the
@@ -60,26 +60,28 @@ def compute_coefficient_bounds(world: RunEvaluator, name: str) -> list[tuple[flo
     nonnegative by definition stays so, and a shape parameter stays in its range.
 
     Args:
-        world: the runs.
+        evaluator: the runs.
         name: name of the effect.
     """
-    effect = world.available_effects[name]
-    pairs = zip(world.parameters[world.slots[name]], effect.coefficients, strict=False)
+    effect = evaluator.available_effects[name]
+    pairs = zip(evaluator.parameters[evaluator.slots[name]], effect.coefficients, strict=False)
     return [
-        _within(_bounds(parameter, coefficient, effect, world), coefficient)
+        _restrict_to_physical(
+            _compute_fit_bounds(parameter, coefficient, effect, evaluator), coefficient
+        )
         for parameter, coefficient in pairs
     ]
 
 
-def clip_coefficients(world: RunEvaluator, name: str, c: Array) -> Array:
+def clip_coefficients(evaluator: RunEvaluator, name: str, c: Array) -> Array:
     """Clip the coefficients (k,) of an effect to the range in which a fit may move them.
 
     Args:
-        world: the runs.
+        evaluator: the runs.
         name: name of the effect.
         c: (k,) its coefficients.
     """
-    limited: Array = np.clip(c, *np.array(compute_coefficient_bounds(world, name)).T)
+    limited: Array = np.clip(c, *np.array(compute_coefficient_bounds(evaluator, name)).T)
     return limited
 
 
@@ -110,7 +112,9 @@ def bound_of(value: float, low: float, high: float) -> Bound | None:
     return "high" if value >= high - min(tolerance, NEAR * abs(high)) else None
 
 
-def _within(bounds: tuple[float, float], coefficient: Coefficient) -> tuple[float, float]:
+def _restrict_to_physical(
+    bounds: tuple[float, float], coefficient: Coefficient
+) -> tuple[float, float]:
     """Return a range restricted to the physical limits of a coefficient."""
     low, high = bounds
     if coefficient.least is not None:
@@ -120,8 +124,8 @@ def _within(bounds: tuple[float, float], coefficient: Coefficient) -> tuple[floa
     return low, high
 
 
-def _bounds(
-    parameter: Parameter, coefficient: Coefficient, effect: Effect, world: RunEvaluator
+def _compute_fit_bounds(
+    parameter: Parameter, coefficient: Coefficient, effect: Effect, evaluator: RunEvaluator
 ) -> tuple[float, float]:
     """Return the range in which a fit may move a coefficient, without its physical limits.
 
@@ -129,9 +133,9 @@ def _bounds(
     of the runs, because the data cannot show slower changes.
     """
     low, high = parameter.bounds
-    longest_run = world.longest
+    longest_run = evaluator.longest
     if is_instant(parameter):
-        return world.clock
+        return evaluator.clock
     if parameter.unit == "Hz":
         # The lower bound is at most half of the upper bound, so that the range is not empty.
         low = min(max(low, MIN_CYCLES_PER_RUN / longest_run), high / 2.0)
@@ -147,7 +151,7 @@ def _bounds(
     )
     range_factor = MAX_RANGE_FACTOR_DRY_FRICTION if is_dry_friction else MAX_RANGE_FACTOR
     # The limits of a robot coefficient refer to the total with the value of the model file.
-    if world.kind.has_model and coefficient.least is not None:
+    if evaluator.kind.has_model and coefficient.least is not None:
         range_factor = BEYOND_MODEL
     # A coefficient whose sign is part of the definition of its effect has a lower bound of zero.
     return range_factor * low, range_factor * high

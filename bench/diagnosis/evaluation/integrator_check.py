@@ -76,19 +76,19 @@ class StepRefinement(NamedTuple):
         )
 
 
-def find_step_refinements(world: RunEvaluator, noise: NoiseModel) -> Iterator[StepRefinement]:
+def find_step_refinements(evaluator: RunEvaluator, noise: NoiseModel) -> Iterator[StepRefinement]:
     """Yield settings that reproduce the converged motion of the robot, the cheapest first.
 
     Nothing is generated if the settings of the model file are accurate, or if no reference
     converges.
 
     Args:
-        world: the runs of a robot.
+        evaluator: the runs of a robot.
         noise: noise of each channel.
     """
-    kind = world.kind
+    kind = evaluator.kind
     assert issubclass(kind, RobotSimulator)
-    motions = _ReferenceMotions(world, noise, kind)
+    motions = _ReferenceMotions(evaluator, noise, kind)
     model_settings = kind.numerics
     reference = motions.reference(model_settings)
     if reference is None:
@@ -96,7 +96,7 @@ def find_step_refinements(world: RunEvaluator, noise: NoiseModel) -> Iterator[St
     error = motions.apart(motions.of(model_settings), reference)
     if not error > MIN_DISCRETISATION_ERROR:
         return
-    for numerics in _settings(model_settings):
+    for numerics in _iterate_settings(model_settings):
         corrected_error = motions.apart(motions.of(numerics), reference)
         if corrected_error < max(
             MAX_CORRECTED_ERROR, min(MAX_CORRECTED_ERROR_FAR_FIT, error / MIN_ERROR_REDUCTION)
@@ -110,7 +110,7 @@ def find_step_refinements(world: RunEvaluator, noise: NoiseModel) -> Iterator[St
             )
 
 
-def _settings(model_settings: IntegratorSettings) -> Iterator[IntegratorSettings]:
+def _iterate_settings(model_settings: IntegratorSettings) -> Iterator[IntegratorSettings]:
     """Yield finer time steps and other integrators than the robot's own, the cheapest first.
 
     A step of RK4 costs 3.3 times as much as one of the other integrators.
@@ -129,30 +129,32 @@ def _settings(model_settings: IntegratorSettings) -> Iterator[IntegratorSettings
 class _ReferenceMotions:
     """Motions of the first runs with any step and integrator, each simulated once."""
 
-    def __init__(self, world: RunEvaluator, noise: NoiseModel, kind: type[RobotSimulator]) -> None:
-        self._world, self._kind, self._noise = world, kind, noise
-        self._tracks = world.tracks[:CHECKED_RUN_COUNT]
+    def __init__(
+        self, evaluator: RunEvaluator, noise: NoiseModel, kind: type[RobotSimulator]
+    ) -> None:
+        self._evaluator, self._kind, self._noise = evaluator, kind, noise
+        self._tracks = evaluator.tracks[:CHECKED_RUN_COUNT]
         self._seen: dict[IntegratorSettings, Array] = {}
 
     def of(self, numerics: IntegratorSettings) -> Array:
         """Return the motion (R, T, C), NaN after the end of a shorter run."""
         if numerics not in self._seen:
-            self._seen[numerics] = self._simulated(numerics)
+            self._seen[numerics] = self._simulate_with(numerics)
         return self._seen[numerics]
 
-    def _simulated(self, numerics: IntegratorSettings) -> Array:
+    def _simulate_with(self, numerics: IntegratorSettings) -> Array:
         """Simulate the first runs with a given time step and integrator, at nominal parameters.
 
         No effects are active. The result is (R, T, C).
         """
-        world = self._world
+        evaluator = self._evaluator
         kind = self._kind.with_integrator_settings(numerics)
-        simulator = kind(world.recording.constants, world.channels)
+        simulator = kind(evaluator.recording.constants, evaluator.channels)
         count = len(self._tracks)
-        theta = np.tile(world.get_nominal_theta()[: world.own], (count, 1))
-        states = dict(zip(world.states, world.guess[:count].T, strict=True))
+        theta = np.tile(evaluator.get_nominal_theta()[: evaluator.own], (count, 1))
+        states = dict(zip(evaluator.states, evaluator.guess[:count].T, strict=True))
         scenarios = [track.scenario for track in self._tracks]
-        world.simulations += count
+        evaluator.simulations += count
         return simulator.simulate_batch(theta, scenarios, states)
 
     def reference(self, model_settings: IntegratorSettings) -> Array | None:

@@ -51,17 +51,17 @@ class NoiseFloor:
     """Relative standard error (C,) of an estimated sigma; 0 if it is specified."""
 
 
-def compute_noise_floor(world: RunEvaluator, recording: Recording) -> NoiseFloor:
+def compute_noise_floor(evaluator: RunEvaluator, recording: Recording) -> NoiseFloor:
     """Return the specified noise of each channel, or estimate it from all runs.
 
     Held-out runs are included, because they also show the sensor noise.
 
     Args:
-        world: the runs for fitting; its simulator defines the channels.
+        evaluator: the runs for fitting; its simulator defines the channels.
         recording: the recording with all its runs.
     """
     sigmas, is_stated, steps, uncertainties = [], [], [], []
-    for channel in world.simulator.channels:
+    for channel in evaluator.simulator.channels:
         signals = [(run.times, run.channels[channel.name]) for run in recording.runs]
         samples = [y[np.isfinite(y)] for _, y in signals]
         values = np.concatenate(samples)

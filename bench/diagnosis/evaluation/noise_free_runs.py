@@ -43,14 +43,16 @@ def add_least_noise(recording: Recording, channels: Sequence[str]) -> tuple[Reco
     Returns:
         The recording, and the names of the channels that were changed.
     """
-    changed = {name: size for name in channels if (size := _missing(recording, name)) > 0.0}
+    changed = {
+        name: size for name in channels if (size := _compute_added_noise(recording, name)) > 0.0
+    }
     if not changed:
         return recording, []
-    runs = tuple(_noisy(run, changed) for run in recording.runs)
+    runs = tuple(_add_noise(run, changed) for run in recording.runs)
     return replace(recording, runs=runs), list(changed)
 
 
-def _missing(recording: Recording, name: str) -> float:
+def _compute_added_noise(recording: Recording, name: str) -> float:
     """Return the standard deviation of the noise to add; 0 for noisy or constant channels."""
     signals = [(run.times, run.channels[name]) for run in recording.runs if name in run.channels]
     values = np.concatenate([y[np.isfinite(y)] for _, y in signals])
@@ -61,7 +63,7 @@ def _missing(recording: Recording, name: str) -> float:
     return min_sigma if differences_sigma(signals, ORDER) < FREE * min_sigma else 0.0
 
 
-def _noisy(run: Run, sizes: dict[str, float]) -> Run:
+def _add_noise(run: Run, sizes: dict[str, float]) -> Run:
     """Add white noise with the standard deviations `sizes`, by channel, to a run.
 
     The noise depends only on the names of run and channel, so it is the same every time.

@@ -63,7 +63,7 @@ class NoiseModel:
     phi: Array
 
 
-def _unit(phi: float) -> NoiseModel:
+def _make_unit_noise(phi: float) -> NoiseModel:
     """Return the noise of one channel with the given correlation and variance one."""
     return NoiseModel(np.ones(1), np.array([phi]))
 
@@ -183,7 +183,7 @@ def _maximise_channel_likelihood(
     count = int(observed_mask.sum())
     best = (-np.inf, 0.0, 0.0)
     for phi in _list_nearby_phis(residual, observed_mask):
-        w = whiten(residual, observed_mask, _unit(phi))
+        w = whiten(residual, observed_mask, _make_unit_noise(phi))
         power = float((w * w).sum())
         variance = max(power / count, MIN_VARIANCE)
         # Equation (4) with the determinant of whitening.
@@ -234,14 +234,14 @@ def compute_portmanteau_p_value(
     for c, phi in enumerate(likelihood.phi.tolist()):
         channel = slice(c, c + 1)
         channel_mask = observed_mask[:, :, channel]
-        white = whiten(residual[:, :, channel], channel_mask, _unit(phi))
+        white = whiten(residual[:, :, channel], channel_mask, _make_unit_noise(phi))
         count = max(int(channel_mask.sum()), 2)
-        statistic = count * (count + 2.0) * _correlated(white[:, :, 0], count)  # (5)
+        statistic = count * (count + 2.0) * _compute_ljung_box_sum(white[:, :, 0], count)  # (5)
         min_p_value = min(min_p_value, chi_squared_tail(PORTMANTEAU_LAGS - 1, statistic))
     return min(1.0, min_p_value * len(likelihood.phi))
 
 
-def _correlated(w: Array, count: int) -> float:
+def _compute_ljung_box_sum(w: Array, count: int) -> float:
     """Return the sum Σ r_k² / (n - k) of the Ljung-Box test of `compute_portmanteau_p_value`.
 
     `w` (R, T) has the whitened values of a channel, and `count` is n, the number of samples.

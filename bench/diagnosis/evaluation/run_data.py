@@ -70,7 +70,7 @@ def prepare_run(
     columns = [run.channels[c.name] for c in simulator.channels]
     # Constants of a run are valid only in this run.
     constants = {**recording.constants, **run.constants}
-    guesses = _guessed(run, simulator)
+    guesses = _guess_initial_states(run, simulator)
     fixed = {*run.initial, *_find_unobserved_states(simulator)}
     # Initial values that are not states of the system, such as the pose of a floating base, are not
     # part of a batch element.
@@ -95,7 +95,7 @@ def prepare_run(
     )
 
 
-def _guessed(run: Run, simulator: SystemSimulator) -> dict[str, float]:
+def _guess_initial_states(run: Run, simulator: SystemSimulator) -> dict[str, float]:
     """Return a guess of each initial state, from which fits start, by name.
 
     It is the specified value, or an estimate from the first samples, or the default.

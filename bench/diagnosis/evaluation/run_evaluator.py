@@ -152,7 +152,7 @@ class RunEvaluator:
             and (effect.hook != "hidden" or kind.has_model or engine in HIDDEN_STATE_ENGINES)
         ]
         self.library = observable_effects if candidates is None else list(candidates)
-        self.simulator, self._fine = self._simulators()
+        self.simulator, self._fine = self._create_simulators()
 
         # Theta has three parts: base parameters, freed constants, coefficients.
         system = self.simulator.system
@@ -162,7 +162,7 @@ class RunEvaluator:
         self.parameters: tuple[Parameter, ...] = (*system.parameters, *self.freed, *coefficients)
         self.base: Indices = np.arange(self.own + len(self.freed))
         self.slots = _allocate_coefficients(self.simulator, self.base.size)
-        self._shifting, self._filtering = self._delaying()
+        self._shifting, self._filtering = self._find_delaying_coefficients()
 
         # A system without coordinates provides the names of its states itself.
         self.states = [*system.coordinates, *system.rates] or list(kind.states)
@@ -170,12 +170,12 @@ class RunEvaluator:
             prepare_run(run, recording, self.simulator, self.states) for run in runs
         )
         self.lengths: Indices = np.array([len(t.observed) for t in self.tracks])
-        self.observed = self._padded()
+        self.observed = self._pad_observations()
         self.known: Mask = np.array([t.known_state_mask for t in self.tracks])
         self.guess: Array = np.array([t.initial_state_guess for t in self.tracks])
-        self.longest = self._longest()
+        self.longest = self._get_longest_duration()
         self.parameters = self._on_time_scale()
-        self.clock = self._clock()
+        self.clock = self._get_time_span()
         self._travels: dict[str, float] = {}
         self.derivatives: Array | None = None
         self.correction: Array | None = None
@@ -192,7 +192,7 @@ class RunEvaluator:
         self.crew = ForkedWorkerPool()
         self._parts: dict[float, list[Scenario]] = {}
 
-    def _simulators(self) -> tuple[SystemSimulator, SystemSimulator]:
+    def _create_simulators(self) -> tuple[SystemSimulator, SystemSimulator]:
         """Create the simulator with all available effects, and a copy with a finer time step.
 
         The copy simulates coefficients that need fine steps, such as those of filters.
@@ -221,7 +221,7 @@ class RunEvaluator:
 
         return make_simulator(default_settings), make_simulator(fine_settings)
 
-    def _padded(self) -> Array:
+    def _pad_observations(self) -> Array:
         """Return the observations (R, T, C) of all runs, NaN after the end of a shorter run."""
         shape = len(self.tracks), self.lengths.max(), len(self.channels)
         observed = np.full(shape, np.nan)
@@ -229,12 +229,12 @@ class RunEvaluator:
             row[: len(track.observed)] = track.observed
         return observed
 
-    def _longest(self) -> float:
+    def _get_longest_duration(self) -> float:
         """Return the duration of the longest run, in seconds."""
         # A duration of zero is replaced, because times are divided by it.
         return max(track.duration for track in self.tracks) or 1.0
 
-    def _clock(self) -> tuple[float, float]:
+    def _get_time_span(self) -> tuple[float, float]:
         """Return the first and the last time stamp of all runs."""
         stamps = [track.scenario.times for track in self.tracks]
         return min(float(t[0]) for t in stamps), max(float(t[-1]) for t in stamps)
@@ -250,36 +250,36 @@ class RunEvaluator:
 
         The range is 0 if the coordinate is not recorded.
         """
-        return self._range(self._coordinate(effect))
+        return self._get_channel_range(self._get_effect_coordinate(effect))
 
     def get_coordinate_range(self, effect: str) -> tuple[float, float]:
         """Return the minimum and maximum, over all runs, of the coordinate that an effect acts on.
 
         Both are 0 if the coordinate is not recorded.
         """
-        name = self._coordinate(effect)
+        name = self._get_effect_coordinate(effect)
         if name not in self.channels:
             return 0.0, 0.0
         values = self.observed[:, :, self.channels.index(name)]
         return float(np.nanmin(values, initial=np.inf)), float(np.nanmax(values, initial=-np.inf))
 
-    def _coordinate(self, effect: str) -> str:
+    def _get_effect_coordinate(self, effect: str) -> str:
         """Return the coordinate that an effect acts on; empty if there are no coordinates."""
         system = self.simulator.system
         coordinate = self.available_effects[effect].coordinate
         place = system.primary if coordinate is None else coordinate
         return system.coordinates[place] if system.coordinates else ""
 
-    def _range(self, name: str) -> float:
+    def _get_channel_range(self, name: str) -> float:
         """Return the largest range of a channel within one run, cached; 0 if not recorded."""
         if name not in self._travels:
-            self._travels[name] = self._travel(name)
+            self._travels[name] = self._compute_channel_range(name)
         return self._travels[name]
 
-    def _travel(self, name: str) -> float:
+    def _compute_channel_range(self, name: str) -> float:
         """Compute the largest range (maximum less minimum) of a channel within one run.
 
-        The range is 0 if the channel is not recorded. `_range` caches it.
+        The range is 0 if the channel is not recorded. `_get_channel_range` caches it.
         """
         if name not in self.channels:
             return 0.0
@@ -289,7 +289,7 @@ class RunEvaluator:
         ranges = np.nanmax(values, axis=1) - np.nanmin(values, axis=1)
         return float(ranges.max(initial=0.0))
 
-    def _delaying(self) -> tuple[Indices, Indices]:
+    def _find_delaying_coefficients(self) -> tuple[Indices, Indices]:
         """Return the indices of coefficients that shift sample times or need fine steps.
 
         Batch elements with such coefficients are simulated separately.
@@ -381,19 +381,19 @@ class RunEvaluator:
                 for element_theta, run, begin in lanes
             ]
             missing_indices = self._cache.missing(keys)
-            new_results = self._simulate(
+            new_results = self._simulate_batch(
                 theta[missing_indices], runs[missing_indices], states[missing_indices], share
             )
             self._cache.fill(keys, missing_indices, new_results, result)
         else:
             # Results are not cached here: the slowest element of a call sets the steps of all
             # elements, so an element differs in its last digits from call to call.
-            result = self._simulate(theta, runs, states, share)
+            result = self._simulate_batch(theta, runs, states, share)
         if self.correction is not None:
             result += self.correction[runs]
         return result
 
-    def _simulate(self, theta: Array, runs: Indices, states: Array, share: float) -> Array:
+    def _simulate_batch(self, theta: Array, runs: Indices, states: Array, share: float) -> Array:
         """Simulate a batch in several engine calls, without cache and discretisation correction.
 
         Elements of different kinds are simulated separately, and large batches are split. Arguments
@@ -419,7 +419,7 @@ class RunEvaluator:
             for part in np.array_split(lanes, -(-lanes.size // max_batch_size)):
                 parts.append(part)
                 calls.append((bool(kind >= 2), theta[part], runs[part], states[part], share))
-        for number, simulated in self.crew.map_unordered(self, _simulated, calls):
+        for number, simulated in self.crew.map_unordered(self, _simulate_engine_call, calls):
             sample_count = simulated.shape[1]
             result[parts[number], :sample_count] = simulated
             result[parts[number], sample_count:] = np.nan
@@ -447,7 +447,7 @@ class RunEvaluator:
         evaluator.clock = self.clock
         # Ranges are computed now, because those of segments would differ.
         for name in self.channels:
-            self._range(name)
+            self._get_channel_range(name)
         evaluator._travels = self._travels
         evaluator.watch = self.watch
         evaluator.crew = self.crew
@@ -498,7 +498,7 @@ class RunEvaluator:
         """True if splitting a batch into several calls costs no time, as with compiled steps."""
         return self.kind.has_model or self.engine == "batch"
 
-    def _scenarios(self, theta: Array, runs: Indices, share: float) -> list[Scenario]:
+    def _make_scenarios(self, theta: Array, runs: Indices, share: float) -> list[Scenario]:
         """Return the scenarios of batch elements with their freed constants.
 
         Args:
@@ -534,7 +534,7 @@ class RunEvaluator:
             Observations (L, T', C).
         """
         simulator = self._fine if is_fine else self.simulator
-        scenarios = self._scenarios(theta, runs, share)
+        scenarios = self._make_scenarios(theta, runs, share)
         # The simulator does not treat freed constants as parameters.
         freed_indices = np.arange(self.own, self.base.size)
         lanes = np.delete(theta, freed_indices, axis=1)
@@ -646,9 +646,9 @@ def _is_effect_observable(effect: type[Effect], recorded_signals: set[str]) -> b
     return all(not member.signal or member.signal in recorded_signals for member in members)
 
 
-def _simulated(world: RunEvaluator, *call: Any) -> Array:
+def _simulate_engine_call(evaluator: RunEvaluator, *call: Any) -> Array:
     """Simulate one engine call; a module-level function, so that workers can run it."""
-    return world.simulate_batch(*call)
+    return evaluator.simulate_batch(*call)
 
 
 def _make_freed_parameter(name: str, simulator: SystemSimulator, recording: Recording) -> Parameter:

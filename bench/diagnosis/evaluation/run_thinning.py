@@ -26,31 +26,33 @@ A channel that is sampled rarely might otherwise lose all its samples.
 """
 
 
-def thin_runs(world: RunEvaluator) -> RunEvaluator | None:
+def thin_runs(evaluator: RunEvaluator) -> RunEvaluator | None:
     """Return a `RunEvaluator` with thinned runs and the same parameters.
 
     Args:
-        world: the runs.
+        evaluator: the runs.
 
     Returns:
         The thinned runs, or None if there are few samples, if the sample interval is already as
         long as an engine step, or if a channel would lose too many samples.
     """
-    total = int(world.lengths.sum())
+    total = int(evaluator.lengths.sum())
     max_factor = total // MIN_THINNED_SAMPLES
-    factors = [min(_factor(run), max_factor) for run in world.runs]
+    factors = [min(_compute_factor(run), max_factor) for run in evaluator.runs]
     if total < MIN_SAMPLES_TO_THIN or max(factors) < 2:
         return None
-    runs = [_take_every_nth(run, factor) for run, factor in zip(world.runs, factors, strict=True)]
+    runs = [
+        _take_every_nth(run, factor) for run, factor in zip(evaluator.runs, factors, strict=True)
+    ]
     if not all(
-        _shown(thinned_run, run, factor)
-        for thinned_run, run, factor in zip(runs, world.runs, factors, strict=True)
+        _keeps_samples(thinned_run, run, factor)
+        for thinned_run, run, factor in zip(runs, evaluator.runs, factors, strict=True)
     ):
         return None
-    return world.with_runs(runs)
+    return evaluator.with_runs(runs)
 
 
-def _factor(run: Run) -> int:
+def _compute_factor(run: Run) -> int:
     """Return the number of sample intervals within one engine step."""
     intervals = np.diff(run.times)
     if not intervals.size:
@@ -68,12 +70,14 @@ def _take_every_nth(run: Run, factor: int) -> Run:
         run,
         times=run.times[first],
         channels={name: values[first] for name, values in run.channels.items()},
-        inputs={name: _means(run.times, values, first) for name, values in run.inputs.items()},
+        inputs={
+            name: _average_input(run.times, values, first) for name, values in run.inputs.items()
+        },
         extra={},
     )
 
 
-def _means(times: Array, values: Array, first: Indices) -> Array:
+def _average_input(times: Array, values: Array, first: Indices) -> Array:
     """Return the mean of an input between kept samples; the value itself after the last one."""
     durations = np.diff(times, append=times[-1])
     # The last sample has no duration; a tiny one avoids 0 / 0 in its block.
@@ -82,7 +86,7 @@ def _means(times: Array, values: Array, first: Indices) -> Array:
     return means
 
 
-def _shown(thinned_run: Run, run: Run, factor: int) -> bool:
+def _keeps_samples(thinned_run: Run, run: Run, factor: int) -> bool:
     """Return whether every channel keeps about its expected number of samples."""
     for name, values in run.channels.items():
         sample_count = int(np.isfinite(values).sum())

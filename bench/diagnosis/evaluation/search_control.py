@@ -162,7 +162,7 @@ class SearchControl:
         Raises:
             SearchStoppedError: the search has to end.
         """
-        self._enter(QUESTION_SECONDS[question])
+        self._enter_part(QUESTION_SECONDS[question])
         self._question = question
         self._ahead = _list_later_weights(question)
         self.stage(STAGES[question])
@@ -170,9 +170,9 @@ class SearchControl:
 
     def begin_larger_models(self) -> None:
         """Begin the search of larger models, whose number cannot be predicted."""
-        self._enter(LARGER_MODEL_SECONDS)
+        self._enter_part(LARGER_MODEL_SECONDS)
 
-    def _enter(self, weight: float) -> None:
+    def _enter_part(self, weight: float) -> None:
         """Move the progress to a part of the search with the given weight."""
         self._done += self._now
         self._now = weight
@@ -191,7 +191,7 @@ class SearchControl:
         """Report the next step without a check, where fits stop by themselves."""
         self._what = step_text
         self._looks += 1
-        self._advance(0.0)
+        self._report_progress(0.0)
 
     def check_not_stopped(self) -> None:
         """Raise an error if the last computation may have been stopped early.
@@ -208,7 +208,7 @@ class SearchControl:
         Args:
             share: share of the fit that is finished, 0 to 1.
         """
-        self._advance(share)
+        self._report_progress(share)
         self._left |= self.should_stop()
         return self._left
 
@@ -232,7 +232,7 @@ class SearchControl:
             skipped_questions = [name for name in skipped_questions if name != "held_out"]
         return EarlyStop(self._by or "interrupt", self._what, tuple(skipped_questions))
 
-    def _advance(self, share: float) -> None:
+    def _report_progress(self, share: float) -> None:
         """Report the finished share of the search.
 
         Args:

@@ -70,7 +70,8 @@ def draw_surrogates(
     """
     channels = residual.shape[2]
     weights = [
-        _autoregression(residual[..., c], observed_mask[..., c], largest) for c in range(channels)
+        _fit_autoregression(residual[..., c], observed_mask[..., c], largest)
+        for c in range(channels)
     ]
     # White noise has no correlation that a fit could reduce.
     if project_out is not None and any(w.size for w in weights):
@@ -109,7 +110,7 @@ def _simulate_autoregression(
     for c, channel_weights in enumerate(weights):
         channel_mask = observed_mask[:, :, c]
         filled = np.where(channel_mask, residual[:, :, c], 0.0)
-        innovations = _centred(filled, channel_mask, channel_weights)
+        innovations = _compute_centred_innovations(filled, channel_mask, channel_weights)
         step = max(
             MAX_CHUNK_SIZE // ((length + BURN_IN_SAMPLES) * runs), MIN_CHUNK_WIDTH // runs, 1
         )
@@ -136,7 +137,7 @@ def _correct_bias(weights: Array, projected_pilots: Array, observed_mask: Mask) 
     """
     order = weights.size
     count, *shape = projected_pilots.shape
-    covariances = _autocovariances(
+    covariances = _estimate_autocovariances(
         projected_pilots.reshape(-1, shape[1]), np.tile(observed_mask, (count, 1)), order
     )
     estimated_weights, _ = _yule_walker(covariances, order)
@@ -168,21 +169,23 @@ def _drive_autoregression(weights: Array, innovations: Array) -> Array:
     return innovations
 
 
-def _autoregression(values: Array, observed_mask: Mask, largest: int) -> Array:
+def _fit_autoregression(values: Array, observed_mask: Mask, largest: int) -> Array:
     """Fit an autoregression to values (R, T); no weights if it has too few innovations."""
     filled = np.where(observed_mask, values, 0.0)
-    covariances = _autocovariances(filled, observed_mask, min(largest, observed_mask.shape[1] - 1))
+    covariances = _estimate_autocovariances(
+        filled, observed_mask, min(largest, observed_mask.shape[1] - 1)
+    )
     weights = _select_order_by_aic(covariances, int(observed_mask.sum()))
     return (
         weights
-        if _innovations(filled, observed_mask, weights).size >= MIN_INNOVATIONS
+        if _compute_innovations(filled, observed_mask, weights).size >= MIN_INNOVATIONS
         else np.zeros(0)
     )
 
 
-def _centred(filled: Array, observed_mask: Mask, weights: Array) -> Array:
+def _compute_centred_innovations(filled: Array, observed_mask: Mask, weights: Array) -> Array:
     """Return the innovations (n,) minus their mean; the samples themselves if there are too few."""
-    innovations = _innovations(filled, observed_mask, weights)
+    innovations = _compute_innovations(filled, observed_mask, weights)
     if innovations.size < MIN_INNOVATIONS:
         return filled[observed_mask] if observed_mask.any() else np.zeros(1)
     # A nonzero mean would accumulate to an offset of the surrogates.
@@ -190,7 +193,7 @@ def _centred(filled: Array, observed_mask: Mask, weights: Array) -> Array:
     return centred
 
 
-def _autocovariances(filled: Array, observed_mask: Mask, largest: int) -> Array:
+def _estimate_autocovariances(filled: Array, observed_mask: Mask, largest: int) -> Array:
     """Estimate the autocovariances (largest + 1,) of values (R, T) at the lags 0 to `largest`.
 
     Missing samples are zero in `filled`; only pairs of available samples (`observed_mask`) count.
@@ -219,7 +222,7 @@ def _select_order_by_aic(covariances: Array, count: int) -> Array:
     return weights
 
 
-def _innovations(filled: Array, observed_mask: Mask, weights: Array) -> Array:
+def _compute_innovations(filled: Array, observed_mask: Mask, weights: Array) -> Array:
     """Return the innovations u_t (n,) of eq. (1): samples minus their prediction from earlier ones.
 
     Times at which one of the required samples is missing are left out.

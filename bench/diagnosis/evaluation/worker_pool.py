@@ -43,7 +43,7 @@ POLL_INTERVAL_SECONDS = 0.05
 
 Result = TypeVar("Result")
 Task = Callable[..., Result]
-"""A module-level function: its first argument is the world, the others come from the message."""
+"""Module-level function of a run evaluator and of arguments that come from the message."""
 
 
 class SharedState(Protocol):
@@ -100,28 +100,28 @@ class ForkedWorkerPool:
         self._ending: mmap.mmap | None = None
 
     def map(
-        self, world: SharedState, task: Task[Result], items: Sequence[tuple[Any, ...]]
+        self, evaluator: SharedState, task: Task[Result], items: Sequence[tuple[Any, ...]]
     ) -> list[Result]:
         """Run a task on each item, and return the results in the order of the items.
 
         Args:
-            world: first argument of the task.
+            evaluator: first argument of the task.
             task: a module-level function.
             items: further arguments of each call.
 
         Returns:
             One result per item.
         """
-        results = dict(self.map_unordered(world, task, items))
+        results = dict(self.map_unordered(evaluator, task, items))
         return [results[number] for number in range(len(items))]
 
     def map_unordered(
-        self, world: SharedState, task: Task[Result], items: Sequence[tuple[Any, ...]]
+        self, evaluator: SharedState, task: Task[Result], items: Sequence[tuple[Any, ...]]
     ) -> Iterator[tuple[int, Result]]:
         """Run a task on each item, and yield item numbers and results as they arrive.
 
         Args:
-            world: first argument of the task; workers have it as it was when they were started.
+            evaluator: first argument of the task; workers have it as it was when they were started.
             task: a module-level function.
             items: further arguments of each call.
 
@@ -130,50 +130,50 @@ class ForkedWorkerPool:
         """
         is_parallel = self._jobs > 1 and len(items) > 1
         if is_parallel and self._spent >= PARALLEL_THRESHOLD_SECONDS:
-            self._ready(world)
+            self._ensure_workers(evaluator)
         if is_parallel and self._team:
-            yield from self._shared(world, task, items)
+            yield from self._distribute(evaluator, task, items)
             return
         for number, item in enumerate(items):
             start_time = time.perf_counter()
-            result = task(world, *item)
+            result = task(evaluator, *item)
             if is_parallel:
                 self._spent += time.perf_counter() - start_time
             yield number, result
 
-    def register(self, world: SharedState) -> None:
-        """Register a world for later work, so that workers inherit it when they start."""
-        self._worlds.append(world)
+    def register(self, evaluator: SharedState) -> None:
+        """Register a run evaluator, so that workers inherit it when they start."""
+        self._worlds.append(evaluator)
 
-    def forget(self, world: SharedState) -> None:
-        """Start new workers before the next work on a world, because it has changed."""
-        self._known = [known_world for known_world in self._known if known_world is not world]
+    def forget(self, evaluator: SharedState) -> None:
+        """Start new workers before the next work on a changed run evaluator."""
+        self._known = [known_world for known_world in self._known if known_world is not evaluator]
 
     def close(self) -> None:
         """Kill all workers, and continue without them."""
         for worker in list(self._team):
             worker.process.kill()
         for worker in list(self._team):
-            self._lose(worker.pipe)
+            self._kill_worker(worker.pipe)
         self._jobs = 1
 
-    def _ready(self, world: SharedState) -> None:
-        """Ensure that the workers have inherited a world; otherwise replace them by new ones.
+    def _ensure_workers(self, evaluator: SharedState) -> None:
+        """Ensure that the workers have inherited a run evaluator; otherwise replace them.
 
         A worker has the data that existed when it was forked, so it does not know later worlds.
         """
-        if _is_same_array(self._known, world):
+        if _is_same_array(self._known, evaluator):
             return
         for worker in list(self._team):
-            self._lose(worker.pipe)
-        if not _is_same_array(self._worlds, world):
-            self.register(world)
+            self._kill_worker(worker.pipe)
+        if not _is_same_array(self._worlds, evaluator):
+            self.register(evaluator)
         self._known = list(self._worlds)
         # Checked at this moment, because threads may start and end.
         if can_fork():
-            self._start()
+            self._fork_workers()
 
-    def _start(self) -> None:
+    def _fork_workers(self) -> None:
         """Fork the workers, each with its own pipe to this process.
 
         A forked worker inherits the registered worlds without a copy. `worker_arguments` has the
@@ -192,16 +192,16 @@ class ForkedWorkerPool:
             other_pipes = [parent_end, *(worker.pipe for worker in self._team)]
             worker_arguments = (self._known, worker_end, other_pipes, self._ending, os.getpid())
             process = context.Process(
-                target=_work, args=worker_arguments, daemon=True, name="explain"
+                target=_run_worker, args=worker_arguments, daemon=True, name="explain"
             )
             process.start()
             worker_end.close()
             self._team.append(_Worker(process, parent_end))
         gc.unfreeze()
 
-    def _shared(
+    def _distribute(
         self,
-        world: SharedState,
+        evaluator: SharedState,
         task: Task[Result],
         items: Sequence[tuple[Any, ...]],
     ) -> Iterator[tuple[int, Result]]:
@@ -210,7 +210,7 @@ class ForkedWorkerPool:
         An item is processed again if its worker dies; without any worker, the items are processed
         in this process. `unprocessed` has the numbers of these items, `busy` the item number of
         each working pipe, and `free` the idle pipes. `place` is the index by which the workers know
-        the world.
+        the run evaluator.
 
         An error in a task is raised after all other items are finished.
         """
@@ -218,31 +218,31 @@ class ForkedWorkerPool:
         unprocessed = list(range(len(items)))[::-1]
         busy: dict[Connection, int] = {}
         free = [worker.pipe for worker in self._team]
-        place = next(i for i, known_world in enumerate(self._known) if known_world is world)
+        place = next(i for i, known_world in enumerate(self._known) if known_world is evaluator)
         while unprocessed or busy:
             while free and unprocessed:
                 pipe = free.pop()
                 number = unprocessed.pop()
-                if _sent(pipe, (place, task, items[number])):
+                if _send(pipe, (place, task, items[number])):
                     busy[pipe] = number
                 else:
-                    self._lose(pipe)
+                    self._kill_worker(pipe)
                     unprocessed.append(number)
             # All workers are gone, so the remaining items are processed here.
             if not busy:
-                yield from ((number, task(world, *items[number])) for number in unprocessed)
+                yield from ((number, task(evaluator, *items[number])) for number in unprocessed)
                 break
-            for pipe in self._heard(list(busy), world):
+            for pipe in self._wait_for_replies(list(busy), evaluator):
                 number = busy.pop(pipe)
-                reply = _received(pipe)
+                reply = _receive(pipe)
                 if reply is None:
                     # The worker died, perhaps for lack of memory, so its item is processed again.
-                    self._lose(pipe)
+                    self._kill_worker(pipe)
                     unprocessed.append(number)
                     continue
                 free.append(pipe)
-                world.simulations += reply.simulations
-                world.watch.record_abandoned_fit(reply.left)
+                evaluator.simulations += reply.simulations
+                evaluator.watch.record_abandoned_fit(reply.left)
                 if reply.error is not None:
                     errors[number] = reply.error, reply.trace
                 else:
@@ -252,16 +252,16 @@ class ForkedWorkerPool:
             error, trace = errors[number]
             raise error from _WorkerTracebackError(trace)
 
-    def _heard(self, pipes: list[Connection], world: SharedState) -> list[Any]:
+    def _wait_for_replies(self, pipes: list[Connection], evaluator: SharedState) -> list[Any]:
         """Wait for replies and return their pipes; tell workers to stop if the search must end."""
         while True:
             ready_pipes = connection.wait(pipes, POLL_INTERVAL_SECONDS)
-            if self._ending is not None and world.watch.should_stop():
+            if self._ending is not None and evaluator.watch.should_stop():
                 self._ending[0] = 1
             if ready_pipes:
                 return ready_pipes
 
-    def _lose(self, pipe: Connection) -> None:
+    def _kill_worker(self, pipe: Connection) -> None:
         """Kill the worker at the other end of a pipe, and remove it from the pool."""
         for worker in list(self._team):
             if worker.pipe is pipe:
@@ -271,9 +271,9 @@ class ForkedWorkerPool:
                 pipe.close()
 
 
-def _is_same_array(worlds: Sequence[SharedState], world: SharedState) -> bool:
-    """Return whether a world is one of the given objects (by identity, not equality)."""
-    return any(other_world is world for other_world in worlds)
+def _is_same_array(evaluators: Sequence[SharedState], evaluator: SharedState) -> bool:
+    """Return whether a run evaluator is one of the given objects (by identity, not equality)."""
+    return any(other_world is evaluator for other_world in evaluators)
 
 
 def count_available_cores() -> int:
@@ -325,7 +325,7 @@ def serialise_message(message: Any) -> bytes:
     return buffer.getvalue()
 
 
-def _sent(pipe: Connection, message: Any) -> bool:
+def _send(pipe: Connection, message: Any) -> bool:
     """Send a message through the pipe; return False if the process at the other end is gone."""
     try:
         pipe.send_bytes(serialise_message(message))
@@ -334,7 +334,7 @@ def _sent(pipe: Connection, message: Any) -> bool:
     return True
 
 
-def _received(pipe: Connection) -> _Answer | None:
+def _receive(pipe: Connection) -> _Answer | None:
     """Return the reply of a worker, or None if the worker is gone."""
     try:
         reply: _Answer = pickle.loads(pipe.recv_bytes())
@@ -343,8 +343,8 @@ def _received(pipe: Connection) -> _Answer | None:
     return reply
 
 
-def _work(
-    worlds: Sequence[SharedState],
+def _run_worker(
+    evaluators: Sequence[SharedState],
     pipe: Connection,
     other_pipes: list[Connection],
     ending: mmap.mmap,
@@ -353,7 +353,7 @@ def _work(
     """Process the requests of the parent until the pipe ends; main loop of a worker.
 
     Args:
-        worlds: objects that the worker inherits; a request names one by its index.
+        evaluators: objects that the worker inherits; a request names one by its index.
         pipe: connection to the parent.
         other_pipes: inherited ends of other pipes, which the worker closes.
         ending: one shared byte; a value other than zero asks all workers to stop.
@@ -368,22 +368,24 @@ def _work(
         return
     for other_pipe in other_pipes:
         other_pipe.close()
-    for world in worlds:
-        world.crew = ForkedWorkerPool()
+    for evaluator in evaluators:
+        evaluator.crew = ForkedWorkerPool()
     while True:
         try:
             place, task, item = pickle.loads(pipe.recv_bytes())
         except (EOFError, OSError):
             return
-        world, deadline = worlds[place], worlds[place].watch.deadline
-        world.watch = SearchControl(stop=lambda: ending[0] != 0)
-        world.watch.deadline = deadline
-        before = world.simulations
+        evaluator, deadline = evaluators[place], evaluators[place].watch.deadline
+        evaluator.watch = SearchControl(stop=lambda: ending[0] != 0)
+        evaluator.watch.deadline = deadline
+        before = evaluator.simulations
         result, error, trace = None, None, ""
         try:
-            result = task(world, *item)
+            result = task(evaluator, *item)
         except Exception as raised:
             error, trace = raised, traceback.format_exc()
-        count = world.simulations - before
-        if not _sent(pipe, _Answer(result, error, trace, count, world.watch.has_abandoned_fits())):
+        count = evaluator.simulations - before
+        if not _send(
+            pipe, _Answer(result, error, trace, count, evaluator.watch.has_abandoned_fits())
+        ):
             return

@@ -75,11 +75,11 @@ class RigModel:
     """Experimental setup, from which variants of the recorded runs are made.
 
     Args:
-        world: Run evaluator of the recorded runs.
+        evaluator: Run evaluator of the recorded runs.
         seconds: Duration of the next run in seconds.
     """
 
-    def __init__(self, world: RunEvaluator, seconds: float) -> None:
+    def __init__(self, evaluator: RunEvaluator, seconds: float) -> None:
         """Measure the usual input levels, command sizes and sampling interval of the present runs.
 
         `rest` has the median of each input over all runs, in the unit of the input; `largest` its
@@ -87,17 +87,17 @@ class RigModel:
         the median sampling interval of the first run in seconds, and `begin` the initial state of a
         candidate run.
         """
-        self.world, self.seconds = world, seconds
-        self.old = world.tracks[0].scenario
+        self.evaluator, self.seconds = evaluator, seconds
+        self.old = evaluator.tracks[0].scenario
         self.step = float(np.median(np.diff(self.old.times)))
         self.largest, self.rest = {}, {}
         for name in self.old.inputs:
-            signals = [track.scenario.inputs[name] for track in world.tracks]
+            signals = [track.scenario.inputs[name] for track in evaluator.tracks]
             middle = float(np.median(np.concatenate(signals)))
             self.largest[name] = max(float(np.abs(values - middle).max()) for values in signals)
             self.rest[name] = middle
         self.driven = tuple(name for name in self.old.inputs if self.largest[name] > 0)
-        self.limits = stated_limits(world)
+        self.limits = stated_limits(evaluator)
         self.begin = self._get_initial_state()
 
     def _get_initial_state(self) -> Array:
@@ -105,9 +105,9 @@ class RigModel:
 
         A robot cannot be started in motion.
         """
-        states = self.world.tracks[0].initial_state_guess.copy()
-        rates = set(self.world.simulator.system.rates)
-        for i, name in enumerate(self.world.states):
+        states = self.evaluator.tracks[0].initial_state_guess.copy()
+        rates = set(self.evaluator.simulator.system.rates)
+        for i, name in enumerate(self.evaluator.states):
             states[i] = 0.0 if name in rates else self._clip_to_joint_range(name, float(states[i]))
         return states
 
@@ -153,10 +153,12 @@ class RigModel:
         They are shares of the usual initial coordinates, and, except for robots, the largest
         initial rates that were recorded, in both directions.
         """
-        system, world = self.world.simulator.system, self.world
-        unobserved_states = {world.states[i] for i in np.flatnonzero(world.known.all(axis=0))}
+        system, evaluator = self.evaluator.simulator.system, self.evaluator
+        unobserved_states = {
+            evaluator.states[i] for i in np.flatnonzero(evaluator.known.all(axis=0))
+        }
         for name in system.coordinates:
-            usual_value = float(self.begin[world.states.index(name)])
+            usual_value = float(self.begin[evaluator.states.index(name)])
             values = [
                 share * usual_value if abs(usual_value) > REST_STATE else share
                 for share in INITIAL_STATE_FACTORS
@@ -165,10 +167,10 @@ class RigModel:
             reachable = dict.fromkeys(self._clip_to_joint_range(name, value) for value in values)
             for value in reachable if name not in unobserved_states else ():
                 yield name, value
-        if world.kind.has_model:
+        if evaluator.kind.has_model:
             return
         for name in system.rates:
-            fastest = float(np.abs(world.guess[:, world.states.index(name)]).max())
+            fastest = float(np.abs(evaluator.guess[:, evaluator.states.index(name)]).max())
             for value in (
                 (fastest, -fastest) if fastest > REST_RATE and name not in unobserved_states else ()
             ):
@@ -177,7 +179,7 @@ class RigModel:
     def _list_adjustable_constants(self) -> dict[str, list[float]]:
         """Return the constants that differ between runs, with their values, which are available."""
         values: dict[str, set[float]] = {}
-        for run in self.world.runs:
+        for run in self.evaluator.runs:
             for name, value in run.constants.items():
                 values.setdefault(name, set()).add(value)
         return {
@@ -205,7 +207,7 @@ class RigModel:
             inputs[name] = self._limit_command(name, command)
             limited_inputs += [name] if (inputs[name] != command).any() else []
         for name, value in plan.states:
-            states[self.world.states.index(name)] = value
+            states[self.evaluator.states.index(name)] = value
         constants = {**self.old.constants, **dict(plan.constants)}
         scenario = replace(self.old, times=times, inputs=inputs, constants=constants)
         return CandidateRun(

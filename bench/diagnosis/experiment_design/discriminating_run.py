@@ -92,13 +92,13 @@ def propose_discriminating_run(
         model: Model of the present diagnosis.
         competing_model: Competing model that explains the data as well.
     """
-    world = models.world
+    evaluator = models.evaluator
     description = ""
     change: dict[str, float] = {}
     largest_discrimination = 0.0
     runs_by_discrimination = [
-        (_compute_discrimination(world, run, model, competing_model, models.noise.sigma), run)
-        for run in _iterate_changed_runs(world)
+        (_compute_discrimination(evaluator, run, model, competing_model, models.noise.sigma), run)
+        for run in _iterate_changed_runs(evaluator)
     ]
     # A run that cannot be simulated with both models is not proposed.
     runs_by_discrimination = [
@@ -107,7 +107,7 @@ def propose_discriminating_run(
     runs_by_discrimination.sort(key=lambda entry: -entry[0])
     is_limited = False
     if first_run := _find_first_within_limits(
-        world, (model, competing_model), runs_by_discrimination
+        evaluator, (model, competing_model), runs_by_discrimination
     ):
         largest_discrimination, (description, change, _, _) = first_run
         is_limited = (
@@ -120,7 +120,7 @@ def propose_discriminating_run(
     competing_effects = " and ".join(sorted(competing_names - effects))
     if largest_discrimination < MIN_DISCRIMINATION_SIGMAS:
         return DiscriminatingRun(
-            _explain_no_run(world, model_effects, competing_effects, is_limited),
+            _explain_no_run(evaluator, model_effects, competing_effects, is_limited),
             {},
             largest_discrimination,
         )
@@ -133,14 +133,14 @@ def propose_discriminating_run(
 
 
 def _find_first_within_limits(
-    world: RunEvaluator, models: Sequence[FittedModel], runs: Sequence[tuple[float, _Run]]
+    evaluator: RunEvaluator, models: Sequence[FittedModel], runs: Sequence[tuple[float, _Run]]
 ) -> tuple[float, _Run] | None:
     """Return the first run that stays within the limits of a robot, whichever model is true.
 
     For a system without a model file it is the first of all runs.
 
     Args:
-        world: Run evaluator of the present runs.
+        evaluator: Run evaluator of the present runs.
         models: Models that may be true.
         runs: Candidate runs with the RMS difference of the two models, largest first.
 
@@ -148,14 +148,14 @@ def _find_first_within_limits(
         A run with its difference, which is 0 if no discriminating run is within the limits; None
         without runs.
     """
-    if not world.kind.has_model or not runs or runs[0][0] < MIN_DISCRIMINATION_SIGMAS:
+    if not evaluator.kind.has_model or not runs or runs[0][0] < MIN_DISCRIMINATION_SIGMAS:
         return runs[0] if runs else None
     # These imports are needed for robots only.
     from bench.diagnosis.experiment_design.candidate_runs import CandidateRun as RigRun
     from bench.diagnosis.experiment_design.candidate_runs import RunPlan
     from bench.diagnosis.experiment_design.safety_limits import RigLimits
 
-    limits = RigLimits(world, models[0])
+    limits = RigLimits(evaluator, models[0])
     for discrimination, run in runs:
         candidate = RigRun(RunPlan(), run.says, run.scenario, run.states)
         if discrimination < MIN_DISCRIMINATION_SIGMAS or all(
@@ -166,11 +166,11 @@ def _find_first_within_limits(
 
 
 def _explain_no_run(
-    world: RunEvaluator, model_effects: str, competing_effects: str, is_limited: bool
+    evaluator: RunEvaluator, model_effects: str, competing_effects: str, is_limited: bool
 ) -> str:
     """Write what to do if no such run would discriminate, or none within the limits of a robot."""
-    channels = [channel.name for channel in world.kind.channels]
-    unrecorded = ", ".join(name for name in channels if name not in world.channels)
+    channels = [channel.name for channel in evaluator.kind.channels]
+    unrecorded = ", ".join(name for name in channels if name not in evaluator.channels)
     advice = "measure one of the causes directly"
     # Another sensor may measure a difference where these sensors agree.
     if unrecorded:
@@ -187,29 +187,29 @@ def _explain_no_run(
     )
 
 
-def _iterate_changed_runs(world: RunEvaluator) -> Iterator[_Run]:
+def _iterate_changed_runs(evaluator: RunEvaluator) -> Iterator[_Run]:
     """Yield runs like the first one with one changed duration, initial state or input."""
-    limits = stated_limits(world)
-    first = _get_first_run(world, limits)
+    limits = stated_limits(evaluator)
+    first = _get_first_run(evaluator, limits)
     # If several runs discriminate equally well, the first one is proposed.
     yield _lengthen_run(first)
-    yield from _change_initial_states(world, first, limits)
-    yield from _scale_inputs(world, first, limits)
+    yield from _change_initial_states(evaluator, first, limits)
+    yield from _scale_inputs(evaluator, first, limits)
 
 
-def _get_first_run(world: RunEvaluator, limits: StatedLimits) -> _Run:
+def _get_first_run(evaluator: RunEvaluator, limits: StatedLimits) -> _Run:
     """Return the first fitted run, as the basis of the proposals.
 
     A robot starts at rest, because it cannot be started in motion, and with commands and positions
     within their limits.
     """
-    track = world.tracks[0]
-    if not world.kind.has_model:
+    track = evaluator.tracks[0]
+    if not evaluator.kind.has_model:
         return _Run("", {}, track.scenario, track.initial_state_guess)
-    rates = set(world.simulator.system.rates)
+    rates = set(evaluator.simulator.system.rates)
     states = [
         0.0 if name in rates else _clip(value, limits.states.get(name))
-        for name, value in zip(world.states, track.initial_state_guess, strict=True)
+        for name, value in zip(evaluator.states, track.initial_state_guess, strict=True)
     ]
     recorded_inputs = track.scenario.inputs
     inputs = {
@@ -241,18 +241,18 @@ def _lengthen_run(first: _Run) -> _Run:
 
 
 def _change_initial_states(
-    world: RunEvaluator, first: _Run, limits: StatedLimits
+    evaluator: RunEvaluator, first: _Run, limits: StatedLimits
 ) -> Iterator[_Run]:
     """Yield runs that differ from the first one in one initial state.
 
     The initial velocities of a robot are not changed, because it starts at rest.
     """
-    system = world.simulator.system
+    system = evaluator.simulator.system
     height = len(system.coordinates) - 1
-    states_with_units = zip(world.states, _list_state_units(world), strict=True)
+    states_with_units = zip(evaluator.states, _list_state_units(evaluator), strict=True)
     for place, (name, unit) in enumerate(states_with_units):
         above_ground = system.bounces and place == height
-        if world.kind.has_model and name not in system.coordinates:
+        if evaluator.kind.has_model and name not in system.coordinates:
             continue
         for share in INITIAL_STATE_FACTORS:
             # A body cannot be released below the ground.
@@ -270,12 +270,12 @@ def _change_initial_states(
             yield _Run(description, {name: value}, first.scenario, states)
 
 
-def _scale_inputs(world: RunEvaluator, first: _Run, limits: StatedLimits) -> Iterator[_Run]:
+def _scale_inputs(evaluator: RunEvaluator, first: _Run, limits: StatedLimits) -> Iterator[_Run]:
     """Yield runs that differ from the first one in the size of one input.
 
     An input is never scaled beyond the limits of its command.
     """
-    shares = ROBOT_INPUTS if world.kind.has_model else INPUT_FACTORS
+    shares = ROBOT_INPUTS if evaluator.kind.has_model else INPUT_FACTORS
     for name, signal in first.scenario.inputs.items():
         if not signal.any():
             continue
@@ -307,10 +307,10 @@ def _compute_largest_share(signal: Array, limits: Interval) -> float:
     return float(np.floor(1e3 * min(factors)) / 1e3) if factors else np.inf
 
 
-def _list_state_units(world: RunEvaluator) -> list[str]:
+def _list_state_units(evaluator: RunEvaluator) -> list[str]:
     """List the units of the states: coordinates, their rates, and further states."""
-    system = world.simulator.system
-    units = {channel.name: channel.unit for channel in world.kind.channels}
+    system = evaluator.simulator.system
+    units = {channel.name: channel.unit for channel in evaluator.kind.channels}
     coordinate_units = [units.get(name, "m") for name in system.coordinates]
     rate_units = [f"{unit}/s" for unit in coordinate_units]
     # A user-defined system may have further states after the rates, in any unit.
@@ -320,7 +320,11 @@ def _list_state_units(world: RunEvaluator) -> list[str]:
 
 
 def _compute_discrimination(
-    world: RunEvaluator, run: _Run, model: FittedModel, competing_model: FittedModel, sigma: Array
+    evaluator: RunEvaluator,
+    run: _Run,
+    model: FittedModel,
+    competing_model: FittedModel,
+    sigma: Array,
 ) -> float:
     """Simulate a run with two models, and compute the RMS of their difference, eq. (1).
 
@@ -329,9 +333,9 @@ def _compute_discrimination(
     """
     model_thetas = [model.fit.theta, competing_model.fit.theta]
     # Freed constants are fitted with the parameters, but passed to the simulator as constants.
-    places = world.base[world.own :]
+    places = evaluator.base[evaluator.own :]
     theta = np.delete(np.stack(model_thetas), places, axis=1)
-    names = [parameter.name for parameter in world.freed]
+    names = [parameter.name for parameter in evaluator.freed]
     scenarios = []
     for model_theta in model_thetas:
         values = model_theta[places].tolist()
@@ -341,11 +345,11 @@ def _compute_discrimination(
 
     # Each model is one batch element of the call, both with the same initial states.
     initial = {}
-    for name, value in zip(world.states, run.states.tolist(), strict=True):
+    for name, value in zip(evaluator.states, run.states.tolist(), strict=True):
         initial[name] = np.full(2, value)
-    model_prediction, competing_prediction = world.simulator.simulate_batch(
+    model_prediction, competing_prediction = evaluator.simulator.simulate_batch(
         theta, scenarios, initial
     )
-    world.simulations += 2
+    evaluator.simulations += 2
     whitened_difference = (model_prediction - competing_prediction) / sigma
     return float(np.sqrt(np.square(whitened_difference).mean()))  # (1)

@@ -118,15 +118,15 @@ class RunRanker:
         gains nothing more, and `patience` the maximum number of exact evaluations in a row. `free`
         (s,) marks the initial states that have to be estimated.
         """
-        self.models, self.world = models, models.world
+        self.models, self.evaluator = models, models.evaluator
         self.known = [_compute_prior_covariance(models, model) for model in competing_models]
         self.noise: NoiseModel = compute_fisher_blocks(models, competing_models[0]).noise
-        self.limits = RigLimits(self.world, competing_models[0])
+        self.limits = RigLimits(self.evaluator, competing_models[0])
         count = len(competing_models)
         self.pairs = list(permutations(range(count), 2))
         self.most = MAX_USEFUL_DISCRIMINATION * len(self.pairs) / 2 if self.pairs else np.inf
-        self.patience = FEWER if self.world.kind.has_model else MANY
-        self.free = ~self.world.known.all(axis=0)
+        self.patience = FEWER if self.evaluator.kind.has_model else MANY
+        self.free = ~self.evaluator.known.all(axis=0)
 
     # -- runs
 
@@ -142,7 +142,7 @@ class RunRanker:
             for run, is_allowed in zip(runs, self.limits(diagnosed_model, runs), strict=True)
             if is_allowed
         ]
-        if self.world.kind.has_model:
+        if self.evaluator.kind.has_model:
             allowed_runs = self._select_distinct_runs(allowed_runs)
         entries = []
         for run in allowed_runs:
@@ -214,7 +214,7 @@ class RunRanker:
     ) -> Array:
         """Simulate the run (L, T, C) with each parameter vector and initial state."""
         scenarios = [run.scenario] * len(thetas)
-        return self.world.simulate_scenarios(np.array(thetas), scenarios, np.array(states))
+        return self.evaluator.simulate_scenarios(np.array(thetas), scenarios, np.array(states))
 
     def _whiten(self, values: Array) -> Array:
         """Whiten observations, or differences of them, to (L, n)."""
@@ -245,7 +245,7 @@ class RunRanker:
         if not np.isfinite(simulated).all():
             return None
         differences = np.abs(simulated[1 + len(free) :] - simulated[0])
-        sizes = np.array([channel.scale for channel in self.world.simulator.channels])
+        sizes = np.array([channel.scale for channel in self.evaluator.simulator.channels])
         if (
             differences.size
             and (differences / sizes).max() > MAX_STATE_STEP_GROWTH * STATE_STEP_SHARE
@@ -318,7 +318,9 @@ def _compute_prior_covariance(models: ModelSet, model: FittedModel) -> _Known:
     for a derivative.
     """
     covariance = compute_covariance(models, model)
-    bounds = np.array([models.world.parameters[i].bounds for i in model.fit.free]).reshape(-1, 2)
+    bounds = np.array([models.evaluator.parameters[i].bounds for i in model.fit.free]).reshape(
+        -1, 2
+    )
     # At most a tenth of the range, because derivatives are finite differences with this step.
     max_spread = 0.1 * (bounds[:, 1] - bounds[:, 0])
     spread = np.minimum(np.sqrt(np.maximum(np.diagonal(covariance), 1e-300)), max_spread)

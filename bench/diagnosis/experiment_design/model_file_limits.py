@@ -49,14 +49,14 @@ class StatedLimits:
         return {**self.states, **self.forces}
 
 
-def stated_limits(world: RunEvaluator) -> StatedLimits:
+def stated_limits(evaluator: RunEvaluator) -> StatedLimits:
     """Read the limits of commands, positions, velocities and forces from a robot's model file.
 
     A system without a model file has none.
     """
-    if not world.kind.has_model:
+    if not evaluator.kind.has_model:
         return StatedLimits()
-    kind: Any = world.kind
+    kind: Any = evaluator.kind
     robot = kind.robot
     joints = {joint.name: joint for joint in robot.joints if joint.has_one_coordinate}
     forces = {}

@@ -109,7 +109,7 @@ def design_next_run(
     Returns:
         The design; None if no run can be simulated.
     """
-    rig = RigModel(models.world, seconds)
+    rig = RigModel(models.evaluator, seconds)
     ranker = RunRanker(models, [model, *competing_models])
     ranked_runs = ranker.rank_runs([rig.make_run(plan) for plan in rig.list_basic_plans()])
     evaluated_plans = {entry.run.plan for entry in ranked_runs}
@@ -118,7 +118,7 @@ def design_next_run(
         if (
             not ranked_runs
             or ranked_runs[0].value >= ranker.most
-            or models.world.watch.has_abandoned_fits()
+            or models.evaluator.watch.has_abandoned_fits()
         ):
             break
         plans = [
@@ -131,7 +131,7 @@ def design_next_run(
         ranked_runs = [*ranked_runs, *ranker.rank_runs([rig.make_run(plan) for plan in new_plans])]
     ranked_runs = _evaluate_fully(ranker, ranked_runs)
     if ranked_runs and _would_longer_run_help(ranked_runs[0], max_seconds / seconds):
-        longer_rig = RigModel(models.world, max_seconds)
+        longer_rig = RigModel(models.evaluator, max_seconds)
         longer_runs = ranker.rank_runs(
             [longer_rig.make_run(entry.run.plan) for entry in ranked_runs[:PLANS_TESTED_FOR_LENGTH]]
         )
@@ -215,7 +215,7 @@ def _describe_best_run(
         discrimination=discrimination,
         times=run.scenario.times,
         inputs=dict(run.scenario.inputs),
-        initial=dict(zip(models.world.states, run.states.tolist(), strict=True)),
+        initial=dict(zip(models.evaluator.states, run.states.tolist(), strict=True)),
         constants={k: v for k, v in constants.items() if rig.old.constants.get(k) != v},
         groups=groups,
     )

@@ -45,17 +45,17 @@ class RigLimits:
     """Check of which runs an experimental setup can execute.
 
     Args:
-        world: Run evaluator of the present runs.
+        evaluator: Run evaluator of the present runs.
         model: Model fitted to them.
     """
 
-    def __init__(self, world: RunEvaluator, model: FittedModel) -> None:
+    def __init__(self, evaluator: RunEvaluator, model: FittedModel) -> None:
         """Simulate the present runs with the fitted model, and derive the channel limits."""
-        self.world = world
+        self.evaluator = evaluator
         self.past = self._simulate_monitored_channels(
             model,
-            [track.scenario for track in world.tracks],
-            np.where(np.isfinite(model.fit.states), model.fit.states, world.guess),
+            [track.scenario for track in evaluator.tracks],
+            np.where(np.isfinite(model.fit.states), model.fit.states, evaluator.guess),
         )
         self.bounds = self._determine_bounds()
 
@@ -79,9 +79,13 @@ class RigLimits:
     @cached_property
     def monitored_channels(self) -> list[str]:
         """Names of the monitored channels."""
-        kind = self.world.kind
+        kind = self.evaluator.kind
         if not kind.has_model:
-            monitored_names = {*kind.system.coordinates, *kind.system.rates, *self.world.channels}
+            monitored_names = {
+                *kind.system.coordinates,
+                *kind.system.rates,
+                *self.evaluator.channels,
+            }
             return [c.name for c in kind.channels if c.name in monitored_names]
         names = {
             f"{quantity}.{joint.name}"
@@ -93,29 +97,31 @@ class RigLimits:
     @property
     def _single_coordinate_joints(self) -> list[Any]:
         """The joints of the robot with one coordinate."""
-        robot: Any = self.world.kind
+        robot: Any = self.evaluator.kind
         return [joint for joint in robot.robot.joints if joint.has_one_coordinate]
 
     def _simulate_monitored_channels(
         self, model: FittedModel, scenarios: Sequence[Scenario], states: Array
     ) -> list[Mapping[str, Array]]:
         """Simulate runs with a model, and return the monitored channels of each, (T,) by name."""
-        world = self.world
-        values = {p.name: float(v) for p, v in zip(world.parameters, model.fit.theta, strict=True)}
-        simulator = world.make_observing_simulator(self.monitored_channels, model.effects)
+        evaluator = self.evaluator
+        values = {
+            p.name: float(v) for p, v in zip(evaluator.parameters, model.fit.theta, strict=True)
+        }
+        simulator = evaluator.make_observing_simulator(self.monitored_channels, model.effects)
         try:
             theta = np.array([[values.get(p.name, 0.0) for p in simulator.parameters]])
-            freed_constants = {p.name: values[p.name] for p in world.freed}
+            freed_constants = {p.name: values[p.name] for p in evaluator.freed}
             model_scenarios = [
                 replace(s, constants={**s.constants, **freed_constants}) for s in scenarios
             ]
-            initial = dict(zip(world.states, states.T, strict=True))
+            initial = dict(zip(evaluator.states, states.T, strict=True))
             result = simulator.simulate_batch(
                 np.repeat(theta, len(model_scenarios), 0), model_scenarios, initial
             )
         finally:
             simulator.close()
-        world.simulations += len(model_scenarios)
+        evaluator.simulations += len(model_scenarios)
         names = [channel.name for channel in simulator.channels]
         return [
             dict(zip(names, lane[: scenario.times.size].T, strict=True))
@@ -137,12 +143,12 @@ class RigLimits:
             recorded_ranges[name] = (
                 (float(values.min()), float(values.max())) if values.size else (0.0, 0.0)
             )
-        scales = {channel.name: channel.scale for channel in self.world.kind.channels}
-        if not self.world.kind.has_model:
+        scales = {channel.name: channel.scale for channel in self.evaluator.kind.channels}
+        if not self.evaluator.kind.has_model:
             return {
                 name: _widen_range(*recorded_ranges[name], scales[name]) for name in recorded_ranges
             }
-        stated_channels = stated_limits(self.world).channels
+        stated_channels = stated_limits(self.evaluator).channels
         bounds = {}
         for name, (low, high) in recorded_ranges.items():
             if name in stated_channels:
@@ -180,14 +186,14 @@ class RigLimits:
             if values.min() < low - tolerance or values.max() > high + tolerance:
                 return False
         return (
-            not self.world.kind.has_model
-            or find_contacts(self.world.kind, channels) <= self._touching_pairs
+            not self.evaluator.kind.has_model
+            or find_contacts(self.evaluator.kind, channels) <= self._touching_pairs
         )
 
     @cached_property
     def _touching_pairs(self) -> frozenset[tuple[int, int]]:
         """Pairs of bodies that touched in the present runs."""
-        return frozenset().union(*(find_contacts(self.world.kind, run) for run in self.past))
+        return frozenset().union(*(find_contacts(self.evaluator.kind, run) for run in self.past))
 
 
 def _widen_by_stop(stated_range: Interval, recorded_range: Interval, is_position: bool) -> Interval:

@@ -77,12 +77,12 @@ class BaseFit:
 
 
 def fit_base_model(
-    world: RunEvaluator, noise: NoiseModel, initial_base: Array | None = None
+    evaluator: RunEvaluator, noise: NoiseModel, initial_base: Array | None = None
 ) -> BaseFit:
     """Fit base parameters and initial states.
 
     Args:
-        world: the runs.
+        evaluator: the runs.
         noise: noise that weights the channels.
         initial_base: (b,) base parameters to start from, for example from a tuner; None for a
             multi-start over the bounds.
@@ -90,87 +90,91 @@ def fit_base_model(
     Returns:
         The best fit, with insensitive parameters at their nominal values.
     """
-    thetas = _starts(world, initial_base)
-    starts = [FitStart((), theta, world.guess) for theta in thetas]
+    thetas = _list_starts(evaluator, initial_base)
+    starts = [FitStart((), theta, evaluator.guess) for theta in thetas]
     # Simulating a start costs far less than fitting it, so the starts are reduced first.
-    world.watch.report(f"base fit from {len(starts)} starts")
+    evaluator.watch.report(f"base fit from {len(starts)} starts")
     if len(starts) > FITTED_STARTS:
-        order = np.argsort(costs_of_starts(world, noise, starts), kind="stable")
+        order = np.argsort(costs_of_starts(evaluator, noise, starts), kind="stable")
         starts = [starts[i] for i in order[:FITTED_STARTS]]
 
     fits: list[TrajectoryFit] = []
-    for horizon in FIT_HORIZONS if world.followed is None else FOLLOWED:
-        world.watch.report(f"base fit, first {horizon.share:.0%} of the runs")
-        fits = TrajectoryFitter(world, noise, share=horizon.share).fit_models(
+    for horizon in FIT_HORIZONS if evaluator.followed is None else FOLLOWED:
+        evaluator.watch.report(f"base fit, first {horizon.share:.0%} of the runs")
+        fits = TrajectoryFitter(evaluator, noise, share=horizon.share).fit_models(
             starts, horizon.iterations
         )
         starts = [fit.make_start() for fit in fits]
     best = min(fits, key=lambda fit: fit.cost)
-    if world.has_linearisation and world.followed is None:
+    if evaluator.has_linearisation and evaluator.followed is None:
         # Derivatives about the first start are replaced by those about the fitted model for all
         # later fits. The import is local, because only robots need it.
         from bench.diagnosis.fitting.linearised_runs import compute_state_jacobian
 
-        compute_state_jacobian(world, best.theta, best.states, is_recomputed=True)
-        best = TrajectoryFitter(world, noise).fit_models([best.make_start()], FINAL_ITERATIONS)[0]
+        compute_state_jacobian(evaluator, best.theta, best.states, is_recomputed=True)
+        best = TrajectoryFitter(evaluator, noise).fit_models([best.make_start()], FINAL_ITERATIONS)[
+            0
+        ]
 
     # An insensitive parameter is set to nominal, because the value that the search reached means
     # nothing.
-    places = world.base.tolist()
-    insensitive = frozenset(i for i in places if not _is_sensitive(world, best, i, noise))
+    places = evaluator.base.tolist()
+    insensitive = frozenset(i for i in places if not _is_sensitive(evaluator, best, i, noise))
     if insensitive:
         insensitive_places = list(insensitive)
         theta = best.theta.copy()
-        theta[insensitive_places] = world.get_nominal_theta()[insensitive_places]
+        theta[insensitive_places] = evaluator.get_nominal_theta()[insensitive_places]
         start = replace(best.make_start(), theta=theta)
-        best = TrajectoryFitter(world, noise, insensitive).fit_models([start], FINAL_ITERATIONS)[0]
+        best = TrajectoryFitter(evaluator, noise, insensitive).fit_models(
+            [start], FINAL_ITERATIONS
+        )[0]
     return BaseFit(best, insensitive)
 
 
-def correct_discretisation(world: RunEvaluator, noise: NoiseModel, base: BaseFit) -> BaseFit:
+def correct_discretisation(evaluator: RunEvaluator, noise: NoiseModel, base: BaseFit) -> BaseFit:
     """Return the base model of a robot, corrected for the discretisation error and fitted again.
 
     Args:
-        world: the runs of a robot; the correction is stored in it.
+        evaluator: the runs of a robot; the correction is stored in it.
         noise: noise of each channel.
         base: the fitted base model.
     """
     # Imported here, because only robots need it.
     from bench.diagnosis.fitting.linearised_runs import correct_discretisation
 
-    correct_discretisation(world, noise, base.fit.theta, base.fit.states)
-    if world.correction is None:
+    correct_discretisation(evaluator, noise, base.fit.theta, base.fit.states)
+    if evaluator.correction is None:
         return base
-    fit = TrajectoryFitter(world, noise, base.fixed_parameters).fit_models(
+    fit = TrajectoryFitter(evaluator, noise, base.fixed_parameters).fit_models(
         [base.fit.make_start()], FINAL_ITERATIONS
     )[0]
     return replace(base, fit=fit)
 
 
-def _starts(world: RunEvaluator, initial_base: Array | None) -> list[Array]:
+def _list_starts(evaluator: RunEvaluator, initial_base: Array | None) -> list[Array]:
     """Return parameter vectors (P,) from which the base model is fitted.
 
     They have the base parameters `initial_base` (b,), or the nominal ones and a regular grid over
     the bounds.
     """
-    nominal = world.get_nominal_theta()
+    nominal = evaluator.get_nominal_theta()
     if initial_base is not None:
-        nominal[world.base] = initial_base
+        nominal[evaluator.base] = initial_base
         return [nominal]
-    parameters = [world.parameters[i] for i in world.base]
+    parameters = [evaluator.parameters[i] for i in evaluator.base]
     starts = [nominal]
     # A simulator may have no parameters; its base fit only fits initial states.
     if not parameters:
         return starts
     for shares in spread_start_points(GRID_STARTS, len(parameters)):
         theta = nominal.copy()
-        for place, parameter, share in zip(world.base, parameters, shares, strict=True):
-            theta[place] = _between(parameter, share)
+        for place, parameter, share in zip(evaluator.base, parameters, shares, strict=True):
+            theta[place] = _interpolate_bounds(parameter, share)
         starts.append(theta)
     return starts
 
 
-def _between(parameter: Parameter, share: float) -> float:
+def _interpolate_bounds(parameter: Parameter, share: float) -> float:
     """Return the value at a share (0 to 1) of the way from the lower to the upper bound.
 
     Over a wide positive range, equal steps of the share multiply the value by equal factors.
@@ -181,23 +185,23 @@ def _between(parameter: Parameter, share: float) -> float:
     return float(low + (high - low) * share)
 
 
-def misfit_of_starts(world: RunEvaluator, noise: NoiseModel, share: float) -> float:
+def misfit_of_starts(evaluator: RunEvaluator, noise: NoiseModel, share: float) -> float:
     """Return the lowest cost of the starts of a base fit, before any fit.
 
     Args:
-        world: the runs.
+        evaluator: the runs.
         noise: noise that weights the channels.
         share: initial share of each run that counts.
 
     Returns:
         The sum of squares; infinite if no start can be simulated.
     """
-    starts = [FitStart((), theta, world.guess) for theta in _starts(world, None)]
-    return float(costs_of_starts(world, noise, starts, share, np.inf).min())
+    starts = [FitStart((), theta, evaluator.guess) for theta in _list_starts(evaluator, None)]
+    return float(costs_of_starts(evaluator, noise, starts, share, np.inf).min())
 
 
 def costs_of_starts(
-    world: RunEvaluator,
+    evaluator: RunEvaluator,
     noise: NoiseModel,
     starts: Sequence[FitStart],
     share: float = FIT_HORIZONS[0].share,
@@ -206,28 +210,30 @@ def costs_of_starts(
     """Return the sum of squares of each start over the first samples of the runs.
 
     Args:
-        world: the runs.
+        evaluator: the runs.
         noise: noise that weights the channels.
         starts: parameters and initial states.
         share: initial share of each run that counts.
         failed_residual: residual of a sample that could not be simulated.
     """
-    count, runs = len(starts), len(world.tracks)
+    count, runs = len(starts), len(evaluator.tracks)
     thetas = [s.theta for s in starts]
     theta = np.repeat(thetas, runs, axis=0)
     states = np.concatenate([s.states for s in starts])
     lanes = np.tile(np.arange(runs), count)
-    simulated = world.simulate(theta, lanes, states, share)
+    simulated = evaluator.simulate(theta, lanes, states, share)
     simulated = simulated.reshape(count, runs, *simulated.shape[1:])
 
     # An abandoned start has no samples, and must not seem to fit them.
-    unmasked_residuals = np.nan_to_num(world.observed - simulated, nan=failed_residual)
-    residuals = np.where(world.get_sample_mask(share), unmasked_residuals, 0.0) / noise.sigma
+    unmasked_residuals = np.nan_to_num(evaluator.observed - simulated, nan=failed_residual)
+    residuals = np.where(evaluator.get_sample_mask(share), unmasked_residuals, 0.0) / noise.sigma
     costs: Array = np.square(residuals).sum(axis=(1, 2, 3))
     return costs
 
 
-def _is_sensitive(world: RunEvaluator, fit: TrajectoryFit, place: int, noise: NoiseModel) -> bool:
+def _is_sensitive(
+    evaluator: RunEvaluator, fit: TrajectoryFit, place: int, noise: NoiseModel
+) -> bool:
     """Return whether the simulated runs depend on a parameter enough to estimate it.
 
     The test is the norm of the change of all samples, in units of the noise, if the parameter moves
@@ -237,9 +243,9 @@ def _is_sensitive(world: RunEvaluator, fit: TrajectoryFit, place: int, noise: No
     columns = np.flatnonzero(fit.free == place)
     if not columns.size:
         return False
-    low, high = world.parameters[place].bounds
+    low, high = evaluator.parameters[place].bounds
     change = fit.jacobian[..., columns[0]] * (high - low) / noise.sigma
     # Count only available samples.
-    available_change = change[np.isfinite(world.observed)]
+    available_change = change[np.isfinite(evaluator.observed)]
     sigmas = np.sqrt(np.square(available_change).sum())
     return float(sigmas) > MIN_SENSITIVITY_SIGMAS

@@ -28,30 +28,30 @@ ROUNDS = 5
 """Maximum number of rounds: the range is then a thousand times as wide."""
 
 
-def at_bounds(world: RunEvaluator, base: BaseFit) -> list[int]:
+def at_bounds(evaluator: RunEvaluator, base: BaseFit) -> list[int]:
     """Return the indices in theta of fitted base parameters whose range should be widened.
 
     They are at a bound of their range, and physics allows values beyond this bound.
     """
     places = []
-    for i in world.base.tolist():
+    for i in evaluator.base.tolist():
         if i in base.fixed_parameters:
             continue
-        low, high = world.parameters[i].bounds
+        low, high = evaluator.parameters[i].bounds
         end = bound_of(float(base.fit.theta[i]), low, high)
-        lower, upper = widened(world.parameters[i], limits_of(world, i))
+        lower, upper = widened(evaluator.parameters[i], limits_of(evaluator, i))
         if (end == "low" and lower < low) or (end == "high" and upper > high):
             places.append(i)
     return places
 
 
 def fit_wider(
-    world: RunEvaluator, noise: NoiseModel, base: BaseFit
+    evaluator: RunEvaluator, noise: NoiseModel, base: BaseFit
 ) -> tuple[BaseFit, dict[str, Bounds]]:
     """Widen the ranges of parameters at a bound, and fit the base model again.
 
     Args:
-        world: the runs for fitting; the ranges of its parameters are replaced.
+        evaluator: the runs for fitting; the ranges of its parameters are replaced.
         noise: noise of each channel.
         base: the fitted base model.
 
@@ -60,32 +60,32 @@ def fit_wider(
     """
     new_bounds: dict[str, Bounds] = {}
     for _ in range(ROUNDS):
-        places = at_bounds(world, base)
-        if not places or world.watch.has_abandoned_fits():
+        places = at_bounds(evaluator, base)
+        if not places or evaluator.watch.has_abandoned_fits():
             break
         for i in places:
-            parameter = world.parameters[i]
-            new_bounds[parameter.name] = widened(parameter, limits_of(world, i))
-        use_bounds(world, new_bounds)
-        fit = TrajectoryFitter(world, noise, base.fixed_parameters).fit_models(
+            parameter = evaluator.parameters[i]
+            new_bounds[parameter.name] = widened(parameter, limits_of(evaluator, i))
+        use_bounds(evaluator, new_bounds)
+        fit = TrajectoryFitter(evaluator, noise, base.fixed_parameters).fit_models(
             [base.fit.make_start()], FINAL_ITERATIONS
         )[0]
         base = replace(base, fit=fit)
     return base, new_bounds
 
 
-def range_around(world: RunEvaluator, place: int, value: float | None = None) -> Bounds:
+def range_around(evaluator: RunEvaluator, place: int, value: float | None = None) -> Bounds:
     """Return the range of a base parameter, widened until it contains a value.
 
     It is widened at most `ROUNDS` times.
 
     Args:
-        world: the runs for fitting.
+        evaluator: the runs for fitting.
         place: index of the parameter.
         value: value that the range must contain; None for the widest range.
     """
-    parameter = world.parameters[place]
-    limits = limits_of(world, place)
+    parameter = evaluator.parameters[place]
+    limits = limits_of(evaluator, place)
     for _ in range(ROUNDS):
         low, high = parameter.bounds
         if value is not None and low <= value <= high:
@@ -94,43 +94,43 @@ def range_around(world: RunEvaluator, place: int, value: float | None = None) ->
     return parameter.bounds
 
 
-def use_bounds(world: RunEvaluator, new_bounds: Mapping[str, Bounds]) -> None:
-    """Replace the ranges of parameters of a world.
+def use_bounds(evaluator: RunEvaluator, new_bounds: Mapping[str, Bounds]) -> None:
+    """Replace the ranges of parameters of a run evaluator.
 
     Args:
-        world: the runs for fitting; its parameters are replaced.
+        evaluator: the runs for fitting; its parameters are replaced.
         new_bounds: new range of each parameter, by name.
     """
     if not new_bounds:
         return
-    world.parameters = tuple(
+    evaluator.parameters = tuple(
         replace(p, bounds=new_bounds[p.name], training=None) if p.name in new_bounds else p
-        for p in world.parameters
+        for p in evaluator.parameters
     )
     # Workers that were forked before still have the narrow ranges.
-    world.crew.forget(world)
+    evaluator.crew.forget(evaluator)
 
 
-def limits_of(world: RunEvaluator, place: int) -> Bounds:
+def limits_of(evaluator: RunEvaluator, place: int) -> Bounds:
     """Return the physical limits of a base parameter; for a robot, those of its total value.
 
     Args:
-        world: the runs for fitting.
+        evaluator: the runs for fitting.
         place: index of the parameter.
     """
-    parameter = world.parameters[place]
-    if world.kind.has_model:
-        coefficient = _coefficient(world.kind, parameter.name)
+    parameter = evaluator.parameters[place]
+    if evaluator.kind.has_model:
+        coefficient = _get_coefficient(evaluator.kind, parameter.name)
         if coefficient is not None:
             lower_limit, upper_limit = coefficient.least, coefficient.most
             return (
                 -np.inf if lower_limit is None else lower_limit,
                 BEYOND_MODEL * coefficient.plausible[0][1] if upper_limit is None else upper_limit,
             )
-    return _limits(parameter)
+    return _get_physical_limits(parameter)
 
 
-def _coefficient(kind: Any, name: str) -> Any:
+def _get_coefficient(kind: Any, name: str) -> Any:
     """Return the effect coefficient that a freed parameter of a robot's model file is fitted as.
 
     It is None for a parameter of the simulator itself.
@@ -142,7 +142,7 @@ def _coefficient(kind: Any, name: str) -> Any:
     return None
 
 
-def _limits(parameter: Parameter) -> Bounds:
+def _get_physical_limits(parameter: Parameter) -> Bounds:
     """Return the limits of a declared parameter from its unit and its range.
 
     A parameter with a nonnegative range stays nonnegative, and a share is at most 1.
@@ -168,18 +168,18 @@ def widened(parameter: Parameter, limits: Bounds) -> Bounds:
 
 
 def outside(
-    world: RunEvaluator, theta: Array, wider: Mapping[str, tuple[Bounds, Bounds]]
+    evaluator: RunEvaluator, theta: Array, wider: Mapping[str, tuple[Bounds, Bounds]]
 ) -> list[str]:
     """Return a sentence for each fitted parameter that lies outside its declared range.
 
     Args:
-        world: the runs for fitting.
+        evaluator: the runs for fitting.
         theta: (P,) the fitted parameters.
         wider: by parameter name, the declared range and the wider range that was used.
     """
     sentences = []
-    for i in world.base.tolist():
-        parameter, value = world.parameters[i], float(theta[i])
+    for i in evaluator.base.tolist():
+        parameter, value = evaluator.parameters[i], float(theta[i])
         if parameter.name not in wider:
             continue
         (low, high), (wide_low, wide_high) = wider[parameter.name]

@@ -19,7 +19,7 @@ MAX_CORRECTABLE_ERROR = 1.0
 
 
 def compute_effect_responses(
-    world: RunEvaluator, theta: Array, states: Array, added: Sequence[tuple[str, Array]]
+    evaluator: RunEvaluator, theta: Array, states: Array, added: Sequence[tuple[str, Array]]
 ) -> Array:
     """Compute the first-order responses of the runs to one additional effect each.
 
@@ -27,7 +27,7 @@ def compute_effect_responses(
     only a derivative.
 
     Args:
-        world: the runs of a robot.
+        evaluator: the runs of a robot.
         theta: (P,) parameters, without the added effects.
         states: (R, s) initial states.
         added: K effects with their coefficients.
@@ -35,44 +35,50 @@ def compute_effect_responses(
     Returns:
         Changes of the runs (K, R, T, C); NaN where they are not finite.
     """
-    runs, length, channels = world.observed.shape
+    runs, length, channels = evaluator.observed.shape
     result: Array = np.full((len(added), runs, length, channels), np.nan, dtype=np.float32)
-    cached_responses = world.simulated
+    cached_responses = evaluator.simulated
     keys = [(name, c.tobytes()) for name, c in added]
     missing_indices = [i for i, key in enumerate(keys) if key not in cached_responses]
     calls = [(run, theta, states[run], [added[i] for i in missing_indices]) for run in range(runs)]
-    for run, (values, simulation_count) in world.crew.map_unordered(world, _responses, calls):
+    for run, (values, simulation_count) in evaluator.crew.map_unordered(
+        evaluator, _compute_responses, calls
+    ):
         # Values that overflow single precision become infinite here.
         with np.errstate(over="ignore"):
             result[missing_indices, run, : values.shape[1]] = values
-        world.simulations += simulation_count
+        evaluator.simulations += simulation_count
     result[~is_finite_response(result)] = np.nan
     for i, key in enumerate(keys):
         if key in cached_responses:
             result[i] = cached_responses[key]
-        elif is_series_effect(world.available_effects[key[0]]):
+        elif is_series_effect(evaluator.available_effects[key[0]]):
             # Responses without a linearisation are simulated, and are similar in all models near
             # the data.
             cached_responses[key] = result[i].copy()
     return result
 
 
-def _responses(
-    world: RunEvaluator, run: int, theta: Array, states: Array, added: Sequence[tuple[str, Array]]
+def _compute_responses(
+    evaluator: RunEvaluator,
+    run: int,
+    theta: Array,
+    states: Array,
+    added: Sequence[tuple[str, Array]],
 ) -> tuple[Array, int]:
     """Compute how one run changes by each of K added effects (K, T, C); runs in a worker.
 
     The second result is the number of simulations that were needed. `states` (s,) is the initial
     state of the run.
     """
-    linearisation = _get_linearisation(world, run, theta, states)
+    linearisation = _get_linearisation(evaluator, run, theta, states)
     return linearisation.compute_effect_responses(
-        [(world.available_effects[name], c) for name, c in added]
+        [(evaluator.available_effects[name], c) for name, c in added]
     )
 
 
 def compute_state_jacobian(
-    world: RunEvaluator, theta: Array, states: Array, is_recomputed: bool = False
+    evaluator: RunEvaluator, theta: Array, states: Array, is_recomputed: bool = False
 ) -> Array:
     """Return derivatives (R, T, C, s) of the runs by their initial states.
 
@@ -81,40 +87,44 @@ def compute_state_jacobian(
     such model converges to the same result.
 
     Args:
-        world: the runs of a robot.
+        evaluator: the runs of a robot.
         theta: (P,) parameters.
         states: (R, s) initial states.
         is_recomputed: whether to recompute the derivatives about this model and store them.
     """
-    if world.derivatives is None or is_recomputed:
-        world.derivatives = begun_about(world, theta, states)
-    return world.derivatives
+    if evaluator.derivatives is None or is_recomputed:
+        evaluator.derivatives = begun_about(evaluator, theta, states)
+    return evaluator.derivatives
 
 
-def begun_about(world: RunEvaluator, theta: Array, states: Array) -> Array:
+def begun_about(evaluator: RunEvaluator, theta: Array, states: Array) -> Array:
     """Compute the derivatives (R, T, C, s) of the runs by their initial states about one model.
 
     Args:
-        world: the runs of a robot.
+        evaluator: the runs of a robot.
         theta: (P,) parameters of the model.
         states: (R, s) initial states of the model.
     """
-    runs, length, channels = world.observed.shape
-    result = np.zeros((runs, length, channels, len(world.states)))
+    runs, length, channels = evaluator.observed.shape
+    result = np.zeros((runs, length, channels, len(evaluator.states)))
     calls = [(run, theta, states[run]) for run in range(runs)]
-    for run, values in world.crew.map_unordered(world, _begun, calls):
+    for run, values in evaluator.crew.map_unordered(
+        evaluator, _compute_initial_state_derivatives, calls
+    ):
         result[run, : values.shape[1]] = np.moveaxis(values, 0, -1)
     result[~is_finite_response(result)] = 0.0
     return result
 
 
-def _begun(world: RunEvaluator, run: int, theta: Array, states: Array) -> Array:
+def _compute_initial_state_derivatives(
+    evaluator: RunEvaluator, run: int, theta: Array, states: Array
+) -> Array:
     """Compute the derivatives (s, T, C) of one run by its initial states; runs in a worker."""
-    return _get_linearisation(world, run, theta, states).compute_initial_state_responses()
+    return _get_linearisation(evaluator, run, theta, states).compute_initial_state_responses()
 
 
 def _get_linearisation(
-    world: RunEvaluator, run: int, theta: Array, states: Array
+    evaluator: RunEvaluator, run: int, theta: Array, states: Array
 ) -> RunLinearisation:
     """Return the linearised dynamics along one run of a robot, about given parameters.
 
@@ -122,23 +132,27 @@ def _get_linearisation(
     `theta` is (P,), `states` (s,): positions first, then velocities.
     """
     key = run, theta.tobytes(), states.tobytes()
-    cache = world.neighbourhoods
+    cache = evaluator.neighbourhoods
     linearisation: RunLinearisation | None = cache.pop(key, None)
     if linearisation is None:
-        coordinate_count = len(world.states) // 2
-        scenario = world.tracks[run].scenario
+        coordinate_count = len(evaluator.states) // 2
+        scenario = evaluator.tracks[run].scenario
         linearisation = RunLinearisation(
-            world.simulator, theta, scenario, states[:coordinate_count], states[coordinate_count:]
+            evaluator.simulator,
+            theta,
+            scenario,
+            states[:coordinate_count],
+            states[coordinate_count:],
         )
     cache[key] = linearisation
     # Drop the linearisations that were not used for the longest time.
-    for oldest_key in list(cache)[: -len(world.tracks)]:
+    for oldest_key in list(cache)[: -len(evaluator.tracks)]:
         del cache[oldest_key]
     return linearisation
 
 
 def correct_discretisation(
-    world: RunEvaluator, noise: NoiseModel, theta: Array, states: Array
+    evaluator: RunEvaluator, noise: NoiseModel, theta: Array, states: Array
 ) -> None:
     """Correct all later simulations for the discretisation error of a model's motion.
 
@@ -152,28 +166,28 @@ def correct_discretisation(
     servo that is nearly too fast for the step.
 
     Args:
-        world: the runs of a robot.
+        evaluator: the runs of a robot.
         noise: noise of each channel.
         theta: (P,) parameters of a model near the data.
         states: (R, s) initial states of the model.
     """
-    if not world.has_linearisation:
+    if not evaluator.has_linearisation:
         return
-    assert issubclass(world.kind, RobotSimulator)
-    effects = [*world.library, *world.extra]
-    runs = len(world.tracks)
-    scenarios = [track.scenario for track in world.tracks]
+    assert issubclass(evaluator.kind, RobotSimulator)
+    effects = [*evaluator.library, *evaluator.extra]
+    runs = len(evaluator.tracks)
+    scenarios = [track.scenario for track in evaluator.tracks]
     lanes = np.tile(theta, (runs, 1))
-    initial_states = dict(zip(world.states, states.T, strict=True))
-    half_step_kind = world.kind.with_half_step()
-    simulated = [world.simulator.simulate_batch(lanes, scenarios, initial_states)]
+    initial_states = dict(zip(evaluator.states, states.T, strict=True))
+    half_step_kind = evaluator.kind.with_half_step()
+    simulated = [evaluator.simulator.simulate_batch(lanes, scenarios, initial_states)]
     for kind in (half_step_kind, half_step_kind.with_half_step()):
-        finer = kind(world.recording.constants, world.channels, effects=effects)
+        finer = kind(evaluator.recording.constants, evaluator.channels, effects=effects)
         simulated.append(finer.simulate_batch(lanes, scenarios, initial_states))
     # In units of a run with the usual step: 1 + 2 with half of the step + 4 with a quarter.
-    world.simulations += 7 * runs
+    evaluator.simulations += 7 * runs
     correction = 2.0 * simulated[2] - simulated[1] - simulated[0]  # (1)
-    sizes = np.square(correction / noise.sigma)[np.isfinite(world.observed)]
+    sizes = np.square(correction / noise.sigma)[np.isfinite(evaluator.observed)]
     # A large error cannot be removed by this correction.
     if float(np.sqrt(sizes.mean())) < MAX_CORRECTABLE_ERROR:
-        world.correction = np.nan_to_num(correction)
+        evaluator.correction = np.nan_to_num(correction)

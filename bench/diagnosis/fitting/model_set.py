@@ -82,7 +82,7 @@ class ModelSet:
     """Fitted models of one recording, by their effects.
 
     Attributes:
-        world: the runs for fitting.
+        evaluator: the runs for fitting.
         noise: sensor noise.
         frozen: indices of parameters that do not influence the data.
         rng: source of all random numbers.
@@ -93,7 +93,7 @@ class ModelSet:
             original fit.
     """
 
-    world: RunEvaluator
+    evaluator: RunEvaluator
     noise: NoiseModel
     frozen: frozenset[int]
     rng: np.random.Generator
@@ -120,11 +120,11 @@ class ModelSet:
     @property
     def observed_mask(self) -> Mask:
         """Mask (R, T, C) of the samples that were recorded."""
-        return np.isfinite(self.world.observed)
+        return np.isfinite(self.evaluator.observed)
 
     def compute_residual(self, fit: TrajectoryFit) -> Array:
         """Return observed minus simulated (R, T, C), zero where no sample exists."""
-        unmasked_residual = self.world.observed - fit.simulated
+        unmasked_residual = self.evaluator.observed - fit.simulated
         residual: Array = np.where(self.observed_mask, unmasked_residual, 0.0)
         return residual
 
@@ -133,9 +133,9 @@ class ModelSet:
 
         The better one is returned.
         """
-        return self._entered(self._of(fit))
+        return self._store_if_better(self._rate_fit(fit))
 
-    def _entered(self, model: FittedModel) -> FittedModel:
+    def _store_if_better(self, model: FittedModel) -> FittedModel:
         """Store a model unless a better one with the same effects is stored; return the better one.
 
         The better one has the higher penalised log-likelihood.
@@ -150,9 +150,9 @@ class ModelSet:
             self.on_replaced(key)
         return self.models[key]
 
-    def _of(self, fit: TrajectoryFit) -> FittedModel:
+    def _rate_fit(self, fit: TrajectoryFit) -> FittedModel:
         """Return a fit with its likelihood and its penalised log-likelihood, eq. (1)."""
-        freedom = fit.free.size + count_identified_states(self.world, fit, self.noise)
+        freedom = fit.free.size + count_identified_states(self.evaluator, fit, self.noise)
         # A model that could not be simulated is stored, too, so that it is not tried again.
         likelihood = _LOST
         if np.isfinite(fit.cost):
@@ -198,7 +198,7 @@ class ModelSet:
         An effect with many shapes gains likelihood from noise alone. The part of this gain that the
         penalty of its coefficients does not cover is subtracted.
         """
-        slot = self.world.slots[name]
+        slot = self.evaluator.slots[name]
         # If there are few shapes, the coefficients alone pay for the gain under the null
         # hypothesis.
         parameter_penalties = (slot.stop - slot.start) * self.parameter_penalty
@@ -222,17 +222,17 @@ class ModelSet:
             race: whether to stop fits that fall far behind.
             iterations: maximum number of steps of each fit.
         """
-        watch = self.world.watch
+        watch = self.evaluator.watch
         watch.report_and_check(f"refit of {_format_starts(starts)}")
         noise = noise or self.noise
         starts = [self.with_sensitivities(start) for start in starts]
         if is_staged:
-            starts = self._sifted(starts, noise)
+            starts = self._select_promising_starts(starts, noise)
         # Sums of squares with different weights are not comparable.
         is_race = race and noise is self.noise
-        lowest_cost = self._reached(starts) if is_race else np.inf
-        fitter = TrajectoryFitter(self.world, noise, self.frozen)
-        watch.stage(_fitting(starts), len(starts))
+        lowest_cost = self._find_lowest_cost(starts) if is_race else np.inf
+        fitter = TrajectoryFitter(self.evaluator, noise, self.frozen)
+        watch.stage(_name_stage(starts), len(starts))
         for fit in fitter.fit_models(
             starts, iterations, race=race, lowest_cost=lowest_cost, finished=watch.advance
         ):
@@ -273,7 +273,7 @@ class ModelSet:
         gap = self.compute_excess(base)
         if gap > 0 and np.isfinite(gap):
             share = 1.0 - max(self.compute_excess(best), 0.0) / gap
-            self.world.watch.found(best.effects, max(share, 0.0))
+            self.evaluator.watch.found(best.effects, max(share, 0.0))
 
     def refine_jacobian(self, model: FittedModel) -> FittedModel:
         """Return the model with derivatives at its own parameters, computed at most once.
@@ -289,7 +289,7 @@ class ModelSet:
             and stored_model.fit.theta is model.fit.theta
         ):
             return stored_model
-        fitter = TrajectoryFitter(self.world, self.noise, self.frozen)
+        fitter = TrajectoryFitter(self.evaluator, self.noise, self.frozen)
         (fit,) = fitter.fit_models([model.fit.make_start()], iterations=0)
         result = replace(model, fit=replace(model.fit, jacobian=fit.jacobian, is_own_jacobian=True))
         if stored_model is model:
@@ -304,8 +304,8 @@ class ModelSet:
         nothing. A fit that leaves clearly larger residuals is rejected: with structured residuals,
         this method prefers smooth residuals to small ones.
         """
-        self.world.watch.stage("refining the model")
-        squares = TrajectoryFitter(self.world, self.noise).compute_cost
+        self.evaluator.watch.stage("refining the model")
+        squares = TrajectoryFitter(self.evaluator, self.noise).compute_cost
         for _ in range(MAX_REWEIGHTED_FITS):
             likelihood = model.likelihood
             if not np.isfinite(model.fit.cost):
@@ -316,11 +316,11 @@ class ModelSet:
             noise = NoiseModel(
                 np.maximum(sigma, MIN_SIGMA_SHARE * self.noise.sigma), likelihood.phi
             )
-            fitter = TrajectoryFitter(self.world, noise, self.frozen, exact=True)
+            fitter = TrajectoryFitter(self.evaluator, noise, self.frozen, exact=True)
             (fit,) = fitter.fit_models([self.make_final_start(model)], MAX_ITERATIONS)
-            if self.world.watch.has_abandoned_fits():
+            if self.evaluator.watch.has_abandoned_fits():
                 break
-            refitted = self._of(replace(fit, cost=squares(fit)))
+            refitted = self._rate_fit(replace(fit, cost=squares(fit)))
             if refitted.fit.cost > MAX_REWEIGHTED_SQUARES_RATIO * squares(model.fit):
                 break
             gain = refitted.penalised_log_likelihood - model.penalised_log_likelihood
@@ -329,10 +329,12 @@ class ModelSet:
                     # The fits are so close that scores about the old one remain valid.
                     model = self.models[frozenset(refitted.effects)] = refitted
                 break
-            model = self._entered(refitted)
+            model = self._store_if_better(refitted)
         return model
 
-    def _sifted(self, starts: Sequence[FitStart], noise: NoiseModel) -> list[FitStart]:
+    def _select_promising_starts(
+        self, starts: Sequence[FitStart], noise: NoiseModel
+    ) -> list[FitStart]:
         """Fit the first part of the runs, and return the starts of the models that fit it best.
 
         Each fit horizon is a longer part of the runs, with fewer models; the last horizon, whole
@@ -341,13 +343,13 @@ class ModelSet:
         remaining_starts = list(starts)
         # Patient fits keep all candidates at first, but only a few may be fitted to whole runs.
         for horizon, count in zip(FIT_HORIZONS[:-1], MODELS_KEPT_PER_HORIZON, strict=True):
-            fitter = TrajectoryFitter(self.world, noise, self.frozen, horizon.share)
+            fitter = TrajectoryFitter(self.evaluator, noise, self.frozen, horizon.share)
             fits = fitter.fit_models(remaining_starts, horizon.iterations)
             fits.sort(key=lambda fit: fit.cost)
             remaining_starts = [fit.make_start() for fit in fits[:count]]
         return remaining_starts
 
-    def _reached(self, starts: Sequence[FitStart]) -> float:
+    def _find_lowest_cost(self, starts: Sequence[FitStart]) -> float:
         """Return the lowest cost of fitted models that are at most as large as the starts.
 
         Fits that fall far behind this cost are stopped early. It is infinite without such models.
@@ -391,14 +393,16 @@ def _format_starts(starts: Sequence[FitStart]) -> str:
     return f"{names[0]}{others_text}" if names else "nothing"
 
 
-def _fitting(starts: Sequence[FitStart]) -> str:
+def _name_stage(starts: Sequence[FitStart]) -> str:
     """Return the name of the stage that fits these models, for the progress display."""
     size = max((len(start.effects) for start in starts), default=0)
     singular, plural = _SIZES.get(size, (f"set of {size} effects", f"sets of {size} effects"))
     return f"fitting {singular if len(starts) == 1 else plural}"
 
 
-def count_identified_states(world: RunEvaluator, fit: TrajectoryFit, noise: NoiseModel) -> float:
+def count_identified_states(
+    evaluator: RunEvaluator, fit: TrajectoryFit, noise: NoiseModel
+) -> float:
     """Return the number of initial states that the data determine, summed over all runs.
 
     These are the effective degrees of freedom of ridge regression (T. Hastie, R. Tibshirani, J.
@@ -409,19 +413,19 @@ def count_identified_states(world: RunEvaluator, fit: TrajectoryFit, noise: Nois
         f = Σ_ij λ_ij / (1 + λ_ij)                                                               (2)
 
     Args:
-        world: the runs.
+        evaluator: the runs.
         fit: the fitted model.
         noise: noise of each channel.
     """
-    observed_mask = np.isfinite(world.observed)
+    observed_mask = np.isfinite(evaluator.observed)
     states = fit.jacobian[..., fit.free.size :]
     observed_states = np.where(observed_mask[..., None], states, 0.0)
     scaled = observed_states / noise.sigma[:, None]
     # The shape is written out, because -1 is ambiguous if there are no states.
     runs, length, channels, size = scaled.shape
-    columns = scaled.reshape(runs, length * channels, size) * compute_state_prior(world)
+    columns = scaled.reshape(runs, length * channels, size) * compute_state_prior(evaluator)
     # A known state is not a degree of freedom.
-    columns = np.where(world.known[:, None, :], 0.0, columns)
+    columns = np.where(evaluator.known[:, None, :], 0.0, columns)
     normal = np.matmul(columns.transpose(0, 2, 1), columns)
     eigenvalues = np.linalg.eigvalsh(normal)
     # Rounding may make an eigenvalue slightly negative.

@@ -40,7 +40,7 @@ The influence is a share of the largest influence within the run.
 """
 
 
-def make_segment_evaluator(world: RunEvaluator) -> RunEvaluator | None:
+def make_segment_evaluator(evaluator: RunEvaluator) -> RunEvaluator | None:
     """Return a `RunEvaluator` of the segments with the same parameters.
 
     A floating base is excluded, because its pose at the start of a segment is not known. A system
@@ -49,18 +49,18 @@ def make_segment_evaluator(world: RunEvaluator) -> RunEvaluator | None:
     (this takes minutes in the updraft cases of the exam).
 
     Args:
-        world: the whole runs.
+        evaluator: the whole runs.
 
     Returns:
         The segments as runs, or None if every run is too short for two segments, or if the system
         has a floating base or bounces.
     """
-    if world.simulator.system.bounces or world.simulator.system.afloat:
+    if evaluator.simulator.system.bounces or evaluator.simulator.system.afloat:
         return None
-    runs = [segment for run in world.runs for segment in _split_run(run)]
-    if len(runs) == len(world.runs):
+    runs = [segment for run in evaluator.runs for segment in _split_run(run)]
+    if len(runs) == len(evaluator.runs):
         return None
-    return world.with_runs(runs)
+    return evaluator.with_runs(runs)
 
 
 def _split_run(run: Run) -> list[Run]:
@@ -79,36 +79,36 @@ def _split_run(run: Run) -> list[Run]:
     return [run.part(part, f"{run.name}.{n}") for n, part in enumerate(parts)]
 
 
-def join_segment_fits(world: RunEvaluator, segment_fit: TrajectoryFit) -> FitStart:
+def join_segment_fits(evaluator: RunEvaluator, segment_fit: TrajectoryFit) -> FitStart:
     """Return the start of a fit of the whole runs from a fit of their segments.
 
     Args:
-        world: the whole runs.
-        segment_fit: fit of the segments of `world`.
+        evaluator: the whole runs.
+        segment_fit: fit of the segments of `evaluator`.
 
     Returns:
         The fitted parameters, with the initial states of the first segment of each run.
     """
-    counts = [len(_split_run(run)) for run in world.runs]
+    counts = [len(_split_run(run)) for run in evaluator.runs]
     # The initial state of a run is that of its first segment.
     first = np.cumsum([0, *counts])[:-1]
     return FitStart(segment_fit.effects, segment_fit.theta, segment_fit.states[first])
 
 
-def forgets_initial_state(world: RunEvaluator, noise: NoiseModel, derivatives: Array) -> bool:
+def forgets_initial_state(evaluator: RunEvaluator, noise: NoiseModel, derivatives: Array) -> bool:
     """Return whether initial states hardly influence the last samples of each run.
 
     In that case a fit of whole runs has no more local minima than a fit of their segments.
 
     Args:
-        world: the runs.
+        evaluator: the runs.
         noise: noise of each channel.
         derivatives: (R, T, C, s) derivatives of the simulated runs by their initial states; zero
             for known states.
     """
-    observed_mask = np.isfinite(world.observed)[..., None]
+    observed_mask = np.isfinite(evaluator.observed)[..., None]
     sizes = np.abs(np.where(observed_mask, derivatives / noise.sigma[:, None], 0.0)).max(axis=2)
-    for run, length in zip(sizes, world.lengths, strict=True):
+    for run, length in zip(sizes, evaluator.lengths, strict=True):
         last_samples = run[int((1.0 - RUN_END_SHARE) * length) : int(length)]
         # If all initial states of a run are known, the decay of their influence cannot be measured.
         if (

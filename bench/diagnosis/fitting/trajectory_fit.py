@@ -115,7 +115,7 @@ class TrajectoryFitter:
     """Fits models to the runs of a `RunEvaluator`.
 
     Attributes:
-        world: the runs.
+        evaluator: the runs.
         noise: noise of each channel.
         frozen: indices of parameters that are not fitted, because the data do not show them.
         share: only this initial share of each run counts.
@@ -123,7 +123,7 @@ class TrajectoryFitter:
         exact: whether fits are refined to final convergence, as needed for reported parameters.
     """
 
-    world: RunEvaluator
+    evaluator: RunEvaluator
     noise: NoiseModel
     frozen: frozenset[int] = frozenset()
     share: float = 1.0
@@ -150,50 +150,55 @@ class TrajectoryFitter:
         Returns:
             The fits in the order of their starts.
         """
-        problems = [self._problem(start) for start in starts]
+        problems = [self._create_fit_state(start) for start in starts]
         for racing_round in iterate_rounds(iterations, race):
             # Unfinished fits continue in groups, which exchange nothing within a round.
             unfinished = [i for i, problem in enumerate(problems) if not problem.is_finished]
             if not unfinished or (
                 racing_round.first
-                and self.world.watch.should_abandon_fit(racing_round.first / iterations)
+                and self.evaluator.watch.should_abandon_fit(racing_round.first / iterations)
             ):
                 break
             best = min(lowest_cost, *(problem.point.cost for problem in problems))
-            groups = self._groups(problems, unfinished)
+            groups = self._group_fits(problems, unfinished)
             calls = [
-                (self._terms(), [problems[i] for i in g], racing_round, race, best) for g in groups
+                (self._list_terms(), [problems[i] for i in g], racing_round, race, best)
+                for g in groups
             ]
-            for number, members in self.world.crew.map_unordered(self.world, _advance_group, calls):
+            for number, members in self.evaluator.crew.map_unordered(
+                self.evaluator, _advance_group, calls
+            ):
                 for i, problem in zip(groups[number], members, strict=True):
                     problems[i] = problem
                     if problem.is_finished or racing_round.last >= iterations:
                         finished()
         return [p.make_fit() for p in problems]
 
-    def _terms(self) -> tuple[Any, ...]:
+    def _list_terms(self) -> tuple[Any, ...]:
         """Return all fields except the run evaluator, which workers have already.
 
         A worker creates its own fitter from them; see `_advance_group`.
         """
         return self.noise, self.frozen, self.share, self.parameters, self.exact
 
-    def _groups(self, problems: Sequence[FitState], unfinished: Sequence[int]) -> list[list[int]]:
+    def _group_fits(
+        self, problems: Sequence[FitState], unfinished: Sequence[int]
+    ) -> list[list[int]]:
         """Split unfinished fits into groups of about `GROUP_COST_SAMPLES` simulated samples.
 
         Each group has models of one kind as far as possible. There is only one group if large
         engine calls cost less per batch element.
         """
-        world = self.world
-        if not world.is_cheap_to_split:
+        evaluator = self.evaluator
+        if not evaluator.is_cheap_to_split:
             return [list(unfinished)]
-        runs, length, _ = world.observed.shape
+        runs, length, _ = evaluator.observed.shape
         state_count = self._moved_states().size
         lanes = sum(1 + problems[i].free.size + state_count for i in unfinished) * runs
         cost = lanes * length * self.share + ALGEBRA_COST_SAMPLES * len(unfinished)
         # Compiled batch elements are stepped in parallel, however long they are.
         count = int(np.ceil(min(cost / GROUP_COST_SAMPLES, lanes / MIN_CHUNK_SIZE)))
-        kinds = world.group_compatible(
+        kinds = evaluator.group_compatible(
             np.stack([problems[i].point.start.theta for i in unfinished])
         )
         order = [unfinished[i] for i in np.argsort(kinds, kind="stable")]
@@ -219,44 +224,50 @@ class TrajectoryFitter:
             The fits after the round.
         """
         # Mask of the samples that count, (R, T, C).
-        sample_mask = self.world.get_sample_mask(self.share)
+        sample_mask = self.evaluator.get_sample_mask(self.share)
         if not racing_round.first:
-            self._begin(problems, sample_mask)
+            self._simulate_starts(problems, sample_mask)
         for iteration in range(racing_round.first, racing_round.last):
             # In the first steps even the correct model may be far behind.
             if race and iteration >= MIN_ITERATIONS_BEFORE_ELIMINATION:
                 eliminate_losing_fits(problems, lowest_cost)
-            self._renew(
+            self._renew_derivatives(
                 problems,
                 sample_mask,
                 includes_waiting=not race or iteration >= MIN_ITERATIONS_BEFORE_ELIMINATION,
             )
-            trials = list(self._trials(problems, sample_mask))
+            trials = list(self._propose_trials(problems, sample_mask))
             if not trials and any(p.is_waiting and not p.is_finished for p in problems):
                 continue
             # The caller checks whether the fit was stopped early here.
-            if not trials or self.world.watch.should_abandon_fit(iteration / racing_round.all):
+            if not trials or self.evaluator.watch.should_abandon_fit(iteration / racing_round.all):
                 break
-            make_points = self._plain_points if self.world.has_linearisation else self._points
+            make_points = (
+                self._plain_points if self.evaluator.has_linearisation else self._simulate_points
+            )
             for (problem, _), point in zip(trials, make_points(trials, sample_mask), strict=True):
-                self._judge(problem, point)
+                self._judge_trial(problem, point)
         return list(problems)
 
-    def _begin(self, problems: Sequence[FitState], sample_mask: Mask) -> None:
+    def _simulate_starts(self, problems: Sequence[FitState], sample_mask: Mask) -> None:
         """Simulate the start of each fit, and compute its derivatives unless they are known."""
-        known_problems = [p for p in problems if self._knows(p)]
-        unknown_problems = [p for p in problems if not self._knows(p)]
+        known_problems = [p for p in problems if self._has_derivatives(p)]
+        unknown_problems = [p for p in problems if not self._has_derivatives(p)]
         if unknown_problems:
-            points = self._points([(p, p.point.start) for p in unknown_problems], sample_mask)
+            points = self._simulate_points(
+                [(p, p.point.start) for p in unknown_problems], sample_mask
+            )
             for problem, point in zip(unknown_problems, points, strict=True):
-                self._take(problem, point)
+                self._move_to_point(problem, point)
         if known_problems:
             points = self._plain_points([(p, p.point.start) for p in known_problems], sample_mask)
             for problem, point in zip(known_problems, points, strict=True):
                 assert point.start.known is not None
-                state_jacobian = self._begun(problem, point.start, point.simulated.shape[1])
+                state_jacobian = self._compute_initial_state_derivatives(
+                    problem, point.start, point.simulated.shape[1]
+                )
                 parameter_jacobian = point.start.known.jacobian[:, : point.simulated.shape[1]]
-                self._take(
+                self._move_to_point(
                     problem,
                     replace(
                         point, jacobian=np.concatenate([parameter_jacobian, state_jacobian], axis=3)
@@ -264,19 +275,19 @@ class TrajectoryFitter:
                 )
                 problem.has_own_jacobian = False
 
-    def _knows(self, problem: FitState) -> bool:
+    def _has_derivatives(self, problem: FitState) -> bool:
         """Return whether the derivatives by all fitted parameters are known near the start.
 
         This saves one simulation per parameter. Only robots reuse derivatives.
         """
         known_jacobian = problem.point.start.known
         return (
-            self.world.has_linearisation
+            self.evaluator.has_linearisation
             and known_jacobian is not None
             and np.array_equal(known_jacobian.free, problem.free)
         )
 
-    def _renew(
+    def _renew_derivatives(
         self, problems: Sequence[FitState], sample_mask: Mask, includes_waiting: bool
     ) -> None:
         """Recompute the derivatives of fits whose present ones are not good enough.
@@ -297,30 +308,30 @@ class TrajectoryFitter:
                 from bench.diagnosis.fitting.linearised_runs import begun_about
 
                 start = problem.point.start
-                problem.by_states = begun_about(self.world, start.theta, start.states)
-        points = self._points([(p, p.point.start) for p in stale_problems], sample_mask)
+                problem.by_states = begun_about(self.evaluator, start.theta, start.states)
+        points = self._simulate_points([(p, p.point.start) for p in stale_problems], sample_mask)
         for problem, point in zip(stale_problems, points, strict=True):
-            self._take(problem, point)
+            self._move_to_point(problem, point)
 
-    def _problem(self, start: FitStart) -> FitState:
+    def _create_fit_state(self, start: FitStart) -> FitState:
         """Create the state of a new fit: fitted parameters, their bounds and difference steps."""
-        world = self.world
+        evaluator = self.evaluator
         free: list[int] = []
         bounds: list[tuple[float, float]] = []
         if self.parameters:
-            free += [i for i in world.base.tolist() if i not in self.frozen]
-            bounds += [world.parameters[i].bounds for i in free]
+            free += [i for i in evaluator.base.tolist() if i not in self.frozen]
+            bounds += [evaluator.parameters[i].bounds for i in free]
             for name in start.effects:
-                free += world.get_coefficient_indices(name)
-                bounds += compute_coefficient_bounds(world, name)
+                free += evaluator.get_coefficient_indices(name)
+                bounds += compute_coefficient_bounds(evaluator, name)
         # The shape has two columns even if nothing is fitted.
         table = np.array(bounds, dtype=np.float64).reshape(-1, 2)
         low, high = table.T
 
         # Plausible ranges scale the finite differences; a fit may go far beyond them.
-        plausible_ranges = [world.parameters[i].bounds for i in free]
+        plausible_ranges = [evaluator.parameters[i].bounds for i in free]
         widths = np.array([b - a for a, b in plausible_ranges], dtype=np.float64)
-        state_steps = np.full(len(world.states), INITIAL_STATE_STEP)
+        state_steps = np.full(len(evaluator.states), INITIAL_STATE_STEP)
 
         # A start may have a size from a score test, or come from wider bounds.
         theta = start.theta.copy()
@@ -334,19 +345,19 @@ class TrajectoryFitter:
             widths=widths,
             steps=np.concatenate([INITIAL_PARAMETER_STEP * widths, state_steps]),
             is_final_fit=self.exact,
-            rough=world.has_linearisation,
-            samples=int(world.get_sample_mask(self.share).sum()),
+            rough=evaluator.has_linearisation,
+            samples=int(evaluator.get_sample_mask(self.share).sum()),
             by_states=start.by_states,
         )
 
-    def _points(self, trials: Sequence[_TrialStep], sample_mask: Mask) -> list[FitPoint]:
+    def _simulate_points(self, trials: Sequence[_TrialStep], sample_mask: Mask) -> list[FitPoint]:
         """Simulate trial points together with their derivatives and cost.
 
         One engine call contains every run of every model with every unknown displaced, so it
         integrates over time only once. An initial state that is known in every run is not an
         unknown.
         """
-        runs, size = self.world.guess.shape
+        runs, size = self.evaluator.guess.shape
         state_indices = self._moved_states()
         steps = [problem.compute_inward_steps(start.theta) for problem, start in trials]
         displaced_inputs = [
@@ -357,7 +368,7 @@ class TrajectoryFitter:
         thetas = np.concatenate([np.repeat(theta, runs, axis=0) for theta, _ in displaced_inputs])
         states = np.concatenate([begin.reshape(-1, size) for _, begin in displaced_inputs])
         lanes = np.tile(np.arange(runs), len(thetas) // runs)
-        simulated = self.world.simulate(thetas, lanes, states, self.share)
+        simulated = self.evaluator.simulate(thetas, lanes, states, self.share)
         simulated = simulated.reshape(-1, runs, *simulated.shape[1:])
 
         points = []
@@ -367,28 +378,33 @@ class TrajectoryFitter:
             end = first + 1 + problem.free.size + state_indices.size
             part = simulated[first:end]
             first = end
-            jacobian = self._derivatives(part, step, state_indices)
-            if self.world.has_linearisation:
-                jacobian[..., problem.free.size :] = self._begun(problem, start, part.shape[2])
-            cost = self._cost(part[0], start.states, sample_mask)
+            jacobian = self._compute_derivatives(part, step, state_indices)
+            if self.evaluator.has_linearisation:
+                jacobian[..., problem.free.size :] = self._compute_initial_state_derivatives(
+                    problem, start, part.shape[2]
+                )
+            cost = self._compute_cost(part[0], start.states, sample_mask)
             points.append(FitPoint(start, part[0], jacobian, cost))
         return points
 
     def _plain_points(self, trials: Sequence[_TrialStep], sample_mask: Mask) -> list[FitPoint]:
         """Simulate trial points, and give each the derivatives of its fit's present point.
 
-        `_judge` updates these derivatives if the point is accepted.
+        `_judge_trial` updates these derivatives if the point is accepted.
         """
-        runs = len(self.world.guess)
-        simulated = self.world.simulate(
+        runs = len(self.evaluator.guess)
+        simulated = self.evaluator.simulate(
             np.concatenate([np.tile(start.theta, (runs, 1)) for _, start in trials]),
             np.tile(np.arange(runs), len(trials)),
             np.concatenate([start.states for _, start in trials]),
             self.share,
-        ).reshape(len(trials), runs, *self.world.observed.shape[1:])
+        ).reshape(len(trials), runs, *self.evaluator.observed.shape[1:])
         return [
             FitPoint(
-                start, part, problem.point.jacobian, self._cost(part, start.states, sample_mask)
+                start,
+                part,
+                problem.point.jacobian,
+                self._compute_cost(part, start.states, sample_mask),
             )
             for (problem, start), part in zip(trials, simulated, strict=True)
         ]
@@ -398,27 +414,29 @@ class TrajectoryFitter:
 
         There are none if the derivatives come from a linearisation.
         """
-        if self.world.has_linearisation:
+        if self.evaluator.has_linearisation:
             return np.array([], dtype=np.intp)
-        return np.flatnonzero(~self.world.known.all(axis=0))
+        return np.flatnonzero(~self.evaluator.known.all(axis=0))
 
-    def _begun(self, problem: FitState, start: FitStart, samples: int) -> Array:
+    def _compute_initial_state_derivatives(
+        self, problem: FitState, start: FitStart, samples: int
+    ) -> Array:
         """Return derivatives (R, T, C, s) by initial states, zero where a state is known.
 
         They are those of the fit itself, if it has any, or those that all models share.
         """
-        world = self.world
+        evaluator = self.evaluator
         # Imported here, because only robots need it.
         from bench.diagnosis.fitting.linearised_runs import compute_state_jacobian
 
         shared = problem.by_states
         if shared is None:
-            shared = compute_state_jacobian(world, start.theta, start.states)
+            shared = compute_state_jacobian(evaluator, start.theta, start.states)
         derivatives = shared[:, :samples]
-        masked_derivatives: Array = derivatives * ~world.known[:, None, None, :]
+        masked_derivatives: Array = derivatives * ~evaluator.known[:, None, None, :]
         return masked_derivatives
 
-    def _derivatives(self, part: Array, steps: Array, state_indices: Indices) -> Array:
+    def _compute_derivatives(self, part: Array, steps: Array, state_indices: Indices) -> Array:
         """Compute finite-difference derivatives (R, T, C, q + s).
 
         They are zero for known initial states, which therefore absorb nothing of the residual.
@@ -428,7 +446,7 @@ class TrajectoryFitter:
             steps: (q + s,) displacements.
             state_indices: (n,) indices of the initial states that are displaced.
         """
-        known_mask = self.world.known
+        known_mask = self.evaluator.known
         q = steps.size - known_mask.shape[1]
         columns = np.concatenate([np.arange(q), q + state_indices])
         # An abandoned batch element is NaN, so the effect of its unknown is not known.
@@ -442,23 +460,23 @@ class TrajectoryFitter:
         jacobian[..., q:] *= ~known_mask[:, None, None, :]
         return jacobian
 
-    def _take(self, problem: FitState, point: FitPoint) -> None:
+    def _move_to_point(self, problem: FitState, point: FitPoint) -> None:
         """Move a fit to a point with its derivatives, and adapt the difference steps to them."""
         problem.point = point
         problem.has_own_jacobian, problem.is_jacobian_stale, problem.is_waiting = True, False, False
         problem.steps = compute_difference_steps(point.jacobian, self.noise, problem.widths)
 
-    def _residual(self, simulated: Array, sample_mask: Mask) -> Array:
+    def _compute_residual(self, simulated: Array, sample_mask: Mask) -> Array:
         """Return observed minus simulated (R, T, C), zero where no sample counts."""
-        residual: Array = np.where(sample_mask, self.world.observed - simulated, 0.0)
+        residual: Array = np.where(sample_mask, self.evaluator.observed - simulated, 0.0)
         return residual
 
-    def _drift(self, states: Array) -> Array:
+    def _compute_state_deviation(self, states: Array) -> Array:
         """Return d (R, s) of eq. (1) of `gauss_newton`: initial states minus their guesses.
 
         They are in units of the prior standard deviation.
         """
-        drift: Array = (states - self.world.guess) / compute_state_prior(self.world)
+        drift: Array = (states - self.evaluator.guess) / compute_state_prior(self.evaluator)
         return drift
 
     def compute_cost(self, fit: TrajectoryFit) -> float:
@@ -466,22 +484,26 @@ class TrajectoryFitter:
 
         Costs with different weights cannot be compared directly.
         """
-        return self._cost(fit.simulated, fit.states, self.world.get_sample_mask(self.share))
+        return self._compute_cost(
+            fit.simulated, fit.states, self.evaluator.get_sample_mask(self.share)
+        )
 
-    def _cost(self, simulated: Array, states: Array, sample_mask: Mask) -> float:
+    def _compute_cost(self, simulated: Array, states: Array, sample_mask: Mask) -> float:
         """Return the cost, eq. (1) of `gauss_newton`: the whitened residual and the prior, squared.
 
         It is infinite if the simulation was abandoned.
         """
-        residual = self._residual(simulated, sample_mask)
+        residual = self._compute_residual(simulated, sample_mask)
         # An abandoned batch element is NaN, which cannot be compared.
         if not np.isfinite(residual).all():
             return np.inf
         w = whiten(residual, sample_mask, self.noise)
-        drift = self._drift(states)
+        drift = self._compute_state_deviation(states)
         return float((w * w).sum() + (drift * drift).sum())
 
-    def _trials(self, problems: Sequence[FitState], sample_mask: Mask) -> Iterator[_TrialStep]:
+    def _propose_trials(
+        self, problems: Sequence[FitState], sample_mask: Mask
+    ) -> Iterator[_TrialStep]:
         """Propose the next point of each fit that is neither finished nor waiting.
 
         A fit without a useful step is marked as finished or waiting and yields nothing.
@@ -489,11 +511,11 @@ class TrajectoryFitter:
         for problem in problems:
             if problem.is_finished or problem.is_waiting:
                 continue
-            next_start = self._trial(problem, sample_mask)
+            next_start = self._propose_trial(problem, sample_mask)
             if next_start is not None:
                 yield problem, next_start
 
-    def _trial(self, problem: FitState, sample_mask: Mask) -> FitStart | None:
+    def _propose_trial(self, problem: FitState, sample_mask: Mask) -> FitStart | None:
         """Return the next parameters and initial states to try.
 
         If no decrease is predicted, mark the fit as finished or waiting, and return None.
@@ -504,7 +526,7 @@ class TrajectoryFitter:
             problem.is_finished = True
             return None
 
-        unwhitened_residual = self._residual(point.simulated, sample_mask)
+        unwhitened_residual = self._compute_residual(point.simulated, sample_mask)
         derivatives = np.where(sample_mask[..., None], point.jacobian, 0.0)
         residual = whiten(unwhitened_residual, sample_mask, self.noise)
         jacobian = whiten(derivatives, sample_mask, self.noise)
@@ -512,9 +534,9 @@ class TrajectoryFitter:
             residual,
             jacobian,
             problem.free.size,
-            self._drift(point.start.states),
-            compute_state_prior(self.world),
-            self.world.known,
+            self._compute_state_deviation(point.start.states),
+            compute_state_prior(self.evaluator),
+            self.evaluator.known,
             problem.damping,
             problem.find_blocked_parameters(
                 residual, jacobian
@@ -536,7 +558,7 @@ class TrajectoryFitter:
         theta[problem.free] = np.clip(trial_values, problem.low, problem.high)
         return replace(point.start, theta=theta, states=point.start.states + step.state_steps)
 
-    def _judge(self, problem: FitState, point: FitPoint) -> None:
+    def _judge_trial(self, problem: FitState, point: FitPoint) -> None:
         """Accept a trial point if its cost is lower, else reject it, and update the damping.
 
         The derivatives of a robot are updated by Broyden's method instead of simulations.
@@ -544,32 +566,33 @@ class TrajectoryFitter:
         decrease = problem.point.cost - point.cost
         is_own_jacobian = problem.has_own_jacobian
         if point.cost < problem.point.cost:
-            if self.world.has_linearisation:
+            if self.evaluator.has_linearisation:
                 problem.point = replace(point, jacobian=problem.update_jacobian(point))
                 problem.has_own_jacobian = not problem.free.size
             else:
-                self._take(problem, point)
+                self._move_to_point(problem, point)
             problem.accept_step(decrease, point.cost, is_own_jacobian)
         else:
             problem.reject_step()
 
 
-def _advance_group(world: RunEvaluator, terms: tuple[Any, ...], *call: Any) -> list[FitState]:
+def _advance_group(evaluator: RunEvaluator, terms: tuple[Any, ...], *call: Any) -> list[FitState]:
     """Advance one group of fits by one racing round; runs in this process or in a worker."""
-    return TrajectoryFitter(world, *terms).advance_round(*call)
+    return TrajectoryFitter(evaluator, *terms).advance_round(*call)
 
 
-def compute_state_prior(world: RunEvaluator) -> Array:
+def compute_state_prior(evaluator: RunEvaluator) -> Array:
     """Return the standard deviations (s,) of the normal priors of the initial states, SI units.
 
     A state that samples show has such a wide prior that only the samples decide.
     """
-    if world.state_prior is not None:
-        return world.state_prior
-    system, recorded_channels = world.simulator.system, set(world.channels)
+    if evaluator.state_prior is not None:
+        return evaluator.state_prior
+    system, recorded_channels = evaluator.simulator.system, set(evaluator.channels)
     # Samples of a coordinate also show its rate; a user-defined system may have further states.
     pairs = dict(zip(system.rates, system.coordinates, strict=False))
     is_measured = [
-        name in recorded_channels or pairs.get(name) in recorded_channels for name in world.states
+        name in recorded_channels or pairs.get(name) in recorded_channels
+        for name in evaluator.states
     ]
     return np.where(is_measured, OBSERVED_STATE_PRIOR_SIGMA, UNOBSERVED_STATE_PRIOR_SIGMA)

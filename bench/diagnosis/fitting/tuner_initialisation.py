@@ -16,39 +16,41 @@ TIME_LIMIT_SECONDS = 300.0
 """Time limit of the tuner, in seconds."""
 
 
-def find_start_with_tuner(name: str, world: RunEvaluator, noise: NoiseModel, seed: int) -> Array:
+def find_start_with_tuner(
+    name: str, evaluator: RunEvaluator, noise: NoiseModel, seed: int
+) -> Array:
     """Run a tuner, and return the base parameters (b,) that it recommends.
 
     Initial states are fixed at their guesses from the first samples.
 
     Args:
         name: name of the tuner.
-        world: the runs.
+        evaluator: the runs.
         noise: noise of each channel.
         seed: seed of the tuner's random numbers.
 
     Raises:
         InputError: the tuner does not exist, or must be trained first.
     """
-    channels = world.observed.shape[2]
+    channels = evaluator.observed.shape[2]
     # A tuner accepts one table, so the runs are concatenated, all padded to the same length.
-    observed = world.observed.reshape(-1, channels)
-    parameters = [world.parameters[i] for i in world.base]
+    observed = evaluator.observed.reshape(-1, channels)
+    parameters = [evaluator.parameters[i] for i in evaluator.base]
     problem = StandaloneProblem(
         parameters=parameters,
-        start=world.get_nominal_theta()[world.base],
+        start=evaluator.get_nominal_theta()[evaluator.base],
         observed=observed,
         scale=noise.sigma,
-        lengths=(world.observed.shape[1],) * len(world.tracks),
-        evaluate=lambda base: _evaluated(world, noise, observed, base),
+        lengths=(evaluator.observed.shape[1],) * len(evaluator.tracks),
+        evaluate=lambda base: _evaluate_base(evaluator, noise, observed, base),
     )
     return run_tuner(
         name, problem, SIMULATION_BUDGET, TIME_LIMIT_SECONDS, make_rng("explain", name, seed)
     )
 
 
-def _evaluated(
-    world: RunEvaluator,
+def _evaluate_base(
+    evaluator: RunEvaluator,
     noise: NoiseModel,
     observed: Array,
     base: Array,
@@ -59,7 +61,7 @@ def _evaluated(
     simulation fails.
 
     Args:
-        world: the runs.
+        evaluator: the runs.
         noise: noise of each channel.
         observed: (T, C) observations of all runs, concatenated.
         base: (n, b) base parameters.
@@ -68,14 +70,14 @@ def _evaluated(
         Observations (n, T, C) and losses (n,).
     """
     count = len(base)
-    runs = len(world.tracks)
+    runs = len(evaluator.tracks)
     # No effect is active, because the coefficients after the base parameters are zero.
-    theta = np.tile(world.get_nominal_theta(), (count, 1))
-    theta[:, world.base] = base
-    simulated = world.simulate(
+    theta = np.tile(evaluator.get_nominal_theta(), (count, 1))
+    theta[:, evaluator.base] = base
+    simulated = evaluator.simulate(
         np.repeat(theta, runs, axis=0),
         np.tile(np.arange(runs), count),
-        np.tile(world.guess, (count, 1)),
+        np.tile(evaluator.guess, (count, 1)),
     ).reshape(count, -1, observed.shape[1])
 
     residuals = np.where(np.isfinite(observed), simulated - observed, 0.0)

@@ -123,7 +123,7 @@ class FollowedRuns:
     """Runs of a robot followed by a Kalman filter with the model.
 
     Attributes:
-        world: the runs.
+        evaluator: the runs.
         theta: (P,) parameters of the model.
         noise: sensor noise.
         linear: linearised model of each run.
@@ -134,7 +134,7 @@ class FollowedRuns:
         typical: (E,) typical forces.
     """
 
-    world: RunEvaluator
+    evaluator: RunEvaluator
     theta: Array
     noise: NoiseModel
     linear: list[MeasuredLinear]
@@ -147,7 +147,7 @@ class FollowedRuns:
     @classmethod
     def follow(
         cls,
-        world: RunEvaluator,
+        evaluator: RunEvaluator,
         theta: Array,
         noise: NoiseModel,
         trajectories: Sequence[Trajectory] | None = None,
@@ -157,15 +157,15 @@ class FollowedRuns:
         """Linearise a model about the measured motion and filter the runs.
 
         Args:
-            world: the runs.
+            evaluator: the runs.
             theta: (P,) parameters of the model.
             noise: sensor noise.
             trajectories: motion of each run, if it has been estimated before.
             force: (E,) initial missing forces for the fit of the process noise.
             max_linearisations: maximum number of linearisations if the motion is not given.
         """
-        assert isinstance(world.simulator, RobotSimulator)
-        robot = world.simulator.robot
+        assert isinstance(evaluator.simulator, RobotSimulator)
+        robot = evaluator.simulator.robot
         typical = np.concatenate(
             [compute_joint_scales(robot).force, compute_floating_forces(robot)]
         )
@@ -173,14 +173,14 @@ class FollowedRuns:
         linear: list[MeasuredLinear] = []
         for number in range(max_linearisations if trajectories is None else 1):
             # Near the data, Jacobians change little from one motion to another.
-            neighbours: Sequence[MeasuredLinear | None] = linear or [None] * len(world.tracks)
-            motion: Sequence[Trajectory | None] = trajectories or [None] * len(world.tracks)
+            neighbours: Sequence[MeasuredLinear | None] = linear or [None] * len(evaluator.tracks)
+            motion: Sequence[Trajectory | None] = trajectories or [None] * len(evaluator.tracks)
             linear = [
-                _linearised(world, theta, noise, run, motion[run], neighbour)
+                _linearise_run(evaluator, theta, noise, run, motion[run], neighbour)
                 for run, neighbour in enumerate(neighbours)
             ]
             initial_force = FIRST_FORCE * typical if force is None else force
-            followed = cls._of_linear(world, theta, noise, linear, initial_force, typical)
+            followed = cls._of_linear(evaluator, theta, noise, linear, initial_force, typical)
             force, noise, trajectories = followed.force, followed.noise, followed.trajectories
             gain = np.inf if best is None else followed.log_likelihood - best.log_likelihood
             # The first linearisation is about the readings alone, which are not a possible motion.
@@ -203,12 +203,12 @@ class FollowedRuns:
 
         Args:
             theta: (P,) the parameters.
-            simulator: simulator to use instead of that of the world.
+            simulator: simulator to use instead of that of the evaluator.
             alike: filter of a similar model, whose Jacobians are reused.
         """
         linear = [
-            _linearised(
-                *(self.world, theta, self.noise, run, motion, neighbour, simulator),
+            _linearise_run(
+                *(self.evaluator, theta, self.noise, run, motion, neighbour, simulator),
                 is_alike=alike is not None,
             )
             for run, (motion, neighbour) in enumerate(
@@ -216,12 +216,12 @@ class FollowedRuns:
             )
         ]
         given = self.noise, linear, self.force, self.typical
-        return self._of_linear(self.world, theta, *given)
+        return self._of_linear(self.evaluator, theta, *given)
 
     @classmethod
     def _of_linear(
         cls,
-        world: RunEvaluator,
+        evaluator: RunEvaluator,
         theta: Array,
         noise: NoiseModel,
         linear: list[MeasuredLinear],
@@ -237,31 +237,35 @@ class FollowedRuns:
         with np.errstate(all="ignore"):
             maps = [run_model.interval_maps() for run_model in linear]
             # An effect may have its own states.
-            prior = _prior(world, linear, maps[0].states.shape[1])
-            runs = LinearRuns.stacked(maps, world.observed, prior)
+            prior = _compute_prior_deviations(evaluator, linear, maps[0].states.shape[1])
+            runs = LinearRuns.stacked(maps, evaluator.observed, prior)
             fitted = _fit_noise(runs, noise, force, typical)
-        return cls(world, theta, linear=linear, runs=runs, typical=typical, **fitted._asdict())
+        return cls(evaluator, theta, linear=linear, runs=runs, typical=typical, **fitted._asdict())
 
     @classmethod
-    def of_model(cls, world: RunEvaluator, theta: Array, noise: NoiseModel) -> FollowedRuns:
-        """Return the filter stored in the world if it has these parameters, else a new one.
+    def of_model(cls, evaluator: RunEvaluator, theta: Array, noise: NoiseModel) -> FollowedRuns:
+        """Return the filter stored in the evaluator if it has these parameters, else a new one.
 
-        The new filter is stored in the world.
+        The new filter is stored in the evaluator.
 
         Args:
-            world: the runs.
+            evaluator: the runs.
             theta: (P,) parameters of the model.
             noise: sensor noise.
         """
-        known: FollowedRuns | None = world.followed
-        if known is not None and known.world is world and np.array_equal(known.theta, theta):
+        known: FollowedRuns | None = evaluator.followed
+        if (
+            known is not None
+            and known.evaluator is evaluator
+            and np.array_equal(known.theta, theta)
+        ):
             return known
-        world.watch.stage("computing prediction errors", 1)
-        assert isinstance(world.simulator, RobotSimulator)
+        evaluator.watch.stage("computing prediction errors", 1)
+        assert isinstance(evaluator.simulator, RobotSimulator)
         # With another step size, the motion at the ends of the steps is not known.
-        has_same_step = known is not None and known.step == world.simulator.time_step
+        has_same_step = known is not None and known.step == evaluator.simulator.time_step
         motion = known.trajectories if known is not None and has_same_step else None
-        followed = world.followed = cls.follow(world, theta, noise, motion)
+        followed = evaluator.followed = cls.follow(evaluator, theta, noise, motion)
         return followed
 
     def refitted(self, runs: LinearRuns) -> FollowedRuns:
@@ -279,12 +283,12 @@ class FollowedRuns:
         The model is linearised about the same motion and filtered with the same process noise.
         """
         maps = [
-            _linearised(
-                self.world, theta, self.noise, run, neighbour.trajectory, neighbour
+            _linearise_run(
+                self.evaluator, theta, self.noise, run, neighbour.trajectory, neighbour
             ).interval_maps()
             for run, neighbour in enumerate(self.linear)
         ]
-        runs = LinearRuns.stacked(maps, self.world.observed, self.runs.prior)
+        runs = LinearRuns.stacked(maps, self.evaluator.observed, self.runs.prior)
         coloured, white = with_coloured_noise(runs, self.noise)
         return filter_runs(coloured, self.force, white).whitened
 
@@ -323,7 +327,7 @@ class FollowedRuns:
     @property
     def joints_by_loss(self) -> list[int]:
         """Indices of the joints, in descending order of the loss without process noise."""
-        joints = len(self.world.simulator.system.coordinates)
+        joints = len(self.evaluator.simulator.system.coordinates)
         order: list[int] = np.argsort(-self.losses_without_force[:joints], kind="stable").tolist()
         return order
 
@@ -354,7 +358,7 @@ class FollowedRuns:
         numbers: dict[tuple[str, bytes], int] = {}
         places = []
         for probe in probes:
-            effect, c = self.world.available_effects[probe.effect], probe.coefficients
+            effect, c = self.evaluator.available_effects[probe.effect], probe.coefficients
             parts = [(one, k) for one, k in effect.parts(c[:, None, None]) if k.any()]
             # A member of a family has the same response as the single effect.
             if len(parts) == 1:
@@ -418,7 +422,7 @@ class FollowedRuns:
         )
         initial_changes = np.zeros((len(self.linear), self.runs.prior.size, joint_states.size))
         initial_changes[:, joint_states, np.arange(joint_states.size)] = 1.0
-        result = np.zeros((*self.runs.residuals.shape, len(self.world.states)))
+        result = np.zeros((*self.runs.residuals.shape, len(self.evaluator.states)))
         result[..., : joint_states.size] = self._without_gain(initial_changes)
         return result
 
@@ -472,7 +476,7 @@ class FollowedRuns:
         the valid range of the linear model.
         """
         joints = len(self.linear[0].trajectory.x[0])
-        if len(self.world.states) != 2 * joints:
+        if len(self.evaluator.states) != 2 * joints:
             return None
         prior = self.runs.prior
         velocities = prior[self.linear[0].positions + np.arange(joints)] / VELOCITY_PRIOR
@@ -496,7 +500,7 @@ class FollowedRuns:
         for run, trajectory in enumerate(self.trajectories):
             first_step = int(self.linear[run].knots[0])
             x, v = trajectory.x[first_step].copy(), trajectory.v[first_step].copy()
-            for joint, states in measured_states(self.world, self.noise.sigma, run).items():
+            for joint, states in measured_states(self.evaluator, self.noise.sigma, run).items():
                 x[joint], v[joint] = states[0, :2]
             first_states.append(np.concatenate([x, v]))
         return np.array(first_states)
@@ -583,8 +587,8 @@ def _fit_noise(runs: LinearRuns, noise: NoiseModel, force: Array, typical: Array
     return best
 
 
-def _linearised(
-    world: RunEvaluator,
+def _linearise_run(
+    evaluator: RunEvaluator,
     theta: Array,
     noise: NoiseModel,
     run: int,
@@ -597,28 +601,30 @@ def _linearised(
 
     The motion `trajectory` is estimated from the readings alone if it is None.
     """
-    half = len(world.states) // 2
-    scenario = world.tracks[run].scenario
-    start = world.guess[run, :half], world.guess[run, half:]
-    robot = simulator or world.simulator
+    half = len(evaluator.states) // 2
+    scenario = evaluator.tracks[run].scenario
+    start = evaluator.guess[run, :half], evaluator.guess[run, half:]
+    robot = simulator or evaluator.simulator
     if trajectory is None:
-        states = measured_states(world, noise.sigma, run)
+        states = measured_states(evaluator, noise.sigma, run)
         return MeasuredLinear(robot, theta, scenario, start, measured=states)
     return MeasuredLinear(robot, theta, scenario, start, trajectory, None, neighbour, is_alike)
 
 
-def _prior(world: RunEvaluator, linear: Sequence[MeasuredLinear], size: int) -> Array:
+def _compute_prior_deviations(
+    evaluator: RunEvaluator, linear: Sequence[MeasuredLinear], size: int
+) -> Array:
     """Return standard deviations (Z,) of the first states about the measured motion.
 
     With a stiff servo, the first velocity decays within a sample, so the readings do not determine
     it.
     """
-    coordinates = world.simulator.system.coordinates
+    coordinates = evaluator.simulator.system.coordinates
     prior = np.full(size, 1e-9)
     joints, positions = len(coordinates), linear[0].positions
     speeds = np.max([np.abs(one.trajectory.v).max(axis=0) for one in linear], axis=0)
     for joint, name in enumerate(coordinates[:joints]):
-        if name in world.channels:
+        if name in evaluator.channels:
             prior[joint] = POSITION_PRIOR
             speed = VELOCITY_PRIOR * float(speeds[joint]) + LEAST_PRIOR
             prior[positions + joint] = min(speed, LARGEST_PRIOR)

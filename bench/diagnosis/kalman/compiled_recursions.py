@@ -14,7 +14,7 @@ import numpy as np
 from sims.core.simulator import Array
 
 
-def _compiled(function: Any) -> Any:
+def _compile(function: Any) -> Any:
     """Compile a function, and cache the code if possible.
 
     If numba does not support this Python version, the function runs uncompiled, a hundred times
@@ -32,7 +32,7 @@ def _compiled(function: Any) -> Any:
         return numba.njit(**settings)(function)
 
 
-def _product(a: Array, b: Array, out: Array) -> None:
+def _multiply_sparse(a: Array, b: Array, out: Array) -> None:
     """Write a b to `out`; zeros of a are skipped, because most entries of a are zero."""
     for i in range(a.shape[0]):
         for j in range(b.shape[1]):
@@ -44,7 +44,7 @@ def _product(a: Array, b: Array, out: Array) -> None:
                     out[i, j] += factor * b[k, j]
 
 
-def _sandwich(a: Array, p: Array, half: Array, out: Array) -> None:
+def _propagate_covariance(a: Array, p: Array, half: Array, out: Array) -> None:
     """Write a p aᵀ for a symmetric matrix p to `out`, as a covariance is propagated.
 
     `half` receives the product a p. Only one triangle is computed; the other one is copied.
@@ -65,7 +65,7 @@ def _sandwich(a: Array, p: Array, half: Array, out: Array) -> None:
             out[i, j] = out[j, i]
 
 
-def _filter(
+def _run_filter(
     states: Array,
     defects: Array,
     forces: Array,
@@ -210,7 +210,7 @@ def _filter(
         likelihood[run] = total
 
 
-def _smooth(
+def _run_smoother(
     states: Array,
     forces: Array,
     readings: Array,
@@ -308,7 +308,7 @@ def _smooth(
                 expected[e] += known
 
 
-product: Any = _compiled(_product)
-sandwich: Any = _compiled(_sandwich)
-filter_recursion: Any = _compiled(_filter)
-smoother_recursion: Any = _compiled(_smooth)
+product: Any = _compile(_multiply_sparse)
+sandwich: Any = _compile(_propagate_covariance)
+filter_recursion: Any = _compile(_run_filter)
+smoother_recursion: Any = _compile(_run_smoother)

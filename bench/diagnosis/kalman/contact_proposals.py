@@ -26,46 +26,48 @@ The margin is needed since the estimate depends on a model that may lack causes.
 """
 
 
-def begin_in_contact(worlds: Sequence[RunEvaluator], theta: Array, sigma: Array) -> None:
+def begin_in_contact(evaluators: Sequence[RunEvaluator], theta: Array, sigma: Array) -> None:
     """Estimate the initial states of a robot whose geoms touch.
 
     Args:
-        worlds: runs for fitting, and held-out runs.
+        evaluators: runs for fitting, and held-out runs.
         theta: (P,) parameters of the model.
         sigma: (C,) standard deviation of the noise of each channel.
     """
-    for world in worlds:
-        found = estimate_first_states(world, theta, sigma)
+    for evaluator in evaluators:
+        found = estimate_first_states(evaluator, theta, sigma)
         if found is not None:
-            world.begin_at(found.states, FIRST_STATE_MARGIN * found.deviations)
+            evaluator.begin_at(found.states, FIRST_STATE_MARGIN * found.deviations)
 
 
-def propose_contact_effects(search: EffectSearch, worlds: Sequence[RunEvaluator]) -> None:
+def propose_contact_effects(search: EffectSearch, evaluators: Sequence[RunEvaluator]) -> None:
     """Fit each effect at a contact, and estimate the initial states again with the best model.
 
     Args:
         search: search with the fitted base model; it gets models with one effect each.
-        worlds: its runs, followed by held-out runs, whose initial states are estimated again.
+        evaluators: its runs, followed by held-out runs, whose initial states are estimated again.
     """
-    world, base = search.world, search.base_model.fit
-    names = [name for name in world.library if world.available_effects[name].at == "contact"]
+    evaluator, base = search.evaluator, search.base_model.fit
+    names = [
+        name for name in evaluator.library if evaluator.available_effects[name].at == "contact"
+    ]
     starts = []
     for name in names:
-        low, high = compute_coefficient_bounds(world, name)[0]
+        low, high = compute_coefficient_bounds(evaluator, name)[0]
         for c in (START_SHARES[0] * low, START_SHARES[1] * high):
             theta = base.theta.copy()
-            theta[world.slots[name]] = c
+            theta[evaluator.slots[name]] = c
             starts.append(FitStart((name,), theta, base.states))
     search.refit_models(starts, race=False)
     fits = [search.models[frozenset((name,))] for name in names]
     best = max([search.base_model, *fits], key=lambda model: model.penalised_log_likelihood)
     if not best.effects:
         return
-    begin_in_contact(worlds, best.fit.theta, search.noise.sigma)
+    begin_in_contact(evaluators, best.fit.theta, search.noise.sigma)
     # Sums of squares about other initial states are not comparable.
     known = [search.base_model, *fits]
     search.models.clear()
     search.refit_models(
-        [FitStart(model.effects, model.fit.theta, world.guess) for model in known], race=False
+        [FitStart(model.effects, model.fit.theta, evaluator.guess) for model in known], race=False
     )
     search.fit_to_convergence(search.models[frozenset(best.effects)])

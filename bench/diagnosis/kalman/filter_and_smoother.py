@@ -101,7 +101,7 @@ class LinearRuns:
 
     def subset(self, chosen: Places) -> LinearRuns:
         """Return some of the runs."""
-        return self._mapped(lambda values: values[chosen])
+        return self._map_arrays(lambda values: values[chosen])
 
     def segments(self, length: int) -> LinearRuns:
         """Split the runs into segments of `length` samples, each with the prior of a run.
@@ -119,9 +119,9 @@ class LinearRuns:
             # A segment has one interval fewer than samples.
             return parts if values.shape[1] == samples else parts[:, :-1]
 
-        return self._mapped(cut)
+        return self._map_arrays(cut)
 
-    def _mapped(self, change: Callable[[Any], Any]) -> LinearRuns:
+    def _map_arrays(self, change: Callable[[Any], Any]) -> LinearRuns:
         """Return the runs with a function applied to the arrays of all runs."""
         names = [one.name for one in fields(self) if one.name != "prior"]
         changed: dict[str, Any] = {name: change(getattr(self, name)) for name in names}
@@ -272,9 +272,9 @@ def filter_runs(runs: LinearRuns, force: Array, white: Array) -> Filtered:
     whiteners = np.zeros((number, samples, channels, channels))
     likelihood = np.zeros(number)
     filter_recursion(
-        *_contiguous(runs.states, runs.defects, runs.forces, runs.readings, runs.residuals),
+        *_make_contiguous(runs.states, runs.defects, runs.forces, runs.readings, runs.residuals),
         *(np.square(runs.jumps), variances, runs.prior),
-        *(_completed(force, runs), LARGEST_COVARIANCE),
+        *(_complete_deviations(force, runs), LARGEST_COVARIANCE),
         *(predicted, covariances, innovations, gains, whiteners, likelihood),
     )
     # The likelihood of a model that diverges is set to zero.
@@ -296,8 +296,8 @@ def smooth_runs(runs: LinearRuns, filtered: Filtered, force: Array) -> Smoothed:
     forces = np.zeros((number, samples - 1, count))
     measured, expected = np.zeros(count), np.zeros(count)
     smoother_recursion(
-        *_contiguous(runs.states, runs.forces, runs.readings),
-        _completed(force, runs),
+        *_make_contiguous(runs.states, runs.forces, runs.readings),
+        _complete_deviations(force, runs),
         *(filtered.predicted, filtered.covariances, filtered.innovations),
         *(filtered.gains, filtered.whiteners, states, forces, measured, expected),
     )
@@ -340,12 +340,12 @@ def fit_process_noise(
     return force, filtered, smoothed
 
 
-def _contiguous(*arrays: Array) -> tuple[Array, ...]:
+def _make_contiguous(*arrays: Array) -> tuple[Array, ...]:
     """Return the arrays in the memory layout for which the recursions are compiled."""
     return tuple(np.ascontiguousarray(array) for array in arrays)
 
 
-def _completed(force: Array, runs: LinearRuns) -> Array:
+def _complete_deviations(force: Array, runs: LinearRuns) -> Array:
     """Return the deviations of all columns of G for each run (B, E), including coloured noise."""
     number, columns = len(runs.residuals), runs.forces.shape[3]
     result = np.ones((number, columns))

@@ -55,11 +55,13 @@ class FirstStates(NamedTuple):
     deviations: Array
 
 
-def estimate_first_states(world: RunEvaluator, theta: Array, sigma: Array) -> FirstStates | None:
+def estimate_first_states(
+    evaluator: RunEvaluator, theta: Array, sigma: Array
+) -> FirstStates | None:
     """Estimate the first states of all runs of a robot with contacts.
 
     Args:
-        world: the runs.
+        evaluator: the runs.
         theta: (P,) parameters of the model.
         sigma: (C,) standard deviation of the noise of each channel.
 
@@ -67,7 +69,7 @@ def estimate_first_states(world: RunEvaluator, theta: Array, sigma: Array) -> Fi
         First states with the likeliest missing force of each run; None if the robot has states in
         addition to joints with one coordinate, or if the filter diverges.
     """
-    simulator = world.simulator
+    simulator = evaluator.simulator
     assert isinstance(simulator, RobotSimulator)
     robot, acting = simulator.robot, simulator.get_active_effects(theta[None])
     joints = len(simulator.addresses.positions)
@@ -76,8 +78,8 @@ def estimate_first_states(world: RunEvaluator, theta: Array, sigma: Array) -> Fi
         return None
     typical = compute_joint_scales(robot).force
     states, variances = [], []
-    for number in range(len(world.tracks)):
-        run = _Run(world, simulator, theta, sigma, number)
+    for number in range(len(evaluator.tracks)):
+        run = _Run(evaluator, simulator, theta, sigma, number)
         tried = [run.smoothed(share * typical) for share in FORCE_SHARES]
         best = max(tried, key=lambda one: one.log_likelihood)
         states.append(best.mean)
@@ -98,11 +100,16 @@ class _Run:
     """One run of a robot, for the cubature filter."""
 
     def __init__(
-        self, world: RunEvaluator, simulator: RobotSimulator, theta: Array, sigma: Array, run: int
+        self,
+        evaluator: RunEvaluator,
+        simulator: RobotSimulator,
+        theta: Array,
+        sigma: Array,
+        run: int,
     ) -> None:
         """Compute the inputs over all steps, and find the recorded components of the state."""
-        track = world.tracks[run]
-        self._start = world.guess[run]
+        track = evaluator.tracks[run]
+        self._start = evaluator.guess[run]
         acting = simulator.get_active_effects(theta[None])
         joints = len(simulator.addresses.positions)
         work = RobotRunBatch(
@@ -112,7 +119,7 @@ class _Run:
             self._start[None, :joints],
             self._start[None, joints:],
         )
-        speeds = list(measured_states(world, sigma, run).values())
+        speeds = list(measured_states(evaluator, sigma, run).values())
         fastest = max((float(np.abs(s[:, 1]).max()) for s in speeds), default=1.0)
         self._prior = np.repeat([POSITION_PRIOR, fastest], joints)
         times = work.times
@@ -125,8 +132,8 @@ class _Run:
             (effect, np.repeat(c, self._bench.count, axis=1)) for effect, c in written
         )
         states = [*simulator.system.coordinates, *simulator.system.rates]
-        self._columns = [i for i, name in enumerate(world.channels) if name in states]
-        self._rows = [states.index(world.channels[i]) for i in self._columns]
+        self._columns = [i for i, name in enumerate(evaluator.channels) if name in states]
+        self._rows = [states.index(evaluator.channels[i]) for i in self._columns]
         self._observed = track.observed[:, self._columns]
         self._variances = np.square(sigma[self._columns])
 

@@ -45,7 +45,7 @@ CLEAR = 2.0
 
 
 def identify_base(
-    world: RunEvaluator, noise: NoiseModel, followed: FollowedRuns, is_resisted: bool = False
+    evaluator: RunEvaluator, noise: NoiseModel, followed: FollowedRuns, is_resisted: bool = False
 ) -> tuple[FollowedRuns, dict[str, Bounds]]:
     """Identify the base parameters of a robot from the innovations of a filter.
 
@@ -53,7 +53,7 @@ def identify_base(
     and then set to zero again. Without these effects, a mass would be overestimated.
 
     Args:
-        world: the runs for fitting; ranges that do not contain an estimate are replaced.
+        evaluator: the runs for fitting; ranges that do not contain an estimate are replaced.
         noise: sensor noise.
         followed: the runs, filtered with the nominal parameters.
         is_resisted: whether friction is certain, so that the parameters are not tried without it.
@@ -64,12 +64,16 @@ def identify_base(
     """
 
     def follow(theta: Array, best: FollowedRuns) -> FollowedRuns:
-        world.watch.stage("identifying the base parameters")
-        return FollowedRuns.follow(world, theta, noise, force=best.force)
+        evaluator.watch.stage("identifying the base parameters")
+        return FollowedRuns.follow(evaluator, theta, noise, force=best.force)
 
-    places = world.base.tolist()
-    limits = [range_around(world, i) for i in places]
-    resisting = [(i, b) for name in _resistance(followed) for i, b in _coefficients(world, name)]
+    places = evaluator.base.tolist()
+    limits = [range_around(evaluator, i) for i in places]
+    resisting = [
+        (i, b)
+        for name in _list_resisting_effects(followed)
+        for i, b in _list_coefficients(evaluator, name)
+    ]
     found = []
     for beside in [resisting] if is_resisted else [[], resisting]:
         own = [*places, *(i for i, _ in beside)]
@@ -87,30 +91,30 @@ def identify_base(
     values = {i: float(best.theta[i]) for i in places}
     wider = {}
     for i, value in values.items():
-        low, high = world.parameters[i].bounds
+        low, high = evaluator.parameters[i].bounds
         if not low <= value <= high:
-            wider[world.parameters[i].name] = range_around(world, i, value)
-    use_bounds(world, wider)
+            wider[evaluator.parameters[i].name] = range_around(evaluator, i, value)
+    use_bounds(evaluator, wider)
     theta = followed.theta.copy()
     theta[places] = best.theta[places]
     return follow(theta, best), wider
 
 
-def _resistance(followed: FollowedRuns) -> list[str]:
+def _list_resisting_effects(followed: FollowedRuns) -> list[str]:
     """Return effects that resist the motion of the joints with the largest missing forces."""
-    world = followed.world
-    coordinates = world.simulator.system.coordinates
+    evaluator = followed.evaluator
+    coordinates = evaluator.simulator.system.coordinates
     joints = [coordinates[j].removeprefix("q.") for j in followed.joints_by_loss[:MAX_JOINTS]]
     names = [f"{effect}@{joint}" for joint in joints for effect in RESISTANCE]
-    return [name for name in names if name in world.slots]
+    return [name for name in names if name in evaluator.slots]
 
 
-def _coefficients(world: RunEvaluator, name: str) -> list[tuple[int, Bounds]]:
+def _list_coefficients(evaluator: RunEvaluator, name: str) -> list[tuple[int, Bounds]]:
     """Return indices in theta and bounds of an effect's coefficients."""
     return list(
         zip(
-            world.get_coefficient_indices(name),
-            compute_coefficient_bounds(world, name),
+            evaluator.get_coefficient_indices(name),
+            compute_coefficient_bounds(evaluator, name),
             strict=True,
         )
     )
@@ -139,7 +143,7 @@ def maximise_likelihood(
     """
     best = followed
     for _ in range(iterations):
-        if best.world.watch.has_abandoned_fits():
+        if best.evaluator.watch.has_abandoned_fits():
             break
         step, expected = gauss_newton_step(best, places, bounds)
         if expected < min_gain:
@@ -202,18 +206,23 @@ def compute_information(
 def _derivatives(followed: FollowedRuns, places: Sequence[int], bounds: Sequence[Bounds]) -> Array:
     """Return minus the derivatives (R T C, n) of the whitened innovations by n parameters."""
     target = followed.filtered.whitened
-    columns = [_derivative(followed, target, i, b) for i, b in zip(places, bounds, strict=True)]
+    columns = [
+        _compute_innovation_derivative(followed, target, i, b)
+        for i, b in zip(places, bounds, strict=True)
+    ]
     return np.stack(columns, axis=-1).reshape(-1, len(places))
 
 
-def _derivative(followed: FollowedRuns, target: Array, place: int, bounds: Bounds) -> Array:
+def _compute_innovation_derivative(
+    followed: FollowedRuns, target: Array, place: int, bounds: Bounds
+) -> Array:
     """Return minus the derivative (R, T, C) of the whitened innovations by one parameter.
 
     It is a one-sided difference that stays within the bounds. `target` has the innovations at the
     present parameters, and `place` is the index of the parameter in theta.
     """
     low, high = bounds
-    first, last = followed.world.parameters[place].bounds
+    first, last = followed.evaluator.parameters[place].bounds
     step = DIFFERENCE * min(last - first, high - low)
     # A parameter without a range has no derivative.
     if not step > 0:

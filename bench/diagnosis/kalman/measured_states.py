@@ -23,35 +23,37 @@ JERKS = 10.0 ** np.arange(-2.0, 3.1, 1.0)
 """Sizes of the jerk that are tried, in units of the range of positions over seconds cubed."""
 
 
-def measured_states(world: RunEvaluator, sigma: Array, run: int) -> Mapping[int, Array]:
+def measured_states(evaluator: RunEvaluator, sigma: Array, run: int) -> Mapping[int, Array]:
     """Estimate positions, velocities and accelerations of the recorded joints of one run.
 
     Args:
-        world: the runs.
+        evaluator: the runs.
         sigma: (C,) standard deviation of the noise of each channel.
         run: index of the run.
 
     Returns:
         States (T, 3) at the samples, by index of the joint.
     """
-    if run not in world.measured:
-        world.measured[run] = _measured(world, sigma, run)
-    return world.measured[run]
+    if run not in evaluator.measured:
+        evaluator.measured[run] = _compute_measured_states(evaluator, sigma, run)
+    return evaluator.measured[run]
 
 
-def _measured(world: RunEvaluator, sigma: Array, run: int) -> Mapping[int, Array]:
+def _compute_measured_states(
+    evaluator: RunEvaluator, sigma: Array, run: int
+) -> Mapping[int, Array]:
     """Compute the result of `measured_states` for a run that is not in its cache.
 
     Joints with fewer than three recorded positions are left out.
     """
-    coordinates, rates = world.simulator.system.coordinates, world.simulator.system.rates
-    track = world.tracks[run]
+    coordinates, rates = evaluator.simulator.system.coordinates, evaluator.simulator.system.rates
+    track = evaluator.tracks[run]
     times, observed = track.scenario.times, track.observed
     joints, readings = [], []
     for joint, names in enumerate(zip(coordinates, rates, strict=True)):
-        if names[0] not in world.channels:
+        if names[0] not in evaluator.channels:
             continue
-        columns = [world.channels.index(n) if n in world.channels else -1 for n in names]
+        columns = [evaluator.channels.index(n) if n in evaluator.channels else -1 for n in names]
         values = [observed[:, c] if c >= 0 else np.full(times.size, np.nan) for c in columns]
         noise = [sigma[c] if c >= 0 else 1.0 for c in columns]
         if np.isfinite(values[0]).sum() < 3:

@@ -68,18 +68,18 @@ class EffectProposals:
             current: the set.
             max_joint_proposals: maximum number of effects of the joint and servo models.
         """
-        world, count = self.filters.world, len(self.columns.library.probes)
-        proposed = self._propose(current) if current.names else self._for_base.get(count)
+        evaluator, count = self.filters.evaluator, len(self.columns.library.probes)
+        proposed = self._propose_effects(current) if current.names else self._for_base.get(count)
         if proposed is None:
-            proposed = self._for_base[count] = self._propose(current)
+            proposed = self._for_base[count] = self._propose_effects(current)
         by_regression, joint_model = proposed
-        present_model = FitStart(current.names, current.followed.theta, world.guess)
+        present_model = FitStart(current.names, current.followed.theta, evaluator.guess)
         return [
-            with_effect(world, present_model, name, c)
+            with_effect(evaluator, present_model, name, c)
             for name, c in by_regression + joint_model[:max_joint_proposals]
         ]
 
-    def _propose(self, current: FilteredSet) -> tuple[Proposals, Proposals]:
+    def _propose_effects(self, current: FilteredSet) -> tuple[Proposals, Proposals]:
         """Return all proposals, with those of the joint and servo models in a separate list."""
         by_regression = self._by_regression(current)
         excluded, joint = {*current.names, *dict(by_regression)}, current.followed.joints_by_loss[0]
@@ -114,19 +114,19 @@ class EffectProposals:
 
         The derivative by more friction does not show the effect of less friction.
         """
-        world, place = self.filters.world, joint_name(self.filters.world, joint)
+        evaluator, place = self.filters.evaluator, joint_name(self.filters.evaluator, joint)
         coefficients = {
-            f"sensor.bias@q.{place}": offset_from_command(world, self.filters.noise, joint)
+            f"sensor.bias@q.{place}": offset_from_command(evaluator, self.filters.noise, joint)
         }
         friction = f"friction.coulomb@{place}"
-        if friction in world.library:
+        if friction in evaluator.library:
             coefficients[friction] = FIRST_SHARE * min(
-                compute_coefficient_bounds(world, friction)[0][0], 0.0
+                compute_coefficient_bounds(evaluator, friction)[0][0], 0.0
             )
         return [
             (name, np.array([c]))
             for name, c in coefficients.items()
-            if c and name in world.library and name not in excluded
+            if c and name in evaluator.library and name not in excluded
         ]
 
     def _joint_model(
@@ -136,19 +136,19 @@ class EffectProposals:
 
         They are in descending order of their gain in likelihood.
         """
-        world, place = self.filters.world, joint_name(self.filters.world, joint)
-        assert isinstance(world.simulator, RobotSimulator)
+        evaluator, place = self.filters.evaluator, joint_name(self.filters.evaluator, joint)
+        assert isinstance(evaluator.simulator, RobotSimulator)
         speed = max(float(np.abs(one.trajectory.v[:, joint]).max()) for one in followed.linear)
         typical = {
             f"drag.linear@{place}": FIRST_SHARE * float(followed.typical[joint]) / max(speed, 1e-9),
             f"inertia.armature@{place}": float(
-                compute_joint_scales(world.simulator.robot).inertia[joint]
+                compute_joint_scales(evaluator.simulator.robot).inertia[joint]
             ),
         }
         proposals = []
         for name in self._effects_at(joint):
             if name not in excluded:
-                places = world.get_coefficient_indices(name)
+                places = evaluator.get_coefficient_indices(name)
                 step, gain = self._gauss_newton_step(followed, name)
                 change = float(step[places[0]])
                 # If much process noise hides an effect, its typical size is tried.
@@ -167,29 +167,32 @@ class EffectProposals:
         Args:
             friction: name of the dry friction.
         """
-        world, base = self.filters.world, self.filters.base
+        evaluator, base = self.filters.evaluator, self.filters.base
         place = friction.partition("@")[2]
-        joints = len(world.simulator.system.coordinates)
-        joint = next(j for j in range(joints) if joint_name(world, j) == place)
+        joints = len(evaluator.simulator.system.coordinates)
+        joint = next(j for j in range(joints) if joint_name(evaluator, j) == place)
         others = [name for name in self._effects_at(joint) if name != friction]
         return max((self._gauss_newton_step(base, name)[1] for name in others), default=0.0)
 
     def _effects_at(self, joint: int) -> list[str]:
         """Return the effects of the joint model of a joint, and of the model of its servo."""
-        world = self.filters.world
-        place, servo = joint_name(world, joint), servo_input(world, joint).removeprefix("u.")
+        evaluator = self.filters.evaluator
+        place, servo = (
+            joint_name(evaluator, joint),
+            servo_input(evaluator, joint).removeprefix("u."),
+        )
         names = [f"{effect}@{place}" for effect in JOINT_MODEL]
         names += [f"{effect}@{servo}" for effect in SERVO_MODEL]
-        return [name for name in names if name in world.library]
+        return [name for name in names if name in evaluator.library]
 
     def _gauss_newton_step(self, followed: FollowedRuns, name: str) -> tuple[Array, float]:
         """Return the Gauss-Newton step of an effect alone, cached for the base model."""
         if followed is self.filters.base and name in self._base_steps:
             return self._base_steps[name]
-        world = self.filters.world
+        evaluator = self.filters.evaluator
         places, bounds = (
-            world.get_coefficient_indices(name),
-            compute_coefficient_bounds(world, name),
+            evaluator.get_coefficient_indices(name),
+            compute_coefficient_bounds(evaluator, name),
         )
         found = gauss_newton_step(followed, places, bounds)
         if followed is self.filters.base:
@@ -221,6 +224,6 @@ class SearchContext:
         return cls(search, filters, columns, EffectProposals(filters, columns))
 
     @property
-    def world(self) -> RunEvaluator:
+    def evaluator(self) -> RunEvaluator:
         """The runs for fitting."""
-        return self.search.world
+        return self.search.evaluator

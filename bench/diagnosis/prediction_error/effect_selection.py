@@ -135,7 +135,9 @@ def regress(
         grams[run] = rows.T @ rows
         crosses[run] = rows.T @ target
         totals[run] = target @ target
-    contains = {name: effect.contains for name, effect in followed.world.available_effects.items()}
+    contains = {
+        name: effect.contains for name, effect in followed.evaluator.available_effects.items()
+    }
     groups = [g for g in groups_of(columns.probes) if not set(g.column_indices) & set(always)]
     samples = int(followed.runs.recorded.sum())
     return Regression(groups, grams, crosses, totals, samples, contains, (count, *always))

@@ -59,7 +59,7 @@ def add_to_model(context: SearchContext, model: FittedModel) -> FittedModel:
         model: the fitted model.
     """
     current = FilteredSet(context.filters.of_model(model), model.effects)
-    larger = _grow(context, current)
+    larger = _grow_set(context, current)
     if larger is current:
         return model
     return without_idle_effects(context, fit_filtered(context, larger))
@@ -96,7 +96,7 @@ def select_in_model(context: SearchContext, friction: FitStart | None = None) ->
     Raises:
         SoftFrictionError: dry friction is likelier in MuJoCo's soft form.
     """
-    watch, filters, base = context.world.watch, context.filters, context.search.base_model
+    watch, filters, base = context.evaluator.watch, context.filters, context.search.base_model
     current = filters.empty_set
     if friction is not None:
         current = filters.with_effects(friction.theta, friction.effects)
@@ -114,7 +114,7 @@ def select_in_model(context: SearchContext, friction: FitStart | None = None) ->
         best = higher_merit(best, _fit_all_servos(context))
     # Two effects together may explain what neither explains alone.
     if larger_sets and not is_explained(context, best) and not watch.has_abandoned_fits():
-        best = higher_merit(best, fit_filtered(context, _grow(context, larger_sets[0])))
+        best = higher_merit(best, fit_filtered(context, _grow_set(context, larger_sets[0])))
     if not np.isfinite(best.fit.cost) or not best.effects:
         return base
     if not is_explained(context, best):
@@ -122,7 +122,7 @@ def select_in_model(context: SearchContext, friction: FitStart | None = None) ->
     return without_idle_effects(context, best)
 
 
-def _grow(context: SearchContext, current: FilteredSet) -> FilteredSet:
+def _grow_set(context: SearchContext, current: FilteredSet) -> FilteredSet:
     """Add one effect after another to a set, each time the one with the largest likelihood.
 
     It stops if no effect is worth its penalty, or if the filter lacks no force any more.
@@ -162,14 +162,14 @@ def try_one_more(context: SearchContext, current: FilteredSet) -> list[FilteredS
     Returns:
         The larger sets, the likeliest first; empty if no effect gains.
     """
-    watch, filters = context.world.watch, context.filters
+    watch, filters = context.evaluator.watch, context.filters
     watch.stage("testing the effects of the model one by one", MAX_REGRESSION_PROPOSALS)
     larger_sets = []
     for start in context.proposals.of(current):
         larger_sets.append(filters.with_effects(start.theta, start.effects, 0))
         watch.advance()
         watch.check_not_stopped()
-    larger_sets.sort(key=lambda one: _criterion(context, one))
+    larger_sets.sort(key=lambda one: _compute_criterion(context, one))
     # The coefficients of the best are improved before they are compared.
     compared = list[FilteredSet]()
     for one in larger_sets[:MAX_IMPROVED_TRIALS]:
@@ -177,14 +177,14 @@ def try_one_more(context: SearchContext, current: FilteredSet) -> list[FilteredS
             compared.append(one)
             continue
         compared.append(filters.with_effects(one.followed.theta, one.names))
-        compared.sort(key=lambda one: _criterion(context, one))
+        compared.sort(key=lambda one: _compute_criterion(context, one))
     return compared
 
 
 def _is_settled(context: SearchContext, best: FilteredSet, other: FilteredSet) -> bool:
     """Return whether a set explains the runs, and another one is far worse."""
-    behind = _criterion(context, other) - _criterion(context, best)
-    is_far_behind = behind > RIVAL_MARGIN + SETTLED_SHARE * _gain(context, best)
+    behind = _compute_criterion(context, other) - _compute_criterion(context, best)
+    is_far_behind = behind > RIVAL_MARGIN + SETTLED_SHARE * _compute_gain(context, best)
     return is_far_behind and not best.followed.lacks_force
 
 
@@ -198,19 +198,19 @@ def _nearly_as_likely(
     """
     if not larger_sets:
         return ()
-    error = LINEARISATION_ERROR * _gain(context, larger_sets[0])
-    limit = _criterion(context, larger_sets[0]) + RIVAL_MARGIN + error
-    near_sets = [one for one in larger_sets if _criterion(context, one) <= limit]
+    error = LINEARISATION_ERROR * _compute_gain(context, larger_sets[0])
+    limit = _compute_criterion(context, larger_sets[0]) + RIVAL_MARGIN + error
+    near_sets = [one for one in larger_sets if _compute_criterion(context, one) <= limit]
     return [*near_sets, *larger_sets[len(near_sets) : MAX_FIRST_EFFECTS]]
 
 
-def _gain(context: SearchContext, current: FilteredSet) -> float:
+def _compute_gain(context: SearchContext, current: FilteredSet) -> float:
     """Return the gain of a set over the base model in twice the log likelihood."""
     base = context.filters.log_likelihood(context.filters.reference)
     return 2.0 * (current.followed.log_likelihood - base)
 
 
-def _criterion(context: SearchContext, current: FilteredSet) -> float:
+def _compute_criterion(context: SearchContext, current: FilteredSet) -> float:
     """Return the penalised log likelihood of a set's last effect, as an information criterion."""
     penalty = context.filters.penalty(current.names[-1])
     return penalty - 2.0 * current.followed.log_likelihood
@@ -224,6 +224,6 @@ def _fit_all_servos(context: SearchContext) -> FittedModel:
     names = [f"{effect}@*" for effect in SERVO_MODEL]
     filters = context.filters
     several = filters.base.missing_forces.sum() > 1
-    if not several or not set(names) <= set(context.world.library):
+    if not several or not set(names) <= set(context.evaluator.library):
         return context.search.base_model
     return fit_filtered(context, filters.with_effects(filters.reference, names, ALL_SERVOS_STEPS))

@@ -144,10 +144,10 @@ def without_inactive_drives(recording: Recording, kind: type[Simulator]) -> Reco
     left_out = [np.zeros(run.times.size, dtype=bool) for run in runs]
     unexplained: list[InactiveDrive] = []
     for drive in drives:
-        switches = [] if drive.is_held else _switches(recording, drive)
+        switches = [] if drive.is_held else _find_switches(recording, drive)
         if not switches:
             unexplained.append(drive)
-            left_out = [a | _widened(b) for a, b in zip(left_out, drive.masks, strict=True)]
+            left_out = [a | _widen_mask(b) for a, b in zip(left_out, drive.masks, strict=True)]
             continue
         runs, said = switched_runs(recording.path, runs, switches)
         lines = " and ".join(switch.line for switch in switches)
@@ -160,12 +160,12 @@ def without_inactive_drives(recording: Recording, kind: type[Simulator]) -> Reco
     pairs = zip(runs, left_out, strict=True)
     kept = [part for run, mask in pairs for part in parts_without(run, mask)]
     if unexplained and any(not run.held_out for run in kept):
-        notes += [_message(recording, unexplained, left_out)]
+        notes += [_format_message(recording, unexplained, left_out)]
         runs = tuple(kept)
     return replace(recording, runs=tuple(runs), notes=tuple(notes))
 
 
-def _message(
+def _format_message(
     recording: Recording, drives: Sequence[InactiveDrive], left_out: Sequence[Mask]
 ) -> str:
     """Write the note on samples with inactive drives that were left out.
@@ -189,7 +189,7 @@ def _message(
     )
 
 
-def _switches(recording: Recording, drive: InactiveDrive) -> list[DriveSwitch]:
+def _find_switches(recording: Recording, drive: InactiveDrive) -> list[DriveSwitch]:
     """Return switches of a drive's actuators from the first column that shows when it is off."""
     for column in recording.runs[0].extra:
         for zero_is_off in (True, False):
@@ -210,7 +210,7 @@ def _changing_column(recording: Recording, drives: Sequence[InactiveDrive]) -> s
             values = run.extra[column]
             changes = np.flatnonzero(np.diff(values) != 0) + 1
             found = np.any([drive.masks[number] for drive in drives], axis=0)
-            near = _widened(found) & _widened(~found)
+            near = _widen_mask(found) & _widen_mask(~found)
             hits += int(near[changes].sum())
             others += int((~near[changes]).sum())
         if hits and not others:
@@ -218,7 +218,7 @@ def _changing_column(recording: Recording, drives: Sequence[InactiveDrive]) -> s
     return ""
 
 
-def _widened(mask: Mask) -> Mask:
+def _widen_mask(mask: Mask) -> Mask:
     """Return a mask that is extended by some samples on either side."""
     wide: Mask = np.convolve(mask, np.ones(2 * EDGE_SAMPLES + 1), mode="same") > 0.5
     return wide
@@ -243,7 +243,9 @@ def inactive_drives(recording: Recording, kind: type[Simulator]) -> list[Inactiv
     total = sum(run.times.size for run in recording.runs)
     every = -(-total // MAX_SAMPLES)
     with np.errstate(all="ignore"):
-        forces = [compute_joint_forces(robot, recording, run) for run in _thinned(recording, every)]
+        forces = [
+            compute_joint_forces(robot, recording, run) for run in _thin_runs(recording, every)
+        ]
     driven = [a for a in robot.actuators if a.joint is not None and a.kind != "other"]
     actuators = {
         number: tuple(a.name for a in driven if a.joint == joint.name)
@@ -274,7 +276,7 @@ def inactive_drives(recording: Recording, kind: type[Simulator]) -> list[Inactiv
     ]
 
 
-def _thinned(recording: Recording, every: int) -> list[Run]:
+def _thin_runs(recording: Recording, every: int) -> list[Run]:
     """Return every k-th sample of all runs."""
     return [run.part(slice(None, None, every)) for run in recording.runs]
 
@@ -305,40 +307,42 @@ class _Stretches:
         self._residuals = [[one.residuals(joint) for one in forces] for joint in joints]
         self.costs = [np.zeros((2, len(one.needed))) for one in forces]
         for of_runs in self._residuals:
-            for cost, more in zip(self.costs, _costs(of_runs, state), strict=True):
+            for cost, more in zip(self.costs, _compute_costs(of_runs, state), strict=True):
                 cost += more
-        masks = [_without_short_stretches(_likeliest(cost)) for cost in self.costs]
+        masks = [_without_short_stretches(_choose_second_hypothesis(cost)) for cost in self.costs]
         if max(len(spans(mask)) for mask in masks) > MAX_STRETCHES:
             masks = [np.zeros_like(mask) for mask in masks]
-        self.masks = self._accepted(masks)
+        self.masks = self._accept_masks(masks)
 
     def any(self) -> bool:
         """Return whether there is an interval."""
         return any(mask.any() for mask in self.masks)
 
-    def _accepted(self, masks: Sequence[Mask]) -> list[Mask]:
+    def _accept_masks(self, masks: Sequence[Mask]) -> list[Mask]:
         """Return masks (T,) if they fulfil the conditions of the module docstring, else empty ones.
 
         Single intervals that do not fulfil them are removed.
         """
         nothing = [np.zeros_like(mask) for mask in masks]
-        working = [~_widened(mask) for mask in masks]
+        working = [~_widen_mask(mask) for mask in masks]
         inner = [_without_edges(mask) for mask in masks]
         if (
             min(sum(int(m.sum()) for m in of_runs) for of_runs in (working, inner))
             < MIN_SAMPLES // 2
         ):
             return nothing
-        missed = self._magnitudes(ON, working)
-        usual = self._magnitudes(self.state, working)
-        driven = self._magnitudes(ON, inner)
-        left = self._magnitudes(self.state, inner)
+        missed = self._compute_residual_magnitudes(ON, working)
+        usual = self._compute_residual_magnitudes(self.state, working)
+        driven = self._compute_residual_magnitudes(ON, inner)
+        left = self._compute_residual_magnitudes(self.state, inner)
         is_worse = any(d >= MIN_MISSED_RATIO * m for d, m in zip(driven, missed, strict=True))
         is_small = all(e <= MAX_RESIDUAL_SHARE * u for e, u in zip(left, usual, strict=True))
         if not (is_worse and is_small and sum(left) <= MAX_RESIDUAL_SHARE * sum(driven)):
             return nothing
         fast = [
-            _magnitude(np.concatenate([f.velocity[m, j] for f, m in self._paired(working)]))
+            _compute_magnitude(
+                np.concatenate([f.velocity[m, j] for f, m in self._pair_with_forces(working)])
+            )
             for j in self._joints
         ]
         result = []
@@ -347,23 +351,25 @@ class _Stretches:
             for first, end in spans(mask):
                 own = [np.zeros_like(m) for m in masks]
                 own[run][first:end] = within[first:end]
-                better = sum(self._magnitudes(self.state, own)) <= MAX_STRETCH_SHARE * sum(
-                    self._magnitudes(ON, own)
-                )
+                better = sum(
+                    self._compute_residual_magnitudes(self.state, own)
+                ) <= MAX_STRETCH_SHARE * sum(self._compute_residual_magnitudes(ON, own))
                 standing[first:end] = better and (
                     self.state == OFF or self._is_still(run, own[run], (first, end), fast)
                 )
             result.append(standing)
         return result
 
-    def _paired(self, masks: Sequence[Mask]) -> zip[tuple[JointForces, Mask]]:
+    def _pair_with_forces(self, masks: Sequence[Mask]) -> zip[tuple[JointForces, Mask]]:
         """Pair forces of runs with masks."""
         return zip(self._forces, masks, strict=True)
 
-    def _magnitudes(self, state: int, masks: Sequence[Mask]) -> list[float]:
+    def _compute_residual_magnitudes(self, state: int, masks: Sequence[Mask]) -> list[float]:
         """Return the magnitude of the residuals of a hypothesis within masks (T,), by joint."""
         return [
-            _magnitude(np.concatenate([r[state, m] for r, m in zip(of_runs, masks, strict=True)]))
+            _compute_magnitude(
+                np.concatenate([r[state, m] for r, m in zip(of_runs, masks, strict=True)])
+            )
             for of_runs in self._residuals
         ]
 
@@ -372,7 +378,7 @@ class _Stretches:
         velocity = self._forces[run].velocity
         at_end = ends[0] <= EDGE_SAMPLES or ends[1] >= mask.size - EDGE_SAMPLES
         still = [
-            _magnitude(velocity[mask, j]) <= MAX_STILL_SPEED * f
+            _compute_magnitude(velocity[mask, j]) <= MAX_STILL_SPEED * f
             for j, f in zip(self._joints, fast, strict=True)
         ]
         return at_end and all(still)
@@ -386,7 +392,7 @@ def _without_edges(mask: Mask) -> Mask:
     return result
 
 
-def _costs(residuals: Sequence[Array], state: int) -> list[Array]:
+def _compute_costs(residuals: Sequence[Array], state: int) -> list[Array]:
     """Return costs (2, T) in each run, of an active drive and of a hypothesis about one joint."""
     chosen = [ON, state]
     pooled = np.concatenate(residuals, axis=1)[chosen]
@@ -394,7 +400,7 @@ def _costs(residuals: Sequence[Array], state: int) -> list[Array]:
     if not pooled.size:
         return [np.zeros((2, r.shape[1])) for r in residuals]
     scale = float(np.median(np.abs(pooled).min(axis=0)))
-    scale = max(scale, MIN_SCALE_SHARE * _magnitude(pooled[1]))
+    scale = max(scale, MIN_SCALE_SHARE * _compute_magnitude(pooled[1]))
     if not scale > 0:
         return [np.zeros((2, r.shape[1])) for r in residuals]
     return [
@@ -405,7 +411,7 @@ def _costs(residuals: Sequence[Array], state: int) -> list[Array]:
     ]
 
 
-def _likeliest(costs: Array) -> Mask:
+def _choose_second_hypothesis(costs: Array) -> Mask:
     """Return where the second of two hypotheses is chosen (T,), from costs (2, T).
 
     Dynamic programming finds the sequence with the lowest cost.
@@ -434,7 +440,7 @@ def _without_short_stretches(mask: Mask) -> Mask:
     return result
 
 
-def _magnitude(values: Array) -> float:
+def _compute_magnitude(values: Array) -> float:
     """Return a quantile of magnitudes (n,).
 
     It excludes impacts, which the smoothed motion does not reproduce.

@@ -104,14 +104,14 @@ def identify_incomplete(context: SearchContext) -> IdentifiedSet | None:
         The identified set; None if the runs are short or nearly explained, if no effect pays, or
         if the set lacks no force, so that a simulation can be fitted.
     """
-    world, filters = context.world, context.filters
+    evaluator, filters = context.evaluator, context.filters
     excess = context.search.compute_excess(context.search.base_model)
-    if not is_long(world) or not excess > MIN_EXCESS or world.watch.has_abandoned_fits():
+    if not is_long(evaluator) or not excess > MIN_EXCESS or evaluator.watch.has_abandoned_fits():
         return None
-    world.watch.stage("identifying the joints and bodies")
+    evaluator.watch.stage("identifying the joints and bodies")
     textbook = [
         name
-        for name in world.library
+        for name in evaluator.library
         if name.partition("@")[0] in TEXTBOOK_EFFECTS and not name.endswith("@*")
     ]
     current, gains = _pruned(context, _maximised(context, filters.base, textbook))
@@ -127,10 +127,10 @@ def identify_incomplete(context: SearchContext) -> IdentifiedSet | None:
     return IdentifiedSet(_simulated(context, current), gains)
 
 
-def is_long(world: RunEvaluator) -> bool:
+def is_long(evaluator: RunEvaluator) -> bool:
     """Return whether all runs of a robot with few joints are long."""
-    few = len(world.simulator.system.coordinates) <= MAX_JOINTS
-    return few and all(run.times[-1] - run.times[0] >= MIN_SECONDS for run in world.runs)
+    few = len(evaluator.simulator.system.coordinates) <= MAX_JOINTS
+    return few and all(run.times[-1] - run.times[0] >= MIN_SECONDS for run in evaluator.runs)
 
 
 def _is_negligible(context: SearchContext, current: FilteredSet) -> bool:
@@ -141,12 +141,12 @@ def _is_negligible(context: SearchContext, current: FilteredSet) -> bool:
 
 def _places(context: SearchContext, names: Sequence[str]) -> tuple[list[int], list[Bounds]]:
     """Return the indices in theta and the bounds of the base parameters and of some effects."""
-    world = context.world
-    base = [i for i in world.base.tolist() if i not in context.search.frozen]
-    places, bounds = list(base), [range_around(world, i) for i in base]
+    evaluator = context.evaluator
+    base = [i for i in evaluator.base.tolist() if i not in context.search.frozen]
+    places, bounds = list(base), [range_around(evaluator, i) for i in base]
     for name in names:
-        places += world.get_coefficient_indices(name)
-        bounds += compute_coefficient_bounds(world, name)
+        places += evaluator.get_coefficient_indices(name)
+        bounds += compute_coefficient_bounds(evaluator, name)
     return places, bounds
 
 
@@ -154,7 +154,7 @@ def _maximised(context: SearchContext, followed: FollowedRuns, names: Sequence[s
     """Maximise the likelihood of the innovations with effects in the filter's model."""
 
     def follow(theta: Array, best: FollowedRuns) -> FollowedRuns:
-        context.world.watch.check_not_stopped()
+        context.evaluator.watch.check_not_stopped()
         return best.with_parameters(theta)
 
     reference = context.filters.log_likelihood(context.filters.reference)
@@ -181,7 +181,7 @@ def _wald_statistics(
     covariance = np.linalg.pinv(information.matrix[np.ix_(rows, rows)], hermitian=True)
     gains = {}
     for name in names:
-        own_places = context.world.get_coefficient_indices(name)
+        own_places = context.evaluator.get_coefficient_indices(name)
         own = [places.index(i) for i in own_places]
         inverse = np.linalg.pinv(covariance[np.ix_(own, own)], hermitian=True)
         c = theta[own_places]
@@ -218,7 +218,7 @@ def _pruned(context: SearchContext, current: FilteredSet) -> tuple[FilteredSet, 
         return current, gains
     theta = followed.theta.copy()
     for name in set(current.names) - set(names):
-        theta[context.world.slots[name]] = 0.0
+        theta[context.evaluator.slots[name]] = 0.0
     if not np.array_equal(theta, followed.theta):
         followed = followed.with_parameters(theta)
     # Effects without influence leave the other coefficients as they are.
@@ -229,7 +229,7 @@ def _pruned(context: SearchContext, current: FilteredSet) -> tuple[FilteredSet, 
 
 def _with_next(context: SearchContext, current: FilteredSet) -> FilteredSet | None:
     """Add the effect that gains most by regression, in place of the effects that it contains."""
-    world, columns = context.world, context.filters.base.columns(_probes(context))
+    evaluator, columns = context.evaluator, context.filters.base.columns(_probes(context))
     regression, _ = regression_about(current, columns, current.followed)
     gains = regression.net_gains()
     for i, group in enumerate(regression.groups):
@@ -238,12 +238,12 @@ def _with_next(context: SearchContext, current: FilteredSet) -> FilteredSet | No
     if not gains.max() > 0.0:
         return None
     name, (solution,) = best.effect, regression.solve([best])[1]
-    c = group_coefficients(world, columns.probes, best, solution)
-    contained = set(world.available_effects[name].contains)
+    c = group_coefficients(evaluator, columns.probes, best, solution)
+    contained = set(evaluator.available_effects[name].contains)
     theta = current.followed.theta.copy()
-    theta[world.slots[name]] = c
+    theta[evaluator.slots[name]] = c
     for one in contained & set(current.names):
-        theta[world.slots[one]] = 0.0
+        theta[evaluator.slots[one]] = 0.0
     names = [*(one for one in current.names if one not in contained), name]
     larger = _maximised(context, current.followed.with_parameters(theta), names)
     gain = 2.0 * (larger.followed.log_likelihood - current.followed.log_likelihood)
@@ -252,26 +252,26 @@ def _with_next(context: SearchContext, current: FilteredSet) -> FilteredSet | No
 
 def _probes(context: SearchContext) -> list[CandidateDirection]:
     """Return probes of the laws that may be added: one place, few coefficients and few shapes."""
-    world = context.world
+    evaluator = context.evaluator
     names = [
         name
-        for name in world.library
+        for name in evaluator.library
         if not name.endswith("@*")
         and not has_many_shapes(name)
-        and len(world.get_coefficient_indices(name)) <= MAX_IMPROVED_SIZE
+        and len(evaluator.get_coefficient_indices(name)) <= MAX_IMPROVED_SIZE
     ]
     return context.columns.probes(names)
 
 
 def _simulated(context: SearchContext, current: FilteredSet) -> FittedModel:
     """Simulate the runs with the parameters of a filter, from fitted initial states."""
-    world, search = context.world, context.search
+    evaluator, search = context.evaluator, context.search
     theta, states = current.followed.theta, context.filters.first_states(current.followed)
     start = FitStart(current.names, theta, states)
-    (begun,) = TrajectoryFitter(world, search.noise, search.frozen, parameters=False).fit_models(
-        [start], STATE_ITERATIONS
-    )
-    (fit,) = TrajectoryFitter(world, search.noise, search.frozen).fit_models(
+    (begun,) = TrajectoryFitter(
+        evaluator, search.noise, search.frozen, parameters=False
+    ).fit_models([start], STATE_ITERATIONS)
+    (fit,) = TrajectoryFitter(evaluator, search.noise, search.frozen).fit_models(
         [replace(start, states=begun.states)], 0
     )
     return search.add_fit(fit)

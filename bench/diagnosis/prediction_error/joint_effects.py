@@ -33,85 +33,85 @@ OFFSET_THRESHOLD = 10.0
 """Minimum difference of positions, as a multiple of the noise, that is an encoder offset."""
 
 
-def joint_name(world: RunEvaluator, joint: int) -> str:
+def joint_name(evaluator: RunEvaluator, joint: int) -> str:
     """Return the name of a joint.
 
     Args:
-        world: the runs.
+        evaluator: the runs.
         joint: index of the joint.
     """
-    coordinate: str = world.simulator.system.coordinates[joint]
+    coordinate: str = evaluator.simulator.system.coordinates[joint]
     return coordinate.removeprefix("q.")
 
 
-def servo_input(world: RunEvaluator, joint: int) -> str:
+def servo_input(evaluator: RunEvaluator, joint: int) -> str:
     """Return the input of the position servo of a joint; empty if it has none.
 
     Args:
-        world: the runs.
+        evaluator: the runs.
         joint: index of the joint.
     """
-    return str(getattr(world.simulator.system, "servos", {}).get(joint, ""))
+    return str(getattr(evaluator.simulator.system, "servos", {}).get(joint, ""))
 
 
-def acts_at(world: RunEvaluator, name: str, joints: Collection[int]) -> bool:
+def acts_at(evaluator: RunEvaluator, name: str, joints: Collection[int]) -> bool:
     """Return whether an effect acts at one of the given joints.
 
     Args:
-        world: the runs.
+        evaluator: the runs.
         name: name of the effect.
         joints: indices of the joints.
     """
-    names = {joint_name(world, joint) for joint in joints}
+    names = {joint_name(evaluator, joint) for joint in joints}
     return any(
         member.coordinate in joints or member.signal.partition(".")[2] in names
-        for member in members_of(world.available_effects[name])
+        for member in members_of(evaluator.available_effects[name])
     )
 
 
-def plain_effects_beside(world: RunEvaluator, name: str) -> set[str]:
+def plain_effects_beside(evaluator: RunEvaluator, name: str) -> set[str]:
     """Return the effects of the joint and servo models at the joint where an effect acts.
 
     Args:
-        world: the runs.
+        evaluator: the runs.
         name: name of the effect.
     """
-    count = len(world.simulator.system.coordinates)
-    joints = {joint for joint in range(count) if acts_at(world, name, {joint})}
+    count = len(evaluator.simulator.system.coordinates)
+    joints = {joint for joint in range(count) if acts_at(evaluator, name, {joint})}
     return {
         other
-        for other in world.library
+        for other in evaluator.library
         if other.partition("@")[0] in JOINT_MODEL + SERVO_MODEL
         and not other.endswith("@*")
-        and acts_at(world, other, joints)
+        and acts_at(evaluator, other, joints)
     }
 
 
-def at_coupled_joints(world: RunEvaluator, name: str) -> list[str]:
+def at_coupled_joints(evaluator: RunEvaluator, name: str) -> list[str]:
     """Return the names of an effect at the other joints of its kinematic loop.
 
     It may act equivalently there, because a filter gives little information on unmeasured joints.
 
     Args:
-        world: the runs.
+        evaluator: the runs.
         name: name of the effect.
     """
     law, _, place = name.partition("@")
-    count = len(world.simulator.system.coordinates)
-    joints = {joint_name(world, joint): joint for joint in range(count)}
+    count = len(evaluator.simulator.system.coordinates)
+    joints = {joint_name(evaluator, joint): joint for joint in range(count)}
     if place not in joints:
         return []
-    assert isinstance(world.simulator, RobotSimulator)
-    velocities = world.simulator.addresses.velocities.tolist()
-    groups = coupled_joints(world.simulator.make_linearisation_batch().model, velocities)
+    assert isinstance(evaluator.simulator, RobotSimulator)
+    velocities = evaluator.simulator.addresses.velocities.tolist()
+    groups = coupled_joints(evaluator.simulator.make_linearisation_batch().model, velocities)
     others = {joint for group in groups if joints[place] in group for joint in group}
-    names = [f"{law}@{joint_name(world, joint)}" for joint in sorted(others - {joints[place]})]
-    return [other for other in names if other in world.slots]
+    names = [f"{law}@{joint_name(evaluator, joint)}" for joint in sorted(others - {joints[place]})]
+    return [other for other in names if other in evaluator.slots]
 
 
-def has_series(world: RunEvaluator, names: Iterable[str]) -> bool:
+def has_series(evaluator: RunEvaluator, names: Iterable[str]) -> bool:
     """Return whether some effects are joints in series with others, which have their own states."""
-    return any(is_series_effect(world.available_effects[name]) for name in names)
+    return any(is_series_effect(evaluator.available_effects[name]) for name in names)
 
 
 def has_many_shapes(name: str) -> bool:
@@ -119,25 +119,25 @@ def has_many_shapes(name: str) -> bool:
     return name.partition("@")[0] in MANY_SHAPES
 
 
-def offset_from_command(world: RunEvaluator, noise: NoiseModel, joint: int) -> float:
+def offset_from_command(evaluator: RunEvaluator, noise: NoiseModel, joint: int) -> float:
     """Return the mean difference of a joint's readings from the command of its position servo.
 
     Args:
-        world: the runs.
+        evaluator: the runs.
         noise: sensor noise.
         joint: index of the joint.
 
     Returns:
         The difference; zero without a servo, or if the difference is small.
     """
-    system, servo = world.simulator.system, servo_input(world, joint)
+    system, servo = evaluator.simulator.system, servo_input(evaluator, joint)
     channel = system.coordinates[joint]
-    if not servo or channel not in world.channels:
+    if not servo or channel not in evaluator.channels:
         return 0.0
-    column = world.channels.index(channel)
+    column = evaluator.channels.index(channel)
     differences = [
         track.observed[:, column] - system.gear(joint) * track.scenario.inputs[servo]
-        for track in world.tracks
+        for track in evaluator.tracks
         if servo in track.scenario.inputs
     ]
     offset = float(np.nanmean(np.concatenate(differences))) if differences else 0.0

@@ -65,9 +65,9 @@ class LibraryColumns:
     def library(self) -> Columns:
         """Candidates of the library: effects with few shapes, and those that were added."""
         if self._library is None:
-            world = self.filters.world
-            names = [name for name in world.library if not has_many_shapes(name)]
-            world.watch.stage(f"testing {len(names)} effects", 1)
+            evaluator = self.filters.evaluator
+            names = [name for name in evaluator.library if not has_many_shapes(name)]
+            evaluator.watch.stage(f"testing {len(names)} effects", 1)
             self._library = self.filters.base.columns(self.probes(names))
         return self._library
 
@@ -83,7 +83,7 @@ class LibraryColumns:
     def hats(self) -> Columns:
         """Forces of any shape as candidates, by the labels of their families."""
         if self._hats is None:
-            probes, _ = hat_probes(self.filters.world)
+            probes, _ = hat_probes(self.filters.evaluator)
             named = [replace(probe, effect=JointHatForce.name) for probe in probes]
             self._hats = replace(self.filters.base.columns(named), probes=tuple(probes))
         return self._hats
@@ -99,14 +99,14 @@ class LibraryColumns:
 
     def probes(self, names: Sequence[str]) -> list[CandidateDirection]:
         """Return small trial coefficients (probes) of effects; their responses are regressors."""
-        base, world, probes = (
+        base, evaluator, probes = (
             self.filters.models.base_model,
-            self.filters.world,
+            self.filters.evaluator,
             list[CandidateDirection](),
         )
         for name in names:
-            bounds = compute_coefficient_bounds(world, name)
-            for probe in first_probes(world, base.fit, name):
+            bounds = compute_coefficient_bounds(evaluator, name)
+            for probe in first_probes(evaluator, base.fit, name):
                 # The value in the model file may be too large, so the correction may be negative.
                 signed = probe.signed or (bounds[probe.place][0] < 0 and not probe.fixed)
                 probes.append(replace(probe, signed=signed))
@@ -115,7 +115,7 @@ class LibraryColumns:
     def select(self) -> Selected:
         """Select effects of the library by regression."""
         library = self.library
-        self.filters.world.watch.stage("selecting effects", 1)
+        self.filters.evaluator.watch.stage("selecting effects", 1)
         selected = identify(self.filters.base, library, self.base_regression)
         self.filters.numerics = selected.numerics
         return selected
@@ -129,7 +129,7 @@ class LibraryColumns:
         """
         theta, base = self.filters.reference.copy(), self.filters.models.base_model
         for group, solution in zip(groups, coefficients, strict=True):
-            theta[self.filters.world.slots[group.effect]] = self.coefficients(group, solution)
+            theta[self.filters.evaluator.slots[group.effect]] = self.coefficients(group, solution)
         return FitStart(tuple(group.effect for group in groups), theta, base.fit.states)
 
     def coefficients(self, group: DirectionGroup, solution: Array) -> Array:
@@ -139,7 +139,7 @@ class LibraryColumns:
             group: columns of the effect.
             solution: regression coefficients of these columns.
         """
-        return group_coefficients(self.filters.world, self.library.probes, group, solution)
+        return group_coefficients(self.filters.evaluator, self.library.probes, group, solution)
 
     def regression(self, model: FittedModel) -> ModelRegression:
         """Return the regression with the effects of a fitted model in the filter's model.
@@ -164,8 +164,8 @@ class LibraryColumns:
 
         They are differences of responses about the measured motion.
         """
-        world, followed = self.filters.world, self.filters.base
-        tangents = [_tangents(world, name, start.theta) for name in start.effects]
+        evaluator, followed = self.filters.evaluator, self.filters.base
+        tangents = [_make_tangent_probes(evaluator, name, start.theta) for name in start.effects]
         columns = followed.columns([probe for effect_probes in tangents for probe in effect_probes])
         responses = followed.sensitivities(columns)
         places, derivatives, first_column = list[int](), [], 0
@@ -175,13 +175,13 @@ class LibraryColumns:
                 step = float(probe.coefficients[k] - whole_change.coefficients[k]) or np.inf
                 change = responses[..., first_column + 1 + k] - responses[..., first_column]
                 derivatives.append(change / step)
-            places += world.get_coefficient_indices(name)
+            places += evaluator.get_coefficient_indices(name)
             first_column += 1 + len(displaced)
         return KnownJacobian(np.array(places, dtype=np.intp), np.stack(derivatives, axis=-1))
 
 
 def group_coefficients(
-    world: RunEvaluator,
+    evaluator: RunEvaluator,
     probes: Sequence[CandidateDirection],
     group: DirectionGroup,
     solution: Array,
@@ -189,22 +189,25 @@ def group_coefficients(
     """Return the coefficients (k,) of an effect from the regression, within their bounds.
 
     Args:
-        world: the runs.
+        evaluator: the runs.
         probes: probes of all columns.
         group: columns of the effect.
         solution: regression coefficients of these columns.
     """
-    own, effect = [probes[i] for i in group.column_indices], world.available_effects[group.effect]
+    own, effect = (
+        [probes[i] for i in group.column_indices],
+        evaluator.available_effects[group.effect],
+    )
     if effect.probe_points():
         sizes = np.array([probe.coefficients[probe.place] for probe in own])
         points = np.array([probe.coefficients for probe in own])
-        return clip_coefficients(world, group.effect, effect.combine(points, solution / sizes))
+        return clip_coefficients(evaluator, group.effect, effect.combine(points, solution / sizes))
     c = own[0].coefficients.copy()
     for column, value in zip(group.column_indices, solution, strict=True):
         # A fixed change is valid only at its own size.
         if not probes[column].fixed:
             c[probes[column].place] = value
-    return clip_coefficients(world, group.effect, c)
+    return clip_coefficients(evaluator, group.effect, c)
 
 
 def regression_about(
@@ -221,7 +224,7 @@ def regression_about(
     probes: list[CandidateDirection] = []
     count = len(columns.probes)
     for name in current.names:
-        tangents = _tangents(followed.world, name, current.followed.theta)
+        tangents = _make_tangent_probes(followed.evaluator, name, current.followed.theta)
         first_column = count + len(probes)
         own_columns[name] = list(range(first_column, first_column + len(tangents)))
         probes += tangents
@@ -230,15 +233,17 @@ def regression_about(
     return ModelRegression(regress(current.followed, joined, always=always), own_columns)
 
 
-def _tangents(world: RunEvaluator, name: str, theta: Array) -> list[CandidateDirection]:
+def _make_tangent_probes(
+    evaluator: RunEvaluator, name: str, theta: Array
+) -> list[CandidateDirection]:
     """Return probes for an effect of the model: as it is, and with each coefficient displaced.
 
     The first shows what the effect changes as a whole; the differences of the others from it are
     the derivatives by the coefficients.
     """
-    c = theta[world.slots[name]]
+    c = theta[evaluator.slots[name]]
     probes = [CandidateDirection(name, 0, 0, c, signed=True, fixed=True)]
-    for place, (low, high) in enumerate(compute_coefficient_bounds(world, name)):
+    for place, (low, high) in enumerate(compute_coefficient_bounds(evaluator, name)):
         displaced = c.copy()
         size = max(abs(float(c[place])), RELATIVE_DIFFERENCE * (high - low))
         step = RELATIVE_DIFFERENCE * size

@@ -68,7 +68,7 @@ class ModelFilters:
     _soft_friction: dict[tuple[str, float], FitStart | None] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        self.world, self.noise = self.models.world, self.models.noise
+        self.evaluator, self.noise = self.models.evaluator, self.models.noise
 
     def take_over(self, other: ModelFilters) -> None:
         """Reuse the likelihoods that another search of the same models has computed."""
@@ -83,10 +83,10 @@ class ModelFilters:
         Without effects, the base model may need absurd values.
         """
         theta: Array = self.models.base_model.fit.theta.copy()
-        identified = self.world.identified
+        identified = self.evaluator.identified
         if identified is not None:
-            is_free = [i not in self.models.frozen for i in self.world.base.tolist()]
-            theta[self.world.base[is_free]] = identified[is_free]
+            is_free = [i not in self.models.frozen for i in self.evaluator.base.tolist()]
+            theta[self.evaluator.base[is_free]] = identified[is_free]
         return theta
 
     def theta_with(self, name: str, c: Array) -> Array:
@@ -97,13 +97,13 @@ class ModelFilters:
             c: (k,) its coefficients.
         """
         theta = self.reference.copy()
-        theta[self.world.slots[name]] = c
+        theta[self.evaluator.slots[name]] = c
         return theta
 
     @property
     def base(self) -> FollowedRuns:
         """The runs, followed with the base model."""
-        return FollowedRuns.of_model(self.world, self.reference, self.noise)
+        return FollowedRuns.of_model(self.evaluator, self.reference, self.noise)
 
     @property
     def empty_set(self) -> FilteredSet:
@@ -159,8 +159,8 @@ class ModelFilters:
             steps: maximum number of Gauss-Newton steps.
         """
         initial = self._of_tried.get(theta.tobytes()) or self._follow_near(theta, self.base)
-        bounds = [b for name in names for b in compute_coefficient_bounds(self.world, name)]
-        places = [place for name in names for place in self.world.get_coefficient_indices(name)]
+        bounds = [b for name in names for b in compute_coefficient_bounds(self.evaluator, name)]
+        places = [place for name in names for place in self.evaluator.get_coefficient_indices(name)]
         best = maximise_likelihood(initial, places, bounds, steps, self._follow_near)
         newest = list(self._of_tried.items())[:MAX_CACHED_FILTERS]
         self._of_tried = {best.theta.tobytes(): best, **dict(newest)}
@@ -180,23 +180,27 @@ class ModelFilters:
         With an encoder offset, positions are smoothed ones. The states of the base fit are not
         used, because they are biased by what is missing.
         """
-        states, positions = self.world.guess.copy(), followed.first_positions()
+        states, positions = self.evaluator.guess.copy(), followed.first_positions()
         measured_positions = states[:, : positions.shape[1]]
         noise = float(np.nanmax(self.noise.sigma))
         has_moved = np.abs(positions - measured_positions) > OFFSET_THRESHOLD * noise
-        is_offset = np.isfinite(positions) & has_moved & ~self.world.known[:, : positions.shape[1]]
+        is_offset = (
+            np.isfinite(positions) & has_moved & ~self.evaluator.known[:, : positions.shape[1]]
+        )
         states[:, : positions.shape[1]] = np.where(is_offset, positions, measured_positions)
         return states
 
     def penalty(self, name: str) -> float:
         """Return the minimum gain of an effect in twice the log-likelihood."""
-        count = len(self.world.get_coefficient_indices(name))
-        return float(count * self.models.parameter_penalty + 2.0 * np.log(len(self.world.library)))
+        count = len(self.evaluator.get_coefficient_indices(name))
+        return float(
+            count * self.models.parameter_penalty + 2.0 * np.log(len(self.evaluator.library))
+        )
 
     @property
     def is_soft(self) -> bool:
         """True if effects add dry friction in MuJoCo's soft form."""
-        return has_soft_form(self.world)
+        return has_soft_form(self.evaluator)
 
     def soft_friction(self, name: str, sign: float) -> FitStart | None:
         """Return the likeliest model of dry friction in MuJoCo's soft form, by filters.
@@ -217,7 +221,7 @@ class ModelFilters:
     def _find_soft_friction(self, name: str, sign: float) -> FitStart | None:
         """Search the force of the model that `soft_friction` returns."""
         joint = name.partition("@")[2]
-        numbers = {joint_name(self.world, j): j for j in range(self.base.force.size)}
+        numbers = {joint_name(self.evaluator, j): j for j in range(self.base.force.size)}
         models = soft_friction_models(self.base, self.reference, numbers[joint], sign)
         if not models:
             return None
@@ -242,7 +246,7 @@ class ModelFilters:
     @cached_property
     def _soft_simulator(self) -> RobotSimulator:
         """Simulator with dry friction in MuJoCo's soft form."""
-        simulator = self.world.simulator_of(soft_kind(self.world.kind))
+        simulator = self.evaluator.simulator_of(soft_kind(self.evaluator.kind))
         assert isinstance(simulator, RobotSimulator)
         return simulator
 
@@ -264,15 +268,15 @@ def soft_friction_models(
     Returns:
         The parameters (P,) of each model, in ascending order of the size.
     """
-    world = followed.world
-    name = f"friction.coulomb@{joint_name(world, joint)}"
-    if has_soft_form(world) or name not in world.library:
+    evaluator = followed.evaluator
+    name = f"friction.coulomb@{joint_name(evaluator, joint)}"
+    if has_soft_form(evaluator) or name not in evaluator.library:
         return []
     models = []
     for factor in SOFT_FACTORS:
         # The missing force of a sliding joint is about the force of its friction.
         size = np.array([sign * factor * float(followed.force[joint])])
         changed = theta.copy()
-        changed[world.slots[name]] = clip_coefficients(world, name, size)
+        changed[evaluator.slots[name]] = clip_coefficients(evaluator, name, size)
         models.append(changed)
     return models

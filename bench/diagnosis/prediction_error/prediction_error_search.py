@@ -89,7 +89,7 @@ class PredictionErrorSearch(EffectSearch):
     identified: IdentifiedSet | None = None
 
     @cached_property
-    def _context(self) -> SearchContext:
+    def _search_context(self) -> SearchContext:
         return SearchContext.of(self)
 
     def run(self) -> FittedModel:
@@ -98,7 +98,7 @@ class PredictionErrorSearch(EffectSearch):
         Raises:
             SoftFrictionError: dry friction of the data has MuJoCo's soft form.
         """
-        context, self.best_supported_model, best = self._context, self.base_model, None
+        context, self.best_supported_model, best = self._search_context, self.base_model, None
         if self.likely is not None:
             best = without_idle_effects(context, fit(context, self.likely))
         else:
@@ -117,7 +117,7 @@ class PredictionErrorSearch(EffectSearch):
         Each further method is slower, so it is tried only if the best model does not explain the
         runs.
         """
-        context = self._context
+        context = self._search_context
         selected = context.columns.select()
         if not self.is_form_given:
             check_selection(context, selected)
@@ -130,7 +130,7 @@ class PredictionErrorSearch(EffectSearch):
         if not is_explained(context, best):
             selected = select_with_shapes(context, selected)
             best = higher_merit(best, fit_quick_selection(context, selected))
-        if not is_explained(context, best) and not self.world.watch.has_abandoned_fits():
+        if not is_explained(context, best) and not self.evaluator.watch.has_abandoned_fits():
             best = higher_merit(best, fit_series_effects(context, selected))
         if not best.effects:
             best = fit_selection(context, selected)
@@ -142,11 +142,11 @@ class PredictionErrorSearch(EffectSearch):
         This is the case if a force is missing, the best model does not explain the runs, and there
         is time left.
         """
-        lacks = self._context.filters.base.lacks_force
+        lacks = self._search_context.filters.base.lacks_force
         return (
             lacks
-            and not is_explained(self._context, best)
-            and not self.world.watch.has_abandoned_fits()
+            and not is_explained(self._search_context, best)
+            and not self.evaluator.watch.has_abandoned_fits()
         )
 
     def _with_missing_effects(
@@ -160,7 +160,7 @@ class PredictionErrorSearch(EffectSearch):
             selected: the selection by regression.
             friction: dry friction of the selection, fitted alone.
         """
-        context = self._context
+        context = self._search_context
         if is_nearly_explained(context, best):
             check_fit(context, best)
             if len(best.effects) > 1:
@@ -174,7 +174,7 @@ class PredictionErrorSearch(EffectSearch):
 
     def fit_rivals(self, best: FittedModel) -> FittedModel:
         """Fit the sets that are nearly as good, and return the best of all."""
-        return fit_rivals(self._context, best)
+        return fit_rivals(self._search_context, best)
 
     def take_over(self, other: PredictionErrorSearch) -> None:
         """Reuse the filter and the responses of another search of the same base model.
@@ -182,10 +182,12 @@ class PredictionErrorSearch(EffectSearch):
         Both searches have the same runs. If the form of the dry friction that effects add differs,
         the base model has none of it.
         """
-        self.world.followed = replace(other._context.filters.base, world=self.world)
-        self._context.columns.take_over(other._context.columns)
-        if self.world is other.world:
-            self._context.filters.take_over(other._context.filters)
+        self.evaluator.followed = replace(
+            other._search_context.filters.base, evaluator=self.evaluator
+        )
+        self._search_context.columns.take_over(other._search_context.columns)
+        if self.evaluator is other.evaluator:
+            self._search_context.filters.take_over(other._search_context.filters)
 
     def p_value_of_missing_effect(self, model: FittedModel) -> float:
         """Return the p-value of the most significant effect that a fitted model lacks.
@@ -195,10 +197,14 @@ class PredictionErrorSearch(EffectSearch):
         scores = self.score_missing_effects(model)
         if scores.p_value > EFFECT_P_VALUE_THRESHOLD or not np.isfinite(model.fit.cost):
             return scores.p_value
-        filters, columns, name = self._context.filters, self._context.columns, scores.effects[0]
+        filters, columns, name = (
+            self._search_context.filters,
+            self._search_context.columns,
+            scores.effects[0],
+        )
         c = columns.coefficients(*scores.peaks[0][0])
-        start = with_effect(self.world, model.fit.make_start(), name, c)
-        places, count = self.world.get_coefficient_indices(name), len(self.world.library)
+        start = with_effect(self.evaluator, model.fit.make_start(), name, c)
+        places, count = self.evaluator.get_coefficient_indices(name), len(self.evaluator.library)
         # A filter with the effect in the model is faster than a fit, and not linear in the effect.
         log_likelihood = filters.of_model(model).log_likelihood
         gains = []
@@ -226,24 +232,24 @@ class PredictionErrorSearch(EffectSearch):
         """
         key = frozenset(model.effects)
         if key not in self.scores_by_effects:
-            self.enter_scores(key, self._scores(model))
+            self.enter_scores(key, self._score_missing_effects(model))
         return self.scores_by_effects[key]
 
-    def _scores(self, model: FittedModel) -> CandidateScores:
+    def _score_missing_effects(self, model: FittedModel) -> CandidateScores:
         """Score the effects that a model lacks by regression of the innovations of its filter."""
-        if has_series(self.world, model.effects):
+        if has_series(self.evaluator, model.effects):
             # The candidates are linear about the robot without additional joints.
             return replace(self.score_missing_effects(self.base_model), p_value=1.0)
-        self._look(model)
-        regression, _ = self._context.columns.regression(model)
+        self._report_scoring(model)
+        regression, _ = self._search_context.columns.regression(model)
         stream = self.make_rng("library", model.effects)
-        return null_scores(regression, set(self._lacking(model)), stream)
+        return null_scores(regression, set(self._list_addable_effects(model)), stream)
 
     def force_of_any_shape(self, model: FittedModel) -> tuple[float, str] | None:
         """Return the p-value of the best additional force and the signal it depends on."""
-        if has_series(self.world, model.effects):
+        if has_series(self.evaluator, model.effects):
             return None
-        columns, filters = self._context.columns, self._context.filters
+        columns, filters = self._search_context.columns, self._search_context.filters
         if self.identified is None:
             regression, _ = columns.regression(model)
         else:
@@ -259,26 +265,26 @@ class PredictionErrorSearch(EffectSearch):
         The filter of the model has them already.
         """
         start = model.fit.make_start()
-        if not model.effects or has_series(self.world, model.effects):
+        if not model.effects or has_series(self.evaluator, model.effects):
             return start
-        followed = self._context.filters.near_model(model)
+        followed = self._search_context.filters.near_model(model)
         return (
             replace(start, by_states=followed.state_sensitivities()) if followed.is_sound else start
         )
 
     def with_sensitivities(self, start: FitStart) -> FitStart:
         """Return a start with derivatives by its coefficients about the measured motion."""
-        free = set(self.world.base.tolist()) - self.frozen
+        free = set(self.evaluator.base.tolist()) - self.frozen
         has_jacobian = start.known is not None or not start.effects
-        if has_jacobian or free or has_series(self.world, start.effects):
+        if has_jacobian or free or has_series(self.evaluator, start.effects):
             return start
-        return replace(start, known=self._context.columns.sensitivities(start))
+        return replace(start, known=self._search_context.columns.sensitivities(start))
 
     def directions_known(self) -> tuple[TrajectoryFit, DirectionSet] | None:
         """Return the first-order changes of the base model's runs by every candidate.
 
         They are linearised about the measured motion.
         """
-        library = self._context.columns.library
-        values = self._context.filters.base.sensitivities(library)
+        library = self._search_context.columns.library
+        values = self._search_context.filters.base.sensitivities(library)
         return self.base_model.fit, DirectionSet(library.probes, values)

@@ -86,7 +86,7 @@ class Regression:
 
     def nuisance(self, chosen: Sequence[DirectionGroup]) -> float:
         """Return the coefficient of the first column of `always`, fitted together with a set."""
-        _, parts = self._solve([*chosen, self._nuisance])
+        _, parts = self._fit_groups([*chosen, self._nuisance])
         return float(parts[-1][0]) if self.always else 0.0
 
     def instead_of(self, own_columns: Sequence[int]) -> Regression:
@@ -109,17 +109,17 @@ class Regression:
 
     def shows_nuisance(self, chosen: Sequence[DirectionGroup]) -> bool:
         """Return whether the data show the first column of `always`, in addition to a set."""
-        with_it, parts = self._solve([*chosen, self._nuisance])
+        with_it, parts = self._fit_groups([*chosen, self._nuisance])
         rest = DirectionGroup("", self.always[1:], (False,) * (len(self.always) - 1))
-        without, _ = self._solve([*chosen, rest])
+        without, _ = self._fit_groups([*chosen, rest])
         return float(parts[-1][0]) > 0.5 and self.log_ratio(without, with_it) > SHOWN
 
     def solve(self, chosen: Sequence[DirectionGroup]) -> tuple[float, list[Array]]:
         """Fit a set of groups, and return the residual sum of squares and all coefficients."""
-        rss, parts = self._solve([*chosen, self._nuisance])
+        rss, parts = self._fit_groups([*chosen, self._nuisance])
         return rss, parts[:-1]
 
-    def _solve(
+    def _fit_groups(
         self,
         chosen: Sequence[DirectionGroup],
         gram: Array | None = None,
@@ -138,7 +138,7 @@ class Regression:
         solution = np.zeros(columns.size)
         while active.any():
             own = columns[active]
-            normal, scale = _normalised(gram, own)
+            normal, scale = _normalise_gram(gram, own)
             solved = np.linalg.solve(normal, cross[own] / scale)
             solution[:] = 0.0
             solution[active] = solved / scale
@@ -181,14 +181,14 @@ class Regression:
         columns = np.append(columns, np.array(self.always, dtype=np.intp))
         gram, cross, rss = self.gram, self.cross, self.total
         if columns.size:
-            normal, scale = _normalised(gram, columns)
+            normal, scale = _normalise_gram(gram, columns)
             rows = gram[columns] / scale[:, None]
             solved = np.linalg.solve(normal, np.c_[rows, cross[columns] / scale])
             gram = gram - rows.T @ solved[:, :-1]
             cross = cross - rows.T @ solved[:, -1]
             rss, _ = self.solve(chosen)
         aliased = np.diagonal(gram) <= ALIASED * np.diagonal(self.gram)
-        held = set(self._held(chosen))
+        held = set(self._list_contained_effects(chosen))
         result = np.zeros(len(self.groups))
         gram = np.where(aliased[:, None] | aliased[None], 0.0, gram)
         cross = np.where(aliased, 0.0, cross)
@@ -210,7 +210,7 @@ class Regression:
         net: Array = self.gains(chosen) - prices
         return net
 
-    def _held(self, chosen: Sequence[DirectionGroup]) -> list[str]:
+    def _list_contained_effects(self, chosen: Sequence[DirectionGroup]) -> list[str]:
         """Return the effects of a set, with all effects that they contain."""
         held = [group.effect for group in chosen]
         return held + [name for own in held for name in self.contains.get(own, ())]
@@ -261,7 +261,7 @@ class Regression:
         columns = columns_of(groups)
         for run, total in enumerate(self.totals):
             gram, cross = self.gram - self.grams[run], self.cross - self.crosses[run]
-            _, parts = self._solve(groups, gram, cross)
+            _, parts = self._fit_groups(groups, gram, cross)
             own = np.concatenate(parts) if parts else np.zeros(0)
             block = self.grams[run][np.ix_(columns, columns)]
             found.append(total - 2.0 * own @ self.crosses[run][columns] + own @ block @ own)
@@ -287,7 +287,7 @@ class Regression:
         return left
 
 
-def _normalised(gram: Array, columns: Places) -> tuple[Array, Array]:
+def _normalise_gram(gram: Array, columns: Places) -> tuple[Array, Array]:
     """Return the scaled normal matrix of some columns, and the lengths of these columns.
 
     Its diagonal is one plus the ridge.

@@ -70,8 +70,8 @@ def fit_single_in_place(context: SearchContext, best: FittedModel) -> FittedMode
     explained = len(best.effects) > 1 and is_explained(context, best)
     if (
         not explained
-        or has_series(context.world, best.effects)
-        or context.world.watch.has_abandoned_fits()
+        or has_series(context.evaluator, best.effects)
+        or context.evaluator.watch.has_abandoned_fits()
     ):
         return best
     filters = context.filters
@@ -93,15 +93,15 @@ def fit_rivals(context: SearchContext, best: FittedModel) -> FittedModel:
         context: context of the search.
         best: the best model so far.
     """
-    search, world = context.search, context.world
+    search, evaluator = context.search, context.evaluator
     has_no_fit = not best.effects or not np.isfinite(best.fit.cost)
-    if has_no_fit or has_series(world, best.effects):
+    if has_no_fit or has_series(evaluator, best.effects):
         return best
     starts, rivals = list[FitStart](), set[str]()
     for name in best.effects:
         for rival in _find_rivals(context, best, name):
             rivals.add(rival.effect)
-            start = in_place_of(world, best, [name], rival.effect, rival.c)
+            start = in_place_of(evaluator, best, [name], rival.effect, rival.c)
             if frozenset(start.effects) in search.models:
                 continue
             confirmed = _confirm_by_filter(context, best, rival, start)
@@ -125,18 +125,18 @@ def fit_rivals(context: SearchContext, best: FittedModel) -> FittedModel:
 
 def _find_rivals(context: SearchContext, model: FittedModel, name: str) -> list[_Rival]:
     """Return the effects that are nearly as good by the regression in place of the given one."""
-    world = context.world
+    evaluator = context.evaluator
     regression, columns = context.columns.regression(model)
     remaining = regression.instead_of(columns[name])
     # Effects with more coefficients gain more under the null hypothesis.
     gains = remaining.net_gains()
     own_gain = remaining.gain_of(columns[name]) - context.filters.penalty(name)
-    same_joint = plain_effects_beside(world, name)
+    same_joint = plain_effects_beside(evaluator, name)
     rivals, near_count = dict[str, _Rival](), 0
     for i in np.argsort(-gains, kind="stable").tolist():
         group = remaining.groups[i]
         effect, behind = group.effect, own_gain - float(gains[i])
-        if effect not in world.library or effect in (*model.effects, *rivals):
+        if effect not in evaluator.library or effect in (*model.effects, *rivals):
             continue
         is_near = (
             behind <= RIVAL_MARGIN + LINEARISATION_ERROR * own_gain and near_count < MAX_RIVALS
@@ -144,7 +144,7 @@ def _find_rivals(context: SearchContext, model: FittedModel, name: str) -> list[
         # Regression is inaccurate for a large effect, so effects at the same joint are tried.
         is_alike = effect in same_joint and gains[i] > ALIKE_SHARE * own_gain
         # A law that contains this one never replaces it.
-        if (is_near or is_alike) and name not in world.available_effects[effect].contains:
+        if (is_near or is_alike) and name not in evaluator.available_effects[effect].contains:
             near_count += is_near
             c = context.columns.coefficients(group, remaining.solve([group])[1][0])
             rivals[effect] = _Rival(effect, c, behind)
@@ -162,7 +162,7 @@ def _confirm_by_filter(
         return start
     filters = context.filters
     has_few_coefficients = (
-        len(context.world.get_coefficient_indices(rival.effect)) <= MAX_IMPROVED_SIZE
+        len(context.evaluator.get_coefficient_indices(rival.effect)) <= MAX_IMPROVED_SIZE
     )
     steps = GAUSS_NEWTON_STEPS if has_few_coefficients else 0
     # Better coefficients do not help an effect with which the filter follows the runs worse.
@@ -178,13 +178,13 @@ def _confirm_by_filter(
 
 def _fit_at_coupled_joints(context: SearchContext, size: int) -> None:
     """Fit the best models of a size with each effect moved to the other joints of its loop."""
-    search, world = context.search, context.world
+    search, evaluator = context.search, context.evaluator
     starts: dict[frozenset[str], FitStart] = {}
     for model in _near_the_best(context, size):
         for name in model.effects:
-            c = model.fit.theta[world.slots[name]]
-            for other in at_coupled_joints(world, name):
-                start = in_place_of(world, model, [name], other, c)
+            c = model.fit.theta[evaluator.slots[name]]
+            for other in at_coupled_joints(evaluator, name):
+                start = in_place_of(evaluator, model, [name], other, c)
                 key = frozenset(start.effects)
                 if other not in model.effects and key not in search.models:
                     starts[key] = start
@@ -198,9 +198,9 @@ def _refine_near(context: SearchContext, size: int) -> None:
     Otherwise, incomplete fits would decide between them.
     """
     search, near_models = context.search, _near_the_best(context, size)
-    if context.world.watch.has_abandoned_fits() or len(near_models) < 2:
+    if context.evaluator.watch.has_abandoned_fits() or len(near_models) < 2:
         return
-    fitter = TrajectoryFitter(context.world, search.noise, search.frozen, exact=True)
+    fitter = TrajectoryFitter(context.evaluator, search.noise, search.frozen, exact=True)
     starts = [model.fit.make_start() for model in near_models]
     for model, fit in zip(near_models, fitter.fit_models(starts, MAX_ITERATIONS), strict=True):
         if fit.cost < model.fit.cost:

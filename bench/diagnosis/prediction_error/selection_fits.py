@@ -139,7 +139,7 @@ def _is_slow(context: SearchContext, names: Sequence[str]) -> bool:
 
     This is the case if forces are computed in every step, or have their own states.
     """
-    effects = [context.world.available_effects[name] for name in names]
+    effects = [context.evaluator.available_effects[name] for name in names]
     return any(
         member.of not in MODEL_FIELD_EFFECTS
         and member.hook in ("force", "hidden")
@@ -156,11 +156,13 @@ def select_with_shapes(context: SearchContext, selected: Selected) -> Selected:
         context: context of the search.
         selected: the previous selection.
     """
-    world, joints = context.world, np.flatnonzero(selected.followed.missing_forces).tolist()
-    many_shaped = [n for n in world.library if has_many_shapes(n) and acts_at(world, n, joints)]
+    evaluator, joints = context.evaluator, np.flatnonzero(selected.followed.missing_forces).tolist()
+    many_shaped = [
+        n for n in evaluator.library if has_many_shapes(n) and acts_at(evaluator, n, joints)
+    ]
     if not many_shaped:
         return selected
-    world.watch.stage(f"testing {len(many_shaped)} effects with several coefficients", 1)
+    evaluator.watch.stage(f"testing {len(many_shaped)} effects with several coefficients", 1)
     context.columns.add(many_shaped)
     return context.columns.select()
 
@@ -221,7 +223,7 @@ def _soft_friction(context: SearchContext) -> FitStart | None:
         The model; None if the gain of dry friction by regression is far below the largest gain, or
         if friction is already soft.
     """
-    columns, world = context.columns, context.world
+    columns, evaluator = context.columns, context.evaluator
     regression = columns.base_regression
     gains, groups = regression.gains([]), regression.groups
     by_gain = [
@@ -230,7 +232,7 @@ def _soft_friction(context: SearchContext) -> FitStart | None:
         if gains[i] > MIN_GAIN_SHARE * gains.max()
         and groups[i].effect.startswith("friction.coulomb@")
         and not groups[i].effect.endswith("@*")
-        and groups[i].effect in world.library
+        and groups[i].effect in evaluator.library
     ]
     if not by_gain:
         return None
@@ -325,16 +327,16 @@ def dry_friction_of(context: SearchContext, selected: Selected) -> FitStart:
         context: context of the search.
         selected: the selection.
     """
-    world, filters = context.world, context.filters
+    evaluator, filters = context.evaluator, context.filters
     start = context.columns.start(selected.groups, selected.coefficients)
-    plain_names, plain_theta = with_plain_friction(world, start.effects, start.theta)
+    plain_names, plain_theta = with_plain_friction(evaluator, start.effects, start.theta)
     native = [name for name in plain_names if name.partition("@")[0] in MODEL_FIELD_EFFECTS]
-    friction = [name for name in native if has_dry_friction(world, [name])]
-    contained = {part for name in friction for part in world.available_effects[name].contains}
+    friction = [name for name in native if has_dry_friction(evaluator, [name])]
+    contained = {part for name in friction for part in evaluator.available_effects[name].contains}
     names = tuple(name for name in friction if name not in contained)
     theta = filters.reference.copy()
     for name in names:
-        theta[world.slots[name]] = plain_theta[world.slots[name]]
+        theta[evaluator.slots[name]] = plain_theta[evaluator.slots[name]]
     return FitStart(names, theta, filters.first_states(filters.base))
 
 
@@ -351,7 +353,7 @@ def stands_alone(context: SearchContext, selected: Selected, friction: FittedMod
     """
     filters = context.filters
     start = context.columns.start(selected.groups, selected.coefficients)
-    _, plain_theta = with_plain_friction(context.world, start.effects, start.theta)
+    _, plain_theta = with_plain_friction(context.evaluator, start.effects, start.theta)
     stiff = filters.log_likelihood(plain_theta)
     soft = -np.inf if filters.is_soft else filters.log_likelihood(plain_theta, is_soft=True)
     selected_log_likelihood = (
@@ -415,7 +417,7 @@ def refine_single_effects(context: SearchContext, fitted: Sequence[FittedModel])
     starts: list[FitStart] = []
     for model in fitted:
         (name,) = model.effects
-        if len(context.world.get_coefficient_indices(name)) <= MAX_IMPROVED_SIZE:
+        if len(context.evaluator.get_coefficient_indices(name)) <= MAX_IMPROVED_SIZE:
             starts += [model.fit.make_start(), *starts_nearby(context, model, name)]
     best = context.search.base_model
     for _, start in lowest_of_each(context, starts)[:MAX_REFINED]:
@@ -423,7 +425,7 @@ def refine_single_effects(context: SearchContext, fitted: Sequence[FittedModel])
         if not is_at_noise(context, refined) and is_nearly_explained(context, refined):
             refined = fit_nearby(context, refined, refined.effects[0])
         best = higher_merit(best, refined)
-        if is_explained(context, best) or context.world.watch.has_abandoned_fits():
+        if is_explained(context, best) or context.evaluator.watch.has_abandoned_fits():
             break
     return best
 
@@ -437,17 +439,19 @@ def fit_series_effects(context: SearchContext, selected: Selected) -> FittedMode
         context: context of the search.
         selected: the selection, whose missing forces determine the joint.
     """
-    world, search = context.world, context.search
+    evaluator, search = context.evaluator, context.search
     joints = selected.followed.joints_by_loss[:1]
-    names = [name for name in world.library if is_series_effect(world.available_effects[name])]
-    probes = context.columns.probes([name for name in names if acts_at(world, name, joints)])
+    names = [
+        name for name in evaluator.library if is_series_effect(evaluator.available_effects[name])
+    ]
+    probes = context.columns.probes([name for name in names if acts_at(evaluator, name, joints)])
     if not probes:
         return search.base_model
-    world.watch.stage("testing elasticity and backlash between drives and links", len(probes))
+    evaluator.watch.stage("testing elasticity and backlash between drives and links", len(probes))
     starts = []
     for probe in probes:
         theta = context.filters.theta_with(probe.effect, probe.coefficients)
-        starts.append(FitStart((probe.effect,), theta, world.guess))
+        starts.append(FitStart((probe.effect,), theta, evaluator.guess))
     fitted = search.fit_all([start for _, start in lowest_of_each(context, starts)])
     return fit(
         context, max(fitted, key=lambda model: model.penalised_log_likelihood).fit.make_start()

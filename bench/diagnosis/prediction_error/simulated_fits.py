@@ -42,18 +42,18 @@ def fit(context: SearchContext, start: FitStart) -> FittedModel:
         context: context of the search.
         start: start of the fit.
     """
-    search, world = context.search, context.world
+    search, evaluator = context.search, context.evaluator
     fitted = search.fit_one(start)
     if is_explained(context, fitted) or not np.isfinite(fitted.fit.cost):
         return fitted
-    derivatives_before = world.derivatives
-    compute_state_jacobian(world, fitted.fit.theta, fitted.fit.states, is_recomputed=True)
+    derivatives_before = evaluator.derivatives
+    compute_state_jacobian(evaluator, fitted.fit.theta, fitted.fit.states, is_recomputed=True)
     fitted = search.fit_one(fitted.fit.make_start())
     if not is_explained(context, fitted):
         # Derivatives about a wrong motion are not valid for other models.
-        world.derivatives = derivatives_before
+        evaluator.derivatives = derivatives_before
     for name in fitted.effects:
-        if has_dry_friction(world, [name]) and not is_explained(context, fitted):
+        if has_dry_friction(evaluator, [name]) and not is_explained(context, fitted):
             fitted = fit_nearby(context, fitted, name)
     return fitted
 
@@ -93,7 +93,7 @@ def starts_nearby(context: SearchContext, model: FittedModel, name: str) -> list
     """
     measured = context.filters.first_states(context.filters.base)
     starts = []
-    for place in context.world.get_coefficient_indices(name):
+    for place in context.evaluator.get_coefficient_indices(name):
         for factor in NEARBY:
             theta = model.fit.theta.copy()
             theta[place] *= factor
@@ -118,7 +118,7 @@ def lowest_of_each(
     if not starts:
         return []
     costs = costs_of_starts(
-        context.world, context.search.noise, starts, share=1.0, failed_residual=np.inf
+        context.evaluator, context.search.noise, starts, share=1.0, failed_residual=np.inf
     )
     lowest: dict[tuple[str, ...], tuple[float, FitStart]] = {}
     for i in np.argsort(costs, kind="stable").tolist():
@@ -136,7 +136,7 @@ def is_explained(context: SearchContext, model: FittedModel) -> bool:
     if is_at_noise(context, model):
         return True
     # Friction of the wrong form may leave a small residual.
-    if has_dry_friction(context.world, model.effects) and not context.filters.is_soft:
+    if has_dry_friction(context.evaluator, model.effects) and not context.filters.is_soft:
         return False
     excess = context.search.compute_excess
     return excess(model) < min(NEGLIGIBLE, NEGLIGIBLE_SHARE * excess(context.search.base_model))
@@ -188,15 +188,17 @@ def _merge_into_families(context: SearchContext, model: FittedModel) -> FittedMo
 
     The family is kept if it fits about as well. It is one decision instead of one per place.
     """
-    world = context.world
-    for family in (name for name in world.library if name.endswith("@*")):
-        members = [member.name for member in members_of(world.available_effects[family])]
+    evaluator = context.evaluator
+    for family in (name for name in evaluator.library if name.endswith("@*")):
+        members = [member.name for member in members_of(evaluator.available_effects[family])]
         if len(members) < 2 or not set(members) <= set(model.effects):
             continue
-        coefficients = np.concatenate([model.fit.theta[world.slots[name]] for name in members])
-        if coefficients.size != len(world.get_coefficient_indices(family)):
+        coefficients = np.concatenate([model.fit.theta[evaluator.slots[name]] for name in members])
+        if coefficients.size != len(evaluator.get_coefficient_indices(family)):
             continue
-        fitted = context.search.fit_one(in_place_of(world, model, members, family, coefficients))
+        fitted = context.search.fit_one(
+            in_place_of(evaluator, model, members, family, coefficients)
+        )
         model = (
             fitted
             if fitted.penalised_log_likelihood
@@ -207,12 +209,12 @@ def _merge_into_families(context: SearchContext, model: FittedModel) -> FittedMo
 
 
 def in_place_of(
-    world: RunEvaluator, model: FittedModel, names: Sequence[str], other: str, c: Array
+    evaluator: RunEvaluator, model: FittedModel, names: Sequence[str], other: str, c: Array
 ) -> FitStart:
     """Return a start in which one effect replaces several others.
 
     Args:
-        world: the runs.
+        evaluator: the runs.
         model: the fitted model.
         names: effects that are removed.
         other: the effect that replaces them.
@@ -220,7 +222,7 @@ def in_place_of(
     """
     theta = model.fit.theta.copy()
     for name in names:
-        theta[world.slots[name]] = 0.0
-    theta[world.slots[other]] = c
+        theta[evaluator.slots[name]] = 0.0
+    theta[evaluator.slots[other]] = c
     remaining = (name for name in model.effects if name not in names)
     return FitStart((*remaining, other), theta, model.fit.states)

@@ -62,12 +62,12 @@ class Confirmation(Inquiry):
         watch.begin_question("rivals")
         self._model = search.fit_rivals(self._model)
         size = len(self._model.effects)
-        self._measure()
+        self._evaluate_on_held_out_runs()
         if 0 < len(self._model.effects) < size:
             # The competing models of the remaining effects were fitted together with the removed
             # ones, so fit them again.
             self._model = search.fit_rivals(self._model)
-            self._measure()
+            self._evaluate_on_held_out_runs()
         watch.begin_question("structure")
         self._model = search.fit_to_convergence(self._model)
         lack_of_fit = assess_lack_of_fit(search, self._model)
@@ -90,7 +90,7 @@ class Confirmation(Inquiry):
         if verdict == "unknown" and state.closed < MIMICRY:
             # Effects that leave most of the discrepancy only mimic what is missing.
             model, causes = base, ()
-        return self._finding(verdict, base, model, causes, lack_of_fit)
+        return self._make_result(verdict, base, model, causes, lack_of_fit)
 
     def _answered_by_filters(self, identified: IdentifiedSet) -> DiagnosisResult:
         """Return the result for a set that filters identified in a model that stays incomplete."""
@@ -113,16 +113,16 @@ class Confirmation(Inquiry):
             key=lambda cause: -cause.gain,
         )
         verdict = decide_verdict(state)
-        return self._finding(verdict, search.base_model, model, tuple(causes), lack_of_fit)
+        return self._make_result(verdict, search.base_model, model, tuple(causes), lack_of_fit)
 
     def _cause(self, name: str, gain: float) -> CauseEvidence:
         """Return the evidence for an effect whose gain is that of filters."""
-        world = self._robot.world
-        count = len(world.get_coefficient_indices(name))
-        p_value = p_value_of_gain(gain, count, len(world.library))
+        evaluator = self._robot.evaluator
+        count = len(evaluator.get_coefficient_indices(name))
+        p_value = p_value_of_gain(gain, count, len(evaluator.library))
         return CauseEvidence(name, (), p_value, gain, name)
 
-    def _measure(self) -> None:
+    def _evaluate_on_held_out_runs(self) -> None:
         """Predict held-out runs with the model and its competitors, and drop unhelpful effects."""
         if self._held_out is None or self._model is None:
             return
@@ -150,5 +150,5 @@ class _RobotAlternatives(AlternativeFinder):
     """Collects alternatives of a robot's effects; p-values are those of the chi-squared law."""
 
     def _p_value(self, rest: FittedModel, effect: str, gain: float) -> float:  # noqa: ARG002
-        slot = self.search.world.slots[effect]
-        return p_value_of_gain(gain, slot.stop - slot.start, len(self.search.world.library))
+        slot = self.search.evaluator.slots[effect]
+        return p_value_of_gain(gain, slot.stop - slot.start, len(self.search.evaluator.library))

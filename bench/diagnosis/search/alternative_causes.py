@@ -61,20 +61,20 @@ class AlternativeFinder:
 
     def collect_evidence(self, model: FittedModel) -> tuple[CauseEvidence, ...]:
         """Return the evidence for each effect of the model, the largest likelihood gain first."""
-        effects = [self._evidence(model, name) for name in model.effects]
+        effects = [self._measure_evidence(model, name) for name in model.effects]
         return tuple(sorted(effects, key=lambda evidence: -evidence.gain))
 
-    def _evidence(self, model: FittedModel, effect: str) -> CauseEvidence:
+    def _measure_evidence(self, model: FittedModel, effect: str) -> CauseEvidence:
         """Return p-value, gain and indistinguishable alternatives of one effect of the model.
 
         The gain is the increase of twice the log-likelihood over the model without the effect
         (`reduced_model`). `competing_effects` has pairs of distance and name, the effect itself
         included.
         """
-        reduced_model = self._rest(model, effect)
+        reduced_model = self._get_model_without(model, effect)
         gain = model.likelihood.value - reduced_model.likelihood.value
         p_value = self._p_value(reduced_model, effect, gain)
-        competing_effects = self._rivals(model, effect)
+        competing_effects = self._list_rivals(model, effect)
         # Effects with implausible coefficients come last in their set.
         competing_effects.sort(key=lambda rival: (not self._is_plausible(rival[1]), rival))
         ordered_effects = [name for _, name in competing_effects]
@@ -92,7 +92,7 @@ class AlternativeFinder:
             preferred=preferred_effect,
         )
 
-    def _rest(self, model: FittedModel, effect: str) -> FittedModel:
+    def _get_model_without(self, model: FittedModel, effect: str) -> FittedModel:
         """Return the model without the effect, against which the gain of the effect is measured.
 
         If no simulations are allowed and this model was not fitted, return the base model.
@@ -120,7 +120,7 @@ class AlternativeFinder:
         by_score = search.best_p_values.get(key, 1.0)
         return min(by_score, by_refit)
 
-    def _rivals(self, model: FittedModel, effect: str) -> list[tuple[float, str]]:
+    def _list_rivals(self, model: FittedModel, effect: str) -> list[tuple[float, str]]:
         """List the effects that explain the data as well as the given one, with their distance.
 
         A competing effect is tested by the fitted models in which it replaces the effect and
@@ -139,7 +139,7 @@ class AlternativeFinder:
             # Skip the model itself, and other fits of the same effects.
             if added == effect:
                 continue
-            distance = self._behind(model, other_model)
+            distance = self._compute_distance(model, other_model)
             if is_indistinguishable(distance) and not self._buys_nothing(effect, added, distance):
                 competing_effects.append((distance, added))
         return self._without_richer(competing_effects)
@@ -152,7 +152,7 @@ class AlternativeFinder:
         """
         if not self.structure:
             return False
-        slots = self.search.world.slots
+        slots = self.search.evaluator.slots
         coefficient_count, other_count = (
             int(slots[name].stop - slots[name].start) for name in (effect, other_effect)
         )
@@ -169,7 +169,7 @@ class AlternativeFinder:
         These are families of which one member explains as much, and richer laws of which the
         simpler one does.
         """
-        effects = self.search.world.available_effects
+        effects = self.search.evaluator.available_effects
         names = {name for _, name in competing_effects}
         return [
             (distance, name)
@@ -177,7 +177,7 @@ class AlternativeFinder:
             if not names & set(effects[name].contains)
         ]
 
-    def _behind(self, model: FittedModel, other_model: FittedModel) -> float:
+    def _compute_distance(self, model: FittedModel, other_model: FittedModel) -> float:
         """Return the distance of another model in twice the log-likelihood.
 
         It is negative if the other model is better. If the residual has structure that neither
@@ -200,7 +200,9 @@ class AlternativeFinder:
                     compute_excess_ratio(other_excess, validation.compute_excess(model.effects))
                 )
             return convert_excess_ratio(ratios)
-        distance = self._merit(model) - self._merit(other_model)
+        distance = self._compute_comparable_merit(model) - self._compute_comparable_merit(
+            other_model
+        )
         # Held-out runs are further data, so their log-likelihoods are added.
         if validation is not None:
             held_out_fit = validation.held_out_fits[model.effects]
@@ -210,18 +212,18 @@ class AlternativeFinder:
             )
         return distance
 
-    def _merit(self, model: FittedModel) -> float:
+    def _compute_comparable_merit(self, model: FittedModel) -> float:
         """Return the merit; for robots without the null-hypothesis penalty of single-shape effects.
 
         Two such effects differ, for example, only in a sign constraint: if all commands have the
         same sign, a dead band is equivalent to a bias.
         """
-        world = self.search.world
-        if not world.has_linearisation:
+        evaluator = self.search.evaluator
+        if not evaluator.has_linearisation:
             return model.penalised_log_likelihood
         null_penalties = 0.0
         for name in model.effects:
-            parameters = world.parameters[world.slots[name]]
+            parameters = evaluator.parameters[evaluator.slots[name]]
             if not any(parameter.bounds[0] > 0 for parameter in parameters):
                 null_penalties += self.search.get_effect_penalty(name)
         return model.penalised_log_likelihood + null_penalties
@@ -231,13 +233,13 @@ class AlternativeFinder:
 
         The best fit is the model with the effect that has the highest penalised log-likelihood.
         """
-        world = self.search.world
+        evaluator = self.search.evaluator
         models_with_effect = [m for m in self.search.models.values() if effect in m.effects]
         if not models_with_effect:
             return False
         best = max(models_with_effect, key=lambda m: m.penalised_log_likelihood)
-        parameters = world.parameters[world.slots[effect]]
-        values = best.fit.theta[world.slots[effect]]
+        parameters = evaluator.parameters[evaluator.slots[effect]]
+        values = best.fit.theta[evaluator.slots[effect]]
         for parameter, value in zip(parameters, values, strict=True):
             low, high = parameter.bounds
             if not low <= value <= high:

@@ -119,20 +119,20 @@ class DirectionSet:
 
 
 def compute_directions(
-    world: RunEvaluator, fit: TrajectoryFit, names: Sequence[str]
+    evaluator: RunEvaluator, fit: TrajectoryFit, names: Sequence[str]
 ) -> DirectionSet:
     """Compute the sensitivity directions of effects about a fitted model.
 
     Args:
-        world: the runs.
+        evaluator: the runs.
         fit: the fitted model.
         names: names of effects that the model does not contain.
     """
-    probes = [probe for name in names for probe in first_probes(world, fit, name)]
-    values = _responses(world, fit, probes)
-    acting = _find_observable_probes(world, probes, values)
+    probes = [probe for name in names for probe in first_probes(evaluator, fit, name)]
+    values = _compute_directions(evaluator, fit, probes)
+    acting = _find_observable_probes(evaluator, probes, values)
     # The first responses show which coefficients only modify, for effects that act at all.
-    modified = list(_make_modifier_probes(world, probes, acting))
+    modified = list(_make_modifier_probes(evaluator, probes, acting))
     places = np.flatnonzero(acting)
     probes = [probes[i] for i in places] + modified
     # This is the largest array of an explanation, so active rows are moved up in place.
@@ -141,23 +141,23 @@ def compute_directions(
             values[row] = values[place]
     values = values[: places.size]
     if modified:
-        values = np.concatenate([values, _responses(world, fit, modified)])
+        values = np.concatenate([values, _compute_directions(evaluator, fit, modified)])
     return DirectionSet(tuple(probes), np.moveaxis(values, 0, -1))
 
 
 def first_probes(
-    world: RunEvaluator, fit: TrajectoryFit, name: str
+    evaluator: RunEvaluator, fit: TrajectoryFit, name: str
 ) -> Iterator[CandidateDirection]:
     """Yield a small value of every scaling coefficient of an effect, at every shape.
 
     Args:
-        world: the runs.
+        evaluator: the runs.
         fit: the fitted model.
         name: name of the effect.
     """
-    parameters = list_coefficients(world, name)
+    parameters = list_coefficients(evaluator, name)
     # A coefficient that cannot be zero is a shape parameter, and does not scale the effect.
-    effect = world.available_effects[name]
+    effect = evaluator.available_effects[name]
     coefficients = effect.coefficients
     for c in effect.probe_points():
         # Changes at several points add up to that at a point between them (`Effect.combine`).
@@ -165,11 +165,11 @@ def first_probes(
     shaping = [i for i, p in enumerate(parameters) if p.bounds[0] > 0]
     count = len(parameters)
     scaling = [i for i in range(count) if i not in shaping]
-    travel = world.get_effect_travel(name)
+    travel = evaluator.get_effect_travel(name)
     grids = [
         parameters[i].bounds[:1]
-        if coefficients[i].of == "rotor" and _is_contained_in_model(world, fit, name)
-        else _make_shape_grid(world, parameters[i], coefficients[i].tried, travel)
+        if coefficients[i].of == "rotor" and _is_contained_in_model(evaluator, fit, name)
+        else _make_shape_grid(evaluator, parameters[i], coefficients[i].tried, travel)
         for i in shaping
     ]
     group = 0
@@ -194,7 +194,7 @@ def first_probes(
             )
         group += 1
     if leading.of == "stop":
-        yield from _make_end_stop_probes(world, name, group)
+        yield from _make_end_stop_probes(evaluator, name, group)
         return
     lowest, _ = parameters[0].bounds
     # A small limit does not act like a large one, so limits are tried at values that the input
@@ -203,21 +203,21 @@ def first_probes(
         leading.of in ("input", "error") and lowest == 0
     ):
         shapes = np.array(list(product(*grids)))
-        yield from _make_limit_probes(world, name, group, shapes if shaping else None)
+        yield from _make_limit_probes(evaluator, name, group, shapes if shaping else None)
 
 
-def _is_contained_in_model(world: RunEvaluator, fit: TrajectoryFit, name: str) -> bool:
+def _is_contained_in_model(evaluator: RunEvaluator, fit: TrajectoryFit, name: str) -> bool:
     """Return whether the model already has a simpler effect that the effect `name` contains.
 
     The simpler effect may also be in the model as a member of a family (one effect at all places).
     """
-    effects = [world.available_effects[effect_name] for effect_name in fit.effects]
+    effects = [evaluator.available_effects[effect_name] for effect_name in fit.effects]
     model_effects = {m.name for effect in effects for m in members_of(effect)}
-    return bool(model_effects & set(world.available_effects[name].contains))
+    return bool(model_effects & set(evaluator.available_effects[name].contains))
 
 
 def _make_end_stop_probes(
-    world: RunEvaluator, name: str, first: int
+    evaluator: RunEvaluator, name: str, first: int
 ) -> Iterator[CandidateDirection]:
     """Yield end stops of several depths and stiffnesses at both ends of the range of a coordinate.
 
@@ -227,7 +227,7 @@ def _make_end_stop_probes(
         c
         for side in (1.0, -1.0)
         for c in generate_end_stops(
-            world, name, side, END_STOP_STIFFNESS_SHARES, END_STOP_DEPTH_SHARES
+            evaluator, name, side, END_STOP_STIFFNESS_SHARES, END_STOP_DEPTH_SHARES
         )
     ]
     for number, c in enumerate(end_stops, start=first):
@@ -237,17 +237,17 @@ def _make_end_stop_probes(
 
 
 def _make_limit_probes(
-    world: RunEvaluator, name: str, group: int, shapes: Array | None
+    evaluator: RunEvaluator, name: str, group: int, shapes: Array | None
 ) -> Iterator[CandidateDirection]:
     """Yield limits, dead bands and backlash of sizes that the motion or the input reaches.
 
     Args:
-        world: the runs.
+        evaluator: the runs.
         name: name of the effect.
         group: number of the first group.
         shapes: (n, k - 1) shape parameters to combine with each size; None if there are none.
     """
-    largest = compute_reachable_levels(world, name)
+    largest = compute_reachable_levels(evaluator, name)
     if not largest.any():
         return
     # The error of a servo peaks briefly after a jump, as the rate of a command does.
@@ -258,9 +258,9 @@ def _make_limit_probes(
         "travel": GAP_TRAVEL_SHARES,
         "give": COMPLIANCE_SHARES,
     }
-    kind = world.available_effects[name].coefficients[0].of
+    kind = evaluator.available_effects[name].coefficients[0].of
     levels = shares_by_kind.get(kind, INPUT_LEVEL_SHARES)
-    if kind == "travel" and world.has_linearisation:
+    if kind == "travel" and evaluator.has_linearisation:
         # Simulating a robot costs a hundred times as much, so fewer sizes are tried.
         levels = GAP_TRAVEL_SHARES[1:4]
     sizes = [level * largest for level in levels]
@@ -278,12 +278,15 @@ def _make_limit_probes(
 
 
 def _make_shape_grid(
-    world: RunEvaluator, parameter: Parameter, specified_values: tuple[float, ...], travel: float
+    evaluator: RunEvaluator,
+    parameter: Parameter,
+    specified_values: tuple[float, ...],
+    travel: float,
 ) -> Array:
     """Return the values to try of a shape parameter.
 
     Args:
-        world: the runs.
+        evaluator: the runs.
         parameter: the shape parameter.
         specified_values: values that the coefficient specifies itself, if any.
         travel: largest range of the position in one run.
@@ -294,20 +297,20 @@ def _make_shape_grid(
     if parameter.unit == "Hz":
         # A periodic effect must complete a cycle within a run, otherwise any slow change would be
         # periodic.
-        min_frequency = max(low, MIN_CYCLES_PER_RUN / world.longest)
+        min_frequency = max(low, MIN_CYCLES_PER_RUN / evaluator.longest)
         lowest_frequency = min(min_frequency, high / 2.0)
-        return _frequencies(lowest_frequency, high, world.longest)
+        return _make_frequency_grid(lowest_frequency, high, evaluator.longest)
     if _is_period(parameter, travel):
-        frequencies = _frequencies(1.0 / high, 1.0 / low, travel)
+        frequencies = _make_frequency_grid(1.0 / high, 1.0 / low, travel)
         return 1.0 / frequencies
     if is_instant(parameter):
-        clock_start, clock_end = world.clock
+        clock_start, clock_end = evaluator.clock
         # An event at the ends of the recording would have nothing before or after it.
         return np.linspace(clock_start, clock_end, EVENT_TIME_COUNT + 2)[1:-1]
     if parameter.unit == "s":
         # A decay much longer than the runs is constant within them; successive times differ by at
         # most a factor of two.
-        high = max(min(high, LASTING * world.longest), 2.0 * low)
+        high = max(min(high, LASTING * evaluator.longest), 2.0 * low)
         return np.geomspace(low, high, int(np.ceil(np.log2(high / low))) + 1)
     return np.geomspace(low, high, SHAPE_GRID_SIZE)
 
@@ -320,26 +323,28 @@ def _is_period(parameter: Parameter, travel: float) -> bool:
     return parameter.name.endswith(".period") and travel > 0
 
 
-def generate_frequency_neighbours(world: RunEvaluator, fit: TrajectoryFit) -> Iterator[FitStart]:
+def generate_frequency_neighbours(
+    evaluator: RunEvaluator, fit: TrajectoryFit
+) -> Iterator[FitStart]:
     """Yield starts with shifted periodic effects, event times and end stops.
 
     Least squares stops at the nearest of the many local minima that such effects have.
 
     Args:
-        world: the runs.
+        evaluator: the runs.
         fit: the fitted model.
     """
     for name in fit.effects:
-        for c in generate_equal_travel_end_stops(world, name, fit.theta[world.slots[name]]):
+        for c in generate_equal_travel_end_stops(evaluator, name, fit.theta[evaluator.slots[name]]):
             theta = fit.theta.copy()
-            theta[world.slots[name]] = c
+            theta[evaluator.slots[name]] = c
             yield FitStart(fit.effects, theta, fit.states)
-        bounds = compute_coefficient_bounds(world, name)
-        for number, place in enumerate(world.get_coefficient_indices(name)):
-            parameter = world.parameters[place]
+        bounds = compute_coefficient_bounds(evaluator, name)
+        for number, place in enumerate(evaluator.get_coefficient_indices(name)):
+            parameter = evaluator.parameters[place]
             value = float(fit.theta[place])
             for shifted_value in _shift_frequency_or_time(
-                world, parameter, value, world.get_effect_travel(name)
+                evaluator, parameter, value, evaluator.get_effect_travel(name)
             ):
                 theta = fit.theta.copy()
                 theta[place] = np.clip(shifted_value, *bounds[number])
@@ -347,7 +352,7 @@ def generate_frequency_neighbours(world: RunEvaluator, fit: TrajectoryFit) -> It
 
 
 def _shift_frequency_or_time(
-    world: RunEvaluator, parameter: Parameter, value: float, travel: float
+    evaluator: RunEvaluator, parameter: Parameter, value: float, travel: float
 ) -> Iterator[float]:
     """Yield shifted values of a frequency, a period or an event time; nothing for others.
 
@@ -355,10 +360,10 @@ def _shift_frequency_or_time(
     """
     if is_instant(parameter):
         for samples in EVENT_TIME_SHIFTS_SAMPLES:
-            yield value + samples * world.sample_interval
+            yield value + samples * evaluator.sample_interval
     for cycles in FREQUENCY_SHIFTS_CYCLES:
         if parameter.unit == "Hz":
-            yield value + cycles / world.longest
+            yield value + cycles / evaluator.longest
         elif _is_period(parameter, travel) and value > 0:
             frequency = 1.0 / value + cycles / travel
             # Beyond the longest period, the frequency might become negative.
@@ -366,7 +371,7 @@ def _shift_frequency_or_time(
             yield 1.0 / max(frequency, lowest)
 
 
-def _frequencies(low: float, high: float, extent: float) -> Array:
+def _make_frequency_grid(low: float, high: float, extent: float) -> Array:
     """Return a grid of frequencies from `low` to `high`, about half a cycle over `extent` apart.
 
     Two frequencies that differ by less are nearly the same signal in a run. `extent` is the length
@@ -381,24 +386,24 @@ def _frequencies(low: float, high: float, extent: float) -> Array:
 
 
 def _find_observable_probes(
-    world: RunEvaluator, probes: Sequence[CandidateDirection], values: Array
+    evaluator: RunEvaluator, probes: Sequence[CandidateDirection], values: Array
 ) -> Mask:
     """Return the mask (K,) of the probes that change the runs by more than rounding errors.
 
     `values` (K, R, T, C) has the direction of each probe; times the size of the probe it is the
     change.
     """
-    rounding = ROUNDING_SHARE * np.nanmax(np.abs(world.observed), axis=(0, 1))
+    rounding = ROUNDING_SHARE * np.nanmax(np.abs(evaluator.observed), axis=(0, 1))
     # One changed channel is sufficient, because effects of a sensor show only in its channel.
     changes = [
         bool((np.abs(size * value) > rounding).any())
-        for value, size in zip(values, _sizes(probes).tolist(), strict=True)
+        for value, size in zip(values, _compute_probe_sizes(probes).tolist(), strict=True)
     ]
     acting: Mask = np.array(changes, dtype=bool)
     return acting
 
 
-def _sizes(probes: Sequence[CandidateDirection]) -> Array:
+def _compute_probe_sizes(probes: Sequence[CandidateDirection]) -> Array:
     """Return the divisor c of eq. (1) for each probe (K,), which is its scaling coefficient.
 
     It is one for a fixed probe, whose direction is the whole change.
@@ -411,7 +416,7 @@ def _sizes(probes: Sequence[CandidateDirection]) -> Array:
 
 
 def _make_modifier_probes(
-    world: RunEvaluator, probes: Sequence[CandidateDirection], acting: Mask
+    evaluator: RunEvaluator, probes: Sequence[CandidateDirection], acting: Mask
 ) -> Iterator[CandidateDirection]:
     """Yield combinations of modifiers: coefficients that act only together with an active one.
 
@@ -429,7 +434,7 @@ def _make_modifier_probes(
         elif (
             probe.group == 0
             and not probe.fixed
-            and world.available_effects[probe.effect].place != ALL_PLACES
+            and evaluator.available_effects[probe.effect].place != ALL_PLACES
         ):
             idle_probes.append(probe)
     modifiers: dict[str, list[CandidateDirection]] = {}
@@ -438,14 +443,14 @@ def _make_modifier_probes(
         if probe.effect in leading:
             modifiers.setdefault(probe.effect, []).append(probe)
     for name, members in modifiers.items():
-        yield from _grid_points(world, leading[name], members)
+        yield from _grid_points(evaluator, leading[name], members)
 
 
 def _grid_points(
-    world: RunEvaluator, first: CandidateDirection, modifiers: Sequence[CandidateDirection]
+    evaluator: RunEvaluator, first: CandidateDirection, modifiers: Sequence[CandidateDirection]
 ) -> Iterator[CandidateDirection]:
     """Yield the first active probe of an effect with all combinations of modifier values."""
-    parameters = list_coefficients(world, first.effect)
+    parameters = list_coefficients(evaluator, first.effect)
     points = product(MODIFIER_SHARES, repeat=len(modifiers))
     for group, point in enumerate(points, start=1):
         # All modifiers at zero give the effect that was already tried.
@@ -464,8 +469,8 @@ def _grid_points(
         )
 
 
-def _responses(
-    world: RunEvaluator, fit: TrajectoryFit, probes: Sequence[CandidateDirection]
+def _compute_directions(
+    evaluator: RunEvaluator, fit: TrajectoryFit, probes: Sequence[CandidateDirection]
 ) -> Array:
     """Compute the directions (K, R, T, C) of eq. (1): change of the runs per unit coefficient.
 
@@ -473,60 +478,60 @@ def _responses(
     """
     added = [(probe.effect, probe.coefficients) for probe in probes]
     # These are the largest arrays of a search, so all operations are in place.
-    values = compute_responses(world, fit, added)
+    values = compute_responses(evaluator, fit, added)
     is_finite = is_finite_response(values)
     # A probe that the simulator cannot follow gets a direction of zeros.
     if not is_finite.all():
         values[~is_finite] = 0.0
-    values /= _sizes(probes)[:, None, None, None]  # (1)
+    values /= _compute_probe_sizes(probes)[:, None, None, None]  # (1)
     return values
 
 
 def compute_responses(
-    world: RunEvaluator, fit: TrajectoryFit, added: Sequence[tuple[str, Array]]
+    evaluator: RunEvaluator, fit: TrajectoryFit, added: Sequence[tuple[str, Array]]
 ) -> Array:
     """Compute the changes of a fitted model's runs by one additional effect each.
 
     Linearised responses are used if the simulator provides them, because they cost less.
 
     Args:
-        world: the runs.
+        evaluator: the runs.
         fit: the fitted model.
         added: K effects with their coefficients.
 
     Returns:
         Changes (K, R, T, C).
     """
-    if world.has_linearisation:
+    if evaluator.has_linearisation:
         # Imported here, because only robots need it.
         from bench.diagnosis.fitting.linearised_runs import compute_effect_responses
 
-        return compute_effect_responses(world, fit.theta, fit.states, added)
-    values = simulate_with_effect(world, fit, added)
+        return compute_effect_responses(evaluator, fit.theta, fit.states, added)
+    values = simulate_with_effect(evaluator, fit, added)
     values -= fit.simulated
     return values
 
 
 def simulate_with_effect(
-    world: RunEvaluator, fit: TrajectoryFit, added: Sequence[tuple[str, Array]]
+    evaluator: RunEvaluator, fit: TrajectoryFit, added: Sequence[tuple[str, Array]]
 ) -> Array:
     """Simulate the runs of a fitted model with one additional effect each.
 
     Args:
-        world: the runs.
+        evaluator: the runs.
         fit: the fitted model.
         added: K effects with their coefficients.
 
     Returns:
         Observations (K, R, T, C).
     """
-    runs = len(world.tracks)
+    runs = len(evaluator.tracks)
     theta = np.tile(fit.theta, (len(added), 1))
     for row, (name, c) in zip(theta, added, strict=True):
-        row[world.slots[name]] = c
+        row[evaluator.slots[name]] = c
     # All candidates and runs are simulated in one engine call, as one batch.
     count = len(added)
-    simulated = world.simulate(
+    simulated = evaluator.simulate(
         theta=np.repeat(theta, runs, axis=0),
         runs=np.tile(np.arange(runs), count),
         states=np.tile(fit.states, (count, 1)),

@@ -101,7 +101,7 @@ class Inquiry:
         """
         self._search = search
         self._held_out = held_out
-        self._watch = search.world.watch
+        self._watch = search.evaluator.watch
         self._trial: HeldOutValidation | None = None
         self._model: FittedModel | None = None
 
@@ -121,10 +121,10 @@ class Inquiry:
         self._model = search.simplify_laws(refine_best_model(search, self._model))
         self._model = search.fit_to_convergence(self._model)
         validated_effects = self._model.effects
-        self._try()
+        self._evaluate_on_held_out_runs()
         self._watch.begin_question("structure")
         lack_of_fit = assess_lack_of_fit(search, self._model)
-        if search.thorough and self._fuller(lack_of_fit):
+        if search.thorough and self._accept_larger_model(lack_of_fit):
             lack_of_fit = assess_lack_of_fit(search, self._model)
         self._watch.begin_question("alternatives")
         model, causes = _select_preferred_model(search, self._trial, self._model, lack_of_fit)
@@ -142,7 +142,7 @@ class Inquiry:
             missed=validation is not None and validation.has_unexplained_gap(model, lack_of_fit),
         )
         # Report the base model that was fitted first, even if the search found a better fit of it.
-        return self._finding(decide_verdict(state), base, model, causes, lack_of_fit)
+        return self._make_result(decide_verdict(state), base, model, causes, lack_of_fit)
 
     def unfit_base(self) -> DiagnosisResult | None:
         """Return the result if causes cannot be searched, else None.
@@ -174,7 +174,7 @@ class Inquiry:
             )
         return None
 
-    def _try(self) -> None:
+    def _evaluate_on_held_out_runs(self) -> None:
         """Compare the model with competitors on held-out runs, and drop effects that do not help.
 
         It does nothing if there are no held-out runs and too few runs for cross-validation.
@@ -191,7 +191,7 @@ class Inquiry:
             validation.drop_unhelpful_effects(self._search, self._model)
         )
 
-    def _fuller(self, lack_of_fit: LackOfFitResult) -> bool:
+    def _accept_larger_model(self, lack_of_fit: LackOfFitResult) -> bool:
         """Replace the model by one with more effects if held-out runs confirm it.
 
         Returns:
@@ -226,12 +226,12 @@ class Inquiry:
         causes = alternatives.collect_evidence(model)
         share = compute_gap_closed(search, model, lack_of_fit)
         verdict = decide_early_stop_verdict(len(causes), share, early_stop.skipped_questions)
-        result = self._finding(
+        result = self._make_result(
             verdict, search.base_model, model, causes, assess_residual_size(search, model)
         )
         return replace(result, early_stop=early_stop)
 
-    def _finding(
+    def _make_result(
         self,
         verdict: VerdictName,
         base: FittedModel,
@@ -251,12 +251,12 @@ def is_motionless(search: EffectSearch) -> bool:
 
     Without motion the residual is only rounding, so the diagnosis ends before the search.
     """
-    observed = search.world.observed
+    observed = search.evaluator.observed
     largest = np.nanmax(observed, axis=(0, 1))
     smallest = np.nanmin(observed, axis=(0, 1))
     ranges = largest - smallest
     # Parameters that do not influence the simulated runs were fixed by the base fit.
-    is_model_sensitive = len(search.frozen) != search.world.base.size
+    is_model_sensitive = len(search.frozen) != search.evaluator.base.size
     residual_sigma = search.base_model.likelihood.sigma
     return verdict_rules.is_motionless(
         ranges, residual_sigma, search.noise.sigma, is_model_sensitive
@@ -265,9 +265,9 @@ def is_motionless(search: EffectSearch) -> bool:
 
 def _without_motion(search: EffectSearch) -> DiagnosisResult:
     """Return the verdict "unidentifiable" for a recording without motion."""
-    base, world = search.base_model, search.world
+    base, evaluator = search.base_model, search.evaluator
     # No parameter can be determined, and no test of the residual is meaningful.
-    unidentified = tuple(world.parameters[i].name for i in world.base)
+    unidentified = tuple(evaluator.parameters[i].name for i in evaluator.base)
     excess = base.likelihood.sigma / search.noise.sigma
     no_lack_of_fit = LackOfFitResult(1.0, "", excess, ())
     return DiagnosisResult(
@@ -284,7 +284,7 @@ def find_unidentified_parameters(search: EffectSearch, base: FittedModel) -> tup
     """
     variances = np.diagonal(compute_covariance(search, base))
     spread = np.sqrt(np.maximum(variances, 0.0))
-    parameters = [search.world.parameters[place] for place in base.fit.free]
+    parameters = [search.evaluator.parameters[place] for place in base.fit.free]
     unidentified = []
     for parameter, sd in zip(parameters, spread.tolist(), strict=True):
         low, high = parameter.bounds

@@ -91,7 +91,7 @@ class EffectSearch(ModelMoves):
                 best, MAX_P_VALUE_FURTHER_EFFECT if best.effects else MAX_P_VALUE_FIRST_EFFECT
             ):
                 break
-            larger = self._larger(best, size)
+            larger = self._search_size(best, size)
             if larger is None:
                 break
             if (
@@ -116,13 +116,13 @@ class EffectSearch(ModelMoves):
             The best model of the same size after the correction, which may be a simpler one.
         """
         key = frozenset(model.effects)
-        if not self.world.has_linearisation or key == self.step_corrected_effects:
+        if not self.evaluator.has_linearisation or key == self.step_corrected_effects:
             return model
         self.step_corrected_effects = key
         # Imported here, because only robots need it.
         from bench.diagnosis.fitting.linearised_runs import correct_discretisation
 
-        correct_discretisation(self.world, self.noise, model.fit.theta, model.fit.states)
+        correct_discretisation(self.evaluator, self.noise, model.fit.theta, model.fit.states)
         size = len(model.effects)
         # A richer effect may have fitted only the discretisation error.
         close_models = [
@@ -156,19 +156,19 @@ class EffectSearch(ModelMoves):
             else best
         )
 
-    def _larger(self, best: FittedModel, size: int) -> FittedModel | None:
+    def _search_size(self, best: FittedModel, size: int) -> FittedModel | None:
         """Fit models of `size` effects, and return the best one after exchanges and simplification.
 
         It may have fewer effects, if some were not needed. `best` is the best smaller model. Return
         None if no model of this size could be fitted.
         """
         if size > 1:
-            self.world.watch.begin_larger_models()
-        larger = self._grown(size)
+            self.evaluator.watch.begin_larger_models()
+        larger = self._grow_models(size)
         if larger is None:
             return None
         if size == 1:
-            return self.simplify_laws(self._simpler(larger))
+            return self.simplify_laws(self._choose_simpler_effect(larger))
         # An idle effect is dropped before the exchange, which would replace it by another idle one.
         return self.simplify_laws(
             select_conservative_model(
@@ -178,7 +178,7 @@ class EffectSearch(ModelMoves):
             )
         )
 
-    def _grown(self, size: int) -> FittedModel | None:
+    def _grow_models(self, size: int) -> FittedModel | None:
         """Return the best model with `size` effects.
 
         First only the best smaller model is extended. If that does not explain the data, segments,
@@ -195,7 +195,7 @@ class EffectSearch(ModelMoves):
         if size == 1:
             self.refit_extensions(smaller_models, MAX_REFITTED_CANDIDATES, fits_all=True)
         else:
-            for members in self._turns(smaller_models[1:]):
+            for members in self._group_models(smaller_models[1:]):
                 self.refit_extensions(members, MAX_REFITTED_CANDIDATES)
                 if self._explained_by(size):
                     break
@@ -210,18 +210,20 @@ class EffectSearch(ModelMoves):
         if model is None:
             return False
         # The discretisation error, of friction for example, could be mistaken for a missing effect.
-        if self.world.has_linearisation and self.compute_excess(model) < FAR_EXCESS:
+        if self.evaluator.has_linearisation and self.compute_excess(model) < FAR_EXCESS:
             model = self.without_step_errors(model)
         return self.is_noise_like(model) and self.is_complete(model, EFFECT_P_VALUE_THRESHOLD)
 
-    def _turns(self, competing_models: Sequence[FittedModel]) -> Sequence[Sequence[FittedModel]]:
+    def _group_models(
+        self, competing_models: Sequence[FittedModel]
+    ) -> Sequence[Sequence[FittedModel]]:
         """Return groups of models to extend together.
 
         If simulations are expensive, models are extended one by one until the data are explained.
         """
         return (
             [[competing_model] for competing_model in competing_models]
-            if self.world.has_linearisation
+            if self.evaluator.has_linearisation
             else [competing_models]
         )
 
@@ -232,9 +234,9 @@ class EffectSearch(ModelMoves):
         accumulate less and fits have fewer local minima (multiple shooting). The search is skipped
         if segments are no easier to fit than whole runs.
         """
-        if size > MAX_EFFECTS_ON_SEGMENTS or self._forgets:
+        if size > MAX_EFFECTS_ON_SEGMENTS or self._forgets_initial_state:
             return
-        segment_evaluator = make_segment_evaluator(self.world)
+        segment_evaluator = make_segment_evaluator(self.evaluator)
         if segment_evaluator is None:
             return
         # One search on segments serves every size; it decides nothing, and only provides starts.
@@ -251,28 +253,30 @@ class EffectSearch(ModelMoves):
         )
         best = select_by_size(segment_models, size)[:SEGMENT_MODELS_KEPT]
         if best:
-            self.refit_models([join_segment_fits(self.world, model.fit) for model in best])
+            self.refit_models([join_segment_fits(self.evaluator, model.fit) for model in best])
 
     @cached_property
-    def _forgets(self) -> bool:
+    def _forgets_initial_state(self) -> bool:
         """True if the motion forgets its initial state quickly, as strongly damped systems do.
 
         Segments of the runs are then no easier to fit than whole runs.
         """
-        fit, world = self.base_model.fit, self.world
+        fit, evaluator = self.base_model.fit, self.evaluator
         by_states = (
-            world.derivatives if world.has_linearisation else fit.jacobian[..., fit.free.size :]
+            evaluator.derivatives
+            if evaluator.has_linearisation
+            else fit.jacobian[..., fit.free.size :]
         )
-        return by_states is not None and forgets_initial_state(world, self.noise, by_states)
+        return by_states is not None and forgets_initial_state(evaluator, self.noise, by_states)
 
-    def _simpler(self, single: FittedModel) -> FittedModel:
+    def _choose_simpler_effect(self, single: FittedModel) -> FittedModel:
         """Return the effect that a single effect contains if the simpler one is preferable.
 
         This applies if the residual has structure to which the richer effect may have adapted.
         """
         if self.is_complete(single, EFFECT_P_VALUE_THRESHOLD):
             return single
-        for name in self.world.available_effects[single.effects[0]].contains:
+        for name in self.evaluator.available_effects[single.effects[0]].contains:
             part = self.models.get(frozenset([name]))
             # The richer effect must reduce the excess clearly, otherwise it mimics a missing
             # effect.

@@ -109,7 +109,7 @@ def compute_explained_squares(
     remaining_groups = np.arange(number)
     # Most effects have no constraint, and then all columns together explain most.
     if not any(positive):
-        solution = _solved(gram, cross, list(range(count)))
+        solution = _solve_subset(gram, cross, list(range(count)))
         best[solution.groups] = solution.gain
         coefficients[solution.groups] = solution.own
         remaining_groups = np.setdiff1d(remaining_groups, solution.groups)
@@ -130,7 +130,7 @@ def _solve_best_subset(gram: Array, cross: Array, positive: Sequence[bool]) -> t
     best = np.zeros((number, samples))
     coefficients = np.zeros((number, count))
     for subset in _enumerate_subsets(count):
-        solution = _solved(gram, cross, subset)
+        solution = _solve_subset(gram, cross, subset)
         constrained = [place for place, i in enumerate(subset) if positive[i]]
         previous_best = best[solution.groups]
         # More columns must explain more than rounding error, otherwise the smaller subset is kept.
@@ -169,7 +169,7 @@ class _SubsetSolution(NamedTuple):
     own: Array
 
 
-def _solved(gram: Array, cross: Array, subset: list[int]) -> _SubsetSolution:
+def _solve_subset(gram: Array, cross: Array, subset: list[int]) -> _SubsetSolution:
     """Solve the normal equations G c = h of each group for a subset of its columns.
 
     Groups whose columns are zero or collinear are left out. `gram` G is (n, k, k), `cross` h (n, k,

@@ -70,7 +70,7 @@ class HeldOutValidation:
         """
         runs = self.runs
         noise = runs.noise.sigma if sigma is None else sigma
-        residual = runs.world.observed - self.held_out_fits[names].simulated
+        residual = runs.evaluator.observed - self.held_out_fits[names].simulated
         scaled = residual / noise
         squares = np.square(scaled[runs.seen])
         return float(np.sqrt(squares.mean())) - 1.0
@@ -86,8 +86,10 @@ class HeldOutValidation:
             model: the model.
         """
         while model.effects and model.effects in self.held_out_fits:
-            submodels = self._smaller(search, model)
-            models_without_idle_effect = [m for m in submodels if not self._helps(search, m, model)]
+            submodels = self._list_smaller_models(search, model)
+            models_without_idle_effect = [
+                m for m in submodels if not self._improves_prediction(search, m, model)
+            ]
             if not models_without_idle_effect:
                 return model
             # If several effects are idle, drop the one without which held-out runs are predicted
@@ -120,14 +122,18 @@ class HeldOutValidation:
         ]
         # The model is included again, so that all initial states start from the same values.
         self.evaluate_models([model, *extensions, *parts])
-        excess_shares = {m.effects: self._share(search, model, m) for m in extensions}
+        excess_shares = {
+            m.effects: self._compute_relative_excess(search, model, m) for m in extensions
+        }
         best = min(extensions, key=lambda m: excess_shares[m.effects], default=model)
         if best is model or not excess_shares[best.effects] < 1.0:
             return model
         reduced_model = self.drop_unhelpful_effects(search, best)
         return reduced_model if names < set(reduced_model.effects) else model
 
-    def _share(self, search: EffectSearch, model: FittedModel, larger: FittedModel) -> float:
+    def _compute_relative_excess(
+        self, search: EffectSearch, model: FittedModel, larger: FittedModel
+    ) -> float:
         """Return the excess of a larger model relative to what its further effects must achieve.
 
         The value is one if the reduction is just enough; the worse of fitted and held-out runs
@@ -144,7 +150,7 @@ class HeldOutValidation:
         )
         return max(fitted_ratio, held_out_ratio) / required_ratio
 
-    def _smaller(self, search: EffectSearch, model: FittedModel) -> list[FittedModel]:
+    def _list_smaller_models(self, search: EffectSearch, model: FittedModel) -> list[FittedModel]:
         """Return the evaluated models that consist of the model without one of its effects."""
         names = set(model.effects)
         size = len(names) - 1
@@ -157,7 +163,7 @@ class HeldOutValidation:
                 submodels.append(other_model)
         return submodels
 
-    def _helps(
+    def _improves_prediction(
         self, search: EffectSearch, reduced_model: FittedModel, full_model: FittedModel
     ) -> bool:
         """Return whether the effect by which two models differ improves held-out predictions.

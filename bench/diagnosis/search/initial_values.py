@@ -27,50 +27,50 @@ MAX_EVENT_TIME_SUBDIVISIONS = 16
 """Maximum number of times between two tried event times at which a fit starts."""
 
 
-def list_coefficients(world: RunEvaluator, name: str) -> Sequence[Parameter]:
+def list_coefficients(evaluator: RunEvaluator, name: str) -> Sequence[Parameter]:
     """Return the coefficients of an effect as parameters, with units and plausible ranges.
 
     Args:
-        world: the runs.
+        evaluator: the runs.
         name: name of the effect.
     """
-    return world.parameters[world.slots[name]]
+    return evaluator.parameters[evaluator.slots[name]]
 
 
-def compute_reachable_levels(world: RunEvaluator, name: str) -> Array:
+def compute_reachable_levels(evaluator: RunEvaluator, name: str) -> Array:
     """Return the largest values (k,) that the limited quantity of an effect reaches in the runs.
 
     Args:
-        world: the runs.
+        evaluator: the runs.
         name: name of the effect.
 
     Returns:
         One value for each member of the effect (a family has several).
     """
-    effect = world.available_effects[name]
+    effect = evaluator.available_effects[name]
     members = members_of(effect)
     kind = effect.coefficients[0].of
     if kind == "give":
         # The coefficients after the first one are shape parameters.
-        return np.array([list_coefficients(world, name)[0].bounds[1]])
-    if kind == "drive" or (kind == "level" and not _recorded(world, effect)):
+        return np.array([list_coefficients(evaluator, name)[0].bounds[1]])
+    if kind == "drive" or (kind == "level" and not _get_limited_channel(evaluator, effect)):
         # The range of the quantity is not recorded, so the plausible range is used.
-        return np.array([p.bounds[1] for p in list_coefficients(world, name)])
+        return np.array([p.bounds[1] for p in list_coefficients(evaluator, name)])
     if kind == "travel":
-        return np.array([world.get_effect_travel(name)])
+        return np.array([evaluator.get_effect_travel(name)])
     level_functions = {
         "input/s": _max_input_rate,
         "input/s^2": _max_input_acceleration,
         "error": _max_servo_error,
         "level": _max_level,
     }
-    level_function = level_functions.get(kind, _largest)
+    level_function = level_functions.get(kind, _get_largest_input)
     return np.array(
-        [max(level_function(world, t, member) for t in world.tracks) for member in members]
+        [max(level_function(evaluator, t, member) for t in evaluator.tracks) for member in members]
     )
 
 
-def _command(track: RunData, effect: Effect) -> Array:
+def _get_command(track: RunData, effect: Effect) -> Array:
     """Return the input signal (T,) of a run on which an effect acts.
 
     It is the first input if the effect names none, and zero if the run has no such input.
@@ -81,58 +81,58 @@ def _command(track: RunData, effect: Effect) -> Array:
     return signals.get(effect.signal, zero_signal) if effect.signal else first_signal
 
 
-def _largest(world: RunEvaluator, track: RunData, effect: Effect) -> float:  # noqa: ARG001
-    """Return the largest magnitude of the input of an effect in a run; `world` is not used."""
-    return float(np.abs(_command(track, effect)).max())
+def _get_largest_input(evaluator: RunEvaluator, track: RunData, effect: Effect) -> float:  # noqa: ARG001
+    """Return the largest magnitude of the input of an effect in a run; `evaluator` is not used."""
+    return float(np.abs(_get_command(track, effect)).max())
 
 
-def _max_input_rate(world: RunEvaluator, track: RunData, effect: Effect) -> float:  # noqa: ARG001
+def _max_input_rate(evaluator: RunEvaluator, track: RunData, effect: Effect) -> float:  # noqa: ARG001
     """Return the largest rate of change of an effect's input in a run, in its unit per second."""
-    changes = np.abs(np.diff(_command(track, effect)))
+    changes = np.abs(np.diff(_get_command(track, effect)))
     return float((changes / np.diff(track.scenario.times)).max(initial=0.0))
 
 
-def _max_input_acceleration(world: RunEvaluator, track: RunData, effect: Effect) -> float:  # noqa: ARG001
+def _max_input_acceleration(evaluator: RunEvaluator, track: RunData, effect: Effect) -> float:  # noqa: ARG001
     """Return the acceleration 4 d / t² that moves the input over its range d from rest to rest.
 
     Half of t = `MIN_PROFILE_SECONDS` is acceleration, half braking. It is the largest acceleration
     limit that is tried.
     """
-    return 4.0 * float(np.ptp(_command(track, effect))) / MIN_PROFILE_SECONDS**2
+    return 4.0 * float(np.ptp(_get_command(track, effect))) / MIN_PROFILE_SECONDS**2
 
 
-def _recorded(world: RunEvaluator, effect: Effect) -> str:
+def _get_limited_channel(evaluator: RunEvaluator, effect: Effect) -> str:
     """Return the channel of the stored quantity, such as a tank's level, that an effect limits.
 
     It is empty if the quantity is not recorded.
     """
-    name = effect.place or world.simulator.system.levels[0]
-    return name if name in world.channels else ""
+    name = effect.place or evaluator.simulator.system.levels[0]
+    return name if name in evaluator.channels else ""
 
 
-def _max_level(world: RunEvaluator, track: RunData, effect: Effect) -> float:
+def _max_level(evaluator: RunEvaluator, track: RunData, effect: Effect) -> float:
     """Return the maximum of the stored quantity, such as a tank's level, recorded in a run."""
-    levels = track.observed[:, world.channels.index(_recorded(world, effect))]
+    levels = track.observed[:, evaluator.channels.index(_get_limited_channel(evaluator, effect))]
     return float(np.nanmax(levels, initial=0.0))
 
 
-def _max_servo_error(world: RunEvaluator, track: RunData, effect: Effect) -> float:
+def _max_servo_error(evaluator: RunEvaluator, track: RunData, effect: Effect) -> float:
     """Return the largest difference of command and position of a servo in a run.
 
     It is zero if the position is not recorded. The position is multiplied by the gear ratio first.
     """
-    system = world.simulator.system
+    system = evaluator.simulator.system
     place = system.primary if effect.coordinate is None else effect.coordinate
     name = system.coordinates[place]
-    if name not in world.channels:
+    if name not in evaluator.channels:
         return 0.0
-    motor_position = system.gear(place) * track.observed[:, world.channels.index(name)]
-    error = _command(track, effect) - motor_position
+    motor_position = system.gear(place) * track.observed[:, evaluator.channels.index(name)]
+    error = _get_command(track, effect) - motor_position
     return float(np.nanmax(np.abs(error), initial=0.0))
 
 
 def generate_end_stops(
-    world: RunEvaluator,
+    evaluator: RunEvaluator,
     name: str,
     side: float,
     stiffness_shares: Sequence[float],
@@ -143,14 +143,14 @@ def generate_end_stops(
     There are none if the range of the coordinate is not recorded.
 
     Args:
-        world: the runs.
+        evaluator: the runs.
         name: name of the effect.
         side: 1 for the upper end, -1 for the lower end.
         stiffness_shares: stiffnesses, as shares of the largest plausible one.
         depth_shares: depths within the range of the coordinate, as shares of the range.
     """
-    low, high = world.get_coordinate_range(name)
-    parameters = list_coefficients(world, name)
+    low, high = evaluator.get_coordinate_range(name)
+    parameters = list_coefficients(evaluator, name)
     max_stiffness = parameters[0].bounds[1]
     for stiffness_share, depth_share in (
         product(stiffness_shares, depth_shares) if low < high else ()
@@ -161,40 +161,46 @@ def generate_end_stops(
         yield c
 
 
-def generate_neighbouring_end_stops(world: RunEvaluator, name: str, c: Array) -> Iterator[Array]:
+def generate_neighbouring_end_stops(
+    evaluator: RunEvaluator, name: str, c: Array
+) -> Iterator[Array]:
     """Yield end stops (k,) on the same side as a given one; nothing for other effects.
 
     All depths are tried, because the stiffness determines the depth of contact.
 
     Args:
-        world: the runs.
+        evaluator: the runs.
         name: name of the effect.
         c: (k,) coefficients of the given end stop.
     """
-    if world.available_effects[name].coefficients[0].of == "stop":
-        part = abs(c[0]) / list_coefficients(world, name)[0].bounds[1]
+    if evaluator.available_effects[name].coefficients[0].of == "stop":
+        part = abs(c[0]) / list_coefficients(evaluator, name)[0].bounds[1]
         # Simulating a robot costs a hundred times as much, so fewer stops are tried.
         times, depths = (
             ((1.0,), END_STOP_DEPTH_SHARES[::2])
-            if world.has_linearisation
+            if evaluator.has_linearisation
             else (END_STOP_STIFFNESS_FACTORS, END_STOP_DEPTH_SHARES)
         )
-        yield from generate_end_stops(world, name, np.sign(c[0]), [part * t for t in times], depths)
+        yield from generate_end_stops(
+            evaluator, name, np.sign(c[0]), [part * t for t in times], depths
+        )
 
 
-def generate_equal_travel_end_stops(world: RunEvaluator, name: str, c: Array) -> Iterator[Array]:
+def generate_equal_travel_end_stops(
+    evaluator: RunEvaluator, name: str, c: Array
+) -> Iterator[Array]:
     """Yield softer and harder end stops (k,) with the same turning point as a given one.
 
     The depth of contact for a motion of equal energy is proportional to k^(-2/5), by eq. (2) of
     `sims.effects.state_limits`.
 
     Args:
-        world: the runs.
+        evaluator: the runs.
         name: name of the effect.
         c: (k,) coefficients of the given end stop.
     """
-    low, high = world.get_coordinate_range(name)
-    if world.available_effects[name].coefficients[0].of != "stop" or not c[0]:
+    low, high = evaluator.get_coordinate_range(name)
+    if evaluator.available_effects[name].coefficients[0].of != "stop" or not c[0]:
         return
     end = high if c[0] > 0 else low
     for factor in REFIT_STIFFNESS_FACTORS:
@@ -204,22 +210,22 @@ def generate_equal_travel_end_stops(world: RunEvaluator, name: str, c: Array) ->
         yield end_stop
 
 
-def generate_event_times(world: RunEvaluator, name: str, c: Array) -> Iterator[Array]:
+def generate_event_times(evaluator: RunEvaluator, name: str, c: Array) -> Iterator[Array]:
     """Yield coefficients (k,) with event times between time stamps, near a given event time.
 
     The times cover the interval to the next tried event times. Nothing is generated for effects
     without an event time.
 
     Args:
-        world: the runs.
+        evaluator: the runs.
         name: name of the effect.
         c: (k,) given coefficients.
     """
-    for i, parameter in enumerate(list_coefficients(world, name)):
+    for i, parameter in enumerate(list_coefficients(evaluator, name)):
         if not is_instant(parameter):
             continue
-        clock_start, clock_end = world.clock
-        stamps = np.unique(np.concatenate([track.scenario.times for track in world.tracks]))
+        clock_start, clock_end = evaluator.clock
+        stamps = np.unique(np.concatenate([track.scenario.times for track in evaluator.tracks]))
         midpoints = (stamps[1:] + stamps[:-1]) / 2.0
         near_midpoints = midpoints[
             np.abs(midpoints - c[i]) <= (clock_end - clock_start) / (EVENT_TIME_COUNT + 1)

@@ -71,22 +71,22 @@ class JointHatFamily(NamedTuple):
     slow: float
 
 
-def list_joint_families(world: RunEvaluator, speed_share: float) -> Iterator[JointHatFamily]:
+def list_joint_families(evaluator: RunEvaluator, speed_share: float) -> Iterator[JointHatFamily]:
     """Yield every family of hats that the recording can show.
 
     Args:
-        world: the runs.
+        evaluator: the runs.
         speed_share: speed over which dry friction reverses its sign, as a share of the high speed
             of a joint.
     """
-    longest_run = world.longest
-    for joint, name in enumerate(world.simulator.system.coordinates):
-        if name not in world.channels:
+    longest_run = evaluator.longest
+    for joint, name in enumerate(evaluator.simulator.system.coordinates):
+        if name not in evaluator.channels:
             continue
-        values = world.observed[:, :, world.channels.index(name)]
+        values = evaluator.observed[:, :, evaluator.channels.index(name)]
         # Quantiles instead of extremes, so that single outliers do not widen the range.
         low, high = (float(v) for v in np.nanquantile(values, [0.01, 0.99]))
-        speed = _fastest(world, world.channels.index(name))
+        speed = _compute_high_speed(evaluator, evaluator.channels.index(name))
         reversal_speed = speed_share * speed
         yield JointHatFamily(
             f"time, along {name}", joint, TIME, ALONG, 0.0, longest_run, reversal_speed
@@ -105,13 +105,13 @@ def list_joint_families(world: RunEvaluator, speed_share: float) -> Iterator[Joi
                 yield JointHatFamily(label, joint, SPEED, direction, 0.0, speed, reversal_speed)
 
 
-def _fastest(world: RunEvaluator, channel: int) -> float:
+def _compute_high_speed(evaluator: RunEvaluator, channel: int) -> float:
     """Return the 98 % quantile of the speed of a joint, from differences of its recorded position.
 
     The quantile is used instead of the maximum, because single differences may be noise.
     """
     rates = [np.zeros(1)]
-    for track in world.tracks:
+    for track in evaluator.tracks:
         if len(track.observed) > 3:
             # Use every third sample, because differences of neighbours are mostly noise.
             step = np.diff(track.scenario.times[::3])

@@ -158,11 +158,11 @@ def assess_lack_of_fit(models: ModelSet, model: FittedModel) -> LackOfFitResult:
         models: the models of the recording.
         model: the fitted model.
     """
-    world, is_noise_stated = models.world, models.stated
+    evaluator, is_noise_stated = models.evaluator, models.stated
     size_result = assess_residual_size(models, model)
-    if not any(probe.name in world.slots for probe in (HatForce, JointHatForce)):
+    if not any(probe.name in evaluator.slots for probe in (HatForce, JointHatForce)):
         return size_result
-    world.watch.report_and_check("an unmodelled force")
+    evaluator.watch.report_and_check("an unmodelled force")
     force_test = models.force_of_any_shape(model)
     level = get_structure_threshold(bool(is_noise_stated.all()))
     # The linear innovations test decides if it finds no force; otherwise the force is simulated.
@@ -175,7 +175,7 @@ def assess_lack_of_fit(models: ModelSet, model: FittedModel) -> LackOfFitResult:
             level,
         )
     model = models.refine_jacobian(model)
-    directions = compute_hat_directions(world, model)
+    directions = compute_hat_directions(evaluator, model)
     if not directions.candidates:
         return size_result
     residual = models.compute_residual(model.fit)
@@ -210,7 +210,7 @@ def assess_residual_size(models: ModelSet, model: FittedModel) -> LackOfFitResul
     residual_sigma = np.where(np.isfinite(sigma), sigma, 0.0)
     excess = residual_sigma / models.noise.sigma
     channels = []
-    for c, name in enumerate(models.world.channels):
+    for c, name in enumerate(models.evaluator.channels):
         error = _sigma_standard_error(models, model, c)
         if exceeds_noise(excess[c], error, models.stated[c]):
             channels.append(name)
@@ -230,33 +230,33 @@ def _sigma_standard_error(models: ModelSet, model: FittedModel, channel: int) ->
     return float(np.sqrt(variance))  # (2)
 
 
-def compute_hat_directions(world: RunEvaluator, model: FittedModel) -> DirectionSet:
+def compute_hat_directions(evaluator: RunEvaluator, model: FittedModel) -> DirectionSet:
     """Compute the responses of a model to hats over every recorded variable.
 
     Args:
-        world: the runs.
+        evaluator: the runs.
         model: the fitted model.
     """
-    probes, size = hat_probes(world)
-    names = [JointHatForce.name if JointHatForce.name in world.slots else HatForce.name] * len(
+    probes, size = hat_probes(evaluator)
+    names = [JointHatForce.name if JointHatForce.name in evaluator.slots else HatForce.name] * len(
         probes
     )
     added = [(name, probe.coefficients) for name, probe in zip(names, probes, strict=True)]
-    changed = compute_responses(world, model.fit, added)
+    changed = compute_responses(evaluator, model.fit, added)
     values = np.nan_to_num(np.moveaxis(changed, 0, -1)) / size
     # A hat outside the range of all runs changes nothing and would be a column of zeros.
     active_hats = np.flatnonzero(np.abs(values).max(axis=(0, 1, 2)) > 0)
     return DirectionSet(tuple(probes[i] for i in active_hats), values[..., active_hats])
 
 
-def hat_probes(world: RunEvaluator) -> tuple[list[CandidateDirection], float]:
+def hat_probes(evaluator: RunEvaluator) -> tuple[list[CandidateDirection], float]:
     """Return hats over every recorded variable, and their strength.
 
     All hats of a family have the same label, because they form one hypothesis and act together.
     """
-    size = HAT_STRENGTH_SHARE * TYPICAL_FORCES[world.simulator.system.kind]
+    size = HAT_STRENGTH_SHARE * TYPICAL_FORCES[evaluator.simulator.system.kind]
     probes = []
-    for label, low, high, coefficients in _shapes(world, size):
+    for label, low, high, coefficients in _iterate_hat_families(evaluator, size):
         # With this spacing, each hat extends to the centres of its neighbours.
         width = (high - low) / (HAT_COUNT - 1)
         for centre in np.linspace(low, high, HAT_COUNT):
@@ -269,22 +269,24 @@ HatFactory = Callable[[float, float], tuple[str, Array]]
 """Function from the centre and width of a hat to the name of its effect and its coefficients."""
 
 
-def _shapes(world: RunEvaluator, size: float) -> Iterator[tuple[str, float, float, HatFactory]]:
+def _iterate_hat_families(
+    evaluator: RunEvaluator, size: float
+) -> Iterator[tuple[str, float, float, HatFactory]]:
     """Yield each family of hats: label, lowest and highest centre, function that makes a hat.
 
     `size` is the strength of a hat.
     """
-    if JointHatForce.name in world.slots:
-        for joint in joint_families(world, SIGN_CHANGE_SPEED_SHARE):
+    if JointHatForce.name in evaluator.slots:
+        for joint in joint_families(evaluator, SIGN_CHANGE_SPEED_SHARE):
             yield joint.label, joint.low, joint.high, partial(_on_joint, joint, size)
         return
-    reversal_speed = SIGN_CHANGE_SPEED_SHARE * _high_speed_quantile(world)
-    for family in _families(world):
+    reversal_speed = SIGN_CHANGE_SPEED_SHARE * _high_speed_quantile(evaluator)
+    for family in _iterate_families(evaluator):
         yield (
             family.label,
             family.low,
             family.high,
-            partial(_anywhere, family, size, reversal_speed),
+            partial(_make_hat_without_joint, family, size, reversal_speed),
         )
 
 
@@ -296,7 +298,7 @@ def _on_joint(
     return JointHatForce.name, np.array([size, *other_coefficients])
 
 
-def _anywhere(
+def _make_hat_without_joint(
     family: _Family, size: float, reversal_speed: float, centre: float, width: float
 ) -> tuple[str, Array]:
     """Return effect name and coefficients of one hat force on a system without joints.
@@ -319,40 +321,40 @@ class _Family(NamedTuple):
     high: float
 
 
-def _families(world: RunEvaluator) -> Iterator[_Family]:
+def _iterate_families(evaluator: RunEvaluator) -> Iterator[_Family]:
     """Yield every family of hat forces, eq. (1), whose variable the recording shows."""
-    yield from _over_time(world)
-    yield from _over_positions(world)
-    yield from _over_speed(world)
+    yield from _over_time(evaluator)
+    yield from _over_positions(evaluator)
+    yield from _over_speed(evaluator)
 
 
-def _over_time(world: RunEvaluator) -> Iterator[_Family]:
+def _over_time(evaluator: RunEvaluator) -> Iterator[_Family]:
     """Yield families of hat forces over time, along each coordinate and against the motion."""
     durations = []
-    for track in world.tracks:
+    for track in evaluator.tracks:
         times = track.scenario.times
         durations.append(float(times[-1] - times[0]))
     longest_run = max(durations)
-    for axis, name in enumerate(world.simulator.system.coordinates):
-        if name in world.channels:
+    for axis, name in enumerate(evaluator.simulator.system.coordinates):
+        if name in evaluator.channels:
             yield _Family(
                 f"time, along {name}", TIME_VARIABLE, AXIS_DIRECTION + axis, 0.0, longest_run
             )
     yield _Family("time, against the motion", TIME_VARIABLE, VISCOUS_DIRECTION, 0.0, longest_run)
 
 
-def _over_positions(world: RunEvaluator) -> Iterator[_Family]:
+def _over_positions(evaluator: RunEvaluator) -> Iterator[_Family]:
     """Yield families of hat forces over each coordinate, from its 1 % to its 99 % quantile.
 
     The forces act along the last coordinate, against the motion, or as dry friction.
     """
-    system = world.simulator.system
+    system = evaluator.simulator.system
     # A bouncing body flies freely and slides on nothing; its last coordinate is the height.
     is_bouncing, last_axis = system.bounces, len(system.coordinates) - 1
     for axis, name in enumerate(system.coordinates):
-        if name not in world.channels:
+        if name not in evaluator.channels:
             continue
-        values = world.observed[:, :, world.channels.index(name)]
+        values = evaluator.observed[:, :, evaluator.channels.index(name)]
         # Quantiles instead of extremes, so that single outliers do not widen the range.
         low, high = (float(v) for v in np.nanquantile(values, [0.01, 0.99]))
         if not high > low:
@@ -368,27 +370,27 @@ def _over_positions(world: RunEvaluator) -> Iterator[_Family]:
             yield _Family(f"position {name}, dry", position, DRY_FRICTION_DIRECTION, low, high)
 
 
-def _over_speed(world: RunEvaluator) -> Iterator[_Family]:
+def _over_speed(evaluator: RunEvaluator) -> Iterator[_Family]:
     """Yield families of hat forces over the speed: against the motion, or dry friction."""
-    speed = _high_speed_quantile(world)
+    speed = _high_speed_quantile(evaluator)
     if speed > 0:
         yield _Family("speed, against the motion", SPEED_VARIABLE, VISCOUS_DIRECTION, 0.0, speed)
-    if speed > 0 and not world.simulator.system.bounces:
+    if speed > 0 and not evaluator.simulator.system.bounces:
         yield _Family("speed, dry", SPEED_VARIABLE, DRY_FRICTION_DIRECTION, 0.0, speed)
 
 
-def _high_speed_quantile(world: RunEvaluator) -> float:
+def _high_speed_quantile(evaluator: RunEvaluator) -> float:
     """Return the 98 % quantile of the speed, from differences of the recorded coordinates.
 
     It is the upper end of the hats over speed; a quantile, because single differences may be noise.
     """
     squares = []
-    for name in world.simulator.system.coordinates:
-        if name not in world.channels:
+    for name in evaluator.simulator.system.coordinates:
+        if name not in evaluator.channels:
             continue
-        c = world.channels.index(name)
+        c = evaluator.channels.index(name)
         rates = [np.zeros(1)]
-        for track in world.tracks:
+        for track in evaluator.tracks:
             if len(track.observed) > 3:
                 # Use every third sample, because differences of neighbours are mostly noise.
                 step = np.diff(track.scenario.times[::3])

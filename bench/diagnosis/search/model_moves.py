@@ -50,10 +50,10 @@ class ModelMoves(ScoredModelSet):
         """
         remaining_effects = frozenset(n for n in model.effects if n != name)
         if remaining_effects not in self.models:
-            self._lessen(model, [name])
+            self._fit_without(model, [name])
         return self.models[remaining_effects]
 
-    def _lessen(self, model: FittedModel, names: Iterable[str]) -> None:
+    def _fit_without(self, model: FittedModel, names: Iterable[str]) -> None:
         """Fit and store the models that lack one of the effects `names`.
 
         Each fit starts from the present parameters and initial states of the model.
@@ -63,10 +63,10 @@ class ModelMoves(ScoredModelSet):
             # Zero coefficients switch the effect off, and they are not fitted; all else starts as
             # it is.
             theta = model.fit.theta.copy()
-            theta[self.world.slots[name]] = 0.0
+            theta[self.evaluator.slots[name]] = 0.0
             remaining_effects = tuple(n for n in model.effects if n != name)
             known_jacobian = model.fit.get_known_jacobian().drop_parameters(
-                self.world.get_coefficient_indices(name)
+                self.evaluator.get_coefficient_indices(name)
             )
             starts.append(FitStart(remaining_effects, theta, model.fit.states, known_jacobian))
         self.refit_models(starts)
@@ -80,7 +80,7 @@ class ModelMoves(ScoredModelSet):
         # From here, the smaller model may reach a minimum that was missed when it was built up.
         if len(model.effects) > 1 and key not in self._lessened:
             self._lessened.add(key)
-            self._lessen(model, model.effects)
+            self._fit_without(model, model.effects)
         for name in model.effects:
             submodel = self.remove_effect(model, name)
             if submodel.penalised_log_likelihood >= model.penalised_log_likelihood:
@@ -95,7 +95,7 @@ class ModelMoves(ScoredModelSet):
         excess.
         """
         for name in model.effects:
-            for parts in self._parts(model, name):
+            for parts in self._iterate_contained_effects(model, name):
                 simpler_model = self._with_parts(model, name, parts)
                 is_excess_close = (
                     self.compute_excess(model)
@@ -109,13 +109,13 @@ class ModelMoves(ScoredModelSet):
                     return self.simplify_laws(simpler_model)
         return model
 
-    def _parts(self, model: FittedModel, name: str) -> Iterator[EffectStarts]:
+    def _iterate_contained_effects(self, model: FittedModel, name: str) -> Iterator[EffectStarts]:
         """Yield simpler effects that may replace an effect, with initial coefficients.
 
         They are the simpler laws at the same place, one by one and all together, and the most
         active member of a family.
         """
-        effects, slots = self.world.available_effects, self.world.slots
+        effects, slots = self.evaluator.available_effects, self.evaluator.slots
         coefficients = model.fit.theta[slots[name]]
         part_coefficients, begin = EffectStarts(), 0
         for part in effects[name].contains:
@@ -135,7 +135,7 @@ class ModelMoves(ScoredModelSet):
         # A coefficient shared by all places says nothing about a single place.
         if len(members) > 1 and coefficients.size == coefficient_count * len(members):
             free = model.fit.free.tolist()
-            columns = [free.index(place) for place in self.world.get_coefficient_indices(name)]
+            columns = [free.index(place) for place in self.evaluator.get_coefficient_indices(name)]
             responses = np.sqrt(np.square(model.fit.jacobian[..., columns]).sum(axis=(0, 1, 2)))
             sizes = (
                 (np.abs(coefficients) * responses)
@@ -166,9 +166,9 @@ class ModelMoves(ScoredModelSet):
         if is_fit_needed and step not in self._simplified:
             self._simplified.add(step)
             theta = model.fit.theta.copy()
-            theta[self.world.slots[name]] = 0.0
+            theta[self.evaluator.slots[name]] = 0.0
             for part, c in parts.items():
-                theta[self.world.slots[part]] += c
+                theta[self.evaluator.slots[part]] += c
             return self.fit_one(FitStart(names, theta, model.fit.states))
         return self.models[key]
 

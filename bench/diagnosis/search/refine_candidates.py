@@ -37,7 +37,7 @@ def refine_best_model(search: EffectSearch, model: FittedModel) -> FittedModel:
     size = len(model.effects)
     if search.settled_effects != frozenset(model.effects):
         model = _swap_each_effect(search, model)
-    neighbour_starts = list(generate_frequency_neighbours(search.world, model.fit))
+    neighbour_starts = list(generate_frequency_neighbours(search.evaluator, model.fit))
     # Periodic effects have dozens of local minima.
     if neighbour_starts:
         search.refit_from_segments(size)
@@ -73,7 +73,7 @@ def _swap_each_effect(search: EffectSearch, model: FittedModel) -> FittedModel:
     size = len(model.effects)
     known_effect_sets = set(search.models)
     submodels = [search.remove_effect(model, name) for name in model.effects]
-    search.refit_extensions(submodels, len(search.world.library))
+    search.refit_extensions(submodels, len(search.evaluator.library))
     best = model
     for key, other_model in search.models.items():
         # The search has already compared the known models.
@@ -100,7 +100,7 @@ def _make_swapped_start(
     (added_effect,), (removed_effect,) = (
         set(m.effects) - set(n.effects) for m, n in ((other_model, model), (model, other_model))
     )
-    slots = search.world.slots
+    slots = search.evaluator.slots
     theta = model.fit.theta.copy()
     theta[slots[removed_effect]] = 0.0
     theta[slots[added_effect]] = other_model.fit.theta[slots[added_effect]]

@@ -51,7 +51,7 @@ RANGE_SHARES = (0.2, 0.7, 1.5)
 
 
 def select_refit_starts(
-    world: RunEvaluator,
+    evaluator: RunEvaluator,
     noise: NoiseModel,
     model: FittedModel,
     direction_set: DirectionSet,
@@ -62,7 +62,7 @@ def select_refit_starts(
     """Return starts for fits with the most promising candidates.
 
     Args:
-        world: the runs.
+        evaluator: the runs.
         noise: noise of each channel.
         model: the model to extend.
         direction_set: sensitivity directions of the candidates.
@@ -72,36 +72,36 @@ def select_refit_starts(
     """
     numbered = []
     # If scores use derivatives of the simulator, few candidates are better than their score.
-    share = MIN_RELATIVE_SCORE_EXACT if world.has_linearisation else MIN_RELATIVE_SCORE
-    if fits_all and world.has_linearisation:
+    share = MIN_RELATIVE_SCORE_EXACT if evaluator.has_linearisation else MIN_RELATIVE_SCORE
+    if fits_all and evaluator.has_linearisation:
         max_count, share = MAX_REFITS_THOROUGH, 0.0
     # If scores are less reliable, they only order the patient fits, and exclude none.
-    is_all_wanted = fits_all and not world.has_linearisation
+    is_all_wanted = fits_all and not evaluator.has_linearisation
     for i in _rank_candidates(
-        scores, max_count, share, is_all_wanted, _find_simulated_scores(world, scores)
+        scores, max_count, share, is_all_wanted, _find_simulated_scores(evaluator, scores)
     ):
         name = scores.effects[i]
         # The score peaks of an effect are fitted separately, because each may lead to its own
         # minimum.
         for peak, (group, scored) in enumerate(scores.peaks[i]):
-            known_jacobian = _predict_jacobian(world, model, direction_set, group, name)
-            for c in _list_start_sizes(world, direction_set, group, scored, name):
+            known_jacobian = _predict_jacobian(evaluator, model, direction_set, group, name)
+            for c in _list_start_sizes(evaluator, direction_set, group, scored, name):
                 start = replace(
-                    with_effect(world, model.fit.make_start(), name, c), known=known_jacobian
+                    with_effect(evaluator, model.fit.make_start(), name, c), known=known_jacobian
                 )
                 numbered.append((peak, start))
     # Patient fits begin with the first part of the runs, so starts are compared there.
     share = FIT_HORIZONS[0].share if fits_all else 1.0
-    return _select_nearest_start(world, noise, numbered, share)
+    return _select_nearest_start(evaluator, noise, numbered, share)
 
 
-def _find_simulated_scores(world: RunEvaluator, scores: CandidateScores) -> frozenset[int]:
+def _find_simulated_scores(evaluator: RunEvaluator, scores: CandidateScores) -> frozenset[int]:
     """Return the indices of the candidates of a robot that are scored by full simulation.
 
     They are the series effects, whose response cannot be linearised; for other systems all scores
     are computed in the same way, and the result is empty.
     """
-    if not world.has_linearisation:
+    if not evaluator.has_linearisation:
         return frozenset()
     # Imported here, because only robots need it.
     from sims.robot.dynamics.series_joints import is_series_effect
@@ -109,7 +109,7 @@ def _find_simulated_scores(world: RunEvaluator, scores: CandidateScores) -> froz
     return frozenset(
         i
         for i, name in enumerate(scores.effects)
-        if is_series_effect(world.available_effects[name])
+        if is_series_effect(evaluator.available_effects[name])
     )
 
 
@@ -149,29 +149,29 @@ def _rank_candidates(
     return selected + selected_by_simulation
 
 
-def with_effect(world: RunEvaluator, start: FitStart, name: str, c: Array) -> FitStart:
+def with_effect(evaluator: RunEvaluator, start: FitStart, name: str, c: Array) -> FitStart:
     """Add an effect to a model, in place of the effects that it contains.
 
     Args:
-        world: the runs.
+        evaluator: the runs.
         start: the model.
         name: name of the effect.
         c: (k,) coefficients of the effect.
     """
-    effect = world.available_effects[name]
+    effect = evaluator.available_effects[name]
     contained, theta = effect.contains, start.theta.copy()
     # An effect and one that it contains together would have no unique solution.
     for part in sorted(set(contained) & set(start.effects)):
-        place = world.slots[part]
+        place = evaluator.slots[part]
         c = effect.taking(c, part, theta[place])
         theta[place] = 0.0
-    theta[world.slots[name]] = c
+    theta[evaluator.slots[name]] = c
     remaining_effects = [n for n in start.effects if n not in contained]
     return FitStart((*remaining_effects, name), theta, start.states)
 
 
 def _predict_jacobian(
-    world: RunEvaluator,
+    evaluator: RunEvaluator,
     model: FittedModel,
     direction_set: DirectionSet,
     group: DirectionGroup,
@@ -182,23 +182,23 @@ def _predict_jacobian(
     They consist of the derivatives of the model and the directions; None if these do not contain
     all coefficients.
     """
-    if not world.has_linearisation:
+    if not evaluator.has_linearisation:
         return None
     columns = {
         direction_set.candidates[i].place: i
         for i in group.column_indices
         if not direction_set.candidates[i].fixed
     }
-    places = world.get_coefficient_indices(name)
-    shaping = [i for i in range(len(places)) if world.parameters[places[i]].bounds[0] > 0]
+    places = evaluator.get_coefficient_indices(name)
+    shaping = [i for i in range(len(places)) if evaluator.parameters[places[i]].bounds[0] > 0]
     if not columns or shaping:
         return None
     jacobian = np.zeros((*direction_set.responses.shape[:3], len(places)))
     for place, column in columns.items():
         jacobian[..., place] = direction_set.responses[..., column]
     contained = [
-        world.get_coefficient_indices(n)
-        for n in world.available_effects[name].contains
+        evaluator.get_coefficient_indices(n)
+        for n in evaluator.available_effects[name].contains
         if n in model.effects
     ]
     replaced_places = {place for span in contained for place in span}
@@ -210,7 +210,7 @@ def _predict_jacobian(
 
 
 def _list_start_sizes(
-    world: RunEvaluator,
+    evaluator: RunEvaluator,
     direction_set: DirectionSet,
     group: DirectionGroup,
     estimate: Array,
@@ -221,12 +221,12 @@ def _list_start_sizes(
     They are the linear estimate (`estimate`), smaller shares of it, and shares of the plausible
     range. `group` has the directions of the effect at one grid point.
     """
-    bounds = compute_coefficient_bounds(world, name)
+    bounds = compute_coefficient_bounds(evaluator, name)
     first = direction_set.candidates[group.column_indices[0]]
     # A direction for one full size says nothing about other sizes.
     if first.fixed:
         yield first.coefficients
-        yield from generate_neighbouring_end_stops(world, name, first.coefficients)
+        yield from generate_neighbouring_end_stops(evaluator, name, first.coefficients)
         return
     for share in SIZE_SHARES:
         c = first.coefficients.copy()
@@ -234,12 +234,12 @@ def _list_start_sizes(
             place = direction_set.candidates[column].place
             c[place] = share * float(np.clip(size, *bounds[place]))
         yield c
-        yield from generate_event_times(world, name, c)
+        yield from generate_event_times(evaluator, name, c)
     # With several coefficients, the ranges do not show how the coefficients are related.
     if len(group.column_indices) > 1:
         return
-    place = world.slots[name].start + first.place
-    _, upper_bound = world.parameters[place].bounds
+    place = evaluator.slots[name].start + first.place
+    _, upper_bound = evaluator.parameters[place].bounds
     shares = list(RANGE_SHARES)
     if first.signed:
         shares += [-share for share in RANGE_SHARES]
@@ -250,12 +250,15 @@ def _list_start_sizes(
 
 
 def _select_nearest_start(
-    world: RunEvaluator, noise: NoiseModel, numbered: Sequence[tuple[int, FitStart]], share: float
+    evaluator: RunEvaluator,
+    noise: NoiseModel,
+    numbered: Sequence[tuple[int, FitStart]],
+    share: float,
 ) -> list[FitStart]:
     """Return the start with the lowest cost for each peak number and set of effects.
 
     Args:
-        world: the runs.
+        evaluator: the runs.
         noise: noise of each channel.
         numbered: starts with the number of their score peak.
         share: initial share of the runs on which the cost is computed.
@@ -263,18 +266,18 @@ def _select_nearest_start(
     if not numbered:
         return []
     starts = [start for _, start in numbered]
-    runs = len(world.tracks)
+    runs = len(evaluator.tracks)
     count = len(starts)
     theta = np.repeat([s.theta for s in starts], runs, axis=0)
     states = np.concatenate([s.states for s in starts])
     lanes = np.tile(np.arange(runs), count)
     # All starts are simulated in one engine call, as one batch.
-    predictions = world.simulate(theta, lanes, states, share)
+    predictions = evaluator.simulate(theta, lanes, states, share)
     predictions = predictions.reshape(count, runs, *predictions.shape[1:])
-    sample_mask = world.get_sample_mask(share)
+    sample_mask = evaluator.get_sample_mask(share)
     best: dict[tuple[int, EffectNames], tuple[float, FitStart]] = {}
     for (number, start), simulated in zip(numbered, predictions, strict=True):
-        residual = world.observed - simulated
+        residual = evaluator.observed - simulated
         normalised_residual = np.where(sample_mask, residual, 0.0) / noise.sigma
         cost = float(np.square(normalised_residual).sum())
         key = (number, start.effects)

@@ -225,10 +225,10 @@ class _BestScores:
         """
         self._phi, self._determinant, self._total = phi, determinant, total
         self._gains[...] = 0.0
-        value_without_effects = self._value(total, total)
+        value_without_effects = self._compute_log_likelihood(total, total)
         self._without = np.maximum(self._without, value_without_effects)
 
-    def _value(self, remaining_squares: Array, total_squares: Array) -> Array:
+    def _compute_log_likelihood(self, remaining_squares: Array, total_squares: Array) -> Array:
         """Return l(phi) of eq. (3), twice the log-likelihood, at the present correlation.
 
         Args:
@@ -255,7 +255,7 @@ class _BestScores:
         present, first = np.unique(rows[order], return_index=True)
         largest = np.maximum.reduceat(gain[order], first, axis=0)
         self._gains[present] = np.maximum(self._gains[present], largest)
-        value = self._value(self._total[0] - gain[:, 0], self._total[0])
+        value = self._compute_log_likelihood(self._total[0] - gain[:, 0], self._total[0])
         # The first residual is the observed one; only its coefficients are used as starts of fits.
         is_better = value > self._values[batch.places]
         places = batch.places[is_better]
@@ -265,11 +265,11 @@ class _BestScores:
 
     def end(self) -> None:
         """Finish a correlation: update the best likelihood of each effect from its groups."""
-        values = self._value(self._total - self._gains, self._total)
+        values = self._compute_log_likelihood(self._total - self._gains, self._total)
         self._best = np.maximum(self._best, values)
         # With phi = 0, whitening leaves sums of squares unchanged.
         if self._phi == 0 and len(self._names):
-            value_without_effects = self._value(self._total[0], self._total[0])
+            value_without_effects = self._compute_log_likelihood(self._total[0], self._total[0])
             self._white = np.maximum(values[:, 0] - value_without_effects, 0.0)
 
     def ranked(self) -> CandidateScores:
@@ -296,14 +296,14 @@ class _BestScores:
             effects=tuple(self._names[i] for i in order),
             score=observed[order],
             null_quantiles=null_quantiles[order],
-            peaks=tuple(self._peaks(np.flatnonzero(self._rows == i)) for i in order),
+            peaks=tuple(self._get_peaks(np.flatnonzero(self._rows == i)) for i in order),
             p_value=p_value,
             phi=phi,
             null_scores=null_scores[order],
             white_noise_scores=self._white[order],
         )
 
-    def _peaks(self, places: NDArray[np.intp]) -> tuple[ScorePeak, ...]:
+    def _get_peaks(self, places: NDArray[np.intp]) -> tuple[ScorePeak, ...]:
         """Return the best group of an effect with its coefficients, as start of a fit.
 
         An effect with many shapes, such as frequencies, may have several local maxima of the

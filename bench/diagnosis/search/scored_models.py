@@ -136,20 +136,20 @@ class ScoredModelSet(ModelSet):
         """
         key = frozenset(model.effects)
         if key not in (self.scores_by_effects if against is None else self.cached_scans):
-            self._survey([model])
+            self._score_models([model])
         if against is None:
             return self.scores_by_effects[key]
         stored_scan = self.cached_scans[key]
-        self._look(model)
+        self._report_scoring(model)
         # Directions cost one simulation per candidate, and are reused with other surrogates. The
         # spectrum of the noise is best estimated from a model with less structure in its residual.
         residual = self.compute_residual(model.fit)
         stream = self.make_rng("library", model.effects)
-        scores = _scored(stored_scan.test, residual, against, self.observed_mask, stream)
-        self._take(key, stored_scan._replace(scores=scores))
+        scores = _score_residual(stored_scan.test, residual, against, self.observed_mask, stream)
+        self._store_scores(key, stored_scan._replace(scores=scores))
         return scores
 
-    def _survey(
+    def _score_models(
         self, models: Sequence[FittedModel], other_kept_models: Sequence[FittedModel] = ()
     ) -> None:
         """Score the effects that each of the models lacks.
@@ -160,7 +160,7 @@ class ScoredModelSet(ModelSet):
         """
         calls, keys = [], []
         for model in models:
-            self._look(model)
+            self._report_scoring(model)
             model = self.refine_jacobian(model)
             key = frozenset(model.effects)
             residual, stream = (
@@ -171,16 +171,18 @@ class ScoredModelSet(ModelSet):
             # A model that has hardly moved keeps its directions.
             if (
                 previous_scan is not None
-                and self._moved(previous_scan.at, model.fit) < UNCHANGED_FIT_SIGMAS
+                and self._compute_fit_distance(previous_scan.at, model.fit) < UNCHANGED_FIT_SIGMAS
             ):
-                scores = _scored(previous_scan.test, residual, residual, self.observed_mask, stream)
-                self._take(key, previous_scan._replace(scores=scores))
+                scores = _score_residual(
+                    previous_scan.test, residual, residual, self.observed_mask, stream
+                )
+                self._store_scores(key, previous_scan._replace(scores=scores))
                 continue
             keys.append(key)
             calls.append(
                 (
                     model.fit,
-                    self._lacking(model),
+                    self._list_addable_effects(model),
                     self.compute_channel_weights(model),
                     residual,
                     self.observed_mask,
@@ -189,22 +191,22 @@ class ScoredModelSet(ModelSet):
             )
         if calls:
             max_effects = max(len(missing_effects) for _, missing_effects, *_ in calls)
-            further_text = f" in addition to {len(calls)} models" if len(calls) > 1 else ""
-            self.world.watch.stage(f"testing {max_effects} effects{further_text}", len(calls))
+            further_text = f" added to each of {len(calls)} models" if len(calls) > 1 else ""
+            self.evaluator.watch.stage(f"testing {max_effects} effects{further_text}", len(calls))
         scans = {}
-        for number, scan in self.world.crew.map_unordered(self.world, _scan_model, calls):
+        for number, scan in self.evaluator.crew.map_unordered(self.evaluator, _scan_model, calls):
             scans[number] = scan
-            self.world.watch.advance()
+            self.evaluator.watch.advance()
         for number, key in enumerate(keys):
             scores = self.scores_by_effects.get(key, scans[number].scores)
             # Scores that were kept when the directions were removed remain valid.
-            self._take(key, scans[number]._replace(scores=scores))
+            self._store_scores(key, scans[number]._replace(scores=scores))
         self._make_room([*keys, *(frozenset(model.effects) for model in other_kept_models)])
 
-    def _look(self, model: FittedModel) -> None:
+    def _report_scoring(self, model: FittedModel) -> None:
         """Report to the user that a model is scored now, and stop if the search has to end."""
         model_text = " + ".join(model.effects) or "the base model"
-        self.world.watch.report_and_check(f"scores of the effect library at {model_text}")
+        self.evaluator.watch.report_and_check(f"scores of the effect library at {model_text}")
 
     def _make_room(self, kept_keys: Sequence[frozenset[str]]) -> None:
         """Remove the oldest stored directions until `DIRECTION_CACHE_BYTES` is not exceeded.
@@ -221,7 +223,7 @@ class ScoredModelSet(ModelSet):
                     return
                 del cache[key]
 
-    def _take(self, key: frozenset[str], scan: ModelScan) -> None:
+    def _store_scores(self, key: frozenset[str], scan: ModelScan) -> None:
         """Store the scan of the model `key` (its effects) as the latest one, with its scores."""
         # Insert the entry again, so that it is the newest one.
         self.cached_scans.pop(key, None)
@@ -241,12 +243,12 @@ class ScoredModelSet(ModelSet):
         if not key and not self.null_gains:
             self.null_gains = dict(zip(scores.effects, scores.null_quantiles.tolist(), strict=True))
 
-    def _moved(self, first: TrajectoryFit, second: TrajectoryFit) -> float:
+    def _compute_fit_distance(self, first: TrajectoryFit, second: TrajectoryFit) -> float:
         """Return by how much two fits differ: RMS over all samples, in units of the noise."""
         normalised_difference = (first.simulated - second.simulated) / self.noise.sigma
         return float(np.sqrt(np.square(normalised_difference[self.observed_mask]).mean()))
 
-    def _lacking(self, model: FittedModel) -> list[str]:
+    def _list_addable_effects(self, model: FittedModel) -> list[str]:
         """Return the effects that could be added to a model.
 
         These are all effects of the library that are neither in the model nor contained in one of
@@ -255,8 +257,8 @@ class ScoredModelSet(ModelSet):
         included_effects = set(model.effects)
         # An effect and one that it contains have no unique solution together.
         for name in model.effects:
-            included_effects.update(self.world.available_effects[name].contains)
-        return [name for name in self.world.library if name not in included_effects]
+            included_effects.update(self.evaluator.available_effects[name].contains)
+        return [name for name in self.evaluator.library if name not in included_effects]
 
     def refit_extensions(
         self, beam: Iterable[FittedModel], max_count: int, fits_all: bool = False
@@ -274,14 +276,14 @@ class ScoredModelSet(ModelSet):
         unscanned_models = [
             model for model in models if frozenset(model.effects) not in self.cached_scans
         ]
-        self._survey(unscanned_models, other_kept_models=models)
+        self._score_models(unscanned_models, other_kept_models=models)
         for model in models:
             key = frozenset(model.effects)
             stored_scan = self.cached_scans[key]
             # The model may have been improved since it was put into the beam.
             latest_model = self.models[key]
             extension_starts = select_refit_starts(
-                self.world,
+                self.evaluator,
                 self.noise,
                 latest_model,
                 stored_scan.directions,
@@ -290,18 +292,20 @@ class ScoredModelSet(ModelSet):
                 fits_all,
             )
             starts += [s for s in extension_starts if fits_all or self._is_new(s, latest_model)]
-        if not self.world.has_linearisation or fits_all:
+        if not self.evaluator.has_linearisation or fits_all:
             if starts:
                 self.refit_models(starts, is_staged=fits_all)
             return
         # Laws that are evaluated in every step cost most, and the laws that they contain are often
         # sufficient.
         names = {frozenset(start.effects) for start in starts} | set(self.models)
-        parts = {id(start): self._contained(start) & names for start in starts}
+        parts = {id(start): self._list_simpler_models(start) & names for start in starts}
         simple_starts = [start for start in starts if not parts[id(start)]]
         if simple_starts:
             self.refit_models(simple_starts)
-        richer_starts = [s for s in starts if parts[id(s)] and not self._explained(parts[id(s)])]
+        richer_starts = [
+            s for s in starts if parts[id(s)] and not self._leaves_only_noise(parts[id(s)])
+        ]
         if richer_starts:
             self.refit_models(richer_starts)
 
@@ -316,22 +320,22 @@ class ScoredModelSet(ModelSet):
         if stored_model is None:
             return True
         likelihood_deficit = model.likelihood.value - stored_model.likelihood.value
-        return self.world.has_linearisation and likelihood_deficit > NESTED_MODEL_TOLERANCE
+        return self.evaluator.has_linearisation and likelihood_deficit > NESTED_MODEL_TOLERANCE
 
-    def _contained(self, start: FitStart) -> set[frozenset[str]]:
+    def _list_simpler_models(self, start: FitStart) -> set[frozenset[str]]:
         """Return the models in which one effect is replaced by a simpler one that it contains.
 
         Each model is the set of its effects.
         """
         effect_names = frozenset(start.effects)
-        effects = self.world.available_effects
+        effects = self.evaluator.available_effects
         return {
             effect_names - {name} | {part}
             for name in effect_names
             for part in effects[name].contains
         }
 
-    def _explained(self, keys: Iterable[frozenset[str]]) -> bool:
+    def _leaves_only_noise(self, keys: Iterable[frozenset[str]]) -> bool:
         """Return whether one of the fitted models `keys` (sets of effects) leaves only noise."""
         models = [self.models[key] for key in keys if key in self.models]
         return any(
@@ -409,7 +413,7 @@ class ScoredModelSet(ModelSet):
 
 
 def _scan_model(
-    world: RunEvaluator,
+    evaluator: RunEvaluator,
     fit: TrajectoryFit,
     missing_effects: Sequence[str],
     weights: NoiseModel,
@@ -420,7 +424,7 @@ def _scan_model(
     """Score all effects that one model lacks; runs in this process or in a worker.
 
     Args:
-        world: the runs.
+        evaluator: the runs.
         fit: the fitted model.
         missing_effects: names of the effects that it lacks.
         weights: noise that weights the channels.
@@ -428,14 +432,14 @@ def _scan_model(
         observed_mask: (R, T, C) mask of available samples.
         stream: random generator of the surrogates.
     """
-    candidates = compute_directions(world, fit, missing_effects)
+    candidates = compute_directions(evaluator, fit, missing_effects)
     test = ScoreTest(fit, candidates, observed_mask, weights)
     return ModelScan(
-        fit, candidates, test, _scored(test, residual, residual, observed_mask, stream)
+        fit, candidates, test, _score_residual(test, residual, residual, observed_mask, stream)
     )
 
 
-def _scored(
+def _score_residual(
     test: ScoreTest,
     residual: Array,
     against: Array,

@@ -39,7 +39,7 @@ def search_with_subsampling(search: EffectSearch) -> FittedModel:
         SearchStoppedError: the search had to end early.
     """
     # Thinned runs would begin in contact without an estimate of their initial states.
-    thinned_runs = None if search.world.is_in_contact else thin_runs(search.world)
+    thinned_runs = None if search.evaluator.is_in_contact else thin_runs(search.evaluator)
     if thinned_runs is None:
         return search.run()
     try:
@@ -82,7 +82,7 @@ def _adopt_subsampled_models(search: EffectSearch, model: FittedModel) -> None:
 
     It is used if the time limit ends the search on the thinned runs.
     """
-    fitter = TrajectoryFitter(search.world, search.noise, search.frozen)
+    fitter = TrajectoryFitter(search.evaluator, search.noise, search.frozen)
     (fit,) = fitter.fit_models([model.fit.make_start()], iterations=0)
     search.best_supported_model = search.add_fit(fit)
 

@@ -214,10 +214,10 @@ class WhiteningDesign:
         self._powers = LaggedSums.zeros(count)
         self._grams = [LaggedSums.zeros(*block.shape, block.shape[1]) for block in self.blocks]
         self._known: dict[float, _ReducedDesign] = {}
-        for place in self._places():
-            self._add(place)
+        for place in self._iterate_sections():
+            self._add_section_products(place)
 
-    def _places(self) -> Iterator[RunSegment]:
+    def _iterate_sections(self) -> Iterator[RunSegment]:
         """Yield sections of the runs that are so short that their columns fit in the CPU cache."""
         count, runs, length, channels = self._directions.shape
         step = max(MAX_CHUNK_SIZE // (max(count, 1) * channels), MIN_CHUNK_SAMPLES)
@@ -228,7 +228,7 @@ class WhiteningDesign:
                 edge = np.flatnonzero(missing_neighbours)
                 yield RunSegment(run, begin, end, edge, missing_neighbours[edge])
 
-    def _columns(
+    def _weight_columns(
         self, values: Array, place: RunSegment, has_neighbours: bool = True
     ) -> SegmentColumns:
         """Return weighted samples of one section, and the sums of their two neighbours in time.
@@ -255,10 +255,10 @@ class WhiteningDesign:
         flat = samples.reshape(size)
         return SegmentColumns(flat, neighbour_sums.reshape(size), flat[:, place.edge])
 
-    def _add(self, place: RunSegment) -> None:
+    def _add_section_products(self, place: RunSegment) -> None:
         """Add the products of one section of a run to the sums of eq. (1)."""
-        jacobian_columns = self._columns(self._jacobian, place)
-        direction_columns = self._columns(self._directions, place)
+        jacobian_columns = self._weight_columns(self._jacobian, place)
+        direction_columns = self._weight_columns(self._directions, place)
         add_cross_products(
             select_run(self._normal, place.run), jacobian_columns, jacobian_columns, place
         )
@@ -291,14 +291,14 @@ class WhiteningDesign:
         squares = LaggedSums.zeros(samples)
         shared = LaggedSums.zeros(runs, size, samples)
         cross = LaggedSums.zeros(len(self._directions), samples)
-        for place in self._places():
+        for place in self._iterate_sections():
             # Concatenate section by section, because whole copies would double the memory.
-            parts = [self._columns(array, place) for array in residuals]
+            parts = [self._weight_columns(array, place) for array in residuals]
             residual_columns = SegmentColumns(
                 *(np.concatenate(rows) for rows in zip(*parts, strict=True))
             )
-            jacobian_columns = self._columns(self._jacobian, place)
-            direction_columns = self._columns(self._directions, place, has_neighbours=False)
+            jacobian_columns = self._weight_columns(self._jacobian, place)
+            direction_columns = self._weight_columns(self._directions, place, has_neighbours=False)
             add_self_products(squares, residual_columns, place)
             add_cross_products(
                 select_run(shared, place.run), jacobian_columns, residual_columns, place
@@ -317,7 +317,7 @@ class WhiteningDesign:
         weighted = self._jacobian * self._weights
         shared = np.stack(
             [
-                _flat(run_jacobian) @ _flat(residuals[:, run] * self._weights[run]).T
+                _flatten(run_jacobian) @ _flatten(residuals[:, run] * self._weights[run]).T
                 for run, run_jacobian in enumerate(np.moveaxis(weighted, 1, 0))
             ]
         )
@@ -331,7 +331,7 @@ class WhiteningDesign:
         result = np.empty_like(residuals)
         for run in range(runs):
             coefficients = np.concatenate([parameters, states[run]])
-            explained_residuals = coefficients.T @ _flat(self._jacobian[:, run])
+            explained_residuals = coefficients.T @ _flatten(self._jacobian[:, run])
             result[:, run] = residuals[:, run] - explained_residuals.reshape(
                 residuals[:, run].shape
             )
@@ -343,10 +343,10 @@ class WhiteningDesign:
         The result is cached.
         """
         if phi not in self._known:
-            self._known[phi] = self._reduce(phi)
+            self._known[phi] = self._whiten_and_project(phi)
         return self._known[phi]
 
-    def _reduce(self, phi: float) -> _ReducedDesign:
+    def _whiten_and_project(self, phi: float) -> _ReducedDesign:
         """Whiten the design with the correlation phi, and project it by eq. (2), without a cache.
 
         First the initial states of each run are projected out, then the parameters of all runs.
@@ -424,7 +424,7 @@ class InnerProducts:
         )
 
 
-def _flat(values: Array) -> Array:
+def _flatten(values: Array) -> Array:
     """Reshape (k, T, C) to (k, T · C)."""
     return values.reshape(len(values), -1)
 

@@ -33,33 +33,33 @@ class CrossValidation:
     """Validation that predicts each run with models that are refitted to the other runs.
 
     Args:
-        world: Run evaluator of all runs; each run has the number of its fold.
+        evaluator: Run evaluator of all runs; each run has the number of its fold.
         noise: Noise that weights the channels.
 
     Attributes:
-        world: Run evaluator of all runs.
+        evaluator: Run evaluator of all runs.
         noise: Noise that weights the channels.
         seen: (R, T, C) mask of the available samples.
     """
 
     is_cross_validation = True
 
-    def __init__(self, world: RunEvaluator, noise: NoiseModel) -> None:
-        self.world = world
+    def __init__(self, evaluator: RunEvaluator, noise: NoiseModel) -> None:
+        self.evaluator = evaluator
         self.noise = noise
-        self.seen: Mask = np.isfinite(world.observed)
+        self.seen: Mask = np.isfinite(evaluator.observed)
 
     @property
     def simulations(self) -> int:
         """Number of simulations made for the folds alone."""
         if "_folds" not in self.__dict__:
             return 0
-        return sum(fold.fitting.simulations + fold.left_out.simulations for fold in self._folds)
+        return sum(fold.fitting.simulations + fold.left_out.simulations for fold in self._run_folds)
 
     def close(self) -> None:
         """Close the simulators of the folds; the run evaluator of all runs stays open."""
         if "_folds" in self.__dict__:
-            for fold in self._folds:
+            for fold in self._run_folds:
                 fold.fitting.close()
                 fold.left_out.close()
 
@@ -75,23 +75,26 @@ class CrossValidation:
         Returns:
             Predictions of all runs by each model.
         """
-        shape = self.world.observed.shape
+        shape = self.evaluator.observed.shape
         simulated = np.full((len(fits), *shape), np.nan)
         states = np.stack([fit.states for fit in fits])
         free = np.zeros(len(fits))
-        for number, fold in enumerate(self._folds):
-            self.world.watch.stage(f"cross-validation, fold {number + 1} of {len(self._folds)}")
-            thetas = self._refitted(fold, fits)
+        for number, fold in enumerate(self._run_folds):
+            self.evaluator.watch.stage(
+                f"cross-validation, fold {number + 1} of {len(self._run_folds)}"
+            )
+            thetas = self._refit_fold(fold, fits)
             predicted = HeldOutRuns(fold.left_out, self.noise).fit_initial_states(thetas)
             for i, prediction in enumerate(predicted):
                 simulated[i, fold.rows, : prediction.simulated.shape[1]] = prediction.simulated
                 states[i, fold.rows] = prediction.states
                 free[i] += prediction.freedom
         return [
-            self._measured(*result) for result in zip(simulated, states, free.tolist(), strict=True)
+            self._predict_all_runs(*result)
+            for result in zip(simulated, states, free.tolist(), strict=True)
         ]
 
-    def _measured(self, simulated: Array, states: Array, free: float) -> HeldOutFit:
+    def _predict_all_runs(self, simulated: Array, states: Array, free: float) -> HeldOutFit:
         """Return a model's prediction of all runs with its merit, the penalised log-likelihood.
 
         A failed simulation has the merit -infinity, so that any other model is preferred.
@@ -103,13 +106,13 @@ class CrossValidation:
         """
         if not np.isfinite(simulated[self.seen]).all():
             return HeldOutFit(np.full_like(simulated, np.nan), -np.inf, states)
-        penalised_likelihood = merit_of(self.world.observed, simulated, free)
+        penalised_likelihood = merit_of(self.evaluator.observed, simulated, free)
         return HeldOutFit(simulated, penalised_likelihood, states, free)
 
     @cached_property
-    def _folds(self) -> list[_Fold]:
+    def _run_folds(self) -> list[_Fold]:
         """The folds; each has run evaluators for its own runs, with the parameters of the whole."""
-        numbers = np.array([run.fold for run in self.world.runs])
+        numbers = np.array([run.fold for run in self.evaluator.runs])
         folds = []
         for number in sorted(set(numbers.tolist())):
             rows = np.flatnonzero(numbers == number)
@@ -119,17 +122,17 @@ class CrossValidation:
 
     def _of_runs(self, rows: Indices) -> RunEvaluator:
         """Make a run evaluator of the runs `rows`, which are the fitted or the left-out ones."""
-        world = self.world.with_runs([self.world.runs[row] for row in rows])
-        length = world.observed.shape[1]
-        if self.world.correction is not None:
-            world.correction = self.world.correction[rows, :length]
-        if self.world.derivatives is not None:
-            world.derivatives = self.world.derivatives[rows, :length]
+        evaluator = self.evaluator.with_runs([self.evaluator.runs[row] for row in rows])
+        length = evaluator.observed.shape[1]
+        if self.evaluator.correction is not None:
+            evaluator.correction = self.evaluator.correction[rows, :length]
+        if self.evaluator.derivatives is not None:
+            evaluator.derivatives = self.evaluator.derivatives[rows, :length]
         # Workers that are started for one fold also know the other folds.
-        world.crew.register(world)
-        return world
+        evaluator.crew.register(evaluator)
+        return evaluator
 
-    def _refitted(self, fold: _Fold, fits: Sequence[TrajectoryFit]) -> list[Array]:
+    def _refit_fold(self, fold: _Fold, fits: Sequence[TrajectoryFit]) -> list[Array]:
         """Refit each model to the runs of a fold that are not left out.
 
         Args:
@@ -139,7 +142,7 @@ class CrossValidation:
         Returns:
             Parameters (P,) of each model; an effect that these runs do not show is switched off.
         """
-        base = set(self.world.base.tolist())
+        base = set(self.evaluator.base.tolist())
         # All models of a search keep the same parameters fixed at their nominal values.
         frozen = frozenset(base - set(fits[0].free.tolist()))
         length = fold.fitting.observed.shape[1]
@@ -152,7 +155,7 @@ class CrossValidation:
         return self._without_unsupported(fold.fitting, refits)
 
     def _without_unsupported(
-        self, world: RunEvaluator, fits: Sequence[TrajectoryFit]
+        self, evaluator: RunEvaluator, fits: Sequence[TrajectoryFit]
     ) -> list[Array]:
         """Return parameters (P,) of each model; effects that the runs do not show are off.
 
@@ -164,21 +167,21 @@ class CrossValidation:
         removals = [(i, name) for i, fit in enumerate(fits) for name in fit.effects]
         if not removals:
             return thetas
-        runs = len(world.tracks)
+        runs = len(evaluator.tracks)
         lanes = np.stack([fits[i].theta for i, _ in removals])
         for lane, (_, name) in zip(lanes, removals, strict=True):
-            lane[world.get_coefficient_indices(name)] = 0.0
-        simulated_without = world.simulate(
+            lane[evaluator.get_coefficient_indices(name)] = 0.0
+        simulated_without = evaluator.simulate(
             np.repeat(lanes, runs, axis=0),
             np.tile(np.arange(runs), len(removals)),
             np.concatenate([fits[i].states for i, _ in removals]),
-        ).reshape(len(removals), *world.observed.shape)
-        observed_mask = np.isfinite(world.observed)
+        ).reshape(len(removals), *evaluator.observed.shape)
+        observed_mask = np.isfinite(evaluator.observed)
         for (i, name), simulated in zip(removals, simulated_without, strict=True):
             change = ((fits[i].simulated - simulated) / self.noise.sigma)[observed_mask]
             # If the simulation fails without the effect, the change is NaN and the effect is kept.
             if np.linalg.norm(change) < SHOWN:
-                thetas[i][world.get_coefficient_indices(name)] = 0.0
+                thetas[i][evaluator.get_coefficient_indices(name)] = 0.0
         return thetas
 
 

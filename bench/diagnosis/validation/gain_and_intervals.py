@@ -55,7 +55,7 @@ meaning.
 
 
 def compute_central_jacobian(
-    world: RunEvaluator, fit: TrajectoryFit, noise: NoiseModel
+    evaluator: RunEvaluator, fit: TrajectoryFit, noise: NoiseModel
 ) -> TrajectoryFit:
     """Compute the Jacobian of a fit by central differences.
 
@@ -63,7 +63,7 @@ def compute_central_jacobian(
     distinguishable that are not.
 
     Args:
-        world: Run evaluator of the runs.
+        evaluator: Run evaluator of the runs.
         fit: Fit with a one-sided Jacobian.
         noise: Noise that weights the channels.
 
@@ -72,11 +72,11 @@ def compute_central_jacobian(
     """
     q = fit.free.size
     runs, size = fit.states.shape
-    bounds = _bounds_around(world, fit)
+    bounds = _bounds_around(evaluator, fit)
     ranges = bounds[:, 1] - bounds[:, 0]
     steps = compute_difference_steps(fit.jacobian, noise, ranges)
     # Derivatives by initial states from a linearisation are not one-sided differences.
-    if world.has_linearisation:
+    if evaluator.has_linearisation:
         steps = steps[:q]
     theta, states = _both_sides(fit, steps, bounds)
 
@@ -84,7 +84,7 @@ def compute_central_jacobian(
     vectors = theta.reshape(-1, fit.theta.size)
     rows = np.repeat(vectors, runs, axis=0)
     lanes = np.tile(np.arange(runs), len(vectors))
-    simulated = world.simulate(rows, lanes, states.reshape(-1, size))
+    simulated = evaluator.simulate(rows, lanes, states.reshape(-1, size))
     lower_side, upper_side = simulated.reshape(2, steps.size, *fit.simulated.shape)
 
     # Row j has changed parameter j, so the widths are on the diagonal.
@@ -94,7 +94,7 @@ def compute_central_jacobian(
     jacobian = np.moveaxis(upper_side - lower_side, 0, -1) / widths
     # A simulation that failed on one side gives no slope.
     jacobian = np.nan_to_num(jacobian, nan=0.0, posinf=0.0, neginf=0.0)
-    state_jacobian = fit.jacobian[..., q:] if world.has_linearisation else jacobian[..., q:]
+    state_jacobian = fit.jacobian[..., q:] if evaluator.has_linearisation else jacobian[..., q:]
     return replace(fit, jacobian=np.concatenate([jacobian[..., :q], state_jacobian], axis=3))
 
 
@@ -110,7 +110,7 @@ def get_central_jacobian(models: ModelSet, fit: TrajectoryFit) -> TrajectoryFit:
     if cached_entry is None or cached_entry[0] is not fit:
         cached_entry = models.derived[id(fit)] = (
             fit,
-            compute_central_jacobian(models.world, fit, models.noise),
+            compute_central_jacobian(models.evaluator, fit, models.noise),
         )
     return cached_entry[1]
 
@@ -135,13 +135,13 @@ def _both_sides(fit: TrajectoryFit, steps: Array, bounds: Array) -> tuple[Array,
     return theta, states
 
 
-def _bounds_around(world: RunEvaluator, fit: TrajectoryFit) -> Array:
+def _bounds_around(evaluator: RunEvaluator, fit: TrajectoryFit) -> Array:
     """Return the bounds (q, 2) of the fitted parameters, widened to contain the fit.
 
     Coefficients may be outside their plausible range.
     """
     values = fit.theta[fit.free]
-    bounds = [world.parameters[i].bounds for i in fit.free]
+    bounds = [evaluator.parameters[i].bounds for i in fit.free]
     # The shape is set explicitly because there may be no parameters.
     table = np.array(bounds).reshape(-1, 2)
     low, high = table.T
@@ -217,27 +217,27 @@ def compute_fisher_blocks(models: ModelSet, model: FittedModel) -> FisherBlocks:
     sigma = np.maximum(model.likelihood.sigma, 1e-300)
     noise = NoiseModel(sigma, model.likelihood.phi)
     return compute_fisher_blocks_from_jacobian(
-        models.world, fit.jacobian, model.fit.free.size, noise
+        models.evaluator, fit.jacobian, model.fit.free.size, noise
     )
 
 
 def compute_fisher_blocks_from_jacobian(
-    world: RunEvaluator, jacobian: Array, q: int, noise: NoiseModel
+    evaluator: RunEvaluator, jacobian: Array, q: int, noise: NoiseModel
 ) -> FisherBlocks:
     """Compute the curvature blocks from a Jacobian.
 
     Args:
-        world: Run evaluator of the runs.
+        evaluator: Run evaluator of the runs.
         jacobian: (R, T, C, q + s) derivatives, those by initial states last.
         q: Number of parameters in the Jacobian.
         noise: Noise for whitening.
     """
-    observed_mask = np.isfinite(world.observed)
+    observed_mask = np.isfinite(evaluator.observed)
     jacobian = whiten(np.where(observed_mask[..., None], jacobian, 0.0), observed_mask, noise)
     runs, *_, size = jacobian.shape
     j = jacobian.reshape(runs, -1, size)
     normal = np.matmul(j.transpose(0, 2, 1), j)
-    precision = 1.0 / compute_state_prior(world) ** 2
+    precision = 1.0 / compute_state_prior(evaluator) ** 2
     # In an unstable motion the derivatives by all initial states may be collinear.
     powers = np.einsum("rii->ri", normal[:, q:, q:])
     ridge = STATE_REGULARISATION * powers[:, :, None] * np.eye(powers.shape[1])
@@ -245,7 +245,7 @@ def compute_fisher_blocks_from_jacobian(
     inner, cross = hold_known_states(
         normal[:, q:, q:] + np.diag(precision) + ridge,
         normal[:, :q, q:],
-        world.known,
+        evaluator.known,
     )
     return FisherBlocks(noise, j, normal[:, :q, :q], cross, inner)
 
@@ -270,7 +270,7 @@ def compute_intervals(
     result = {}
     for place, sd in zip(places, spread.tolist(), strict=True):
         value = float(model.fit.theta[place])
-        low, high = models.world.parameters[place].bounds
+        low, high = models.evaluator.parameters[place].bounds
         # A value may be far outside its plausible range, and is then the scale itself.
         size = max(high - low, abs(value))
         is_bounded = np.isfinite(sd) and 2.0 * Z95 * sd < MAX_INTERVAL_WIDTH * size
@@ -305,7 +305,7 @@ class HeldOutGain:
 
 
 def compute_held_out_gain(
-    world: RunEvaluator,
+    evaluator: RunEvaluator,
     before: Array,
     after: Array,
     channels: Sequence[int],
@@ -319,7 +319,7 @@ def compute_held_out_gain(
     Romano 1992).
 
     Args:
-        world: Run evaluator of the held-out runs.
+        evaluator: Run evaluator of the held-out runs.
         before: (R, T, C) simulated by the base model.
         after: (R, T, C) simulated by the extended model.
         channels: Indices of the channels that count; they share a unit.
@@ -327,7 +327,7 @@ def compute_held_out_gain(
         rng: Random generator of the resampling.
         by_stretches: Resample segments of the runs; two or three runs are too few to resample.
     """
-    sums = _sums(world, before, after, channels, by_stretches)
+    sums = _sum_squared_errors(evaluator, before, after, channels, by_stretches)
     total_sums = sums.sum(axis=0)
     before_sum, after_sum, count = total_sums
     base = float(np.sqrt(before_sum / count))
@@ -336,25 +336,29 @@ def compute_held_out_gain(
     parts = len(sums)
     rows = rng.integers(parts, size=(BOOTSTRAP_RESAMPLES, parts))
     resampled = sums[rows].sum(axis=1)
-    shares = _closed(resampled, floor)
+    shares = _compute_closed_share(resampled, floor)
     low = high = np.nan
     # All resamples of a single part are equal, and would look certain.
     if parts > 1:
         low, high = np.quantile(shares, [0.025, 0.975]).tolist()
-    gap_closed = float(_closed(total_sums[None], floor)[0])
+    gap_closed = float(_compute_closed_share(total_sums[None], floor)[0])
     return HeldOutGain(base, extended, floor, gap_closed, low, high)
 
 
-def _sums(
-    world: RunEvaluator, before: Array, after: Array, channels: Sequence[int], by_stretches: bool
+def _sum_squared_errors(
+    evaluator: RunEvaluator,
+    before: Array,
+    after: Array,
+    channels: Sequence[int],
+    by_stretches: bool,
 ) -> Array:
     """Sum up the squared errors of two models over each run or segment, for the bootstrap.
 
     Each row (n, 3) has the sum of squares before, the one after, and the number of samples.
     """
     rows = []
-    for run, part in _parts(world, by_stretches):
-        observed = world.observed[run, part][:, channels]
+    for run, part in _list_resampled_parts(evaluator, by_stretches):
+        observed = evaluator.observed[run, part][:, channels]
         observed_mask = np.isfinite(observed)
         # A part without samples would be a row of zeros with an undefined error.
         if not observed_mask.any():
@@ -369,23 +373,23 @@ def _sums(
     return np.array(rows)
 
 
-def _parts(world: RunEvaluator, by_stretches: bool) -> list[tuple[int, slice]]:
+def _list_resampled_parts(evaluator: RunEvaluator, by_stretches: bool) -> list[tuple[int, slice]]:
     """List the parts that the bootstrap resamples: whole runs, or segments of too few runs.
 
     Each is the index of the run and the slice of its samples.
     """
-    count = len(world.tracks)
+    count = len(evaluator.tracks)
     if count > 1 and not by_stretches:
         return [(run, slice(None)) for run in range(count)]
     parts = []
-    for run, length in enumerate(world.lengths.tolist()):
+    for run, length in enumerate(evaluator.lengths.tolist()):
         samples = np.linspace(0, length, SINGLE_RUN_SEGMENTS + 1).astype(int).tolist()
         # A run of few samples has empty segments.
         parts += [(run, slice(a, b)) for a, b in pairwise(samples) if b > a]
     return parts
 
 
-def _closed(sums: Array, floor: float) -> Array:
+def _compute_closed_share(sums: Array, floor: float) -> Array:
     """Compute the share of the gap closed, eq. (1), for each row of sums (n, 3); 0 without a gap.
 
     A row has the squared errors before and after, and the number of samples.

@@ -70,13 +70,13 @@ class Validation(Protocol):
     The runs are held-out runs, or all runs in turn (`bench.diagnosis.validation.cross_validation`).
 
     Attributes:
-        world: Run evaluator of the predicted runs.
+        evaluator: Run evaluator of the predicted runs.
         noise: Noise that weights the channels.
         seen: (R, T, C) mask of the available samples.
         is_cross_validation: Whether the reported model is fitted to these runs too.
     """
 
-    world: RunEvaluator
+    evaluator: RunEvaluator
     noise: NoiseModel
     seen: Mask
     is_cross_validation: bool
@@ -99,25 +99,25 @@ class HeldOutRuns:
     """Validation on held-out runs, of which only the initial states are fitted.
 
     Args:
-        world: Run evaluator of the runs, with the effects at the same indices as in the fit.
+        evaluator: Run evaluator of the runs, with the effects at the same indices as in the fit.
         noise: Noise that weights the channels.
     """
 
     is_cross_validation = False
 
-    def __init__(self, world: RunEvaluator, noise: NoiseModel) -> None:
-        self.world = world
+    def __init__(self, evaluator: RunEvaluator, noise: NoiseModel) -> None:
+        self.evaluator = evaluator
         self.noise = noise
-        self.seen: Mask = np.isfinite(world.observed)
+        self.seen: Mask = np.isfinite(evaluator.observed)
 
     @property
     def simulations(self) -> int:
         """Number of simulations of the held-out runs."""
-        return self.world.simulations
+        return self.evaluator.simulations
 
     def close(self) -> None:
         """Release the resources of the simulator."""
-        self.world.close()
+        self.evaluator.close()
 
     def validate(self, fits: Sequence[TrajectoryFit]) -> list[HeldOutFit]:
         """Predict the held-out runs with each model; see `fit_initial_states`."""
@@ -130,29 +130,29 @@ class HeldOutRuns:
         decide between them. Models far from the nearest one are therefore fitted again from its
         initial states, and the better fit counts.
         """
-        guess = self.world.guess
+        guess = self.evaluator.guess
         initial_starts = [FitStart((), theta, guess) for theta in thetas]
-        is_filtered = self.world.followed is not None
-        fits = self._fitted(initial_starts, FOLLOWED if is_filtered else HORIZON_STAGES)
+        is_filtered = self.evaluator.followed is not None
+        fits = self._fit_initial_states(initial_starts, FOLLOWED if is_filtered else HORIZON_STAGES)
         count = max(int(self.seen.sum()), 1)
         # Runs that amplify differences of the initial state need a fit in stages.
-        if is_filtered and not _nearest(fits).cost < FAR * count:
-            fits = _each_nearer(fits, self._fitted(initial_starts, HORIZON_STAGES))
+        if is_filtered and not _find_lowest_cost_fit(fits).cost < FAR * count:
+            fits = _each_nearer(fits, self._fit_initial_states(initial_starts, HORIZON_STAGES))
             is_filtered = False
-        if not is_filtered and self._bends(_nearest(fits)):
-            fits = self._led(initial_starts, fits)
-        nearest_fit = _nearest(fits)
+        if not is_filtered and self._leaves_linear_range(_find_lowest_cost_fit(fits)):
+            fits = self._continue_from_nearest(initial_starts, fits)
+        nearest_fit = _find_lowest_cost_fit(fits)
         # The comparison is negated because the cost of a failed fit may be NaN.
         limit = REFIT_SQUARES_RATIO * nearest_fit.cost
         far_indices = [i for i, fit in enumerate(fits) if not fit.cost < limit]
         starts = [replace(fits[i].make_start(), states=nearest_fit.states) for i in far_indices]
         # These initial states are good over the first fraction of the runs already.
-        refits = self._fitted(starts, FOLLOWED if is_filtered else HORIZON_STAGES[1:])
+        refits = self._fit_initial_states(starts, FOLLOWED if is_filtered else HORIZON_STAGES[1:])
         for i, fit in zip(far_indices, refits, strict=True):
-            fits[i] = _nearest([fits[i], fit])
-        return [self._measured(fit) for fit in fits]
+            fits[i] = _find_lowest_cost_fit([fits[i], fit])
+        return [self._predict_runs(fit) for fit in fits]
 
-    def _fitted(
+    def _fit_initial_states(
         self, starts: Sequence[FitStart], stages: Sequence[tuple[float, int]]
     ) -> list[TrajectoryFit]:
         """Fit only the initial states of the runs, first to their beginning, then to longer parts.
@@ -162,29 +162,29 @@ class HeldOutRuns:
         fits: list[TrajectoryFit] = []
         if not starts:
             return fits
-        watch = self.world.watch
+        watch = self.evaluator.watch
         models = "one model" if len(starts) == 1 else f"{len(starts)} models"
         watch.stage(f"simulating held-out runs with {models}", len(stages))
         for share, iterations in stages:
-            fitter = TrajectoryFitter(self.world, self.noise, share=share, parameters=False)
+            fitter = TrajectoryFitter(self.evaluator, self.noise, share=share, parameters=False)
             fits = fitter.fit_models(starts, iterations)
             starts = [fit.make_start() for fit in fits]
             watch.advance()
         return fits
 
-    def _bends(self, fit: TrajectoryFit) -> bool:
+    def _leaves_linear_range(self, fit: TrajectoryFit) -> bool:
         """Return whether the motion has left the range of its linearisation by the initial states.
 
         For a robot this linearisation is computed once for all models. A chaotic motion leaves its
         range even if the initial guess is off by no more than the noise.
         """
-        world = self.world
-        if not world.has_linearisation or not np.isfinite(fit.cost):
+        evaluator = self.evaluator
+        if not evaluator.has_linearisation or not np.isfinite(fit.cost):
             return False
-        runs = len(world.guess)
+        runs = len(evaluator.guess)
         lanes = np.tile(fit.theta, (runs, 1))
-        simulated_from_guess = world.simulate(lanes, np.arange(runs), world.guess)
-        state_changes = fit.states - world.guess
+        simulated_from_guess = evaluator.simulate(lanes, np.arange(runs), evaluator.guess)
+        state_changes = fit.states - evaluator.guess
         # A diverging simulation from the guess is infinite or NaN.
         with np.errstate(over="ignore", invalid="ignore"):
             linearisation_error = (
@@ -197,7 +197,7 @@ class HeldOutRuns:
         # The comparison is negated because NaN compares as false.
         return not rms < LINEARISATION_ERROR_TOLERANCE
 
-    def _led(
+    def _continue_from_nearest(
         self, starts: Sequence[FitStart], fits: Sequence[TrajectoryFit]
     ) -> list[TrajectoryFit]:
         """Continue the fits with derivatives at the nearest of them.
@@ -205,38 +205,41 @@ class HeldOutRuns:
         If that reduces the nearest sum of squares enough, the fits are repeated from the starts
         with derivatives that are computed again before each stage.
         """
-        continued_fits = _each_nearer(fits, self._about(fits, HORIZON_STAGES[-1:]))
-        if _nearest(fits).cost - _nearest(continued_fits).cost < MIN_SQUARES_DECREASE:
+        continued_fits = _each_nearer(fits, self._continue_about_best(fits, HORIZON_STAGES[-1:]))
+        if (
+            _find_lowest_cost_fit(fits).cost - _find_lowest_cost_fit(continued_fits).cost
+            < MIN_SQUARES_DECREASE
+        ):
             return continued_fits
-        staged_fits = self._fitted(starts, HORIZON_STAGES[:1])
+        staged_fits = self._fit_initial_states(starts, HORIZON_STAGES[:1])
         for stage in (*HORIZON_STAGES[1:], HORIZON_STAGES[-1]):
-            staged_fits = self._about(staged_fits, [stage])
+            staged_fits = self._continue_about_best(staged_fits, [stage])
         return _each_nearer(continued_fits, staged_fits)
 
-    def _about(
+    def _continue_about_best(
         self, fits: Sequence[TrajectoryFit], stages: Sequence[tuple[float, int]]
     ) -> list[TrajectoryFit]:
         """Continue the fits with derivatives by initial states about the best of them."""
         # This import is needed for robots only.
         from bench.diagnosis.fitting.linearised_runs import compute_state_jacobian
 
-        nearest_fit = _nearest(fits)
+        nearest_fit = _find_lowest_cost_fit(fits)
         compute_state_jacobian(
-            self.world, nearest_fit.theta, nearest_fit.states, is_recomputed=True
+            self.evaluator, nearest_fit.theta, nearest_fit.states, is_recomputed=True
         )
-        return self._fitted([fit.make_start() for fit in fits], stages)
+        return self._fit_initial_states([fit.make_start() for fit in fits], stages)
 
-    def _measured(self, fit: TrajectoryFit) -> HeldOutFit:
+    def _predict_runs(self, fit: TrajectoryFit) -> HeldOutFit:
         """Return the prediction of a fit with its merit, the penalised log-likelihood.
 
         A failed fit has the merit -infinity, so that any other model is preferred.
         """
         if not np.isfinite(fit.cost):
-            no_prediction = np.full_like(self.world.observed, np.nan)
+            no_prediction = np.full_like(self.evaluator.observed, np.nan)
             return HeldOutFit(no_prediction, -np.inf, fit.states)
         # Only initial states were fitted here, so only they count as free.
-        free = count_identified_states(self.world, fit, self.noise)
-        penalised_likelihood = merit_of(self.world.observed, fit.simulated, free)
+        free = count_identified_states(self.evaluator, fit, self.noise)
+        penalised_likelihood = merit_of(self.evaluator.observed, fit.simulated, free)
         return HeldOutFit(fit.simulated, penalised_likelihood, fit.states, free)
 
 
@@ -254,7 +257,7 @@ def merit_of(observed: Array, simulated: Array, free: float) -> float:
     return maximise_likelihood(residual, observed_mask, free).value - free * state_penalty  # (1)
 
 
-def _nearest(fits: Iterable[TrajectoryFit]) -> TrajectoryFit:
+def _find_lowest_cost_fit(fits: Iterable[TrajectoryFit]) -> TrajectoryFit:
     """Return the fit with the smallest cost."""
     return min(fits, key=lambda fit: fit.cost)
 
@@ -263,4 +266,4 @@ def _each_nearer(
     fits: Sequence[TrajectoryFit], other_fits: Sequence[TrajectoryFit]
 ) -> list[TrajectoryFit]:
     """Return the better of two fits of each model."""
-    return [_nearest(pair) for pair in zip(fits, other_fits, strict=True)]
+    return [_find_lowest_cost_fit(pair) for pair in zip(fits, other_fits, strict=True)]

@@ -178,15 +178,15 @@ def assess_consistency(models: ModelSet, model: FittedModel) -> tuple[ParameterC
     Returns:
         One entry for each parameter and grouping; empty without groups or free parameters.
     """
-    world = models.world
-    groupings = list(_list_groupings(world.runs))
+    evaluator = models.evaluator
+    groupings = list(_list_groupings(evaluator.runs))
     if not groupings or not model.fit.free.size:
         return ()
     curvatures, gradients = _compute_run_normal_equations(models, model)
     consistencies = [
         (grouping, consistency)
         for grouping in groupings
-        for consistency in _spreads(world, model, grouping, curvatures, gradients)
+        for consistency in _test_parameters(evaluator, model, grouping, curvatures, gradients)
     ]
     level = SIGNIFICANCE_LEVEL / max(len(consistencies), 1)
     assessed = [
@@ -196,14 +196,15 @@ def assess_consistency(models: ModelSet, model: FittedModel) -> tuple[ParameterC
         consistency
         if consistency.is_consistent
         else replace(
-            consistency, trend_covariate=_find_trend_covariate(world, model, grouping, consistency)
+            consistency,
+            trend_covariate=_find_trend_covariate(evaluator, model, grouping, consistency),
         )
         for grouping, consistency in assessed
     )
 
 
 def _find_trend_covariate(
-    world: RunEvaluator,
+    evaluator: RunEvaluator,
     model: FittedModel,
     grouping: _RunGrouping,
     consistency: ParameterConsistency,
@@ -216,10 +217,12 @@ def _find_trend_covariate(
     if grouping.by not in ("run", "log"):
         if consistency.trend is None or consistency.trend.p_value >= SIGNIFICANCE_LEVEL:
             return None
-        return TrendCovariate(classify_constant(world, grouping.by), grouping.by, consistency.trend)
+        return TrendCovariate(
+            classify_constant(evaluator, grouping.by), grouping.by, consistency.trend
+        )
     places = {name: list(runs) for name, runs in zip(grouping.names, grouping.runs, strict=True)}
     trends = []
-    for covariate in compute_run_covariates(world, model, consistency.number):
+    for covariate in compute_run_covariates(evaluator, model, consistency.number):
         values = np.array(
             [covariate.values[places[part.group]].mean() for part in consistency.group_estimates]
         )
@@ -293,13 +296,13 @@ def _list_groupings(runs: Sequence[Run]) -> Iterator[_RunGrouping]:
 
 def _compute_run_normal_equations(models: ModelSet, model: FittedModel) -> tuple[Array, Array]:
     """Compute the normal equations of each run: H (R, q, q) and g (R, q) of eq. (1)."""
-    world, fit = models.world, model.fit
+    evaluator, fit = models.evaluator, model.fit
     q = fit.free.size
     fisher_blocks = compute_fisher_blocks(models, model)
     residual = whiten(models.compute_residual(fit), models.observed_mask, fisher_blocks.noise)
     pull = np.einsum("rnk,rn->rk", fisher_blocks.jacobian, residual.reshape(len(residual), -1))
-    pull[:, q:] += compute_state_prior(world) ** -2.0 * (world.guess - fit.states)
-    pull[:, q:] *= ~world.known
+    pull[:, q:] += compute_state_prior(evaluator) ** -2.0 * (evaluator.guess - fit.states)
+    pull[:, q:] *= ~evaluator.known
     right_hand_sides = np.concatenate(
         [fisher_blocks.cross.transpose(0, 2, 1), pull[:, q:, None]], 2
     )
@@ -309,8 +312,8 @@ def _compute_run_normal_equations(models: ModelSet, model: FittedModel) -> tuple
     return curvatures, gradients
 
 
-def _spreads(
-    world: RunEvaluator,
+def _test_parameters(
+    evaluator: RunEvaluator,
     model: FittedModel,
     grouping: _RunGrouping,
     curvatures: Array,
@@ -322,7 +325,7 @@ def _spreads(
     whose interval is too wide is left out, and a parameter needs at least two groups.
 
     Args:
-        world: Run evaluator of the runs.
+        evaluator: Run evaluator of the runs.
         model: Joint fit of all runs.
         grouping: Groups of runs, for example one for each load.
         curvatures: (R, q, q) H_r of eq. (1), the information of each run on the parameters.
@@ -335,7 +338,7 @@ def _spreads(
         steps.append(group_covariance @ gradients[list(runs)].sum(axis=0))  # (2)
         errors.append(np.sqrt(np.maximum(np.diagonal(group_covariance), 0.0)))
     for column, place in enumerate(model.fit.free.tolist()):
-        parameter, value = world.parameters[place], float(model.fit.theta[place])
+        parameter, value = evaluator.parameters[place], float(model.fit.theta[place])
         low, high = parameter.bounds
         size = max(high - low, abs(value))
         parts, numbers = [], []
@@ -404,10 +407,14 @@ def _fit_trend(parts: Sequence[GroupEstimate], numbers: Array) -> Trend | None:
     error = float(np.sqrt(max(ratio, 1.0) / power))
     # If the scatter agrees with the errors, these are known; otherwise they are estimated.
     size = abs(slope) / error
-    return Trend(slope, error, erfc(size / sqrt(2.0)) if ratio <= 1.0 else _student(size, freedom))
+    return Trend(
+        slope,
+        error,
+        erfc(size / sqrt(2.0)) if ratio <= 1.0 else _compute_student_p_value(size, freedom),
+    )
 
 
-def _student(size: float, freedom: int) -> float:
+def _compute_student_p_value(size: float, freedom: int) -> float:
     """Return the two-sided p-value of Student's t."""
     # Importing scipy.special takes 0.1 s, and this is the only place of most diagnoses to need it.
     from scipy.special import stdtr

@@ -43,70 +43,72 @@ class RunCovariate(NamedTuple):
 
 
 def compute_run_covariates(
-    world: RunEvaluator, model: FittedModel, number: str
+    evaluator: RunEvaluator, model: FittedModel, number: str
 ) -> list[RunCovariate]:
     """List the quantities that differ between the runs and may explain a trend of a parameter.
 
     Args:
-        world: Run evaluator with the runs.
+        evaluator: Run evaluator with the runs.
         model: Fitted model whose simulated motion is used.
         number: Name of the parameter, ``parameter`` or ``parameter@joint``.
     """
     covariates = [
-        *_list_non_motion_covariates(world),
-        *_compute_motion_covariates(world, model, number),
+        *_list_non_motion_covariates(evaluator),
+        *_compute_motion_covariates(evaluator, model, number),
     ]
     return [covariate for covariate in covariates if _varies_between_runs(covariate.values)]
 
 
-def classify_constant(world: RunEvaluator, name: str) -> CovariateKind:
+def classify_constant(evaluator: RunEvaluator, name: str) -> CovariateKind:
     """Return the category of a constant that differs between runs, from its unit.
 
     Args:
-        world: Run evaluator; its simulator declares the constants.
+        evaluator: Run evaluator; its simulator declares the constants.
         name: Name of the constant.
     """
-    units = {constant.name: constant.unit for constant in world.kind.constants}
+    units = {constant.name: constant.unit for constant in evaluator.kind.constants}
     unit = units.get(name, "")
     if unit in LOAD_UNITS:
         return "load"
     return "supply" if unit == "V" else "other"
 
 
-def _list_non_motion_covariates(world: RunEvaluator) -> Iterator[RunCovariate]:
+def _list_non_motion_covariates(evaluator: RunEvaluator) -> Iterator[RunCovariate]:
     """Yield the covariates of each run that do not depend on its motion.
 
     They are the order of the runs, the root mean square of each command, and the mean of each
     recorded signal that the simulator does not use, such as a temperature.
     """
-    yield RunCovariate("time", "the order of runs", np.arange(len(world.runs), dtype=np.float64))
-    for name in world.runs[0].inputs:
-        sizes = [float(np.sqrt(np.mean(np.square(run.inputs[name])))) for run in world.runs]
+    yield RunCovariate(
+        "time", "the order of runs", np.arange(len(evaluator.runs), dtype=np.float64)
+    )
+    for name in evaluator.runs[0].inputs:
+        sizes = [float(np.sqrt(np.mean(np.square(run.inputs[name])))) for run in evaluator.runs]
         yield RunCovariate("command", f"the size of {name}", np.array(sizes))
-    for name in world.runs[0].extra:
-        columns = [run.extra.get(name, np.empty(0)) for run in world.runs]
+    for name in evaluator.runs[0].extra:
+        columns = [run.extra.get(name, np.empty(0)) for run in evaluator.runs]
         means = [float(np.nanmean(v)) if np.isfinite(v).any() else np.nan for v in columns]
         yield RunCovariate("other", name, np.array(means))
 
 
 def _compute_motion_covariates(
-    world: RunEvaluator, model: FittedModel, number: str
+    evaluator: RunEvaluator, model: FittedModel, number: str
 ) -> Iterator[RunCovariate]:
     """Yield covariates of the simulated motion of each run, at the joint of a parameter.
 
     They are the amplitude (standard deviation), the RMS speed, the direction of motion (-1 to 1),
     and the mean position.
     """
-    system = world.simulator.system
+    system = evaluator.simulator.system
     if not system.coordinates:
         return
     joint = f"q.{number.partition('@')[2]}"
     name = joint if joint in system.coordinates else system.coordinates[system.primary]
-    if name not in world.channels:
+    if name not in evaluator.channels:
         return
-    column = world.channels.index(name)
+    column = evaluator.channels.index(name)
     rows = []
-    for track, simulated in zip(world.tracks, model.fit.simulated, strict=True):
+    for track, simulated in zip(evaluator.tracks, model.fit.simulated, strict=True):
         times = track.scenario.times
         place = simulated[: times.size, column]
         rate = np.gradient(place, times)

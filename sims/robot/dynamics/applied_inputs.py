@@ -61,7 +61,7 @@ Thousands of simulations share the same commands.
 """
 
 
-def _digest(times: Array, signal: Array) -> bytes:
+def _compute_signal_digest(times: Array, signal: Array) -> bytes:
     """Compute a digest of a signal and its sample times, which is a key of the cache."""
     digest = hashlib.blake2b(times.tobytes(), digest_size=16)
     digest.update(signal.tobytes())
@@ -150,9 +150,11 @@ def compute_inputs_over_steps(
     for name, signal in commands.items():
         earlier = scenario.before[name].tobytes() if name in scenario.before else b""
         read = name in scenario.linear, scenario.offset, earlier
-        key = step, steps, cuts.tobytes(), *read, _digest(scenario.times, signal)
+        key = step, steps, cuts.tobytes(), *read, _compute_signal_digest(scenario.times, signal)
         bare = _InputRequest(0, scenario, name, signal, np.zeros(1, dtype=np.intp), ())
-        plain = _applied_input_cache.get(key, partial(_given, step, [bare], steps, seen, cuts))
+        plain = _applied_input_cache.get(
+            key, partial(_compute_applied_inputs, step, [bare], steps, seen, cuts)
+        )
         applied_inputs[name] = np.repeat(plain, n, axis=0)
     for _, name, lanes, values in compute_changed_inputs(step, [run], share):
         applied_inputs[name][lanes] = values
@@ -191,8 +193,8 @@ def compute_changed_inputs(
             ]
     for (steps, cut_bytes, seen_bytes), requests in alike.items():
         cuts, seen = np.frombuffer(cut_bytes), np.frombuffer(seen_bytes, dtype=bool)
-        for group in _groups(requests):
-            values = _given(step, group, steps, seen, cuts)
+        for group in _group_requests(requests):
+            values = _compute_applied_inputs(step, group, steps, seen, cuts)
             ends = np.cumsum([one.lanes.size for one in group])
             for one, rows in zip(group, np.split(values, ends[:-1]), strict=True):
                 yield one.run, one.name, one.lanes, rows
@@ -218,7 +220,7 @@ class _InputRequest(NamedTuple):
     acting: ActiveEffects
 
 
-def _alone(scenario: Scenario, name: str) -> Scenario:
+def _restrict_to_input(scenario: Scenario, name: str) -> Scenario:
     """Restrict a scenario to one input, under the name `SINGLE_INPUT_NAME`."""
     return replace(
         scenario,
@@ -242,7 +244,7 @@ def _by_kinds(passed: ActiveEffects, n: int) -> Iterator[tuple[Places, ActiveEff
             yield lanes, slice_active_effects(passed, lanes)
 
 
-def _groups(asked: Sequence[_InputRequest]) -> Iterator[list[_InputRequest]]:
+def _group_requests(asked: Sequence[_InputRequest]) -> Iterator[list[_InputRequest]]:
     """Group requests with equal types of effects, at most `MAX_BATCH_SIZE` elements each."""
     alike: dict[tuple[str, ...], list[_InputRequest]] = {}
     for one in asked:
@@ -254,14 +256,14 @@ def _groups(asked: Sequence[_InputRequest]) -> Iterator[list[_InputRequest]]:
             yield [group[k] for k in np.flatnonzero(parts == part)]
 
 
-def _together(asked: Sequence[_InputRequest]) -> ActiveEffects:
+def _concatenate_effects(asked: Sequence[_InputRequest]) -> ActiveEffects:
     """Concatenate the effects of a group of requests along the batch elements."""
     first = [effect for effect, _ in asked[0].acting]
     rows = zip(*([c for _, c in one.acting] for one in asked), strict=True)
     return tuple((effect, np.concatenate(c, axis=1)) for effect, c in zip(first, rows, strict=True))
 
 
-def _given(
+def _compute_applied_inputs(
     step: float,
     requests: Sequence[_InputRequest],
     steps: int,
@@ -274,9 +276,9 @@ def _given(
     at which it is divided for them. With the cuts of `STEP_SUBDIVISION` the parts are combined to
     one value per step; with fewer cuts, the first part is returned.
     """
-    acting = _together(requests)
+    acting = _concatenate_effects(requests)
     of = np.repeat(np.arange(len(requests)), [one.lanes.size for one in requests])
-    runs = ScenarioGroups(tuple(_alone(one.scenario, one.name) for one in requests), of)
+    runs = ScenarioGroups(tuple(_restrict_to_input(one.scenario, one.name) for one in requests), of)
     plan = _parts_of_steps(step, steps, of.size, cuts, alike=not acting)
     commands = [{SINGLE_INPUT_NAME: one.signal} for one in requests]
     values = compute_applied_inputs(plan, runs, commands, acting)[SINGLE_INPUT_NAME]

@@ -89,10 +89,10 @@ class BenchCache:
             raise RefusedModelError(self._refused[series])
         key = (derived, count, *settings.values())
         try:
-            variant = self._variant(series)
+            variant = self._get_variant(series)
             if key not in variant.benches:
                 variant.benches[key] = MujocoBatch(variant.robot, derived, settings, count)
-                self._trim()
+                self._drop_least_recent()
             return variant.benches[key]
         except ValueError as error:
             if not series:
@@ -105,7 +105,7 @@ class BenchCache:
             sys.stderr.write(f"simgap: not simulated: {said}\n")
             raise RefusedModelError(said) from None
 
-    def _variant(self, series: SeriesJoints) -> _Variant:
+    def _get_variant(self, series: SeriesJoints) -> _Variant:
         """Return the model with these joints in series, and mark it as most recently used.
 
         Without joints in series, this is the robot's own model, which is never dropped from
@@ -120,7 +120,7 @@ class BenchCache:
         self._series[series] = variant
         return variant
 
-    def _trim(self) -> None:
+    def _drop_least_recent(self) -> None:
         """Drop the least recently used variants, except the last one, until the limit is met."""
         sizes = {series: variant.nbytes for series, variant in self._series.items()}
         for series in list(sizes)[:-1]:

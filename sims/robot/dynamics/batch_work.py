@@ -108,19 +108,21 @@ class BatchInputs(NamedTuple):
         steps = max(part.controls.shape[1] for part in parts)
         names = parts[0].applied_inputs
         return cls(
-            np.concatenate([_lasting(part.controls, steps) for part in parts]),
-            np.concatenate([_lasting(part.forces, steps) for part in parts]),
+            np.concatenate([_extend_to_steps(part.controls, steps) for part in parts]),
+            np.concatenate([_extend_to_steps(part.forces, steps) for part in parts]),
             {
-                n: np.concatenate([_lasting(part.applied_inputs[n], steps) for part in parts])
+                n: np.concatenate(
+                    [_extend_to_steps(part.applied_inputs[n], steps) for part in parts]
+                )
                 for n in names
             },
-            np.concatenate([_lasting(part.instant, steps) for part in parts]),
+            np.concatenate([_extend_to_steps(part.instant, steps) for part in parts]),
             np.concatenate([part.activations for part in parts]),
-            np.concatenate([_lasting(part.off, steps) for part in parts]),
+            np.concatenate([_extend_to_steps(part.off, steps) for part in parts]),
         )
 
 
-def _lasting(values: NDArray[Number], steps: int) -> NDArray[Number]:
+def _extend_to_steps(values: NDArray[Number], steps: int) -> NDArray[Number]:
     """Extend values (n, S', ...) to S steps by repeating the last one."""
     more = steps - values.shape[1]
     if not more:

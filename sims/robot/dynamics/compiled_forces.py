@@ -163,10 +163,10 @@ class _Tracing:
         if key not in self._programs:
             if len(self._programs) == MAX_CACHED_PROGRAMS:
                 self._programs.clear()
-            self._programs[key] = self._composed(effects)
+            self._programs[key] = self._compose_program(effects)
         return self._programs[key]
 
-    def _composed(self, effects: Sequence[Sequence[Effect]]) -> _Program:
+    def _compose_program(self, effects: Sequence[Sequence[Effect]]) -> _Program:
         """Trace all given effects, and emit one list of instructions for their outputs.
 
         The three groups of `effects` are forces, dry frictions and effects with hidden
@@ -181,7 +181,7 @@ class _Tracing:
             for effect in group:
                 # An effect may occur twice: alone, and as a member of a family in other batch
                 # elements.
-                asked[-1].append(self._of(effect, before[type(effect)]))
+                asked[-1].append(self._make_graph_effect(effect, before[type(effect)]))
                 before[type(effect)] += 1
         forces, frictions, hidden = ([(one.effect, one.c) for one in group] for group in asked)
         states = [one.state for one in asked[2] if one.state is not None]
@@ -193,7 +193,7 @@ class _Tracing:
             force = force + more
         limit: Any = compute_friction_limits(frictions, self._middle)  # type: ignore[arg-type]
         after: Any = [part for state in later for part in (state.x, state.v)]
-        outputs = [self._nodes(values) for values in (force, limit, *after)]
+        outputs = [self._get_nodes(values) for values in (force, limit, *after)]
         begun: Any = [part for state in states for part in (state.x, state.v)]
         coefficients = [one.c for group in asked for one in group]
         clock = self._t, self._after, self._step, self._past
@@ -210,7 +210,7 @@ class _Tracing:
         after_all = np.concatenate([np.empty(0, dtype=np.intp), *places[2:]])
         return _Program(written, places[0], places[1], after_all)
 
-    def _of(self, effect: Effect, number: int) -> _Asked:
+    def _make_graph_effect(self, effect: Effect, number: int) -> _Asked:
         """Return an effect with graph inputs for its coefficients and its hidden state.
 
         `number` counts earlier occurrences of the same class in a program, each with inputs
@@ -231,7 +231,7 @@ class _Tracing:
         return self._asked[kind]
 
     @staticmethod
-    def _nodes(values: Any) -> list[Any]:
+    def _get_nodes(values: Any) -> list[Any]:
         """Return the nodes of a traced value; the shape of a hidden state may have changed."""
         if not hasattr(values, "nodes"):
             raise NotTraceableError("its result does not depend on its arguments")
@@ -274,7 +274,7 @@ class CompiledForces:
         self._states = slice(states, written.first)
         r[step] = forces.step
         r[stiffness:c] = forces.stiffness.T
-        coefficients = [own[:, :, 0] for _, own in _effects(forces)]
+        coefficients = [own[:, :, 0] for _, own in _list_effects(forces)]
         r[c:states] = np.concatenate(coefficients)
         first, moment, end, _ = written.ends.tolist()
         kernel = get_kernel()
@@ -376,7 +376,7 @@ def compile_forces(forces: EffectForces) -> CompiledForces | None:
     The result is None if there is nothing to compile, if an effect cannot be traced, or if the
     program would be too large; then the caller evaluates `forces` with NumPy.
     """
-    groups = [[effect for effect, _ in group] for group in _groups(forces)]
+    groups = [[effect for effect, _ in group] for group in _list_groups(forces)]
     if not any(groups):
         return None
     inputs = tuple(forces.applied_inputs)
@@ -384,7 +384,7 @@ def compile_forces(forces: EffectForces) -> CompiledForces | None:
     if inputs not in tracings:
         tracings[inputs] = _Tracing(forces.system, inputs)
     tracing = tracings[inputs]
-    if not all(_compiles(tracing, forces, effect) for effect, _ in _effects(forces)):
+    if not all(_can_compile(tracing, forces, effect) for effect, _ in _list_effects(forces)):
         return None
     try:
         return CompiledForces(forces, tracing.program(groups))
@@ -392,7 +392,7 @@ def compile_forces(forces: EffectForces) -> CompiledForces | None:
         return None
 
 
-def _compiles(tracing: _Tracing, forces: EffectForces, effect: Effect) -> bool:
+def _can_compile(tracing: _Tracing, forces: EffectForces, effect: Effect) -> bool:
     """Return whether an effect can be traced, and then gives the same numbers as with NumPy.
 
     Each class of effects is tested once; a failure is reported on standard error.
@@ -401,7 +401,7 @@ def _compiles(tracing: _Tracing, forces: EffectForces, effect: Effect) -> bool:
     if kind not in tracing.known:
         tracing.known[kind] = False
         try:
-            _check(tracing, _alone(forces, effect))
+            _check_against_numpy(tracing, _select_effect(forces, effect))
             tracing.known[kind] = True
         # An effect of a user may raise any exception when it is evaluated with traced values.
         except Exception as reason:
@@ -413,7 +413,7 @@ def _compiles(tracing: _Tracing, forces: EffectForces, effect: Effect) -> bool:
     return tracing.known[kind]
 
 
-def _check(tracing: _Tracing, forces: EffectForces) -> None:
+def _check_against_numpy(tracing: _Tracing, forces: EffectForces) -> None:
     """Compare an effect's program with numpy at random states.
 
     Positions, velocities and loads are random numbers of different sizes, with a fixed seed, so
@@ -422,7 +422,7 @@ def _check(tracing: _Tracing, forces: EffectForces) -> None:
     Raises:
         NotTraceableError: the results differ.
     """
-    program = tracing.program([[effect for effect, _ in group] for group in _groups(forces)])
+    program = tracing.program([[effect for effect, _ in group] for group in _list_groups(forces)])
     quick = CompiledForces(forces, program)
     rng = np.random.default_rng(0)
     steps = min([CHECKED_INSTANTS, *(u.shape[1] for u in forces.applied_inputs.values())])
@@ -437,17 +437,17 @@ def _check(tracing: _Tracing, forces: EffectForces) -> None:
                 raise NotTraceableError("compiled it gives other numbers")
 
 
-def _groups(forces: EffectForces) -> list[Sequence[tuple[Effect, Array]]]:
+def _list_groups(forces: EffectForces) -> list[Sequence[tuple[Effect, Array]]]:
     return [forces.forces, forces.frictions, forces.hidden]
 
 
-def _effects(forces: EffectForces) -> list[tuple[Effect, Array]]:
-    return [pair for group in _groups(forces) for pair in group]
+def _list_effects(forces: EffectForces) -> list[tuple[Effect, Array]]:
+    return [pair for group in _list_groups(forces) for pair in group]
 
 
-def _alone(forces: EffectForces, effect: Effect) -> EffectForces:
+def _select_effect(forces: EffectForces, effect: Effect) -> EffectForces:
     """Return the forces of one effect without the others, to test whether it can be compiled."""
-    own = tuple(pair for pair in _effects(forces) if pair[0] is effect)
+    own = tuple(pair for pair in _list_effects(forces) if pair[0] is effect)
     return EffectForces(
         forces.system, own, forces.applied_inputs, forces.addresses, forces.stiffness, forces.step
     )

@@ -57,7 +57,7 @@ class DriveSensorModel:
             column = readings[:, :, bench.drives[actuator.joint]]
             before = column.copy()
             column += apart * self._by_control(actuator)[:n, None]
-            np.clip(column, *self._limits(actuator), out=column)
+            np.clip(column, *self._get_force_limits(actuator), out=column)
             if actuator.joint in bench.robot.coupled:
                 first = joint_before(self.robot, actuator.joint)
                 assert first is not None
@@ -119,7 +119,7 @@ class DriveSensorModel:
         """Return whether a filter precedes the actuator, so that controls act with a delay."""
         return any(one.actuator == actuator for one in activation_filters(self.robot))
 
-    def _limits(self, actuator: Actuator) -> tuple[float, float]:
+    def _get_force_limits(self, actuator: Actuator) -> tuple[float, float]:
         """Return lower and upper limit of an actuator's joint force; infinite if unspecified."""
         gear = abs(float(self.robot.compiled.actuator_gear[actuator.id, 0]))
         low, high = actuator.force or (-np.inf, np.inf)

@@ -174,7 +174,7 @@ class EffectForces:
             look: joint states at the beginning of the step.
         """
         x, v = predict_midpoint(look.x, look.v, look.a, self.step)
-        moment = self._moment(k + 0.5, k, (x, v, *look.at_midpoint))
+        moment = self._make_snapshot(k + 0.5, k, (x, v, *look.at_midpoint))
         force = compute_effect_forces(self.forces, moment)
         if self.hidden:
             begun = self.make_step_snapshot(k, look)
@@ -189,9 +189,9 @@ class EffectForces:
 
     def make_step_snapshot(self, k: int, look: JointStates) -> RobotSnapshot:
         """Return the snapshot at the beginning of step k."""
-        return self._moment(k, k, (look.x, look.v, *look.transmission_loads))
+        return self._make_snapshot(k, k, (look.x, look.v, *look.transmission_loads))
 
-    def _moment(self, steps: float, k: int, motion: Sequence[Array]) -> RobotSnapshot:
+    def _make_snapshot(self, steps: float, k: int, motion: Sequence[Array]) -> RobotSnapshot:
         """Return the snapshot after a number of steps, with the inputs of step k."""
         x, v, *sides = motion
         now = np.full((len(x), 1), steps * self.step)

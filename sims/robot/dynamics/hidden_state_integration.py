@@ -76,14 +76,14 @@ def integrate_state(
 
     none, whole, half = rate(0.0, 0.0), rate(1.0, 0.0), rate(0.5, 1.0)
     if np.allclose(half, 0.5 * (none + whole), rtol=1e-9, atol=0.0):
-        return _linear(state, step * none, step * (whole - none))
+        return _integrate_linear_state(state, step * none, step * (whole - none))
     states = [state]
     for k in range(steps):
         states.append(advance_state(effect, c, moment.select_element(k), states[-1], step))
     return HiddenState(np.concatenate([s.x for s in states]), np.concatenate([s.v for s in states]))
 
 
-def _linear(state: HiddenState, grown: Array, z: Array) -> HiddenState:
+def _integrate_linear_state(state: HiddenState, grown: Array, z: Array) -> HiddenState:
     """Integrate a hidden state whose rate is linear in the state throughout the motion.
 
     Args:

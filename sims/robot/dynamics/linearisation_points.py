@@ -126,10 +126,10 @@ class LinearisationPoints:
         self.numbers, self.of = _looked_at(motion, self.every)
         # Fields must be bound before MuJoCo's first call, since later ones are not updated before
         # the next call.
-        self._bind(bench)
+        self._bind_fields(bench)
         self.seen = 0
         self._asked = [(e, c) for e, c in acting if is_evaluated_per_step(e)]
-        bench.write_effects(_repeated(acting, bench.count))
+        bench.write_effects(_repeat_coefficients(acting, bench.count))
         self._stiffness = bench.get_servo_stiffness(places)[:1]
         self._working = working_servos(bench.robot, places.velocities, motion.off)
         self._states = [self.integrate_hidden_state(effect, c) for effect, c in self._asked]
@@ -140,7 +140,7 @@ class LinearisationPoints:
         bench.batch.reset(stage=0)
         self._fresh = bench.batch.state.copy()
 
-    def _bind(self, bench: MujocoBatch) -> None:
+    def _bind_fields(self, bench: MujocoBatch) -> None:
         """Bind the fields of MuJoCo's data that are read, before MuJoCo's first call."""
         for name in ("qacc", *TRANSMISSION_FORCE_FIELDS, *dict(self._outputs)):
             bench.batch.bind(name)
@@ -169,7 +169,7 @@ class LinearisationPoints:
         states, readings = [], []
         bind, places, floating = self._bench.batch.bind, self._places, self._floating
         begin = 0
-        for n, ids in self._placed(moved, acting):
+        for n, ids in self._place_points(moved, acting):
             for _ in range(steps):
                 self._bench.batch.step(ids)
             parts = [bind("qpos")[:n, places.positions], bind("qvel")[:n, places.velocities]]
@@ -184,7 +184,7 @@ class LinearisationPoints:
                 parts.append(bind("qvel")[:n, floating.velocities])
             begin += n
             states.append(np.concatenate(parts, axis=1))
-            readings.append(self._readings(n))
+            readings.append(self._read_outputs(n))
         return np.concatenate(states), np.concatenate(readings)
 
     def compute_accelerations(
@@ -202,16 +202,16 @@ class LinearisationPoints:
         accelerations, readings = [], []
         applied = self._bench.batch.bind("qfrc_applied")
         dofs, begin = self._dofs, 0
-        for n, ids in self._placed({}, acting):
+        for n, ids in self._place_points({}, acting):
             if more is not None:
                 applied[:n, dofs] += more[begin : begin + n]
                 begin += n
             self._bench.batch.forward(ids)
             accelerations.append(self._bench.batch.bind("qacc")[:n, dofs].copy())
-            readings.append(self._readings(n))
+            readings.append(self._read_outputs(n))
         return np.concatenate(accelerations), np.concatenate(readings)
 
-    def _readings(self, n: int) -> Array:
+    def _read_outputs(self, n: int) -> Array:
         """Read the O outputs from the first n elements of the batch, (n, O).
 
         To readings of drive forces, the forces that effects exert in the drive are added.
@@ -226,7 +226,7 @@ class LinearisationPoints:
             read[:, of >= 0] += self._exerted[:, of[of >= 0]]
         return read
 
-    def _placed(
+    def _place_points(
         self, moved: Mapping[str, tuple[int, float]], acting: ActiveEffects
     ) -> Iterator[tuple[int, Places | None]]:
         """Place the points in the elements of the batch, as many at a time as it has elements.
@@ -243,7 +243,7 @@ class LinearisationPoints:
         motion, places, floating = self.motion, self._places, self._floating
         count = self._bench.count
         self.seen += self.numbers.size
-        self._bench.write_effects(_repeated(acting, count))
+        self._bench.write_effects(_repeat_coefficients(acting, count))
         batch = self._bench.batch
         bind = batch.bind
         qpos, qvel, ctrl = bind("qpos"), bind("qvel"), bind("ctrl")
@@ -280,10 +280,10 @@ class LinearisationPoints:
                     qpos[:n, floating.positions] = poses
                 elif name != "w":
                     targets[name](k)[:n] += size
-            self._ask(at, n, dict([moved["w"]]) if "w" in moved else {})
+            self._add_effect_forces(at, n, dict([moved["w"]]) if "w" in moved else {})
             yield n, None if n == count else np.arange(n)
 
-    def _ask(self, at: Places, n: int, remembered: Mapping[int, float]) -> None:
+    def _add_effect_forces(self, at: Places, n: int, remembered: Mapping[int, float]) -> None:
         """Add state-dependent effect forces at the states of the batch elements.
 
         Args:
@@ -343,7 +343,7 @@ class LinearisationPoints:
         """
         own = self._bench, self._fresh
         if bench is not self._bench:
-            self._bind(bench)
+            self._bind_fields(bench)
             bench.batch.reset(stage=0)
             self._bench, self._fresh = bench, bench.batch.state.copy()
         try:
@@ -371,7 +371,7 @@ class LinearisationPoints:
         own = self._outputs, self._drives
         self._outputs = self._bench.force_limits.outputs
         self._drives = np.full(len(self._outputs), -1)
-        self._bind(self._bench)
+        self._bind_fields(self._bench)
         try:
             yield
         finally:
@@ -384,7 +384,7 @@ class LinearisationPoints:
         """
         import mujoco
 
-        self._bench.write_effects(_repeated(self.acting, self._bench.count))
+        self._bench.write_effects(_repeat_coefficients(self.acting, self._bench.count))
         model = self._bench.batch.get_model(0)
         data = mujoco.MjData(model)
         places = self._places
@@ -548,6 +548,6 @@ def _looked_at(motion: RobotMotion, every: int) -> tuple[Places, Places]:
     return np.flatnonzero(looked), np.cumsum(looked) - 1
 
 
-def _repeated(acting: ActiveEffects, count: int) -> ActiveEffects:
+def _repeat_coefficients(acting: ActiveEffects, count: int) -> ActiveEffects:
     """Repeat the coefficients of model-field effects for all elements of a batch."""
     return tuple((e, np.repeat(c, count, axis=1)) for e, c in select_model_field_effects(acting))

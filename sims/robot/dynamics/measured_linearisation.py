@@ -150,7 +150,7 @@ class MeasuredLinear(RunLinearisation):
         nothing = np.zeros((1, *self._motion.x.shape[:1], self._tangent.state_size))
         unread = np.zeros((1, self._motion.x.shape[0], len(self._names)))
         with np.errstate(all="ignore"), capture_mujoco_warnings():
-            self.observed = self._seen(nothing, unread, [()])[0]
+            self.observed = self._compute_observations(nothing, unread, [()])[0]
         knots = np.rint(self._times / self._simulator.time_step).astype(np.intp)
         self.knots: Places = np.clip(knots, 0, self._steps)
 
@@ -169,13 +169,13 @@ class MeasuredLinear(RunLinearisation):
         """The motion about which the model is linearised."""
         return Trajectory(self._motion.x, self._motion.v, self._motion.afloat)
 
-    def _nominal(self) -> RobotMotion:
+    def _simulate_nominal_motion(self) -> RobotMotion:
         """Return the given motion with the commands of the run, in place of a simulated motion.
 
         Commands, activations and joints in series come from a simulation, or from the
         motion of `nearby`.
         """
-        motion = self._near() or super()._nominal()
+        motion = self._get_nearby_motion() or super()._simulate_nominal_motion()
         given = self._given or self._from_samples(motion)
         # Joints in series are not measured, so they keep the simulated motion.
         own = given.x.shape[1]
@@ -183,7 +183,7 @@ class MeasuredLinear(RunLinearisation):
         x[:, :own], v[:, :own] = given.x, given.v
         return self._with_loads(replace(motion, x=x, v=v, afloat=given.afloat))
 
-    def _near(self) -> RobotMotion | None:
+    def _get_nearby_motion(self) -> RobotMotion | None:
         """Return the motion of `nearby` with the commands of this model, which saves a simulation.
 
         The result is None if there is no such motion, or if more than the given joints moves.
@@ -197,7 +197,8 @@ class MeasuredLinear(RunLinearisation):
             return None
         self._readings = dict(self._nearby._readings)
         return replace(
-            motion, **self._commanded(self._simulator.compute_controls(self._work, steps))
+            motion,
+            **self._compute_command_fields(self._simulator.compute_controls(self._work, steps)),
         )
 
     def _from_samples(self, motion: RobotMotion) -> Trajectory:
@@ -246,7 +247,7 @@ class MeasuredLinear(RunLinearisation):
         missed = np.zeros((intervals, size))
         errors = self._step_errors()
         of, quotients = tangent.looked_at, tangent.quotients
-        for steps, active in self._within():
+        for steps, active in self._list_active_intervals():
             a = quotients.states[of[steps]]
             states[active] = a @ states[active]
             defect[active] = np.einsum("izy,iy->iz", a, defect[active]) + defects[steps]
@@ -259,13 +260,20 @@ class MeasuredLinear(RunLinearisation):
             rows = of[np.minimum(np.arange(count), of.size - 1)]
             read = SMALL * np.moveaxis(quotients.read_states[rows], 2, 0)
         with np.errstate(all="ignore"), capture_mujoco_warnings():
-            seen = self._seen(moved, read, [()] * size)
+            seen = self._compute_observations(moved, read, [()] * size)
         readings = np.moveaxis((seen - self.observed) / SMALL, 0, 2)
         return IntervalMaps(
-            states, defect, force, self._composed, readings, self.observed, missed, self._jumps()
+            states,
+            defect,
+            force,
+            self._input_responses,
+            readings,
+            self.observed,
+            missed,
+            self._compute_limit_jumps(),
         )
 
-    def _jumps(self) -> Array:
+    def _compute_limit_jumps(self) -> Array:
         """Return the standard deviations (T - 1, Z) of jumps at force limits of stiff servos."""
         bench = self._simulator.make_linearisation_batch(self._work.acting)
         limits = bench.force_limits
@@ -275,7 +283,7 @@ class MeasuredLinear(RunLinearisation):
         with np.errstate(all="ignore"), capture_mujoco_warnings():
             reached = np.abs(self._tangent.limited_forces) >= limits.sizes
         own = limits.jumps[:, bench.places.velocities]
-        for steps, active in self._within():
+        for steps, active in self._list_active_intervals():
             result[active, : own.shape[1]] += reached[steps] @ own
         # A position servo returns from a jump of position within the interval or later.
         lengths = np.maximum(np.diff(self.knots), 1)[:, None] * self._simulator.time_step
@@ -291,7 +299,7 @@ class MeasuredLinear(RunLinearisation):
         with np.errstate(all="ignore"), capture_mujoco_warnings():
             return tangent.step_errors(simulator.half_steps(self._work.acting))
 
-    def _within(self) -> list[tuple[Places, Places]]:
+    def _list_active_intervals(self) -> list[tuple[Places, Places]]:
         """Return the active intervals of the first step, then of the second, and so on.
 
         Each entry contains the step numbers, and the numbers of the intervals that have such a
@@ -344,16 +352,16 @@ class MeasuredLinear(RunLinearisation):
                 for one, k in parts:
                     known = isinstance(one, (Sensor, Input)) or is_series_effect(one)
                     if not known and k.any():
-                        changes += self._changes(owner, one, k)
+                        changes += self._list_perturbations(owner, one, k)
                 changes += [c._replace(owner=owner) for c in driven.get(number, ())]
             own = slice(begin, part.stop)
             with np.errstate(all="ignore"):
                 pushed, read = self._tangent.pushed(changes, len(part))
-                means[:, :, own] = self._means(pushed)
+                means[:, :, own] = self._compute_interval_means(pushed)
                 readings[:, :, own] = self._read_directly(read, sensors, predicted)
         return means, readings
 
-    def _means(self, pushed: Array) -> Array:
+    def _compute_interval_means(self, pushed: Array) -> Array:
         """Return interval means (T - 1, E + nu, K) of forces and controls (S, E + nu, K)."""
         lengths = np.diff(self.knots)
         some = np.flatnonzero(lengths)
@@ -363,7 +371,7 @@ class MeasuredLinear(RunLinearisation):
         return result
 
     @cached_property
-    def _composed(self) -> Array:
+    def _input_responses(self) -> Array:
         """State changes (T - 1, Z, E + nu) at the end of each interval between samples.
 
         They are per unit of a generalised force or a control that is constant over the
@@ -373,7 +381,7 @@ class MeasuredLinear(RunLinearisation):
         of, quotients = tangent.looked_at, tangent.quotients
         by = np.concatenate([quotients.forces, quotients.controls], axis=2)
         result = np.zeros((self.knots.size - 1, *by.shape[1:]))
-        for steps, active in self._within():
+        for steps, active in self._list_active_intervals():
             looked = of[steps]
             result[active] = quotients.states[looked] @ result[active] + by[looked]
         return result
@@ -406,7 +414,7 @@ class MeasuredLinear(RunLinearisation):
         changes = np.concatenate(
             [np.moveaxis(read[:, :, some], 2, 0), np.zeros((1, *read.shape[:2]))]
         )
-        seen = self._seen(states, changes, [*(sensors[k] for k in some), ()])
+        seen = self._compute_observations(states, changes, [*(sensors[k] for k in some), ()])
         plain = np.where(sensed[:, None, None], seen[-1], self.observed)
         result[:, :, some] = np.moveaxis(seen[:-1] - plain, 0, 2)
         return result
@@ -425,7 +433,7 @@ class MeasuredLinear(RunLinearisation):
         result = np.zeros((self._motion.x.shape[0], tangent.state_size))
         now = begun[:-1].copy()
         with np.errstate(all="ignore"):
-            for steps, active in self._within():
+            for steps, active in self._list_active_intervals():
                 result[steps] = now[active]
                 ahead = np.einsum("izy,iy->iz", quotients.states[of[steps]], now[active])
                 push = np.einsum("ize,ie->iz", quotients.forces[of[steps]], forces[active])

@@ -115,35 +115,35 @@ class MidpointPredictor:
         Args:
             anew: (L,) whether commands have changed since the previous step; they are already set.
         """
-        x, v, a, drive, bias = self._shown()
+        x, v, a, drive, bias = self._get_field_values()
         # The initial acceleration lacks the applied forces, so it is not used for prediction.
         first, self._first = self._first, False
         a = np.zeros_like(a) if first else a
         if not self._any:
             return JointStates(x, v, a, drive, bias, drive, bias)
-        begun, later = self._sides(anew, first)
+        begun, later = self._compute_transmission_loads(anew, first)
         return JointStates(x, v, a, *begun, *later)
 
-    def _shown(self) -> list[Array]:
+    def _get_field_values(self) -> list[Array]:
         """Return the present values of the fields, (L, D) each."""
         return [field[:, places] for field, places in self._fields]
 
-    def _sides(self, anew: Mask, first: bool) -> tuple[Array, Array]:
+    def _compute_transmission_loads(self, anew: Mask, first: bool) -> tuple[Array, Array]:
         """Return the transmission loads (2, L, D) at the beginning and at the middle of a step."""
-        ended = self._carried()
+        ended = self._copy_forces()
         begun, last = ended, self._last
         asked = self._loaded & anew if self._ends else self._loaded
         # At the first step MuJoCo has already evaluated the batch.
         if not first and asked.any():
             # Only these batch elements are evaluated, so that no element depends on others.
             self._batch.forward(np.flatnonzero(asked))
-            begun = self._carried()
+            begun = self._copy_forces()
         self._last = begun
         if first or not self._ends:
             return begun, begun
         return begun, begun + self._share * (ended - last)  # (2)
 
-    def _carried(self) -> Array:
+    def _copy_forces(self) -> Array:
         """Return a copy of the drive and bias forces, (2, L, D)."""
         (drive, of), (bias, _) = self._fields[3:]
         lanes, joints = len(self._loaded), self._last.shape[-1]

@@ -220,7 +220,7 @@ class MujocoBatch:
         """Write model-field effects, with coefficients (K, N, 1), into the batch's fields."""
         for name in self._changed:
             self.fields[name][...] = self._stated[name]
-        was_derived = any(self._derives(name) for name in self._changed)
+        was_derived = any(self._needs_recomputed_constants(name) for name in self._changed)
         self._changed.clear()
         derives = was_derived or bool(self.robot.series)
         for effect, c in sorted(acting, key=lambda one: get_write_order(one[0].of)):
@@ -241,7 +241,7 @@ class MujocoBatch:
         self._loaded_friction = self.fields["dof_frictionloss"].copy()
 
     @staticmethod
-    def _derives(field: str) -> bool:
+    def _needs_recomputed_constants(field: str) -> bool:
         """Return whether MuJoCo must recompute derived constants after a field changed.
 
         An example is body_mass, from which MuJoCo derives the inverse weights of bodies and
@@ -280,7 +280,7 @@ class MujocoBatch:
         begun = np.zeros((n, second.positions.size))
         if begun.size:
             passive, bias = self.batch.bind("qfrc_passive"), self.batch.bind("qfrc_bias")
-            self.batch.forward(self._ids(n))
+            self.batch.forward(self._get_element_ids(n))
             pulls = (passive - bias)[:n, second.velocities].T
             begun[:] = np.stack(
                 compute_rest_positions(self.fields, self.robot, list(pulls)), axis=1
@@ -334,19 +334,23 @@ class MujocoBatch:
             spec |= int(state.mjSTATE_QFRC_APPLIED)
             given = np.concatenate([controls, forces], axis=2)
         n, steps, _ = controls.shape
-        result = self._begun(n, steps, record)
-        for part in self._switched(n, steps, off):
+        result = self._allocate_records(n, steps, record)
+        for part in self._split_at_switches(n, steps, off):
             if before_call is not None:
                 before_call(part.start)
             done = self.batch.rollout(
-                part.stop - part.start, given[:, part], spec, tuple(record), self._ids(n)
+                part.stop - part.start,
+                given[:, part],
+                spec,
+                tuple(record),
+                self._get_element_ids(n),
             )
             for name, values in done.items():
                 result[name][:, part] = values
-        self._fails(n)
+        self._record_failures(n)
         return result
 
-    def _switched(self, n: int, steps: int, off: Mask | None) -> Iterator[slice]:
+    def _split_at_switches(self, n: int, steps: int, off: Mask | None) -> Iterator[slice]:
         """Yield the steps in consecutive parts, and switch actuators on or off before each part.
 
         Within a part no switch changes. An actuator is switched off by a force range of
@@ -354,12 +358,12 @@ class MujocoBatch:
         on.
         """
         if off is None or not off.any():
-            yield from self._parts(n, steps)
+            yield from self._split_for_interrupts(n, steps)
             return
         ranges = self.force_ranges()
         for stretch in constant_stretches(off):
             ranges.write(off[:, stretch.start])
-            for part in self._parts(n, stretch.stop - stretch.start):
+            for part in self._split_for_interrupts(n, stretch.stop - stretch.start):
                 yield slice(stretch.start + part.start, stretch.start + part.stop)
         ranges.restore()
 
@@ -395,9 +399,9 @@ class MujocoBatch:
         loss = self.fields["dof_frictionloss"]
         rubs = bool(step_forces.has_dry_friction.any())
         own = self.begin_dry_friction(step_forces, n)
-        result = self._begun(n, steps, record)
+        result = self._allocate_records(n, steps, record)
         shown = {name: bind(name)[:n] for name in record}
-        ids = self._ids(n)
+        ids = self._get_element_ids(n)
         # This precedes MuJoCo's first evaluation, since fields that are bound later would not
         # contain it.
         lanes_at = MidpointPredictor(
@@ -430,7 +434,7 @@ class MujocoBatch:
                 values[:, k] = shown[name]
         if ranges is not None:
             ranges.restore()
-        self._fails(n)
+        self._record_failures(n)
         return result
 
     def begin_dry_friction(self, step_forces: StepwiseForces, n: int) -> Array:
@@ -489,19 +493,19 @@ class MujocoBatch:
         loss[:n, dof] = self._loaded_friction[:n, dof] + limit
         write_friction_form(self.fields, self.robot, slice(n), dof)
 
-    def _begun(self, n: int, steps: int, record: Sequence[str]) -> dict[str, Array]:
+    def _allocate_records(self, n: int, steps: int, record: Sequence[str]) -> dict[str, Array]:
         """Allocate arrays for recorded fields."""
         return {name: np.empty((n, steps, *self.batch.bind(name).shape[1:])) for name in record}
 
-    def _ids(self, n: int) -> Places | None:
+    def _get_element_ids(self, n: int) -> Places | None:
         return None if n == self.count else np.arange(n)
 
-    def _fails(self, n: int) -> None:
+    def _record_failures(self, n: int) -> None:
         """Record which batch elements have failed: MuJoCo no longer moves those with a warning."""
         self.failed = (self.batch.warning[:n, :, 1] > 0).any(axis=1)
 
     @staticmethod
-    def _parts(lanes: int, steps: int) -> Iterator[slice]:
+    def _split_for_interrupts(lanes: int, steps: int) -> Iterator[slice]:
         """Yield parts of all steps that take a fraction of a second, to allow Ctrl-C between."""
         largest = max(MAX_UNINTERRUPTED_STEPS // max(lanes, 1), 1)
         for begin in range(0, steps, largest):

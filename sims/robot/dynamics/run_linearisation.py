@@ -88,17 +88,17 @@ class RunLinearisation:
         self._work = RobotRunBatch(scenario, commands, acting, x[None], v[None])
         self._names = [c.name for c in simulator.channels if c.name.startswith(("tau.", "s."))]
         with np.errstate(all="ignore"), capture_mujoco_warnings():
-            self._motion = self._nominal()
-            self._tangent = self._neighbourhood()
+            self._motion = self._simulate_nominal_motion()
+            self._tangent = self._make_tangent_model()
             self._built = self._tangent.placed_element_count
         self._known: dict[tuple[str, bytes], Perturbation] = {}
         nothing = np.zeros((1, *self._motion.x.shape[:1], self._tangent.state_size))
         unread = np.zeros((1, self._motion.x.shape[0], len(self._names)))
-        self.observed: Array = self._seen(nothing, unread, [()])[0]
+        self.observed: Array = self._compute_observations(nothing, unread, [()])[0]
         # The joints of the file come first; joints in series follow them.
         self._joints = len(simulator.addresses.positions)
 
-    def _nominal(self) -> RobotMotion:
+    def _simulate_nominal_motion(self) -> RobotMotion:
         """Simulate the motion of the run, plus one step that begins at the run's end."""
         simulator = self._simulator
         steps = self._steps + 1
@@ -122,12 +122,12 @@ class RunLinearisation:
             v=np.concatenate([made.v[0], made.series[1][0]], axis=1),
             act=np.concatenate([first, act[:-1]]),
             carried=carried,
-            afloat=self._afloat(made.fields),
+            afloat=self._get_floating_states(made.fields),
             step=simulator.time_step,
-            **self._commanded(given),
+            **self._compute_command_fields(given),
         )
 
-    def _commanded(self, given: BatchInputs) -> dict[str, Any]:
+    def _compute_command_fields(self, given: BatchInputs) -> dict[str, Any]:
         """Return the fields of a motion that follow from the commands of the run."""
         return {
             "controls": given.controls[0],
@@ -139,7 +139,7 @@ class RunLinearisation:
             "off": given.off[0],
         }
 
-    def _afloat(self, fields: Mapping[str, Array]) -> FloatingState:
+    def _get_floating_states(self, fields: Mapping[str, Array]) -> FloatingState:
         """Return states of floating bodies, at the beginnings of steps and at the end."""
         begun = self._simulator.get_floating_start(self._work)
         floating = self._simulator.make_linearisation_batch(self._work.acting).floating
@@ -149,7 +149,7 @@ class RunLinearisation:
             np.concatenate([begun.pose[None], pose]), np.concatenate([begun.rate[None], rate])
         )
 
-    def _neighbourhood(self) -> TangentModel:
+    def _make_tangent_model(self) -> TangentModel:
         """Make the tangent linear model about the motion of the run.
 
         `sizes` are the typical forces (N or N m) of the joints of the file, the joints in
@@ -161,7 +161,7 @@ class RunLinearisation:
         bench = simulator.make_linearisation_batch(self._work.acting)
         sizes = compute_joint_scales(simulator.robot).force
         # A joint in series transmits the force of its joint.
-        second = [self._joint(name) for name in bench.robot.series]
+        second = [self._find_series_joint(name) for name in bench.robot.series]
         at = LinearisationPoints(
             bench,
             simulator.robotic,
@@ -180,7 +180,7 @@ class RunLinearisation:
         kind, _, joint = channel.partition(".")
         return self._simulator.system.coordinates.index(f"q.{joint}") if kind == "tau" else -1
 
-    def _joint(self, second: str) -> int:
+    def _find_series_joint(self, second: str) -> int:
         """Return the number of the joint with which a joint is in series."""
         coordinates = self._simulator.system.coordinates
         return coordinates.index(f"q.{second.rpartition('_')[0]}")
@@ -206,7 +206,7 @@ class RunLinearisation:
         (driven,) = compute_control_changes([self], added)
         apart = [i for i, (effect, _) in enumerate(added) if is_series_effect(effect)]
         if apart:
-            result[apart] = self._simulated([added[i] for i in apart]) - self.observed
+            result[apart] = self._simulate_with_effects([added[i] for i in apart]) - self.observed
         for begin in range(0, len(added), MAX_SIMULTANEOUS_CHANGES):
             part = range(begin, min(begin + MAX_SIMULTANEOUS_CHANGES, len(added)))
             changes: list[Perturbation] = []
@@ -220,18 +220,18 @@ class RunLinearisation:
                         continue
                     if isinstance(one, Input) or is_series_effect(one):
                         continue
-                    changes += self._changes(owner, one, k)
+                    changes += self._list_perturbations(owner, one, k)
                 changes += [c._replace(owner=owner) for c in driven.get(number, ())]
             # A change that overflows is one that a fit could not follow.
             with np.errstate(all="ignore"):
                 states, readings = self._tangent.propagate(changes, len(part))
-                seen = self._seen(states, readings, sensors)
+                seen = self._compute_observations(states, readings, sensors)
             own = np.setdiff1d(part, apart).astype(np.intp)
             result[own] = (seen - self.observed)[own - part.start]
         looks = self._tangent.placed_element_count - before
         return result, 1 + len(apart) + looks // len(self._motion.controls)
 
-    def _simulated(self, added: Sequence[EffectWithCoefficients]) -> Array:
+    def _simulate_with_effects(self, added: Sequence[EffectWithCoefficients]) -> Array:
         """Simulate observations (K, T, C) of the run with each effect added.
 
         An added effect replaces the simpler effects of the run that it contains.
@@ -257,12 +257,12 @@ class RunLinearisation:
             states, readings = self._tangent.propagate_initial_state()
         # The changes are small enough for nonlinear sensor effects to be linear.
         small = 1e-4
-        seen = self._seen(small * states, small * readings, [()] * len(states))
+        seen = self._compute_observations(small * states, small * readings, [()] * len(states))
         result: Array = (seen - self.observed) / small
         half, own = len(result) // 2, self._joints
         return np.concatenate([result[:own], result[half : half + own]])
 
-    def _changes(self, owner: int, effect: Effect, c: Array) -> list[Perturbation]:
+    def _list_perturbations(self, owner: int, effect: Effect, c: Array) -> list[Perturbation]:
         """Return the perturbations by an effect that acts on neither inputs nor sensors."""
         name = effect.of or effect.name
         joint = effect.coordinate
@@ -272,7 +272,7 @@ class RunLinearisation:
         if (
             name not in MODEL_FIELD_EFFECTS
             or name in FORCE_EVALUATED_EFFECTS
-            or self._springs(name, joint)
+            or self._is_centred_spring(name, joint)
         ):
             return self._tangent.perturb_by_force(owner, effect, c)
         key = effect.name, c.tobytes()
@@ -283,7 +283,7 @@ class RunLinearisation:
                 self._known[key] = self._tangent.perturb_model_numbers(0, acting, 1.0, bench)
         return [self._known[key]._replace(owner=owner)]
 
-    def _springs(self, name: str, joint: int | None) -> bool:
+    def _is_centred_spring(self, name: str, joint: int | None) -> bool:
         """Return whether an effect is a spring about zero, equal to a joint stiffness.
 
         In MuJoCo a joint stiffness acts about the rest position qpos_spring. Only where
@@ -311,7 +311,9 @@ class RunLinearisation:
         given = self._work.scenario, self._work.commands, tuple(acting.values())
         return RunInputs(*given, count, steps)
 
-    def _seen(self, states: Array, readings: Array, sensors: Sequence[ActiveEffects]) -> Array:
+    def _compute_observations(
+        self, states: Array, readings: Array, sensors: Sequence[ActiveEffects]
+    ) -> Array:
         """Compute observations (n, T, C) of the perturbed motion, with further sensor effects.
 
         Args:
@@ -326,7 +328,7 @@ class RunLinearisation:
         columns = []
         at_ends = find_sample_steps(simulator.time_step, self._times, upto)
         for channel in simulator.channels:
-            acting = _on(channel.name, own, sensors)
+            acting = _select_sensor_effects(channel.name, own, sensors)
             # Most channels are needed at the sample times only.
             some = at_ends if preserves_time(acting) else None
             rows: slice | NDArray[np.intp] = slice(upto) if some is None else some
@@ -402,7 +404,9 @@ def compute_control_changes(
     return result
 
 
-def _on(channel: str, own: ActiveEffects, more: Sequence[ActiveEffects]) -> ActiveEffects:
+def _select_sensor_effects(
+    channel: str, own: ActiveEffects, more: Sequence[ActiveEffects]
+) -> ActiveEffects:
     """Return the sensor effects on a channel: those of the run, then the additional ones.
 
     Args:

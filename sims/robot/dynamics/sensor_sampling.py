@@ -51,13 +51,13 @@ def sample_readings(
         if type(effect).times is not Sensor.times:
             instants = np.where(is_active(c), effect.times(c, instants), instants)
     instants = np.clip(instants, 0.0, ends[-1])
-    result = _at(values, slopes, step, instants)
-    for some, filters in _filtering(sensors):
+    result = _interpolate(values, slopes, step, instants)
+    for some, filters in _iterate_filters(sensors):
         grid = np.broadcast_to(ends, (some.size, count))
         steps = np.diff(grid, axis=1, prepend=0.0)
         filtered = apply_sensor_effects(filters, values[some], steps, grid, clock)
         # The slope of a filtered signal is unknown.
-        result[some] = _at(filtered, None, step, instants[some])
+        result[some] = _interpolate(filtered, None, step, instants[some])
     return apply_effects_to_readings(result, times, sensors, clock)
 
 
@@ -112,7 +112,7 @@ def preserves_time(sensors: ActiveEffects) -> bool:
     return all(type(e).times is Sensor.times and not e.filters for e in shown)
 
 
-def _filtering(sensors: ActiveEffects) -> Iterator[tuple[NDArray[np.intp], ActiveEffects]]:
+def _iterate_filters(sensors: ActiveEffects) -> Iterator[tuple[NDArray[np.intp], ActiveEffects]]:
     """Yield the batch elements with an active filter, and the filters there, if any."""
     filters = tuple((e, c) for e, c in sensors if isinstance(e, Sensor) and e.filters)
     on = [is_active(c)[:, 0] for _, c in filters]
@@ -121,7 +121,7 @@ def _filtering(sensors: ActiveEffects) -> Iterator[tuple[NDArray[np.intp], Activ
         yield lanes, tuple((e, c[:, lanes]) for e, c in filters)
 
 
-def _at(values: Array, slopes: Array | None, step: float, instants: Array) -> Array:
+def _interpolate(values: Array, slopes: Array | None, step: float, instants: Array) -> Array:
     """Interpolate values (L, S + 1), given at the ends of steps, at times (L, T) in seconds.
 
     With slopes, the cubic Hermite polynomial (1) is used, otherwise a straight line.

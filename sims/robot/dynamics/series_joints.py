@@ -162,7 +162,7 @@ def add_series_joints(robot: RobotModel, added: SeriesJoints) -> RobotModel:
         return robot
     spec = robot.spec.copy()
     joints = name_unnamed_elements(spec, robot)
-    inertias = _inertias(robot)
+    inertias = _compute_joint_inertias(robot)
     for name, effects in group_by_joint(added).items():
         first = joints[robot.joint(name).id]
         # Default classes of the file apply to the first joint only.
@@ -211,7 +211,7 @@ def compile_error(robot: RobotModel, added: SeriesJoints) -> str:
 
 
 @cache_per_robot
-def _inertias(robot: RobotModel) -> dict[str, float]:
+def _compute_joint_inertias(robot: RobotModel) -> dict[str, float]:
     """Return the inertia about each joint, in the pose that the file specifies."""
     inertias = np.diagonal(inertia_matrix(robot.compiled)).tolist()
     return {j.name: inertias[j.velocity] for j in robot.joints if j.has_one_coordinate}
@@ -287,7 +287,9 @@ def write_elements(
     option = robot.compiled.opt
     step = float(fields["opt.timestep"][0] if "opt.timestep" in fields else option.timestep)
     number = fields["opt.integrator"][0] if "opt.integrator" in fields else option.integrator
-    stiffness, damping = _stepped(made, inertia, drive, step, int(number) == RK4_INTEGRATOR_ID)
+    stiffness, damping = _limit_for_step(
+        made, inertia, drive, step, int(number) == RK4_INTEGRATOR_ID
+    )
     give = is_compliant_flank(made)
     fields["jnt_stiffness"][:, second.id] = np.where(give, 0.0, stiffness)
     fields["dof_damping"][:, second.velocity] = np.where(give, 0.0, damping)
@@ -295,7 +297,9 @@ def write_elements(
         half = 0.5 * made.gap
         fields["jnt_range"][:, second.id] = np.stack([-half, half], axis=1)
         soft = np.stack([-stiffness, -damping], axis=1)
-        fields["jnt_solref"][:, second.id] = np.where(give[:, None], soft, _hard(step))
+        fields["jnt_solref"][:, second.id] = np.where(
+            give[:, None], soft, _compute_rigid_solref(step)
+        )
         fields["jnt_solimp"][:, second.id] = np.where(
             give[:, None], COMPLIANT_FLANK_SOLIMP, RIGID_FLANK_SOLIMP
         )
@@ -320,7 +324,7 @@ def convert_flank_parameters(fields: Mapping[str, Any], robot: RobotModel) -> No
         fields["jnt_solref"][soft, second.id] *= inverse  # (6)
 
 
-def _hard(step: float) -> tuple[float, float]:
+def _compute_rigid_solref(step: float) -> tuple[float, float]:
     """Return `solref` of rigid flanks: the stiffest value that is stable for a time step."""
     return 2.0 * step, 1.0
 
@@ -350,11 +354,11 @@ def prepare_flanks_for_file(
         turns = robot.joint(joint.name).kind == "hinge" and spec.compiler.degree
         half = float(np.rad2deg(half)) if turns else half
         joint.range = (-half, half)
-        joint.solref_limit, joint.solimp_limit = _hard(step), RIGID_FLANK_SOLIMP
+        joint.solref_limit, joint.solimp_limit = _compute_rigid_solref(step), RIGID_FLANK_SOLIMP
         if model is not None and is_compliant_flank(one)[0]:
             inertia, drive = robot.series[joint.name], model.dof_armature
             drive = drive[[robot.joint(place).velocity]]
-            numbers = np.stack(_stepped(one, inertia, drive, step, explicit))[:, 0]
+            numbers = np.stack(_limit_for_step(one, inertia, drive, step, explicit))[:, 0]
             inverse = model.dof_invweight0[robot.joint(joint.name).velocity]
             joint.solref_limit, joint.solimp_limit = (
                 -numbers * inverse,
@@ -363,7 +367,7 @@ def prepare_flanks_for_file(
     return replace(robot, spec=spec)
 
 
-def _stepped(
+def _limit_for_step(
     made: SeriesElement, inertia: float, drive: Array, step: float, explicit: bool
 ) -> tuple[Array, Array]:
     """Limit stiffness and damping (L,) to values that are stable for a time step.

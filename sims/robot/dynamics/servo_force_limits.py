@@ -58,7 +58,7 @@ def stiff_force_limits(model: Any) -> ForceLimits:
     gains = np.zeros(model.nv)
     if model.opt.integrator in implicit:
         for k in range(model.nu):
-            dof = _dof(model, k)
+            dof = _find_dof(model, k)
             if dof is None:
                 continue
             gear = abs(float(model.actuator_gear[k, 0]))
@@ -72,7 +72,7 @@ def stiff_force_limits(model: Any) -> ForceLimits:
             if _is_stiff(model, dof, float(gains[dof])):
                 limit = float(np.abs(model.jnt_actfrcrange[joint]).max())
                 rows.append((dof, ("qfrc_actuator", dof), limit, limit))
-    jumps = [_jump(model, dof, force, gains) for dof, *_, force in rows]
+    jumps = [_compute_jump(model, dof, force, gains) for dof, *_, force in rows]
     return ForceLimits(
         tuple(output for _, output, *_ in rows),
         NEAR * np.array([limit for *_, limit, _ in rows]),
@@ -80,7 +80,7 @@ def stiff_force_limits(model: Any) -> ForceLimits:
     )
 
 
-def _jump(model: Any, dof: int, force: float, gains: Array) -> Array:
+def _compute_jump(model: Any, dof: int, force: float, gains: Array) -> Array:
     """Compute the jump of all positions (nv,) in a step in which one servo is at its force limit.
 
     The servos of the other joints are taken as not limited.
@@ -101,7 +101,7 @@ def _jump(model: Any, dof: int, force: float, gains: Array) -> Array:
     return jump
 
 
-def _dof(model: Any, actuator: int) -> int | None:
+def _find_dof(model: Any, actuator: int) -> int | None:
     """Return the degree of freedom of an actuator's joint; None if it drives no hinge or slide."""
     import mujoco
 

@@ -114,11 +114,11 @@ class TangentModel:
         self._steps = len(at.motion.controls)
         numbers = np.arange(self._steps)
         self._share: Array = (numbers - at.numbers[at.of]) / at.every
-        self._earlier, self._later = _neighbours(at.numbers, at.every)[:, at.of]
+        self._earlier, self._later = _find_neighbours(at.numbers, at.every)[:, at.of]
         self._base, self._read = at.step_displaced({}, at.acting)
         # If commands change at other times, the linearisation points differ.
         if quotients is None or quotients.states.shape[:2] != self._base.shape:
-            quotients = self._quotients()
+            quotients = self._compute_difference_quotients()
         self.quotients = quotients
 
     @cached_property
@@ -140,7 +140,7 @@ class TangentModel:
         """
         return int(self._base.shape[1])
 
-    def _quotients(self) -> DifferenceQuotients:
+    def _compute_difference_quotients(self) -> DifferenceQuotients:
         """Compute the matrices A, B and C of (1) by forward differences at all points.
 
         `moves` lists the displacements as (quantity, index, size). The quantities are q
@@ -190,7 +190,7 @@ class TangentModel:
             change: size of the change.
             bench: batch whose model has the required elements.
         """
-        meant = self._meant
+        meant = self._mean_acceleration_forces
         with self._at.with_batch(bench):
             accelerations, readings = self._at.compute_accelerations(acting, meant)
             # External forces change readings of drives immediately, so the other readings are
@@ -199,18 +199,18 @@ class TangentModel:
                 _, readings = self._at.compute_accelerations(acting)
         # A change of the acceleration is equivalent to a force.
         apart = (accelerations - self.accelerations[self._at.numbers]) / change
-        force = np.einsum("nij,nj->ni", self._inertias, apart)
+        force = np.einsum("nij,nj->ni", self._compute_inertias, apart)
         return Perturbation(owner, forces=force, readings=(readings - self._still[1]) / change)
 
     @cached_property
-    def _meant(self) -> Array:
+    def _mean_acceleration_forces(self) -> Array:
         """Forces (N, E) that convert accelerations at a state to mean accelerations over the step.
 
         They represent the damping of an implicit integrator, and the motion of other joints within
         the step.
         """
         apart = self.accelerations[self._at.numbers] - self._still[0]
-        forces: Array = np.einsum("nij,nj->ni", self._inertias, apart)
+        forces: Array = np.einsum("nij,nj->ni", self._compute_inertias, apart)
         return forces
 
     def perturb_by_force(self, owner: int, effect: Effect, c: Array) -> list[Perturbation]:
@@ -233,7 +233,7 @@ class TangentModel:
         return changes
 
     @cached_property
-    def _inertias(self) -> Array:
+    def _compute_inertias(self) -> Array:
         return self._at.compute_mass_matrices()
 
     @cached_property
@@ -301,14 +301,14 @@ class TangentModel:
                 if outputs:
                     at_once[change.actuator, owner] += instant
             if change.forces is not None:
-                pushed[:joints, owner] += self._between(change.forces).T
+                pushed[:joints, owner] += self._interpolate_to_steps(change.forces).T
             if change.readings is not None:
-                read[:, :, owner] += self._between(change.readings)
+                read[:, :, owner] += self._interpolate_to_steps(change.readings)
         whole = np.ascontiguousarray(pushed.transpose(2, 0, 1))
         if outputs:
             forces = whole[:, :joints].copy()
             # Changes of model parameters already contain their effect on readings.
-            forces[:, :, self._numbered(changes, count)] = 0.0
+            forces[:, :, self._find_parameter_changes(changes, count)] = 0.0
             read += np.matmul(q.read_forces[self._at.of], forces)
             instants = np.ascontiguousarray(at_once.transpose(2, 0, 1))
             read += np.matmul(q.read_controls[self._at.of], instants)
@@ -383,7 +383,7 @@ class TangentModel:
         with self._at.every_step(), self._at.limited_forces():
             return self._at.step_displaced({}, self._at.acting)
 
-    def _between(self, values: Array) -> Array:
+    def _interpolate_to_steps(self, values: Array) -> Array:
         """Interpolate values (N, k) at linearisation points to all steps, (S, k).
 
         Values are linear between points while a command is constant, and are extrapolated after the
@@ -394,7 +394,7 @@ class TangentModel:
         return result
 
     @staticmethod
-    def _numbered(changes: Sequence[Perturbation], count: int) -> Mask:
+    def _find_parameter_changes(changes: Sequence[Perturbation], count: int) -> Mask:
         """Return which of `count` owners change model parameters, as a mask (count,)."""
         numbered = np.zeros(count, dtype=bool)
         numbered[[change.owner for change in changes if change.forces is not None]] = True
@@ -420,7 +420,7 @@ class TangentModel:
         return np.moveaxis(states, 2, 0), np.moveaxis(readings, 2, 0)
 
 
-def _neighbours(looks: Places, every: int) -> Places:
+def _find_neighbours(looks: Places, every: int) -> Places:
     """Find the pairs of linearisation points for interpolation, (2, N).
 
     A pair is `every` steps apart: a point and the next one, or the previous one and the point if a

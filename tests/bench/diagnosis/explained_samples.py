@@ -53,33 +53,33 @@ def with_runs(recorded, runs):
     )
 
 
-def world(recorded, **options):
+def evaluator(recorded, **options):
     """Return the run evaluator of all runs of a recording."""
     return RunEvaluator(simulators.get(recorded.system), recorded, recorded.runs, **options)
 
 
-def white(world, sigma):
+def white(evaluator, sigma):
     """Return a white noise model with one sigma for all channels or one per channel."""
-    return autoregressive(world, sigma, 0.0)
+    return autoregressive(evaluator, sigma, 0.0)
 
 
-def autoregressive(world, sigma, phi):
+def autoregressive(evaluator, sigma, phi):
     """Return an AR(1) noise model; sigma and phi are for all channels, or one per channel."""
-    shape = (len(world.channels),)
+    shape = (len(evaluator.channels),)
     sigmas, correlations = (
         np.broadcast_to(np.asarray(value, dtype=float), shape).copy() for value in (sigma, phi)
     )
     return NoiseModel(sigmas, correlations)
 
 
-def marked(world, stated):
+def marked(evaluator, stated):
     """Return a (C,) mask of the channels with specified noise, from one value or C values."""
-    return np.broadcast_to(np.asarray(stated, dtype=bool), (len(world.channels),)).copy()
+    return np.broadcast_to(np.asarray(stated, dtype=bool), (len(evaluator.channels),)).copy()
 
 
 def searched(recorded, sigma, seed=0, stated=True, **options):
     """Return a search that contains the fitted base model, and that model."""
-    there = world(recorded, **options)
+    there = evaluator(recorded, **options)
     noise = white(there, sigma)
     base = fit_base_model(there, noise)
     search = EffectSearch(

@@ -78,16 +78,16 @@ def fitted(path, name):
     """Return the models with stiff friction, that with this effect, and the soft run evaluator."""
     recording, kind = load_joined([path], None, None, ())
 
-    def world(of):
+    def evaluator(of):
         return RunEvaluator(of, recording, recording.training(), None, candidates=CANDIDATES)
 
-    stiff = world(kind)
+    stiff = evaluator(kind)
     noise = NoiseModel(np.full(2, NOISE), np.zeros(2))
     base = fit_base_model(stiff, noise)
     rng = np.random.default_rng(0)
     models = ModelSet(stiff, noise, base.fixed_parameters, rng, np.ones(2, dtype=bool))
     models.refit_models([FitStart((name,), base.fit.theta, base.fit.states)], race=False)
-    return models, models.models[frozenset([name])], world(soft_kind(kind))
+    return models, models.models[frozenset([name])], evaluator(soft_kind(kind))
 
 
 CANDIDATES = ["drag.linear@elbow", "friction.coulomb@elbow", "friction.hysteresis@elbow"]
@@ -99,13 +99,13 @@ def test_the_form_that_was_planted_fits_better(tmp_path, form):
     models, stiff, other = fitted(recorded(tmp_path, form), name)
     soft = choose_friction_form(models, stiff, other, INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO)
     assert (soft is not None) == (form == "soft")
-    best, world = (stiff, models.world) if soft is None else (soft, other)
+    best, evaluator = (stiff, models.evaluator) if soft is None else (soft, other)
     assert best.effects == (name,)
-    assert best.fit.theta[world.get_coefficient_indices(name)[0]] == pytest.approx(
+    assert best.fit.theta[evaluator.get_coefficient_indices(name)[0]] == pytest.approx(
         PLANTED, rel=0.03
     )
     assert abs(models.compute_excess(best)) < 0.1
-    assert form_of(world, name) == ("soft" if form == "soft" else None)
+    assert form_of(evaluator, name) == ("soft" if form == "soft" else None)
     assert form_of(other, "drag.linear@elbow") is None
 
 
@@ -118,8 +118,8 @@ def test_what_imitates_soft_friction_is_fitted_as_soft_friction(tmp_path):
     assert soft.fit.theta[other.get_coefficient_indices(soft.effects[0])[0]] == pytest.approx(
         PLANTED, rel=0.03
     )
-    assert has_dry_friction(models.world, ["friction.hysteresis@elbow"])
-    assert not has_dry_friction(models.world, ["drag.linear@elbow"])
+    assert has_dry_friction(models.evaluator, ["friction.hysteresis@elbow"])
+    assert not has_dry_friction(models.evaluator, ["drag.linear@elbow"])
 
 
 def names_friction_alone(search, held_out):

@@ -17,7 +17,7 @@ from bench.diagnosis.explain import explain
 from bench.diagnosis.search.diagnose import DiagnosisResult
 from bench.diagnosis.search.lack_of_fit import LackOfFitResult
 from bench.diagnosis.verdict_builder import VerdictBuilder
-from tests.bench.diagnosis.explained_samples import changed, recording, world
+from tests.bench.diagnosis.explained_samples import changed, evaluator, recording
 
 
 @pytest.mark.parametrize("system", ["pendulum", "servo", "ball"])
@@ -68,7 +68,7 @@ def test_a_channel_that_never_changes_has_the_noise_of_what_no_sample_tells_of()
     still = [changed(run, qd=lambda v: np.zeros_like(v)) for run in made.runs]
     made = replace(made, runs=tuple(still), noise={})
     assert add_least_noise(made, ["qd"])[1] == []
-    assert compute_noise_floor(world(made, candidates=[]), made).sigma[1] == pytest.approx(
+    assert compute_noise_floor(evaluator(made, candidates=[]), made).sigma[1] == pytest.approx(
         1e-3 * 10.0
     )
 
@@ -93,7 +93,7 @@ def judged(fitted, held_out, left=NOTHING, base_error=1.0):
     measured |= {
         (name,): SimpleNamespace(penalised_log_likelihood=m) for name, m in held_out.items()
     }
-    runs = SimpleNamespace(world=SimpleNamespace(observed=np.zeros((1, 4, 1))))
+    runs = SimpleNamespace(evaluator=SimpleNamespace(observed=np.zeros((1, 4, 1))))
     floor = SimpleNamespace(sigma=np.ones(1))
     finding = DiagnosisResult("unknown", base, base, (), left, held_out_fits=measured)
     assessor = VerdictBuilder(None, None, runs, floor, None)

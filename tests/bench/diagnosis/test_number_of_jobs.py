@@ -25,13 +25,13 @@ def test_the_answer_is_the_same_to_the_last_bit_with_one_two_and_eight(monkeypat
     monkeypatch.setattr(run_evaluator, "MAX_CHUNK_SAMPLES", 4_000)
     monkeypatch.setattr(worker_pool, "PARALLEL_THRESHOLD_SECONDS", 0.0)
     shared = []
-    usual = ForkedWorkerPool._shared
+    usual = ForkedWorkerPool._distribute
 
     def counted(self, *given):
         shared.append(len(self._team))
         return usual(self, *given)
 
-    monkeypatch.setattr(ForkedWorkerPool, "_shared", counted)
+    monkeypatch.setattr(ForkedWorkerPool, "_distribute", counted)
     swing = recording(
         effects=["drag.linear=1e-3", "friction.coulomb=2e-3", "force.bias=0.02"],
         noise=["q=0.003", "qd=0.02"],

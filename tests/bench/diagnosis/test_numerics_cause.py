@@ -58,7 +58,7 @@ def chosen(path):
     """Return the explainer of a log after the base fit and the choice of the step."""
     explainer = _ExplainRun([path], ExplainOptions(), ForkedWorkerPool(1))
     try:
-        explainer._stepped(fit_base_model(explainer.fitting, explainer.noise))
+        explainer._choose_base_step(fit_base_model(explainer.fitting, explainer.noise))
     finally:
         explainer.close()
     return explainer

@@ -26,7 +26,7 @@ from bench.diagnosis.report.summary_text import (
 from bench.diagnosis.search.verdict_rules import verdict_of_numbers
 from sims.core.simulator import Parameter
 from sims.extended_simulator import FittedValue
-from tests.bench.diagnosis.explained_samples import recording, world
+from tests.bench.diagnosis.explained_samples import evaluator, recording
 from tests.bench.diagnosis.sample_report_data import DRAG, story
 from tests.conftest import PLUGINS
 
@@ -105,7 +105,7 @@ def test_ranges_of_times_follow_the_duration_and_the_sampling(
 
 @pytest.mark.parametrize("seconds", [1.0, 4.0, 40.0])
 def test_a_fit_may_move_a_delay_up_to_the_longest_run(seconds):
-    there = world(
+    there = evaluator(
         recording(runs=2, seconds=seconds, rate=20),
         candidates=["sensor.lag", "input.delay", "input.lag"],
     )

@@ -73,10 +73,10 @@ def fault_of(path=None, recording=None, kind=None):
         recording, kind = load_joined([path], None, None, ())
     kind = kind or simulators.get(recording.system)
     subject = Subject(kind, recording, "batch" if not kind.own_engine else None)
-    world = subject.world(recording)
-    sigma = compute_noise_floor(world, recording).sigma
+    evaluator = subject.evaluator(recording)
+    sigma = compute_noise_floor(evaluator, recording).sigma
     noise = NoiseModel(sigma, np.zeros(len(sigma)))
-    return wrong_units(subject, world, noise, fit_base_model(world, noise))
+    return wrong_units(subject, evaluator, noise, fit_base_model(evaluator, noise))
 
 
 @pytest.mark.parametrize(
@@ -227,11 +227,11 @@ def test_a_plausible_gain_is_a_gain(effect, value):
 def recognised_of(effect, value):
     recording = simulate_recording(Wish("pendulum", **WISHES["pendulum"])).recording
     subject = Subject(simulators.get("pendulum"), recording, "batch")
-    world = RunEvaluator(subject.kind, recording, recording.training(), candidates=[effect])
+    evaluator = RunEvaluator(subject.kind, recording, recording.training(), candidates=[effect])
     number = FittedValue(value, "1", value - 1e-3, value + 1e-3)
     nowhere = SimpleNamespace(free=np.array([], dtype=int), theta=np.array([]))
     cause = Cause(effect, (), "says so", {"coefficient": number}, 0.0)
-    return recognised(subject, world, cause, nowhere)
+    return recognised(subject, evaluator, cause, nowhere)
 
 
 def test_the_gains_of_units_are_those_of_the_unit_library():

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from bench.diagnosis.evaluation.noise_floor import compute_noise_floor
-from tests.bench.diagnosis.explained_samples import changed, recording, world
+from tests.bench.diagnosis.explained_samples import changed, evaluator, recording
 
 
 def floor_of(made):
-    return compute_noise_floor(world(made, candidates=[]), made)
+    return compute_noise_floor(evaluator(made, candidates=[]), made)
 
 
 def test_stated_noise_is_believed_and_the_rest_estimated():

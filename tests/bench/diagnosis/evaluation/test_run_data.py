@@ -6,7 +6,7 @@ import pytest
 from bench.diagnosis.evaluation.run_data import estimate_initial_value_and_slope, take_first_samples
 from sims.core.simulator import Scenario
 from sims.systems.ball import Ball
-from tests.bench.diagnosis.explained_samples import changed, recorded, recording, world
+from tests.bench.diagnosis.explained_samples import changed, evaluator, recorded, recording
 
 
 def test_first_samples_tell_place_and_slope():
@@ -37,7 +37,7 @@ def test_guesses_are_near_stated_states_are_kept_and_hidden_axes_stay():
     first, second = made.runs
     second = replace(second, initial={"z": 2.5, "vx": 7.0})
     made = replace(made, runs=(first, second))
-    there = world(made, candidates=[])
+    there = evaluator(made, candidates=[])
     assert there.states == ["x", "y", "z", "vx", "vy", "vz"]
     np.testing.assert_allclose(there.guess[0], [0, 0, 3, 2, 0, 1], atol=0.15)
     # No recorded channel depends on y.
@@ -52,7 +52,7 @@ def test_guesses_are_near_stated_states_are_kept_and_hidden_axes_stay():
 def test_a_ball_whose_height_is_not_recorded_begins_too_high_for_an_impact():
     start, times = {"z": 3.0, "vx": 2.0}, np.arange(100) / 50
     made = recorded(Ball(observe=["x"]), [0.7], [start], times, 0.001)
-    there = world(made, candidates=[])
+    there = evaluator(made, candidates=[])
     z = there.states.index("z")
     assert there.guess[0, z] > 0.5 * 9.81 * 2.0**2 + 10
     assert (
@@ -66,7 +66,7 @@ def test_missing_samples_at_the_beginning_and_first_samples():
     made = recording(runs=1, seconds=1, rate=100, initial=["q=1"], noise=["0.001"])
     # The first four angles are missing, but their rates are present.
     run = changed(made.runs[0], q=lambda v: np.where(np.arange(v.size) < 4, np.nan, v))
-    there = world(replace(made, runs=(run,)), candidates=[])
+    there = evaluator(replace(made, runs=(run,)), candidates=[])
     assert there.guess[0, 0] == pytest.approx(1.0, abs=0.02)
     scenario = Scenario(np.arange(5.0), inputs={"u": np.arange(5.0)})
     cut = take_first_samples(scenario, 3)

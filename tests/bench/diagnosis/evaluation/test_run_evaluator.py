@@ -11,11 +11,11 @@ from bench.diagnosis.evaluation.coefficient_bounds import (
 from bench.diagnosis.evaluation.run_evaluator import FREED_CONSTANT_RANGE_FACTOR
 from sims.core.simulator import InputError, Scenario
 from sims.systems.pendulum import Pendulum
-from tests.bench.diagnosis.explained_samples import recorded, recording, with_runs, world
+from tests.bench.diagnosis.explained_samples import evaluator, recorded, recording, with_runs
 
 
 def test_a_vector_holds_parameters_constants_set_free_and_coefficients():
-    there = world(
+    there = evaluator(
         recording(runs=2, seconds=0.5, rate=50),
         free=["length", "mass"],
         candidates=["drag.linear", "spring.linear"],
@@ -36,7 +36,7 @@ def test_cached_elements_equal_the_simulation():
     for q, rate, samples in ((1.0, 50, 40), (0.4, 80, 90)):
         times = np.arange(samples) / rate
         made.append(recorded(Pendulum(), [3e-3], [{"q": q}], times))
-    there = world(
+    there = evaluator(
         with_runs(made[0], [part.runs[0] for part in made]),
         candidates=["drag.linear"],
         free=["gravity"],
@@ -75,7 +75,7 @@ def test_a_later_clock_changes_nothing():
     made = recording(runs=1, seconds=1, rate=50, noise=["0.003"])
     run = made.runs[0]
     later = replace(made, runs=(replace(run, times=run.times + 1e4),))
-    one, two = (world(part, candidates=["drag.linear"]) for part in (made, later))
+    one, two = (evaluator(part, candidates=["drag.linear"]) for part in (made, later))
     np.testing.assert_allclose(one.guess, two.guess, atol=1e-6)
     lane = one.get_nominal_theta()[None], np.array([0]), one.guess
     seen = [there.simulate(*lane) for there in (one, two)]
@@ -83,7 +83,7 @@ def test_a_later_clock_changes_nothing():
 
 
 def test_effects_may_grow_beyond_what_is_plausible_but_not_change_their_meaning():
-    there = world(
+    there = evaluator(
         recording(runs=1, seconds=0.5),
         candidates=["drag.linear", "spring.linear", "friction.stribeck"],
     )
@@ -103,7 +103,7 @@ def test_effects_may_grow_beyond_what_is_plausible_but_not_change_their_meaning(
 
 def test_only_what_sticks_by_itself_has_the_narrow_range_of_dry_friction():
     name = "friction.load_quadratic"
-    there = world(recording("servo", runs=1, seconds=0.5), candidates=[name])
+    there = evaluator(recording("servo", runs=1, seconds=0.5), candidates=[name])
     (_, share), (_, square) = (p.bounds for p in there.parameters[there.slots[name]])
     expected = [(0.0, MAX_RANGE_FACTOR_DRY_FRICTION * share), (0.0, MAX_RANGE_FACTOR * square)]
     assert compute_coefficient_bounds(there, name) == expected
@@ -126,7 +126,7 @@ def test_constants_that_cannot_be_free(free, message):
     made = recording(runs=1, seconds=0.5)
     made = replace(made, runs=(replace(made.runs[0], constants={"gravity": 1.6}),))
     with pytest.raises(InputError, match=message):
-        world(made, free=free)
+        evaluator(made, free=free)
 
 
 def test_constants_of_a_run_are_its_own():
@@ -134,7 +134,7 @@ def test_constants_of_a_run_are_its_own():
     first, second = made.runs
     second = replace(second, constants={"gravity": 0.001})
     made = replace(made, runs=(first, second))
-    there = world(made, candidates=[])
+    there = evaluator(made, candidates=[])
     theta = np.tile(there.get_nominal_theta(), (2, 1))
     states = np.array([[0.5, 0.0]] * 2)
     seen = there.simulate(theta, np.arange(2), states)

@@ -8,7 +8,7 @@ import pytest
 from bench.diagnosis.evaluation import run_thinning
 from bench.diagnosis.evaluation.run_thinning import thin_runs
 from sims.systems.slider import Slider
-from tests.bench.diagnosis.explained_samples import changed, recorded, with_runs, world
+from tests.bench.diagnosis.explained_samples import changed, evaluator, recorded, with_runs
 
 TIMES = np.arange(0, 2.0, 0.001)
 PUSHED = np.sin(40.0 * TIMES)
@@ -28,7 +28,7 @@ def log():
 
 
 def test_of_samples_closer_than_steps_every_so_manyth_is_kept(log):
-    there = world(log)
+    there = evaluator(log)
     few = thin_runs(there)
     assert few.lengths.tolist() == [200, 200]
     np.testing.assert_array_equal(few.observed, there.observed[:, ::10])
@@ -38,14 +38,14 @@ def test_of_samples_closer_than_steps_every_so_manyth_is_kept(log):
 
 
 def test_an_input_gives_the_same_momentum(log):
-    few = thin_runs(world(log)).tracks[0].scenario
+    few = thin_runs(evaluator(log)).tracks[0].scenario
     before = np.concatenate([[0.0], np.cumsum(PUSHED[:-1] * np.diff(TIMES))])[::10]
     after = np.concatenate([[0.0], np.cumsum(few.inputs["u"][:-1] * np.diff(few.times))])
     np.testing.assert_allclose(after, before, atol=1e-12)
 
 
 def test_the_same_parameters_give_nearly_the_same_motion(log):
-    there = world(log)
+    there = evaluator(log)
     few = thin_runs(there)
     theta, runs = np.array([there.get_nominal_theta()]), np.zeros(1, dtype=int)
     whole = there.simulate(theta, runs, there.guess[:1])
@@ -55,15 +55,17 @@ def test_the_same_parameters_give_nearly_the_same_motion(log):
 
 def test_few_samples_or_far_apart_or_seldom_recorded_are_left_alone(log, monkeypatch):
     one = with_runs(log, log.runs[:1])
-    assert thin_runs(world(one)) is None, "few"
+    assert thin_runs(evaluator(one)) is None, "few"
     slow = [replace(run, times=20.0 * run.times) for run in log.runs]
-    assert thin_runs(world(with_runs(log, slow))) is None, "far apart"
+    assert thin_runs(evaluator(with_runs(log, slow))) is None, "far apart"
 
     def seldom(values):
         values[np.arange(values.size) % 10 != 5] = np.nan
         return values
 
     holes = [changed(run, x=seldom) for run in log.runs]
-    assert thin_runs(world(with_runs(log, holes))) is None, "of the samples kept none is recorded"
+    assert thin_runs(evaluator(with_runs(log, holes))) is None, (
+        "of the samples kept none is recorded"
+    )
     monkeypatch.setattr(run_thinning, "MIN_THINNED_SAMPLES", 1000)
-    assert thin_runs(world(log)).lengths.tolist() == [500, 500], "as many as must be left"
+    assert thin_runs(evaluator(log)).lengths.tolist() == [500, 500], "as many as must be left"

@@ -25,7 +25,7 @@ from bench.diagnosis.evaluation.worker_pool import (
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="workers are forked on Linux alone")
 
 
-def world(**watch):
+def evaluator(**watch):
     """Return the attributes of a run evaluator that a worker pool needs."""
     return SimpleNamespace(simulations=0, watch=SearchControl(**watch), crew=None, factor=3)
 
@@ -72,7 +72,7 @@ def alive(numbers):
 
 @pytest.mark.parametrize("jobs", [2, 5])
 def test_results_come_in_order_from_other_processes_and_are_accounted_for(jobs):
-    there = world()
+    there = evaluator()
     with closing(ForkedWorkerPool(jobs)) as crew:
         results = crew.map(there, times, [(n,) for n in range(20)])
     assert [value for value, _ in results] == [3 * n for n in range(20)]
@@ -84,7 +84,7 @@ def test_results_come_in_order_from_other_processes_and_are_accounted_for(jobs):
 
 
 def test_one_job_and_one_item_stay_here():
-    there = world()
+    there = evaluator()
     with closing(ForkedWorkerPool(1)) as crew:
         assert {process for _, process in crew.map(there, times, [(1,), (2,)])} == {os.getpid()}
     with closing(ForkedWorkerPool(2)) as crew:
@@ -95,7 +95,7 @@ def test_little_work_starts_nobody(monkeypatch):
     monkeypatch.setattr(crews, "PARALLEL_THRESHOLD_SECONDS", 60.0)
     with closing(ForkedWorkerPool(2)) as crew:
         for _ in range(3):
-            results = crew.map(world(), times, [(1,), (2,)])
+            results = crew.map(evaluator(), times, [(1,), (2,)])
             assert {process for _, process in results} == {os.getpid()}
 
 
@@ -106,7 +106,7 @@ def test_no_process_is_forked_while_a_thread_runs(monkeypatch):
     thread.start()
     try:
         with closing(ForkedWorkerPool(2)) as crew:
-            results = crew.map(world(), times, [(1,), (2,)])
+            results = crew.map(evaluator(), times, [(1,), (2,)])
     finally:
         done.set()
         thread.join()
@@ -114,7 +114,7 @@ def test_no_process_is_forked_while_a_thread_runs(monkeypatch):
 
 
 def test_what_a_worker_that_died_was_at_is_done_again():
-    there = world()
+    there = evaluator()
     with closing(ForkedWorkerPool(2)) as crew:
         # Each worker that takes number 2 dies, until only this process remains.
         assert crew.map(there, dies, [(n,) for n in range(6)]) == list(range(6))
@@ -123,17 +123,17 @@ def test_what_a_worker_that_died_was_at_is_done_again():
 
 def test_a_fault_is_raised_here():
     with closing(ForkedWorkerPool(2)) as crew, pytest.raises(ValueError, match="no 1") as raised:
-        crew.map(world(), fails, [(n,) for n in range(3)])
+        crew.map(evaluator(), fails, [(n,) for n in range(3)])
     assert "in fails" in str(raised.value.__cause__)
 
 
 def test_workers_leave_off_when_the_search_has_to_end():
     wanted = []
-    there = world(stop=lambda: bool(wanted) or wanted.append(1))
+    there = evaluator(stop=lambda: bool(wanted) or wanted.append(1))
     with closing(ForkedWorkerPool(2)) as crew:
         assert crew.map(there, waits, [(1,), (2,)]) == [1, 2]
     assert there.watch.has_abandoned_fits()
-    there = world(budget=0.2)
+    there = evaluator(budget=0.2)
     with closing(ForkedWorkerPool(2)) as crew:
         assert crew.map(there, waits, [(1,), (2,)]) == [1, 2]
 
@@ -142,7 +142,7 @@ def test_a_message_keeps_the_order_of_arrays_in_memory():
     rng = np.random.default_rng(0)
     values = np.moveaxis(rng.standard_normal((7, 11, 13)), 0, -1)
     with closing(ForkedWorkerPool(2)) as crew:
-        found = crew.map(world(), summed, [(values,), (values.T,)])
+        found = crew.map(evaluator(), summed, [(values,), (values.T,)])
     for (total, strides, back), sent in zip(found, (values, values.T), strict=True):
         assert total == float(sent.sum())
         assert strides == back.strides == sent.strides

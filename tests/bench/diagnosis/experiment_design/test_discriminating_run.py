@@ -13,12 +13,12 @@ from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
 from bench.diagnosis.search.effect_search import EffectSearch
 from sims.core.simulator import Scenario
 from sims.systems.pendulum import Pendulum
-from tests.bench.diagnosis.explained_samples import marked, recording, white, world
+from tests.bench.diagnosis.explained_samples import evaluator, marked, recording, white
 
 
 def rivals(made, sigma, effects, **options):
     """Return a search and one fitted model per effect."""
-    there = world(made, candidates=list(effects), **options)
+    there = evaluator(made, candidates=list(effects), **options)
     noise = white(there, sigma)
     base = fit_base_model(there, noise)
     search = EffectSearch(
@@ -50,7 +50,7 @@ def test_the_run_that_differs_most_is_proposed_and_does_tell_them_apart(free):
     assert float(said[2]) == pytest.approx(found.apart, rel=0.01)
     if free:
         return
-    track = search.world.tracks[0]
+    track = search.evaluator.tracks[0]
     initial = dict(zip(("q", "qd"), track.initial_state_guess.tolist(), strict=True)) | {
         k: v for k, v in found.change.items() if k in ("q", "qd")
     }
@@ -60,7 +60,7 @@ def test_the_run_that_differs_most_is_proposed_and_does_tell_them_apart(free):
         assert found.change["seconds"] == pytest.approx(times[-1])
     seen = [
         Pendulum(
-            fixed={name: m.fit.theta[search.world.slots[name]].tolist()}, time_step=1e-3
+            fixed={name: m.fit.theta[search.evaluator.slots[name]].tolist()}, time_step=1e-3
         ).simulate(m.fit.theta[None, :1], Scenario(times, initial))[0]
         for name, m in zip(effects, (model, rival), strict=True)
     ]
@@ -89,9 +89,9 @@ def test_an_input_is_made_smaller_or_larger():
     made = recording("slider", runs=1, seconds=1, rate=50, inputs=["u=square:1:1"], noise=["0.003"],
                      effects=["input.gain=0.2"])  # fmt: skip
     search, model, rival = rivals(made, 0.003, ("input.deadband", "friction.coulomb"))
-    before = search.world.simulations
+    before = search.evaluator.simulations
     found = propose_discriminating_run(search, model, rival)
     assert np.isfinite(found.apart)
-    assert search.world.simulations - before == 2 * (1 + 6 + 2), (
+    assert search.evaluator.simulations - before == 2 * (1 + 6 + 2), (
         "twice as long, each state three ways, the input two"
     )

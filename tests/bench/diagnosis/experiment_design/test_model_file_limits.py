@@ -146,8 +146,8 @@ def test_set_points_keep_to_the_limits_of_an_mjcf(tmp_path, capsys):
 
 def test_all_limits_of_a_urdf_are_read(tmp_path):
     kind = kind_of(tmp_path, URDF, actuators={"m": {**MOTOR["m"], "gear": 4.0}})
-    world, _ = world_of(kind, 0.1 * np.sin(TIMES))
-    limits = stated_limits(world)
+    evaluator, _ = world_of(kind, 0.1 * np.sin(TIMES))
+    limits = stated_limits(evaluator)
     assert limits.commands == {"u.m": (-0.25, 0.25), "force.hip": (-1.0, 1.0)}
     assert limits.states == {"q.hip": (-0.9, 0.9), "qd.hip": (-2.5, 2.5)}
     assert limits.forces == {"tau.hip": (-1.0, 1.0)}
@@ -155,8 +155,8 @@ def test_all_limits_of_a_urdf_are_read(tmp_path):
 
 def test_a_velocity_servo_keeps_to_the_velocity_of_a_urdf(tmp_path):
     servo = {"m": {"joint": "hip", "kind": "velocity", "kv": 2.0, "gear": 2.0}}
-    world, _ = world_of(kind_of(tmp_path, URDF, actuators=servo), 0.1 * np.sin(TIMES))
-    assert stated_limits(world).commands["u.m"] == (-5.0, 5.0)
+    evaluator, _ = world_of(kind_of(tmp_path, URDF, actuators=servo), 0.1 * np.sin(TIMES))
+    assert stated_limits(evaluator).commands["u.m"] == (-5.0, 5.0)
 
 
 def test_limits_of_an_mjcf_are_those_of_joint_and_actuator_together(tmp_path):
@@ -174,13 +174,13 @@ def test_limits_of_an_mjcf_are_those_of_joint_and_actuator_together(tmp_path):
 def test_every_simple_run_of_a_robot_is_within_the_limits(tmp_path):
     kind = kind_of(tmp_path, URDF, actuators=MOTOR)
     # The recorded command exceeds the limits, which hold for runs with this command too.
-    world, _ = world_of(kind, 1.3 * np.sin(2.0 * TIMES))
-    limits = stated_limits(world)
-    runs = list(_iterate_changed_runs(world))
+    evaluator, _ = world_of(kind, 1.3 * np.sin(2.0 * TIMES))
+    limits = stated_limits(evaluator)
+    runs = list(_iterate_changed_runs(evaluator))
     assert len(runs) > 4
     for run in runs:
         assert np.abs(run.scenario.inputs["u.m"]).max() <= 1.0
-        states = dict(zip(world.states, run.states, strict=True))
+        states = dict(zip(evaluator.states, run.states, strict=True))
         assert abs(states["q.hip"]) <= 0.9
         assert states["qd.hip"] == 0.0
         assert "commands limited" in run.says
@@ -198,8 +198,8 @@ def test_a_signal_is_enlarged_up_to_its_limit():
 
 def test_what_the_runs_so_far_did_wrongly_is_not_proposed_again(tmp_path):
     kind = kind_of(tmp_path, URDF.replace('velocity="2.5"', 'velocity="0.5"'), actuators=MOTOR)
-    world, model = world_of(kind, 0.9 * np.sin(3.0 * TIMES))
-    rig, limits = RigModel(world, 2.0), RigLimits(world, model)
+    evaluator, model = world_of(kind, 0.9 * np.sin(3.0 * TIMES))
+    rig, limits = RigModel(evaluator, 2.0), RigLimits(evaluator, model)
     assert np.abs(limits.past[0]["qd.hip"]).max() > 0.5
     assert limits.bounds["qd.hip"] == (-0.5, 0.5)
     strong, weak = (rig.make_run(RunPlan(("u.m",), "slow sine", size)) for size in (1.0, 0.05))
@@ -208,8 +208,8 @@ def test_what_the_runs_so_far_did_wrongly_is_not_proposed_again(tmp_path):
 
 def test_plans_say_that_a_command_is_limited_and_begin_in_range(tmp_path):
     kind = kind_of(tmp_path, URDF, actuators=MOTOR)
-    world, _ = world_of(kind, 0.7 * np.sin(2.0 * TIMES), begin=0.6)
-    rig = RigModel(world, 2.0)
+    evaluator, _ = world_of(kind, 0.7 * np.sin(2.0 * TIMES), begin=0.6)
+    rig = RigModel(evaluator, 2.0)
     run = rig.make_run(RunPlan(("u.m",), "slow sine", 2.0))
     assert np.abs(run.scenario.inputs["u.m"]).max() == 1.0
     assert "u.m limited to -1 to 1" in run.says

@@ -47,9 +47,9 @@ def arm(tmp_path_factory):
         channels = dict(zip(("q.hip", "q.knee"), seen.T, strict=True))
         run = Run("1", TIMES, channels, inputs, {}, {}, held_out=False)
         recording = Recording(Path("x.csv"), kind.name, "", {}, {}, (run,))
-        world = RunEvaluator(kind, recording, (run,), None, candidates=())
-        fit = SimpleNamespace(theta=world.get_nominal_theta(), states=world.guess)
-        return world, SimpleNamespace(fit=fit, effects=())
+        evaluator = RunEvaluator(kind, recording, (run,), None, candidates=())
+        fit = SimpleNamespace(theta=evaluator.get_nominal_theta(), states=evaluator.guess)
+        return evaluator, SimpleNamespace(fit=fit, effects=())
 
     return made
 
@@ -59,9 +59,9 @@ def pushes(rig, size):
 
 
 def test_a_speed_that_the_file_states_is_kept_though_nobody_recorded_it(arm):
-    world, model = arm(9.0)
-    assert world.kind.robot.speeds == {"hip": 9.0}
-    rig, limits = RigModel(world, 2.0), RigLimits(world, model)
+    evaluator, model = arm(9.0)
+    assert evaluator.kind.robot.speeds == {"hip": 9.0}
+    rig, limits = RigModel(evaluator, 2.0), RigLimits(evaluator, model)
     assert limits.bounds["qd.hip"] == (-9.0, 9.0)
     gentle, strong = pushes(rig, 1.0), pushes(rig, 1.5)
     assert limits(model, [gentle, strong]) == [True, True]
@@ -75,8 +75,8 @@ def test_a_speed_that_the_file_states_is_kept_though_nobody_recorded_it(arm):
 
 
 def test_what_nothing_states_is_as_fast_and_as_strong_as_it_was(arm):
-    world, model = arm(0.0)
-    limits, rig = RigLimits(world, model), RigModel(world, 2.0)
+    evaluator, model = arm(0.0)
+    limits, rig = RigLimits(evaluator, model), RigModel(evaluator, 2.0)
     past = limits.past[0]
     assert limits.bounds["qd.hip"][1] == pytest.approx(
         SPEED_AND_FORCE_FACTOR * np.abs(past["qd.hip"]).max()
@@ -87,8 +87,8 @@ def test_what_nothing_states_is_as_fast_and_as_strong_as_it_was(arm):
 
 
 def test_commands_keep_to_what_joints_take(arm):
-    world, _ = arm(9.0)
-    rig = RigModel(world, 2.0)
+    evaluator, _ = arm(9.0)
+    rig = RigModel(evaluator, 2.0)
     assert rig.limits.commands["force.hip"] == (-30.0, 30.0)
     assert np.abs(rig._limit_command("force.hip", np.array([-50.0, 7.0]))).max() == 30.0
 

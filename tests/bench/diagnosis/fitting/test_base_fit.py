@@ -5,7 +5,7 @@ from bench.benchmark.runner.standalone_tuning import spread_start_points
 from bench.diagnosis.fitting.base_fit import fit_base_model
 from sims.systems.ball import Ball
 from sims.systems.pendulum import Pendulum
-from tests.bench.diagnosis.explained_samples import recorded, recording, white, with_runs, world
+from tests.bench.diagnosis.explained_samples import evaluator, recorded, recording, white, with_runs
 
 TIMES = np.arange(90) / 60
 """Sample times of 1.5 s at 60 Hz."""
@@ -21,7 +21,7 @@ def test_any_inertia_in_the_bounds_is_found(inertia):
     starts = [{"q": 0.9}, {"q": -2.0, "qd": 4.0}]
     sigma = [0.003, 0.02]
     made = recorded(Pendulum(), [inertia], starts, TIMES, sigma, seed=1)
-    there = world(made, candidates=[])
+    there = evaluator(made, candidates=[])
     base = fit_base_model(there, white(there, sigma))
     assert base.fit.theta[0] == pytest.approx(inertia, rel=3e-3)
     samples = np.isfinite(there.observed).sum()
@@ -34,7 +34,7 @@ def test_restitution_is_found_through_many_bounces(restitution):
     starts = [{"z": 2.5, "vx": 0.5}, {"z": 1.5, "vz": 1.0}]
     times = np.arange(150) / 60
     made = recorded(ball(), [restitution], starts, times, 0.005)
-    there = world(made, candidates=[])
+    there = evaluator(made, candidates=[])
     base = fit_base_model(there, white(there, 0.005))
     assert base.fit.theta[0] == pytest.approx(restitution, abs=2e-3)
     assert base.fit.cost / np.isfinite(there.observed).sum() == pytest.approx(1.0, abs=0.2)
@@ -45,7 +45,7 @@ def test_restitution_that_a_fall_does_not_touch_is_reported_and_stays_nominal():
     starts = [{"z": 20.0, "vx": 1.0}, {"z": 25.0}]
     times = np.arange(60) / 60
     made = recorded(ball(), [0.9], starts, times, 0.005)
-    there = world(made, candidates=[])
+    there = evaluator(made, candidates=[])
     base = fit_base_model(there, white(there, 0.005))
     assert base.insensitive_parameters == frozenset({0})
     assert base.fit.theta[0] == there.get_nominal_theta()[0] == 0.5
@@ -54,7 +54,7 @@ def test_restitution_that_a_fall_does_not_touch_is_reported_and_stays_nominal():
 
     # One run with an impact is enough.
     hit = recorded(ball(), [0.9], [{"z": 1.0}], TIMES, 0.005)
-    again = world(with_runs(made, [*made.runs, *hit.runs]), candidates=[])
+    again = evaluator(with_runs(made, [*made.runs, *hit.runs]), candidates=[])
     touched = fit_base_model(again, white(again, 0.005))
     assert not touched.insensitive_parameters
     assert touched.fit.theta[0] == pytest.approx(0.9, abs=5e-3)
@@ -62,7 +62,7 @@ def test_restitution_that_a_fall_does_not_touch_is_reported_and_stays_nominal():
 
 def test_a_given_start_is_where_it_begins():
     made = recording(theta=["6e-3"], runs=2, seconds=1, rate=60, noise=["q=0.003", "qd=0.02"])
-    there = world(made, candidates=[])
+    there = evaluator(made, candidates=[])
     noise = white(there, [0.003, 0.02])
     many = fit_base_model(there, noise)
     # Number of simulations of the fit with many starts.

@@ -11,7 +11,7 @@ from bench.diagnosis.fitting.bound_widening import fit_wider, widened
 from bench.diagnosis.report.summary_text import format_headline, format_summary
 from bench.diagnosis.search.verdict_rules import BORDERING
 from sims.core.simulator import Parameter
-from tests.bench.diagnosis.explained_samples import recording, world
+from tests.bench.diagnosis.explained_samples import evaluator, recording
 
 HEAVIER = 1.025
 
@@ -61,7 +61,7 @@ def test_a_parameter_at_a_bound_that_physics_sets_keeps_a_cause_from_being_named
 
 
 def test_within_its_range_nothing_is_widened():
-    there = world(recording(runs=2, seconds=1, rate=50), candidates=[])
+    there = evaluator(recording(runs=2, seconds=1, rate=50), candidates=[])
     noise = NoiseModel(np.full(len(there.channels), 0.002), np.zeros(len(there.channels)))
     base = fit_base_model(there, noise)
     assert fit_wider(there, noise, base) == (base, {})

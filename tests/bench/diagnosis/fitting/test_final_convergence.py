@@ -13,10 +13,10 @@ from sims.systems.slider import Slider
 from tests.bench.diagnosis.explained_samples import (
     autoregressive,
     correlated,
+    evaluator,
     marked,
     recorded,
     white,
-    world,
 )
 
 MASS, DRAG, SIGMA = 1.3, 0.4, 0.004
@@ -28,7 +28,7 @@ def there():
     times = np.arange(240) / 60
     push = np.where(np.sin(5 * times) > 0, 1.0, -1.0)
     made = recorded(Slider(fixed={NAME: DRAG}, observe=["x"]), [MASS], [({}, {"u": push})], times)
-    return world(made, candidates=[NAME])
+    return evaluator(made, candidates=[NAME])
 
 
 def search_of(there, phi, seed=0):
@@ -39,8 +39,8 @@ def search_of(there, phi, seed=0):
 
 
 def entered(search, theta, iterations, noise=None, exact=False):
-    start = FitStart((NAME,), np.array(theta), search.world.guess)
-    fitter = TrajectoryFitter(search.world, noise or search.noise, exact=exact)
+    start = FitStart((NAME,), np.array(theta), search.evaluator.guess)
+    fitter = TrajectoryFitter(search.evaluator, noise or search.noise, exact=exact)
     return search.add_fit(fitter.fit_models([start], iterations)[0])
 
 
@@ -59,7 +59,7 @@ def test_it_is_where_generalised_least_squares_ends(there, phi):
     assert told.likelihood.phi[0] == pytest.approx(phi, abs=0.12)
     noise = autoregressive(there, told.likelihood.sigma[0], told.likelihood.phi)
     start = FitStart((NAME,), np.array([1.1, 0.1]), there.guess)
-    best = search._of(TrajectoryFitter(there, noise, exact=True).fit_models([start], 60)[0])
+    best = search._rate_fit(TrajectoryFitter(there, noise, exact=True).fit_models([start], 60)[0])
     assert off(search, told, best) < 0.05
     assert off(search, begun, best) > 0.3
     assert search.models[frozenset({NAME})] is told
@@ -99,7 +99,9 @@ def test_a_residual_that_is_no_noise_does_not_bias_it(there):
     begun = entered(search, [MASS, DRAG], 60, exact=True)
     noise = autoregressive(there, begun.likelihood.sigma[0], begun.likelihood.phi)
     (fit,) = TrajectoryFitter(there, noise, exact=True).fit_models([begun.fit.make_start()], 60)
-    pulled = search._of(replace(fit, cost=TrajectoryFitter(there, search.noise).compute_cost(fit)))
+    pulled = search._rate_fit(
+        replace(fit, cost=TrajectoryFitter(there, search.noise).compute_cost(fit))
+    )
     assert pulled.penalised_log_likelihood > begun.penalised_log_likelihood
     assert pulled.fit.cost > 2.0 * begun.fit.cost
     assert pulled.fit.theta[1] == 0.0

@@ -21,7 +21,7 @@ SERVO = '<actuator><position name="m" joint="hinge" kp="30" kv="2"/></actuator>'
 TIMES = np.arange(0, 2, 0.02)
 
 
-def world(tmp_path, text):
+def evaluator(tmp_path, text):
     """Return the run evaluator of a log with two runs of an arm."""
     kind = kind_of(text)
     simulator = kind(observe=["q.hinge"])
@@ -57,7 +57,7 @@ def world(tmp_path, text):
 def test_what_is_held_or_damped_forgets_and_what_swings_or_creeps_does_not(
     tmp_path, text, expected
 ):
-    there = world(tmp_path, text)
+    there = evaluator(tmp_path, text)
     noise = NoiseModel(np.array([1e-3]), np.zeros(1))
     by_states = compute_state_jacobian(there, there.get_nominal_theta(), there.guess)
     assert forgets_initial_state(there, noise, by_states) is expected
@@ -68,7 +68,7 @@ def test_what_is_held_or_damped_forgets_and_what_swings_or_creeps_does_not(
 
 
 def test_a_simulated_element_is_not_simulated_again(tmp_path):
-    there = world(tmp_path, ARM.format(damping=0.4, drive=SERVO))
+    there = evaluator(tmp_path, ARM.format(damping=0.4, drive=SERVO))
     theta = np.tile(there.get_nominal_theta(), (3, 1))
     runs = np.array([0, 1, 0])
     states = there.guess[runs] + np.array([[0.0], [0.0], [0.1]])

@@ -17,7 +17,7 @@ from bench.diagnosis.search.refine_candidates import refine_best_model
 from sims.systems.ball import Ball
 from sims.systems.pendulum import Pendulum
 from sims.systems.servo import Servo
-from tests.bench.diagnosis.explained_samples import recorded, searched, white, with_runs, world
+from tests.bench.diagnosis.explained_samples import evaluator, recorded, searched, white, with_runs
 
 TIMES = np.arange(0, 12.0, 0.02)
 SIGMA = [0.002, 0.01]
@@ -27,7 +27,7 @@ LONG = recorded(Pendulum(), [0.0035], STARTS, TIMES, noise=SIGMA)
 
 
 def test_pieces_are_the_runs_cut_up_and_nothing_else():
-    there = world(LONG)
+    there = evaluator(LONG)
     cut = make_segment_evaluator(there)
     assert len(cut.tracks) == 2 * SEGMENTS_PER_RUN
     again = np.concatenate([t.scenario.times for t in cut.tracks[:SEGMENTS_PER_RUN]])
@@ -42,7 +42,7 @@ def test_pieces_are_the_runs_cut_up_and_nothing_else():
 
 def test_what_is_known_of_the_beginning_is_known_of_the_first_piece_alone():
     told = with_runs(LONG, [replace(run, initial={"q": 1.2}) for run in LONG.runs])
-    known = make_segment_evaluator(world(told)).known[:, 0]
+    known = make_segment_evaluator(evaluator(told)).known[:, 0]
     assert known.tolist() == ([True] + [False] * (SEGMENTS_PER_RUN - 1)) * 2
 
 
@@ -50,13 +50,13 @@ def test_runs_too_short_for_two_pieces_are_left_alone():
     # This is one sample fewer than two segments need.
     times = np.arange(39) * 0.02
     short = recorded(Pendulum(), [0.0035], STARTS[:1], times, noise=SIGMA)
-    assert make_segment_evaluator(world(short)) is None
+    assert make_segment_evaluator(evaluator(short)) is None
     both = with_runs(short, [*short.runs, LONG.runs[0]])
-    assert len(make_segment_evaluator(world(both)).tracks) == 1 + SEGMENTS_PER_RUN
+    assert len(make_segment_evaluator(evaluator(both)).tracks) == 1 + SEGMENTS_PER_RUN
 
 
 def test_over_pieces_the_sum_of_squares_has_one_minimum_where_whole_runs_have_many():
-    there = world(LONG)
+    there = evaluator(LONG)
     cut = make_segment_evaluator(there)
 
     def minima(some):
@@ -81,7 +81,7 @@ def test_over_pieces_the_sum_of_squares_has_one_minimum_where_whole_runs_have_ma
 
 
 def test_a_fit_of_pieces_begins_that_of_whole_runs_with_their_first_pieces():
-    there = world(LONG)
+    there = evaluator(LONG)
     cut = make_segment_evaluator(there)
     # On whole runs, a fit from this start does not reach the true parameters.
     theta = cut.get_nominal_theta()
@@ -135,4 +135,4 @@ def test_what_bounces_is_left_whole():
     times = np.arange(200) * 0.02
     starts = [{"z": 2.0}, {"z": 3.0}]
     falls = recorded(Ball(observe=["z"]), [0.6], starts, times, noise=0.002)
-    assert make_segment_evaluator(world(falls)) is None
+    assert make_segment_evaluator(evaluator(falls)) is None

@@ -15,11 +15,11 @@ from sims.systems.pendulum import Pendulum
 from tests.bench.diagnosis.explained_samples import (
     autoregressive,
     changed,
+    evaluator,
     recorded,
     recording,
     white,
     with_runs,
-    world,
 )
 
 TRUTH = 2.7e-3
@@ -43,7 +43,7 @@ def fitted(there, theta=None, sigma=1e-3, iterations=30, states=None, effects=()
 
 
 def test_parameters_and_initial_states_of_noiseless_runs_come_back():
-    there = world(swings())
+    there = evaluator(swings())
     fit = fitted(there)
     assert there.observed.shape == (3, 130, 2)
     assert fit.theta[0] == pytest.approx(TRUTH, rel=2e-5)
@@ -62,7 +62,7 @@ def test_restitution_and_six_initial_states_of_noiseless_bounces():
         {"z": 2.0, "vx": 1.0, "vz": 0.5},
         {"z": 3.0, "y": 0.3, "vy": -0.7},
     ]
-    there = world(recorded(Ball(observe=["x", "y", "z"]), [0.72], starts, times))
+    there = evaluator(recorded(Ball(observe=["x", "y", "z"]), [0.72], starts, times))
     fit = fitted(there)
     assert fit.theta[0] == pytest.approx(0.72, abs=2e-5)
     # Columns: x, y, z and their rates.
@@ -75,7 +75,7 @@ def test_restitution_and_six_initial_states_of_noiseless_bounces():
 
 def test_an_effect_is_fitted_with_the_parameters():
     made = recording(effects=["drag.linear=8e-4"], theta=["2.7e-3"], runs=2, seconds=1.5, rate=60)
-    there = world(made, candidates=["drag.linear", "friction.coulomb"])
+    there = evaluator(made, candidates=["drag.linear", "friction.coulomb"])
     fit = fitted(there, effects=("drag.linear",))
     assert list(fit.free) == [0, 1]
     assert fit.theta[0] == pytest.approx(TRUTH, rel=1e-4)
@@ -84,7 +84,7 @@ def test_an_effect_is_fitted_with_the_parameters():
 
 
 def test_the_jacobian_is_the_derivative():
-    there = world(swings(), candidates=["drag.linear"])
+    there = evaluator(swings(), candidates=["drag.linear"])
     fit = fitted(there, effects=("drag.linear",))
     runs = np.arange(3)
     for column, step in ((0, 1e-6), (1, 1e-6)):
@@ -102,7 +102,7 @@ def test_the_jacobian_is_the_derivative():
 
 
 def test_several_models_in_one_call_equal_one_by_one():
-    there = world(swings(), candidates=["drag.linear", "friction.coulomb", "sensor.delay"])
+    there = evaluator(swings(), candidates=["drag.linear", "friction.coulomb", "sensor.delay"])
     starts = []
     for effects, inertia in (
         ((), 2e-3),
@@ -130,7 +130,7 @@ def test_missing_samples_change_nothing_but_what_is_known():
         lost = {name: rng.random(run.times.size) < 0.4 for name in ("q", "qd")}
         q, qd = (np.where(lost[name], np.nan, run.channels[name]) for name in ("q", "qd"))
         runs.append(changed(run, q=lambda _, q=q: q, qd=lambda _, qd=qd: qd))
-    there = world(replace(swings(), runs=tuple(runs)))
+    there = evaluator(replace(swings(), runs=tuple(runs)))
     fit = fitted(there)
     assert np.isnan(there.observed).sum() > 200
     assert fit.theta[0] == pytest.approx(TRUTH, rel=2e-5)
@@ -143,7 +143,7 @@ def test_only_the_first_share_counts():
         return values
 
     runs = tuple(changed(run, q=spoilt, qd=spoilt) for run in swings().runs)
-    there = world(replace(swings(), runs=runs))
+    there = evaluator(replace(swings(), runs=runs))
     assert fitted(there, share=0.45).theta[0] == pytest.approx(TRUTH, rel=1e-4)
     assert abs(fitted(there).theta[0] / TRUTH - 1) > 0.05
 
@@ -153,7 +153,7 @@ def test_bounds_are_kept():
     # Negative drag makes the motion grow.
     runaway = Pendulum(fixed={"drag.linear": -5e-4})
     made = recorded(runaway, [TRUTH], starts, times)
-    there = world(made, candidates=["drag.linear"])
+    there = evaluator(made, candidates=["drag.linear"])
     theta = there.get_nominal_theta()
     theta[1] = 1e-4
     fit = fitted(there, theta, effects=("drag.linear",))
@@ -164,7 +164,7 @@ def test_a_parameter_that_would_leave_its_bounds_ends_at_them():
     starts, times = [{"q": 0.8}, {"q": 1.3}], np.arange(80) / 60
     # A tenth of the stated gravity requires ten times the inertia.
     light = recorded(Pendulum({"gravity": 0.981}), [6e-3], starts, times)
-    there = world(replace(light, constants={**light.constants, "gravity": 9.81}))
+    there = evaluator(replace(light, constants={**light.constants, "gravity": 9.81}))
     theta = there.get_nominal_theta()
     theta[0] = 8e-3
     assert fitted(there, theta).theta[0] == 1e-2, "an inertia of 6e-2 would be needed"
@@ -175,27 +175,27 @@ def test_frozen_parameters_and_known_initial_states_stay():
     # The first angle is specified wrongly but treated as known.
     stated = (0.71, -1.2, 2.2)
     runs = [replace(run, initial={"q": q}) for run, q in zip(made.runs, stated, strict=True)]
-    there = world(replace(made, runs=tuple(runs)))
+    there = evaluator(replace(made, runs=tuple(runs)))
     fit = fitted(there)
     assert tuple(fit.states[:, 0]) == stated
     assert (there.known == [[True, False]] * 3).all()
     assert np.abs(fit.states[1:, 1]).max() > 0
-    frozen = fitted(world(made), frozen=frozenset({0}))
+    frozen = fitted(evaluator(made), frozen=frozenset({0}))
     assert frozen.theta[0] == 3.3e-3
     assert frozen.free.size == 0
-    alone = fitted(world(made), parameters=False)
+    alone = fitted(evaluator(made), parameters=False)
     assert alone.theta[0] == 3.3e-3
-    assert alone.cost > 1e3 * fitted(world(made)).cost
+    assert alone.cost > 1e3 * fitted(evaluator(made)).cost
 
 
 def test_no_derivative_is_simulated_by_what_is_known():
     made = swings()
     told = [{"q": 0.7, "qd": 0.0}, {"q": -1.2}, {"q": 2.2}]
     runs = [replace(run, initial=known) for run, known in zip(made.runs, told, strict=True)]
-    there = world(replace(made, runs=tuple(runs)))
+    there = evaluator(replace(made, runs=tuple(runs)))
     fit = fitted(there, iterations=0)
     assert there.simulations == 3 * (1 + 1 + 1), "as it is, the inertia moved, the rate moved"
-    usual = fitted(world(made), iterations=0, states=there.guess)
+    usual = fitted(evaluator(made), iterations=0, states=there.guess)
     np.testing.assert_array_equal(fit.jacobian[..., 0], usual.jacobian[..., 0])
     assert not fit.jacobian[..., 1].any()
     assert not fit.jacobian[0, ..., 2].any(), "a state that only one run states"
@@ -205,11 +205,12 @@ def test_no_derivative_is_simulated_by_what_is_known():
 def test_what_is_known_beforehand_depends_on_the_channels():
     made = recording(runs=1, seconds=0.5, observe=["q"])
     np.testing.assert_array_equal(
-        compute_state_prior(world(made)), [OBSERVED_STATE_PRIOR_SIGMA, OBSERVED_STATE_PRIOR_SIGMA]
+        compute_state_prior(evaluator(made)),
+        [OBSERVED_STATE_PRIOR_SIGMA, OBSERVED_STATE_PRIOR_SIGMA],
     )
     only_rate = recording(runs=1, seconds=0.5, observe=["qd"])
     np.testing.assert_array_equal(
-        compute_state_prior(world(only_rate)),
+        compute_state_prior(evaluator(only_rate)),
         [UNOBSERVED_STATE_PRIOR_SIGMA, OBSERVED_STATE_PRIOR_SIGMA],
     )
 
@@ -224,7 +225,7 @@ def test_least_squares_with_coloured_noise_is_generalised():
         for t in range(1, 150):
             noise[t] = 0.95 * noise[t - 1] + np.sqrt(1 - 0.95**2) * noise[t]
         run = changed(clean.runs[0], q=lambda v, noise=noise: v + 0.02 * noise)
-        there = world(replace(clean, runs=(run,)))
+        there = evaluator(replace(clean, runs=(run,)))
         start = FitStart((), there.get_nominal_theta(), there.guess)
         # The noise is treated once as white and once as AR(1).
         fitters = [

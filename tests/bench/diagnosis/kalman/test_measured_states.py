@@ -25,45 +25,51 @@ EFFECTS = {
 
 
 @pytest.fixture(scope="module")
-def world():
+def evaluator():
     recording, kind = load_joined([EXAMPLE], None, None, ())
     return RunEvaluator(kind, recording, recording.training()[:2], kind.default_engine)
 
 
-def theta_of(world, name, c):
-    theta = world.get_nominal_theta()
-    theta[world.slots[name]] = c
+def theta_of(evaluator, name, c):
+    theta = evaluator.get_nominal_theta()
+    theta[evaluator.slots[name]] = c
     return theta
 
 
-def motion_with(world, theta):
+def motion_with(evaluator, theta):
     """Return the linear model about the motion simulated with these parameters."""
-    half = len(world.states) // 2
-    start = world.guess[0, :half], world.guess[0, half:]
-    simulated = MeasuredLinear(world.simulator, theta, world.tracks[0].scenario, start)
+    half = len(evaluator.states) // 2
+    start = evaluator.guess[0, :half], evaluator.guess[0, half:]
+    simulated = MeasuredLinear(evaluator.simulator, theta, evaluator.tracks[0].scenario, start)
     x, v, _ = simulated.trajectory
     nothing = FloatingState(np.zeros((len(x), 0)), np.zeros((len(x), 0)))
     motion = Trajectory(x, v, nothing)
     return MeasuredLinear(
-        world.simulator, world.get_nominal_theta(), world.tracks[0].scenario, start, motion
+        evaluator.simulator,
+        evaluator.get_nominal_theta(),
+        evaluator.tracks[0].scenario,
+        start,
+        motion,
     )
 
 
-def added(linear, world, name, c):
+def added(linear, evaluator, name, c):
     """Return the force and readings that an effect adds about the motion, at zero deviation."""
-    size = 2 * (len(world.states) // 2)
-    return linear.added([(world.available_effects[name], c)], np.zeros((linear.knots.size, size)))
+    size = 2 * (len(evaluator.states) // 2)
+    return linear.added(
+        [(evaluator.available_effects[name], c)], np.zeros((linear.knots.size, size))
+    )
 
 
 @pytest.mark.parametrize("name", EFFECTS)
-def test_the_model_misses_a_motion_by_what_the_missing_effect_adds(world, name):
+def test_the_model_misses_a_motion_by_what_the_missing_effect_adds(evaluator, name):
     """Eq. (3) of `sims.robot.dynamics.measured_linearisation` with δ = 0: the defects are Σ c b."""
     c = np.array(EFFECTS[name])
-    linear = motion_with(world, theta_of(world, name, c))
+    linear = motion_with(evaluator, theta_of(evaluator, name, c))
     maps = linear.interval_maps()
-    pushed, _ = added(linear, world, name, c)
+    pushed, _ = added(linear, evaluator, name, c)
     expected = (maps.inputs @ pushed)[:, :, 0]
-    joints = len(world.states) // 2
+    joints = len(evaluator.states) // 2
     # Only velocities are compared: the model uses the mean force, which moves positions
     # differently.
     found, wanted = maps.defects[:, joints:], expected[:, joints:]
@@ -71,65 +77,65 @@ def test_the_model_misses_a_motion_by_what_the_missing_effect_adds(world, name):
     assert error < 0.02, f"{name}: {error:.3f}"
 
 
-def test_without_an_effect_nothing_is_missed(world):
-    maps = motion_with(world, world.get_nominal_theta()).interval_maps()
+def test_without_an_effect_nothing_is_missed(evaluator):
+    maps = motion_with(evaluator, evaluator.get_nominal_theta()).interval_maps()
     assert np.abs(maps.defects).max() < 1e-9
 
 
-def test_a_sensor_effect_changes_readings_alone(world):
-    linear = motion_with(world, world.get_nominal_theta())
-    pushed, readings = added(linear, world, "sensor.bias@q.elbow", np.array([0.01]))
-    column = world.channels.index("q.elbow")
+def test_a_sensor_effect_changes_readings_alone(evaluator):
+    linear = motion_with(evaluator, evaluator.get_nominal_theta())
+    pushed, readings = added(linear, evaluator, "sensor.bias@q.elbow", np.array([0.01]))
+    column = evaluator.channels.index("q.elbow")
     np.testing.assert_allclose(readings[:, column, 0], 0.01, atol=1e-7)
     assert not pushed.any()
 
 
-def test_a_gain_of_a_sensor_acts_on_what_is_predicted(world):
+def test_a_gain_of_a_sensor_acts_on_what_is_predicted(evaluator):
     """If the gain scaled the reading itself, it would explain the noise."""
-    linear = motion_with(world, world.get_nominal_theta())
-    predicted = np.zeros((linear.knots.size, 2 * (len(world.states) // 2)))
-    elbow = world.channels.index("q.elbow")
-    predicted[:, world.simulator.system.coordinates.index("q.elbow")] = 0.2
+    linear = motion_with(evaluator, evaluator.get_nominal_theta())
+    predicted = np.zeros((linear.knots.size, 2 * (len(evaluator.states) // 2)))
+    elbow = evaluator.channels.index("q.elbow")
+    predicted[:, evaluator.simulator.system.coordinates.index("q.elbow")] = 0.2
     _, readings = linear.added(
-        [(world.available_effects["sensor.gain@q.elbow"], np.array([0.5]))], predicted
+        [(evaluator.available_effects["sensor.gain@q.elbow"], np.array([0.5]))], predicted
     )
     wanted = 0.5 * (linear.observed[:, elbow] + 0.2)
     np.testing.assert_allclose(readings[:, elbow, 0], wanted, atol=1e-6)
 
 
-def test_jacobians_of_other_commands_are_not_used_again(world):
+def test_jacobians_of_other_commands_are_not_used_again(evaluator):
     """Delayed steps change between samples, so the model is evaluated at more times."""
-    scenario, half = world.tracks[0].scenario, len(world.states) // 2
+    scenario, half = evaluator.tracks[0].scenario, len(evaluator.states) // 2
     steps = {name: np.full_like(values, values[0]) for name, values in scenario.inputs.items()}
     for values in steps.values():
         for sample in (3, 8, 14, 21, 29):
             values[sample:] += 0.06
     scenario = replace(scenario, inputs=steps)
-    start = world.guess[0, :half], world.guess[0, half:]
-    nominal = MeasuredLinear(world.simulator, world.get_nominal_theta(), scenario, start)
-    delayed = theta_of(world, "input.delay@m_shoulder", (0.013,))
+    start = evaluator.guess[0, :half], evaluator.guess[0, half:]
+    nominal = MeasuredLinear(evaluator.simulator, evaluator.get_nominal_theta(), scenario, start)
+    delayed = theta_of(evaluator, "input.delay@m_shoulder", (0.013,))
     given = delayed, scenario, start, nominal.trajectory
-    anew = MeasuredLinear(world.simulator, *given)
-    reused = MeasuredLinear(world.simulator, *given, nearby=nominal)
+    anew = MeasuredLinear(evaluator.simulator, *given)
+    reused = MeasuredLinear(evaluator.simulator, *given, nearby=nominal)
     np.testing.assert_allclose(
         reused.interval_maps().defects, anew.interval_maps().defects, atol=1e-4
     )
 
 
-def test_maps_carry_a_deviation_as_the_simulator_does(world):
+def test_maps_carry_a_deviation_as_the_simulator_does(evaluator):
     """Compare a state deviation mapped to the next sample with that of two simulations."""
-    linear = motion_with(world, world.get_nominal_theta())
+    linear = motion_with(evaluator, evaluator.get_nominal_theta())
     maps = linear.interval_maps()
-    half = len(world.states) // 2
+    half = len(evaluator.states) // 2
     moved = 1e-5
-    scenario = world.tracks[0].scenario
-    start = world.guess[0, :half].copy(), world.guess[0, half:].copy()
-    base = MeasuredLinear(world.simulator, world.get_nominal_theta(), scenario, start)
+    scenario = evaluator.tracks[0].scenario
+    start = evaluator.guess[0, :half].copy(), evaluator.guess[0, half:].copy()
+    base = MeasuredLinear(evaluator.simulator, evaluator.get_nominal_theta(), scenario, start)
     for column in range(half):
         other = start[0].copy()
         other[column] += moved
         changed = MeasuredLinear(
-            world.simulator, world.get_nominal_theta(), scenario, (other, start[1])
+            evaluator.simulator, evaluator.get_nominal_theta(), scenario, (other, start[1])
         )
         for sample in (1, 4):
             step = base.knots[sample]
@@ -158,20 +164,23 @@ def test_a_quintic_goes_through_values_and_derivatives():
     assert beyond[0] == pytest.approx(value[-1] + 0.2 * slope[-1])
 
 
-def test_control_changes_of_several_runs_are_those_of_each_run(world):
-    half = len(world.states) // 2
+def test_control_changes_of_several_runs_are_those_of_each_run(evaluator):
+    half = len(evaluator.states) // 2
     linear = [
-        MeasuredLinear(world.simulator, world.get_nominal_theta(), track.scenario, start)
+        MeasuredLinear(evaluator.simulator, evaluator.get_nominal_theta(), track.scenario, start)
         for track, start in zip(
-            world.tracks,
-            zip(world.guess[:, :half], world.guess[:, half:], strict=True),
+            evaluator.tracks,
+            zip(evaluator.guess[:, :half], evaluator.guess[:, half:], strict=True),
             strict=True,
         )
     ]
     laws = ("input.lag@", "input.rate@")
-    names = [n for n in world.library if n.startswith(laws) and not n.endswith("@*")]
+    names = [n for n in evaluator.library if n.startswith(laws) and not n.endswith("@*")]
     effects = [
-        (world.available_effects[name], np.full(len(world.get_coefficient_indices(name)), 0.02))
+        (
+            evaluator.available_effects[name],
+            np.full(len(evaluator.get_coefficient_indices(name)), 0.02),
+        )
         for name in names
     ]
     together = compute_control_changes(linear, effects)

@@ -38,19 +38,19 @@ def error_in_segments(log, extended_path, seconds):
     extended, kind, _ = open_extended(extended_path, simulators.get)
     recording, _ = segment_recording(load_recording(log)[0], kind, seconds)
     runs = recording.held_out()
-    world = RunEvaluator(kind, recording, runs, None, candidates=list(extended.effects))
-    theta = world.get_nominal_theta()
-    for place, parameter in enumerate(world.parameters[: world.own]):
+    evaluator = RunEvaluator(kind, recording, runs, None, candidates=list(extended.effects))
+    theta = evaluator.get_nominal_theta()
+    for place, parameter in enumerate(evaluator.parameters[: evaluator.own]):
         theta[place] = extended.parameters[parameter.name].value
     for name, numbers in extended.effects.items():
-        coefficients = world.available_effects[name].on(world.simulator.system)
-        places = world.get_coefficient_indices(name)
+        coefficients = evaluator.available_effects[name].on(evaluator.simulator.system)
+        places = evaluator.get_coefficient_indices(name)
         for place, coefficient in zip(places, coefficients, strict=True):
             theta[place] = numbers[coefficient.name].value
-    channels = len(world.channels)
-    held_out = HeldOutRuns(world, NoiseModel(np.full(channels, 2.4e-5), np.zeros(channels)))
+    channels = len(evaluator.channels)
+    held_out = HeldOutRuns(evaluator, NoiseModel(np.full(channels, 2.4e-5), np.zeros(channels)))
     (fit,) = held_out.fit_initial_states([theta])
-    error = (world.observed - fit.simulated)[held_out.seen]
+    error = (evaluator.observed - fit.simulated)[held_out.seen]
     return float(np.sqrt(np.mean(error**2)))
 
 
@@ -93,5 +93,5 @@ def test_inertias_stated_about_the_joints_and_dry_friction_are_found(tmp_path):
 def test_only_long_runs_of_few_joints_are_identified_by_filters_alone(seconds, joints, expected):
     runs = [SimpleNamespace(times=np.array([0.0, end])) for end in seconds]
     system = SimpleNamespace(coordinates=["q"] * joints)
-    world = SimpleNamespace(runs=runs, simulator=SimpleNamespace(system=system))
-    assert is_long(world) is expected
+    evaluator = SimpleNamespace(runs=runs, simulator=SimpleNamespace(system=system))
+    assert is_long(evaluator) is expected

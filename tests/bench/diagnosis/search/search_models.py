@@ -35,7 +35,7 @@ def held_out(left):
     A model with a smaller residual has a higher penalised log-likelihood.
     """
     runs = SimpleNamespace(
-        world=SimpleNamespace(observed=np.zeros((1, 4, 1))),
+        evaluator=SimpleNamespace(observed=np.zeros((1, 4, 1))),
         noise=SimpleNamespace(sigma=np.ones(1)),
         seen=np.ones((1, 4, 1), dtype=bool),
     )

@@ -29,7 +29,9 @@ def evidence(
     search.best_p_values = {frozenset(): best}
     slots = {name: slice(0, size) for name, size in zip("abc", sizes, strict=True)}
     effects = {name: placed() for name in "abc"}
-    search.world = SimpleNamespace(available_effects=effects, slots=slots, has_linearisation=False)
+    search.evaluator = SimpleNamespace(
+        available_effects=effects, slots=slots, has_linearisation=False
+    )
     monkeypatch.setattr(
         AlternativeFinder, "_is_plausible", lambda self, effect: effect in plausible
     )
@@ -98,7 +100,7 @@ def test_what_contains_a_place_or_law_that_does_as_well_is_no_answer(
     """The simpler effect is preferred; a family whose place scores far lower stays in the set."""
     search = search_of(model(), BEST, ALIKE, BEHIND)
     effects = {name: placed() for name in "abc"} | {family: placed(place, contains)}
-    search.world = SimpleNamespace(available_effects=effects, has_linearisation=False)
+    search.evaluator = SimpleNamespace(available_effects=effects, has_linearisation=False)
     monkeypatch.setattr(AlternativeFinder, "_is_plausible", lambda self, effect: True)
     monkeypatch.setattr(AlternativeFinder, "_p_value", lambda self, rest, effect, gain: 0.0)
     (found,) = AlternativeFinder(search, None, structure=False).collect_evidence(BEST)
@@ -114,7 +116,7 @@ def test_the_null_gain_of_one_of_two_signs_does_not_count_for_a_robot(
     search = search_of(
         model(), BEST, model("b", merit=100.0 - 3.0 * INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO)
     )
-    search.world = SimpleNamespace(
+    search.evaluator = SimpleNamespace(
         available_effects={"a": placed(), "b": placed()},
         has_linearisation=True,
         parameters=[SimpleNamespace(bounds=(least, 1.0))] * 2,

@@ -28,7 +28,7 @@ from bench.diagnosis.search.initial_values import (
 from bench.diagnosis.search.score_test import ScoreTest
 from sims.core.simulator import Scenario
 from sims.systems.pendulum import Pendulum
-from tests.bench.diagnosis.explained_samples import recording, searched, white, world
+from tests.bench.diagnosis.explained_samples import evaluator, recording, searched, white
 
 
 def fitted(there):
@@ -39,7 +39,7 @@ def fitted(there):
 
 @pytest.fixture(scope="module")
 def swing():
-    there = world(recording(runs=2, seconds=1, rate=60, noise=["q=0.003", "qd=0.02"], seed=1))
+    there = evaluator(recording(runs=2, seconds=1, rate=60, noise=["q=0.003", "qd=0.02"], seed=1))
     return there, fitted(there)
 
 
@@ -99,7 +99,7 @@ def test_effects_that_change_nothing_here_have_no_direction(swing):
 
 def test_driven_runs_try_limits_of_the_input():
     made = recording("slider", runs=2, seconds=1, rate=50, inputs=["u=sine:2:1"], noise=["0.003"])
-    there = world(made, candidates=["input.gain", "input.saturation", "input.deadband"])
+    there = evaluator(made, candidates=["input.gain", "input.saturation", "input.deadband"])
     found = compute_directions(there, fitted(there), there.library)
     limits = sorted(
         found.candidates[i].coefficients[0]
@@ -154,7 +154,7 @@ def test_what_modifies_an_effect_is_tried_with_it():
         ),
         0.005,
     )
-    found = compute_directions(search.world, model.fit, ["wind"])
+    found = compute_directions(search.evaluator, model.fit, ["wind"])
     columns = of(found, "wind")
     winds = {tuple(found.candidates[i].coefficients[1:]) for i in columns}
     assert (0.0, 0.0) in winds, "drag in still air"
@@ -165,7 +165,7 @@ def test_what_modifies_an_effect_is_tried_with_it():
         for i in columns
         if found.candidates[i].coefficients[1] == 7.0 and found.candidates[i].coefficients[2] == 0.0
     ]
-    x = search.world.channels.index("x")
+    x = search.evaluator.channels.index("x")
     assert found.responses[0, -1, x, along[0]] > 0, "it blows the ball along x"
 
 
@@ -183,8 +183,8 @@ def test_an_effect_added_to_a_model_is_simulated_with_what_the_model_has(swing):
 def test_a_diverging_change_counts_as_zero_and_multiplies_without_a_warning(swing, monkeypatch):
     there, fit = swing
 
-    def exploding(world, at, added):
-        changed = simulate_with_effect(world, at, added)
+    def exploding(evaluator, at, added):
+        changed = simulate_with_effect(evaluator, at, added)
         # These values are finite, but their products overflow.
         changed[0, 0, 10:] = -1e200 * np.arange(1.0, changed.shape[2] - 9)[:, None]
         changed[0, 1, 10:] = np.nan
@@ -209,7 +209,7 @@ def test_what_happens_once_is_looked_for_on_the_clock_of_the_stamps():
     made = recording(runs=2, seconds=1, rate=60, noise=["q=0.003", "qd=0.02"])
     first, second = made.runs
     later = replace(second, times=second.times + 5.0)
-    there = world(replace(made, runs=(first, later)))
+    there = evaluator(replace(made, runs=(first, later)))
     end = float(later.times[-1])
     found = compute_directions(there, fitted(there), ["sensor.slip"])
     columns = of(found, "sensor.slip")
@@ -235,7 +235,9 @@ def test_what_happens_once_is_looked_for_on_the_clock_of_the_stamps():
 
 
 def test_stops_are_tried_at_both_ends_of_where_it_has_been():
-    there = world(recording("slider", runs=2, seconds=1, rate=60, noise=["0.003"], inputs=["u=1"]))
+    there = evaluator(
+        recording("slider", runs=2, seconds=1, rate=60, noise=["0.003"], inputs=["u=1"])
+    )
     x = there.observed[..., there.channels.index("x")]
     low, high = float(np.nanmin(x)), float(np.nanmax(x))
     assert there.get_coordinate_range("state.limit") == (low, high)
@@ -254,7 +256,9 @@ def test_stops_are_tried_at_both_ends_of_where_it_has_been():
 
 
 def test_a_harder_stop_that_turns_back_at_the_same_place_is_met_later():
-    there = world(recording("slider", runs=2, seconds=1, rate=60, noise=["0.003"], inputs=["u=1"]))
+    there = evaluator(
+        recording("slider", runs=2, seconds=1, rate=60, noise=["0.003"], inputs=["u=1"])
+    )
     fit = fitted(there)
     _, high = there.get_coordinate_range("state.limit")
     theta = fit.theta.copy()

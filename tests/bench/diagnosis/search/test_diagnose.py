@@ -69,7 +69,7 @@ def test_a_fuller_account_is_asked_for_where_causes_stand_and_something_is_left(
     measured = []
     watch = SimpleNamespace(watch=None)
     search = SimpleNamespace(
-        world=watch,
+        evaluator=watch,
         fit_to_convergence=lambda m: m,
         simplify_laws=lambda m: PLAINER if m is FULLER else m,
     )
@@ -79,7 +79,7 @@ def test_a_fuller_account_is_asked_for_where_causes_stand_and_something_is_left(
         inquiry._trial = SimpleNamespace(
             find_better_extension=lambda search, model: fuller, evaluate_models=measured.extend
         )
-    taken = inquiry._fuller(SimpleNamespace(has_structure=structure))
+    taken = inquiry._accept_larger_model(SimpleNamespace(has_structure=structure))
     assert inquiry._model is stands
     assert taken is (stands is PLAINER)
     assert measured == ([PLAINER] if taken else [])

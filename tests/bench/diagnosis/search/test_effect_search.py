@@ -32,7 +32,7 @@ def test_an_effect_is_taken_that_has_merit_and_is_no_chance(monkeypatch, merit, 
     made = search(
         monkeypatch, is_complete=lambda self, best, doubt: best is not BASE,
         compute_missing_effect_p_value=chance,
-        _larger=lambda self, best, size: larger, compute_excess=0.1, is_noise_like=False,
+        _search_size=lambda self, best, size: larger, compute_excess=0.1, is_noise_like=False,
         without_step_errors=lambda self, model: model,
     )  # fmt: skip
     assert made.run() is (larger if taken else BASE)
@@ -50,7 +50,7 @@ def test_where_nothing_suggests_an_effect_none_is_tried(monkeypatch):
         return LARGER
 
     asked = {
-        "is_complete": plain, "_larger": grown, "compute_missing_effect_p_value": 0.0,
+        "is_complete": plain, "_search_size": grown, "compute_missing_effect_p_value": 0.0,
         "compute_excess": 0.1, "is_noise_like": False,
     }  # fmt: skip
     asked["without_step_errors"] = lambda self, model: model
@@ -115,7 +115,7 @@ def test_the_residual_may_be_noise_up_to_the_floor_or_if_its_correlation_decays(
         "bench.diagnosis.search.scored_models.compute_portmanteau_p_value", lambda *_: chance
     )
     made = search(monkeypatch, compute_residual=np.zeros((1, 1, 1)))
-    made.world = SimpleNamespace(observed=np.zeros((1, 1, 1)))
+    made.evaluator = SimpleNamespace(observed=np.zeros((1, 1, 1)))
     made.noise = SimpleNamespace(sigma=np.array([2.0]))
     made.stated = np.array([stated])
     asked = SimpleNamespace(fit=None, likelihood=Likelihood(0.0, 2.0 * np.array([sigma]), None))

@@ -115,7 +115,7 @@ def test_autocorrelated_noise_is_estimated_less_precisely(phi, samples):
 def test_hats_cover_time_position_and_speed():
     made = recorded(Slider(), [1.0], [({}, {"u": np.sin(4 * TIMES)})], TIMES, 0.003)
     search, model = searched(made, 0.003, extra=[HatForce])
-    found = compute_hat_directions(search.world, model)
+    found = compute_hat_directions(search.evaluator, model)
     labels = {probe.effect for probe in found.candidates}
     assert {
         "time, along x",
@@ -132,10 +132,10 @@ def test_hats_cover_time_position_and_speed():
         for i, p in enumerate(found.candidates)
         if p.effect == "time, along x" and p.coefficients[2] == centres[2]
     )
-    x = found.responses[0, :, search.world.channels.index("x"), first]
+    x = found.responses[0, :, search.evaluator.channels.index("x"), first]
     begins = TIMES[np.flatnonzero(np.abs(x) > 1e-6)[0]]
     assert begins == pytest.approx(centres[1], abs=0.06), "nothing moves before the hat does"
-    v = found.responses[0, -1, search.world.channels.index("v"), first]
+    v = found.responses[0, -1, search.evaluator.channels.index("v"), first]
     assert v == pytest.approx(TIMES[-1] / 6, rel=0.02), "impulse of a unit triangle on 1 kg"
 
 

@@ -36,7 +36,7 @@ def test_a_competitor_that_is_better_after_convergence_stays_unless_structure_re
 ):
     base, best = model(), model("a", merit=100.0)
     search = search_of(base, best, model("b", merit=90.0))
-    search.world = SimpleNamespace(library=["a", "b"])
+    search.evaluator = SimpleNamespace(library=["a", "b"])
     refits = []
 
     def refit(starts, noise):
@@ -44,7 +44,7 @@ def test_a_competitor_that_is_better_after_convergence_stays_unless_structure_re
         search.models[frozenset("b")] = model("b", merit=110.0)
 
     search.refit_models, search.refit_extensions = refit, lambda models, most: None
-    monkeypatch.setattr(settling, "generate_frequency_neighbours", lambda world, fit: [])
+    monkeypatch.setattr(settling, "generate_frequency_neighbours", lambda evaluator, fit: [])
     monkeypatch.setattr(
         settling,
         "assess_lack_of_fit",
@@ -71,13 +71,13 @@ def test_a_competitor_of_a_pair_also_starts_from_the_shared_effects(monkeypatch)
     rival = replace(rival, fit=replace(rival.fit, theta=np.array([1.1, 2.2, 0.0, 4.0])))
     search = search_of(best, rival, model("a"), model("b"))
     slots = {"a": slice(1, 2), "b": slice(2, 3), "c": slice(3, 4)}
-    search.world = SimpleNamespace(library=["a", "b", "c"], slots=slots)
+    search.evaluator = SimpleNamespace(library=["a", "b", "c"], slots=slots)
     begun = []
     search.refit_models, search.refit_extensions = (
         lambda s, noise: begun.extend(s),
         lambda models, most: None,
     )
-    monkeypatch.setattr(settling, "generate_frequency_neighbours", lambda world, fit: [])
+    monkeypatch.setattr(settling, "generate_frequency_neighbours", lambda evaluator, fit: [])
     left = SimpleNamespace(has_structure=False)
     monkeypatch.setattr(settling, "assess_lack_of_fit", lambda search, model: left)
     refine_best_model(search, best)

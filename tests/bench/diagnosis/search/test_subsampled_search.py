@@ -36,13 +36,13 @@ def search(log):
 def test_what_few_samples_show_is_fitted_to_all_of_them(search, log, monkeypatch):
     found = refine_best_model(search, search_with_subsampling(search))
     assert found.effects == ("friction.coulomb",)
-    assert found.fit.simulated.shape == search.world.observed.shape
+    assert found.fit.simulated.shape == search.evaluator.observed.shape
     assert search.settled_effects == {"friction.coulomb"}
     monkeypatch.setattr(run_thinning, "MIN_SAMPLES_TO_THIN", 10_000)
     usual = searched(log, SIGMA)[0]
     same = refine_best_model(usual, search_with_subsampling(usual))
     assert same.effects == found.effects
-    (place,) = search.world.get_coefficient_indices("friction.coulomb")
+    (place,) = search.evaluator.get_coefficient_indices("friction.coulomb")
     assert found.fit.theta[place] == pytest.approx(same.fit.theta[place], rel=1e-3)
     assert len(search.models) < len(usual.models), "few of them are fitted to all samples"
 
@@ -55,7 +55,7 @@ def test_where_all_samples_show_more_the_search_is_made_on_all(search, monkeypat
     run = EffectSearch.run
 
     def counted(self):
-        asked.append(self.world.observed.shape[1])
+        asked.append(self.evaluator.observed.shape[1])
         return run(self)
 
     monkeypatch.setattr(EffectSearch, "run", counted)
@@ -85,7 +85,7 @@ def test_a_search_that_has_to_end_tells_what_few_samples_support(search, monkeyp
         return model
 
     monkeypatch.setattr(EffectSearch, "add_fit", watched)
-    search.world.watch = ended
+    search.evaluator.watch = ended
     with pytest.raises(SearchStoppedError):
         search_with_subsampling(search)
     assert search.best_supported_model is not None

@@ -18,7 +18,7 @@ from bench.logs.joined_recordings import load_joined
 from sims.core.simulator import Scenario
 from sims.recording.recording import split_held_out
 from sims.systems.pendulum import Pendulum
-from tests.bench.diagnosis.explained_samples import recorded, white, with_runs, world
+from tests.bench.diagnosis.explained_samples import evaluator, recorded, white, with_runs
 from tests.bench.diagnosis.report_tables import table
 
 TIMES = np.arange(150) / 50
@@ -65,13 +65,13 @@ def test_each_run_is_predicted_by_a_fit_to_the_other_alone():
         for value in (3.3e-3, 3.5e-3)
     ]
     made = with_runs(parts[0], [part.runs[0] for part in parts])
-    there = world(split_held_out(made, folds=True))
+    there = evaluator(split_held_out(made, folds=True))
     noise = white(there, SIGMA)
     fit = fit_base_model(there, noise).fit
     (predicted,) = CrossValidation(there, noise).validate([fit])
     for run in (0, 1):
-        other = world(replace(made, runs=made.runs[1 - run : 2 - run]))
-        alone = world(replace(made, runs=made.runs[run : run + 1]))
+        other = evaluator(replace(made, runs=made.runs[1 - run : 2 - run]))
+        alone = evaluator(replace(made, runs=made.runs[run : run + 1]))
         theta = fit_base_model(other, noise).fit.theta
         (expected,) = HeldOutRuns(alone, noise).fit_initial_states([theta])
         np.testing.assert_allclose(predicted.simulated[run], expected.simulated[0], atol=SIGMA / 4)
@@ -100,7 +100,7 @@ def test_an_effect_that_the_other_runs_do_not_show_predicts_nothing():
         TIMES,
         SIGMA,
     )
-    there = world(split_held_out(made, folds=True))
+    there = evaluator(split_held_out(made, folds=True))
     noise = white(there, SIGMA)
     fits = TrajectoryFitter(there, noise).fit_models(
         [

@@ -20,13 +20,13 @@ from sims.systems.slider import Slider
 from tests.bench.diagnosis.explained_samples import (
     autoregressive,
     correlated,
+    evaluator,
     marked,
     recorded,
     recording,
     searched,
     white,
     with_runs,
-    world,
 )
 
 
@@ -140,7 +140,7 @@ def test_intervals_cover_the_true_parameters(phi):
     made = recorded(
         Slider(fixed={"drag.linear": 0.4}, observe=["x"]), [1.3], [({}, {"u": push})], times
     )
-    there = world(made, candidates=["drag.linear"])
+    there = evaluator(made, candidates=["drag.linear"])
     clean, noise = there.observed.copy(), autoregressive(there, 0.004, phi)
     theta = np.array([1.3, 0.4])
     for _ in range(60):
@@ -169,7 +169,8 @@ def test_the_covariance_is_that_of_all_unknowns_at_once(told):
         model.penalised_log_likelihood,
     )
     jacobian = (
-        compute_central_jacobian(search.world, model.fit, search.noise).jacobian / sigma[:, None]
+        compute_central_jacobian(search.evaluator, model.fit, search.noise).jacobian
+        / sigma[:, None]
     )
     rows = np.zeros((2, jacobian[0, ..., 0].size, 5))
     for r in range(2):
@@ -177,7 +178,7 @@ def test_the_covariance_is_that_of_all_unknowns_at_once(told):
         rows[r, :, 0], rows[r, :, 1 + 2 * r : 3 + 2 * r] = flattened[:, 0], flattened[:, 1:]
     normal = np.einsum("rnk,rnl->kl", rows, rows) + np.diag([0, *[1e-4] * 4])
     # A known initial state is not an unknown.
-    unknown = [0, *(1 + np.flatnonzero(~search.world.known))]
+    unknown = [0, *(1 + np.flatnonzero(~search.evaluator.known))]
     inverse = np.linalg.inv(normal[np.ix_(unknown, unknown)])
     # Values in kg^2 m^4 are far below absolute tolerances, so they are scaled.
     known = compute_covariance(search, model)[0, 0]
@@ -203,7 +204,7 @@ def test_a_coordinate_that_is_not_recorded_hides_no_coefficient_of_the_others():
         rate=60,
         seed=5,
     )
-    there = world(made, candidates=["lift.magnus"])
+    there = evaluator(made, candidates=["lift.magnus"])
     noise = white(there, 0.003)
     theta = np.array([0.5, 0.2, -0.02])
     fit = TrajectoryFitter(there, noise).fit_models(
@@ -227,14 +228,14 @@ def test_parameters_that_act_alike_have_no_interval():
     spread = np.sqrt(np.diagonal(compute_covariance(search, model))) / model.fit.theta[:2]
     assert (spread > 5).all()
     assert np.isnan([compute_intervals(search, model)[i][1] for i in range(2)]).all()
-    exact = compute_central_jacobian(search.world, model.fit, search.noise).jacobian
+    exact = compute_central_jacobian(search.evaluator, model.fit, search.noise).jacobian
     ratio = exact[..., 0] * model.fit.theta[0] + exact[..., 1] * model.fit.theta[1]
     assert np.abs(ratio).max() < 1e-3 * np.abs(exact[..., 0] * model.fit.theta[0]).max()
 
 
 def test_what_the_data_do_not_bound_has_no_interval():
     made = recorded(Pendulum(), [3.3e-3], [{"q": 1e-4}], np.arange(60) / 60, [0.01, 0.05])
-    there = world(made, candidates=["drag.quadratic"])
+    there = evaluator(made, candidates=["drag.quadratic"])
     noise = white(there, [0.01, 0.05])
     start = FitStart(("drag.quadratic",), np.array([3.3e-3, 1e-3]), there.guess)
     search = EffectSearch(there, noise, frozenset(), np.random.default_rng(0), marked(there, True))
@@ -256,7 +257,7 @@ def test_held_out_runs_estimate_initial_states_and_nothing_else():
     made = recording(
         theta=["4e-3"], runs=3, seconds=1, rate=60, noise=["q=0.003", "qd=0.02"], held_out=0
     )
-    there = world(made, candidates=["drag.linear"])
+    there = evaluator(made, candidates=["drag.linear"])
     held_out = HeldOutRuns(there, white(there, [0.003, 0.02]))
     right, wrong, failed = held_out.fit_initial_states(
         [np.array(theta) for theta in ([4e-3, 0.0], [3e-3, 0.0], [np.nan, 0.0])]
