@@ -137,6 +137,8 @@ class Effect(metaclass=EffectType):
         coordinate: Coordinate on which it acts; None for the system's primary one.
         signal: Input or channel on which it acts; empty for the first, or for all.
         of: Name of the registered effect of which it is a form at one place.
+        is_traceable: Whether its force can be compiled; False if it selects by the values of its
+            coefficients, so that NumPy evaluates it.
         pairs: For an effect at a contact of a robot, the pairs of geoms whose contacts get
             parameters of their own.
     """
@@ -155,6 +157,7 @@ class Effect(metaclass=EffectType):
     coordinate: ClassVar[int | None] = None
     signal: ClassVar[str] = ""
     of: ClassVar[str] = ""
+    is_traceable: ClassVar[bool] = True
     pairs: ClassVar[tuple[str, ...]] = ()
 
     def parts(self, c: Array) -> ActiveEffects:

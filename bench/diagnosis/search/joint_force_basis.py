@@ -30,6 +30,7 @@ class JointHatForce(Force):
     says = "a force acts in an interval of time, position or speed"
     source = "this module"
     of = "probe.joint_hat"
+    is_traceable = False  # joint, variable and direction are chosen by the values of coefficients
     coefficients = tuple(
         Coefficient(name, ("1", "1", "1"), ((-1, 1), (-1, 1), (-1, 1)))
         for name in ("strength", "joint", "variable", "centre", "width", "direction", "slow")

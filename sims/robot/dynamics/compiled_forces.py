@@ -395,8 +395,11 @@ def compile_forces(forces: EffectForces) -> CompiledForces | None:
 def _can_compile(tracing: _Tracing, forces: EffectForces, effect: Effect) -> bool:
     """Return whether an effect can be traced, and then gives the same numbers as with NumPy.
 
-    Each class of effects is tested once; a failure is reported on standard error.
+    Each class of effects is tested once; a failure is reported on standard error, unless the effect
+    declares that it cannot be traced.
     """
+    if not effect.is_traceable:
+        return False
     kind = type(effect)
     if kind not in tracing.known:
         tracing.known[kind] = False

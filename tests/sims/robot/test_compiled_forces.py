@@ -97,6 +97,13 @@ class Branching(Plain):
         return c[0] * (moment.x if (np.asarray(moment.v) > 0).any() else -moment.x)
 
 
+class Declared(Branching):
+    """An effect that declares that it cannot be traced, which is not reported."""
+
+    name = "declared"
+    is_traceable = False
+
+
 class Changing(Plain):
     """An effect whose values change with each call, so that its trace cannot be trusted."""
 
@@ -114,6 +121,7 @@ class Changing(Plain):
         (Plain, ""),
         (Branching, "converts its arguments to a new array"),
         (Changing, "other numbers"),
+        (Declared, ""),
     ],
 )
 def test_untraceable_effects_are_reported_once_and_evaluated_by_numpy(
