@@ -14,7 +14,7 @@ from tests.docs.documentation_pages import blocks, quoted, section, tables, text
 
 PAGE = text_of("recording.md")
 BLOCKS = dict(blocks(PAGE))
-FAULTS = tables(section(PAGE, "## What a fault is told"))[0][1:]
+FAULTS = tables(section(PAGE, "## Error messages"))[0][1:]
 
 
 @pytest.fixture
