@@ -47,6 +47,15 @@ ARM_MJCF = """
 """
 """Model file of the arm. All values differ, so that confusing two places is detected."""
 
+_CONTACT_GEOMS = (
+    ('<flag contact="disable"/>', ""),
+    ("<worldbody>", '<worldbody><geom name="table" type="plane" pos="0 0 -0.57" size="2 2 1"/>'),
+    ('<site name="tip"', '<geom name="ball" size="0.02" pos="0 0 -0.2"/><site name="tip"'),
+)
+"""Changes of the model file for effects at contacts: the arm's tip slides on a table."""
+_CONTACT = "table/ball"
+"""Contact at which these effects act."""
+
 OBSERVED_CHANNELS = ("q.shoulder", "q.elbow", "qd.shoulder", "tau.elbow", "s.wrist.y")
 """Observed channels, one of each kind."""
 
@@ -55,8 +64,8 @@ _SECONDS = 0.8
 
 
 @lru_cache(maxsize=1)
-def make_arm_simulator(effect: type[Effect]) -> type[RobotSimulator]:  # noqa: ARG001
-    """Make the simulator of the arm.
+def make_arm_simulator(effect: type[Effect]) -> type[RobotSimulator]:
+    """Make the simulator of the arm, with a table that it touches for effects at contacts.
 
     It is made anew for each effect, because it caches the places of effects by name.
     """
@@ -65,8 +74,13 @@ def make_arm_simulator(effect: type[Effect]) -> type[RobotSimulator]:  # noqa: A
     from sims.robot.robot_model import RobotModel
     from sims.robot.robot_simulator import make_robot_simulator
 
-    spec = mujoco.MjSpec.from_string(ARM_MJCF)
-    return make_robot_simulator(RobotModel(Path("checks.xml"), "mjcf", spec, digest="checks"))
+    mjcf, is_contact = ARM_MJCF, effect.at == "contact"
+    if is_contact:
+        for text, replacement in _CONTACT_GEOMS:
+            mjcf = mjcf.replace(text, replacement)
+    spec = mujoco.MjSpec.from_string(mjcf)
+    kind = make_robot_simulator(RobotModel(Path("checks.xml"), "mjcf", spec, digest="checks"))
+    return kind.with_contacts((_CONTACT,)) if is_contact else kind
 
 
 def list_effect_places(effect: type[Effect]) -> tuple[type[Effect], ...]:

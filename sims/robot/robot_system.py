@@ -14,6 +14,7 @@ from sims.core.registry import PartUnavailableError
 from sims.core.simulator import Array, Channel, InputError, Parameter, make_unknown_name_error
 from sims.core.system import StateSnapshot, System, SystemKind
 from sims.robot import coupled_drives
+from sims.robot.contact_pairs import PAIR_SEPARATOR
 from sims.robot.dynamics.activation_filters import activation_filters
 from sims.robot.dynamics.series_joints import SeriesJoints, compile_error, is_series_effect
 from sims.robot.floating_joints import FloatingJoints
@@ -156,7 +157,7 @@ class RobotSystem(System):
         effects_by_name = {placed_effect.name: placed_effect for placed_effect in cls._placed[base]}
         if name in effects_by_name:
             return effects_by_name[name]
-        if registered.at == "contact" and place and place != ALL_PLACES:
+        if registered.at == "contact" and PAIR_SEPARATOR in place:
             # The contacts of a recording are candidates, but any contact may be named.
             spot = make_contact_place(cls.robot, place, (place,))
             return effect_places.make_placed_effect(registered, spot)

@@ -25,7 +25,7 @@ WIDE = "\\x04" * 3000
 SPEECHLESS = "raise type('E', (Exception,), {'__str__': lambda s: 1 / 0})()"
 CASES = {
     "a plugin that raises what is no Exception": (listed("raise BaseException('x')"), "x"),
-    "an error that cannot say anything": (listed(SPEECHLESS), "E: without words"),
+    "an error that cannot say anything": (listed(SPEECHLESS), "E: without a message"),
     "a message that its escapes make long": (listed(f"raise ValueError('{WIDE}')"), "\\x04"),
     "a name that no file can have": (said("status", "x" * 900), "DIR: expected a path"),
     "a plugin's name that no file can have": (

@@ -457,7 +457,7 @@ def test_interrupted_it_is_resumed_with_its_own_plugins_and_what_changed_is_refu
     monkeypatch.setattr(shot_planning, "tune_and_plan", interrupted)
     assert main.main(["compare", *crashing, "--out", str(out)]) == 130
     said = capsys.readouterr()
-    assert "simgap: interrupted; 1 of 2 shots are made and kept" in said.err
+    assert "simgap: interrupted; 1 of 2 shots are made and stored" in said.err
     assert f"simgap: to finish: simgap compare --resume {out}" in said.err
     assert len(pd.read_csv(out / "status.csv")) == 6, "what there is is reported"
     assert main.main(["status", str(out)]) == 1

@@ -52,7 +52,7 @@ def test_fits_leave_off_where_they_are(swing):
 
 
 def test_what_the_search_came_upon_is_listed_and_not_believed(swing):
-    found = until(swing, "scores of the library about drag.linear")
+    found = until(swing, "scores of the effect library at drag.linear")
     assert found.verdict == "unknown"
     assert [cause.effect for cause in found.causes] == ["drag.linear"]
     assert found.answer.cut.skipped_questions == ("rivals", "held_out", "structure", "alternatives")

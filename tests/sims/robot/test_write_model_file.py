@@ -135,7 +135,7 @@ def test_files_of_a_file_are_found_from_anywhere(tmp_path: Path) -> None:
     assert 'file="defaults.xml"' not in done.xml
     assert str(home / "defaults.xml") in done.xml
     assert 'class="arm">' not in done.xml.replace('childclass="arm">', "")
-    assert "from here: fore.xml" in done.xml
+    assert "start of fore.xml" in done.xml
     assert 'damping="0.3 0.15' in done.xml
     assert done.xml.count("\r\n") == done.xml.count("\n")
 

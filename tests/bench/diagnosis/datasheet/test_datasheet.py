@@ -82,7 +82,7 @@ def test_what_is_not_there_is_not_shown_within_what_these_data_resolve(sheet: Da
 
 def test_the_terminal_names_few_of_the_effects_that_are_not_shown(sheet: DataSheet) -> None:
     hidden = [row.name for row in sheet.rows if row.number is None]
-    (line,) = [line for line in sheet.lines() if line.startswith("not shown")]
+    (line,) = [line for line in sheet.lines() if line.startswith("not detected")]
     assert len(hidden) > 5
     named, _, more = line.partition(": ")[2].partition(" and ")
     assert named.split(", ") == hidden[:5]

@@ -45,7 +45,9 @@ def test_the_run_that_differs_most_is_proposed_and_does_tell_them_apart(free):
     assert found.apart > MIN_DISCRIMINATION_SIGMAS
     assert found.change
     said = re.fullmatch(
-        r"(.*): there drag.linear and drag.quadratic differ by (.*) times the noise", found.says
+        r"(.*): in it the predictions with drag.linear and drag.quadratic differ by (.*) times "
+        "the noise",
+        found.says,
     )
     assert float(said[2]) == pytest.approx(found.apart, rel=0.01)
     if free:
@@ -82,7 +84,7 @@ def test_what_is_not_recorded_is_proposed_where_no_run_would_do():
     search, model, _ = rivals(
         small_swing(observe=["q"], noise=["0.003"]), 0.003, ("drag.linear", "drag.quadratic")
     )
-    assert propose_discriminating_run(search, model, model).says.endswith("record qd besides")
+    assert propose_discriminating_run(search, model, model).says.endswith("also record qd")
 
 
 def test_an_input_is_made_smaller_or_larger():

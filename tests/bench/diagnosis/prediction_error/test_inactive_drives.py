@@ -159,7 +159,7 @@ def test_another_column_that_changes_then_is_named(tmp_path):
     rig = Rig(off={2: (1.5, 9.0, (0, 1))}, column=("status", 3, 7))
     recording, kind = load_recording(recorded(tmp_path, rig), divide=False)
     (note,) = without_inactive_drives(recording, kind).notes
-    assert "the drives of joints shoulder, elbow do nothing" in note
+    assert "the drives of joints shoulder, elbow exert no force" in note
     assert "column status changes there" in note
 
 
@@ -181,7 +181,7 @@ def test_an_emergency_stop_with_brakes_is_found(tmp_path):
     assert times_of(recording, drives[0].masks[0], 0) == pytest.approx((1.5, 3.0), abs=0.05)
     left = without_inactive_drives(recording, kind)
     assert [round(float(run.times[-1]), 1) for run in left.runs] == [1.4, 3.0, 1.9]
-    assert "the joints stand stillwhatever the command is" in left.notes[0]
+    assert "the joints stand still, whatever the command is" in left.notes[0]
 
 
 @pytest.mark.parametrize(
