@@ -119,6 +119,8 @@ class Table:
         quick = None
         if self.path.stat().st_size >= MIN_FAST_PARSE_BYTES:
             quick = read_csv_fast(self.path, header, self.wanted[1:], self.gaps)
+            if quick and max(map(len, set(quick[0])), default=0) > MAX_NAME_LENGTH:
+                quick = None
         # If the fast reader gives up, read cell by cell to locate the error.
         names, columns = quick or self._convert_cells(header, records)
         return self.runs(names, columns)

@@ -167,7 +167,7 @@ def test_interrupt_ends_cleanly_and_keeps_what_is_finished(experiment, tmp_path)
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 130, errors
     assert "Traceback" not in errors
-    assert "runs are finished and kept" in errors
+    assert "runs are finished and stored" in errors
     statuses = pd.read_csv(tmp_path / "out" / "status.csv")
     runs = pd.read_parquet(tmp_path / "out" / "runs.parquet")
     assert 0 < len(statuses) < 16000

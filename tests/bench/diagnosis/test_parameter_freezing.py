@@ -54,7 +54,7 @@ def test_a_confounded_number_is_fixed_and_reported(log):
     said = []
     found = explain(log("damping@*", "mass@*", "inertia.armature@*"), say=said.append)
     assert found.verdict == "adequate"
-    (frozen,) = [text for text in said if text.startswith("frozen")]
+    (frozen,) = [text for text in said if text.startswith("kept at the nominal value")]
     (name,) = re.findall(r"\S+@\S+", frozen)
     assert name in ("mass.scale@body1", "inertia.armature@hinge")
     assert any(

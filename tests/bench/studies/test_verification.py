@@ -12,6 +12,7 @@ import tomli_w
 from bench.benchmark.runner.study_setup import prepare_study
 from bench.benchmark.storage.result_folder import read_configuration
 from bench.cli.main import main
+from bench.figures.style import TRUSTED_TUNERS_NOTE
 from tests.conftest import PLUGINS
 from tests.sample_experiments import SPRING
 from tests.without_drawing import undrawn
@@ -203,7 +204,7 @@ def test_trusted_runs_are_marked_in_every_table_and_figure(tmp_path, capsys, mon
     command = ["compare", str(tmp_path / "e.toml"), *PLUGIN, "--out", str(tmp_path / "out")]
     assert main([*command, "--trust", "--jobs", "1"]) == 0
     said = capsys.readouterr().out
-    assert "trusted: the tuners ran inside the harness" in said
+    assert TRUSTED_TUNERS_NOTE in said
     assert "public salt" in said
     assert titles
     assert all(title.endswith("(trusted)") for title in titles), titles
