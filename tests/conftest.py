@@ -108,7 +108,10 @@ def undrawn():
 
 
 _SECONDS = {True: 15.0, False: 0.2}
-"""Approximate duration of a test in seconds, by whether it is marked as slow."""
+"""Approximate duration of a test in seconds, by whether it is marked as slow.
+
+A mark ``slow(seconds=...)`` states the duration of a test that takes much longer.
+"""
 
 
 @pytest.hookimpl(tryfirst=True)  # before `-m` selects tests by marker
@@ -123,7 +126,10 @@ def pytest_collection_modifyitems(items):
         name = item.originalname if item.cls is None else item.cls.__name__
         if name in reads[item.path] or "recordings" in item.fixturenames:
             item.add_marker(pytest.mark.data)
-        seconds[item.path] += _SECONDS[item.get_closest_marker("slow") is not None]
+        slow = item.get_closest_marker("slow")
+        seconds[item.path] += (
+            slow.kwargs.get("seconds", _SECONDS[True]) if slow else _SECONDS[False]
+        )
     items.sort(key=lambda item: -seconds[item.path])
 
 

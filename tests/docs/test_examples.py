@@ -88,7 +88,7 @@ def table_commands():
     return [shlex.split(line)[1:] for line in lines if line.startswith("simgap ")]
 
 
-@pytest.mark.slow
+@pytest.mark.slow(seconds=275)
 def test_the_commands_of_the_readme_work_as_written_in_a_clone_that_stands_alone(tmp_path):
     shutil.copytree(ROOT / "examples", tmp_path / "examples")
     env = {k: v for k, v in os.environ.items() if k not in ("SIMGAP_DATA", "SIMGAP_ROBOTS")}
