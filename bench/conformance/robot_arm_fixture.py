@@ -79,7 +79,9 @@ def make_arm_simulator(effect: type[Effect]) -> type[RobotSimulator]:
         for text, replacement in _CONTACT_GEOMS:
             mjcf = mjcf.replace(text, replacement)
     spec = mujoco.MjSpec.from_string(mjcf)
-    kind = make_robot_simulator(RobotModel(Path("checks.xml"), "mjcf", spec, digest="checks"))
+    # Results are cached by the digest.
+    digest = "checks with contacts" if is_contact else "checks"
+    kind = make_robot_simulator(RobotModel(Path("checks.xml"), "mjcf", spec, digest=digest))
     return kind.with_contacts((_CONTACT,)) if is_contact else kind
 
 
