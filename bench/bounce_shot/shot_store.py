@@ -24,6 +24,7 @@ from bench.bounce_shot.shot_config import ShotConfig
 from bench.bounce_shot.shot_execution import build_shot_rows
 from bench.bounce_shot.shot_sampling import ShotSetup
 from sims.core.atomic_files import write_atomically
+from sims.core.plain_values import to_json_value
 from sims.core.simulator import InputError
 
 SHOTS_FOLDER = "shots"
@@ -70,7 +71,7 @@ def store_shot(
         visible_share: fraction of the drop's sample times at which its recording has a height.
     """
     rows = [{**row, "seen": visible_share} for row in build_shot_rows(setup, settings, models)]
-    document = _convert_for_json({"models": models, "rows": rows})
+    document = to_json_value({"models": models, "rows": rows})
     write_atomically(
         get_shot_path(folder, setup), json.dumps(document, indent=1, allow_nan=False) + "\n"
     )
@@ -160,14 +161,3 @@ def _check_effects(row: int, effects: Any) -> None:
         except CellError as error:
             error.row = row
             raise
-
-
-def _convert_for_json(value: Any) -> Any:
-    """Convert a value for JSON: numbers that are not finite become null, tuples become lists."""
-    if isinstance(value, dict):
-        return {key: _convert_for_json(v) for key, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_convert_for_json(v) for v in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value

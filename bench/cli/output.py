@@ -8,13 +8,13 @@ here prints either the one or the other; so every command has ``--json``, and er
 from __future__ import annotations
 
 import json
-import math
 import os
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext, redirect_stdout
-from pathlib import PurePath
 from typing import Any, Literal, NamedTuple, Protocol
+
+from sims.core.plain_values import to_json_value
 
 JsonDocument = dict[str, Any]
 """Data that can be written as JSON after conversion by `to_json_value`."""
@@ -124,23 +124,6 @@ def _print_warning(kind: ErrorKind, message: str) -> None:
 def format_json(document: JsonDocument) -> str:
     """Format a document as indented JSON."""
     return json.dumps(to_json_value(document), indent=1, allow_nan=False, ensure_ascii=False)
-
-
-def to_json_value(value: Any) -> Any:
-    """Convert a value to JSON types: paths to text, tuples to lists, NaN and infinity to None."""
-    if isinstance(value, Mapping):
-        return {str(key): to_json_value(item) for key, item in value.items()}
-    if isinstance(value, tuple | list | set | frozenset):
-        return [to_json_value(item) for item in value]
-    if isinstance(value, PurePath):
-        return str(value)
-    # NumPy numbers and arrays have this method.
-    if hasattr(value, "tolist"):
-        return to_json_value(value.tolist())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    # Text from files or system calls may contain lone surrogates, which cannot be encoded.
-    return value.encode("utf-8", "replace").decode() if isinstance(value, str) else value
 
 
 @contextmanager

@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
-from sims.core.simulator import InputError
+from sims.core.file_lock import open_locked
 
 ANSWERS_FILE = "answers.jsonl"
 """File of the answers. It contains the true causes too; no diagnoser can read it."""
@@ -32,14 +32,7 @@ class AnswerStore:
         The lock prevents two processes from appending to the same file.
         """
         self._path = folder / ANSWERS_FILE
-        self._file: IO[str] = self._path.open("a", encoding="utf-8")
-        try:
-            _lock_file(self._file)
-        except OSError:
-            self._file.close()
-            raise InputError(
-                f"{folder}: another simgap process uses this folder; wait for it, or end it"
-            ) from None
+        self._file = open_locked(self._path, folder)
         self._end_last_line()
         self.answered = read_answers(folder)
 
@@ -105,12 +98,3 @@ def _add_line(answers: AnswersByCase, document: Mapping[str, Any]) -> None:
     stored["item"] = document["item"]
     for row in document["rows"]:
         stored["rows"][row["diagnoser"]] = row
-
-
-def _lock_file(file: IO[str]) -> None:
-    """Lock the file until it is closed or this process ends."""
-    try:
-        import fcntl
-    except ImportError:  # no file locks on this operating system
-        return
-    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -12,6 +12,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
+from sims.core.plain_values import to_toml_value
 from sims.core.simulator import Array, InputError, make_unknown_name_error, similar
 from sims.core.toml_validation import check_table, format_value
 from sims.core.value_limits import is_plausible_number
@@ -96,7 +97,7 @@ def described(
     Raises:
         InputError: A column belongs to no signal, or a unit is missing.
     """
-    result: dict[str, Any] = _copy_plain(meta)
+    result: dict[str, Any] = to_toml_value(meta)
     poses = get_floating_state_units(declared)
     usual = {**poses, **{s.name: s.unit for s in (*declared.channels, *declared.inputs)}}
     columns = [name for name in frame.columns if name != "run"]
@@ -160,15 +161,6 @@ def _state_unit(
     elif "unit" not in table and column in noted_units:
         table["unit"] = noted_units[column]
     return "unit" in table
-
-
-def _copy_plain(value: Any) -> Any:
-    """Copy a value with plain Python dicts, lists and numbers, as TOML gives them."""
-    if isinstance(value, Mapping):
-        return {key: _copy_plain(entry) for key, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [_copy_plain(entry) for entry in value]
-    return value.item() if isinstance(value, np.generic) else value
 
 
 def _list_names(signals: Iterable[Any]) -> list[str]:

@@ -5,12 +5,13 @@ Folders of killed processes are deleted by the next process that makes one.
 
 from __future__ import annotations
 
-import fcntl
 import os
 import shutil
 import tempfile
 from pathlib import Path
 from typing import NamedTuple
+
+from sims.core.file_lock import lock_file
 
 _PREFIX = "simgap-tuner-"
 
@@ -66,7 +67,7 @@ def _lock_folder(path: str, is_blocking: bool) -> int | None:
     except OSError:
         return None
     try:
-        fcntl.flock(lock, fcntl.LOCK_EX | (0 if is_blocking else fcntl.LOCK_NB))
+        lock_file(lock, is_blocking)
     except OSError:
         os.close(lock)
         return None

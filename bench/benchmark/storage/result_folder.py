@@ -32,6 +32,7 @@ from sims.core.atomic_files import (
     make_timestamped_path,
     write_atomically,
 )
+from sims.core.plain_values import to_toml_value
 from sims.core.simulator import InputError
 from sims.core.toml_validation import check_entries, format_value, read_toml
 from sims.engines import describe_stepping
@@ -144,17 +145,8 @@ def write_configuration(folder: Path, experiment: Experiment) -> None:
     import tomli_w
 
     write_atomically(
-        folder / CONFIGURATION_FILE, tomli_w.dumps(_convert_for_toml(experiment.document()))
+        folder / CONFIGURATION_FILE, tomli_w.dumps(to_toml_value(experiment.document()))
     )
-
-
-def _convert_for_toml(value: Any) -> Any:
-    """Convert tuples to lists and mappings to dicts, the types that TOML supports."""
-    if isinstance(value, Mapping):
-        return {str(k): _convert_for_toml(v) for k, v in value.items()}
-    if isinstance(value, tuple | list):
-        return [_convert_for_toml(v) for v in value]
-    return value
 
 
 def read_configuration(folder: Path) -> FolderConfiguration:

@@ -1,7 +1,6 @@
 """Crash-safe journal of finished runs: each is appended as one record the moment it ends.
 
-The folder ``list_segments`` of an unfinished comparison contains ``plan.txt`` (the id of every run,
-in
+The folder ``segments`` of an unfinished comparison contains ``plan.txt`` (the id of every run, in
 order), ``NNNNNN.journal`` (records that are being appended) and ``NNNNNN.parquet`` (parts of many
 records). A part is written next to its journal, renamed, and only then is the journal deleted; if
 both are found, the part contains everything. A record that was cut off by a kill fails its checksum
@@ -28,6 +27,7 @@ from bench.benchmark.storage.journal_segments import (
 )
 from bench.benchmark.storage.run_status import RunStatus
 from sims.core.atomic_files import atomic_replacement
+from sims.core.file_lock import open_locked
 from sims.core.simulator import InputError
 
 if TYPE_CHECKING:
@@ -61,7 +61,7 @@ class RunJournal:
             raise InputError(
                 f"{self.folder}: expected a folder, found a file; move it elsewhere"
             ) from None
-        self._lock = _lock_folder(self.folder / "lock")
+        self._lock = open_locked(self.folder / "lock", self.folder.parent)
         # An incomplete part of a process that was killed while it wrote; its journal still exists.
         for partial_file in self.folder.glob("*.partial"):
             partial_file.unlink()
@@ -224,26 +224,3 @@ def _add_place_column(place: int, rows: pa.Table) -> pa.Table:
     import pyarrow as pa
 
     return rows.append_column("place", pa.array(np.full(len(rows), place)))
-
-
-def _lock_folder(path: Path) -> IO[str]:
-    """Lock the folder until this process ends in any way.
-
-    Two processes that write to one journal would damage it.
-
-    Raises:
-        InputError: another process has the lock.
-    """
-    file = path.open("a", encoding="ascii")
-    try:
-        import fcntl
-
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except ImportError:  # This system has no such locks.
-        pass
-    except OSError:
-        file.close()
-        raise InputError(
-            f"{path.parent.parent}: another simgap process uses this folder; wait for it, or end it"
-        ) from None
-    return file

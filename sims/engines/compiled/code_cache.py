@@ -12,6 +12,8 @@ import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+from sims.core.file_lock import lock_file
+
 _DIGEST = hashlib.sha256().digest_size
 
 
@@ -74,15 +76,10 @@ def _hold_lock(path: Path, report_wait: Callable[[], None]) -> Iterator[None]:
     If another process has the lock, `report_wait` is called before waiting. Without fcntl
     (Windows) there is no lock, and several processes may compile.
     """
-    try:
-        import fcntl
-    except ImportError:
-        yield
-        return
     with path.open("w") as lock:
         try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            lock_file(lock)
         except BlockingIOError:
             report_wait()
-            fcntl.flock(lock, fcntl.LOCK_EX)
+            lock_file(lock, is_blocking=True)
         yield

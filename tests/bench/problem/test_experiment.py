@@ -14,7 +14,7 @@ from bench.benchmark.problem.recorded_runs import find_recording
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.benchmark.runner.run_ids import RunIds
 from bench.benchmark.runner.tuner_training import compute_training_key
-from bench.benchmark.storage.result_folder import _convert_for_toml
+from sims.core.plain_values import to_toml_value
 from sims.core.simulator import InputError
 from sims.core.toml_validation import tomllib
 from tests.sample_experiments import SPRING, spring_experiment
@@ -23,7 +23,7 @@ from tests.sample_experiments import SPRING, spring_experiment
 @pytest.mark.parametrize("name", list_experiment_names())
 def test_document_of_every_shipped_experiment_gives_it_back(name):
     experiment = load_experiment(name)
-    document = tomllib.loads(tomli_w.dumps(_convert_for_toml(experiment.document())))
+    document = tomllib.loads(tomli_w.dumps(to_toml_value(experiment.document())))
     assert parse_experiment(name, document, Path("x.toml")) == experiment
     assert experiment.says
 
