@@ -25,7 +25,6 @@ from typing import Literal
 
 import numpy as np
 
-from bench.core.unit_text import format_unit
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.fit_state import TrajectoryFit
@@ -34,6 +33,7 @@ from bench.diagnosis.search.candidate_directions import DirectionSet, compute_di
 from bench.diagnosis.validation.gain_and_intervals import Z95
 from sims.core.effect import ALL_PLACES
 from sims.core.simulator import Array
+from sims.core.unit_text import format_unit
 
 IdentifiabilityLevel = Literal["identifiable", "weak", "not identifiable"]
 

@@ -18,6 +18,7 @@ from bench.figures.style import (
 )
 from bench.logs.signal_statistics import list_recorded_signals
 from sims.core.simulator import Array, Simulator
+from sims.core.unit_text import format_unit
 from sims.recording.recording import Recording, Run
 
 if TYPE_CHECKING:
@@ -79,7 +80,7 @@ def draw_recording_figure(recording: Recording, kind: type[Simulator]) -> Figure
     width = float(np.clip(3 + 0.8 * len(placed_runs), 9, 16))
     figure, axes = make_panel_grid(len(signals), 1, (width, 1.2 + 2.0 * len(signals)), sharex=True)
     for axis, (channel, role) in zip(axes[:, 0], signals, strict=True):
-        unit = "" if channel.unit == "1" else f" [{_format_unit(channel.unit)}]"
+        unit = "" if channel.unit == "1" else f" [{format_unit(channel.unit)}]"
         axis.set_ylabel(f"{channel.name}{unit}\n({role})")
         for part in placed_runs:
             values = part.run.channels.get(channel.name)
@@ -96,10 +97,6 @@ def draw_recording_figure(recording: Recording, kind: type[Simulator]) -> Figure
         frameon=False,
     )
     return figure
-
-
-def _format_unit(unit: str) -> str:
-    return unit.replace("^2", "²").replace("^3", "³").replace("*", "·")
 
 
 def _place_runs(runs: Sequence[Run]) -> list[_PlacedRun]:

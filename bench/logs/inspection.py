@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from bench.core.plugin_registries import make_robot_simulator, simulators
-from bench.core.unit_text import format_unit
 from bench.logs.signal_statistics import (
     compute_run_statistics,
     compute_signal_statistics,
     list_recorded_signals,
 )
 from sims.core.simulator import InputError, Simulator
+from sims.core.unit_text import format_unit
 from sims.core.value_limits import MAX_NUMBER
 from sims.recording.recording import (
     Recording,

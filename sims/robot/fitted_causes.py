@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sims.core.simulator import Array
+from sims.core.unit_text import append_unit
 from sims.extended_simulator import FittedValue
 
 if TYPE_CHECKING:
@@ -91,17 +92,13 @@ def _format_estimate(number: FittedValue) -> str:
 
     The last part is the number in the model file before and after.
     """
-    text = f"{number.value:.4g}{_format_unit(number.unit)}"
+    text = append_unit(f"{number.value:.4g}", number.unit)
     if number.low is not None and number.high is not None:
         text += f" (95 %: {number.low:.4g} to {number.high:.4g})"
     if number.stated is not None and number.total is not None:
-        unit = _format_unit(number.total_unit or number.unit)
-        text += f", from {number.stated:.4g} to {number.total:.4g}{unit}"
+        total = append_unit(f"{number.total:.4g}", number.total_unit or number.unit)
+        text += f", from {number.stated:.4g} to {total}"
     return text
-
-
-def _format_unit(unit: str) -> str:
-    return "" if unit == "1" else f" {unit.replace('*', '·')}"
 
 
 def expand_families(

@@ -5,8 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
-# All text functions of explain's pages are imported from this module, including the shared ones.
-from bench.core import unit_text
 from bench.pages.text_format import format_estimate as format_estimate
 from bench.pages.text_format import format_number as format_number
 from bench.pages.text_format import format_p_value as format_p_value
@@ -14,6 +12,9 @@ from bench.pages.text_format import format_percent as format_percent
 from bench.pages.text_format import joined as joined
 from bench.pages.text_format import sanitise as sanitise
 from sims import effects
+
+# All text functions of explain's pages are imported from this module, including the shared ones.
+from sims.core import unit_text
 from sims.core.simulator import InputError
 from sims.extended_simulator import FittedValue
 
@@ -160,7 +161,7 @@ def format_label(name: str, unit: str, max_length: int = 30) -> str:
 
 def append_unit(text: str, unit: str) -> str:
     """Append a unit to a number."""
-    return f"{text} {format_unit(unit)}" if format_unit(unit) else text
+    return unit_text.append_unit(text, sanitise(unit, 60))
 
 
 def format_fitted_value(fitted: FittedValue) -> str:

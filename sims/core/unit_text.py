@@ -13,3 +13,9 @@ def format_unit(unit: str) -> str:
     """Format a unit for print, such as ``kg·m²`` for ``kg*m^2``; empty for a pure number."""
     raised = _POWER.sub(lambda match: match[1].translate(SUPERSCRIPT_DIGITS), unit)
     return "" if raised == "1" else raised.replace("*", "·")
+
+
+def append_unit(text: str, unit: str) -> str:
+    """Append a unit to a number; a pure number has none."""
+    unit_text = format_unit(unit)
+    return f"{text} {unit_text}" if unit_text else text
