@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 MAX_SIDE_INCHES = 4.4
 """Length of the longer side of the drawing, in inches."""
-MIN_LABEL_COLUMN_INCHES = 2.1
+MIN_LABEL_COLUMN_INCHES = 1.0
 """Minimum width of a column of labels, in inches."""
 LETTER_WIDTH_INCHES = 0.083
 """Average width of a letter of a label, in inches."""
