@@ -271,6 +271,7 @@ def _run_score(options: argparse.Namespace, print_line: PrintLine) -> CommandRes
     units = result.pop("units")
     for channel, error in result["rmse"].items():
         print_line(f"{channel}: RMSE {error:.4g} {units[channel]}")
-    counts = f"{result['runs']} runs, {result['samples']} samples"
+    runs = "1 run" if result["runs"] == 1 else f"{result['runs']} runs"
+    counts = f"{runs}, {result['samples']} samples"
     print_line(f"{result['normalised_rmse']:.4g} times the noise; {counts}")
     return CommandResult(result)

@@ -133,7 +133,7 @@ def test_score_says_it_to_a_person(folder, capsys):
     out = capsys.readouterr().out.splitlines()
     assert out[0].startswith("q: RMSE 0.00")
     assert out[0].endswith(" rad")
-    assert out[-1].endswith("times the noise; 1 runs, 90 samples") or out[-1].endswith(
+    assert out[-1].endswith("times the noise; 1 run, 90 samples") or out[-1].endswith(
         "1 run, 90 samples"
     )
 
