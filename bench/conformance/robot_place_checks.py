@@ -256,13 +256,11 @@ def _find_changed_fields(effect: Effect, c: Array, kind: type) -> tuple[object, 
     Raises:
         CheckError: an effect of one place changes several places.
     """
-    from sims.robot.coupled_drives import COUPLING_PLACEHOLDER
-    from sims.robot.dynamics.series_joints import add_series_joints
+    from sims.robot.dynamics.added_elements import add_elements, list_added_elements
     from sims.robot.model_field_effects import MODEL_FIELD_EFFECTS
 
-    robot, native = kind.robot, MODEL_FIELD_EFFECTS[effect.of]  # type: ignore[attr-defined]
-    if effect.of == COUPLING_PLACEHOLDER[1]:
-        robot = add_series_joints(robot, (COUPLING_PLACEHOLDER,))
+    native = MODEL_FIELD_EFFECTS[effect.of]
+    robot = add_elements(kind.robot, list_added_elements(effect))  # type: ignore[attr-defined]
     fields, changes = {}, []
     for name in native.fields:
         owner, _, field = name.rpartition(".")

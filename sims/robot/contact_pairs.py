@@ -9,13 +9,12 @@ dimension, and `solref` and `solimp` as a mean with the weights `solmix`.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection
 from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from sims.core.effect import Effect
 from sims.core.simulator import Array, make_unknown_name_error
 from sims.robot.mujoco_messages import capture_mujoco_warnings
 from sims.robot.robot_model import RobotModel, cache_per_robot
@@ -160,8 +159,3 @@ def add_contact_pairs(robot: RobotModel, pairs: Collection[str]) -> RobotModel:
             **found._asdict(),
         )
     return replace(robot, spec=spec)
-
-
-def list_acting_pairs(acting: Iterable[tuple[Effect, Array]]) -> list[str]:
-    """List the pairs of geoms that the model needs for effects at contacts."""
-    return sorted({pair for effect, c in acting if c.any() for pair in effect.pairs})

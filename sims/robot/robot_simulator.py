@@ -37,6 +37,7 @@ from sims.robot.dynamics.active_effects import (
     select_model_field_effects,
     slice_active_effects,
 )
+from sims.robot.dynamics.added_elements import AddedElements, group_by_added_elements
 from sims.robot.dynamics.applied_inputs import (
     SAME_INSTANT_SHARE,
     STEP_COUNT_TOLERANCE,
@@ -59,7 +60,6 @@ from sims.robot.dynamics.effect_forces import EffectForces, compute_time_depende
 from sims.robot.dynamics.midpoint_state import Mask, Places
 from sims.robot.dynamics.mujoco_batch import BATCH_SIZE, JointAddresses, MujocoBatch
 from sims.robot.dynamics.sensor_sampling import sample_readings
-from sims.robot.dynamics.series_joints import SeriesJoints, group_by_series_joints
 from sims.robot.floating_joints import FloatingJoints, FloatingState
 from sims.robot.friction_form import FrictionForm
 from sims.robot.integrator_settings import (
@@ -225,7 +225,7 @@ class RobotSimulator(SystemSimulator):
         is_stepwise = find_active_elements(acting, len(x), is_evaluated_per_step)
         # A diverging batch element becomes NaN, so floating-point warnings are suppressed.
         with np.errstate(all="ignore"), capture_mujoco_warnings():
-            for series, kind, lanes in _group_alike_elements(acting, derived, is_stepwise):
+            for added, kind, lanes in _group_batch_elements(acting, derived, is_stepwise):
                 # Batch elements are sorted by run, so that data common to a run are computed once.
                 lanes = lanes[np.argsort(runs.scenario_index[lanes], kind="stable")]
                 for part in np.array_split(lanes, max(-(-lanes.size // BATCH_SIZE), 1)):
@@ -242,7 +242,7 @@ class RobotSimulator(SystemSimulator):
                     bits = bool(kind & 1), bool(kind & 2)
                     try:
                         run_observations = self._simulate_run_batch(
-                            run_batches, slice_active_effects(acting, part), *bits, series
+                            run_batches, slice_active_effects(acting, part), *bits, added
                         )
                     except RefusedModelError:
                         # These elements stay NaN, like those of a diverging motion; the others are
@@ -262,7 +262,7 @@ class RobotSimulator(SystemSimulator):
         acting: ActiveEffects,
         derived: bool,
         is_stepwise: bool,
-        series: SeriesJoints = (),
+        added: AddedElements = (),
     ) -> list[Array]:
         """Simulate observations (n, T, C) of the batch elements of each run, in one batch.
 
@@ -271,7 +271,7 @@ class RobotSimulator(SystemSimulator):
             acting: effects active on all of them.
             derived: whether effects change constants that MuJoCo derives.
             is_stepwise: whether forces are evaluated in every step.
-            series: effects in series with joints.
+            added: elements that effects add to the model.
         """
         if not run_batches:
             return []
@@ -291,7 +291,7 @@ class RobotSimulator(SystemSimulator):
             inputs,
             derived,
             is_stepwise,
-            series=series,
+            added=added,
         )
         observations = []
         first = 0
@@ -468,31 +468,31 @@ class RobotSimulator(SystemSimulator):
         return super().run_initial(replace(scenario, initial=state_values))
 
     def make_linearisation_batch(self, acting: ActiveEffects = ()) -> MujocoBatch:
-        """Return the batch for linearisation, with the joints in series that effects need.
+        """Return the batch for linearisation, with the elements that effects add to the model.
 
         Args:
             acting: effects active in the motion.
         """
-        (series,) = group_by_series_joints(acting, 1)
-        return self._get_batch(True, LINEARISATION_BATCH_SIZE, series)
+        (added,) = group_by_added_elements(acting, 1)
+        return self._get_batch(True, LINEARISATION_BATCH_SIZE, added)
 
     def half_steps(self, acting: ActiveEffects = ()) -> MujocoBatch:
         """Return the batch of `make_linearisation_batch` with half the time step."""
-        (series,) = group_by_series_joints(acting, 1)
+        (added,) = group_by_added_elements(acting, 1)
         engine = self.engine
         assert isinstance(engine, RobotEngine)
         settings = dict(engine.numerics.to_model_options())
         settings["timestep"] *= 0.5
-        return bench_cache(self.robot).bench(series, True, LINEARISATION_BATCH_SIZE, settings)
+        return bench_cache(self.robot).bench(added, True, LINEARISATION_BATCH_SIZE, settings)
 
     def step_batch(
         self, batch: RobotRunBatch, inputs: BatchInputs, extra_fields: Sequence[str] = ()
     ) -> BatchResult:
         """Step the batch elements of one run.
 
-        It finds out what the effects need (derived constants, evaluation in each step,
-        joints in series), and simulates all elements together; they must have the same
-        joints in series.
+        It finds out what the effects need (derived constants, evaluation in each step, elements
+        added to the model), and simulates all batch elements together; their effects must add the
+        same elements to the model.
 
         Args:
             batch: batch elements of the run.
@@ -502,9 +502,9 @@ class RobotSimulator(SystemSimulator):
         n = len(batch.x)
         derived = bool(find_active_elements(batch.acting, n, changes_derived_constants).any())
         is_stepwise = bool(find_active_elements(batch.acting, n, is_evaluated_per_step).any())
-        (series,) = group_by_series_joints(batch.acting, n)
+        (added,) = group_by_added_elements(batch.acting, n)
         start = BatchStart(batch.x, batch.v, batch.acting, self._get_floating_states([batch]))
-        return self._simulate_steps(start, inputs, derived, is_stepwise, extra_fields, series)
+        return self._simulate_steps(start, inputs, derived, is_stepwise, extra_fields, added)
 
     def _simulate_steps(
         self,
@@ -513,7 +513,7 @@ class RobotSimulator(SystemSimulator):
         derived: bool,
         is_stepwise: bool,
         extra_fields: Sequence[str] = (),
-        series: SeriesJoints = (),
+        added: AddedElements = (),
     ) -> BatchResult:
         """Simulate a batch of n elements over all steps, and return its states and readings.
 
@@ -526,12 +526,12 @@ class RobotSimulator(SystemSimulator):
             is_stepwise: whether an effect depends on the state, so that it is evaluated in each
                 step.
             extra_fields: additional fields of MuJoCo's data to record.
-            series: joints in series that effects add to the robot.
+            added: elements that effects add to the model.
         """
         n = len(start.x)
         # A single simulation uses a small batch, so that constants need not be derived for a whole
         # one.
-        bench = self._get_batch(derived, 1 if n == 1 else BATCH_SIZE, series)
+        bench = self._get_batch(derived, 1 if n == 1 else BATCH_SIZE, added)
         places, second = bench.places, bench.second
         bench.write_effects(
             pad_coefficients(select_model_field_effects(start.acting), n, bench.count)
@@ -591,12 +591,12 @@ class RobotSimulator(SystemSimulator):
             (second_states[0], second_states[1]),
         )
 
-    def _get_batch(self, derived: bool, count: int, series: SeriesJoints = ()) -> MujocoBatch:
+    def _get_batch(self, derived: bool, count: int, added: AddedElements = ()) -> MujocoBatch:
         """Return the batch for this time step and integrator, from the robot's cache."""
         engine = self.engine
         assert isinstance(engine, RobotEngine)
         settings = engine.numerics.to_model_options()
-        return bench_cache(self.robot).bench(series, derived, count, settings)
+        return bench_cache(self.robot).bench(added, derived, count, settings)
 
     def _compute_observations(
         self, result_of_batch: BatchResult, batch: RobotRunBatch, times: Array, steps: int
@@ -644,21 +644,21 @@ class RobotSimulator(SystemSimulator):
         return next(s for s in self.robot.sensors if s.name == element_name).address
 
 
-def _group_alike_elements(
+def _group_batch_elements(
     acting: ActiveEffects, derived: Mask, is_stepwise: Mask
-) -> Iterator[tuple[SeriesJoints, int, Places]]:
+) -> Iterator[tuple[AddedElements, int, Places]]:
     """Group batch elements that can be simulated together.
 
     Yields:
-        Effects in series with joints, a bit field (1: derived constants change, 2: forces are
+        Elements added to the model, a bit field (1: derived constants change, 2: forces are
         evaluated in every step), and the indices of the batch elements.
     """
-    for series, group_lanes in group_by_series_joints(acting, len(derived)).items():
+    for added, group_lanes in group_by_added_elements(acting, len(derived)).items():
         is_in_group = np.zeros(len(derived), dtype=bool)
         is_in_group[group_lanes] = True
         for kind in range(4):
             of_kind = is_in_group & (derived == bool(kind & 1)) & (is_stepwise == bool(kind & 2))
-            yield series, kind, np.flatnonzero(of_kind)
+            yield added, kind, np.flatnonzero(of_kind)
 
 
 def make_robot_simulator(

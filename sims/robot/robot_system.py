@@ -13,10 +13,9 @@ from sims.core.effect import ALL_PLACES, Effect
 from sims.core.registry import PartUnavailableError
 from sims.core.simulator import Array, Channel, InputError, Parameter, make_unknown_name_error
 from sims.core.system import StateSnapshot, System, SystemKind
-from sims.robot import coupled_drives
 from sims.robot.contact_pairs import PAIR_SEPARATOR
 from sims.robot.dynamics.activation_filters import activation_filters
-from sims.robot.dynamics.series_joints import SeriesJoints, compile_error, is_series_effect
+from sims.robot.dynamics.added_elements import find_compile_error, list_added_elements
 from sims.robot.floating_joints import FloatingJoints
 from sims.robot.model_field_effects import MODEL_FIELD_EFFECTS
 from sims.robot.places import effect_places
@@ -121,13 +120,11 @@ class RobotSystem(System):
 
         If not, MuJoCo's reason is stored in `left_out`.
         """
-        if effect.of == coupled_drives.COUPLING_EFFECT:
-            added: SeriesJoints = (coupled_drives.COUPLING_PLACEHOLDER,)
-        elif is_series_effect(effect):
-            added = ((effect.place, effect.of),)
-        else:
+        added = list_added_elements(effect)
+        # A pair of existing geoms always compiles.
+        if not added or effect.pairs:
             return True
-        error = compile_error(cls.robot, added)
+        error = find_compile_error(cls.robot, added)
         if error:
             cls.left_out[effect.name] = f"MuJoCo does not compile the model with it: {error}"
         return not error

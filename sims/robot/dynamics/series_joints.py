@@ -36,14 +36,9 @@ from numpy.typing import NDArray
 
 from sims.core.effect import ActiveEffects, Effect, HiddenStateEffect, SeriesElement
 from sims.core.simulator import Array
-from sims.robot.contact_pairs import add_contact_pairs, list_acting_pairs
-from sims.robot.coupled_drives import COUPLING_EFFECT, COUPLING_PLACEHOLDER, name_unnamed_elements
-from sims.robot.coupled_drives import list_coupling_places as coupled_places
-from sims.robot.coupled_drives import make_coupled_robot as coupled_robot
+from sims.robot.coupled_drives import name_unnamed_elements
 from sims.robot.dynamics.inertia_matrix import inertia_matrix
 from sims.robot.model_field_effects import RK4_INTEGRATOR_ID
-from sims.robot.mujoco_messages import format_mujoco_error
-from sims.robot.reduced_model import strip_shapes
 from sims.robot.robot_model import RobotModel, cache_per_robot
 
 MIN_DRIVE_INERTIA_SHARE = 0.01
@@ -75,9 +70,6 @@ WRITTEN_FIELDS = (
 """Model fields that are written for joints in series."""
 USED_FIELDS = (*WRITTEN_FIELDS, "dof_invweight0")
 """Model fields that are written for joints in series, and those derived by MuJoCo that are read."""
-
-CONTACT_PAIR = "contact"
-"""Name in the list of effects in series for a pair of geoms, which needs an element `<pair>`."""
 
 Flags = NDArray[np.bool_]
 
@@ -111,33 +103,6 @@ def group_by_joint(added: SeriesJoints) -> dict[str, list[str]]:
     return effects
 
 
-def group_by_series_joints(acting: ActiveEffects, count: int) -> dict[SeriesJoints, list[int]]:
-    """Group batch elements by their effects in series with joints.
-
-    Elements with other joints in series need another model, so that they cannot share a batch.
-    The result maps the joints in series to the numbers of the batch elements.
-
-    Args:
-        acting: effects with their coefficients (K, L, 1).
-        count: number L of batch elements.
-    """
-    lanes: dict[SeriesJoints, list[int]] = {}
-    there = [(e, (c[0] > 0)[:, 0]) for e, c in acting if is_series_effect(e)]
-    touching = [(e, c) for e, c in acting if e.pairs]
-    coupled = np.zeros(count, dtype=bool)
-    for e, c in acting:
-        if e.of == COUPLING_EFFECT:
-            coupled |= (c[0] != 0)[:, 0]
-    for lane in range(count):
-        added = tuple((e.place, e.of) for e, on in there if on[lane])
-        if coupled[lane]:
-            added += (COUPLING_PLACEHOLDER,)
-        pairs = list_acting_pairs([(e, c[:, lane]) for e, c in touching])
-        added += tuple((pair, CONTACT_PAIR) for pair in pairs)
-        lanes.setdefault(added, []).append(lane)
-    return lanes
-
-
 def add_series_joints(robot: RobotModel, added: SeriesJoints) -> RobotModel:
     """Add joints in series to a robot, without changing element names.
 
@@ -146,20 +111,10 @@ def add_series_joints(robot: RobotModel, added: SeriesJoints) -> RobotModel:
 
     Args:
         robot: robot as read from its model file.
-        added: joints, each the last one of its body, with the effect in series;
-            `COUPLING_PLACEHOLDER` requests the tendons of coupled drives, and `CONTACT_PAIR` an
-            element `<pair>`.
+        added: joints, each the last one of its body, with the effect in series.
     """
     import mujoco
 
-    if pairs := [place for place, effect in added if effect == CONTACT_PAIR]:
-        robot = add_contact_pairs(robot, pairs)
-        added = tuple(one for one in added if one[1] != CONTACT_PAIR)
-    if COUPLING_PLACEHOLDER in added:
-        robot = coupled_robot(robot, dict.fromkeys(coupled_places(robot), 0.0))
-        added = tuple(one for one in added if one != COUPLING_PLACEHOLDER)
-    if not added:
-        return robot
     spec = robot.spec.copy()
     joints = name_unnamed_elements(spec, robot)
     inertias = _compute_joint_inertias(robot)
@@ -192,22 +147,6 @@ def add_series_joints(robot: RobotModel, added: SeriesJoints) -> RobotModel:
         for name, own in group_by_joint(added).items()
     }
     return replace(robot, spec=spec, series=series)
-
-
-@cache_per_robot
-def compile_error(robot: RobotModel, added: SeriesJoints) -> str:
-    """Return why the model with joints in series does not compile; empty if it does.
-
-    Args:
-        robot: robot as read from its model file.
-        added: effects in series, as for `add_series_joints`.
-    """
-    try:
-        add_series_joints(strip_shapes(robot), added).compiled  # noqa: B018
-    # MuJoCo raises several kinds of errors, and an effect of a user's plugin may raise any.
-    except Exception as error:
-        return format_mujoco_error(error) or type(error).__name__
-    return ""
 
 
 @cache_per_robot

@@ -12,7 +12,7 @@ from mujoco.batch import Batch
 
 from sims.robot import model_field_effects
 from sims.robot.coupled_drives import COUPLING_PLACEHOLDER
-from sims.robot.dynamics.series_joints import add_series_joints
+from sims.robot.dynamics.added_elements import add_elements
 from sims.robot.robot_model import RobotModel
 from tests.sims.robot.sample_arms import ARM, robot
 
@@ -92,7 +92,7 @@ def lanes(robot: RobotModel, effect: str, place: str, c: tuple[float, ...]) -> A
     """Return (2, nq) positions after 0.4 s: an element without the effect, and one with it."""
     of = model_field_effects.MODEL_FIELD_EFFECTS[effect]
     if effect == COUPLING_PLACEHOLDER[1]:
-        robot = add_series_joints(robot, (COUPLING_PLACEHOLDER,))
+        robot = add_elements(robot, (COUPLING_PLACEHOLDER,))
     batch = Batch(model_field_effects.compile_batch_model(robot), 2, 1)
     fields = {name: batch.expand(name) for name in of.fields}
     of.write(fields, robot, place, np.array([[0.0, value] for value in c]))
