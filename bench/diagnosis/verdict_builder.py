@@ -12,7 +12,7 @@ import numpy as np
 from bench.core.random_streams import make_rng
 from bench.diagnosis.evaluation.coefficient_bounds import (
     bound_of,
-    compute_coefficient_bounds,
+    get_bounds_by_index,
     is_unusual,
 )
 from bench.diagnosis.evaluation.noise_floor import NoiseFloor
@@ -238,15 +238,7 @@ class VerdictBuilder:
         """Return the bounds of each fitted number, by index in the parameter vector."""
         evaluator = self.fitting_evaluator
         ranges = {i: evaluator.parameters[i].bounds for i in evaluator.base.tolist()}
-        for name in model.effects:
-            ranges |= dict(
-                zip(
-                    evaluator.get_coefficient_indices(name),
-                    compute_coefficient_bounds(evaluator, name),
-                    strict=True,
-                )
-            )
-        return ranges
+        return ranges | get_bounds_by_index(evaluator, model.effects)
 
     def judged(self, search: EffectSearch, finding: DiagnosisResult) -> DiagnosisResult:
         """Return the finding with the verdict that its numbers and the fitted models allow.

@@ -36,7 +36,7 @@ from bench.diagnosis.conventions.convention_hypotheses import (
 )
 from bench.diagnosis.conventions.copied_commands import find_copied_commands
 from bench.diagnosis.conventions.unit_check import Subject
-from bench.diagnosis.evaluation.coefficient_bounds import compute_coefficient_bounds
+from bench.diagnosis.evaluation.coefficient_bounds import get_bounds_by_index
 from bench.diagnosis.evaluation.noise_floor import compute_noise_floor
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
@@ -45,7 +45,7 @@ from bench.diagnosis.friction_form_verdict import soft_kind
 from bench.diagnosis.identifiability import listed
 from bench.diagnosis.kalman.candidate_responses import MAX_LINEARISATIONS, FollowedRuns
 from bench.diagnosis.kalman.joint_forces import compute_joint_forces, has_joint_forces
-from bench.diagnosis.kalman.likelihood_fit import maximise_likelihood
+from bench.diagnosis.kalman.likelihood_fit import maximise_innovation_likelihood
 from bench.diagnosis.prediction_error.effect_selection import identify
 from bench.diagnosis.prediction_error.joint_effects import MANY_SHAPES
 from bench.diagnosis.prediction_error.library_columns import group_coefficients
@@ -504,11 +504,9 @@ def _with_best_coefficients(
     `groups` names the effects; their present coefficients are those of the filter.
     """
     evaluator = followed.evaluator
-    names = [group.effect for group in groups]
-    return maximise_likelihood(
+    return maximise_innovation_likelihood(
         followed,
-        [place for name in names for place in evaluator.get_coefficient_indices(name)],
-        [bounds for name in names for bounds in compute_coefficient_bounds(evaluator, name)],
+        get_bounds_by_index(evaluator, [group.effect for group in groups]),
         GAUSS_NEWTON_STEPS,
         lambda theta, best: best.with_parameters(theta),
     )

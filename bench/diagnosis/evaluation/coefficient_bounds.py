@@ -5,6 +5,7 @@ Times and frequencies follow the time scale of the recording (`evaluation.time_s
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Literal
 
 import numpy as np
@@ -71,6 +72,22 @@ def compute_coefficient_bounds(evaluator: RunEvaluator, name: str) -> list[tuple
         )
         for parameter, coefficient in pairs
     ]
+
+
+def get_bounds_by_index(
+    evaluator: RunEvaluator, names: Iterable[str]
+) -> dict[int, tuple[float, float]]:
+    """Return the ranges of `compute_coefficient_bounds` for some effects, by index in theta.
+
+    Args:
+        evaluator: the runs.
+        names: names of the effects.
+    """
+    bounds: dict[int, tuple[float, float]] = {}
+    for name in names:
+        places = evaluator.get_coefficient_indices(name)
+        bounds |= zip(places, compute_coefficient_bounds(evaluator, name), strict=True)
+    return bounds
 
 
 def clip_coefficients(evaluator: RunEvaluator, name: str, c: Array) -> Array:

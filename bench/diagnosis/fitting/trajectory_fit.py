@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bench.diagnosis.evaluation.coefficient_bounds import compute_coefficient_bounds
+from bench.diagnosis.evaluation.coefficient_bounds import get_bounds_by_index
 from bench.diagnosis.evaluation.noise_model import Mask, NoiseModel, whiten
 from bench.diagnosis.evaluation.run_evaluator import MIN_CHUNK_SIZE, Indices, RunEvaluator
 from bench.diagnosis.fitting.finite_differences import (
@@ -316,16 +316,14 @@ class TrajectoryFitter:
     def _create_fit_state(self, start: FitStart) -> FitState:
         """Create the state of a new fit: fitted parameters, their bounds and difference steps."""
         evaluator = self.evaluator
-        free: list[int] = []
-        bounds: list[tuple[float, float]] = []
+        bounds: dict[int, tuple[float, float]] = {}
         if self.parameters:
-            free += [i for i in evaluator.base.tolist() if i not in self.frozen]
-            bounds += [evaluator.parameters[i].bounds for i in free]
-            for name in start.effects:
-                free += evaluator.get_coefficient_indices(name)
-                bounds += compute_coefficient_bounds(evaluator, name)
+            base = [i for i in evaluator.base.tolist() if i not in self.frozen]
+            bounds = {i: evaluator.parameters[i].bounds for i in base}
+            bounds |= get_bounds_by_index(evaluator, start.effects)
+        free = list(bounds)
         # The shape has two columns even if nothing is fitted.
-        table = np.array(bounds, dtype=np.float64).reshape(-1, 2)
+        table = np.array(list(bounds.values()), dtype=np.float64).reshape(-1, 2)
         low, high = table.T
 
         # Plausible ranges scale the finite differences; a fit may go far beyond them.

@@ -11,19 +11,18 @@ accelerations contain the noise of the innovations that they should explain, whi
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from typing import TypeAlias
 
 import numpy as np
 
-from bench.diagnosis.evaluation.coefficient_bounds import bound_of, compute_coefficient_bounds
+from bench.diagnosis.evaluation.coefficient_bounds import bound_of, get_bounds_by_index
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.diagnosis.fitting.bound_widening import range_around, use_bounds
+from bench.diagnosis.fitting.bound_widening import Bounds, range_around, use_bounds
 from bench.diagnosis.kalman.candidate_responses import FollowedRuns
 from sims.core.simulator import Array
 
-Bounds = tuple[float, float]
 Follow: TypeAlias = Callable[[Array, FollowedRuns], FollowedRuns]
 
 ITERATIONS = 8
@@ -68,18 +67,12 @@ def identify_base(
         return FollowedRuns.follow(evaluator, theta, noise, force=best.force)
 
     places = evaluator.base.tolist()
-    limits = [range_around(evaluator, i) for i in places]
-    resisting = [
-        (i, b)
-        for name in _list_resisting_effects(followed)
-        for i, b in _list_coefficients(evaluator, name)
-    ]
+    limits = {i: range_around(evaluator, i) for i in places}
+    resisting = get_bounds_by_index(evaluator, _list_resisting_effects(followed))
     found = []
-    for beside in [resisting] if is_resisted else [[], resisting]:
-        own = [*places, *(i for i, _ in beside)]
-        bounds = [*limits, *(one for _, one in beside)]
-        tried = maximise_likelihood(followed, own, bounds, ITERATIONS, follow)
-        ends = [bound_of(float(tried.theta[i]), *b) for i, b in zip(places, limits, strict=True)]
+    for further in [resisting] if is_resisted else [{}, resisting]:
+        tried = maximise_innovation_likelihood(followed, limits | further, ITERATIONS, follow)
+        ends = [bound_of(float(tried.theta[i]), *bounds) for i, bounds in limits.items()]
         if tried.is_sound and not any(ends):
             found.append(tried)
         # The base parameters alone leave no force missing, so friction is not needed.
@@ -109,21 +102,9 @@ def _list_resisting_effects(followed: FollowedRuns) -> list[str]:
     return [name for name in names if name in evaluator.slots]
 
 
-def _list_coefficients(evaluator: RunEvaluator, name: str) -> list[tuple[int, Bounds]]:
-    """Return indices in theta and bounds of an effect's coefficients."""
-    return list(
-        zip(
-            evaluator.get_coefficient_indices(name),
-            compute_coefficient_bounds(evaluator, name),
-            strict=True,
-        )
-    )
-
-
-def maximise_likelihood(
+def maximise_innovation_likelihood(
     followed: FollowedRuns,
-    places: Sequence[int],
-    bounds: Sequence[Bounds],
+    bounds: Mapping[int, Bounds],
     iterations: int,
     follow: Follow,
     min_gain: float = LEAST_GAIN,
@@ -132,8 +113,7 @@ def maximise_likelihood(
 
     Args:
         followed: the runs, filtered with the initial parameters.
-        places: indices of the fitted parameters.
-        bounds: bounds of these parameters.
+        bounds: bounds of the fitted parameters, by index.
         iterations: maximum number of steps.
         follow: filters the runs with other parameters; its second argument is the best filter.
         min_gain: minimum gain in log-likelihood by a step for which another step follows.
@@ -145,7 +125,7 @@ def maximise_likelihood(
     for _ in range(iterations):
         if best.evaluator.watch.has_abandoned_fits():
             break
-        step, expected = gauss_newton_step(best, places, bounds)
+        step, expected = compute_likelihood_step(best, bounds)
         if expected < min_gain:
             break
         gained = 0.0
@@ -161,56 +141,49 @@ def maximise_likelihood(
     return best
 
 
-def gauss_newton_step(
-    followed: FollowedRuns, places: Sequence[int], bounds: Sequence[Bounds]
+def compute_likelihood_step(
+    followed: FollowedRuns, bounds: Mapping[int, Bounds]
 ) -> tuple[Array, float]:
     """Compute the Gauss-Newton step of some parameters on the innovations.
 
     Args:
         followed: the runs, filtered with the present parameters.
-        places: indices of the parameters that change.
-        bounds: bounds of these parameters, which limit the step.
+        bounds: bounds of the parameters that change, by index; they limit the step.
 
     Returns:
         The change of all parameters (P,), and the predicted gain in log-likelihood for linear
         innovations.
     """
-    innovations = list(places)
-    rows, target = _derivatives(followed, places, bounds), followed.filtered.whitened
+    places = list(bounds)
+    rows, target = _compute_derivatives(followed, bounds), followed.filtered.whitened
     gram, cross = rows.T @ rows, rows.T @ target.reshape(-1)
     scale = np.maximum(np.sqrt(np.diagonal(gram)), 1e-300)
-    normal = gram / scale / scale[:, None] + RIDGE * np.eye(len(innovations))
-    values = followed.theta[innovations]
-    low, high = np.array(bounds).T
+    normal = gram / scale / scale[:, None] + RIDGE * np.eye(len(places))
+    values = followed.theta[places]
+    low, high = np.array(list(bounds.values())).T
     change = np.clip(values + np.linalg.solve(normal, cross / scale) / scale, low, high) - values
     step = np.zeros_like(followed.theta)
-    step[innovations] = change
+    step[places] = change
     return step, float(change @ cross - 0.5 * change @ gram @ change)
 
 
-def compute_information(
-    followed: FollowedRuns, places: Sequence[int], bounds: Sequence[Bounds]
-) -> Array:
+def compute_information(followed: FollowedRuns, bounds: Mapping[int, Bounds]) -> Array:
     """Return the Fisher information (n, n) of some parameters in the innovations.
 
     Args:
         followed: the runs, filtered with the present parameters.
-        places: indices of the n parameters.
-        bounds: bounds of these parameters.
+        bounds: bounds of the n parameters, by index.
     """
-    rows = _derivatives(followed, places, bounds)
+    rows = _compute_derivatives(followed, bounds)
     information: Array = rows.T @ rows
     return information
 
 
-def _derivatives(followed: FollowedRuns, places: Sequence[int], bounds: Sequence[Bounds]) -> Array:
+def _compute_derivatives(followed: FollowedRuns, bounds: Mapping[int, Bounds]) -> Array:
     """Return minus the derivatives (R T C, n) of the whitened innovations by n parameters."""
     target = followed.filtered.whitened
-    columns = [
-        _compute_innovation_derivative(followed, target, i, b)
-        for i, b in zip(places, bounds, strict=True)
-    ]
-    return np.stack(columns, axis=-1).reshape(-1, len(places))
+    columns = [_compute_innovation_derivative(followed, target, i, b) for i, b in bounds.items()]
+    return np.stack(columns, axis=-1).reshape(-1, len(bounds))
 
 
 def _compute_innovation_derivative(

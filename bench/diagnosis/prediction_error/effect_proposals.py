@@ -12,11 +12,14 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from bench.diagnosis.evaluation.coefficient_bounds import compute_coefficient_bounds
+from bench.diagnosis.evaluation.coefficient_bounds import (
+    compute_coefficient_bounds,
+    get_bounds_by_index,
+)
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.fit_state import FitStart
 from bench.diagnosis.kalman.candidate_responses import FollowedRuns
-from bench.diagnosis.kalman.likelihood_fit import gauss_newton_step
+from bench.diagnosis.kalman.likelihood_fit import compute_likelihood_step
 from bench.diagnosis.prediction_error.joint_effects import (
     JOINT_MODEL,
     SERVO_MODEL,
@@ -189,15 +192,12 @@ class EffectProposals:
         """Return the Gauss-Newton step of an effect alone, cached for the base model."""
         if followed is self.filters.base and name in self._base_steps:
             return self._base_steps[name]
-        evaluator = self.filters.evaluator
-        places, bounds = (
-            evaluator.get_coefficient_indices(name),
-            compute_coefficient_bounds(evaluator, name),
+        step = compute_likelihood_step(
+            followed, get_bounds_by_index(self.filters.evaluator, [name])
         )
-        found = gauss_newton_step(followed, places, bounds)
         if followed is self.filters.base:
-            self._base_steps[name] = found
-        return found
+            self._base_steps[name] = step
+        return step
 
 
 @dataclass(frozen=True)

@@ -141,13 +141,12 @@ def _larger_that_pay(context: SearchContext, current: FilteredSet) -> list[Filte
     The likeliest set is the first.
     """
     filters = context.filters
-    base = filters.log_likelihood(filters.reference)
-    log_likelihood = current.followed.log_likelihood if current.names else base
-    share = LEAST_SHARE * 2.0 * (log_likelihood - base)
+    present = current.followed if current.names else filters.base
+    share = LEAST_SHARE * filters.compute_gain(present)
     return [
         larger
         for larger in try_one_more(context, current)
-        if 2.0 * (larger.followed.log_likelihood - log_likelihood)
+        if 2.0 * (larger.followed.log_likelihood - present.log_likelihood)
         >= max(filters.penalty(larger.names[-1]), share)
     ]
 
@@ -184,8 +183,8 @@ def try_one_more(context: SearchContext, current: FilteredSet) -> list[FilteredS
 def _is_settled(context: SearchContext, best: FilteredSet, other: FilteredSet) -> bool:
     """Return whether a set explains the runs, and another one is far worse."""
     behind = _compute_criterion(context, other) - _compute_criterion(context, best)
-    is_far_behind = behind > RIVAL_MARGIN + SETTLED_SHARE * _compute_gain(context, best)
-    return is_far_behind and not best.followed.lacks_force
+    gain = context.filters.compute_gain(best.followed)
+    return behind > RIVAL_MARGIN + SETTLED_SHARE * gain and not best.followed.lacks_force
 
 
 def _nearly_as_likely(
@@ -198,16 +197,10 @@ def _nearly_as_likely(
     """
     if not larger_sets:
         return ()
-    error = LINEARISATION_ERROR * _compute_gain(context, larger_sets[0])
+    error = LINEARISATION_ERROR * context.filters.compute_gain(larger_sets[0].followed)
     limit = _compute_criterion(context, larger_sets[0]) + RIVAL_MARGIN + error
     near_sets = [one for one in larger_sets if _compute_criterion(context, one) <= limit]
     return [*near_sets, *larger_sets[len(near_sets) : MAX_FIRST_EFFECTS]]
-
-
-def _compute_gain(context: SearchContext, current: FilteredSet) -> float:
-    """Return the gain of a set over the base model in twice the log likelihood."""
-    base = context.filters.log_likelihood(context.filters.reference)
-    return 2.0 * (current.followed.log_likelihood - base)
 
 
 def _compute_criterion(context: SearchContext, current: FilteredSet) -> float:

@@ -22,17 +22,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bench.diagnosis.evaluation.coefficient_bounds import compute_coefficient_bounds
+from bench.diagnosis.evaluation.coefficient_bounds import get_bounds_by_index
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.bound_widening import Bounds, range_around
 from bench.diagnosis.fitting.fit_state import FitStart
 from bench.diagnosis.fitting.model_set import FittedModel
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
-from bench.diagnosis.kalman.candidate_responses import FollowedRuns
+from bench.diagnosis.kalman.candidate_responses import Columns, FollowedRuns
 from bench.diagnosis.kalman.likelihood_fit import (
     LEAST_GAIN,
     compute_information,
-    maximise_likelihood,
+    maximise_innovation_likelihood,
 )
 from bench.diagnosis.prediction_error.effect_proposals import SearchContext
 from bench.diagnosis.prediction_error.joint_effects import has_many_shapes
@@ -40,6 +40,7 @@ from bench.diagnosis.prediction_error.library_columns import group_coefficients,
 from bench.diagnosis.prediction_error.model_filters import FilteredSet
 from bench.diagnosis.prediction_error.selection_fits import LEAST_SHARE, MAX_IMPROVED_SIZE
 from bench.diagnosis.search.candidate_directions import CandidateDirection
+from bench.diagnosis.search.refit_starts import with_effect
 from sims.core.simulator import Array
 
 MIN_SECONDS = 8.0
@@ -114,17 +115,21 @@ def identify_incomplete(context: SearchContext) -> IdentifiedSet | None:
         for name in evaluator.library
         if name.partition("@")[0] in TEXTBOOK_EFFECTS and not name.endswith("@*")
     ]
-    current, gains = _pruned(context, _maximised(context, filters.base, textbook))
+    current, gains = _prune_set(context, _fit_set(context, filters.base, textbook))
+    columns: Columns | None = None
     for _ in range(MAX_ADDED):
-        larger = None if _is_negligible(context, current) else _with_next(context, current)
+        if _is_negligible(context, current):
+            break
+        columns = columns or filters.base.columns(_list_probes(context))
+        larger = _add_next_effect(context, current, columns)
         if larger is None:
             break
-        current, gains = _pruned(context, larger)
+        current, gains = _prune_set(context, larger)
         if larger.names[-1] not in current.names:
             break
     if not current.names or not current.followed.lacks_force:
         return None
-    return IdentifiedSet(_simulated(context, current), gains)
+    return IdentifiedSet(_simulate_set(context, current), gains)
 
 
 def is_long(evaluator: RunEvaluator) -> bool:
@@ -139,31 +144,29 @@ def _is_negligible(context: SearchContext, current: FilteredSet) -> bool:
     return not current.followed.lacks_force or bool((current.followed.force < share).all())
 
 
-def _places(context: SearchContext, names: Sequence[str]) -> tuple[list[int], list[Bounds]]:
-    """Return the indices in theta and the bounds of the base parameters and of some effects."""
+def _get_bounds(context: SearchContext, names: Sequence[str]) -> dict[int, Bounds]:
+    """Return the bounds of the base parameters and of some effects, by index in theta."""
     evaluator = context.evaluator
-    base = [i for i in evaluator.base.tolist() if i not in context.search.frozen]
-    places, bounds = list(base), [range_around(evaluator, i) for i in base]
-    for name in names:
-        places += evaluator.get_coefficient_indices(name)
-        bounds += compute_coefficient_bounds(evaluator, name)
-    return places, bounds
+    free = [i for i in evaluator.base.tolist() if i not in context.search.frozen]
+    bounds = {i: range_around(evaluator, i) for i in free}
+    return bounds | get_bounds_by_index(evaluator, names)
 
 
-def _maximised(context: SearchContext, followed: FollowedRuns, names: Sequence[str]) -> FilteredSet:
+def _fit_set(context: SearchContext, followed: FollowedRuns, names: Sequence[str]) -> FilteredSet:
     """Maximise the likelihood of the innovations with effects in the filter's model."""
 
     def follow(theta: Array, best: FollowedRuns) -> FollowedRuns:
         context.evaluator.watch.check_not_stopped()
         return best.with_parameters(theta)
 
-    reference = context.filters.log_likelihood(context.filters.reference)
-    min_gain = max(CONVERGED_SHARE * (followed.log_likelihood - reference), LEAST_GAIN)
-    best = maximise_likelihood(followed, *_places(context, names), ITERATIONS, follow, min_gain)
+    base_log_likelihood = context.filters.base.log_likelihood
+    min_gain = max(CONVERGED_SHARE * (followed.log_likelihood - base_log_likelihood), LEAST_GAIN)
+    bounds = _get_bounds(context, names)
+    best = maximise_innovation_likelihood(followed, bounds, ITERATIONS, follow, min_gain)
     return FilteredSet(best, tuple(names))
 
 
-def _wald_statistics(
+def _compute_wald_statistics(
     context: SearchContext, theta: Array, names: Sequence[str], information: Information
 ) -> dict[str, float]:
     """Return the loss in twice the log-likelihood without each effect of a set.
@@ -176,42 +179,43 @@ def _wald_statistics(
         names: its effects.
         information: Fisher information of the set, or of a larger one.
     """
-    places, _ = _places(context, names)
+    places = list(_get_bounds(context, names))
     rows = [information.places.index(i) for i in places]
     covariance = np.linalg.pinv(information.matrix[np.ix_(rows, rows)], hermitian=True)
-    gains = {}
+    statistics = {}
     for name in names:
-        own_places = context.evaluator.get_coefficient_indices(name)
-        own = [places.index(i) for i in own_places]
-        inverse = np.linalg.pinv(covariance[np.ix_(own, own)], hermitian=True)
-        c = theta[own_places]
-        gains[name] = float(c @ inverse @ c)
-    return gains
+        effect_places = context.evaluator.get_coefficient_indices(name)
+        effect_rows = [places.index(i) for i in effect_places]
+        inverse = np.linalg.pinv(covariance[np.ix_(effect_rows, effect_rows)], hermitian=True)
+        c = theta[effect_places]
+        statistics[name] = float(c @ inverse @ c)
+    return statistics
 
 
-def _min_gain(context: SearchContext, current: FilteredSet, name: str) -> float:
+def _compute_min_gain(context: SearchContext, current: FilteredSet, name: str) -> float:
     """Return the minimum gain of an effect of a set in twice the log-likelihood."""
     filters = context.filters
-    whole = 2.0 * (current.followed.log_likelihood - filters.log_likelihood(filters.reference))
-    return max(filters.penalty(name), LEAST_SHARE * whole)
+    return max(filters.penalty(name), LEAST_SHARE * filters.compute_gain(current.followed))
 
 
-def _pruned(context: SearchContext, current: FilteredSet) -> tuple[FilteredSet, dict[str, float]]:
+def _prune_set(
+    context: SearchContext, current: FilteredSet
+) -> tuple[FilteredSet, dict[str, float]]:
     """Remove the effects that gain too little, the least first, and maximise the likelihood again.
 
     Returns:
         The remaining set, and the gain of each of its effects.
     """
     followed, names, lost = current.followed, list(current.names), 0.0
-    places, bounds = _places(context, names)
-    information = Information(places, compute_information(followed, places, bounds))
-    min_gains = {name: _min_gain(context, current, name) for name in names}
+    bounds = _get_bounds(context, names)
+    information = Information(list(bounds), compute_information(followed, bounds))
+    min_gains = {name: _compute_min_gain(context, current, name) for name in names}
     while True:
-        gains = _wald_statistics(context, followed.theta, names, information)
-        idle = [name for name in names if gains[name] < min_gains[name]]
-        if not idle:
+        gains = _compute_wald_statistics(context, followed.theta, names, information)
+        negligible = [name for name in names if gains[name] < min_gains[name]]
+        if not negligible:
             break
-        weakest = min(idle, key=lambda name: gains[name] - min_gains[name])
+        weakest = min(negligible, key=lambda name: gains[name] - min_gains[name])
         names.remove(weakest)
         lost += gains[weakest]
     if len(names) == len(current.names):
@@ -223,13 +227,24 @@ def _pruned(context: SearchContext, current: FilteredSet) -> tuple[FilteredSet, 
         followed = followed.with_parameters(theta)
     # Effects without influence leave the other coefficients as they are.
     if lost > 2.0 * LEAST_GAIN:
-        return _pruned(context, _maximised(context, followed, names))
+        return _prune_set(context, _fit_set(context, followed, names))
     return FilteredSet(followed, tuple(names)), gains
 
 
-def _with_next(context: SearchContext, current: FilteredSet) -> FilteredSet | None:
-    """Add the effect that gains most by regression, in place of the effects that it contains."""
-    evaluator, columns = context.evaluator, context.filters.base.columns(_probes(context))
+def _add_next_effect(
+    context: SearchContext, current: FilteredSet, columns: Columns
+) -> FilteredSet | None:
+    """Add the effect that gains most by regression, in place of the effects that it contains.
+
+    Args:
+        context: context of the search.
+        current: the set.
+        columns: inputs of the effects that may be added.
+
+    Returns:
+        The larger set; None if no effect gains enough.
+    """
+    evaluator = context.evaluator
     regression, _ = regression_about(current, columns, current.followed)
     gains = regression.net_gains()
     for i, group in enumerate(regression.groups):
@@ -239,18 +254,14 @@ def _with_next(context: SearchContext, current: FilteredSet) -> FilteredSet | No
         return None
     name, (solution,) = best.effect, regression.solve([best])[1]
     c = group_coefficients(evaluator, columns.probes, best, solution)
-    contained = set(evaluator.available_effects[name].contains)
-    theta = current.followed.theta.copy()
-    theta[evaluator.slots[name]] = c
-    for one in contained & set(current.names):
-        theta[evaluator.slots[one]] = 0.0
-    names = [*(one for one in current.names if one not in contained), name]
-    larger = _maximised(context, current.followed.with_parameters(theta), names)
+    present = FitStart(current.names, current.followed.theta, evaluator.guess)
+    start = with_effect(evaluator, present, name, c)
+    larger = _fit_set(context, current.followed.with_parameters(start.theta), start.effects)
     gain = 2.0 * (larger.followed.log_likelihood - current.followed.log_likelihood)
-    return larger if gain > _min_gain(context, larger, name) else None
+    return larger if gain > _compute_min_gain(context, larger, name) else None
 
 
-def _probes(context: SearchContext) -> list[CandidateDirection]:
+def _list_probes(context: SearchContext) -> list[CandidateDirection]:
     """Return probes of the laws that may be added: one place, few coefficients and few shapes."""
     evaluator = context.evaluator
     names = [
@@ -263,15 +274,15 @@ def _probes(context: SearchContext) -> list[CandidateDirection]:
     return context.columns.probes(names)
 
 
-def _simulated(context: SearchContext, current: FilteredSet) -> FittedModel:
+def _simulate_set(context: SearchContext, current: FilteredSet) -> FittedModel:
     """Simulate the runs with the parameters of a filter, from fitted initial states."""
     evaluator, search = context.evaluator, context.search
     theta, states = current.followed.theta, context.filters.first_states(current.followed)
     start = FitStart(current.names, theta, states)
-    (begun,) = TrajectoryFitter(
+    (fitted_states,) = TrajectoryFitter(
         evaluator, search.noise, search.frozen, parameters=False
     ).fit_models([start], STATE_ITERATIONS)
     (fit,) = TrajectoryFitter(evaluator, search.noise, search.frozen).fit_models(
-        [replace(start, states=begun.states)], 0
+        [replace(start, states=fitted_states.states)], 0
     )
     return search.add_fit(fit)

@@ -16,13 +16,13 @@ import numpy as np
 
 from bench.diagnosis.evaluation.coefficient_bounds import (
     clip_coefficients,
-    compute_coefficient_bounds,
+    get_bounds_by_index,
 )
 from bench.diagnosis.fitting.fit_state import FitStart
 from bench.diagnosis.fitting.model_set import FittedModel
 from bench.diagnosis.friction_form_verdict import has_soft_form, soft_kind
 from bench.diagnosis.kalman.candidate_responses import FollowedRuns
-from bench.diagnosis.kalman.likelihood_fit import maximise_likelihood
+from bench.diagnosis.kalman.likelihood_fit import maximise_innovation_likelihood
 from bench.diagnosis.prediction_error.joint_effects import OFFSET_THRESHOLD, joint_name
 from bench.diagnosis.search.scored_models import ScoredModelSet
 from sims.core.simulator import Array
@@ -148,6 +148,10 @@ class ModelFilters:
             self._likelihoods[key] = self.base.with_parameters(theta, simulator).log_likelihood
         return self._likelihoods[key]
 
+    def compute_gain(self, followed: FollowedRuns) -> float:
+        """Return the gain of a filter over the base model in twice the log-likelihood."""
+        return 2.0 * (followed.log_likelihood - self.base.log_likelihood)
+
     def with_effects(
         self, theta: Array, names: Sequence[str], steps: int = GAUSS_NEWTON_STEPS
     ) -> FilteredSet:
@@ -159,9 +163,8 @@ class ModelFilters:
             steps: maximum number of Gauss-Newton steps.
         """
         initial = self._of_tried.get(theta.tobytes()) or self._follow_near(theta, self.base)
-        bounds = [b for name in names for b in compute_coefficient_bounds(self.evaluator, name)]
-        places = [place for name in names for place in self.evaluator.get_coefficient_indices(name)]
-        best = maximise_likelihood(initial, places, bounds, steps, self._follow_near)
+        bounds = get_bounds_by_index(self.evaluator, names)
+        best = maximise_innovation_likelihood(initial, bounds, steps, self._follow_near)
         newest = list(self._of_tried.items())[:MAX_CACHED_FILTERS]
         self._of_tried = {best.theta.tobytes(): best, **dict(newest)}
         return FilteredSet(best, tuple(names))

@@ -112,7 +112,7 @@ def without_surplus(context: SearchContext, selected: Selected) -> Selected:
         selected: the selection.
     """
     filters = context.filters
-    base_log_likelihood = filters.log_likelihood(filters.reference)
+    base_log_likelihood = filters.base.log_likelihood
     best_net_gain, best_count, best_gain = 0.0, 0, 0.0
     best_coefficients: list[Array] = []
     for count in range(1, len(selected.groups) + 1):
