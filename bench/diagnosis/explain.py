@@ -14,7 +14,7 @@ import numpy as np
 
 from bench.benchmark.runner.thread_limit import limit_to_one_thread
 from bench.core.random_streams import make_rng
-from bench.diagnosis.conventions.unit_check import Subject, recognised, wrong_units
+from bench.diagnosis.conventions.unit_check import Subject, find_imitated_unit, find_wrong_units
 from bench.diagnosis.evaluation.noise_floor import (
     INTEGRATION_ERROR_SHARE,
     NoiseFloor,
@@ -34,11 +34,16 @@ from bench.diagnosis.fitting.base_fit import (
     correct_discretisation,
     fit_base_model,
 )
-from bench.diagnosis.fitting.bound_widening import Bounds, fit_wider, outside, use_bounds
+from bench.diagnosis.fitting.bound_widening import (
+    Bounds,
+    describe_unusual_values,
+    fit_wider,
+    use_bounds,
+)
 from bench.diagnosis.fitting.fit_state import FitStart
 from bench.diagnosis.fitting.model_set import MAX_ITERATIONS
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
-from bench.diagnosis.friction_form_verdict import has_dry_friction, is_likelier_soft, soft_kind
+from bench.diagnosis.friction_form_verdict import has_dry_friction, is_likelier_soft, make_soft_kind
 from bench.diagnosis.numerics_cause import (
     CoarseStepFinding,
     Reusable,
@@ -133,7 +138,7 @@ def _explain_run(
         yield run
 
 
-def _added_noise(channels: Sequence[str]) -> str:
+def _format_added_noise(channels: Sequence[str]) -> str:
     """Return the message about channels to which noise was added; empty if there are none."""
     if not channels:
         return ""
@@ -175,12 +180,12 @@ def _without_inactive_drives(recording: Recording, kind: type[Simulator]) -> Rec
     if not kind.has_model:
         return recording
     # This import is needed for robots only.
-    from bench.diagnosis.prediction_error.inactive_drives import without_inactive_drives
+    from bench.diagnosis.prediction_error.inactive_drives import remove_inactive_drives
 
-    return without_inactive_drives(recording, kind)
+    return remove_inactive_drives(recording, kind)
 
 
-class _Worlds(NamedTuple):
+class _RunEvaluators(NamedTuple):
     """Simulator with one time step, and its run evaluators for fitting and validation."""
 
     kind: type[SystemSimulator]
@@ -188,7 +193,7 @@ class _Worlds(NamedTuple):
     validation: Validation | None
 
 
-class _Found(NamedTuple):
+class _SearchResult(NamedTuple):
     """Search result: base model, search, finding and random generator."""
 
     base: BaseFit
@@ -234,7 +239,7 @@ class _ExplainRun:
         )
         self.path = self.recording.path
         if not issubclass(kind, SystemSimulator):
-            raise self._takes_no_effects()
+            raise self._make_no_effects_error()
         # Effects that are part of the simulator already could not be chosen again.
         extend.check_not_extended(kind)
         # A simulator with its own integrator has no choice of engine.
@@ -243,7 +248,7 @@ class _ExplainRun:
         # A free number of a robot is a number of its model file, and so a parameter of its
         # simulator.
         self.free = () if kind.has_model else tuple(options.free)
-        kind = self._with_contacts(kind)
+        kind = self._add_contact_effects(kind)
         # This check precedes the run evaluators, which plan every step of every run.
         for odd in check_recording_plausible(self.recording, kind, force):
             say(f"{self.path}: {odd}")
@@ -255,7 +260,7 @@ class _ExplainRun:
         recorded = self.recording.runs[0].channels
         names = [channel.name for channel in kind.channels if channel.name in recorded]
         self.recording, quiet = add_least_noise(self.recording, names)
-        said = thinned, settled, note, _added_noise(quiet)
+        said = thinned, settled, note, _format_added_noise(quiet)
         self.notes = tuple(text for text in said if text)
         for note in self.notes:
             say(note)
@@ -275,12 +280,12 @@ class _ExplainRun:
         self._filtered: FollowedRuns | None = None
         # Finer steps than the file's, and the run evaluators with the file's step if one is used.
         self.finer: Reusable[StepRefinement] | None = None
-        self.file = _Worlds(self.kind, self.fitting, self.validation)
+        self.file = _RunEvaluators(self.kind, self.fitting, self.validation)
         self.found: tuple[EffectSearch, DiagnosisResult] | None = None
         self.faults: tuple[RecordingFault, ...] = ()
         self._check_recording()
 
-    def _with_contacts(self, kind: type[SystemSimulator]) -> type[SystemSimulator]:
+    def _add_contact_effects(self, kind: type[SystemSimulator]) -> type[SystemSimulator]:
         """Return the simulator of a robot with effects at the contacts of the recording."""
         if not kind.has_model:
             return kind
@@ -352,7 +357,7 @@ class _ExplainRun:
         evaluator.identified = self.identified
         return evaluator
 
-    def _takes_no_effects(self) -> InputError:
+    def _make_no_effects_error(self) -> InputError:
         """Return the error for a simulator to which no effects can be added."""
         return InputError(
             f"{self.path}: simulator {self.recording.system} takes no effects, "
@@ -403,7 +408,7 @@ class _ExplainRun:
         if not np.isfinite(base.fit.simulated[np.isfinite(self.fitting.observed)]).all():
             raise self._make_simulation_error()
         found = self._search_with_friction_forms(base)
-        found = self._with_better_step(found.search, found.finding) or found
+        found = self._search_with_better_step(found.search, found.finding) or found
         base, search, finding, rng = found
         self.watch.stage("measuring the gain")
         verdict = self.assessor.build_verdict(search, finding, rng, self.started)
@@ -413,13 +418,16 @@ class _ExplainRun:
         if self.coarse is not None:
             verdict = add_numerics_cause(verdict, self.coarse)
         self.found = search, finding
-        notes = (*outside(self.fitting, finding.model.fit.theta, self.wider), *self.notes)
+        notes = (
+            *describe_unusual_values(self.fitting, finding.model.fit.theta, self.wider),
+            *self.notes,
+        )
         story = DiagnosisReportDataBuilder(
             self.assessor, search, base, finding, notes
         ).build_report_data(verdict)
         return Explanation(verdict, story, self._build_extended_simulator(search, finding))
 
-    def _search_with_friction_forms(self, base: BaseFit) -> _Found:
+    def _search_with_friction_forms(self, base: BaseFit) -> _SearchResult:
         """Search for causes; repeat with MuJoCo's soft dry friction if the data support that form.
 
         Dry friction of a robot is either a stiff limit (the search's own effects) or MuJoCo's soft
@@ -429,14 +437,14 @@ class _ExplainRun:
         rng = self._make_rng()
         search = self._create_search(base, rng)
         if not self.kind.has_model:
-            return _Found(base, search, self._find_causes(search), rng)
+            return _SearchResult(base, search, self._find_causes(search), rng)
         # This import is needed for robots only.
         from bench.diagnosis.prediction_error.prediction_error_search import PredictionErrorSearch
         from bench.diagnosis.prediction_error.selection_fits import SoftFrictionError
 
-        stiff = _Worlds(self.kind, self.fitting, self.validation)
+        stiff = _RunEvaluators(self.kind, self.fitting, self.validation)
         try:
-            found = _Found(base, search, self._find_causes(search), rng)
+            found = _SearchResult(base, search, self._find_causes(search), rng)
             # A search does not select dry friction that is a free number.
             is_free = has_dry_friction(self.fitting, ())
             done = self.watch.has_abandoned_fits() or bool(self.faults) or not is_free
@@ -444,9 +452,9 @@ class _ExplainRun:
                 search, found.finding.model, INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
             ):
                 return found
-            return self._searched_soft(base, search)
+            return self._search_with_soft_friction(base, search)
         except SoftFrictionError as error:
-            soft = self._searched_soft(base, search, error.start)
+            soft = self._search_with_soft_friction(base, search, error.start)
             if (
                 not error.is_preliminary
                 or self._is_explained(soft)
@@ -460,9 +468,9 @@ class _ExplainRun:
         if isinstance(search, PredictionErrorSearch) and isinstance(again, PredictionErrorSearch):
             again.take_over(search)
         try:
-            return _Found(base, again, self._find_causes(again), rng)
+            return _SearchResult(base, again, self._find_causes(again), rng)
         except SoftFrictionError as error:
-            return self._searched_soft(base, search, error.start)
+            return self._search_with_soft_friction(base, search, error.start)
 
     def _refuse_broken_conventions(self) -> None:
         """Refuse a robot's recording whose conventions differ from those of its model file.
@@ -474,10 +482,10 @@ class _ExplainRun:
             return
         # These imports are needed for robots only.
         from bench.diagnosis.conventions.convention_comparison import ConventionComparison
-        from bench.diagnosis.conventions.corrected_description import lines_of
+        from bench.diagnosis.conventions.corrected_description import list_changed_tables
 
         self.watch.stage("comparing conventions of log and model")
-        if self._has_contacts and self._fails_at_contacts(self._filter()):
+        if self._has_contacts and self._is_linear_model_wrong_at_contacts(self._get_filter()):
             return
         differences = ConventionComparison(self._unit_check_subject).differences()
         if not differences:
@@ -485,7 +493,7 @@ class _ExplainRun:
         remedy = "correct these signals"
         if self.recording.path.with_suffix(".toml").exists():
             _, meta = read_meta(self.recording.path)
-            lines = "; ".join(lines_of(meta, self.kind, differences))
+            lines = "; ".join(list_changed_tables(meta, self.kind, differences))
             remedy = (
                 f"set {lines} in {self._unit_check_subject.file}, "
                 "or write a corrected description: "
@@ -498,13 +506,13 @@ class _ExplainRun:
         )
 
     @staticmethod
-    def _is_explained(found: _Found) -> bool:
+    def _is_explained(found: _SearchResult) -> bool:
         """Return whether a result explains the data down to the noise."""
         return found.finding.verdict in EXPLAINED
 
-    def _searched_soft(
+    def _search_with_soft_friction(
         self, base: BaseFit, before: EffectSearch, likely: FitStart | None = None
-    ) -> _Found:
+    ) -> _SearchResult:
         """Search and judge with MuJoCo's soft dry friction.
 
         Args:
@@ -517,12 +525,12 @@ class _ExplainRun:
 
         self.say(SOFT_FRICTION)
         held_out = self.assessor.before
-        self._set_up(soft_kind(self.kind))
+        self._set_up(make_soft_kind(self.kind))
         self.assessor = replace(self.assessor, before=held_out)
         fitter = TrajectoryFitter(self.fitting, self.noise, base.fixed_parameters)
         start = replace(base.fit.make_start(), states=self.fitting.guess)
         (fit,) = fitter.fit_models([start], FINAL_ITERATIONS)
-        base = self._without_step(replace(base, fit=fit))
+        base = self._correct_step_errors(replace(base, fit=fit))
         rng = self._make_rng()
         search = self._create_search(base, rng)
         if isinstance(search, PredictionErrorSearch) and isinstance(before, PredictionErrorSearch):
@@ -530,11 +538,11 @@ class _ExplainRun:
             # Friction of the file keeps its form unless it is a free number.
             if not has_dry_friction(self.fitting, ()):
                 search.take_over(before)
-        return _Found(base, search, self._find_causes(search), rng)
+        return _SearchResult(base, search, self._find_causes(search), rng)
 
-    def _search_from_settled_base(self, base: BaseFit) -> _Found:
+    def _finish_base_and_search(self, base: BaseFit) -> _SearchResult:
         """Freeze and correct a base model that was fitted with another step, and search again."""
-        return self._search_with_friction_forms(self._settle_base(base))
+        return self._search_with_friction_forms(self._finish_robot_base(base))
 
     def _find_causes(self, search: EffectSearch) -> DiagnosisResult:
         """Return the finding; without causes if the recording has a wrong unit or sign.
@@ -543,7 +551,7 @@ class _ExplainRun:
         """
         base = search.base_model
         if not self.faults:
-            finding = self.assessor.judged(search, self._search_and_decide(search))
+            finding = self.assessor.restrict_verdict(search, self._search_and_decide(search))
             self.faults = self._check_units_imitated_by_causes(
                 search, finding
             ) or self._check_units_of_unexplained(search, finding)
@@ -576,7 +584,7 @@ class _ExplainRun:
         For a robot, units are usually tested only if no effect has explained the gap before.
         """
         explained = finding.verdict in EXPLAINED
-        if not self._asks_units_late or explained or self.watch.has_abandoned_fits():
+        if not self._checks_units_late or explained or self.watch.has_abandoned_fits():
             return ()
         left, before = (
             search.compute_excess(model) for model in (finding.model, search.base_model)
@@ -585,7 +593,7 @@ class _ExplainRun:
         if left < MAX_EXCESS_SHARE_WITH_RIGHT_UNITS * before:
             return ()
         base = BaseFit(search.base_model.fit, frozenset(search.frozen))
-        fault = wrong_units(self._unit_check_subject, self.fitting, self.noise, base)
+        fault = find_wrong_units(self._unit_check_subject, self.fitting, self.noise, base)
         return () if fault is None else (fault,)
 
     def _check_units_imitated_by_causes(
@@ -593,7 +601,7 @@ class _ExplainRun:
     ) -> tuple[RecordingFault, ...]:
         """Return wrong units and signs that the diagnosed causes imitate."""
         found = [
-            recognised(self._unit_check_subject, self.fitting, cause, search.base_model.fit)
+            find_imitated_unit(self._unit_check_subject, self.fitting, cause, search.base_model.fit)
             for cause in self.assessor.causes(search, finding)
         ]
         return tuple(fault for fault in found if fault is not None)
@@ -660,26 +668,34 @@ class _ExplainRun:
         if self.kind.has_model:
             self._filter_runs()
         base = fit_base_model(self.fitting, self.noise, self._get_given_starts())
-        if self._asks_units_late:
+        if self._checks_units_late:
             return self._prepare_robot_base(base)
         if not self.watch.has_abandoned_fits():
-            fault = wrong_units(self._unit_check_subject, self.fitting, self.noise, base)
+            fault = find_wrong_units(self._unit_check_subject, self.fitting, self.noise, base)
             self.faults = (fault,) if fault is not None else ()
         if self.faults:
             return base
-        return self._prepare_robot_base(base) if self.kind.has_model else self._within_range(base)
+        return (
+            self._prepare_robot_base(base)
+            if self.kind.has_model
+            else self._widen_bounds_at_fit(base)
+        )
 
     @property
-    def _asks_units_late(self) -> bool:
+    def _checks_units_late(self) -> bool:
         """Return whether units are checked only after no effect has explained the gap.
 
         This is so for a robot's recording, unless its free numbers could not be identified.
         """
-        lost = self.free_numbers and self.identified is None and self.fitting.followed is not None
+        lost = (
+            self.has_base_parameters
+            and self.identified is None
+            and self.fitting.followed is not None
+        )
         return self.kind.has_model and not lost
 
     @property
-    def free_numbers(self) -> bool:
+    def has_base_parameters(self) -> bool:
         """Return whether the base model has parameters."""
         return bool(self.fitting.base.size)
 
@@ -694,17 +710,17 @@ class _ExplainRun:
 
         self.watch.stage("computing prediction errors")
         evaluator, *held_out = self._list_run_evaluators()
-        followed = self._filter()
+        followed = self._get_filter()
         # Where the linear model diverges, causes are searched by simulation.
-        if not followed.is_sound or self._fails_at_contacts(followed):
+        if not followed.is_sound or self._is_linear_model_wrong_at_contacts(followed):
             if self._has_contacts:
                 # This import is needed for robots only.
-                from bench.diagnosis.kalman.contact_proposals import begin_in_contact
+                from bench.diagnosis.kalman.contact_proposals import set_first_states_in_contact
 
                 theta = evaluator.get_nominal_theta()
-                begin_in_contact(self._list_run_evaluators(), theta, self.noise.sigma)
+                set_first_states_in_contact(self._list_run_evaluators(), theta, self.noise.sigma)
             return
-        if self.free_numbers and self.tuner is None:
+        if self.has_base_parameters and self.tuner is None:
             followed = self._filter_with_fitted_parameters(followed)
         evaluator.follow(followed)
         for evaluator in held_out:
@@ -715,7 +731,7 @@ class _ExplainRun:
             if found.is_sound:
                 evaluator.follow(found)
 
-    def _fails_at_contacts(self, followed: FollowedRuns) -> bool:
+    def _is_linear_model_wrong_at_contacts(self, followed: FollowedRuns) -> bool:
         """Return whether the linear model of a robot fails at the contacts of the recording.
 
         The depth of a contact is smaller than the noise of most encoders, so that a model that is
@@ -731,7 +747,7 @@ class _ExplainRun:
         robot: Any = self.kind
         return bool(robot.robot.contacts)
 
-    def _filter(self) -> FollowedRuns:
+    def _get_filter(self) -> FollowedRuns:
         """Return the runs for fitting of a robot, filtered with the numbers of the model file."""
         # This import is needed for robots only.
         from bench.diagnosis.kalman.candidate_responses import FollowedRuns
@@ -771,11 +787,11 @@ class _ExplainRun:
 
         Free numbers that the data cannot identify are frozen.
         """
-        if self._shows_steps(base):
+        if self._shows_step_errors(base):
             base = self._choose_base_step(base)
-        return self._settle_base(base)
+        return self._finish_robot_base(base)
 
-    def _shows_steps(self, base: BaseFit) -> bool:
+    def _shows_step_errors(self, base: BaseFit) -> bool:
         """Return whether the recording shows the discretisation error of the engine's steps."""
         lost = self.fitting.followed is None or not np.isfinite(base.fit.cost)
         if self.watch.has_abandoned_fits() or lost:
@@ -784,9 +800,11 @@ class _ExplainRun:
         from bench.diagnosis.kalman.candidate_responses import FollowedRuns
         from bench.diagnosis.prediction_error.effect_selection import shows_step_errors
 
-        return shows_step_errors(FollowedRuns.of_model(self.fitting, base.fit.theta, self.noise))
+        return shows_step_errors(
+            FollowedRuns.get_or_follow(self.fitting, base.fit.theta, self.noise)
+        )
 
-    def _without_step(self, base: BaseFit) -> BaseFit:
+    def _correct_step_errors(self, base: BaseFit) -> BaseFit:
         """Return the base model without the discretisation error of the engine's steps.
 
         The error is corrected if the recording shows it, or if no filter could decide.
@@ -799,13 +817,13 @@ class _ExplainRun:
             return base
         return correct_discretisation(self.fitting, self.noise, base)
 
-    def _settle_base(self, base: BaseFit) -> BaseFit:
+    def _finish_robot_base(self, base: BaseFit) -> BaseFit:
         """Widen ranges, freeze unidentified numbers and correct the step error of a base model."""
-        base = self._freeze_unidentified(self._within_range(base))
+        base = self._freeze_unidentified(self._widen_bounds_at_fit(base))
         # The choice of the step precedes this correction, which hides the discretisation error.
-        return self._without_step(base)
+        return self._correct_step_errors(base)
 
-    def _within_range(self, base: BaseFit) -> BaseFit:
+    def _widen_bounds_at_fit(self, base: BaseFit) -> BaseFit:
         """Widen the ranges of base parameters that the fit leaves at a bound."""
         declared = {p.name: p.bounds for p in self.fitting.parameters}
         declared |= {name: bounds for name, (bounds, _) in self.wider.items()}
@@ -844,7 +862,7 @@ class _ExplainRun:
         from bench.diagnosis.evaluation.integrator_check import find_step_refinements
 
         self.finer = Reusable(find_step_refinements(self.fitting, self.noise))
-        file = _Worlds(self.kind, self.fitting, self.validation)
+        file = _RunEvaluators(self.kind, self.fitting, self.validation)
         value, left = self._rate_base(base)
         gap = left - 1.0
         for fine in self.finer:
@@ -868,7 +886,9 @@ class _ExplainRun:
         self._restore_evaluators(file)
         return base
 
-    def _use_finer(self, fine: StepRefinement, gain: float, base: BaseFit, file: _Worlds) -> None:
+    def _use_finer(
+        self, fine: StepRefinement, gain: float, base: BaseFit, file: _RunEvaluators
+    ) -> None:
         """Record that the file's own step is too coarse; the finer step is in use already."""
         numerics = fine.numerics
         self.say(
@@ -879,7 +899,9 @@ class _ExplainRun:
             self.assessor, before=self._predict_with_file_step(base, file.validation)
         )
 
-    def _with_better_step(self, search: EffectSearch, finding: DiagnosisResult) -> _Found | None:
+    def _search_with_better_step(
+        self, search: EffectSearch, finding: DiagnosisResult
+    ) -> _SearchResult | None:
         """Return the result with another step, if that explains the data better; otherwise None.
 
         The other step is compared with the effects of this result or some of them.
@@ -899,7 +921,7 @@ class _ExplainRun:
         if not finding.causes and (self.coarse is not None or finding.verdict == "adequate"):
             return None
         found = finding.model.penalised_log_likelihood, search.compute_excess(finding.model)
-        here = _Worlds(self.kind, self.fitting, self.validation)
+        here = _RunEvaluators(self.kind, self.fitting, self.validation)
         if self.coarse is not None:
             before = self.assessor.before
             self._restore_evaluators(self.file)
@@ -909,7 +931,7 @@ class _ExplainRun:
                 )
                 self.coarse = None
                 base = BaseFit(search.base_model.fit, search.frozen)
-                return self._search_from_settled_base(
+                return self._finish_base_and_search(
                     fit_base_model(self.fitting, self.noise, self._get_nearby_starts(base))
                 )
             self._restore_evaluators(here, before)
@@ -925,7 +947,7 @@ class _ExplainRun:
         base = BaseFit(search.base_model.fit, search.frozen)
         other = fit_base_model(self.fitting, self.noise, self._get_nearby_starts(base))
         self._use_finer(fine, best[0] - found[0], base, here)
-        return self._search_from_settled_base(other)
+        return self._finish_base_and_search(other)
 
     def _rate_best_subset(
         self, search: EffectSearch, finding: DiagnosisResult
@@ -972,7 +994,7 @@ class _ExplainRun:
             return None
         return validation.validate([base.fit])[0].simulated
 
-    def _restore_evaluators(self, evaluators: _Worlds, before: Array | None = None) -> None:
+    def _restore_evaluators(self, evaluators: _RunEvaluators, before: Array | None = None) -> None:
         """Return to run evaluators that were in use before."""
         self.kind, self.fitting, self.validation = evaluators
         self.assessor = replace(self._create_verdict_builder(), before=before)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bench.diagnosis.extended_robot_files import ExtendedRobotFiles, build_robot_files
-from bench.diagnosis.randomization.ranges import RandomizationRanges, randomization_ranges
+from bench.diagnosis.randomization.ranges import RandomizationRanges, list_randomization_ranges
 from bench.diagnosis.report import explanation_figures
 from bench.diagnosis.report.consistency_section import AGREEMENT_COLUMNS, build_consistency_rows
 from bench.diagnosis.report.explanation_page import render_report
@@ -111,9 +111,9 @@ class Explanation:
         contents |= {folder / name: text for name, text in self._robot_files.contents.items()}
         if ranges:
             # This import is needed only if ranges are requested.
-            from bench.diagnosis.randomization.files import range_files
+            from bench.diagnosis.randomization.files import build_range_files
 
-            range_contents = range_files(self.ranges, self.extended, folder)
+            range_contents = build_range_files(self.ranges, self.extended, folder)
             contents |= {folder / name: text for name, text in range_contents.items()}
         for name, figure in figures.items():
             contents[folder / f"{name}.png"] = figure.png
@@ -136,7 +136,7 @@ class Explanation:
         They contain, for each fitted number of a robot's diagnosed causes and for each free number,
         the 95 % interval of the resulting value in the model file.
         """
-        return randomization_ranges(self.answer, self.extended)
+        return list_randomization_ranges(self.answer, self.extended)
 
     @property
     def unsaid(self) -> tuple[str, ...]:

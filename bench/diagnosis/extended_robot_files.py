@@ -42,7 +42,7 @@ def build_robot_files(extended: ExtendedSimulator) -> ExtendedRobotFiles:
 
     # Models with all meshes are compiled several times, which needs the memory of the search.
     release_free_memory()
-    causes, left_out = written_causes(collect_causes(extended))
+    causes, left_out = select_written_causes(collect_causes(extended))
     written_files = write_model_files(kind.robot, causes, extended.title)
     try:
         check_written_files(kind.robot, causes, written_files)
@@ -65,7 +65,7 @@ def build_robot_files(extended: ExtendedSimulator) -> ExtendedRobotFiles:
     )
 
 
-def written_causes(
+def select_written_causes(
     causes: Mapping[str, Mapping[str, FittedValue]],
 ) -> tuple[dict[str, Mapping[str, FittedValue]], tuple[str, ...]]:
     """Select the causes that a model file may contain.

@@ -25,7 +25,7 @@ _HOLDS = ", and smaller forces do not start motion"
 """
 
 
-def soft_kind(kind: type[SystemSimulator]) -> type[SystemSimulator]:
+def make_soft_kind(kind: type[SystemSimulator]) -> type[SystemSimulator]:
     """Return the simulator class of a robot with dry friction in MuJoCo's soft form."""
     robot: Any = kind
     soft_simulator: type[SystemSimulator] = robot.with_friction_form("soft")
@@ -45,7 +45,7 @@ def has_dry_friction(evaluator: RunEvaluator, names: Iterable[str]) -> bool:
     if not robot.has_model:
         return False
     freed_effects: list[type[Effect]] = list(robot.system.freed_effects)
-    plain_names = [plain_friction(evaluator, name) for name in names]
+    plain_names = [get_stateless_friction(evaluator, name) for name in names]
     effects = [*(type(evaluator.available_effects[name]) for name in plain_names), *freed_effects]
     return any(_is_dry_friction(effect) for effect in effects)
 
@@ -56,7 +56,7 @@ def has_soft_form(evaluator: RunEvaluator) -> bool:
     return bool(robot.has_model and robot.robot.friction_form == "soft")
 
 
-def form_of(evaluator: RunEvaluator, name: str) -> str | None:
+def get_friction_form(evaluator: RunEvaluator, name: str) -> str | None:
     """Return ``soft`` for dry friction in MuJoCo's soft form, and None for other effects.
 
     Args:
@@ -67,7 +67,7 @@ def form_of(evaluator: RunEvaluator, name: str) -> str | None:
     return "soft" if is_soft else None
 
 
-def with_solver_parameters(evaluator: RunEvaluator, name: str, description: str) -> str:
+def add_solver_parameters(evaluator: RunEvaluator, name: str, description: str) -> str:
     """Add the soft form to the description of an effect, before the place in brackets at its end.
 
     For example ``..., in MuJoCo's soft form (solreffriction 0.02 1) (at joint elbow)``.
@@ -102,7 +102,7 @@ def is_likelier_soft(models: ModelSet, model: FittedModel, margin: float) -> boo
     """
     if not has_dry_friction(models.evaluator, model.effects) or has_soft_form(models.evaluator):
         return False
-    soft_world = models.evaluator.with_kind(soft_kind(models.evaluator.kind))
+    soft_world = models.evaluator.with_kind(make_soft_kind(models.evaluator.kind))
     try:
         return choose_friction_form(models, model, soft_world, margin) is not None
     finally:
@@ -138,7 +138,7 @@ def _refit_in(evaluator: RunEvaluator, models: ModelSet, model: FittedModel) -> 
 
     Both forms can then be compared by their likelihoods.
     """
-    names, theta = with_plain_friction(models.evaluator, model.effects, model.fit.theta)
+    names, theta = replace_by_stateless_friction(models.evaluator, model.effects, model.fit.theta)
     # The random numbers of these models do not affect the result.
     other_models = ModelSet(
         evaluator, models.noise, models.frozen, make_rng("friction form"), models.stated
@@ -162,7 +162,7 @@ def _is_dry_friction(effect: type[Effect]) -> bool:
     return issubclass(effect, Friction) or any(isinstance(member, Friction) for member in members)
 
 
-def plain_friction(evaluator: RunEvaluator, name: str) -> str:
+def get_stateless_friction(evaluator: RunEvaluator, name: str) -> str:
     """Return the dry friction that an effect with a state contains, or else the effect itself.
 
     Args:
@@ -177,7 +177,7 @@ def plain_friction(evaluator: RunEvaluator, name: str) -> str:
     return friction[0] if friction else name
 
 
-def with_plain_friction(
+def replace_by_stateless_friction(
     evaluator: RunEvaluator, names: Iterable[str], theta: Array
 ) -> tuple[tuple[str, ...], Array]:
     """Replace effects with a state by the dry friction that they contain.
@@ -192,7 +192,7 @@ def with_plain_friction(
     """
     theta, plain_names = theta.copy(), dict[str, None]()
     for name in names:
-        friction = plain_friction(evaluator, name)
+        friction = get_stateless_friction(evaluator, name)
         plain_names[friction] = None
         if friction != name:
             # The first coefficient of both effects is the limit of the friction force.

@@ -317,7 +317,7 @@ def format_identifiability(
         *list(causes.items())[1:],
     ):
         if members:
-            lines.append(f"  {level}: {listed(_count_effects(members), max_count)}")
+            lines.append(f"  {level}: {join_first_names(_count_effects(members), max_count)}")
     if any(len(members) > max_count for members in causes.values()):
         lines.append("  all causes with their intervals: the same command with --json")
     return lines
@@ -332,7 +332,7 @@ def _format_parameter(number: ParameterIdentifiability) -> str:
     )
     if np.isnan(number.half):
         interval_text = "a limit inside the range of the data"
-    confounder_text = listed([f"{name} ({corr:.3f})" for name, corr in number.mixed], 2)
+    confounder_text = join_first_names([f"{name} ({corr:.3f})" for name, corr in number.mixed], 2)
     confounding_note = f"; confounded with {confounder_text}" if confounder_text else ""
     span = f"{number.low:.3g} to {number.high:.3g}"
     return (
@@ -351,7 +351,7 @@ def _count_effects(numbers: Sequence[ParameterIdentifiability]) -> list[str]:
     return [f"{name} ({n} places)" if n > 1 else name for name, n in place_counts.items()]
 
 
-def listed(names: Sequence[str], max_count: int) -> str:
+def join_first_names(names: Sequence[str], max_count: int) -> str:
     """Join the first names, and count the remaining ones.
 
     Args:

@@ -18,7 +18,7 @@ from bench.diagnosis.report.report_data import (
     GapLocation,
     ParameterChange,
 )
-from bench.diagnosis.report.wording import END, in_file
+from bench.diagnosis.report.wording import END, format_file_change
 from bench.diagnosis.search.diagnose import DiagnosisResult
 from bench.diagnosis.search.effect_search import EffectSearch
 from bench.diagnosis.search.verdict_rules import STRUCTURE_P_VALUE_THRESHOLD
@@ -158,7 +158,7 @@ class DiagnosisReportDataBuilder:
         """Assess identifiability from the directions that the search has simulated."""
         key: frozenset[str] = frozenset()
         scan = self.search.cached_scans.get(key) or self.search.superseded_scans.get(key)
-        directions = self.search.directions_known()
+        directions = self.search.get_known_directions()
         if directions is not None:
             return assess_identifiability(self.search.evaluator, self.search.noise, *directions)
         if scan is None:
@@ -231,7 +231,7 @@ class DiagnosisReportDataBuilder:
                 _get_value_and_interval(after[i]),
                 is_free,
                 (before[i].at_bound, after[i].at_bound),
-                in_file(after[i]),
+                format_file_change(after[i]),
             )
 
     def _list_unexplained(self) -> Iterator[str]:

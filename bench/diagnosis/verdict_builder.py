@@ -23,7 +23,7 @@ from bench.diagnosis.experiment_design.discriminating_run import (
     propose_discriminating_run,
 )
 from bench.diagnosis.fitting.model_set import EffectNames, FittedModel
-from bench.diagnosis.friction_form_verdict import form_of, with_solver_parameters
+from bench.diagnosis.friction_form_verdict import add_solver_parameters, get_friction_form
 from bench.diagnosis.search import verdict_rules
 from bench.diagnosis.search.alternative_causes import CauseEvidence
 from bench.diagnosis.search.diagnose import DiagnosisResult
@@ -240,7 +240,7 @@ class VerdictBuilder:
         ranges = {i: evaluator.parameters[i].bounds for i in evaluator.base.tolist()}
         return ranges | get_bounds_by_index(evaluator, model.effects)
 
-    def judged(self, search: EffectSearch, finding: DiagnosisResult) -> DiagnosisResult:
+    def restrict_verdict(self, search: EffectSearch, finding: DiagnosisResult) -> DiagnosisResult:
         """Return the finding with the verdict that its numbers and the fitted models allow.
 
         Args:
@@ -339,10 +339,10 @@ class VerdictBuilder:
             for c, i in zip(coefficients, places, strict=True)
             if c.least is None or c.least != c.most
         }
-        form = form_of(evaluator, evidence.effect)
+        form = get_friction_form(evaluator, evidence.effect)
         description = effect.says
         if form is not None:
-            description = with_solver_parameters(evaluator, evidence.effect, description)
+            description = add_solver_parameters(evaluator, evidence.effect, description)
         if evaluator.kind.has_model and is_gravity_compensated(evidence.effect, by_name):
             description = GRAVITY_COMPENSATED
         return Cause(

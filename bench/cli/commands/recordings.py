@@ -296,9 +296,9 @@ def _remove_inactive_drives(
 
     if not kind.has_model:
         return recording, []
-    from bench.diagnosis.prediction_error.inactive_drives import without_inactive_drives
+    from bench.diagnosis.prediction_error.inactive_drives import remove_inactive_drives
 
-    active = without_inactive_drives(recording, kind)
+    active = remove_inactive_drives(recording, kind)
     findings = []
     for note in active.notes[len(recording.notes) :]:
         text, _, remedy = note.rpartition("; ")
@@ -332,11 +332,11 @@ def _find_differing_conventions(
         )
     if not differences:
         return [], []
-    from bench.diagnosis.conventions.corrected_description import lines_of
+    from bench.diagnosis.conventions.corrected_description import list_changed_tables
     from sims.recording.recording_description import read_meta
 
     _, meta = read_meta(options.recording)
-    return differences, list(lines_of(meta, kind, differences))
+    return differences, list(list_changed_tables(meta, kind, differences))
 
 
 def _print_identifiability(

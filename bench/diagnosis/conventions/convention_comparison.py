@@ -41,16 +41,19 @@ from bench.diagnosis.evaluation.noise_floor import compute_noise_floor
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.fit_state import TrajectoryFit
-from bench.diagnosis.friction_form_verdict import soft_kind
-from bench.diagnosis.identifiability import listed
+from bench.diagnosis.friction_form_verdict import make_soft_kind
+from bench.diagnosis.identifiability import join_first_names
 from bench.diagnosis.kalman.candidate_responses import MAX_LINEARISATIONS, FollowedRuns
 from bench.diagnosis.kalman.joint_forces import compute_joint_forces, has_joint_forces
 from bench.diagnosis.kalman.likelihood_fit import maximise_innovation_likelihood
 from bench.diagnosis.prediction_error.effect_selection import identify
 from bench.diagnosis.prediction_error.joint_effects import MANY_SHAPES
 from bench.diagnosis.prediction_error.library_columns import group_coefficients
-from bench.diagnosis.prediction_error.model_filters import GAUSS_NEWTON_STEPS, soft_friction_models
-from bench.diagnosis.search.candidate_directions import first_probes
+from bench.diagnosis.prediction_error.model_filters import (
+    GAUSS_NEWTON_STEPS,
+    make_soft_friction_models,
+)
+from bench.diagnosis.search.candidate_directions import iterate_first_probes
 from bench.diagnosis.search.explained_variance import DirectionGroup
 from bench.diagnosis.search.lack_of_fit import list_hat_effects
 from sims.recording.recording import Recording, Run
@@ -137,7 +140,7 @@ class ConventionDifference:
         """Description of the difference and of its alternatives."""
         if not self.alternatives:
             return self.hypothesis.description
-        others = listed([one.description for one in self.alternatives], MAX_NAMED)
+        others = join_first_names([one.description for one in self.alternatives], MAX_NAMED)
         return f"{self.hypothesis.description} (or {others})"
 
 
@@ -182,7 +185,7 @@ class ConventionComparison:
         differences: list[ConventionDifference] = []
         for _ in range(MAX_DIFFERENCES):
             suspects = self._list_suspect_joints(self._filter_runs(self._select_parts(corrected)))
-            best = self._best_hypothesis(corrected, suspects) if suspects else None
+            best = self._find_best_hypothesis(corrected, suspects) if suspects else None
             if best is None:
                 break
             differences.append(best)
@@ -191,29 +194,31 @@ class ConventionComparison:
             return []
         hypotheses = [difference.hypothesis for difference in differences]
         parts = self._select_parts(corrected)
-        explained = _log_likelihood(self._filter_runs(parts)) + _log_scales(hypotheses, parts)
-        causes = self._log_likelihood_of_causes(corrected)
+        explained = _get_log_likelihood(self._filter_runs(parts)) + _compute_log_scales(
+            hypotheses, parts
+        )
+        causes = self._compute_log_likelihood_of_causes(corrected)
         if explained < causes + CAUSES_MARGIN:
             return []
         # If the filter diverges on the log as described, causes cannot be compared: only a
         # correction that leaves nothing unexplained is certain.
-        if np.isinf(causes) and self._largest_missing_force(corrected) > MIN_MISSING_FORCE:
+        if np.isinf(causes) and self._compute_largest_missing_force(corrected) > MIN_MISSING_FORCE:
             return []
         if not self._removes_missing_force(described, corrected):
             return []
         before, after = (
-            _log_likelihood(self._filter_runs(difference))
-            for difference in _equally_long(described, corrected)
+            _get_log_likelihood(self._filter_runs(difference))
+            for difference in _cut_to_common_samples(described, corrected)
         )
-        after += _log_scales(hypotheses, corrected)
+        after += _compute_log_scales(hypotheses, corrected)
         return differences if after > before + LOG_LIKELIHOOD_MARGIN else []
 
     def _removes_missing_force(self, described: Recording, corrected: Recording) -> bool:
         """Return whether the corrections leave only a small part of the largest missing force."""
-        before, after = map(self._largest_missing_force, (described, corrected))
+        before, after = map(self._compute_largest_missing_force, (described, corrected))
         return after <= MAX_REMAINING_FORCE * before
 
-    def _largest_missing_force(self, recording: Recording) -> float:
+    def _compute_largest_missing_force(self, recording: Recording) -> float:
         """Return the largest missing force of a joint, as a share of its typical force.
 
         It is infinite if the filter diverges.
@@ -240,7 +245,7 @@ class ConventionComparison:
         share_of = dict(zip(coordinates, shares.tolist(), strict=True))
         return [j for j in self._generator.joints if share_of[f"q.{j.name}"] > limit]
 
-    def _best_hypothesis(
+    def _find_best_hypothesis(
         self, recording: Recording, suspects: Sequence[JointSignals]
     ) -> ConventionDifference | None:
         """Return the convention with which the model predicts the recording clearly best.
@@ -257,7 +262,7 @@ class ConventionComparison:
         ]
         worst_run = int(np.argmin(by_run))
         min_log_likelihood = by_run[worst_run] + MIN_WORST_RUN_SHARE * LOG_LIKELIHOOD_MARGIN
-        force_error = self._force_error(described, recording, worst_run)
+        force_error = self._compute_log_force_error(described, recording, worst_run)
         scored: dict[str, tuple[float, ConventionHypothesis]] = {}
         evaluated: list[object] = []
         for hypothesis in self._generator.generate(recording, suspects):
@@ -265,7 +270,7 @@ class ConventionComparison:
             if key in evaluated:
                 continue
             evaluated.append(key)
-            growth = self._force_error(hypothesis, recording, worst_run) - force_error
+            growth = self._compute_log_force_error(hypothesis, recording, worst_run) - force_error
             if growth > MAX_FORCE_ERROR_GROWTH:
                 continue
             if (
@@ -293,7 +298,7 @@ class ConventionComparison:
         gain = best - limit + LOG_LIKELIHOOD_MARGIN
         return ConventionDifference(first, gain, tuple(others[: MAX_NAMED - 1]))
 
-    def _force_error(
+    def _compute_log_force_error(
         self, hypothesis: ConventionHypothesis, recording: Recording, run: int
     ) -> float:
         """Return the logarithm of the joint forces that the drives lack on the short part of a run.
@@ -343,7 +348,7 @@ class ConventionComparison:
         step = FIRST_OFFSET_STEP
         while step > OFFSET_ACCURACY:
             for signed in (step, -step):
-                moved = hypothesis.with_offset_step(signed)
+                moved = hypothesis.add_offset_step(signed)
                 moved_score = self._compute_log_likelihood(moved, recording)
                 if moved_score > score + MIN_REFINEMENT_GAIN:
                     score, hypothesis = moved_score, moved
@@ -366,7 +371,7 @@ class ConventionComparison:
         self.evaluations += 1
         parts = self._select_parts(hypothesis.applied(recording), run)
         followed = self._filter_runs(parts, max_linearisations=1)
-        return _log_likelihood(followed) + _log_scales([hypothesis], parts)
+        return _get_log_likelihood(followed) + _compute_log_scales([hypothesis], parts)
 
     def _filter_runs(
         self, recording: Recording, max_linearisations: int = MAX_LINEARISATIONS
@@ -376,14 +381,14 @@ class ConventionComparison:
         followed = FollowedRuns.follow(
             evaluator,
             evaluator.get_nominal_theta(),
-            _white_noise(evaluator, recording),
+            _estimate_white_noise(evaluator, recording),
             None,
             max_linearisations=max_linearisations,
         )
         evaluator.close()
         return followed
 
-    def _log_likelihood_of_causes(self, corrected: Recording) -> float:
+    def _compute_log_likelihood_of_causes(self, corrected: Recording) -> float:
         """Return the penalised log-likelihood of the log as described with the best set of causes.
 
         Each effect has a penalty of half the logarithm of the number of samples for each
@@ -400,7 +405,7 @@ class ConventionComparison:
             subject.kind, parts, parts.training(), subject.engine, list_hat_effects(subject.kind)
         )
         followed = FollowedRuns.follow(
-            evaluator, evaluator.get_nominal_theta(), _white_noise(evaluator, parts), None
+            evaluator, evaluator.get_nominal_theta(), _estimate_white_noise(evaluator, parts), None
         )
         if not followed.is_sound:
             evaluator.close()
@@ -408,7 +413,7 @@ class ConventionComparison:
         left_out = MANY_SHAPES | CONVENTION_EFFECTS
         names = [name for name in evaluator.library if name.partition("@")[0] not in left_out]
         base = _make_unfitted_start(evaluator)
-        probes = [probe for name in names for probe in first_probes(evaluator, base, name)]
+        probes = [probe for name in names for probe in iterate_first_probes(evaluator, base, name)]
         selected = identify(followed, followed.columns(probes))
         samples = int(followed.runs.recorded.sum())
         best, penalty = followed.log_likelihood, 0.0
@@ -420,11 +425,11 @@ class ConventionComparison:
                 theta[evaluator.slots[one.effect]] = group_coefficients(
                     evaluator, probes, one, numbers
                 )
-            fitted = _with_best_coefficients(followed.with_parameters(theta), groups)
+            fitted = _fit_coefficients(followed.with_parameters(theta), groups)
             best = max(best, fitted.log_likelihood - penalty)
-        best = max(best, _log_likelihood_of_soft_friction(followed))
+        best = max(best, _compute_log_likelihood_of_soft_friction(followed))
         evaluator.close()
-        if self._largest_missing_force(corrected) < LARGE_MISSING_FORCE:
+        if self._compute_largest_missing_force(corrected) < LARGE_MISSING_FORCE:
             return best
         return max(best, selected.log_likelihood - penalty)
 
@@ -451,10 +456,10 @@ class ConventionComparison:
         coordinates = self.subject.kind.system.coordinates
         if not all(coordinate in runs[0].channels for coordinate in coordinates):
             return [slice(0, min(run.times.size, PART_SAMPLES)) for run in runs]
-        return [_liveliest_part(run) for run in runs]
+        return [_select_liveliest_part(run) for run in runs]
 
 
-def _equally_long(one: Recording, other: Recording) -> tuple[Recording, Recording]:
+def _cut_to_common_samples(one: Recording, other: Recording) -> tuple[Recording, Recording]:
     """Cut the runs of two versions of a recording to the samples that both have."""
     pairs = list(zip(one.runs, other.runs, strict=True))
     counts = [min(a.times.size, b.times.size) for a, b in pairs]
@@ -466,13 +471,13 @@ def _equally_long(one: Recording, other: Recording) -> tuple[Recording, Recordin
     return cut(one), cut(other)
 
 
-def _log_likelihood(followed: FollowedRuns) -> float:
+def _get_log_likelihood(followed: FollowedRuns) -> float:
     """Return the log-likelihood of the innovations; minus infinity if the filter diverges."""
     likelihood = followed.log_likelihood
     return likelihood if np.isfinite(likelihood) and followed.is_sound else -np.inf
 
 
-def _log_scales(hypotheses: Sequence[ConventionHypothesis], recording: Recording) -> float:
+def _compute_log_scales(hypotheses: Sequence[ConventionHypothesis], recording: Recording) -> float:
     """Return the last term of (1) for the training runs of a recording."""
     result = 0.0
     for name, change in (item for one in hypotheses for item in one.changes.items()):
@@ -482,7 +487,7 @@ def _log_scales(hypotheses: Sequence[ConventionHypothesis], recording: Recording
     return result
 
 
-def _white_noise(evaluator: RunEvaluator, recording: Recording) -> NoiseModel:
+def _estimate_white_noise(evaluator: RunEvaluator, recording: Recording) -> NoiseModel:
     """Return the noise floor of the channels as noise without autocorrelation."""
     sigma = compute_noise_floor(evaluator, recording).sigma
     return NoiseModel(sigma, np.zeros(len(sigma)))
@@ -496,9 +501,7 @@ def _make_unfitted_start(evaluator: RunEvaluator) -> TrajectoryFit:
     )
 
 
-def _with_best_coefficients(
-    followed: FollowedRuns, groups: Sequence[DirectionGroup]
-) -> FollowedRuns:
+def _fit_coefficients(followed: FollowedRuns, groups: Sequence[DirectionGroup]) -> FollowedRuns:
     """Fit the coefficients of effects by maximum likelihood of a Kalman filter (Gauss-Newton).
 
     `groups` names the effects; their present coefficients are those of the filter.
@@ -512,7 +515,7 @@ def _with_best_coefficients(
     )
 
 
-def _log_likelihood_of_soft_friction(followed: FollowedRuns) -> float:
+def _compute_log_likelihood_of_soft_friction(followed: FollowedRuns) -> float:
     """Return the largest log-likelihood with dry friction in MuJoCo's soft form.
 
     The friction acts at the joint with the largest missing force, and is not part of the
@@ -520,17 +523,17 @@ def _log_likelihood_of_soft_friction(followed: FollowedRuns) -> float:
     """
     evaluator = followed.evaluator
     joint = followed.joints_by_loss[0]
-    thetas = soft_friction_models(followed, evaluator.get_nominal_theta(), joint)
+    thetas = make_soft_friction_models(followed, evaluator.get_nominal_theta(), joint)
     if not thetas:
         return -np.inf
-    simulator = evaluator.simulator_of(soft_kind(evaluator.kind))
+    simulator = evaluator.make_simulator(make_soft_kind(evaluator.kind))
     assert isinstance(simulator, RobotSimulator)
     likelihoods = [followed.with_parameters(theta, simulator).log_likelihood for theta in thetas]
     simulator.close()
     return max(likelihoods)
 
 
-def _liveliest_part(run: Run) -> slice:
+def _select_liveliest_part(run: Run) -> slice:
     """Return the part of a run, of `PART_SAMPLES` samples, in which its channels move most.
 
     Hypotheses are compared on such parts, because whole runs would take too long.

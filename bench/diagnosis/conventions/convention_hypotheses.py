@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from bench.diagnosis.conventions.unit_check import UNITS, UNITS_IN_WORDS, Signal, Subject
-from bench.diagnosis.identifiability import listed
+from bench.diagnosis.identifiability import join_first_names
 from bench.logs.importing.joint_order import least_order
 from sims.core.simulator import Array
 from sims.recording.angle_unwrapping import unwrapped
@@ -101,9 +101,9 @@ class ConventionHypothesis:
         for name, change in self.changes.items():
             if change.source in recording.noise:
                 noise[name] = abs(change.scale) * recording.noise[change.source]
-        return replace(recording, noise=noise, runs=tuple(map(self._applied_to, recording.runs)))
+        return replace(recording, noise=noise, runs=tuple(map(self._apply_to_run, recording.runs)))
 
-    def _applied_to(self, run: Run) -> Run:
+    def _apply_to_run(self, run: Run) -> Run:
         """Return one run with its signals converted to the conventions of the model.
 
         `run.before` has, by signal name, the stacked pair of time stamps and values recorded before
@@ -133,7 +133,7 @@ class ConventionHypothesis:
         )
         return _advance_inputs(result, self.late) if self.late else result
 
-    def with_offset_step(self, step: float) -> ConventionHypothesis:
+    def add_offset_step(self, step: float) -> ConventionHypothesis:
         """Return the hypothesis with a step in rad added to its offsets."""
         changes = {
             name: replace(change, offset=change.offset + step)
@@ -184,7 +184,7 @@ class JointSignals:
     is_hinge: bool
 
 
-def recorded_joints(subject: Subject) -> list[JointSignals]:
+def list_recorded_joints(subject: Subject) -> list[JointSignals]:
     """Collect for each joint of a robot its recorded channels, inputs and position range.
 
     The order is that of the coordinates of the robot.
@@ -219,7 +219,7 @@ class HypothesisGenerator:
 
     def __init__(self, subject: Subject) -> None:
         channels = list(subject.recording.runs[0].channels)
-        self.joints = [joint for joint in recorded_joints(subject) if joint.channels]
+        self.joints = [joint for joint in list_recorded_joints(subject) if joint.channels]
         self._signals = {signal.name: signal for signal in subject.signals(channels)}
 
     def generate(
@@ -241,11 +241,11 @@ class HypothesisGenerator:
         yield from _generate_wraps(suspects, recording)
         yield from _generate_orders(self.joints, recording, suspects)
         if 2 * len(suspects) >= len(self.joints):
-            yield from self._units_of_log(recording)
+            yield from self._generate_common_units(recording)
             yield from self._generate_normalised()
-        yield from _late_commands(recording)
+        yield from _generate_late_commands(recording)
 
-    def _units_of_log(self, recording: Recording) -> Iterator[ConventionHypothesis]:
+    def _generate_common_units(self, recording: Recording) -> Iterator[ConventionHypothesis]:
         """Yield hypotheses that all positions, commands, velocities or torques have another unit.
 
         They are tried together only if the description states the same unit for all of them.
@@ -295,7 +295,7 @@ def _generate_signs(joint: JointSignals) -> Iterator[ConventionHypothesis]:
         groups += [[joint.channels[q]] for q in ("qd", "tau") if q in joint.channels]
     for names in groups:
         if names:
-            text = f"the sign of {listed(names, MAX_NAMED)} looks reversed"
+            text = f"the sign of {join_first_names(names, MAX_NAMED)} looks reversed"
             yield ConventionHypothesis(text, {name: SignalChange(name, -1.0) for name in names})
     if positions and joint.inputs:
         names = [*joint.channels.values(), *joint.inputs]
@@ -337,7 +337,7 @@ def _generate_wraps(
         name = joint.channels.get("q")
         if name is None or not joint.is_hinge:
             continue
-        jumps = [_largest_jump(run.channels[name]) for run in recording.training()]
+        jumps = [_compute_largest_jump(run.channels[name]) for run in recording.training()]
         if max(jumps) > WRAP_JUMP:
             command = joint.servo_inputs[0] if joint.servo_inputs else ""
             text = f"position {name} looks wrapped: whole turns are left out"
@@ -346,7 +346,7 @@ def _generate_wraps(
             )
 
 
-def _largest_jump(values: Array) -> float:
+def _compute_largest_jump(values: Array) -> float:
     """Return the largest difference of successive samples; missing samples are skipped."""
     return float(np.abs(np.diff(values[np.isfinite(values)])).max(initial=0.0))
 
@@ -371,12 +371,12 @@ def _generate_orders(
         {i: len(joints) - 1 - i for i in numbers},
     ]
     if has_commands and "q" in quantities:
-        orders.append(_order_of_commands(joints, recording))
+        orders.append(_find_order_of_commands(joints, recording))
     for order in orders:
         moved = {a: b for a, b in order.items() if a != b}
         if not moved:
             continue
-        names = listed([joints[a].name for a in sorted(moved)], MAX_NAMED)
+        names = join_first_names([joints[a].name for a in sorted(moved)], MAX_NAMED)
         channels = {
             joints[a].channels[q]: SignalChange(joints[b].channels[q])
             for a, b in moved.items()
@@ -395,7 +395,7 @@ def _generate_orders(
             yield ConventionHypothesis(text, {**channels, **commands})
 
 
-def _order_of_commands(joints: Sequence[JointSignals], recording: Recording) -> dict[int, int]:
+def _find_order_of_commands(joints: Sequence[JointSignals], recording: Recording) -> dict[int, int]:
     """Return the order of positions that follows the commands best, by linear assignment."""
     count = len(joints)
     costs = np.zeros((count, count))
@@ -415,7 +415,7 @@ def _generate_units(
     """
     first = signals[0]
     names = [signal.name for signal in signals]
-    text = listed(names, MAX_NAMED)
+    text = join_first_names(names, MAX_NAMED)
     for unit, gain in UNITS.get(first.si, {}).items():
         scale = first.scale * gain / first.gain
         if not math.isclose(scale, 1.0, rel_tol=1e-6):
@@ -448,7 +448,7 @@ def _are_whole(signals: Sequence[Signal], recording: Recording) -> bool:
     return True
 
 
-def _late_commands(recording: Recording) -> Iterator[ConventionHypothesis]:
+def _generate_late_commands(recording: Recording) -> Iterator[ConventionHypothesis]:
     """Yield delays of command time stamps: the robot responds before them."""
     run = recording.runs[0]
     if not run.inputs or run.times.size < 2:

@@ -54,10 +54,10 @@ def find_copied_commands(
         measured = np.isfinite(y)
         u, y = u[measured], y[measured]
         if len(np.unique(y)) >= MIN_SAMPLES and np.array_equal(u, y):
-            yield command, channel, _likely_column(recording, channel)
+            yield command, channel, _find_likely_column(recording, channel)
 
 
-def _likely_column(recording: Recording, channel: str) -> str:
+def _find_likely_column(recording: Recording, channel: str) -> str:
     """Find the column of the log that is the likely command of a recorded position.
 
     It is the column with the highest correlation that the description does not use. Return

@@ -23,7 +23,7 @@ SHOWN = ("column", "unit", "scale", "offset", "unwrap")
 """Keys of a signal that a correction changes, in the order in which they are shown."""
 
 
-def corrected(
+def correct_description(
     meta: Mapping[str, Any], declared: DeclaredSignals, differences: Sequence[ConventionDifference]
 ) -> dict[str, Any]:
     """Return the content of a description with conventions corrected one after another.
@@ -100,7 +100,7 @@ def _round_value(value: float) -> float:
     return float(f"{value:.9g}")
 
 
-def lines_of(
+def list_changed_tables(
     meta: Mapping[str, Any], declared: DeclaredSignals, differences: Sequence[ConventionDifference]
 ) -> Iterator[str]:
     """Yield the tables of the signals that a correction changes, one line each.
@@ -110,7 +110,10 @@ def lines_of(
         declared: Simulator of the robot, with the units of its signals.
         differences: Differences to correct.
     """
-    after, before = corrected(meta, declared, differences), corrected(meta, declared, ())
+    after, before = (
+        correct_description(meta, declared, differences),
+        correct_description(meta, declared, ()),
+    )
     for kind in KINDS:
         names = [
             name for one in differences for name in one.hypothesis.changes if name in after[kind]
@@ -171,7 +174,7 @@ def write_corrected(
             f'it, or write its column into [inputs."{unknown[0]}"] by hand'
         )
     description, meta = read_meta(recording)
-    content = corrected(meta, declared, differences)
+    content = correct_description(meta, declared, differences)
     if "model" in content:
         model = (description.parent / content["model"]).resolve()
         content["model"] = os.path.relpath(model, path.parent.resolve())

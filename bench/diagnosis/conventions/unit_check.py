@@ -29,9 +29,14 @@ from bench.diagnosis.evaluation.coefficient_bounds import bound_of
 from bench.diagnosis.evaluation.noise_floor import compute_noise_floor
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.diagnosis.fitting.base_fit import FIT_HORIZONS, BaseFit, fit_base_model, misfit_of_starts
+from bench.diagnosis.fitting.base_fit import (
+    FIT_HORIZONS,
+    BaseFit,
+    compute_lowest_start_cost,
+    fit_base_model,
+)
 from bench.diagnosis.fitting.fit_state import TrajectoryFit
-from bench.diagnosis.identifiability import listed
+from bench.diagnosis.identifiability import join_first_names
 from bench.diagnosis.verdict import Cause, RecordingFault
 from sims.core.simulator import Array, InputError
 from sims.core.toml_validation import toml_key
@@ -219,7 +224,7 @@ class Hypothesis:
         which the recorded values have to be multiplied; it is shown for a wrong unit.
         """
         first, unit = self.signals[0], self.units[0]
-        names = listed([signal.said for signal in self.signals], _NAMED)
+        names = join_first_names([signal.said for signal in self.signals], _NAMED)
         table = f"[{first.kind}.{first.name}]" if len(self.signals) == 1 else "the tables of each"
         scale = f"set scale = {self._get_corrected_scale(first):.9g} in {table} of {file}"
         if unit == first.stated and self.scale == -1.0:
@@ -274,7 +279,7 @@ class Subject:
                 )
         return tuple(signals)
 
-    def rescaled(self, factors: Mapping[str, float]) -> Recording:
+    def rescale(self, factors: Mapping[str, float]) -> Recording:
         """Return the recording with signals multiplied by factors."""
         recording = self.recording
         noise = {n: abs(factors.get(n, 1.0)) * s for n, s in recording.noise.items()}
@@ -288,7 +293,7 @@ class Subject:
         )
 
 
-def wrong_units(
+def find_wrong_units(
     subject: Subject, evaluator: RunEvaluator, noise: NoiseModel, base: BaseFit
 ) -> RecordingFault | None:
     """Find the wrong unit or sign that explains nearly all of the misfit of the base model.
@@ -310,7 +315,7 @@ def wrong_units(
     before = _compute_residual_rms(residual, is_recorded, noise)
     known = before if np.isfinite(before) else None
     signals = subject.signals(evaluator.channels)
-    hypotheses = list(_generate_hypotheses(signals, _suspected_parts(evaluator, shares)))
+    hypotheses = list(_generate_hypotheses(signals, _list_suspected_parts(evaluator, shares)))
     excess = REMAINING * (before - 1.0)
     accepted: list[tuple[Hypothesis, float]] = []
     others: list[str] = []
@@ -323,7 +328,9 @@ def wrong_units(
             accepted.append((hypothesis, after))
         elif distinction == "absorbed":
             accepted.append((hypothesis, after))
-            others += [_BEYOND.format(name) for name in _parameters_at_bounds(evaluator, base.fit)]
+            others += [
+                _BEYOND.format(name) for name in _list_parameters_at_bounds(evaluator, base.fit)
+            ]
     if not accepted:
         return None
     # Among hypotheses that fit equally well, the simplest is preferred.
@@ -339,7 +346,7 @@ def wrong_units(
     return replace(best.fault(subject.file, known, after), alternatives=alternatives)
 
 
-def recognised(
+def find_imitated_unit(
     subject: Subject, evaluator: RunEvaluator, cause: Cause, base: TrajectoryFit
 ) -> RecordingFault | None:
     """Find the wrong unit or sign that a fitted gain of a sensor or an input imitates.
@@ -374,11 +381,11 @@ def recognised(
         return None
     # A sensor gain multiplies the true value, an input gain the commanded value.
     factor = 1.0 / gain if kind == "channels" else gain
-    for hypothesis in _hypotheses_of_one_unit((signal,)):
+    for hypothesis in _generate_unit_hypotheses((signal,)):
         wanted = hypothesis.factors()[signal.name]
         if wanted * factor > 0 and abs(math.log(wanted / factor)) < CLOSE:
             alternatives = tuple(
-                _BEYOND.format(name) for name in _parameters_at_bounds(evaluator, base)
+                _BEYOND.format(name) for name in _list_parameters_at_bounds(evaluator, base)
             )
             return replace(hypothesis.fault(subject.file, None, None), alternatives=alternatives)
     if kind == "channels" and abs(gain) <= IGNORED:
@@ -388,7 +395,7 @@ def recognised(
             f"sign of {signal.said} in {subject.file}"
         )
         alternatives = tuple(
-            _BEYOND.format(name) for name in _parameters_at_bounds(evaluator, base)
+            _BEYOND.format(name) for name in _list_parameters_at_bounds(evaluator, base)
         )
         return RecordingFault((signal.name,), factor, None, message, (), None, None, alternatives)
     return None
@@ -416,7 +423,7 @@ def _rescale_run(run: Run, factors: Mapping[str, float]) -> Run:
     return replace(run, channels=scaled(run.channels), inputs=scaled(run.inputs), before=before)
 
 
-def _parameters_at_bounds(evaluator: RunEvaluator, fit: TrajectoryFit) -> list[str]:
+def _list_parameters_at_bounds(evaluator: RunEvaluator, fit: TrajectoryFit) -> list[str]:
     """List the names of parameters whose value in the base fit is at a bound of their range."""
     names = []
     for index in fit.free.tolist():
@@ -451,7 +458,7 @@ def _compute_residual_rms(residual: Array, is_recorded: Any, noise: NoiseModel) 
     return rms if np.isfinite(rms) else np.inf
 
 
-def _suspected_parts(evaluator: RunEvaluator, shares: Array) -> frozenset[str] | None:
+def _list_suspected_parts(evaluator: RunEvaluator, shares: Array) -> frozenset[str] | None:
     """Return the joints and actuators of a robot to check; None for other systems: check all."""
     if not evaluator.kind.has_model:
         return None
@@ -472,13 +479,13 @@ def _generate_hypotheses(
     """
     for signal in signals:
         if suspects is None or signal.name.partition(".")[2] in suspects:
-            yield from _hypotheses_of_one_unit((signal,))
+            yield from _generate_unit_hypotheses((signal,))
     by_unit: dict[tuple[str, str, str], list[Signal]] = {}
     for signal in signals:
         by_unit.setdefault((signal.kind, signal.si, signal.stated), []).append(signal)
     for alike in by_unit.values():
         if len(alike) > 1:
-            yield from _hypotheses_of_one_unit(tuple(alike))
+            yield from _generate_unit_hypotheses(tuple(alike))
     for units in _TOGETHER:
         either = [s for s in signals if s.si in units]
         for wanted in (units, {si: si for si in units}):
@@ -489,10 +496,10 @@ def _generate_hypotheses(
             si = either[0].si
             stated = tuple(s.stated for s in either)
             yield Hypothesis(tuple(either), stated, 1.0 / UNITS[si][units[si]])
-    yield from _reversed_joints(signals, suspects)
+    yield from _generate_reversed_joints(signals, suspects)
 
 
-def _hypotheses_of_one_unit(signals: tuple[Signal, ...]) -> Iterator[Hypothesis]:
+def _generate_unit_hypotheses(signals: tuple[Signal, ...]) -> Iterator[Hypothesis]:
     """Yield hypotheses that signals of one unit have another unit, a reversed sign, or both.
 
     Factors that undo a conversion that was made twice are tried as well.
@@ -515,7 +522,7 @@ def _hypotheses_of_one_unit(signals: tuple[Signal, ...]) -> Iterator[Hypothesis]
             yield Hypothesis(signals, stated_units, -factor)
 
 
-def _reversed_joints(
+def _generate_reversed_joints(
     signals: Sequence[Signal], suspects: frozenset[str] | None
 ) -> Iterator[Hypothesis]:
     """Yield hypotheses of joints with reversed direction: all their channels change sign."""
@@ -544,7 +551,7 @@ def _select_promising(subject: Subject, hypotheses: Sequence[Hypothesis]) -> lis
         scores = []
         for one in those:
             evaluator, noise = _build_rescaled_evaluator(subject, one.factors())
-            scores.append(misfit_of_starts(evaluator, noise, share))
+            scores.append(compute_lowest_start_cost(evaluator, noise, share))
             evaluator.close()
         return [those[i] for i in np.argsort(scores, kind="stable").tolist()]
 
@@ -565,7 +572,7 @@ def _build_rescaled_evaluator(
         The run evaluator, which the caller closes, and the noise with the standard deviation sigma
         (C,) of each channel and no autocorrelation.
     """
-    recording = subject.rescaled(factors)
+    recording = subject.rescale(factors)
     evaluator = subject.evaluator(recording)
     sigma = compute_noise_floor(evaluator, recording).sigma
     return evaluator, NoiseModel(sigma, np.zeros(len(sigma)))

@@ -137,14 +137,16 @@ def compute_detection_limits(
     # The residual of the model is taken as the noise, whatever the recording specifies.
     noise = NoiseModel(np.maximum(likelihood.sigma, 1e-300), likelihood.phi)
     directions = _add_small_gaps(evaluator, fit, compute_directions(evaluator, fit, names))
-    information = _Shown(
+    information = _DetectionLimitCalculator(
         evaluator,
         noise,
         get_central_jacobian(models, fit),
         directions,
         models.compute_residual(fit),
     )
-    return information.shown(_compute_prediction_half_widths(assess_consistency(models, model)))
+    return information.compute_limits(
+        _compute_prediction_half_widths(assess_consistency(models, model))
+    )
 
 
 def _compute_prediction_half_widths(
@@ -219,7 +221,7 @@ def _linearise_extended(
     ]
 
 
-class _Shown:
+class _DetectionLimitCalculator:
     """Information in the runs about the coefficients of absent effects, at a fitted model."""
 
     def __init__(
@@ -263,7 +265,7 @@ class _Shown:
         pull = self.left[self.q : -1, -1] - along @ self.left[: self.q, -1]
         self.leaning = pull / np.maximum(self.powers, 1e-300)  # (2)
 
-    def shown(self, prediction_half_widths: Mapping[str, float]) -> DetectionLimits:
+    def compute_limits(self, prediction_half_widths: Mapping[str, float]) -> DetectionLimits:
         """Compute the detection limit of each coefficient, at the shape that is detected best."""
         shapes: dict[tuple[str, int], list[int]] = {}
         for k in np.argsort(-self.powers, kind="stable").tolist():

@@ -138,7 +138,7 @@ def draw_sheet(content: SheetContent) -> Figure:
     top = _draw_number_table(figure, content, top)
     diagram = content.diagram
     if diagram is None:
-        text = "\n".join(textwrap.wrap(content.without_drive(), _LETTERS))
+        text = "\n".join(textwrap.wrap(content.explain_missing_diagram(), _LETTERS))
         figure.text(_MARGIN, top - 0.01, text, va="top", linespacing=1.4)
         # Without a diagram there is space for a table with a larger font.
         _draw_effects_not_shown(figure, content, size=_SMALL_SIZE + 1.4, table_top=top - 0.09)

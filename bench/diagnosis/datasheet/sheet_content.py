@@ -88,7 +88,7 @@ class SheetContent:
         """Diagram of where the joint moves, holds and slips; None without a drive."""
         return self.rest if self.is_driven else None
 
-    def without_drive(self) -> str:
+    def explain_missing_diagram(self) -> str:
         """Return why there is no diagram, and what is known of the joint at rest instead."""
         reason = "the log has no input"
         if self.subject.joint:

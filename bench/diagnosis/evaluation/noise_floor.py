@@ -72,7 +72,7 @@ def compute_noise_floor(evaluator: RunEvaluator, recording: Recording) -> NoiseF
         sigma = recording.noise[channel.name] if is_specified else estimate.sigma
 
         # No simulation is accurate enough for a noise floor of zero.
-        min_sigma = max(INTEGRATION_ERROR_SHARE * range_of(values), MIN_SIGMA)
+        min_sigma = max(INTEGRATION_ERROR_SHARE * compute_value_range(values), MIN_SIGMA)
         # There may be too few samples; a channel that never changes does not show its noise.
         if not np.isfinite(sigma) or (not is_specified and is_constant(values)):
             sigma = DEFAULT_FLOOR_SHARE * channel.scale
@@ -97,6 +97,6 @@ def is_constant(values: Array) -> bool:
     return bool(values.size) and not np.ptp(values)
 
 
-def range_of(values: Array) -> float:
+def compute_value_range(values: Array) -> float:
     """Return the range of values (n,) without outliers; 0 if there are no values."""
     return float(np.ptp(np.quantile(values, RANGE_QUANTILES))) if values.size else 0.0

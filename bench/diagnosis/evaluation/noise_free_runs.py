@@ -13,7 +13,11 @@ from dataclasses import replace
 import numpy as np
 
 from bench.core.random_streams import make_rng
-from bench.diagnosis.evaluation.noise_floor import INTEGRATION_ERROR_SHARE, MIN_SIGMA, range_of
+from bench.diagnosis.evaluation.noise_floor import (
+    INTEGRATION_ERROR_SHARE,
+    MIN_SIGMA,
+    compute_value_range,
+)
 from bench.logs.quality.noise_estimation import differences_sigma
 from sims.core.simulator import Array
 from sims.recording.recording import Recording, Run
@@ -56,7 +60,7 @@ def _compute_added_noise(recording: Recording, name: str) -> float:
     """Return the standard deviation of the noise to add; 0 for noisy or constant channels."""
     signals = [(run.times, run.channels[name]) for run in recording.runs if name in run.channels]
     values = np.concatenate([y[np.isfinite(y)] for _, y in signals])
-    min_sigma = INTEGRATION_ERROR_SHARE * range_of(values)
+    min_sigma = INTEGRATION_ERROR_SHARE * compute_value_range(values)
     if min_sigma < MIN_SIGMA:
         return 0.0
     # The estimate is not finite if all runs are too short for the differences.

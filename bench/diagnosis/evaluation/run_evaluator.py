@@ -14,7 +14,7 @@ from bench.diagnosis.evaluation.noise_model import Mask
 from bench.diagnosis.evaluation.run_data import RunData, prepare_run, take_first_samples
 from bench.diagnosis.evaluation.search_control import SearchControl
 from bench.diagnosis.evaluation.simulation_cache import LaneCache
-from bench.diagnosis.evaluation.time_scale import on_time_scale
+from bench.diagnosis.evaluation.time_scale import adapt_to_time_scale
 from bench.diagnosis.evaluation.worker_pool import ForkedWorkerPool
 from sims import effects as library
 from sims.core.effect import Effect, Input, Sensor, members_of
@@ -174,7 +174,7 @@ class RunEvaluator:
         self.known: Mask = np.array([t.known_state_mask for t in self.tracks])
         self.guess: Array = np.array([t.initial_state_guess for t in self.tracks])
         self.longest = self._get_longest_duration()
-        self.parameters = self._on_time_scale()
+        self.parameters = self._scale_coefficient_ranges()
         self.clock = self._get_time_span()
         self._travels: dict[str, float] = {}
         self.derivatives: Array | None = None
@@ -309,11 +309,11 @@ class RunEvaluator:
         # The type must be given, because an empty list would become an array of floats.
         return np.array(shifting_indices, dtype=np.intp), np.array(filtering, dtype=np.intp)
 
-    def _on_time_scale(self) -> tuple[Parameter, ...]:
+    def _scale_coefficient_ranges(self) -> tuple[Parameter, ...]:
         """Return the parameters with coefficient ranges for the time scale of the runs."""
         first, spacing = self.base.size, self.sample_interval
         coefficients = self.parameters[first:]
-        scaled = [on_time_scale(p, self.longest, spacing) for p in coefficients]
+        scaled = [adapt_to_time_scale(p, self.longest, spacing) for p in coefficients]
         return (*self.parameters[:first], *scaled)
 
     @property
@@ -476,7 +476,7 @@ class RunEvaluator:
         self.crew.register(evaluator)
         return evaluator
 
-    def simulator_of(self, kind: type[SystemSimulator]) -> SystemSimulator:
+    def make_simulator(self, kind: type[SystemSimulator]) -> SystemSimulator:
         """Return another simulator of the same system with the same effects and channels."""
         effects: list[str | type[Effect]] = [*self.library, *self.extra]
         return kind(self.recording.constants, self.channels, effects=effects)
@@ -514,7 +514,7 @@ class RunEvaluator:
         # Elements of one run share its scenario object, so the simulator prepares it only once.
         scenarios = [self._parts[share][run] for run in runs]
         return [
-            self._freed_in(scenario, element_theta)
+            self._set_freed_constants(scenario, element_theta)
             for scenario, element_theta in zip(scenarios, theta, strict=True)
         ]
 
@@ -564,7 +564,7 @@ class RunEvaluator:
             simulator = self._fine if kind >= 2 else self.simulator
             lanes = np.flatnonzero(kinds == kind)
             for part in np.array_split(lanes, -(-lanes.size // max_batch_size)):
-                part_scenarios = [self._freed_in(scenarios[i], theta[i]) for i in part]
+                part_scenarios = [self._set_freed_constants(scenarios[i], theta[i]) for i in part]
                 initial = dict(zip(self.states, states[part].T, strict=True))
                 observations = simulator.simulate_batch(
                     np.delete(theta[part], freed_indices, 1), part_scenarios, initial
@@ -572,7 +572,7 @@ class RunEvaluator:
                 result[part, : observations.shape[1]] = observations
         return result
 
-    def _freed_in(self, scenario: Scenario, theta: Array) -> Scenario:
+    def _set_freed_constants(self, scenario: Scenario, theta: Array) -> Scenario:
         """Return a scenario with the freed constants set from parameters (P,)."""
         if not self.freed:
             return scenario
@@ -617,11 +617,11 @@ class RunEvaluator:
                 `bench.diagnosis.kalman.candidate_responses.FollowedRuns`.
         """
         self.followed = filtered_runs
-        initial_states = filtered_runs.first_states()
+        initial_states = filtered_runs.get_first_states()
         is_finite = np.isfinite(initial_states).all()
         self.guess = np.where(self.known | ~is_finite, self.guess, initial_states)
-        self.derivatives = filtered_runs.state_sensitivities()
-        self.state_prior = filtered_runs.state_prior()
+        self.derivatives = filtered_runs.compute_state_sensitivities()
+        self.state_prior = filtered_runs.get_state_prior()
 
     def begin_at(self, states: Array, deviations: Array) -> None:
         """Use estimated initial states.

@@ -140,13 +140,13 @@ def _correct_bias(weights: Array, projected_pilots: Array, observed_mask: Mask) 
     covariances = _estimate_autocovariances(
         projected_pilots.reshape(-1, shape[1]), np.tile(observed_mask, (count, 1)), order
     )
-    estimated_weights, _ = _yule_walker(covariances, order)
+    estimated_weights, _ = _solve_yule_walker(covariances, order)
     # If no autoregression of this order is found, the bias is unknown.
     if estimated_weights.size != order:
         return weights
     for share in BIAS_CORRECTION_SHARES:
         corrected = weights + share * (weights - estimated_weights)
-        if _max_root(corrected) <= MAX_ROOT:
+        if _compute_max_root(corrected) <= MAX_ROOT:
             return corrected
     return weights
 
@@ -214,7 +214,7 @@ def _select_order_by_aic(covariances: Array, count: int) -> Array:
     best = np.inf
     weights = np.zeros(0)
     for order in range(len(covariances)):
-        order_weights, variance = _yule_walker(covariances, order)
+        order_weights, variance = _solve_yule_walker(covariances, order)
         criterion = count * np.log(max(variance, MIN_VARIANCE)) + 2.0 * order
         if criterion < best - MIN_AIC_GAIN:
             best = criterion
@@ -239,7 +239,7 @@ def _compute_innovations(filled: Array, observed_mask: Mask, weights: Array) -> 
     return innovations
 
 
-def _yule_walker(covariances: Array, order: int) -> tuple[Array, float]:
+def _solve_yule_walker(covariances: Array, order: int) -> tuple[Array, float]:
     """Solve the Yule-Walker equations for weights (p,) and the variance of the innovations.
 
     With autocovariances γ (Box & Jenkins, chapter 3):
@@ -260,12 +260,12 @@ def _yule_walker(covariances: Array, order: int) -> tuple[Array, float]:
     matrix = covariances[lags] + YULE_WALKER_RIDGE * power * np.eye(order)
     weights = np.linalg.solve(matrix, lagged_covariances)
     variance = float(power - weights @ lagged_covariances)
-    if variance <= 0 or _max_root(weights) > MAX_ROOT:
+    if variance <= 0 or _compute_max_root(weights) > MAX_ROOT:
         return np.zeros(0), np.inf
     return weights, variance
 
 
-def _max_root(weights: Array) -> float:
+def _compute_max_root(weights: Array) -> float:
     """Return the largest modulus of the roots; the impulse response is a sum of their powers."""
     roots = np.roots(np.concatenate([[1.0], -weights]))
     return float(np.abs(roots).max(initial=0.0))

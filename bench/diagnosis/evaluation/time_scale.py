@@ -22,7 +22,7 @@ DECADES = 100.0
 """Ratio of the highest to the lowest plausible frequency if the sampling limits the highest one."""
 
 
-def on_time_scale(parameter: Parameter, longest: float, spacing: float) -> Parameter:
+def adapt_to_time_scale(parameter: Parameter, longest: float, spacing: float) -> Parameter:
     """Return the coefficient with a plausible range for the time scale of a recording.
 
     Args:

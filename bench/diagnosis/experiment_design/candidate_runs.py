@@ -13,7 +13,7 @@ import numpy as np
 
 from bench.core.input_signals import evaluate_signal
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.diagnosis.experiment_design.model_file_limits import UNLIMITED, stated_limits
+from bench.diagnosis.experiment_design.model_file_limits import UNLIMITED, read_model_file_limits
 from sims.core.simulator import Array, Scenario
 
 COMMAND_SIZE_FACTORS = (1.0, 2.0, 0.4)
@@ -97,7 +97,7 @@ class RigModel:
             self.largest[name] = max(float(np.abs(values - middle).max()) for values in signals)
             self.rest[name] = middle
         self.driven = tuple(name for name in self.old.inputs if self.largest[name] > 0)
-        self.limits = stated_limits(evaluator)
+        self.limits = read_model_file_limits(evaluator)
         self.begin = self._get_initial_state()
 
     def _get_initial_state(self) -> Array:

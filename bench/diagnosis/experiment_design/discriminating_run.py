@@ -25,7 +25,7 @@ from bench.diagnosis.experiment_design.model_file_limits import (
     UNLIMITED,
     Interval,
     StatedLimits,
-    stated_limits,
+    read_model_file_limits,
 )
 from bench.diagnosis.fitting.model_set import FittedModel, ModelSet
 from sims.core.simulator import Array, Scenario
@@ -189,7 +189,7 @@ def _explain_no_run(
 
 def _iterate_changed_runs(evaluator: RunEvaluator) -> Iterator[_Run]:
     """Yield runs like the first one with one changed duration, initial state or input."""
-    limits = stated_limits(evaluator)
+    limits = read_model_file_limits(evaluator)
     first = _get_first_run(evaluator, limits)
     # If several runs discriminate equally well, the first one is proposed.
     yield _lengthen_run(first)

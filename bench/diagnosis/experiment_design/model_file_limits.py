@@ -49,7 +49,7 @@ class StatedLimits:
         return {**self.states, **self.forces}
 
 
-def stated_limits(evaluator: RunEvaluator) -> StatedLimits:
+def read_model_file_limits(evaluator: RunEvaluator) -> StatedLimits:
     """Read the limits of commands, positions, velocities and forces from a robot's model file.
 
     A system without a model file has none.

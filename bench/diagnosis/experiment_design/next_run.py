@@ -130,7 +130,7 @@ def design_next_run(
         evaluated_plans.update(new_plans)
         ranked_runs = [*ranked_runs, *ranker.rank_runs([rig.make_run(plan) for plan in new_plans])]
     ranked_runs = _evaluate_fully(ranker, ranked_runs)
-    if ranked_runs and _would_longer_run_help(ranked_runs[0], max_seconds / seconds):
+    if ranked_runs and _may_longer_run_help(ranked_runs[0], max_seconds / seconds):
         longer_rig = RigModel(models.evaluator, max_seconds)
         longer_runs = ranker.rank_runs(
             [longer_rig.make_run(entry.run.plan) for entry in ranked_runs[:PLANS_TESTED_FOR_LENGTH]]
@@ -145,7 +145,7 @@ def design_next_run(
     )
 
 
-def _would_longer_run_help(best: RunValue, times: float) -> bool:
+def _may_longer_run_help(best: RunValue, times: float) -> bool:
     """Return whether a longer run may distinguish models that the best run does not."""
     discrimination = np.minimum(best.values, best.values.T)
     undistinguished = discrimination[

@@ -18,7 +18,7 @@ import numpy as np
 
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.experiment_design.candidate_runs import CandidateRun
-from bench.diagnosis.experiment_design.model_file_limits import Interval, stated_limits
+from bench.diagnosis.experiment_design.model_file_limits import Interval, read_model_file_limits
 from bench.diagnosis.fitting.model_set import FittedModel
 from bench.logs.quality.pose_check import find_contacts
 from sims.core.simulator import Array, Scenario
@@ -148,7 +148,7 @@ class RigLimits:
             return {
                 name: _widen_range(*recorded_ranges[name], scales[name]) for name in recorded_ranges
             }
-        stated_channels = stated_limits(self.evaluator).channels
+        stated_channels = read_model_file_limits(self.evaluator).channels
         bounds = {}
         for name, (low, high) in recorded_ranges.items():
             if name in stated_channels:

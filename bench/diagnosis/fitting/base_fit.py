@@ -95,7 +95,7 @@ def fit_base_model(
     # Simulating a start costs far less than fitting it, so the starts are reduced first.
     evaluator.watch.report(f"base fit from {len(starts)} starts")
     if len(starts) > FITTED_STARTS:
-        order = np.argsort(costs_of_starts(evaluator, noise, starts), kind="stable")
+        order = np.argsort(compute_start_costs(evaluator, noise, starts), kind="stable")
         starts = [starts[i] for i in order[:FITTED_STARTS]]
 
     fits: list[TrajectoryFit] = []
@@ -185,7 +185,7 @@ def _interpolate_bounds(parameter: Parameter, share: float) -> float:
     return float(low + (high - low) * share)
 
 
-def misfit_of_starts(evaluator: RunEvaluator, noise: NoiseModel, share: float) -> float:
+def compute_lowest_start_cost(evaluator: RunEvaluator, noise: NoiseModel, share: float) -> float:
     """Return the lowest cost of the starts of a base fit, before any fit.
 
     Args:
@@ -197,10 +197,10 @@ def misfit_of_starts(evaluator: RunEvaluator, noise: NoiseModel, share: float) -
         The sum of squares; infinite if no start can be simulated.
     """
     starts = [FitStart((), theta, evaluator.guess) for theta in _list_starts(evaluator, None)]
-    return float(costs_of_starts(evaluator, noise, starts, share, np.inf).min())
+    return float(compute_start_costs(evaluator, noise, starts, share, np.inf).min())
 
 
-def costs_of_starts(
+def compute_start_costs(
     evaluator: RunEvaluator,
     noise: NoiseModel,
     starts: Sequence[FitStart],

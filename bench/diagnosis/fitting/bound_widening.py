@@ -28,7 +28,7 @@ ROUNDS = 5
 """Maximum number of rounds: the range is then a thousand times as wide."""
 
 
-def at_bounds(evaluator: RunEvaluator, base: BaseFit) -> list[int]:
+def list_parameters_at_bounds(evaluator: RunEvaluator, base: BaseFit) -> list[int]:
     """Return the indices in theta of fitted base parameters whose range should be widened.
 
     They are at a bound of their range, and physics allows values beyond this bound.
@@ -39,7 +39,7 @@ def at_bounds(evaluator: RunEvaluator, base: BaseFit) -> list[int]:
             continue
         low, high = evaluator.parameters[i].bounds
         end = bound_of(float(base.fit.theta[i]), low, high)
-        lower, upper = widened(evaluator.parameters[i], limits_of(evaluator, i))
+        lower, upper = widen_range(evaluator.parameters[i], get_physical_limits(evaluator, i))
         if (end == "low" and lower < low) or (end == "high" and upper > high):
             places.append(i)
     return places
@@ -60,12 +60,12 @@ def fit_wider(
     """
     new_bounds: dict[str, Bounds] = {}
     for _ in range(ROUNDS):
-        places = at_bounds(evaluator, base)
+        places = list_parameters_at_bounds(evaluator, base)
         if not places or evaluator.watch.has_abandoned_fits():
             break
         for i in places:
             parameter = evaluator.parameters[i]
-            new_bounds[parameter.name] = widened(parameter, limits_of(evaluator, i))
+            new_bounds[parameter.name] = widen_range(parameter, get_physical_limits(evaluator, i))
         use_bounds(evaluator, new_bounds)
         fit = TrajectoryFitter(evaluator, noise, base.fixed_parameters).fit_models(
             [base.fit.make_start()], FINAL_ITERATIONS
@@ -74,7 +74,7 @@ def fit_wider(
     return base, new_bounds
 
 
-def range_around(evaluator: RunEvaluator, place: int, value: float | None = None) -> Bounds:
+def compute_range_around(evaluator: RunEvaluator, place: int, value: float | None = None) -> Bounds:
     """Return the range of a base parameter, widened until it contains a value.
 
     It is widened at most `ROUNDS` times.
@@ -85,12 +85,12 @@ def range_around(evaluator: RunEvaluator, place: int, value: float | None = None
         value: value that the range must contain; None for the widest range.
     """
     parameter = evaluator.parameters[place]
-    limits = limits_of(evaluator, place)
+    limits = get_physical_limits(evaluator, place)
     for _ in range(ROUNDS):
         low, high = parameter.bounds
         if value is not None and low <= value <= high:
             break
-        parameter = replace(parameter, bounds=widened(parameter, limits), training=None)
+        parameter = replace(parameter, bounds=widen_range(parameter, limits), training=None)
     return parameter.bounds
 
 
@@ -111,7 +111,7 @@ def use_bounds(evaluator: RunEvaluator, new_bounds: Mapping[str, Bounds]) -> Non
     evaluator.crew.forget(evaluator)
 
 
-def limits_of(evaluator: RunEvaluator, place: int) -> Bounds:
+def get_physical_limits(evaluator: RunEvaluator, place: int) -> Bounds:
     """Return the physical limits of a base parameter; for a robot, those of its total value.
 
     Args:
@@ -152,7 +152,7 @@ def _get_physical_limits(parameter: Parameter) -> Bounds:
     return 0.0 if low >= 0.0 else -np.inf, 1.0 if share else np.inf
 
 
-def widened(parameter: Parameter, limits: Bounds) -> Bounds:
+def widen_range(parameter: Parameter, limits: Bounds) -> Bounds:
     """Return the next wider range of a parameter.
 
     Args:
@@ -167,7 +167,7 @@ def widened(parameter: Parameter, limits: Bounds) -> Bounds:
     return max(lower, min(limits[0], low)), min(upper, max(limits[1], high))
 
 
-def outside(
+def describe_unusual_values(
     evaluator: RunEvaluator, theta: Array, wider: Mapping[str, tuple[Bounds, Bounds]]
 ) -> list[str]:
     """Return a sentence for each fitted parameter that lies outside its declared range.

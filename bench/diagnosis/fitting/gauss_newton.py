@@ -76,7 +76,7 @@ class _ArrowheadEquations:
     gradient: Array
     pull: Array
 
-    def solved(self, blocked_mask: Mask) -> tuple[Array, Array]:
+    def solve(self, blocked_mask: Mask) -> tuple[Array, Array]:
         """Solve the normal equations by the Schur complement, eqs. (4) and (5).
 
         Args:
@@ -178,7 +178,7 @@ def compute_gauss_newton_step(
     equations = _apply_damping(
         _assemble_normal_equations(j, r, q, drift, prior), damping, known_mask
     )
-    parameter_step, state_steps = equations.solved(blocked_mask)
+    parameter_step, state_steps = equations.solve(blocked_mask)
     return GaussNewtonStep(
         parameter_step,
         state_steps,

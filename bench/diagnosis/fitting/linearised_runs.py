@@ -93,11 +93,13 @@ def compute_state_jacobian(
         is_recomputed: whether to recompute the derivatives about this model and store them.
     """
     if evaluator.derivatives is None or is_recomputed:
-        evaluator.derivatives = begun_about(evaluator, theta, states)
+        evaluator.derivatives = compute_initial_state_derivatives(evaluator, theta, states)
     return evaluator.derivatives
 
 
-def begun_about(evaluator: RunEvaluator, theta: Array, states: Array) -> Array:
+def compute_initial_state_derivatives(
+    evaluator: RunEvaluator, theta: Array, states: Array
+) -> Array:
     """Compute the derivatives (R, T, C, s) of the runs by their initial states about one model.
 
     Args:

@@ -176,7 +176,7 @@ class ModelSet:
         """
         return start
 
-    def force_of_any_shape(self, model: FittedModel) -> tuple[float, str] | None:  # noqa: ARG002
+    def score_unmodelled_force(self, model: FittedModel) -> tuple[float, str] | None:  # noqa: ARG002
         """Return the p-value of the best additional force and the signal that the force depends on.
 
         Here always None: the test for unmodelled forces uses simulations.

@@ -193,7 +193,7 @@ class TrajectoryFitter:
         if not evaluator.is_cheap_to_split:
             return [list(unfinished)]
         runs, length, _ = evaluator.observed.shape
-        state_count = self._moved_states().size
+        state_count = self._list_displaced_states().size
         lanes = sum(1 + problems[i].free.size + state_count for i in unfinished) * runs
         cost = lanes * length * self.share + ALGEBRA_COST_SAMPLES * len(unfinished)
         # Compiled batch elements are stepped in parallel, however long they are.
@@ -243,7 +243,9 @@ class TrajectoryFitter:
             if not trials or self.evaluator.watch.should_abandon_fit(iteration / racing_round.all):
                 break
             make_points = (
-                self._plain_points if self.evaluator.has_linearisation else self._simulate_points
+                self._simulate_without_derivatives
+                if self.evaluator.has_linearisation
+                else self._simulate_points
             )
             for (problem, _), point in zip(trials, make_points(trials, sample_mask), strict=True):
                 self._judge_trial(problem, point)
@@ -260,7 +262,9 @@ class TrajectoryFitter:
             for problem, point in zip(unknown_problems, points, strict=True):
                 self._move_to_point(problem, point)
         if known_problems:
-            points = self._plain_points([(p, p.point.start) for p in known_problems], sample_mask)
+            points = self._simulate_without_derivatives(
+                [(p, p.point.start) for p in known_problems], sample_mask
+            )
             for problem, point in zip(known_problems, points, strict=True):
                 assert point.start.known is not None
                 state_jacobian = self._compute_initial_state_derivatives(
@@ -305,10 +309,14 @@ class TrajectoryFitter:
             problem.renewals += 1
             if problem.needs_own_states:
                 # Imported here, because only robots need it.
-                from bench.diagnosis.fitting.linearised_runs import begun_about
+                from bench.diagnosis.fitting.linearised_runs import (
+                    compute_initial_state_derivatives,
+                )
 
                 start = problem.point.start
-                problem.by_states = begun_about(self.evaluator, start.theta, start.states)
+                problem.by_states = compute_initial_state_derivatives(
+                    self.evaluator, start.theta, start.states
+                )
         points = self._simulate_points([(p, p.point.start) for p in stale_problems], sample_mask)
         for problem, point in zip(stale_problems, points, strict=True):
             self._move_to_point(problem, point)
@@ -356,7 +364,7 @@ class TrajectoryFitter:
         unknown.
         """
         runs, size = self.evaluator.guess.shape
-        state_indices = self._moved_states()
+        state_indices = self._list_displaced_states()
         steps = [problem.compute_inward_steps(start.theta) for problem, start in trials]
         displaced_inputs = [
             build_displaced_inputs(start, problem.free, step, state_indices)
@@ -385,7 +393,9 @@ class TrajectoryFitter:
             points.append(FitPoint(start, part[0], jacobian, cost))
         return points
 
-    def _plain_points(self, trials: Sequence[_TrialStep], sample_mask: Mask) -> list[FitPoint]:
+    def _simulate_without_derivatives(
+        self, trials: Sequence[_TrialStep], sample_mask: Mask
+    ) -> list[FitPoint]:
         """Simulate trial points, and give each the derivatives of its fit's present point.
 
         `_judge_trial` updates these derivatives if the point is accepted.
@@ -407,7 +417,7 @@ class TrajectoryFitter:
             for (problem, start), part in zip(trials, simulated, strict=True)
         ]
 
-    def _moved_states(self) -> Indices:
+    def _list_displaced_states(self) -> Indices:
         """Return the indices (n,) of initial states that finite differences displace.
 
         There are none if the derivatives come from a linearisation.

@@ -31,11 +31,11 @@ from bench.diagnosis.kalman.filter_and_smoother import (
     Mask,
     Places,
     Smoothed,
+    add_noise_states,
     filter_runs,
     fit_process_noise,
-    with_coloured_noise,
 )
-from bench.diagnosis.kalman.measured_states import measured_states
+from bench.diagnosis.kalman.measured_states import estimate_measured_states
 from bench.diagnosis.search.candidate_directions import CandidateDirection
 from sims.core.effect import Effect
 from sims.core.simulator import Array
@@ -180,7 +180,7 @@ class FollowedRuns:
                 for run, neighbour in enumerate(neighbours)
             ]
             initial_force = FIRST_FORCE * typical if force is None else force
-            followed = cls._of_linear(evaluator, theta, noise, linear, initial_force, typical)
+            followed = cls._filter_linear(evaluator, theta, noise, linear, initial_force, typical)
             force, noise, trajectories = followed.force, followed.noise, followed.trajectories
             gain = np.inf if best is None else followed.log_likelihood - best.log_likelihood
             # The first linearisation is about the readings alone, which are not a possible motion.
@@ -216,10 +216,10 @@ class FollowedRuns:
             )
         ]
         given = self.noise, linear, self.force, self.typical
-        return self._of_linear(self.evaluator, theta, *given)
+        return self._filter_linear(self.evaluator, theta, *given)
 
     @classmethod
-    def _of_linear(
+    def _filter_linear(
         cls,
         evaluator: RunEvaluator,
         theta: Array,
@@ -243,7 +243,9 @@ class FollowedRuns:
         return cls(evaluator, theta, linear=linear, runs=runs, typical=typical, **fitted._asdict())
 
     @classmethod
-    def of_model(cls, evaluator: RunEvaluator, theta: Array, noise: NoiseModel) -> FollowedRuns:
+    def get_or_follow(
+        cls, evaluator: RunEvaluator, theta: Array, noise: NoiseModel
+    ) -> FollowedRuns:
         """Return the filter stored in the evaluator if it has these parameters, else a new one.
 
         The new filter is stored in the evaluator.
@@ -268,7 +270,7 @@ class FollowedRuns:
         followed = evaluator.followed = cls.follow(evaluator, theta, noise, motion)
         return followed
 
-    def refitted(self, runs: LinearRuns) -> FollowedRuns:
+    def refit_noise(self, runs: LinearRuns) -> FollowedRuns:
         """Return the filter of changed linear models with refitted noise.
 
         Process noise and the correlation of the sensor noise are fitted again.
@@ -277,7 +279,7 @@ class FollowedRuns:
             self, runs=runs, **_fit_noise(runs, self.noise, self.force, self.typical)._asdict()
         )
 
-    def whitened_innovations(self, theta: Array) -> Array:
+    def compute_whitened_innovations(self, theta: Array) -> Array:
         """Return the whitened innovations (R, T, C) of a model with similar parameters.
 
         The model is linearised about the same motion and filtered with the same process noise.
@@ -289,7 +291,7 @@ class FollowedRuns:
             for run, neighbour in enumerate(self.linear)
         ]
         runs = LinearRuns.stacked(maps, self.evaluator.observed, self.runs.prior)
-        coloured, white = with_coloured_noise(runs, self.noise)
+        coloured, white = add_noise_states(runs, self.noise)
         return filter_runs(coloured, self.force, white).whitened
 
     @property
@@ -303,7 +305,7 @@ class FollowedRuns:
 
         A large loss shows that the model lacks a force at this coordinate.
         """
-        coloured, white = with_coloured_noise(self.runs, self.noise)
+        coloured, white = add_noise_states(self.runs, self.noise)
         log_likelihood = self.log_likelihood
         losses = []
         for j in range(self.force.size):
@@ -390,7 +392,9 @@ class FollowedRuns:
         """Return the whitened response (R, T, C) to the errors of the integrator's steps."""
         step_errors = self.runs.step_errors[..., None].astype(np.float32)
         no_readings = np.zeros((*self.runs.residuals.shape, 1), dtype=np.float32)
-        response: Array = self._through_filter(step_errors, no_readings)[..., 0].astype(np.float64)
+        response: Array = self._propagate_through_filter(step_errors, no_readings)[..., 0].astype(
+            np.float64
+        )
         return response
 
     def responses(self, columns: Columns) -> SingleArray:
@@ -403,7 +407,7 @@ class FollowedRuns:
             Whitened responses (R, T, C, K), in units of the probes' coefficients.
         """
         inputs = self.runs.inputs.astype(np.float32)
-        whitened = self._through_filter(columns.pushed, columns.readings, inputs)
+        whitened = self._propagate_through_filter(columns.pushed, columns.readings, inputs)
         sizes: SingleArray = columns.sizes.astype(np.float32)
         with np.errstate(all="ignore"):
             result: SingleArray = whitened[..., columns.places] / sizes
@@ -411,7 +415,7 @@ class FollowedRuns:
         result[~(np.abs(result) < LARGEST)] = 0.0
         return result
 
-    def state_sensitivities(self) -> Array:
+    def compute_state_sensitivities(self) -> Array:
         """Return the derivatives (R, T, C, 2 D) of the readings by the first states of D joints.
 
         The first states are positions and velocities; readings are not fed back.
@@ -423,7 +427,7 @@ class FollowedRuns:
         initial_changes = np.zeros((len(self.linear), self.runs.prior.size, joint_states.size))
         initial_changes[:, joint_states, np.arange(joint_states.size)] = 1.0
         result = np.zeros((*self.runs.residuals.shape, len(self.evaluator.states)))
-        result[..., : joint_states.size] = self._without_gain(initial_changes)
+        result[..., : joint_states.size] = self._propagate_without_gain(initial_changes)
         return result
 
     def sensitivities(self, columns: Columns) -> Array:
@@ -432,11 +436,13 @@ class FollowedRuns:
         They follow from (1) without gain, in units of the probes' coefficients.
         """
         number, _, _, count = columns.readings.shape
-        changes = self._without_gain(np.zeros((number, self.runs.prior.size, count)), columns)
+        changes = self._propagate_without_gain(
+            np.zeros((number, self.runs.prior.size, count)), columns
+        )
         with np.errstate(all="ignore"):
             return changes[..., columns.places] / columns.sizes
 
-    def _without_gain(self, s: Array, columns: Columns | None = None) -> Array:
+    def _propagate_without_gain(self, s: Array, columns: Columns | None = None) -> Array:
         """Propagate first states and optional columns by (1) without gain.
 
         Args:
@@ -468,7 +474,7 @@ class FollowedRuns:
             size = float(np.square(self.filtered.whitened).sum()) / max(self.runs.recorded.sum(), 1)
         return bool(size < UNSOUND)
 
-    def state_prior(self) -> Array | None:
+    def get_state_prior(self) -> Array | None:
         """Return the prior standard deviations (2 D,) of the first positions and velocities.
 
         The result is None if further states are fitted. With a stiff servo, the first velocity
@@ -482,7 +488,7 @@ class FollowedRuns:
         velocities = prior[self.linear[0].positions + np.arange(joints)] / VELOCITY_PRIOR
         return np.concatenate([prior[:joints], velocities])
 
-    def first_positions(self) -> Array:
+    def get_first_positions(self) -> Array:
         """Return the smoothed positions of the joints at the first samples (R, D)."""
         positions = []
         for run, linear in enumerate(self.linear):
@@ -490,7 +496,7 @@ class FollowedRuns:
             positions.append(x + self.smoothed.states[run, 0, : x.size])
         return np.array(positions)
 
-    def first_states(self) -> Array:
+    def get_first_states(self) -> Array:
         """Return positions and velocities of the joints at the first samples (R, 2 D).
 
         For recorded joints they are estimated from the readings alone, because a stiff servo hides
@@ -500,12 +506,14 @@ class FollowedRuns:
         for run, trajectory in enumerate(self.trajectories):
             first_step = int(self.linear[run].knots[0])
             x, v = trajectory.x[first_step].copy(), trajectory.v[first_step].copy()
-            for joint, states in measured_states(self.evaluator, self.noise.sigma, run).items():
+            for joint, states in estimate_measured_states(
+                self.evaluator, self.noise.sigma, run
+            ).items():
                 x[joint], v[joint] = states[0, :2]
             first_states.append(np.concatenate([x, v]))
         return np.array(first_states)
 
-    def _through_filter(
+    def _propagate_through_filter(
         self, pushed: SingleArray, readings: SingleArray, inputs: SingleArray | None = None
     ) -> SingleArray:
         """Propagate columns through (1).
@@ -515,7 +523,7 @@ class FollowedRuns:
             readings: ψ (R, T, C, M).
             inputs: (R, T - 1, Z, E + nu) matrices that map `pushed` to b.
         """
-        coloured, _ = with_coloured_noise(self.runs, self.noise)
+        coloured, _ = add_noise_states(self.runs, self.noise)
         number, samples, channels, count = readings.shape
         size = self.runs.prior.size
         result = np.zeros((number, samples, channels, count), dtype=np.float32)
@@ -574,7 +582,7 @@ def _fit_noise(runs: LinearRuns, noise: NoiseModel, force: Array, typical: Array
         tried_noise = (
             noise if phi is None else NoiseModel(noise.sigma, np.full_like(noise.phi, phi))
         )
-        coloured, white = with_coloured_noise(runs, tried_noise)
+        coloured, white = add_noise_states(runs, tried_noise)
         if best is not None:
             filtered = filter_runs(coloured, best.force, white)
             before, after = best.filtered.log_likelihood.sum(), filtered.log_likelihood.sum()
@@ -606,7 +614,7 @@ def _linearise_run(
     start = evaluator.guess[run, :half], evaluator.guess[run, half:]
     robot = simulator or evaluator.simulator
     if trajectory is None:
-        states = measured_states(evaluator, noise.sigma, run)
+        states = estimate_measured_states(evaluator, noise.sigma, run)
         return MeasuredLinear(robot, theta, scenario, start, measured=states)
     return MeasuredLinear(robot, theta, scenario, start, trajectory, None, neighbour, is_alike)
 

@@ -26,7 +26,9 @@ The margin is needed since the estimate depends on a model that may lack causes.
 """
 
 
-def begin_in_contact(evaluators: Sequence[RunEvaluator], theta: Array, sigma: Array) -> None:
+def set_first_states_in_contact(
+    evaluators: Sequence[RunEvaluator], theta: Array, sigma: Array
+) -> None:
     """Estimate the initial states of a robot whose geoms touch.
 
     Args:
@@ -63,7 +65,7 @@ def propose_contact_effects(search: EffectSearch, evaluators: Sequence[RunEvalua
     best = max([search.base_model, *fits], key=lambda model: model.penalised_log_likelihood)
     if not best.effects:
         return
-    begin_in_contact(evaluators, best.fit.theta, search.noise.sigma)
+    set_first_states_in_contact(evaluators, best.fit.theta, search.noise.sigma)
     # Sums of squares about other initial states are not comparable.
     known = [search.base_model, *fits]
     search.models.clear()

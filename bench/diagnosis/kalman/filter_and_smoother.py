@@ -205,7 +205,7 @@ class Smoothed:
     score: Array
 
 
-def with_coloured_noise(runs: LinearRuns, noise: NoiseModel) -> tuple[LinearRuns, Array]:
+def add_noise_states(runs: LinearRuns, noise: NoiseModel) -> tuple[LinearRuns, Array]:
     """Add states for AR(1) noise.
 
     Args:

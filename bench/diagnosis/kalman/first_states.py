@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.diagnosis.kalman.measured_states import measured_states
+from bench.diagnosis.kalman.measured_states import estimate_measured_states
 from sims.core.simulator import Array
 from sims.robot.dynamics.active_effects import (
     is_evaluated_per_step,
@@ -79,8 +79,8 @@ def estimate_first_states(
     typical = compute_joint_scales(robot).force
     states, variances = [], []
     for number in range(len(evaluator.tracks)):
-        run = _Run(evaluator, simulator, theta, sigma, number)
-        tried = [run.smoothed(share * typical) for share in FORCE_SHARES]
+        run = _CubatureFilter(evaluator, simulator, theta, sigma, number)
+        tried = [run.smooth(share * typical) for share in FORCE_SHARES]
         best = max(tried, key=lambda one: one.log_likelihood)
         states.append(best.mean)
         variances.append(np.diag(best.covariance))
@@ -96,7 +96,7 @@ class _Smoothed(NamedTuple):
     covariance: Array
 
 
-class _Run:
+class _CubatureFilter:
     """One run of a robot, for the cubature filter."""
 
     def __init__(
@@ -119,7 +119,7 @@ class _Run:
             self._start[None, :joints],
             self._start[None, joints:],
         )
-        speeds = list(measured_states(evaluator, sigma, run).values())
+        speeds = list(estimate_measured_states(evaluator, sigma, run).values())
         fastest = max((float(np.abs(s[:, 1]).max()) for s in speeds), default=1.0)
         self._prior = np.repeat([POSITION_PRIOR, fastest], joints)
         times = work.times
@@ -137,7 +137,7 @@ class _Run:
         self._observed = track.observed[:, self._columns]
         self._variances = np.square(sigma[self._columns])
 
-    def smoothed(self, force: Array) -> _Smoothed:
+    def smooth(self, force: Array) -> _Smoothed:
         """Filter and smooth the run.
 
         Args:
@@ -152,11 +152,11 @@ class _Run:
         with np.errstate(all="ignore"), capture_mujoco_warnings():
             self._bench.write_effects(self._acting)
             for i, (begin, end) in enumerate(zip(self._knots, self._knots[1:], strict=False)):
-                gained, mean, covariance = self._updated(i, mean, covariance)
+                gained, mean, covariance = self._update(i, mean, covariance)
                 log_likelihood += gained
                 root = np.linalg.cholesky(covariance + SMALLEST_VARIANCE * np.eye(size))
                 moved = points[:, :size] @ root.T  # (1)
-                ends = self._advanced(mean + moved, points[:, size:] * force, int(begin), int(end))
+                ends = self._propagate(mean + moved, points[:, size:] * force, int(begin), int(end))
                 if not np.isfinite(ends).all():
                     return _Smoothed(-np.inf, self._start, covariance)
                 predicted = ends.mean(axis=0)
@@ -165,14 +165,14 @@ class _Run:
                 crossed = moved.T @ (ends - predicted) / len(ends)
                 intervals.append((mean, covariance, predicted, spread, crossed))
                 mean, covariance = predicted, spread
-            gained, mean, covariance = self._updated(self._knots.size - 1, mean, covariance)
+            gained, mean, covariance = self._update(self._knots.size - 1, mean, covariance)
         for before, own, predicted, spread, crossed in reversed(intervals):
             gain = np.linalg.solve(spread, crossed.T).T  # (2)
             mean = before + gain @ (mean - predicted)
             covariance = own + gain @ (covariance - spread) @ gain.T
         return _Smoothed(log_likelihood + gained, mean, covariance)
 
-    def _updated(self, i: int, mean: Array, covariance: Array) -> tuple[float, Array, Array]:
+    def _update(self, i: int, mean: Array, covariance: Array) -> tuple[float, Array, Array]:
         """Update mean and covariance by the readings of sample i (Kalman).
 
         Returns:
@@ -190,7 +190,7 @@ class _Run:
         after = covariance - gain @ covariance[rows]
         return log_likelihood, mean + gain @ residual, 0.5 * (after + after.T)
 
-    def _advanced(self, states: Array, forces: Array, begin: int, end: int) -> Array:
+    def _propagate(self, states: Array, forces: Array, begin: int, end: int) -> Array:
         """Step states (n, 2 D) with additional forces (n, D) through the engine.
 
         Returns:

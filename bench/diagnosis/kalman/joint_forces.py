@@ -1,6 +1,6 @@
 """Joint forces that a measured motion requires, and those that the model's drives exert.
 
-Positions, velocities and accelerations are estimated from the readings alone (`measured_states`).
+Positions, velocities and accelerations are estimated from the readings alone (`track_joints`).
 """
 
 from __future__ import annotations
@@ -57,15 +57,15 @@ def compute_joint_forces(robot: RobotModel, recording: Recording, run: Run) -> J
     Positions, velocities and accelerations are estimated from the recorded positions first.
     """
     model = robot.compiled
-    states = np.stack(track_joints(run.times, _readings(robot, recording, run)))
+    states = np.stack(track_joints(run.times, _get_readings(robot, recording, run)))
     motion = np.transpose(states, (2, 1, 0))
     still = np.stack([motion[0], np.zeros_like(motion[0]), np.zeros_like(motion[0])])
-    controls, activations = _controls(robot, run)
+    controls, activations = _compute_controls(robot, run)
     applied = np.zeros(motion.shape[1:])
     for column, joint in enumerate(robot.joints):
         name = f"force.{joint.name}"
         if name in run.inputs:
-            applied[:, column] = _mean_input(run, name)
+            applied[:, column] = _compute_mean_input(run, name)
     needed, driven = motion_forces(model, robot.joints, motion, controls, activations)
     holding, _ = motion_forces(model, robot.joints, still, controls, activations)
     names = [joint.name for joint in robot.joints]
@@ -77,7 +77,7 @@ def compute_joint_forces(robot: RobotModel, recording: Recording, run: Run) -> J
     return JointForces(needed - applied, driven, holding - applied, motion[1])
 
 
-def _readings(robot: RobotModel, recording: Recording, run: Run) -> list[tuple[Array, Array]]:
+def _get_readings(robot: RobotModel, recording: Recording, run: Run) -> list[tuple[Array, Array]]:
     """Return for each joint its recorded positions and velocities (T, 2), and their noise (2,).
 
     A velocity that is not recorded is NaN. Noise that is not stated is estimated.
@@ -96,7 +96,7 @@ def _readings(robot: RobotModel, recording: Recording, run: Run) -> list[tuple[A
     return readings
 
 
-def _mean_input(run: Run, name: str) -> Array:
+def _compute_mean_input(run: Run, name: str) -> Array:
     """Return an input (T,) at each sample: the mean of its values before and after the sample."""
     values = run.inputs[name]
     if name in run.linear:
@@ -106,7 +106,7 @@ def _mean_input(run: Run, name: str) -> Array:
     return mean
 
 
-def _controls(robot: RobotModel, run: Run) -> tuple[Array, Array]:
+def _compute_controls(robot: RobotModel, run: Run) -> tuple[Array, Array]:
     """Return the controls (T, nu) and filtered activations (T, na) of a run at its samples.
 
     nu and na are MuJoCo's numbers of actuators and of activation states.
@@ -117,7 +117,7 @@ def _controls(robot: RobotModel, run: Run) -> tuple[Array, Array]:
     for actuator in robot.actuators:
         name = f"u.{actuator.name}"
         if name in run.inputs:
-            controls[:, actuator.control] = _mean_input(run, name)
+            controls[:, actuator.control] = _compute_mean_input(run, name)
     steps = np.diff(run.times)
     for one in activation_filters(robot):
         taken = one.clipped(controls[:, one.actuator.control])

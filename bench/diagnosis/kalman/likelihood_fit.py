@@ -19,7 +19,7 @@ import numpy as np
 from bench.diagnosis.evaluation.coefficient_bounds import bound_of, get_bounds_by_index
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.diagnosis.fitting.bound_widening import Bounds, range_around, use_bounds
+from bench.diagnosis.fitting.bound_widening import Bounds, compute_range_around, use_bounds
 from bench.diagnosis.kalman.candidate_responses import FollowedRuns
 from sims.core.simulator import Array
 
@@ -67,7 +67,7 @@ def identify_base(
         return FollowedRuns.follow(evaluator, theta, noise, force=best.force)
 
     places = evaluator.base.tolist()
-    limits = {i: range_around(evaluator, i) for i in places}
+    limits = {i: compute_range_around(evaluator, i) for i in places}
     resisting = get_bounds_by_index(evaluator, _list_resisting_effects(followed))
     found = []
     for further in [resisting] if is_resisted else [{}, resisting]:
@@ -86,7 +86,7 @@ def identify_base(
     for i, value in values.items():
         low, high = evaluator.parameters[i].bounds
         if not low <= value <= high:
-            wider[evaluator.parameters[i].name] = range_around(evaluator, i, value)
+            wider[evaluator.parameters[i].name] = compute_range_around(evaluator, i, value)
     use_bounds(evaluator, wider)
     theta = followed.theta.copy()
     theta[places] = best.theta[places]
@@ -202,6 +202,6 @@ def _compute_innovation_derivative(
         return np.zeros_like(target)
     moved = followed.theta.copy()
     moved[place] += step if moved[place] + step <= high else -step
-    change = target - followed.whitened_innovations(moved)
+    change = target - followed.compute_whitened_innovations(moved)
     derivative: Array = np.nan_to_num(change / (moved[place] - followed.theta[place]))
     return derivative

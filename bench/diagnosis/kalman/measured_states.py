@@ -23,7 +23,9 @@ JERKS = 10.0 ** np.arange(-2.0, 3.1, 1.0)
 """Sizes of the jerk that are tried, in units of the range of positions over seconds cubed."""
 
 
-def measured_states(evaluator: RunEvaluator, sigma: Array, run: int) -> Mapping[int, Array]:
+def estimate_measured_states(
+    evaluator: RunEvaluator, sigma: Array, run: int
+) -> Mapping[int, Array]:
     """Estimate positions, velocities and accelerations of the recorded joints of one run.
 
     Args:
@@ -42,7 +44,7 @@ def measured_states(evaluator: RunEvaluator, sigma: Array, run: int) -> Mapping[
 def _compute_measured_states(
     evaluator: RunEvaluator, sigma: Array, run: int
 ) -> Mapping[int, Array]:
-    """Compute the result of `measured_states` for a run that is not in its cache.
+    """Compute the result of `estimate_measured_states` for a run that is not in its cache.
 
     Joints with fewer than three recorded positions are left out.
     """

@@ -23,11 +23,11 @@ from bench.diagnosis.kalman.likelihood_fit import compute_likelihood_step
 from bench.diagnosis.prediction_error.joint_effects import (
     JOINT_MODEL,
     SERVO_MODEL,
-    joint_name,
+    get_joint_name,
+    get_servo_input,
     offset_from_command,
-    servo_input,
 )
-from bench.diagnosis.prediction_error.library_columns import LibraryColumns, regression_about
+from bench.diagnosis.prediction_error.library_columns import LibraryColumns, build_regression_about
 from bench.diagnosis.prediction_error.model_filters import FilteredSet, ModelFilters
 from bench.diagnosis.search.effect_search import EffectSearch
 from bench.diagnosis.search.refit_starts import with_effect
@@ -84,22 +84,22 @@ class EffectProposals:
 
     def _propose_effects(self, current: FilteredSet) -> tuple[Proposals, Proposals]:
         """Return all proposals, with those of the joint and servo models in a separate list."""
-        by_regression = self._by_regression(current)
+        by_regression = self._propose_by_regression(current)
         excluded, joint = {*current.names, *dict(by_regression)}, current.followed.joints_by_loss[0]
-        joint_model = self._joint_model(current.followed, joint, excluded)
-        return by_regression + self._offset_and_friction(joint, excluded), joint_model
+        joint_model = self._propose_joint_model(current.followed, joint, excluded)
+        return by_regression + self._propose_offset_and_friction(joint, excluded), joint_model
 
-    def _by_regression(self, current: FilteredSet) -> Proposals:
+    def _propose_by_regression(self, current: FilteredSet) -> Proposals:
         """Propose the effects with the largest net gain by regression, with their coefficients.
 
         The innovations (one-step prediction errors) of the filter with the set `current` are
         regressed on the responses to each effect.
         """
         if current.names:
-            regression, _ = regression_about(current, self.columns.library, current.followed)
+            regression, _ = build_regression_about(current, self.columns.library, current.followed)
         else:
             regression = self.columns.base_regression
-        gains = regression.net_gains()
+        gains = regression.compute_net_gains()
         proposals: dict[str, Array] = {}
         for i in np.argsort(-gains, kind="stable").tolist():
             group = regression.groups[i]
@@ -112,12 +112,12 @@ class EffectProposals:
             proposals[group.effect] = self.columns.coefficients(group, solution)
         return list(proposals.items())
 
-    def _offset_and_friction(self, joint: int, excluded: Collection[str]) -> Proposals:
+    def _propose_offset_and_friction(self, joint: int, excluded: Collection[str]) -> Proposals:
         """Return an encoder offset of a joint, and less dry friction than the model file specifies.
 
         The derivative by more friction does not show the effect of less friction.
         """
-        evaluator, place = self.filters.evaluator, joint_name(self.filters.evaluator, joint)
+        evaluator, place = self.filters.evaluator, get_joint_name(self.filters.evaluator, joint)
         coefficients = {
             f"sensor.bias@q.{place}": offset_from_command(evaluator, self.filters.noise, joint)
         }
@@ -132,14 +132,14 @@ class EffectProposals:
             if c and name in evaluator.library and name not in excluded
         ]
 
-    def _joint_model(
+    def _propose_joint_model(
         self, followed: FollowedRuns, joint: int, excluded: Collection[str]
     ) -> Proposals:
         """Return friction, damping and armature of a joint, and stiffness and damping of its servo.
 
         They are in descending order of their gain in likelihood.
         """
-        evaluator, place = self.filters.evaluator, joint_name(self.filters.evaluator, joint)
+        evaluator, place = self.filters.evaluator, get_joint_name(self.filters.evaluator, joint)
         assert isinstance(evaluator.simulator, RobotSimulator)
         speed = max(float(np.abs(one.trajectory.v[:, joint]).max()) for one in followed.linear)
         typical = {
@@ -149,10 +149,10 @@ class EffectProposals:
             ),
         }
         proposals = []
-        for name in self._effects_at(joint):
+        for name in self._list_effects_at(joint):
             if name not in excluded:
                 places = evaluator.get_coefficient_indices(name)
-                step, gain = self._gauss_newton_step(followed, name)
+                step, gain = self._compute_likelihood_step(followed, name)
                 change = float(step[places[0]])
                 # If much process noise hides an effect, its typical size is tried.
                 if not gain > 0.5 * self.filters.penalty(name):
@@ -161,7 +161,7 @@ class EffectProposals:
         proposals.sort(key=lambda one: -one[0])
         return [(name, c) for _, name, c in proposals]
 
-    def largest_gain_of_others(self, friction: str) -> float:
+    def compute_largest_gain_of_others(self, friction: str) -> float:
         """Return the largest gain in log-likelihood by another effect where dry friction acts.
 
         The effects are those of the joint and servo models at the same joint, alone and added to
@@ -173,22 +173,22 @@ class EffectProposals:
         evaluator, base = self.filters.evaluator, self.filters.base
         place = friction.partition("@")[2]
         joints = len(evaluator.simulator.system.coordinates)
-        joint = next(j for j in range(joints) if joint_name(evaluator, j) == place)
-        others = [name for name in self._effects_at(joint) if name != friction]
-        return max((self._gauss_newton_step(base, name)[1] for name in others), default=0.0)
+        joint = next(j for j in range(joints) if get_joint_name(evaluator, j) == place)
+        others = [name for name in self._list_effects_at(joint) if name != friction]
+        return max((self._compute_likelihood_step(base, name)[1] for name in others), default=0.0)
 
-    def _effects_at(self, joint: int) -> list[str]:
+    def _list_effects_at(self, joint: int) -> list[str]:
         """Return the effects of the joint model of a joint, and of the model of its servo."""
         evaluator = self.filters.evaluator
         place, servo = (
-            joint_name(evaluator, joint),
-            servo_input(evaluator, joint).removeprefix("u."),
+            get_joint_name(evaluator, joint),
+            get_servo_input(evaluator, joint).removeprefix("u."),
         )
         names = [f"{effect}@{place}" for effect in JOINT_MODEL]
         names += [f"{effect}@{servo}" for effect in SERVO_MODEL]
         return [name for name in names if name in evaluator.library]
 
-    def _gauss_newton_step(self, followed: FollowedRuns, name: str) -> tuple[Array, float]:
+    def _compute_likelihood_step(self, followed: FollowedRuns, name: str) -> tuple[Array, float]:
         """Return the Gauss-Newton step of an effect alone, cached for the base model."""
         if followed is self.filters.base and name in self._base_steps:
             return self._base_steps[name]

@@ -17,7 +17,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bench.diagnosis.kalman.candidate_responses import Columns, FollowedRuns
-from bench.diagnosis.prediction_error.regression_selection import Regression, columns_of, groups_of
+from bench.diagnosis.prediction_error.regression_selection import (
+    Regression,
+    group_probes,
+    list_columns,
+)
 from bench.diagnosis.search.explained_variance import DirectionGroup
 from sims.core.simulator import Array
 
@@ -78,11 +82,13 @@ def identify(followed: FollowedRuns, columns: Columns, first: Regression | None 
     for _ in range(PASSES):
         regression = first or regress(refitted, columns, selected_before, coefficients, numerics)
         first = None
-        selected = regression.pruned(selected_before) if selected_before else []
+        selected = regression.prune(selected_before) if selected_before else []
         selected = regression.select(MOST, selected)
         _, new_coefficients = regression.solve(selected)
         numerics = regression.nuisance(selected)
-        refitted = with_effects(followed, columns, selected, new_coefficients, numerics)
+        refitted = follow_linear_with_effects(
+            followed, columns, selected, new_coefficients, numerics
+        )
         likelihood = refitted.log_likelihood
         done = result is not None and likelihood < result.log_likelihood + 1.0
         if result is None or likelihood > result.log_likelihood:
@@ -123,7 +129,7 @@ def regress(
     responses = followed.responses(columns)
     number, _, _, count = responses.shape
     nuisance = followed.step_error_response()
-    own_columns = columns_of(chosen)
+    own_columns = list_columns(chosen)
     weights = np.concatenate([*coefficients, np.zeros(0)])
     grams = np.zeros((number, count + 1, count + 1))
     crosses, totals = np.zeros((number, count + 1)), np.zeros(number)
@@ -138,12 +144,12 @@ def regress(
     contains = {
         name: effect.contains for name, effect in followed.evaluator.available_effects.items()
     }
-    groups = [g for g in groups_of(columns.probes) if not set(g.column_indices) & set(always)]
+    groups = [g for g in group_probes(columns.probes) if not set(g.column_indices) & set(always)]
     samples = int(followed.runs.recorded.sum())
     return Regression(groups, grams, crosses, totals, samples, contains, (count, *always))
 
 
-def with_effects(
+def follow_linear_with_effects(
     followed: FollowedRuns,
     columns: Columns,
     chosen: Sequence[DirectionGroup],
@@ -166,4 +172,4 @@ def with_effects(
         pushed, readings = columns.total(own_columns, np.concatenate(list(coefficients)))
         defects = defects - np.einsum("rtze,rte->rtz", runs.inputs, pushed)
         residuals = np.where(runs.recorded, residuals - readings, 0.0)
-    return followed.refitted(replace(runs, defects=defects, residuals=residuals))
+    return followed.refit_noise(replace(runs, defects=defects, residuals=residuals))

@@ -25,14 +25,14 @@ from bench.diagnosis.prediction_error.selection_fits import (
     LEAST_SHARE,
     check_filter,
     check_fit,
-    dry_friction_of,
-    stands_alone,
+    is_friction_sufficient,
+    make_dry_friction_start,
 )
 from bench.diagnosis.prediction_error.simulated_fits import (
     fit_filtered,
-    higher_merit,
     is_explained,
-    without_idle_effects,
+    remove_idle_effects,
+    select_higher_merit,
 )
 
 MAX_STEPS = 4
@@ -58,11 +58,11 @@ def add_to_model(context: SearchContext, model: FittedModel) -> FittedModel:
         context: context of the search.
         model: the fitted model.
     """
-    current = FilteredSet(context.filters.of_model(model), model.effects)
+    current = FilteredSet(context.filters.get_filter(model), model.effects)
     larger = _grow_set(context, current)
     if larger is current:
         return model
-    return without_idle_effects(context, fit_filtered(context, larger))
+    return remove_idle_effects(context, fit_filtered(context, larger))
 
 
 def add_to_dry_friction(
@@ -81,9 +81,9 @@ def add_to_dry_friction(
     Raises:
         SoftFrictionError: the friction has MuJoCo's soft form.
     """
-    if not friction.effects or not stands_alone(context, selected, friction):
+    if not friction.effects or not is_friction_sufficient(context, selected, friction):
         return context.search.base_model
-    return select_in_model(context, dry_friction_of(context, selected))
+    return select_in_model(context, make_dry_friction_start(context, selected))
 
 
 def select_in_model(context: SearchContext, friction: FitStart | None = None) -> FittedModel:
@@ -99,27 +99,27 @@ def select_in_model(context: SearchContext, friction: FitStart | None = None) ->
     watch, filters, base = context.evaluator.watch, context.filters, context.search.base_model
     current = filters.empty_set
     if friction is not None:
-        current = filters.with_effects(friction.theta, friction.effects)
-    larger_sets = _larger_that_pay(context, current)
+        current = filters.follow_with_effects(friction.theta, friction.effects)
+    larger_sets = _list_larger_that_pay(context, current)
     if not larger_sets and friction is None:
         check_filter(context, current.followed.log_likelihood)
         return base
     best = base if larger_sets else fit_filtered(context, current)
-    for trial in _nearly_as_likely(context, larger_sets):
-        best = higher_merit(best, fit_filtered(context, trial))
+    for trial in _select_nearly_as_likely(context, larger_sets):
+        best = select_higher_merit(best, fit_filtered(context, trial))
         if watch.has_abandoned_fits():
             break
     if friction is None and not is_explained(context, best) and not watch.has_abandoned_fits():
         check_filter(context, larger_sets[0].followed.log_likelihood)
-        best = higher_merit(best, _fit_all_servos(context))
+        best = select_higher_merit(best, _fit_all_servos(context))
     # Two effects together may explain what neither explains alone.
     if larger_sets and not is_explained(context, best) and not watch.has_abandoned_fits():
-        best = higher_merit(best, fit_filtered(context, _grow_set(context, larger_sets[0])))
+        best = select_higher_merit(best, fit_filtered(context, _grow_set(context, larger_sets[0])))
     if not np.isfinite(best.fit.cost) or not best.effects:
         return base
     if not is_explained(context, best):
         check_fit(context, best)
-    return without_idle_effects(context, best)
+    return remove_idle_effects(context, best)
 
 
 def _grow_set(context: SearchContext, current: FilteredSet) -> FilteredSet:
@@ -128,14 +128,14 @@ def _grow_set(context: SearchContext, current: FilteredSet) -> FilteredSet:
     It stops if no effect is worth its penalty, or if the filter lacks no force any more.
     """
     for _ in range(MAX_STEPS - 1):
-        larger = _larger_that_pay(context, current) if current.followed.lacks_force else []
+        larger = _list_larger_that_pay(context, current) if current.followed.lacks_force else []
         if not larger:
             break
         current = larger[0]
     return current
 
 
-def _larger_that_pay(context: SearchContext, current: FilteredSet) -> list[FilteredSet]:
+def _list_larger_that_pay(context: SearchContext, current: FilteredSet) -> list[FilteredSet]:
     """Return the sets with one more effect whose gain in likelihood exceeds its penalty.
 
     The likeliest set is the first.
@@ -145,13 +145,13 @@ def _larger_that_pay(context: SearchContext, current: FilteredSet) -> list[Filte
     share = LEAST_SHARE * filters.compute_gain(present)
     return [
         larger
-        for larger in try_one_more(context, current)
+        for larger in try_one_more_effect(context, current)
         if 2.0 * (larger.followed.log_likelihood - present.log_likelihood)
         >= max(filters.penalty(larger.names[-1]), share)
     ]
 
 
-def try_one_more(context: SearchContext, current: FilteredSet) -> list[FilteredSet]:
+def try_one_more_effect(context: SearchContext, current: FilteredSet) -> list[FilteredSet]:
     """Follow the runs with each effect that gains most in addition to a set.
 
     Args:
@@ -165,7 +165,7 @@ def try_one_more(context: SearchContext, current: FilteredSet) -> list[FilteredS
     watch.stage("testing the effects of the model one by one", MAX_REGRESSION_PROPOSALS)
     larger_sets = []
     for start in context.proposals.of(current):
-        larger_sets.append(filters.with_effects(start.theta, start.effects, 0))
+        larger_sets.append(filters.follow_with_effects(start.theta, start.effects, 0))
         watch.advance()
         watch.check_not_stopped()
     larger_sets.sort(key=lambda one: _compute_criterion(context, one))
@@ -175,7 +175,7 @@ def try_one_more(context: SearchContext, current: FilteredSet) -> list[FilteredS
         if compared and _is_settled(context, compared[0], one):
             compared.append(one)
             continue
-        compared.append(filters.with_effects(one.followed.theta, one.names))
+        compared.append(filters.follow_with_effects(one.followed.theta, one.names))
         compared.sort(key=lambda one: _compute_criterion(context, one))
     return compared
 
@@ -187,7 +187,7 @@ def _is_settled(context: SearchContext, best: FilteredSet, other: FilteredSet) -
     return behind > RIVAL_MARGIN + SETTLED_SHARE * gain and not best.followed.lacks_force
 
 
-def _nearly_as_likely(
+def _select_nearly_as_likely(
     context: SearchContext, larger_sets: Sequence[FilteredSet]
 ) -> Sequence[FilteredSet]:
     """Return the sets whose likelihood in the filter is too close to that of the best set.
@@ -219,4 +219,6 @@ def _fit_all_servos(context: SearchContext) -> FittedModel:
     several = filters.base.missing_forces.sum() > 1
     if not several or not set(names) <= set(context.evaluator.library):
         return context.search.base_model
-    return fit_filtered(context, filters.with_effects(filters.reference, names, ALL_SERVOS_STEPS))
+    return fit_filtered(
+        context, filters.follow_with_effects(filters.reference, names, ALL_SERVOS_STEPS)
+    )

@@ -2,9 +2,9 @@
 
 If a drive is switched off, if a servo is limp after a fault, or after an emergency stop, the
 commands continue. Effects of the library could only imitate this. Velocities and accelerations are
-estimated from positions alone (`measured_states`), and from them three forces at each joint and
-sample: the force f that the motion requires by inverse dynamics, the force τ of the model's drive,
-and the force g that holds the joint still. Three hypotheses have the residuals
+estimated from positions alone, and from them three forces at each joint and sample
+(`kalman.joint_forces`): the force f that the motion requires by inverse dynamics, the force τ of
+the model's drive, and the force g that holds the joint still. Three hypotheses have the residuals
 
     on: f - τ,        off: f,        held (by a brake): f - g                                    (1)
 
@@ -126,7 +126,7 @@ class InactiveDrive:
         return more <= MAX_EXTRA_COST * CHANGE_COST * max(changes, 1)
 
 
-def without_inactive_drives(recording: Recording, kind: type[Simulator]) -> Recording:
+def remove_inactive_drives(recording: Recording, kind: type[Simulator]) -> Recording:
     """Switch off inactive drives or omit these samples, and add notes to the recording.
 
     If a column of the recording shows when a drive is off, the drive is switched off there;
@@ -136,7 +136,7 @@ def without_inactive_drives(recording: Recording, kind: type[Simulator]) -> Reco
         recording: the recording as it was read, before its runs are divided.
         kind: a simulator of its system.
     """
-    drives = inactive_drives(recording, kind)
+    drives = find_inactive_drives(recording, kind)
     if not drives:
         return recording
     notes = list(recording.notes)
@@ -177,7 +177,7 @@ def _format_message(
     where = spans_of_runs(recording.runs, left_out)
     noun = "joint" if len(drives) == 1 else "joints"
     does = "the joints stand still" if drives[0].is_held else "the motion shows no force of them"
-    column = _changing_column(recording, drives)
+    column = _find_changing_column(recording, drives)
     near = f"; column {column} changes there" if column else ""
     name = drives[0].actuators[0]
     line = DriveSwitch(name, "COLUMN", True).line
@@ -199,7 +199,7 @@ def _find_switches(recording: Recording, drive: InactiveDrive) -> list[DriveSwit
     return []
 
 
-def _changing_column(recording: Recording, drives: Sequence[InactiveDrive]) -> str:
+def _find_changing_column(recording: Recording, drives: Sequence[InactiveDrive]) -> str:
     """Return the first other column that changes only where drives become inactive or active.
 
     The result is empty if there is no such column.
@@ -224,7 +224,7 @@ def _widen_mask(mask: Mask) -> Mask:
     return wide
 
 
-def inactive_drives(recording: Recording, kind: type[Simulator]) -> list[InactiveDrive]:
+def find_inactive_drives(recording: Recording, kind: type[Simulator]) -> list[InactiveDrive]:
     """Find drives that are inactive in some samples, by (1).
 
     Args:
@@ -254,11 +254,11 @@ def inactive_drives(recording: Recording, kind: type[Simulator]) -> list[Inactiv
     joints = [number for number, names in actuators.items() if names]
     drives = []
     for joint in joints:
-        stretches = _Stretches(forces, [joint], OFF)
+        stretches = _Intervals(forces, [joint], OFF)
         if stretches.any():
             drives.append((joint, stretches))
     if not drives and joints:
-        stretches = _Stretches(forces, joints, HELD)
+        stretches = _Intervals(forces, joints, HELD)
         drives = [(joint, stretches) for joint in joints] if stretches.any() else []
     return [
         InactiveDrive(
@@ -281,7 +281,7 @@ def _thin_runs(recording: Recording, every: int) -> list[Run]:
     return [run.part(slice(None, None, every)) for run in recording.runs]
 
 
-class _Stretches:
+class _Intervals:
     """Intervals of runs in which a hypothesis about some joints holds instead of active drives.
 
     Attributes:
@@ -309,7 +309,7 @@ class _Stretches:
         for of_runs in self._residuals:
             for cost, more in zip(self.costs, _compute_costs(of_runs, state), strict=True):
                 cost += more
-        masks = [_without_short_stretches(_choose_second_hypothesis(cost)) for cost in self.costs]
+        masks = [_remove_short_intervals(_choose_second_hypothesis(cost)) for cost in self.costs]
         if max(len(spans(mask)) for mask in masks) > MAX_STRETCHES:
             masks = [np.zeros_like(mask) for mask in masks]
         self.masks = self._accept_masks(masks)
@@ -325,7 +325,7 @@ class _Stretches:
         """
         nothing = [np.zeros_like(mask) for mask in masks]
         working = [~_widen_mask(mask) for mask in masks]
-        inner = [_without_edges(mask) for mask in masks]
+        inner = [_remove_edges(mask) for mask in masks]
         if (
             min(sum(int(m.sum()) for m in of_runs) for of_runs in (working, inner))
             < MIN_SAMPLES // 2
@@ -384,7 +384,7 @@ class _Stretches:
         return at_end and all(still)
 
 
-def _without_edges(mask: Mask) -> Mask:
+def _remove_edges(mask: Mask) -> Mask:
     """Return a mask without the samples near changes, where the smoothed motion is blurred."""
     result = np.zeros_like(mask)
     for first, end in spans(mask):
@@ -432,7 +432,7 @@ def _choose_second_hypothesis(costs: Array) -> Mask:
     return result
 
 
-def _without_short_stretches(mask: Mask) -> Mask:
+def _remove_short_intervals(mask: Mask) -> Mask:
     """Return a mask without intervals that are too short."""
     result = np.zeros_like(mask)
     for first, end in spans(mask):

@@ -24,7 +24,7 @@ import numpy as np
 
 from bench.diagnosis.evaluation.coefficient_bounds import get_bounds_by_index
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.diagnosis.fitting.bound_widening import Bounds, range_around
+from bench.diagnosis.fitting.bound_widening import Bounds, compute_range_around
 from bench.diagnosis.fitting.fit_state import FitStart
 from bench.diagnosis.fitting.model_set import FittedModel
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
@@ -36,7 +36,10 @@ from bench.diagnosis.kalman.likelihood_fit import (
 )
 from bench.diagnosis.prediction_error.effect_proposals import SearchContext
 from bench.diagnosis.prediction_error.joint_effects import has_many_shapes
-from bench.diagnosis.prediction_error.library_columns import group_coefficients, regression_about
+from bench.diagnosis.prediction_error.library_columns import (
+    build_regression_about,
+    group_coefficients,
+)
 from bench.diagnosis.prediction_error.model_filters import FilteredSet
 from bench.diagnosis.prediction_error.selection_fits import LEAST_SHARE, MAX_IMPROVED_SIZE
 from bench.diagnosis.search.candidate_directions import CandidateDirection
@@ -148,7 +151,7 @@ def _get_bounds(context: SearchContext, names: Sequence[str]) -> dict[int, Bound
     """Return the bounds of the base parameters and of some effects, by index in theta."""
     evaluator = context.evaluator
     free = [i for i in evaluator.base.tolist() if i not in context.search.frozen]
-    bounds = {i: range_around(evaluator, i) for i in free}
+    bounds = {i: compute_range_around(evaluator, i) for i in free}
     return bounds | get_bounds_by_index(evaluator, names)
 
 
@@ -245,8 +248,8 @@ def _add_next_effect(
         The larger set; None if no effect gains enough.
     """
     evaluator = context.evaluator
-    regression, _ = regression_about(current, columns, current.followed)
-    gains = regression.net_gains()
+    regression, _ = build_regression_about(current, columns, current.followed)
+    gains = regression.compute_net_gains()
     for i, group in enumerate(regression.groups):
         gains[i] *= group.effect not in current.names
     best = regression.groups[int(np.argmax(gains))]
@@ -277,7 +280,7 @@ def _list_probes(context: SearchContext) -> list[CandidateDirection]:
 def _simulate_set(context: SearchContext, current: FilteredSet) -> FittedModel:
     """Simulate the runs with the parameters of a filter, from fitted initial states."""
     evaluator, search = context.evaluator, context.search
-    theta, states = current.followed.theta, context.filters.first_states(current.followed)
+    theta, states = current.followed.theta, context.filters.estimate_first_states(current.followed)
     start = FitStart(current.names, theta, states)
     (fitted_states,) = TrajectoryFitter(
         evaluator, search.noise, search.frozen, parameters=False

@@ -33,7 +33,7 @@ OFFSET_THRESHOLD = 10.0
 """Minimum difference of positions, as a multiple of the noise, that is an encoder offset."""
 
 
-def joint_name(evaluator: RunEvaluator, joint: int) -> str:
+def get_joint_name(evaluator: RunEvaluator, joint: int) -> str:
     """Return the name of a joint.
 
     Args:
@@ -44,7 +44,7 @@ def joint_name(evaluator: RunEvaluator, joint: int) -> str:
     return coordinate.removeprefix("q.")
 
 
-def servo_input(evaluator: RunEvaluator, joint: int) -> str:
+def get_servo_input(evaluator: RunEvaluator, joint: int) -> str:
     """Return the input of the position servo of a joint; empty if it has none.
 
     Args:
@@ -54,7 +54,7 @@ def servo_input(evaluator: RunEvaluator, joint: int) -> str:
     return str(getattr(evaluator.simulator.system, "servos", {}).get(joint, ""))
 
 
-def acts_at(evaluator: RunEvaluator, name: str, joints: Collection[int]) -> bool:
+def acts_at_joint(evaluator: RunEvaluator, name: str, joints: Collection[int]) -> bool:
     """Return whether an effect acts at one of the given joints.
 
     Args:
@@ -62,14 +62,14 @@ def acts_at(evaluator: RunEvaluator, name: str, joints: Collection[int]) -> bool
         name: name of the effect.
         joints: indices of the joints.
     """
-    names = {joint_name(evaluator, joint) for joint in joints}
+    names = {get_joint_name(evaluator, joint) for joint in joints}
     return any(
         member.coordinate in joints or member.signal.partition(".")[2] in names
         for member in members_of(evaluator.available_effects[name])
     )
 
 
-def plain_effects_beside(evaluator: RunEvaluator, name: str) -> set[str]:
+def list_joint_model_effects(evaluator: RunEvaluator, name: str) -> set[str]:
     """Return the effects of the joint and servo models at the joint where an effect acts.
 
     Args:
@@ -77,17 +77,17 @@ def plain_effects_beside(evaluator: RunEvaluator, name: str) -> set[str]:
         name: name of the effect.
     """
     count = len(evaluator.simulator.system.coordinates)
-    joints = {joint for joint in range(count) if acts_at(evaluator, name, {joint})}
+    joints = {joint for joint in range(count) if acts_at_joint(evaluator, name, {joint})}
     return {
         other
         for other in evaluator.library
         if other.partition("@")[0] in JOINT_MODEL + SERVO_MODEL
         and not other.endswith("@*")
-        and acts_at(evaluator, other, joints)
+        and acts_at_joint(evaluator, other, joints)
     }
 
 
-def at_coupled_joints(evaluator: RunEvaluator, name: str) -> list[str]:
+def list_at_coupled_joints(evaluator: RunEvaluator, name: str) -> list[str]:
     """Return the names of an effect at the other joints of its kinematic loop.
 
     It may act equivalently there, because a filter gives little information on unmeasured joints.
@@ -98,14 +98,16 @@ def at_coupled_joints(evaluator: RunEvaluator, name: str) -> list[str]:
     """
     law, _, place = name.partition("@")
     count = len(evaluator.simulator.system.coordinates)
-    joints = {joint_name(evaluator, joint): joint for joint in range(count)}
+    joints = {get_joint_name(evaluator, joint): joint for joint in range(count)}
     if place not in joints:
         return []
     assert isinstance(evaluator.simulator, RobotSimulator)
     velocities = evaluator.simulator.addresses.velocities.tolist()
     groups = coupled_joints(evaluator.simulator.make_linearisation_batch().model, velocities)
     others = {joint for group in groups if joints[place] in group for joint in group}
-    names = [f"{law}@{joint_name(evaluator, joint)}" for joint in sorted(others - {joints[place]})]
+    names = [
+        f"{law}@{get_joint_name(evaluator, joint)}" for joint in sorted(others - {joints[place]})
+    ]
     return [other for other in names if other in evaluator.slots]
 
 
@@ -130,7 +132,7 @@ def offset_from_command(evaluator: RunEvaluator, noise: NoiseModel, joint: int) 
     Returns:
         The difference; zero without a servo, or if the difference is small.
     """
-    system, servo = evaluator.simulator.system, servo_input(evaluator, joint)
+    system, servo = evaluator.simulator.system, get_servo_input(evaluator, joint)
     channel = system.coordinates[joint]
     if not servo or channel not in evaluator.channels:
         return 0.0

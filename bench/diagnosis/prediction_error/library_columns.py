@@ -24,10 +24,10 @@ from bench.diagnosis.prediction_error.effect_selection import Selected, identify
 from bench.diagnosis.prediction_error.joint_effects import has_many_shapes
 from bench.diagnosis.prediction_error.model_filters import FilteredSet, ModelFilters
 from bench.diagnosis.prediction_error.regression_selection import Regression
-from bench.diagnosis.search.candidate_directions import CandidateDirection, first_probes
+from bench.diagnosis.search.candidate_directions import CandidateDirection, iterate_first_probes
 from bench.diagnosis.search.explained_variance import DirectionGroup
 from bench.diagnosis.search.joint_force_basis import JointHatForce
-from bench.diagnosis.search.lack_of_fit import hat_probes
+from bench.diagnosis.search.lack_of_fit import list_hat_probes
 from sims.core.simulator import Array
 
 RELATIVE_DIFFERENCE = 0.02
@@ -83,7 +83,7 @@ class LibraryColumns:
     def hats(self) -> Columns:
         """Forces of any shape as candidates, by the labels of their families."""
         if self._hats is None:
-            probes, _ = hat_probes(self.filters.evaluator)
+            probes, _ = list_hat_probes(self.filters.evaluator)
             named = [replace(probe, effect=JointHatForce.name) for probe in probes]
             self._hats = replace(self.filters.base.columns(named), probes=tuple(probes))
         return self._hats
@@ -106,7 +106,7 @@ class LibraryColumns:
         )
         for name in names:
             bounds = compute_coefficient_bounds(evaluator, name)
-            for probe in first_probes(evaluator, base.fit, name):
+            for probe in iterate_first_probes(evaluator, base.fit, name):
                 # The value in the model file may be too large, so the correction may be negative.
                 signed = probe.signed or (bounds[probe.place][0] < 0 and not probe.fixed)
                 probes.append(replace(probe, signed=signed))
@@ -153,9 +153,9 @@ class LibraryColumns:
             known, regression = self._regressions[names]
             if (np.abs(theta - known) <= RELATIVE_DIFFERENCE * np.abs(known)).all():
                 return regression
-        current = FilteredSet(self.filters.of_model(model), names)
+        current = FilteredSet(self.filters.get_filter(model), names)
         columns = self.library.joined(self.hats)
-        regression = regression_about(current, columns, self.filters.base)
+        regression = build_regression_about(current, columns, self.filters.base)
         self._regressions[names] = theta, regression
         return regression
 
@@ -210,7 +210,7 @@ def group_coefficients(
     return clip_coefficients(evaluator, group.effect, c)
 
 
-def regression_about(
+def build_regression_about(
     current: FilteredSet, columns: Columns, followed: FollowedRuns
 ) -> ModelRegression:
     """Set up the regression with effects in the model.

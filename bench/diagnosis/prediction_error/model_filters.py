@@ -20,10 +20,10 @@ from bench.diagnosis.evaluation.coefficient_bounds import (
 )
 from bench.diagnosis.fitting.fit_state import FitStart
 from bench.diagnosis.fitting.model_set import FittedModel
-from bench.diagnosis.friction_form_verdict import has_soft_form, soft_kind
+from bench.diagnosis.friction_form_verdict import has_soft_form, make_soft_kind
 from bench.diagnosis.kalman.candidate_responses import FollowedRuns
 from bench.diagnosis.kalman.likelihood_fit import maximise_innovation_likelihood
-from bench.diagnosis.prediction_error.joint_effects import OFFSET_THRESHOLD, joint_name
+from bench.diagnosis.prediction_error.joint_effects import OFFSET_THRESHOLD, get_joint_name
 from bench.diagnosis.search.scored_models import ScoredModelSet
 from sims.core.simulator import Array
 from sims.robot.robot_simulator import RobotSimulator
@@ -89,7 +89,7 @@ class ModelFilters:
             theta[self.evaluator.base[is_free]] = identified[is_free]
         return theta
 
-    def theta_with(self, name: str, c: Array) -> Array:
+    def make_theta_with(self, name: str, c: Array) -> Array:
         """Return parameters (P,) with one effect.
 
         Args:
@@ -103,14 +103,14 @@ class ModelFilters:
     @property
     def base(self) -> FollowedRuns:
         """The runs, followed with the base model."""
-        return FollowedRuns.of_model(self.evaluator, self.reference, self.noise)
+        return FollowedRuns.get_or_follow(self.evaluator, self.reference, self.noise)
 
     @property
     def empty_set(self) -> FilteredSet:
         """The base model as a set of effects."""
         return FilteredSet(self.base, ())
 
-    def of_model(self, model: FittedModel) -> FollowedRuns:
+    def get_filter(self, model: FittedModel) -> FollowedRuns:
         """Return the Kalman filter of the runs with a fitted model; it is cached."""
         if not model.effects:
             return self.base
@@ -124,13 +124,13 @@ class ModelFilters:
             self._of_sets[names] = followed
             if self.numerics:
                 defects = followed.runs.defects - self.numerics * followed.runs.step_errors
-                followed = followed.refitted(replace(followed.runs, defects=defects))
+                followed = followed.refit_noise(replace(followed.runs, defects=defects))
             self._of_models[key] = followed
         return self._of_models[key]
 
-    def near_model(self, model: FittedModel) -> FollowedRuns:
+    def get_similar_filter(self, model: FittedModel) -> FollowedRuns:
         """Return a filter with the effects of a fitted model, perhaps with other coefficients."""
-        return self._of_sets.get(frozenset(model.effects)) or self.of_model(model)
+        return self._of_sets.get(frozenset(model.effects)) or self.get_filter(model)
 
     def log_likelihood(self, theta: Array, is_soft: bool = False) -> float:
         """Return the log-likelihood of the innovations of a model.
@@ -152,7 +152,7 @@ class ModelFilters:
         """Return the gain of a filter over the base model in twice the log-likelihood."""
         return 2.0 * (followed.log_likelihood - self.base.log_likelihood)
 
-    def with_effects(
+    def follow_with_effects(
         self, theta: Array, names: Sequence[str], steps: int = GAUSS_NEWTON_STEPS
     ) -> FilteredSet:
         """Follow the runs with effects in the model, and improve their coefficients.
@@ -177,13 +177,13 @@ class ModelFilters:
         is_far = deviations.max() > RELINEARISATION_THRESHOLD * float(np.nanmax(self.noise.sigma))
         return followed.with_parameters(theta) if is_far else followed
 
-    def first_states(self, followed: FollowedRuns) -> Array:
+    def estimate_first_states(self, followed: FollowedRuns) -> Array:
         """Return states at the first samples (R, s), estimated from the readings.
 
         With an encoder offset, positions are smoothed ones. The states of the base fit are not
         used, because they are biased by what is missing.
         """
-        states, positions = self.evaluator.guess.copy(), followed.first_positions()
+        states, positions = self.evaluator.guess.copy(), followed.get_first_positions()
         measured_positions = states[:, : positions.shape[1]]
         noise = float(np.nanmax(self.noise.sigma))
         has_moved = np.abs(positions - measured_positions) > OFFSET_THRESHOLD * noise
@@ -205,7 +205,7 @@ class ModelFilters:
         """True if effects add dry friction in MuJoCo's soft form."""
         return has_soft_form(self.evaluator)
 
-    def soft_friction(self, name: str, sign: float) -> FitStart | None:
+    def find_soft_friction(self, name: str, sign: float) -> FitStart | None:
         """Return the likeliest model of dry friction in MuJoCo's soft form, by filters.
 
         The likelihood has one maximum over the force, which is searched from the middle.
@@ -218,14 +218,14 @@ class ModelFilters:
             The model; None if friction is already soft.
         """
         if (name, sign) not in self._soft_friction:
-            self._soft_friction[name, sign] = self._find_soft_friction(name, sign)
+            self._soft_friction[name, sign] = self._search_soft_friction(name, sign)
         return self._soft_friction[name, sign]
 
-    def _find_soft_friction(self, name: str, sign: float) -> FitStart | None:
-        """Search the force of the model that `soft_friction` returns."""
+    def _search_soft_friction(self, name: str, sign: float) -> FitStart | None:
+        """Search the force of the model that `find_soft_friction` returns."""
         joint = name.partition("@")[2]
-        numbers = {joint_name(self.evaluator, j): j for j in range(self.base.force.size)}
-        models = soft_friction_models(self.base, self.reference, numbers[joint], sign)
+        numbers = {get_joint_name(self.evaluator, j): j for j in range(self.base.force.size)}
+        models = make_soft_friction_models(self.base, self.reference, numbers[joint], sign)
         if not models:
             return None
         followed: dict[int, FollowedRuns] = {}
@@ -244,17 +244,17 @@ class ModelFilters:
         best = middle if step > 0 else middle - 1
         while 0 <= best + step < len(models) and log_likelihood(best + step) > log_likelihood(best):
             best += step
-        return FitStart((name,), models[best], self.first_states(self.base))
+        return FitStart((name,), models[best], self.estimate_first_states(self.base))
 
     @cached_property
     def _soft_simulator(self) -> RobotSimulator:
         """Simulator with dry friction in MuJoCo's soft form."""
-        simulator = self.evaluator.simulator_of(soft_kind(self.evaluator.kind))
+        simulator = self.evaluator.make_simulator(make_soft_kind(self.evaluator.kind))
         assert isinstance(simulator, RobotSimulator)
         return simulator
 
 
-def soft_friction_models(
+def make_soft_friction_models(
     followed: FollowedRuns, theta: Array, joint: int, sign: float = 1.0
 ) -> list[Array]:
     """Return models with dry friction of several sizes at a joint.
@@ -272,7 +272,7 @@ def soft_friction_models(
         The parameters (P,) of each model, in ascending order of the size.
     """
     evaluator = followed.evaluator
-    name = f"friction.coulomb@{joint_name(evaluator, joint)}"
+    name = f"friction.coulomb@{get_joint_name(evaluator, joint)}"
     if has_soft_form(evaluator) or name not in evaluator.library:
         return []
     models = []

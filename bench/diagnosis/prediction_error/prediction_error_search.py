@@ -41,9 +41,12 @@ from bench.diagnosis.prediction_error.forward_growth import (
 )
 from bench.diagnosis.prediction_error.incomplete_model import IdentifiedSet, identify_incomplete
 from bench.diagnosis.prediction_error.joint_effects import has_series
-from bench.diagnosis.prediction_error.library_columns import regression_about
+from bench.diagnosis.prediction_error.library_columns import build_regression_about
 from bench.diagnosis.prediction_error.model_filters import FilteredSet
-from bench.diagnosis.prediction_error.regression_selection import null_scores, p_value_of_gain
+from bench.diagnosis.prediction_error.regression_selection import (
+    compute_p_value_of_gain,
+    score_by_regression,
+)
 from bench.diagnosis.prediction_error.rival_sets import fit_rivals, fit_single_in_place
 from bench.diagnosis.prediction_error.selection_fits import (
     check_fit,
@@ -57,10 +60,10 @@ from bench.diagnosis.prediction_error.selection_fits import (
 )
 from bench.diagnosis.prediction_error.simulated_fits import (
     fit,
-    higher_merit,
     is_explained,
     is_nearly_explained,
-    without_idle_effects,
+    remove_idle_effects,
+    select_higher_merit,
 )
 from bench.diagnosis.search.candidate_directions import DirectionSet
 from bench.diagnosis.search.effect_search import EffectSearch
@@ -100,7 +103,7 @@ class PredictionErrorSearch(EffectSearch):
         """
         context, self.best_supported_model, best = self._search_context, self.base_model, None
         if self.likely is not None:
-            best = without_idle_effects(context, fit(context, self.likely))
+            best = remove_idle_effects(context, fit(context, self.likely))
         else:
             self.identified = identify_incomplete(context)
         if self.identified is not None:
@@ -124,14 +127,14 @@ class PredictionErrorSearch(EffectSearch):
         friction = fit_dry_friction(context, selected)
         best = friction
         if not is_explained(context, best):
-            best = higher_merit(best, fit_quick_selection(context, selected))
+            best = select_higher_merit(best, fit_quick_selection(context, selected))
         if self._should_continue(best):
-            best = self._with_missing_effects(best, selected, friction)
+            best = self._add_missing_effects(best, selected, friction)
         if not is_explained(context, best):
             selected = select_with_shapes(context, selected)
-            best = higher_merit(best, fit_quick_selection(context, selected))
+            best = select_higher_merit(best, fit_quick_selection(context, selected))
         if not is_explained(context, best) and not self.evaluator.watch.has_abandoned_fits():
-            best = higher_merit(best, fit_series_effects(context, selected))
+            best = select_higher_merit(best, fit_series_effects(context, selected))
         if not best.effects:
             best = fit_selection(context, selected)
         return fit_single_in_place(context, best)
@@ -149,7 +152,7 @@ class PredictionErrorSearch(EffectSearch):
             and not self.evaluator.watch.has_abandoned_fits()
         )
 
-    def _with_missing_effects(
+    def _add_missing_effects(
         self, best: FittedModel, selected: Selected, friction: FittedModel
     ) -> FittedModel:
         """Fit effects alone, and add effects one by one, until a set explains the runs.
@@ -164,12 +167,12 @@ class PredictionErrorSearch(EffectSearch):
         if is_nearly_explained(context, best):
             check_fit(context, best)
             if len(best.effects) > 1:
-                return higher_merit(best, add_to_model(context, best))
-        best = higher_merit(best, fit_single_effects(context))
+                return select_higher_merit(best, add_to_model(context, best))
+        best = select_higher_merit(best, fit_single_effects(context))
         if self._should_continue(best):
-            best = higher_merit(best, add_to_dry_friction(context, selected, friction))
+            best = select_higher_merit(best, add_to_dry_friction(context, selected, friction))
         if self._should_continue(best):
-            best = higher_merit(best, select_in_model(context))
+            best = select_higher_merit(best, select_in_model(context))
         return best
 
     def fit_rivals(self, best: FittedModel) -> FittedModel:
@@ -189,7 +192,7 @@ class PredictionErrorSearch(EffectSearch):
         if self.evaluator is other.evaluator:
             self._search_context.filters.take_over(other._search_context.filters)
 
-    def p_value_of_missing_effect(self, model: FittedModel) -> float:
+    def compute_p_value_of_missing_effect(self, model: FittedModel) -> float:
         """Return the p-value of the most significant effect that a fitted model lacks.
 
         If it is significant by the linear innovations, it is fitted by simulation.
@@ -206,18 +209,18 @@ class PredictionErrorSearch(EffectSearch):
         start = with_effect(self.evaluator, model.fit.make_start(), name, c)
         places, count = self.evaluator.get_coefficient_indices(name), len(self.evaluator.library)
         # A filter with the effect in the model is faster than a fit, and not linear in the effect.
-        log_likelihood = filters.of_model(model).log_likelihood
+        log_likelihood = filters.get_filter(model).log_likelihood
         gains = []
         for share in TRIED_SHARES:
             theta = start.theta.copy()
             theta[places] *= share
             gains.append(2.0 * (filters.log_likelihood(theta) - log_likelihood))
-        by_filter = p_value_of_gain(max(gains), len(places), count)
+        by_filter = compute_p_value_of_gain(max(gains), len(places), count)
         if by_filter > EFFECT_P_VALUE_THRESHOLD:
             return by_filter
         larger = self.fit_one(start)
         gain = larger.likelihood.value - model.likelihood.value
-        return p_value_of_gain(gain, len(places), count)
+        return compute_p_value_of_gain(gain, len(places), count)
 
     def score_missing_effects(
         self,
@@ -243,9 +246,9 @@ class PredictionErrorSearch(EffectSearch):
         self._report_scoring(model)
         regression, _ = self._search_context.columns.regression(model)
         stream = self.make_rng("library", model.effects)
-        return null_scores(regression, set(self._list_addable_effects(model)), stream)
+        return score_by_regression(regression, set(self._list_addable_effects(model)), stream)
 
-    def force_of_any_shape(self, model: FittedModel) -> tuple[float, str] | None:
+    def score_unmodelled_force(self, model: FittedModel) -> tuple[float, str] | None:
         """Return the p-value of the best additional force and the signal it depends on."""
         if has_series(self.evaluator, model.effects):
             return None
@@ -253,10 +256,10 @@ class PredictionErrorSearch(EffectSearch):
         if self.identified is None:
             regression, _ = columns.regression(model)
         else:
-            current = FilteredSet(filters.of_model(model), model.effects)
-            regression, _ = regression_about(current, columns.hats, filters.base)
+            current = FilteredSet(filters.get_filter(model), model.effects)
+            regression, _ = build_regression_about(current, columns.hats, filters.base)
         labels = {probe.effect for probe in columns.hats.probes}
-        scores = null_scores(regression, labels, self.make_rng("structure", model.effects))
+        scores = score_by_regression(regression, labels, self.make_rng("structure", model.effects))
         return scores.p_value, scores.effects[0] if scores.effects else ""
 
     def make_final_start(self, model: FittedModel) -> FitStart:
@@ -267,9 +270,11 @@ class PredictionErrorSearch(EffectSearch):
         start = model.fit.make_start()
         if not model.effects or has_series(self.evaluator, model.effects):
             return start
-        followed = self._search_context.filters.near_model(model)
+        followed = self._search_context.filters.get_similar_filter(model)
         return (
-            replace(start, by_states=followed.state_sensitivities()) if followed.is_sound else start
+            replace(start, by_states=followed.compute_state_sensitivities())
+            if followed.is_sound
+            else start
         )
 
     def with_sensitivities(self, start: FitStart) -> FitStart:
@@ -280,7 +285,7 @@ class PredictionErrorSearch(EffectSearch):
             return start
         return replace(start, known=self._search_context.columns.sensitivities(start))
 
-    def directions_known(self) -> tuple[TrajectoryFit, DirectionSet] | None:
+    def get_known_directions(self) -> tuple[TrajectoryFit, DirectionSet] | None:
         """Return the first-order changes of the base model's runs by every candidate.
 
         They are linearised about the measured motion.

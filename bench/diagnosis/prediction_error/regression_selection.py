@@ -89,7 +89,7 @@ class Regression:
         _, parts = self._fit_groups([*chosen, self._nuisance])
         return float(parts[-1][0]) if self.always else 0.0
 
-    def instead_of(self, own_columns: Sequence[int]) -> Regression:
+    def make_regression_without(self, own_columns: Sequence[int]) -> Regression:
         """Return the regression without an effect that is in the model.
 
         Args:
@@ -102,17 +102,17 @@ class Regression:
         totals = self.totals + 2.0 * self.crosses[:, whole] + self.grams[:, whole, whole]
         return replace(self, crosses=crosses, totals=totals, always=always)
 
-    def gain_of(self, own: Sequence[int]) -> float:
+    def compute_gain(self, own: Sequence[int]) -> float:
         """Return the gain of columns in twice the log-likelihood, with any signs."""
         group = DirectionGroup("", tuple(own), (False,) * len(own))
-        return self.log_ratio(self.solve([])[0], self.solve([group])[0])
+        return self.compute_log_ratio(self.solve([])[0], self.solve([group])[0])
 
     def shows_nuisance(self, chosen: Sequence[DirectionGroup]) -> bool:
         """Return whether the data show the first column of `always`, in addition to a set."""
         with_it, parts = self._fit_groups([*chosen, self._nuisance])
         rest = DirectionGroup("", self.always[1:], (False,) * (len(self.always) - 1))
         without, _ = self._fit_groups([*chosen, rest])
-        return float(parts[-1][0]) > 0.5 and self.log_ratio(without, with_it) > SHOWN
+        return float(parts[-1][0]) > 0.5 and self.compute_log_ratio(without, with_it) > SHOWN
 
     def solve(self, chosen: Sequence[DirectionGroup]) -> tuple[float, list[Array]]:
         """Fit a set of groups, and return the residual sum of squares and all coefficients."""
@@ -132,7 +132,7 @@ class Regression:
         """
         gram = self.gram if gram is None else gram
         cross = self.cross if cross is None else cross
-        columns = columns_of(chosen)
+        columns = list_columns(chosen)
         positive = np.array([p for group in chosen for p in group.positive], dtype=bool)
         active = np.ones(columns.size, dtype=bool)
         solution = np.zeros(columns.size)
@@ -157,7 +157,7 @@ class Regression:
             begin += len(group.column_indices)
         return rss, parts
 
-    def log_ratio(self, before: float, after: float) -> float:
+    def compute_log_ratio(self, before: float, after: float) -> float:
         """Return twice the gain in log-likelihood, N log(before / after).
 
         Args:
@@ -177,7 +177,7 @@ class Regression:
         The columns of the set are projected out first. Groups that are collinear with the set, or
         that the set contains, gain nothing.
         """
-        columns = columns_of(chosen)
+        columns = list_columns(chosen)
         columns = np.append(columns, np.array(self.always, dtype=np.intp))
         gram, cross, rss = self.gram, self.cross, self.total
         if columns.size:
@@ -204,7 +204,7 @@ class Regression:
                 result[i] = 0.0
         return result
 
-    def net_gains(self, chosen: Sequence[DirectionGroup] = ()) -> Array:
+    def compute_net_gains(self, chosen: Sequence[DirectionGroup] = ()) -> Array:
         """Return the gain of each group in addition to a set, minus its price (n,)."""
         prices = np.array([self.price(group) for group in self.groups])
         net: Array = self.gains(chosen) - prices
@@ -224,14 +224,14 @@ class Regression:
         """
         chosen = list(begin)
         while len(chosen) < most:
-            gains = self.net_gains(chosen)
+            gains = self.compute_net_gains(chosen)
             best = int(np.argmax(gains))
             if gains[best] <= 0.0:
                 break
             larger = [*chosen, self.groups[best]]
             if not self.generalises(chosen, larger):
                 break
-            larger = self.pruned(larger)
+            larger = self.prune(larger)
             if self.groups[best] not in larger:
                 break
             chosen = larger
@@ -251,14 +251,14 @@ class Regression:
         """
         if len(self.totals) < 2:
             return True
-        before, after = self._left_out(smaller), self._left_out(larger)
+        before, after = self._compute_left_out_rss(smaller), self._compute_left_out_rss(larger)
         return bool(after.sum() < before.sum() and (after < before).mean() >= MAJORITY)
 
-    def _left_out(self, chosen: Sequence[DirectionGroup]) -> Array:
+    def _compute_left_out_rss(self, chosen: Sequence[DirectionGroup]) -> Array:
         """Return the residual sum of squares (R,) of each run, predicted from the other runs."""
         found = []
         groups = [*chosen, self._nuisance]
-        columns = columns_of(groups)
+        columns = list_columns(groups)
         for run, total in enumerate(self.totals):
             gram, cross = self.gram - self.grams[run], self.cross - self.crosses[run]
             _, parts = self._fit_groups(groups, gram, cross)
@@ -267,7 +267,7 @@ class Regression:
             found.append(total - 2.0 * own @ self.crosses[run][columns] + own @ block @ own)
         return np.array(found)
 
-    def pruned(self, chosen: Sequence[DirectionGroup]) -> list[DirectionGroup]:
+    def prune(self, chosen: Sequence[DirectionGroup]) -> list[DirectionGroup]:
         """Remove effects one by one whose gain is below their price, the right side of (2).
 
         The effect with the smallest net gain is removed first.
@@ -279,7 +279,7 @@ class Regression:
             for group in left:
                 rest = [other for other in left if other is not group]
                 without = self.solve(rest)[0]
-                losses.append(self.log_ratio(without, rss) - self.price(group))
+                losses.append(self.compute_log_ratio(without, rss) - self.price(group))
             least = int(np.argmin(losses))
             if losses[least] > 0:
                 break
@@ -298,12 +298,12 @@ def _normalise_gram(gram: Array, columns: Places) -> tuple[Array, Array]:
     return normal, scale
 
 
-def columns_of(groups: Sequence[DirectionGroup]) -> Places:
+def list_columns(groups: Sequence[DirectionGroup]) -> Places:
     """Return the columns of some groups, one group after another."""
     return np.array([c for group in groups for c in group.column_indices], dtype=np.intp)
 
 
-def groups_of(probes: Sequence[CandidateDirection]) -> list[DirectionGroup]:
+def group_probes(probes: Sequence[CandidateDirection]) -> list[DirectionGroup]:
     """Group the columns of the probes of one effect at one grid point, which act together."""
     places: dict[tuple[str, int], list[int]] = {}
     for i, probe in enumerate(probes):
@@ -318,7 +318,7 @@ DRAWS = 200
 """Number of draws from the null distribution."""
 
 
-def p_value_of_gain(gain: float, coefficients: int, candidates: int) -> float:
+def compute_p_value_of_gain(gain: float, coefficients: int, candidates: int) -> float:
     """Return the p-value of the largest gain among several candidates.
 
     Args:
@@ -329,7 +329,7 @@ def p_value_of_gain(gain: float, coefficients: int, candidates: int) -> float:
     return min(candidates * float(chdtrc(coefficients, max(gain, 0.0))), 1.0)
 
 
-def null_scores(
+def score_by_regression(
     regression: Regression, lacking: Collection[str], rng: np.random.Generator
 ) -> CandidateScores:
     """Score effects by a regression.
@@ -356,7 +356,7 @@ def null_scores(
         )
         uniform = rng.random(DRAWS) ** (1.0 / shapes)
         null_draws.append(chdtri(degrees_of_freedom, 1.0 - uniform))
-        p_values.append(p_value_of_gain(largest_gain, degrees_of_freedom, shapes))
+        p_values.append(compute_p_value_of_gain(largest_gain, degrees_of_freedom, shapes))
         peak: DirectionGroup = regression.groups[max(group_indices, key=lambda i: gains[i])]
         peaks.append(((peak, regression.solve([peak])[1][0]),))
     order = np.argsort(-score, kind="stable")

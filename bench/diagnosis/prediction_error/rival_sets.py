@@ -16,22 +16,22 @@ from bench.diagnosis.prediction_error.effect_proposals import SearchContext
 from bench.diagnosis.prediction_error.forward_growth import (
     LINEARISATION_ERROR,
     RIVAL_MARGIN,
-    try_one_more,
+    try_one_more_effect,
 )
 from bench.diagnosis.prediction_error.joint_effects import (
     JOINT_MODEL,
     SERVO_MODEL,
-    at_coupled_joints,
     has_series,
-    plain_effects_beside,
+    list_at_coupled_joints,
+    list_joint_model_effects,
 )
 from bench.diagnosis.prediction_error.model_filters import GAUSS_NEWTON_STEPS
 from bench.diagnosis.prediction_error.selection_fits import MAX_IMPROVED_SIZE, refine_single_effects
 from bench.diagnosis.prediction_error.simulated_fits import (
     fit_filtered,
-    higher_merit,
-    in_place_of,
     is_explained,
+    make_replacing_start,
+    select_higher_merit,
 )
 from sims.core.simulator import Array
 
@@ -75,15 +75,15 @@ def fit_single_in_place(context: SearchContext, best: FittedModel) -> FittedMode
     ):
         return best
     filters = context.filters
-    single_sets = try_one_more(context, filters.empty_set)
+    single_sets = try_one_more_effect(context, filters.empty_set)
     if not single_sets:
         return best
     (name,) = single_sets[0].names
     penalty = sum(filters.penalty(one) for one in best.effects) - filters.penalty(name)
-    loss = filters.of_model(best).log_likelihood - single_sets[0].followed.log_likelihood
+    loss = filters.get_filter(best).log_likelihood - single_sets[0].followed.log_likelihood
     if 2.0 * loss > penalty + RIVAL_MARGIN:
         return best
-    return higher_merit(fit_rivals(context, fit_filtered(context, single_sets[0])), best)
+    return select_higher_merit(fit_rivals(context, fit_filtered(context, single_sets[0])), best)
 
 
 def fit_rivals(context: SearchContext, best: FittedModel) -> FittedModel:
@@ -101,7 +101,7 @@ def fit_rivals(context: SearchContext, best: FittedModel) -> FittedModel:
     for name in best.effects:
         for rival in _find_rivals(context, best, name):
             rivals.add(rival.effect)
-            start = in_place_of(evaluator, best, [name], rival.effect, rival.c)
+            start = make_replacing_start(evaluator, best, [name], rival.effect, rival.c)
             if frozenset(start.effects) in search.models:
                 continue
             confirmed = _confirm_by_filter(context, best, rival, start)
@@ -127,11 +127,11 @@ def _find_rivals(context: SearchContext, model: FittedModel, name: str) -> list[
     """Return the effects that are nearly as good by the regression in place of the given one."""
     evaluator = context.evaluator
     regression, columns = context.columns.regression(model)
-    remaining = regression.instead_of(columns[name])
+    remaining = regression.make_regression_without(columns[name])
     # Effects with more coefficients gain more under the null hypothesis.
-    gains = remaining.net_gains()
-    own_gain = remaining.gain_of(columns[name]) - context.filters.penalty(name)
-    same_joint = plain_effects_beside(evaluator, name)
+    gains = remaining.compute_net_gains()
+    own_gain = remaining.compute_gain(columns[name]) - context.filters.penalty(name)
+    same_joint = list_joint_model_effects(evaluator, name)
     rivals, near_count = dict[str, _Rival](), 0
     for i in np.argsort(-gains, kind="stable").tolist():
         group = remaining.groups[i]
@@ -171,8 +171,8 @@ def _confirm_by_filter(
         and filters.log_likelihood(start.theta) < filters.base.log_likelihood
     ):
         return None
-    followed, names = filters.with_effects(start.theta, start.effects, steps)
-    loss = filters.of_model(best).log_likelihood - followed.log_likelihood
+    followed, names = filters.follow_with_effects(start.theta, start.effects, steps)
+    loss = filters.get_filter(best).log_likelihood - followed.log_likelihood
     return None if 2.0 * loss > RIVAL_MARGIN else FitStart(names, followed.theta, start.states)
 
 
@@ -180,11 +180,11 @@ def _fit_at_coupled_joints(context: SearchContext, size: int) -> None:
     """Fit the best models of a size with each effect moved to the other joints of its loop."""
     search, evaluator = context.search, context.evaluator
     starts: dict[frozenset[str], FitStart] = {}
-    for model in _near_the_best(context, size):
+    for model in _list_models_near_the_best(context, size):
         for name in model.effects:
             c = model.fit.theta[evaluator.slots[name]]
-            for other in at_coupled_joints(evaluator, name):
-                start = in_place_of(evaluator, model, [name], other, c)
+            for other in list_at_coupled_joints(evaluator, name):
+                start = make_replacing_start(evaluator, model, [name], other, c)
                 key = frozenset(start.effects)
                 if other not in model.effects and key not in search.models:
                     starts[key] = start
@@ -197,7 +197,7 @@ def _refine_near(context: SearchContext, size: int) -> None:
 
     Otherwise, incomplete fits would decide between them.
     """
-    search, near_models = context.search, _near_the_best(context, size)
+    search, near_models = context.search, _list_models_near_the_best(context, size)
     if context.evaluator.watch.has_abandoned_fits() or len(near_models) < 2:
         return
     fitter = TrajectoryFitter(context.evaluator, search.noise, search.frozen, exact=True)
@@ -207,7 +207,7 @@ def _refine_near(context: SearchContext, size: int) -> None:
             search.add_fit(fit)
 
 
-def _near_the_best(context: SearchContext, size: int) -> list[FittedModel]:
+def _list_models_near_the_best(context: SearchContext, size: int) -> list[FittedModel]:
     """Return the models with `size` effects whose merit is close to the highest."""
     of_size = [m for m in context.search.models.values() if len(m.effects) == size]
     highest = max((model.penalised_log_likelihood for model in of_size), default=-np.inf)

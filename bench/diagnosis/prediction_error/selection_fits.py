@@ -18,26 +18,26 @@ from bench.diagnosis.fitting.model_set import FittedModel
 from bench.diagnosis.friction_form_verdict import (
     has_dry_friction,
     is_likelier_soft,
-    with_plain_friction,
+    replace_by_stateless_friction,
 )
 from bench.diagnosis.prediction_error.effect_proposals import MIN_GAIN_SHARE, SearchContext
 from bench.diagnosis.prediction_error.effect_selection import Selected
 from bench.diagnosis.prediction_error.joint_effects import (
     JOINT_MODEL,
     SERVO_MODEL,
-    acts_at,
+    acts_at_joint,
     has_many_shapes,
 )
 from bench.diagnosis.prediction_error.simulated_fits import (
     fit,
     fit_nearby,
-    higher_merit,
     is_at_noise,
     is_explained,
     is_nearly_explained,
-    lowest_of_each,
-    starts_nearby,
-    without_idle_effects,
+    list_nearby_starts,
+    remove_idle_effects,
+    select_higher_merit,
+    select_lowest_of_each,
 )
 from bench.diagnosis.search.verdict_rules import INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
 from sims.core.effect import members_of
@@ -74,7 +74,7 @@ def fit_quick_selection(context: SearchContext, selected: Selected) -> FittedMod
     Returns:
         The fitted model, or the base model if simulation is slow and a force is still missing.
     """
-    paying = without_surplus(context, selected)
+    paying = drop_surplus_effects(context, selected)
     is_slow = len(paying.groups) > MAX_SLOW_EFFECTS and _is_slow(context, paying.effects)
     if is_slow and selected.followed.lacks_force:
         return context.search.base_model
@@ -92,17 +92,17 @@ def fit_selection(context: SearchContext, selected: Selected) -> FittedModel:
     if not selected.groups:
         return base
     start = context.columns.start(selected.groups, selected.coefficients)
-    states = context.filters.first_states(selected.followed)
+    states = context.filters.estimate_first_states(selected.followed)
     fitted = fit(context, replace(start, states=states))
     if not np.isfinite(fitted.fit.cost):
         return base
-    fitted = without_idle_effects(context, fitted)
+    fitted = remove_idle_effects(context, fitted)
     if selected.shows_steps:
-        fitted = context.search.without_step_errors(fitted)
-    return higher_merit(fitted, base)
+        fitted = context.search.correct_step_errors(fitted)
+    return select_higher_merit(fitted, base)
 
 
-def without_surplus(context: SearchContext, selected: Selected) -> Selected:
+def drop_surplus_effects(context: SearchContext, selected: Selected) -> Selected:
     """Drop the last effects of a selection that gain little with the set in a filter's model.
 
     Far from the base model, the linear regression is wrong.
@@ -158,7 +158,7 @@ def select_with_shapes(context: SearchContext, selected: Selected) -> Selected:
     """
     evaluator, joints = context.evaluator, np.flatnonzero(selected.followed.missing_forces).tolist()
     many_shaped = [
-        n for n in evaluator.library if has_many_shapes(n) and acts_at(evaluator, n, joints)
+        n for n in evaluator.library if has_many_shapes(n) and acts_at_joint(evaluator, n, joints)
     ]
     if not many_shaped:
         return selected
@@ -193,30 +193,30 @@ def check_selection(context: SearchContext, selected: Selected) -> None:
     filters = context.filters
     if filters.is_soft or not filters.base.lacks_force:
         return
-    friction = dry_friction_of(context, selected)
+    friction = make_dry_friction_start(context, selected)
     # Stiff friction that explains the runs needs no comparison.
     if friction.effects and is_explained(
         context, context.search.fit_one(friction, FIRST_ITERATIONS)
     ):
         return
-    soft = _soft_friction(context)
+    soft = _find_soft_friction(context)
     if soft is None:
         return
     softer = filters.log_likelihood(soft.theta, is_soft=True)
     gain = softer - filters.base.log_likelihood
     # Another effect at the joint that promises more is fitted first.
-    if not gain > max(context.proposals.largest_gain_of_others(soft.effects[0]), 0.0):
+    if not gain > max(context.proposals.compute_largest_gain_of_others(soft.effects[0]), 0.0):
         return
     if _is_far_less_likely(context, selected, softer):
         raise SoftFrictionError(soft, is_preliminary=True)
-    paying = without_surplus(context, selected)
+    paying = drop_surplus_effects(context, selected)
     log_likelihood = filters.log_likelihood(
         context.columns.start(paying.groups, paying.coefficients).theta
     )
     check_filter(context, log_likelihood, is_preliminary=True)
 
 
-def _soft_friction(context: SearchContext) -> FitStart | None:
+def _find_soft_friction(context: SearchContext) -> FitStart | None:
     """Return the likeliest model of soft dry friction at the joint where regression shows friction.
 
     Returns:
@@ -238,7 +238,7 @@ def _soft_friction(context: SearchContext) -> FitStart | None:
         return None
     best = groups[by_gain[0]]
     (c,) = columns.coefficients(best, regression.solve([best])[1][0])
-    return context.filters.soft_friction(best.effect, float(np.copysign(1.0, c)))
+    return context.filters.find_soft_friction(best.effect, float(np.copysign(1.0, c)))
 
 
 def _is_far_less_likely(context: SearchContext, selected: Selected, log_likelihood: float) -> bool:
@@ -273,7 +273,7 @@ def check_filter(
     Raises:
         SoftFrictionError: soft friction is likelier.
     """
-    soft = _soft_friction(context)
+    soft = _find_soft_friction(context)
     if soft is None:
         return
     softer = context.filters.log_likelihood(soft.theta, is_soft=True)
@@ -306,19 +306,19 @@ def fit_dry_friction(context: SearchContext, selected: Selected) -> FittedModel:
         The fitted model, or the base model if the selection has no friction or leaves no force
         missing.
     """
-    friction = dry_friction_of(context, selected)
+    friction = make_dry_friction_start(context, selected)
     if not friction.effects or not selected.followed.lacks_force:
         return context.search.base_model
     fitted_before = context.search.models.get(frozenset(friction.effects))
     if fitted_before is not None and is_explained(context, fitted_before):
-        return without_idle_effects(context, fitted_before)
+        return remove_idle_effects(context, fitted_before)
     if fitted_before is not None and np.isfinite(fitted_before.fit.cost):
         friction = fitted_before.fit.make_start()
     fitted = fit(context, friction)
-    return without_idle_effects(context, fitted) if is_explained(context, fitted) else fitted
+    return remove_idle_effects(context, fitted) if is_explained(context, fitted) else fitted
 
 
-def dry_friction_of(context: SearchContext, selected: Selected) -> FitStart:
+def make_dry_friction_start(context: SearchContext, selected: Selected) -> FitStart:
     """Return a start with only the dry friction of a selection, in its form without a state.
 
     A family replaces its members.
@@ -329,7 +329,7 @@ def dry_friction_of(context: SearchContext, selected: Selected) -> FitStart:
     """
     evaluator, filters = context.evaluator, context.filters
     start = context.columns.start(selected.groups, selected.coefficients)
-    plain_names, plain_theta = with_plain_friction(evaluator, start.effects, start.theta)
+    plain_names, plain_theta = replace_by_stateless_friction(evaluator, start.effects, start.theta)
     native = [name for name in plain_names if name.partition("@")[0] in MODEL_FIELD_EFFECTS]
     friction = [name for name in native if has_dry_friction(evaluator, [name])]
     contained = {part for name in friction for part in evaluator.available_effects[name].contains}
@@ -337,10 +337,12 @@ def dry_friction_of(context: SearchContext, selected: Selected) -> FitStart:
     theta = filters.reference.copy()
     for name in names:
         theta[evaluator.slots[name]] = plain_theta[evaluator.slots[name]]
-    return FitStart(names, theta, filters.first_states(filters.base))
+    return FitStart(names, theta, filters.estimate_first_states(filters.base))
 
 
-def stands_alone(context: SearchContext, selected: Selected, friction: FittedModel) -> bool:
+def is_friction_sufficient(
+    context: SearchContext, selected: Selected, friction: FittedModel
+) -> bool:
     """Return whether dry friction without a state follows the data as well as the selection.
 
     Args:
@@ -353,7 +355,7 @@ def stands_alone(context: SearchContext, selected: Selected, friction: FittedMod
     """
     filters = context.filters
     start = context.columns.start(selected.groups, selected.coefficients)
-    _, plain_theta = with_plain_friction(context.evaluator, start.effects, start.theta)
+    _, plain_theta = replace_by_stateless_friction(context.evaluator, start.effects, start.theta)
     stiff = filters.log_likelihood(plain_theta)
     soft = -np.inf if filters.is_soft else filters.log_likelihood(plain_theta, is_soft=True)
     selected_log_likelihood = (
@@ -385,7 +387,7 @@ def fit_single_effects(context: SearchContext) -> FittedModel:
         SoftFrictionError: dry friction is likelier in MuJoCo's soft form.
     """
     search, filters = context.search, context.filters
-    states = filters.first_states(filters.base)
+    states = filters.estimate_first_states(filters.base)
     starts = context.proposals.of(filters.empty_set, len(JOINT_MODEL + SERVO_MODEL))
     fitted, best = list[FittedModel](), search.base_model
     for is_slow in (False, True):
@@ -395,10 +397,10 @@ def fit_single_effects(context: SearchContext) -> FittedModel:
             fitted += search.fit_all([replace(start, states=states) for start in group])
             best = max(fitted, key=lambda model: model.penalised_log_likelihood)
     if not is_explained(context, best):
-        best = higher_merit(best, refine_single_effects(context, fitted))
+        best = select_higher_merit(best, refine_single_effects(context, fitted))
     if is_explained(context, best):
-        return without_idle_effects(context, best)
-    check_filter(context, filters.of_model(best).log_likelihood)
+        return remove_idle_effects(context, best)
+    check_filter(context, filters.get_filter(best).log_likelihood)
     check_fit(context, best)
     return search.base_model
 
@@ -418,13 +420,13 @@ def refine_single_effects(context: SearchContext, fitted: Sequence[FittedModel])
     for model in fitted:
         (name,) = model.effects
         if len(context.evaluator.get_coefficient_indices(name)) <= MAX_IMPROVED_SIZE:
-            starts += [model.fit.make_start(), *starts_nearby(context, model, name)]
+            starts += [model.fit.make_start(), *list_nearby_starts(context, model, name)]
     best = context.search.base_model
-    for _, start in lowest_of_each(context, starts)[:MAX_REFINED]:
+    for _, start in select_lowest_of_each(context, starts)[:MAX_REFINED]:
         refined = fit(context, start)
         if not is_at_noise(context, refined) and is_nearly_explained(context, refined):
             refined = fit_nearby(context, refined, refined.effects[0])
-        best = higher_merit(best, refined)
+        best = select_higher_merit(best, refined)
         if is_explained(context, best) or context.evaluator.watch.has_abandoned_fits():
             break
     return best
@@ -444,15 +446,17 @@ def fit_series_effects(context: SearchContext, selected: Selected) -> FittedMode
     names = [
         name for name in evaluator.library if is_series_effect(evaluator.available_effects[name])
     ]
-    probes = context.columns.probes([name for name in names if acts_at(evaluator, name, joints)])
+    probes = context.columns.probes(
+        [name for name in names if acts_at_joint(evaluator, name, joints)]
+    )
     if not probes:
         return search.base_model
     evaluator.watch.stage("testing elasticity and backlash between drives and links", len(probes))
     starts = []
     for probe in probes:
-        theta = context.filters.theta_with(probe.effect, probe.coefficients)
+        theta = context.filters.make_theta_with(probe.effect, probe.coefficients)
         starts.append(FitStart((probe.effect,), theta, evaluator.guess))
-    fitted = search.fit_all([start for _, start in lowest_of_each(context, starts)])
+    fitted = search.fit_all([start for _, start in select_lowest_of_each(context, starts)])
     return fit(
         context, max(fitted, key=lambda model: model.penalised_log_likelihood).fit.make_start()
     )

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.diagnosis.fitting.base_fit import costs_of_starts
+from bench.diagnosis.fitting.base_fit import compute_start_costs
 from bench.diagnosis.fitting.fit_state import FitStart
 from bench.diagnosis.fitting.linearised_runs import compute_state_jacobian
 from bench.diagnosis.fitting.model_set import FittedModel
@@ -65,7 +65,7 @@ def fit_filtered(context: SearchContext, current: FilteredSet) -> FittedModel:
         context: context of the search.
         current: the set.
     """
-    states = context.filters.first_states(current.followed)
+    states = context.filters.estimate_first_states(current.followed)
     return fit(context, FitStart(current.names, current.followed.theta, states))
 
 
@@ -77,11 +77,11 @@ def fit_nearby(context: SearchContext, model: FittedModel, name: str) -> FittedM
         model: the fitted model.
         name: name of the effect.
     """
-    ((cost, start),) = lowest_of_each(context, starts_nearby(context, model, name))
+    ((cost, start),) = select_lowest_of_each(context, list_nearby_starts(context, model, name))
     return context.search.fit_one(start) if cost < model.fit.cost else model
 
 
-def starts_nearby(context: SearchContext, model: FittedModel, name: str) -> list[FitStart]:
+def list_nearby_starts(context: SearchContext, model: FittedModel, name: str) -> list[FitStart]:
     """Return starts with nearby coefficients of an effect.
 
     Initial states are those of the fit, or those that were measured.
@@ -91,7 +91,7 @@ def starts_nearby(context: SearchContext, model: FittedModel, name: str) -> list
         model: the fitted model.
         name: name of the effect.
     """
-    measured = context.filters.first_states(context.filters.base)
+    measured = context.filters.estimate_first_states(context.filters.base)
     starts = []
     for place in context.evaluator.get_coefficient_indices(name):
         for factor in NEARBY:
@@ -103,7 +103,7 @@ def starts_nearby(context: SearchContext, model: FittedModel, name: str) -> list
     return starts
 
 
-def lowest_of_each(
+def select_lowest_of_each(
     context: SearchContext, starts: Sequence[FitStart]
 ) -> list[tuple[float, FitStart]]:
     """Simulate starts, and return the one with the lowest cost for each set of effects.
@@ -117,7 +117,7 @@ def lowest_of_each(
     """
     if not starts:
         return []
-    costs = costs_of_starts(
+    costs = compute_start_costs(
         context.evaluator, context.search.noise, starts, share=1.0, failed_residual=np.inf
     )
     lowest: dict[tuple[str, ...], tuple[float, FitStart]] = {}
@@ -166,12 +166,12 @@ def is_nearly_explained(context: SearchContext, model: FittedModel) -> bool:
     return excess(model) < NEARLY_EXPLAINED * excess(context.search.base_model)
 
 
-def higher_merit(one: FittedModel, other: FittedModel) -> FittedModel:
+def select_higher_merit(one: FittedModel, other: FittedModel) -> FittedModel:
     """Return the model with the higher merit; the first one if they are equal."""
     return max(one, other, key=lambda model: model.penalised_log_likelihood)
 
 
-def without_idle_effects(context: SearchContext, model: FittedModel) -> FittedModel:
+def remove_idle_effects(context: SearchContext, model: FittedModel) -> FittedModel:
     """Remove effects that do not pay, and replace a family by a member that is as good.
 
     Args:
@@ -197,7 +197,7 @@ def _merge_into_families(context: SearchContext, model: FittedModel) -> FittedMo
         if coefficients.size != len(evaluator.get_coefficient_indices(family)):
             continue
         fitted = context.search.fit_one(
-            in_place_of(evaluator, model, members, family, coefficients)
+            make_replacing_start(evaluator, model, members, family, coefficients)
         )
         model = (
             fitted
@@ -208,7 +208,7 @@ def _merge_into_families(context: SearchContext, model: FittedModel) -> FittedMo
     return model
 
 
-def in_place_of(
+def make_replacing_start(
     evaluator: RunEvaluator, model: FittedModel, names: Sequence[str], other: str, c: Array
 ) -> FitStart:
     """Return a start in which one effect replaces several others.

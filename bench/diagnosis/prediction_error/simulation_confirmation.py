@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from bench.diagnosis.fitting.model_set import FittedModel
 from bench.diagnosis.prediction_error.incomplete_model import IdentifiedSet
 from bench.diagnosis.prediction_error.prediction_error_search import PredictionErrorSearch
-from bench.diagnosis.prediction_error.regression_selection import p_value_of_gain
+from bench.diagnosis.prediction_error.regression_selection import compute_p_value_of_gain
 from bench.diagnosis.search.alternative_causes import AlternativeFinder, CauseEvidence
 from bench.diagnosis.search.diagnose import DiagnosisResult, Inquiry, compute_gap_closed
 from bench.diagnosis.search.effect_search import EffectSearch
@@ -51,14 +51,14 @@ class Confirmation(Inquiry):
             SearchStoppedError: the search had to end early.
         """
         search, watch = self._robot, self._watch
-        unfit = self.unfit_base()
+        unfit = self.classify_unfit_base()
         if unfit is not None:
             return unfit
         base = search.base_model
         watch.begin_question("search")
         self._model = search.run()
         if search.identified is not None:
-            return self._answered_by_filters(search.identified)
+            return self._build_filter_result(search.identified)
         watch.begin_question("rivals")
         self._model = search.fit_rivals(self._model)
         size = len(self._model.effects)
@@ -82,7 +82,7 @@ class Confirmation(Inquiry):
             alternatives=any(cause.alternatives for cause in causes),
             closed=compute_gap_closed(search, model, lack_of_fit),
             unexplained=is_unexplained(
-                lack_of_fit.has_structure, search.p_value_of_missing_effect(model)
+                lack_of_fit.has_structure, search.compute_p_value_of_missing_effect(model)
             ),
             missed=trial is not None and trial.has_unexplained_gap(model, lack_of_fit),
         )
@@ -92,7 +92,7 @@ class Confirmation(Inquiry):
             model, causes = base, ()
         return self._make_result(verdict, base, model, causes, lack_of_fit)
 
-    def _answered_by_filters(self, identified: IdentifiedSet) -> DiagnosisResult:
+    def _build_filter_result(self, identified: IdentifiedSet) -> DiagnosisResult:
         """Return the result for a set that filters identified in a model that stays incomplete."""
         search, watch, model, trial = self._robot, self._watch, identified.model, None
         if self._held_out is not None:
@@ -119,7 +119,7 @@ class Confirmation(Inquiry):
         """Return the evidence for an effect whose gain is that of filters."""
         evaluator = self._robot.evaluator
         count = len(evaluator.get_coefficient_indices(name))
-        p_value = p_value_of_gain(gain, count, len(evaluator.library))
+        p_value = compute_p_value_of_gain(gain, count, len(evaluator.library))
         return CauseEvidence(name, (), p_value, gain, name)
 
     def _evaluate_on_held_out_runs(self) -> None:
@@ -149,6 +149,8 @@ class Confirmation(Inquiry):
 class _RobotAlternatives(AlternativeFinder):
     """Collects alternatives of a robot's effects; p-values are those of the chi-squared law."""
 
-    def _p_value(self, rest: FittedModel, effect: str, gain: float) -> float:  # noqa: ARG002
+    def _compute_p_value(self, rest: FittedModel, effect: str, gain: float) -> float:  # noqa: ARG002
         slot = self.search.evaluator.slots[effect]
-        return p_value_of_gain(gain, slot.stop - slot.start, len(self.search.evaluator.library))
+        return compute_p_value_of_gain(
+            gain, slot.stop - slot.start, len(self.search.evaluator.library)
+        )

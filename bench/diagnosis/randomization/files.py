@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from bench.diagnosis.randomization.isaac_lab import isaac_lab_code
-from bench.diagnosis.randomization.mujoco_playground import mujoco_playground_code
+from bench.diagnosis.randomization.isaac_lab import render_isaac_lab_code
+from bench.diagnosis.randomization.mujoco_playground import render_mujoco_playground_code
 from bench.diagnosis.randomization.ranges import RandomizationRanges
 from bench.pages.csv_text import csv_text
 from sims.extended_simulator import ExtendedSimulator
@@ -21,7 +21,7 @@ COLUMNS = (
 """Columns of ranges.csv: the keys of a range in ranges.toml."""
 
 
-def range_files(
+def build_range_files(
     ranges: RandomizationRanges, extended: ExtendedSimulator, folder: Path | None = None
 ) -> Mapping[str, str]:
     """Return the content of each file by its name.
@@ -53,8 +53,8 @@ def range_files(
     robot = getattr(extended.kind, "robot", None)
     return {
         **tables,
-        "ranges_isaac_lab.py": isaac_lab_code(ranges, extended, robot),
-        "ranges_mujoco_playground.py": mujoco_playground_code(ranges, extended, robot),
+        "ranges_isaac_lab.py": render_isaac_lab_code(ranges, extended, robot),
+        "ranges_mujoco_playground.py": render_mujoco_playground_code(ranges, extended, robot),
     }
 
 

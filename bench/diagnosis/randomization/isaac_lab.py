@@ -46,7 +46,9 @@ class Term(NamedTuple):
     comments: Sequence[str]
 
 
-def isaac_lab_code(ranges: RandomizationRanges, extended: ExtendedSimulator, robot: Any) -> str:
+def render_isaac_lab_code(
+    ranges: RandomizationRanges, extended: ExtendedSimulator, robot: Any
+) -> str:
     """Return a Python file with a configclass of event terms.
 
     Args:

@@ -19,7 +19,7 @@ OBJECTS = {"joint": "mjOBJ_JOINT", "body": "mjOBJ_BODY", "actuator": "mjOBJ_ACTU
 """MuJoCo's object types by kind of place."""
 
 
-def mujoco_playground_code(
+def render_mujoco_playground_code(
     ranges: RandomizationRanges, extended: ExtendedSimulator, robot: Any
 ) -> str:
     """Return a Python file with a function `domain_randomize`.

@@ -115,7 +115,7 @@ class _Entry(NamedTuple):
     coefficient: str
 
 
-def randomization_ranges(answer: Verdict, extended: ExtendedSimulator) -> RandomizationRanges:
+def list_randomization_ranges(answer: Verdict, extended: ExtendedSimulator) -> RandomizationRanges:
     """Return the ranges of the fitted numbers of diagnosed causes and of free numbers.
 
     Args:

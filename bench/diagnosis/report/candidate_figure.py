@@ -76,7 +76,7 @@ _BAR = 0.16
 _NAME_SIZE = 9
 
 
-def candidates_figure(report: DiagnosisReportData) -> Figure:
+def draw_candidates_figure(report: DiagnosisReportData) -> Figure:
     """Draw the candidates, the highest score first.
 
     The left panel shows the share of the held-out gap that each closes alone, with its 95 %

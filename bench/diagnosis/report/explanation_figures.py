@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from bench.diagnosis.report.candidate_figure import candidates_figure
+from bench.diagnosis.report.candidate_figure import draw_candidates_figure
 from bench.diagnosis.report.candidate_ranking import select_shown_candidates
 from bench.diagnosis.report.cause_text import list_place_marks
 from bench.diagnosis.report.figure_panels import (
@@ -23,10 +23,10 @@ from bench.diagnosis.report.figure_panels import (
     LONGEST_NAME,
     draw_gap_location_panel,
     draw_profile_panel,
+    format_profile_label,
     get_legend_entries,
     has_extended_model,
     place_names,
-    profile_label,
     select_gap_locations,
     select_informative_profiles,
     shorten_label,
@@ -323,7 +323,7 @@ def _draw_residual_locations(report: DiagnosisReportData) -> Figure:
     width = left_margin + 3.3 + (3.1 * columns if columns != 1 else 4.4)
     row = 0.27 + 0.13 * (most_lines(names) - 1)
     # Variables of robots have long names, which need several lines below the panels.
-    label_height = 0.15 * (most_lines([profile_label(profile) for profile in profiles]) - 1)
+    label_height = 0.15 * (most_lines([format_profile_label(profile) for profile in profiles]) - 1)
     height = max(2.6 + row * len(places), 1.5 + (1.9 + label_height) * rows)
     figure, axes = make_panel_grid(1, 1, (width, height), layout=None)
     layout, axis = _FigureLayout(figure, width, height), axes[0, 0]
@@ -367,5 +367,5 @@ _MAKERS: Mapping[str, Callable[[DiagnosisReportData], Figure]] = {
     "robot": _draw_robot,
     "overview": _draw_overview,
     "where": _draw_residual_locations,
-    "candidates": candidates_figure,
+    "candidates": draw_candidates_figure,
 }

@@ -231,7 +231,7 @@ def _compute_profile_significance(profile: ResidualProfile) -> float:
     return float(np.mean((profile.before[is_measured] / profile.error[is_measured]) ** 2))
 
 
-def profile_label(profile: ResidualProfile) -> str:
+def format_profile_label(profile: ResidualProfile) -> str:
     """Format a variable with its unit, in as many lines as needed."""
     name = format_label(
         sanitise(profile.variable, LONGEST_NAME), sanitise(profile.unit, 12), LONGEST_NAME
@@ -276,7 +276,7 @@ def draw_profile_panel(
         )
     for values, curve_style in curves:
         axis.errorbar(centres, values[is_measured], yerr=bars, elinewidth=1.0, **curve_style)
-    axis.set_xlabel(profile_label(profile))
+    axis.set_xlabel(format_profile_label(profile))
     label = (
         "residual" if one_channel else f"residual of {sanitise(profile.channel, MAX_LABEL_LENGTH)}"
     )

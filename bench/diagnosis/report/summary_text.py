@@ -193,7 +193,7 @@ def _format_unconfirmed_reason(causes: Sequence[Cause]) -> str:
     return f"the fit ends at the {END[first.at_bound or 'high']} bound of its range, {value}"
 
 
-def undetermined(report: DiagnosisReportData) -> Iterator[str]:
+def iterate_undetermined_numbers(report: DiagnosisReportData) -> Iterator[str]:
     """Yield which coefficients are not results, what that means, and what to do."""
     open_numbers = [
         (f"{sanitise(cause.effect, 60)}, {sanitise(key, 60)}", fitted)
@@ -292,7 +292,7 @@ def format_gain_and_caveats(report: DiagnosisReportData) -> Iterator[str]:
         yield format_search_summary(report)
         yield format_detectable_gap(report)
     yield format_gain(report)
-    yield from undetermined(report)
+    yield from iterate_undetermined_numbers(report)
     if verdict == "partial" or (verdict == "named" and len(report.verdict.causes) > 1):
         # The headline describes a single diagnosed cause; several causes are described here.
         cause_texts = [

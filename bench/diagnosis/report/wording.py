@@ -172,10 +172,10 @@ def format_fitted_value(fitted: FittedValue) -> str:
     text = append_unit(format_estimate(fitted.value, fitted.low, fitted.high), fitted.unit)
     if fitted.at_bound is not None:
         text = at_bound(fitted.value, fitted.unit, fitted.at_bound)
-    return text + in_file(fitted) + beyond_usual(fitted)
+    return text + format_file_change(fitted) + format_usual_range(fitted)
 
 
-def in_file(fitted: FittedValue) -> str:
+def format_file_change(fitted: FittedValue) -> str:
     """Format the change in the model file: ``, in the model file 0.2 → 0.15 N·m``; else empty."""
     if fitted.stated is None or fitted.total is None:
         return ""
@@ -183,7 +183,7 @@ def in_file(fitted: FittedValue) -> str:
     return f", in the model file {format_number(fitted.stated)} → {total}"
 
 
-def beyond_usual(fitted: FittedValue) -> str:
+def format_usual_range(fitted: FittedValue) -> str:
     """Format the usual range of a value outside it: ``, beyond the usual range of 0 to 0.6 N``."""
     if fitted.usual_range is None:
         return ""

@@ -73,7 +73,7 @@ class AlternativeFinder:
         """
         reduced_model = self._get_model_without(model, effect)
         gain = model.likelihood.value - reduced_model.likelihood.value
-        p_value = self._p_value(reduced_model, effect, gain)
+        p_value = self._compute_p_value(reduced_model, effect, gain)
         competing_effects = self._list_rivals(model, effect)
         # Effects with implausible coefficients come last in their set.
         competing_effects.sort(key=lambda rival: (not self._is_plausible(rival[1]), rival))
@@ -102,7 +102,7 @@ class AlternativeFinder:
         remaining_effects = frozenset(model.effects) - {effect}
         return self.search.models.get(remaining_effects, self.search.base_model)
 
-    def _p_value(self, reduced_model: FittedModel, effect: str, gain: float) -> float:
+    def _compute_p_value(self, reduced_model: FittedModel, effect: str, gain: float) -> float:
         """Return the p-value of a gain about the model without the effect.
 
         It is the smaller one of the p-values of the gain and of the best score.
@@ -142,7 +142,7 @@ class AlternativeFinder:
             distance = self._compute_distance(model, other_model)
             if is_indistinguishable(distance) and not self._buys_nothing(effect, added, distance):
                 competing_effects.append((distance, added))
-        return self._without_richer(competing_effects)
+        return self._remove_richer(competing_effects)
 
     def _buys_nothing(self, effect: str, other_effect: str, distance: float) -> bool:
         """Return whether another effect needs more coefficients without reducing the excess enough.
@@ -161,9 +161,7 @@ class AlternativeFinder:
             [MAX_RICHER_LAW_EXCESS_RATIO]
         )
 
-    def _without_richer(
-        self, competing_effects: list[tuple[float, str]]
-    ) -> list[tuple[float, str]]:
+    def _remove_richer(self, competing_effects: list[tuple[float, str]]) -> list[tuple[float, str]]:
         """Return the rivals without those that contain another rival.
 
         These are families of which one member explains as much, and richer laws of which the

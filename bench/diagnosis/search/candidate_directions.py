@@ -128,7 +128,7 @@ def compute_directions(
         fit: the fitted model.
         names: names of effects that the model does not contain.
     """
-    probes = [probe for name in names for probe in first_probes(evaluator, fit, name)]
+    probes = [probe for name in names for probe in iterate_first_probes(evaluator, fit, name)]
     values = _compute_directions(evaluator, fit, probes)
     acting = _find_observable_probes(evaluator, probes, values)
     # The first responses show which coefficients only modify, for effects that act at all.
@@ -145,7 +145,7 @@ def compute_directions(
     return DirectionSet(tuple(probes), np.moveaxis(values, 0, -1))
 
 
-def first_probes(
+def iterate_first_probes(
     evaluator: RunEvaluator, fit: TrajectoryFit, name: str
 ) -> Iterator[CandidateDirection]:
     """Yield a small value of every scaling coefficient of an effect, at every shape.
@@ -443,10 +443,10 @@ def _make_modifier_probes(
         if probe.effect in leading:
             modifiers.setdefault(probe.effect, []).append(probe)
     for name, members in modifiers.items():
-        yield from _grid_points(evaluator, leading[name], members)
+        yield from _iterate_grid_points(evaluator, leading[name], members)
 
 
-def _grid_points(
+def _iterate_grid_points(
     evaluator: RunEvaluator, first: CandidateDirection, modifiers: Sequence[CandidateDirection]
 ) -> Iterator[CandidateDirection]:
     """Yield the first active probe of an effect with all combinations of modifier values."""

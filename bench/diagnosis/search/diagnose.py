@@ -80,7 +80,7 @@ def answer(inquiry: Inquiry) -> DiagnosisResult:
     try:
         return inquiry.answered()
     except SearchStoppedError:
-        return inquiry.so_far()
+        return inquiry.build_early_result()
 
 
 class Inquiry:
@@ -111,7 +111,7 @@ class Inquiry:
         Raises:
             SearchStoppedError: the search had to end early.
         """
-        early_result = self.unfit_base()
+        early_result = self.classify_unfit_base()
         if early_result is not None:
             return early_result
         search, base = self._search, self._search.base_model
@@ -144,7 +144,7 @@ class Inquiry:
         # Report the base model that was fitted first, even if the search found a better fit of it.
         return self._make_result(decide_verdict(state), base, model, causes, lack_of_fit)
 
-    def unfit_base(self) -> DiagnosisResult | None:
+    def classify_unfit_base(self) -> DiagnosisResult | None:
         """Return the result if causes cannot be searched, else None.
 
         This is the case if nothing moves, or if the data do not determine the base model.
@@ -158,7 +158,7 @@ class Inquiry:
             raise SearchStoppedError
         # Without motion, residual tests would only test rounding.
         if is_motionless(search):
-            return _without_motion(search)
+            return _build_motionless_result(search)
         base = search.base_model
         unidentified = find_unidentified_parameters(search, base)
         # Causes would represent values of parameters that the data do not determine.
@@ -212,7 +212,7 @@ class Inquiry:
         validation.evaluate_models([self._model])
         return True
 
-    def so_far(self) -> DiagnosisResult:
+    def build_early_result(self) -> DiagnosisResult:
         """Return the result of a search that had to end early, which claims only what was tested.
 
         Only existing fits and scores are used; nothing is simulated here.
@@ -263,7 +263,7 @@ def is_motionless(search: EffectSearch) -> bool:
     )
 
 
-def _without_motion(search: EffectSearch) -> DiagnosisResult:
+def _build_motionless_result(search: EffectSearch) -> DiagnosisResult:
     """Return the verdict "unidentifiable" for a recording without motion."""
     base, evaluator = search.base_model, search.evaluator
     # No parameter can be determined, and no test of the residual is meaningful.

@@ -98,7 +98,7 @@ class EffectSearch(ModelMoves):
                 larger.penalised_log_likelihood > best.penalised_log_likelihood
                 and self.compute_missing_effect_p_value(best, larger) <= EFFECT_P_VALUE_THRESHOLD
             ):
-                best = self.without_step_errors(larger)
+                best = self.correct_step_errors(larger)
             # Near the noise, or if the residual may be noise, adding two effects at once would fit
             # noise.
             elif self.compute_excess(best) < FAR_EXCESS or self.is_noise_like(best):
@@ -109,7 +109,7 @@ class EffectSearch(ModelMoves):
         self.best_supported_model = best
         return best
 
-    def without_step_errors(self, model: FittedModel) -> FittedModel:
+    def correct_step_errors(self, model: FittedModel) -> FittedModel:
         """Correct the discretisation error about a model, and refit its close rivals.
 
         Returns:
@@ -187,21 +187,21 @@ class EffectSearch(ModelMoves):
         smaller_models = select_beam(self, size - 1)
         self.refit_extensions(smaller_models[:1], MAX_REFITTED_CANDIDATES)
         # Each further method needs more simulations, so it is skipped if the data are explained.
-        if self._explained_by(size):
+        if self._is_explained_with(size):
             return self.get_best(size)
         self.refit_from_segments(size)
-        if self._explained_by(size):
+        if self._is_explained_with(size):
             return self.get_best(size)
         if size == 1:
             self.refit_extensions(smaller_models, MAX_REFITTED_CANDIDATES, fits_all=True)
         else:
             for members in self._group_models(smaller_models[1:]):
                 self.refit_extensions(members, MAX_REFITTED_CANDIDATES)
-                if self._explained_by(size):
+                if self._is_explained_with(size):
                     break
         return self.get_best(size)
 
-    def _explained_by(self, size: int) -> bool:
+    def _is_explained_with(self, size: int) -> bool:
         """Return whether the best model with `size` effects leaves nothing to explain.
 
         A residual above the noise answers this without a score test.
@@ -211,7 +211,7 @@ class EffectSearch(ModelMoves):
             return False
         # The discretisation error, of friction for example, could be mistaken for a missing effect.
         if self.evaluator.has_linearisation and self.compute_excess(model) < FAR_EXCESS:
-            model = self.without_step_errors(model)
+            model = self.correct_step_errors(model)
         return self.is_noise_like(model) and self.is_complete(model, EFFECT_P_VALUE_THRESHOLD)
 
     def _group_models(

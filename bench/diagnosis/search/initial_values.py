@@ -59,10 +59,10 @@ def compute_reachable_levels(evaluator: RunEvaluator, name: str) -> Array:
     if kind == "travel":
         return np.array([evaluator.get_effect_travel(name)])
     level_functions = {
-        "input/s": _max_input_rate,
-        "input/s^2": _max_input_acceleration,
-        "error": _max_servo_error,
-        "level": _max_level,
+        "input/s": _compute_max_input_rate,
+        "input/s^2": _compute_max_input_acceleration,
+        "error": _compute_max_servo_error,
+        "level": _compute_max_level,
     }
     level_function = level_functions.get(kind, _get_largest_input)
     return np.array(
@@ -86,13 +86,17 @@ def _get_largest_input(evaluator: RunEvaluator, track: RunData, effect: Effect) 
     return float(np.abs(_get_command(track, effect)).max())
 
 
-def _max_input_rate(evaluator: RunEvaluator, track: RunData, effect: Effect) -> float:  # noqa: ARG001
+def _compute_max_input_rate(evaluator: RunEvaluator, track: RunData, effect: Effect) -> float:  # noqa: ARG001
     """Return the largest rate of change of an effect's input in a run, in its unit per second."""
     changes = np.abs(np.diff(_get_command(track, effect)))
     return float((changes / np.diff(track.scenario.times)).max(initial=0.0))
 
 
-def _max_input_acceleration(evaluator: RunEvaluator, track: RunData, effect: Effect) -> float:  # noqa: ARG001
+def _compute_max_input_acceleration(
+    evaluator: RunEvaluator,  # noqa: ARG001
+    track: RunData,
+    effect: Effect,
+) -> float:
     """Return the acceleration 4 d / t² that moves the input over its range d from rest to rest.
 
     Half of t = `MIN_PROFILE_SECONDS` is acceleration, half braking. It is the largest acceleration
@@ -110,13 +114,13 @@ def _get_limited_channel(evaluator: RunEvaluator, effect: Effect) -> str:
     return name if name in evaluator.channels else ""
 
 
-def _max_level(evaluator: RunEvaluator, track: RunData, effect: Effect) -> float:
+def _compute_max_level(evaluator: RunEvaluator, track: RunData, effect: Effect) -> float:
     """Return the maximum of the stored quantity, such as a tank's level, recorded in a run."""
     levels = track.observed[:, evaluator.channels.index(_get_limited_channel(evaluator, effect))]
     return float(np.nanmax(levels, initial=0.0))
 
 
-def _max_servo_error(evaluator: RunEvaluator, track: RunData, effect: Effect) -> float:
+def _compute_max_servo_error(evaluator: RunEvaluator, track: RunData, effect: Effect) -> float:
     """Return the largest difference of command and position of a servo in a run.
 
     It is zero if the position is not recorded. The position is multiplied by the gear ratio first.

@@ -163,7 +163,7 @@ def assess_lack_of_fit(models: ModelSet, model: FittedModel) -> LackOfFitResult:
     if not any(probe.name in evaluator.slots for probe in (HatForce, JointHatForce)):
         return size_result
     evaluator.watch.report_and_check("an unmodelled force")
-    force_test = models.force_of_any_shape(model)
+    force_test = models.score_unmodelled_force(model)
     level = get_structure_threshold(bool(is_noise_stated.all()))
     # The linear innovations test decides if it finds no force; otherwise the force is simulated.
     if force_test is not None and force_test[0] > level:
@@ -211,13 +211,13 @@ def assess_residual_size(models: ModelSet, model: FittedModel) -> LackOfFitResul
     excess = residual_sigma / models.noise.sigma
     channels = []
     for c, name in enumerate(models.evaluator.channels):
-        error = _sigma_standard_error(models, model, c)
+        error = _compute_sigma_standard_error(models, model, c)
         if exceeds_noise(excess[c], error, models.stated[c]):
             channels.append(name)
     return LackOfFitResult(1.0, "", excess, tuple(channels))
 
 
-def _sigma_standard_error(models: ModelSet, model: FittedModel, channel: int) -> float:
+def _compute_sigma_standard_error(models: ModelSet, model: FittedModel, channel: int) -> float:
     """Return the relative standard error of the estimated noise of a channel, eq. (2).
 
     Its residual must exceed the noise by a multiple of this error to count as too large.
@@ -237,7 +237,7 @@ def compute_hat_directions(evaluator: RunEvaluator, model: FittedModel) -> Direc
         evaluator: the runs.
         model: the fitted model.
     """
-    probes, size = hat_probes(evaluator)
+    probes, size = list_hat_probes(evaluator)
     names = [JointHatForce.name if JointHatForce.name in evaluator.slots else HatForce.name] * len(
         probes
     )
@@ -249,7 +249,7 @@ def compute_hat_directions(evaluator: RunEvaluator, model: FittedModel) -> Direc
     return DirectionSet(tuple(probes[i] for i in active_hats), values[..., active_hats])
 
 
-def hat_probes(evaluator: RunEvaluator) -> tuple[list[CandidateDirection], float]:
+def list_hat_probes(evaluator: RunEvaluator) -> tuple[list[CandidateDirection], float]:
     """Return hats over every recorded variable, and their strength.
 
     All hats of a family have the same label, because they form one hypothesis and act together.
@@ -278,9 +278,9 @@ def _iterate_hat_families(
     """
     if JointHatForce.name in evaluator.slots:
         for joint in joint_families(evaluator, SIGN_CHANGE_SPEED_SHARE):
-            yield joint.label, joint.low, joint.high, partial(_on_joint, joint, size)
+            yield joint.label, joint.low, joint.high, partial(_make_joint_hat, joint, size)
         return
-    reversal_speed = SIGN_CHANGE_SPEED_SHARE * _high_speed_quantile(evaluator)
+    reversal_speed = SIGN_CHANGE_SPEED_SHARE * _compute_high_speed_quantile(evaluator)
     for family in _iterate_families(evaluator):
         yield (
             family.label,
@@ -290,7 +290,7 @@ def _iterate_hat_families(
         )
 
 
-def _on_joint(
+def _make_joint_hat(
     family: JointHatFamily, size: float, centre: float, width: float
 ) -> tuple[str, Array]:
     """Return the name of the effect and the coefficients of one hat force at a joint of a robot."""
@@ -323,12 +323,12 @@ class _Family(NamedTuple):
 
 def _iterate_families(evaluator: RunEvaluator) -> Iterator[_Family]:
     """Yield every family of hat forces, eq. (1), whose variable the recording shows."""
-    yield from _over_time(evaluator)
-    yield from _over_positions(evaluator)
-    yield from _over_speed(evaluator)
+    yield from _iterate_hats_over_time(evaluator)
+    yield from _iterate_hats_over_positions(evaluator)
+    yield from _iterate_hats_over_speed(evaluator)
 
 
-def _over_time(evaluator: RunEvaluator) -> Iterator[_Family]:
+def _iterate_hats_over_time(evaluator: RunEvaluator) -> Iterator[_Family]:
     """Yield families of hat forces over time, along each coordinate and against the motion."""
     durations = []
     for track in evaluator.tracks:
@@ -343,7 +343,7 @@ def _over_time(evaluator: RunEvaluator) -> Iterator[_Family]:
     yield _Family("time, against the motion", TIME_VARIABLE, VISCOUS_DIRECTION, 0.0, longest_run)
 
 
-def _over_positions(evaluator: RunEvaluator) -> Iterator[_Family]:
+def _iterate_hats_over_positions(evaluator: RunEvaluator) -> Iterator[_Family]:
     """Yield families of hat forces over each coordinate, from its 1 % to its 99 % quantile.
 
     The forces act along the last coordinate, against the motion, or as dry friction.
@@ -370,16 +370,16 @@ def _over_positions(evaluator: RunEvaluator) -> Iterator[_Family]:
             yield _Family(f"position {name}, dry", position, DRY_FRICTION_DIRECTION, low, high)
 
 
-def _over_speed(evaluator: RunEvaluator) -> Iterator[_Family]:
+def _iterate_hats_over_speed(evaluator: RunEvaluator) -> Iterator[_Family]:
     """Yield families of hat forces over the speed: against the motion, or dry friction."""
-    speed = _high_speed_quantile(evaluator)
+    speed = _compute_high_speed_quantile(evaluator)
     if speed > 0:
         yield _Family("speed, against the motion", SPEED_VARIABLE, VISCOUS_DIRECTION, 0.0, speed)
     if speed > 0 and not evaluator.simulator.system.bounces:
         yield _Family("speed, dry", SPEED_VARIABLE, DRY_FRICTION_DIRECTION, 0.0, speed)
 
 
-def _high_speed_quantile(evaluator: RunEvaluator) -> float:
+def _compute_high_speed_quantile(evaluator: RunEvaluator) -> float:
     """Return the 98 % quantile of the speed, from differences of the recorded coordinates.
 
     It is the upper end of the hats over speed; a quantile, because single differences may be noise.

@@ -96,7 +96,7 @@ class ModelMoves(ScoredModelSet):
         """
         for name in model.effects:
             for parts in self._iterate_contained_effects(model, name):
-                simpler_model = self._with_parts(model, name, parts)
+                simpler_model = self._fit_with_parts(model, name, parts)
                 is_excess_close = (
                     self.compute_excess(model)
                     > MAX_RICHER_LAW_EXCESS_RATIO * self.compute_excess(simpler_model)
@@ -149,7 +149,7 @@ class ModelMoves(ScoredModelSet):
                 ]
             }
 
-    def _with_parts(self, model: FittedModel, name: str, parts: EffectStarts) -> FittedModel:
+    def _fit_with_parts(self, model: FittedModel, name: str, parts: EffectStarts) -> FittedModel:
         """Fit the model with the simpler effects `parts` in place of the richer effect `name`.
 
         All other parameters start from their present values. A model that was already fitted from

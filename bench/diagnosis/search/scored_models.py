@@ -108,7 +108,7 @@ class ScoredModelSet(ModelSet):
             return self.scores_by_effects.get(key)
         return self.superseded_scans[key].scores
 
-    def directions_known(self) -> tuple[TrajectoryFit, DirectionSet] | None:
+    def get_known_directions(self) -> tuple[TrajectoryFit, DirectionSet] | None:
         """Return the directions of all candidates about the base model, if already computed.
 
         Here always None; subclasses may compute them separately from the scores.

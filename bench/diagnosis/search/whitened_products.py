@@ -357,12 +357,12 @@ class WhiteningDesign:
         powers = self._powers.combine(phi)
 
         # Eq. (2) for the initial states of each run, then for the parameters.
-        states = _matrix_root(normal[:, q:, q:])
+        states = _compute_matrix_root(normal[:, q:, q:])
         other_products = np.concatenate([normal[:, q:, :q], mixed[:, q:]], axis=2)
         by_states = _project_directions(states, other_products)
         by_parameters, by_directions = by_states[:, :q], by_states[:, q:]
         schur_complement = normal[:, :q, :q].sum(axis=0) - by_parameters.T @ by_parameters
-        parameter_root = _matrix_root(schur_complement)
+        parameter_root = _compute_matrix_root(schur_complement)
         by_own_parameters = parameter_root.T @ (
             mixed[:, :q].sum(axis=0) - by_parameters.T @ by_directions
         )
@@ -457,7 +457,7 @@ def _project_directions(roots: Array, products: Array) -> Array:
     return (roots.transpose(0, 2, 1) @ products).reshape(runs * size, count)
 
 
-def _matrix_root(normal: Array) -> Array:
+def _compute_matrix_root(normal: Array) -> Array:
     """Return L of eq. (2) for positive semidefinite matrices (..., s, s).
 
     Eigenvectors with very small eigenvalues are omitted.

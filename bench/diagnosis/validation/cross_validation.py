@@ -18,7 +18,7 @@ from bench.diagnosis.evaluation.noise_model import Mask, NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import Indices, RunEvaluator
 from bench.diagnosis.fitting.fit_state import FitStart, KnownJacobian, TrajectoryFit
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
-from bench.diagnosis.validation.held_out_runs import HeldOutFit, HeldOutRuns, merit_of
+from bench.diagnosis.validation.held_out_runs import HeldOutFit, HeldOutRuns, compute_merit
 from sims.core.simulator import Array
 
 MAX_STEPS = 8
@@ -106,7 +106,7 @@ class CrossValidation:
         """
         if not np.isfinite(simulated[self.seen]).all():
             return HeldOutFit(np.full_like(simulated, np.nan), -np.inf, states)
-        penalised_likelihood = merit_of(self.evaluator.observed, simulated, free)
+        penalised_likelihood = compute_merit(self.evaluator.observed, simulated, free)
         return HeldOutFit(simulated, penalised_likelihood, states, free)
 
     @cached_property
@@ -117,10 +117,14 @@ class CrossValidation:
         for number in sorted(set(numbers.tolist())):
             rows = np.flatnonzero(numbers == number)
             fitted_rows = np.flatnonzero(numbers != number)
-            folds.append(_Fold(rows, fitted_rows, self._of_runs(fitted_rows), self._of_runs(rows)))
+            folds.append(
+                _Fold(
+                    rows, fitted_rows, self._make_evaluator(fitted_rows), self._make_evaluator(rows)
+                )
+            )
         return folds
 
-    def _of_runs(self, rows: Indices) -> RunEvaluator:
+    def _make_evaluator(self, rows: Indices) -> RunEvaluator:
         """Make a run evaluator of the runs `rows`, which are the fitted or the left-out ones."""
         evaluator = self.evaluator.with_runs([self.evaluator.runs[row] for row in rows])
         length = evaluator.observed.shape[1]
@@ -152,9 +156,9 @@ class CrossValidation:
             known_jacobian = KnownJacobian(fit.free, jacobian)
             starts.append(FitStart(fit.effects, fit.theta, fit.states[fold.others], known_jacobian))
         refits = TrajectoryFitter(fold.fitting, self.noise, frozen).fit_models(starts, MAX_STEPS)
-        return self._without_unsupported(fold.fitting, refits)
+        return self._remove_unsupported(fold.fitting, refits)
 
-    def _without_unsupported(
+    def _remove_unsupported(
         self, evaluator: RunEvaluator, fits: Sequence[TrajectoryFit]
     ) -> list[Array]:
         """Return parameters (P,) of each model; effects that the runs do not show are off.

@@ -72,13 +72,13 @@ def compute_central_jacobian(
     """
     q = fit.free.size
     runs, size = fit.states.shape
-    bounds = _bounds_around(evaluator, fit)
+    bounds = _widen_bounds(evaluator, fit)
     ranges = bounds[:, 1] - bounds[:, 0]
     steps = compute_difference_steps(fit.jacobian, noise, ranges)
     # Derivatives by initial states from a linearisation are not one-sided differences.
     if evaluator.has_linearisation:
         steps = steps[:q]
-    theta, states = _both_sides(fit, steps, bounds)
+    theta, states = _displace_both_sides(fit, steps, bounds)
 
     # One call simulates both sides and all runs, because the engine steps a batch at once.
     vectors = theta.reshape(-1, fit.theta.size)
@@ -115,7 +115,7 @@ def get_central_jacobian(models: ModelSet, fit: TrajectoryFit) -> TrajectoryFit:
     return cached_entry[1]
 
 
-def _both_sides(fit: TrajectoryFit, steps: Array, bounds: Array) -> tuple[Array, Array]:
+def _displace_both_sides(fit: TrajectoryFit, steps: Array, bounds: Array) -> tuple[Array, Array]:
     """Build the parameters (2, n, P) and initial states (2, n, R, s) of the central differences.
 
     The first axis is the lower and the upper side. Row j of the first n parameters and states has
@@ -135,7 +135,7 @@ def _both_sides(fit: TrajectoryFit, steps: Array, bounds: Array) -> tuple[Array,
     return theta, states
 
 
-def _bounds_around(evaluator: RunEvaluator, fit: TrajectoryFit) -> Array:
+def _widen_bounds(evaluator: RunEvaluator, fit: TrajectoryFit) -> Array:
     """Return the bounds (q, 2) of the fitted parameters, widened to contain the fit.
 
     Coefficients may be outside their plausible range.

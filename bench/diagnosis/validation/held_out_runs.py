@@ -137,7 +137,9 @@ class HeldOutRuns:
         count = max(int(self.seen.sum()), 1)
         # Runs that amplify differences of the initial state need a fit in stages.
         if is_filtered and not _find_lowest_cost_fit(fits).cost < FAR * count:
-            fits = _each_nearer(fits, self._fit_initial_states(initial_starts, HORIZON_STAGES))
+            fits = _select_nearer_fits(
+                fits, self._fit_initial_states(initial_starts, HORIZON_STAGES)
+            )
             is_filtered = False
         if not is_filtered and self._leaves_linear_range(_find_lowest_cost_fit(fits)):
             fits = self._continue_from_nearest(initial_starts, fits)
@@ -205,7 +207,9 @@ class HeldOutRuns:
         If that reduces the nearest sum of squares enough, the fits are repeated from the starts
         with derivatives that are computed again before each stage.
         """
-        continued_fits = _each_nearer(fits, self._continue_about_best(fits, HORIZON_STAGES[-1:]))
+        continued_fits = _select_nearer_fits(
+            fits, self._continue_about_best(fits, HORIZON_STAGES[-1:])
+        )
         if (
             _find_lowest_cost_fit(fits).cost - _find_lowest_cost_fit(continued_fits).cost
             < MIN_SQUARES_DECREASE
@@ -214,7 +218,7 @@ class HeldOutRuns:
         staged_fits = self._fit_initial_states(starts, HORIZON_STAGES[:1])
         for stage in (*HORIZON_STAGES[1:], HORIZON_STAGES[-1]):
             staged_fits = self._continue_about_best(staged_fits, [stage])
-        return _each_nearer(continued_fits, staged_fits)
+        return _select_nearer_fits(continued_fits, staged_fits)
 
     def _continue_about_best(
         self, fits: Sequence[TrajectoryFit], stages: Sequence[tuple[float, int]]
@@ -239,11 +243,11 @@ class HeldOutRuns:
             return HeldOutFit(no_prediction, -np.inf, fit.states)
         # Only initial states were fitted here, so only they count as free.
         free = count_identified_states(self.evaluator, fit, self.noise)
-        penalised_likelihood = merit_of(self.evaluator.observed, fit.simulated, free)
+        penalised_likelihood = compute_merit(self.evaluator.observed, fit.simulated, free)
         return HeldOutFit(fit.simulated, penalised_likelihood, fit.states, free)
 
 
-def merit_of(observed: Array, simulated: Array, free: float) -> float:
+def compute_merit(observed: Array, simulated: Array, free: float) -> float:
     """Compute the penalised log-likelihood of predictions, eq. (1) of the module docstring.
 
     Args:
@@ -262,7 +266,7 @@ def _find_lowest_cost_fit(fits: Iterable[TrajectoryFit]) -> TrajectoryFit:
     return min(fits, key=lambda fit: fit.cost)
 
 
-def _each_nearer(
+def _select_nearer_fits(
     fits: Sequence[TrajectoryFit], other_fits: Sequence[TrajectoryFit]
 ) -> list[TrajectoryFit]:
     """Return the better of two fits of each model."""

@@ -331,10 +331,10 @@ def _test_parameters(
         curvatures: (R, q, q) H_r of eq. (1), the information of each run on the parameters.
         gradients: (R, q) g_r of eq. (1).
     """
-    joint_covariance = _regularised_inverse(curvatures.sum(axis=0))
+    joint_covariance = _invert_regularised(curvatures.sum(axis=0))
     steps, errors = [], []
     for runs in grouping.runs:
-        group_covariance = _regularised_inverse(curvatures[list(runs)].sum(axis=0))
+        group_covariance = _invert_regularised(curvatures[list(runs)].sum(axis=0))
         steps.append(group_covariance @ gradients[list(runs)].sum(axis=0))  # (2)
         errors.append(np.sqrt(np.maximum(np.diagonal(group_covariance), 0.0)))
     for column, place in enumerate(model.fit.free.tolist()):
@@ -366,7 +366,7 @@ def _test_parameters(
         )
 
 
-def _regularised_inverse(curvature: Array) -> Array:
+def _invert_regularised(curvature: Array) -> Array:
     """Invert a curvature matrix; directions that the runs do not identify get a huge variance."""
     scale = np.sqrt(np.maximum(np.diagonal(curvature), 1e-200))
     values, vectors = np.linalg.eigh(curvature / np.outer(scale, scale))

@@ -18,9 +18,9 @@ from bench.diagnosis.fitting.fit_state import FitStart
 from bench.diagnosis.fitting.model_set import ModelSet
 from bench.diagnosis.friction_form_verdict import (
     choose_friction_form,
-    form_of,
+    get_friction_form,
     has_dry_friction,
-    soft_kind,
+    make_soft_kind,
 )
 from bench.diagnosis.score_extended import score_model
 from bench.diagnosis.search.alternative_causes import CauseEvidence
@@ -87,7 +87,7 @@ def fitted(path, name):
     rng = np.random.default_rng(0)
     models = ModelSet(stiff, noise, base.fixed_parameters, rng, np.ones(2, dtype=bool))
     models.refit_models([FitStart((name,), base.fit.theta, base.fit.states)], race=False)
-    return models, models.models[frozenset([name])], evaluator(soft_kind(kind))
+    return models, models.models[frozenset([name])], evaluator(make_soft_kind(kind))
 
 
 CANDIDATES = ["drag.linear@elbow", "friction.coulomb@elbow", "friction.hysteresis@elbow"]
@@ -105,8 +105,8 @@ def test_the_form_that_was_planted_fits_better(tmp_path, form):
         PLANTED, rel=0.03
     )
     assert abs(models.compute_excess(best)) < 0.1
-    assert form_of(evaluator, name) == ("soft" if form == "soft" else None)
-    assert form_of(other, "drag.linear@elbow") is None
+    assert get_friction_form(evaluator, name) == ("soft" if form == "soft" else None)
+    assert get_friction_form(other, "drag.linear@elbow") is None
 
 
 def test_what_imitates_soft_friction_is_fitted_as_soft_friction(tmp_path):

@@ -10,7 +10,7 @@ import pytest
 from bench.diagnosis.evaluation.noise_floor import (
     INTEGRATION_ERROR_SHARE,
     compute_noise_floor,
-    range_of,
+    compute_value_range,
 )
 from bench.diagnosis.evaluation.noise_free_runs import add_least_noise
 from bench.diagnosis.explain import explain
@@ -43,7 +43,7 @@ def test_noise_is_added_where_there_is_none_and_nowhere_else():
     for before, after in zip(made.runs, again.runs, strict=True):
         np.testing.assert_array_equal(before.channels["q"], after.channels["q"])
         added = after.channels["qd"] - before.channels["qd"]
-        size = INTEGRATION_ERROR_SHARE * range_of(
+        size = INTEGRATION_ERROR_SHARE * compute_value_range(
             np.concatenate([run.channels["qd"] for run in made.runs])
         )
         assert np.std(added) == pytest.approx(size, rel=0.2)

@@ -12,9 +12,9 @@ from scipy.integrate import solve_ivp
 from bench.cli.main import main
 from bench.core.plugin_registries import load_plugins
 from bench.diagnosis.evaluation.coefficient_bounds import bound_of, compute_coefficient_bounds
-from bench.diagnosis.evaluation.time_scale import on_time_scale
+from bench.diagnosis.evaluation.time_scale import adapt_to_time_scale
 from bench.diagnosis.explain import explain
-from bench.diagnosis.extended_robot_files import written_causes
+from bench.diagnosis.extended_robot_files import select_written_causes
 from bench.diagnosis.report.report_data import ParameterChange
 from bench.diagnosis.report.summary_text import (
     format_headline,
@@ -99,7 +99,7 @@ def test_a_lag_of_seconds_in_a_system_of_minutes_is_named(tmp_path):
 def test_ranges_of_times_follow_the_duration_and_the_sampling(
     name, unit, stated, longest, spacing, expected
 ):
-    scaled = on_time_scale(Parameter(name, unit, stated[1], stated), longest, spacing)
+    scaled = adapt_to_time_scale(Parameter(name, unit, stated[1], stated), longest, spacing)
     assert scaled.bounds == pytest.approx(expected)
 
 
@@ -211,7 +211,7 @@ def test_a_parameter_at_its_bound_is_said_to_be_there():
 
 def test_nothing_of_a_number_at_a_bound_is_written_into_a_model_file():
     good, bad = FittedValue(0.3, "N*m", 0.2, 0.4), FittedValue(2.0, "N*m", None, None, "high")
-    kept, left_out = written_causes(
+    kept, left_out = select_written_causes(
         {
             "friction.coulomb@*": {"coefficient@a": good, "coefficient@b": bad},
             "mass.scale@arm": {"coefficient": FittedValue(-0.99, "1", None, None, "low")},

@@ -14,7 +14,10 @@ from bench.diagnosis.conventions.convention_comparison import (
     ConventionDifference,
 )
 from bench.diagnosis.conventions.convention_hypotheses import ConventionHypothesis, SignalChange
-from bench.diagnosis.conventions.corrected_description import corrected, lines_of
+from bench.diagnosis.conventions.corrected_description import (
+    correct_description,
+    list_changed_tables,
+)
 from bench.diagnosis.conventions.unit_check import Subject
 from bench.logs.inspection import load_recording
 from sims.core.toml_validation import read_toml
@@ -132,10 +135,10 @@ def test_the_corrected_description_reads_as_the_change_says(tmp_path):
     change = ConventionHypothesis("", {"q.j1": SignalChange("q.j1", -1.0, 0.5)})
     differences = [ConventionDifference(change, 1.0)]
     _, meta = read_meta(log.path)
-    after = corrected(meta, kind, differences)["channels"]["q.j1"]
+    after = correct_description(meta, kind, differences)["channels"]["q.j1"]
     degree = math.pi / 180.0
     raw = before / degree / 2.0 - 3.0 / 2.0
     assert degree * (after["scale"] * raw + after["offset"]) == pytest.approx(0.5 - before)
-    assert list(lines_of(meta, kind, differences)) == [
+    assert list(list_changed_tables(meta, kind, differences)) == [
         f'[channels."q.j1"] scale = -2, offset = {0.5 / degree - 3.0:.9g}'
     ]

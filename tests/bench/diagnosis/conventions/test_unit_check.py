@@ -11,7 +11,12 @@ import pytest
 
 from bench.cli.main import main
 from bench.core.plugin_registries import simulators
-from bench.diagnosis.conventions.unit_check import UNITS, Subject, recognised, wrong_units
+from bench.diagnosis.conventions.unit_check import (
+    UNITS,
+    Subject,
+    find_imitated_unit,
+    find_wrong_units,
+)
 from bench.diagnosis.evaluation.noise_floor import compute_noise_floor
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
@@ -76,7 +81,7 @@ def fault_of(path=None, recording=None, kind=None):
     evaluator = subject.evaluator(recording)
     sigma = compute_noise_floor(evaluator, recording).sigma
     noise = NoiseModel(sigma, np.zeros(len(sigma)))
-    return wrong_units(subject, evaluator, noise, fit_base_model(evaluator, noise))
+    return find_wrong_units(subject, evaluator, noise, fit_base_model(evaluator, noise))
 
 
 @pytest.mark.parametrize(
@@ -111,7 +116,7 @@ def test_a_sign_that_does_not_matter_is_not_questioned():
     wish = {"noise": ["q=0.002"], "observe": ["q"], "initial": ["q=-1:1"]}
     recording = simulate_recording(Wish("pendulum", **wish)).recording
     subject = Subject(simulators.get("pendulum"), recording, "batch")
-    found = fault_of(recording=subject.rescaled({"q": 1 / DEGREE}))
+    found = fault_of(recording=subject.rescale({"q": 1 / DEGREE}))
     assert found.lines == ('[channels.q] unit = "deg"',)
     assert found.alternatives == ()
 
@@ -168,7 +173,7 @@ def test_a_scale_is_applied_to_the_column_and_its_noise(tmp_path):
 def test_a_wrong_unit_is_reported_although_a_friction_is_missing_too(factors, line):
     recording, kind = load_joined([ARM], None, None, ())
     subject = Subject(kind, recording, None)
-    found = fault_of(recording=subject.rescaled(factors), kind=kind)
+    found = fault_of(recording=subject.rescale(factors), kind=kind)
     assert found is not None
     assert found.signals == tuple(sorted(factors, reverse=True))
     assert found.lines[0] == line
@@ -195,7 +200,7 @@ def test_a_true_gain_near_a_conversion_is_not_a_unit():
     recording = simulate_recording(Wish("pendulum", **WISHES["pendulum"])).recording
     subject = Subject(simulators.get("pendulum"), recording, "batch")
     # A turn is 2 pi rad, 4.5 % more than 6: its factor reduces the misfit by 95 %.
-    assert fault_of(recording=subject.rescaled({"q": 1 / 6.0})) is None
+    assert fault_of(recording=subject.rescale({"q": 1 / 6.0})) is None
 
 
 @pytest.mark.parametrize(
@@ -231,7 +236,7 @@ def recognised_of(effect, value):
     number = FittedValue(value, "1", value - 1e-3, value + 1e-3)
     nowhere = SimpleNamespace(free=np.array([], dtype=int), theta=np.array([]))
     cause = Cause(effect, (), "says so", {"coefficient": number}, 0.0)
-    return recognised(subject, evaluator, cause, nowhere)
+    return find_imitated_unit(subject, evaluator, cause, nowhere)
 
 
 def test_the_gains_of_units_are_those_of_the_unit_library():

@@ -14,7 +14,7 @@ from bench.diagnosis.experiment_design.discriminating_run import (
     _compute_largest_share,
     _iterate_changed_runs,
 )
-from bench.diagnosis.experiment_design.model_file_limits import UNLIMITED, stated_limits
+from bench.diagnosis.experiment_design.model_file_limits import UNLIMITED, read_model_file_limits
 from bench.diagnosis.experiment_design.safety_limits import RigLimits
 from sims.core.simulator import Scenario
 from sims.recording.recording import Recording, Run
@@ -147,7 +147,7 @@ def test_set_points_keep_to_the_limits_of_an_mjcf(tmp_path, capsys):
 def test_all_limits_of_a_urdf_are_read(tmp_path):
     kind = kind_of(tmp_path, URDF, actuators={"m": {**MOTOR["m"], "gear": 4.0}})
     evaluator, _ = world_of(kind, 0.1 * np.sin(TIMES))
-    limits = stated_limits(evaluator)
+    limits = read_model_file_limits(evaluator)
     assert limits.commands == {"u.m": (-0.25, 0.25), "force.hip": (-1.0, 1.0)}
     assert limits.states == {"q.hip": (-0.9, 0.9), "qd.hip": (-2.5, 2.5)}
     assert limits.forces == {"tau.hip": (-1.0, 1.0)}
@@ -156,12 +156,12 @@ def test_all_limits_of_a_urdf_are_read(tmp_path):
 def test_a_velocity_servo_keeps_to_the_velocity_of_a_urdf(tmp_path):
     servo = {"m": {"joint": "hip", "kind": "velocity", "kv": 2.0, "gear": 2.0}}
     evaluator, _ = world_of(kind_of(tmp_path, URDF, actuators=servo), 0.1 * np.sin(TIMES))
-    assert stated_limits(evaluator).commands["u.m"] == (-5.0, 5.0)
+    assert read_model_file_limits(evaluator).commands["u.m"] == (-5.0, 5.0)
 
 
 def test_limits_of_an_mjcf_are_those_of_joint_and_actuator_together(tmp_path):
     kind = kind_of(tmp_path, MANY, "many.xml")
-    found = stated_limits(SimpleNamespace(kind=kind))
+    found = read_model_file_limits(SimpleNamespace(kind=kind))
     # Two motors share the force range of the joint; the first also has its own range.
     assert found.commands["u.m"] == pytest.approx((-0.75, 0.5))
     assert found.commands["u.g"] == pytest.approx((-1.0, 1.0))
@@ -175,7 +175,7 @@ def test_every_simple_run_of_a_robot_is_within_the_limits(tmp_path):
     kind = kind_of(tmp_path, URDF, actuators=MOTOR)
     # The recorded command exceeds the limits, which hold for runs with this command too.
     evaluator, _ = world_of(kind, 1.3 * np.sin(2.0 * TIMES))
-    limits = stated_limits(evaluator)
+    limits = read_model_file_limits(evaluator)
     runs = list(_iterate_changed_runs(evaluator))
     assert len(runs) > 4
     for run in runs:

@@ -10,7 +10,7 @@ from bench.core.plugin_registries import make_robot_simulator
 from bench.diagnosis.experiment_design.information_gain import RunValue
 from bench.diagnosis.experiment_design.next_run import (
     _iterate_connected_groups,
-    _would_longer_run_help,
+    _may_longer_run_help,
 )
 from bench.logs.quality.pose_check import find_contacts
 from sims.core.simulator import InputError
@@ -147,10 +147,10 @@ def test_what_hangs_together_and_what_a_longer_run_would_tell():
     assert list(_iterate_connected_groups(["a", "b", "c", "d"], least)) == [("a", "c"), ("b", "d")]
     run = RunValue(None, least + np.triu(least), 0.0, is_exact=True)
     # With 7 and 3 noise variances, twice the run length may exceed the threshold of 25.
-    assert _would_longer_run_help(run, 2.0)
-    assert not _would_longer_run_help(run, 1.0)
+    assert _may_longer_run_help(run, 2.0)
+    assert not _may_longer_run_help(run, 1.0)
     run = RunValue(None, np.where(least < 10, 1.0, least), 0.0, is_exact=True)
-    assert not _would_longer_run_help(run, 5.0)
+    assert not _may_longer_run_help(run, 5.0)
 
 
 def test_parts_that_touch_are_seen(tmp_path):

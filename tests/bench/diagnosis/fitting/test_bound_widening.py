@@ -7,7 +7,7 @@ from bench.cli.main import main
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.explain import explain
 from bench.diagnosis.fitting.base_fit import fit_base_model
-from bench.diagnosis.fitting.bound_widening import fit_wider, widened
+from bench.diagnosis.fitting.bound_widening import fit_wider, widen_range
 from bench.diagnosis.report.summary_text import format_headline, format_summary
 from bench.diagnosis.search.verdict_rules import BORDERING
 from sims.core.simulator import Parameter
@@ -79,5 +79,5 @@ def test_within_its_range_nothing_is_widened():
 )
 def test_a_range_is_widened_as_far_as_physics_allows(unit, bounds, limits, expected):
     nominal = max(bounds[0], 0.0)
-    made = widened(Parameter("p", unit, nominal, bounds), limits)
+    made = widen_range(Parameter("p", unit, nominal, bounds), limits)
     assert made == pytest.approx(expected)

@@ -6,10 +6,10 @@ import pytest
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.kalman.filter_and_smoother import (
     LinearRuns,
+    add_noise_states,
     filter_runs,
     fit_process_noise,
     smooth_runs,
-    with_coloured_noise,
 )
 
 SAMPLES, SIZE = 12, 2
@@ -86,7 +86,7 @@ def test_the_likelihood_is_that_of_the_joint_distribution(residuals, with_jumps)
 def test_coloured_noise_has_the_covariance_of_a_first_order_process(residuals):
     phi = 0.8
     lags = np.abs(np.subtract.outer(np.arange(SAMPLES), np.arange(SAMPLES)))
-    runs, white = with_coloured_noise(
+    runs, white = add_noise_states(
         runs_of(residuals), NoiseModel(np.array([SIGMA]), np.array([phi]))
     )
     noise = SIGMA**2 * phi**lags + white[0] * np.eye(SAMPLES)

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from bench.diagnosis.prediction_error.inactive_drives import (
-    inactive_drives,
-    without_inactive_drives,
+    find_inactive_drives,
+    remove_inactive_drives,
 )
 from bench.logs.inspection import load_recording
 
@@ -111,12 +111,12 @@ def times_of(recording, mask, run):
 def test_a_servo_that_is_switched_off_is_found_and_its_samples_are_left_out(tmp_path):
     rig = Rig(off={1: (1.2, 2.1, (0,)), 3: (2.0, 9.0, (0,))})
     recording, kind = load_recording(recorded(tmp_path, rig), divide=False)
-    (drive,) = inactive_drives(recording, kind)
+    (drive,) = find_inactive_drives(recording, kind)
     assert (drive.joint, drive.actuators, drive.is_held) == ("shoulder", ("s1",), False)
     assert times_of(recording, drive.masks[0], 0) == pytest.approx((1.2, 2.1), abs=0.05)
     assert not drive.masks[1].any()
     assert times_of(recording, drive.masks[2], 2) == pytest.approx((2.0, 3.0), abs=0.05)
-    left = without_inactive_drives(recording, kind)
+    left = remove_inactive_drives(recording, kind)
     assert [run.name.partition(" ")[0] for run in left.runs] == ["1", "1", "2", "3"]
     assert left.runs[0].times[-1] < 1.2
     assert left.runs[1].times[0] > 2.1
@@ -138,7 +138,7 @@ def test_a_servo_that_is_switched_off_is_found_and_its_samples_are_left_out(tmp_
 def test_a_column_that_says_so_is_taken_for_the_switch(tmp_path, column, line):
     rig = Rig(off={run: (1.0 + 0.3 * run, 9.0, (1,)) for run in (1, 2, 3)}, column=column)
     recording, kind = load_recording(recorded(tmp_path, rig), divide=False)
-    found = without_inactive_drives(recording, kind)
+    found = remove_inactive_drives(recording, kind)
     for number, run in enumerate(found.runs):
         assert run.times.size == TIMES.size
         assert list(run.off) == ["s2"]
@@ -152,13 +152,13 @@ def test_a_column_that_says_so_is_taken_for_the_switch(tmp_path, column, line):
         np.array_equal(one.off["s2"], two.off["s2"])
         for one, two in zip(again.runs, found.runs, strict=True)
     )
-    assert without_inactive_drives(again, kind) is again
+    assert remove_inactive_drives(again, kind) is again
 
 
 def test_another_column_that_changes_then_is_named(tmp_path):
     rig = Rig(off={2: (1.5, 9.0, (0, 1))}, column=("status", 3, 7))
     recording, kind = load_recording(recorded(tmp_path, rig), divide=False)
-    (note,) = without_inactive_drives(recording, kind).notes
+    (note,) = remove_inactive_drives(recording, kind).notes
     assert "the drives of joints shoulder, elbow exert no force" in note
     assert "column status changes there" in note
 
@@ -166,20 +166,20 @@ def test_another_column_that_changes_then_is_named(tmp_path):
 def test_a_servo_that_is_limp_in_a_whole_run_is_found(tmp_path):
     rig = Rig(off={2: (0.0, 9.0, (0,))})
     recording, kind = load_recording(recorded(tmp_path, rig), divide=False)
-    left = without_inactive_drives(recording, kind)
+    left = remove_inactive_drives(recording, kind)
     assert [run.name for run in left.runs] == ["1", "3"]
 
 
 def test_an_emergency_stop_with_brakes_is_found(tmp_path):
     rig = Rig(brakes={1: 1.5, 3: 2.0})
     recording, kind = load_recording(recorded(tmp_path, rig), divide=False)
-    drives = inactive_drives(recording, kind)
+    drives = find_inactive_drives(recording, kind)
     assert [(drive.joint, drive.is_held) for drive in drives] == [
         ("shoulder", True),
         ("elbow", True),
     ]
     assert times_of(recording, drives[0].masks[0], 0) == pytest.approx((1.5, 3.0), abs=0.05)
-    left = without_inactive_drives(recording, kind)
+    left = remove_inactive_drives(recording, kind)
     assert [round(float(run.times[-1]), 1) for run in left.runs] == [1.4, 3.0, 1.9]
     assert "the joints stand still, whatever the command is" in left.notes[0]
 
@@ -204,5 +204,5 @@ def test_an_emergency_stop_with_brakes_is_found(tmp_path):
 )
 def test_what_is_wrong_at_all_times_is_not_taken_for_a_drive_that_does_nothing(tmp_path, rig):
     recording, kind = load_recording(recorded(tmp_path, rig), divide=False)
-    assert inactive_drives(recording, kind) == []
-    assert without_inactive_drives(recording, kind) is recording
+    assert find_inactive_drives(recording, kind) == []
+    assert remove_inactive_drives(recording, kind) is recording

@@ -60,7 +60,7 @@ def test_gains_in_addition_to_a_set_are_those_of_fits(rows):
     gains = regression.gains(chosen)
     for k in (2, 3, 4, 5):
         after, _ = regression.solve([*chosen, groups[k]])
-        assert gains[k] == pytest.approx(regression.log_ratio(before, after), abs=1e-6)
+        assert gains[k] == pytest.approx(regression.compute_log_ratio(before, after), abs=1e-6)
     assert gains[0] == 0.0
 
 
@@ -90,7 +90,7 @@ def test_an_effect_of_the_model_is_put_back(rows):
     whole = rows[:, :, 0]
     target = 0.7 * whole + noise()
     about = regression_of(rows, target - whole, singles()[1:], always=(5, 0))
-    rest = about.instead_of([0])
+    rest = about.make_regression_without([0])
     direct = regression_of(rows, target, singles()[1:], always=(5,))
     assert rest.solve([])[0] == pytest.approx(direct.solve([])[0], rel=1e-10)
     np.testing.assert_allclose(rest.gains([]), direct.gains([]), atol=1e-7)

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from bench.api.explain import explain
-from bench.diagnosis.report.candidate_figure import candidates_figure
+from bench.diagnosis.report.candidate_figure import draw_candidates_figure
 from bench.diagnosis.report.explanation_figures import draw_figure
 from bench.diagnosis.report.wording import format_p_value
 from tests.bench.diagnosis.explained_samples import recording
@@ -70,7 +70,7 @@ def test_no_text_is_shortened_cut_or_covered(case):
 
 def test_a_place_stands_in_full_with_its_effect():
     one = "friction.load_quadratic@left_arm_shoulder_lift_joint_of_the_upper_body"
-    drawn = candidates_figure(robot_story(causes=(), candidates=[row(one, 300.0)]))
+    drawn = draw_candidates_figure(robot_story(causes=(), candidates=[row(one, 300.0)]))
     (name,) = labels(drawn)
     assert name.replace("\n", " ").replace("_ ", "_") == (
         "friction that increases with load and its square "
@@ -80,7 +80,7 @@ def test_a_place_stands_in_full_with_its_effect():
 
 def test_a_p_value_is_printed_once_where_it_distinguishes_nothing():
     rows = [row(f"my.effect_{i}", 400.0 - i, p_value=10.0 ** -(20 + i)) for i in range(12)]
-    texts = words(candidates_figure(told(*rows)))
+    texts = words(draw_candidates_figure(told(*rows)))
     assert sum(text.count("p <") for text in texts) == 1
     assert any("p < 10⁻¹² for all shown" in text for text in texts)
     most = Counter(texts).most_common(1)
@@ -93,7 +93,7 @@ def test_p_values_near_the_threshold_are_next_to_their_bars_and_others_are_white
         row("drag.quadratic", 20.0, p_value=0.012),
         row("wind", 3.0, p_value=0.7),
     )
-    drawn = candidates_figure(told(*rows))
+    drawn = draw_candidates_figure(told(*rows))
     assert f"20  ({format_p_value(0.012)})" in words(drawn)
     assert any("p ≥ 0.7 for white bars" in text for text in words(drawn))
     colours = [bar.get_facecolor() for bar in drawn.axes[-1].patches]
@@ -102,7 +102,7 @@ def test_p_values_near_the_threshold_are_next_to_their_bars_and_others_are_white
 
 
 def test_each_candidate_says_how_much_it_closes_with_the_interval():
-    drawn = candidates_figure(
+    drawn = draw_candidates_figure(
         told(row("drag.linear", 300.0, share=0.93), row("wind", 3.0, share=0.2), intervals=DRAG)
     )
     texts = words(drawn)
@@ -114,7 +114,7 @@ def test_each_candidate_says_how_much_it_closes_with_the_interval():
 
 
 def test_a_cause_stands_out_without_colour():
-    drawn = candidates_figure(told(row("drag.linear", 300.0), row("wind", 3.0)))
+    drawn = draw_candidates_figure(told(row("drag.linear", 300.0), row("wind", 3.0)))
     cause, other = drawn.axes[0].get_yticklabels()
     assert (cause.get_text(), cause.get_fontweight()) == ("▸ linear drag", "bold")
     assert (other.get_text(), other.get_fontweight()) == ("wind", "normal")

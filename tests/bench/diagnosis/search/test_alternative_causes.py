@@ -102,7 +102,7 @@ def test_what_contains_a_place_or_law_that_does_as_well_is_no_answer(
     effects = {name: placed() for name in "abc"} | {family: placed(place, contains)}
     search.evaluator = SimpleNamespace(available_effects=effects, has_linearisation=False)
     monkeypatch.setattr(AlternativeFinder, "_is_plausible", lambda self, effect: True)
-    monkeypatch.setattr(AlternativeFinder, "_p_value", lambda self, rest, effect, gain: 0.0)
+    monkeypatch.setattr(AlternativeFinder, "_compute_p_value", lambda self, rest, effect, gain: 0.0)
     (found,) = AlternativeFinder(search, None, structure=False).collect_evidence(BEST)
     assert found.alternatives == kept
     assert found.preferred == ("b" if family == "a" else "a")
@@ -124,6 +124,6 @@ def test_the_null_gain_of_one_of_two_signs_does_not_count_for_a_robot(
     )
     search.get_effect_penalty = {"a": 0.0, "b": 3.0 * INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO}.get
     monkeypatch.setattr(AlternativeFinder, "_is_plausible", lambda self, effect: True)
-    monkeypatch.setattr(AlternativeFinder, "_p_value", lambda self, rest, effect, gain: 0.0)
+    monkeypatch.setattr(AlternativeFinder, "_compute_p_value", lambda self, rest, effect, gain: 0.0)
     (found,) = AlternativeFinder(search, None, structure=False).collect_evidence(BEST)
     assert found.alternatives == alternatives

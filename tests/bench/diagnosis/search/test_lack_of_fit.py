@@ -5,7 +5,7 @@ import pytest
 
 from bench.diagnosis.search.lack_of_fit import (
     HatForce,
-    _sigma_standard_error,
+    _compute_sigma_standard_error,
     assess_lack_of_fit,
     compute_hat_directions,
 )
@@ -107,7 +107,7 @@ def test_autocorrelated_noise_is_estimated_less_precisely(phi, samples):
     """AR(1) noise reduces the effective number of samples (Bartlett's formula)."""
     models = SimpleNamespace(observed_mask=np.ones((2, 100, 1), dtype=bool))
     model = SimpleNamespace(likelihood=SimpleNamespace(phi=np.array([phi])))
-    assert _sigma_standard_error(models, model, 0) == pytest.approx(
+    assert _compute_sigma_standard_error(models, model, 0) == pytest.approx(
         1 / np.sqrt(2 * 200 * samples), rel=1e-12
     )
 
