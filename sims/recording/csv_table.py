@@ -1,4 +1,4 @@
-"""Read the table `MAX_NAME_LENGTH.csv` of a recording cell by cell; errors state row and column.
+"""Read the table `NAME.csv` of a recording cell by cell; errors state row and column.
 
 Rows are lines of the file, counted from 1 with the header, as in an editor.
 """

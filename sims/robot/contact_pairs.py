@@ -69,19 +69,16 @@ def find_pair_geoms(robot: RobotModel, pair: str) -> tuple[int, int]:
 
 def combine_contact_parameters(model: Any, geoms: tuple[int, int]) -> ContactParameters:
     """Return the parameters that MuJoCo gives to a contact of two geoms."""
-    one, other = geoms
-    rows = list(geoms)
+    rows = np.array(geoms)
     margin, gap = float(model.geom_margin[rows].sum()), float(model.geom_gap[rows].sum())
     priority = model.geom_priority[rows]
-    mixes = np.maximum(model.geom_solmix[rows], 0.0)
-    if priority[0] != priority[1]:
-        rows = [one if priority[0] > priority[1] else other]
-        weights = np.ones(1)
-    elif (mixes < MIN_MIX).all():
-        weights = np.full(2, 0.5)
-    else:
-        weights = np.where(mixes < MIN_MIX, 0.0, mixes) / mixes[mixes >= MIN_MIX].sum()
+    rows = rows[priority == priority.max()]
+    mixes = np.where(model.geom_solmix[rows] < MIN_MIX, 0.0, model.geom_solmix[rows])
+    if not mixes.any():
+        mixes = np.ones(len(rows))
+    weights = mixes / mixes.sum()
     solref = model.geom_solref[rows]
+    # Stiffness and damping, as negative numbers, are not averaged.
     direct = (solref[:, 0] <= 0).any()
     sliding, torsional, rolling = model.geom_friction[rows].max(axis=0)
     return ContactParameters(

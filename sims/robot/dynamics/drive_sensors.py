@@ -8,7 +8,7 @@ import numpy as np
 
 from sims.core.effect import ActiveEffects
 from sims.core.simulator import Array
-from sims.robot.coupled_drives import find_preceding_joint as joint_before
+from sims.robot.coupled_drives import find_preceding_joint
 from sims.robot.dynamics.activation_filters import activation_filters
 from sims.robot.dynamics.active_effects import find_active_elements, slice_active_effects
 from sims.robot.dynamics.batch_work import BatchInputs
@@ -59,7 +59,7 @@ class DriveSensorModel:
             column += apart * self._by_control(actuator)[:n, None]
             np.clip(column, *self._get_force_limits(actuator), out=column)
             if actuator.joint in bench.robot.coupled:
-                first = joint_before(self.robot, actuator.joint)
+                first = find_preceding_joint(self.robot, actuator.joint)
                 assert first is not None
                 arms: Array = bench.fields[COUPLING_FIELD][
                     :n, get_coupling_address(bench.robot, actuator.joint)

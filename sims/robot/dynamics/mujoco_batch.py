@@ -18,14 +18,14 @@ from sims.core.effect import ActiveEffects
 from sims.core.simulator import Array
 from sims.robot.dynamics.disabled_drives import FORCE_FIELDS, ForceRanges, constant_stretches
 from sims.robot.dynamics.midpoint_state import JointStates, Mask, MidpointPredictor, Places
-from sims.robot.dynamics.series_joints import USED_FIELDS as SERIES
 from sims.robot.dynamics.series_joints import (
+    USED_FIELDS,
     WRITTEN_FIELDS,
     compute_rest_positions,
     convert_flank_parameters,
     is_series_effect,
+    write_series_effects,
 )
-from sims.robot.dynamics.series_joints import write_series_effects as in_series
 from sims.robot.dynamics.servo_force_limits import ForceLimits, stiff_force_limits
 from sims.robot.floating_joints import FloatingJoints, FloatingState
 from sims.robot.model_field_effects import (
@@ -193,7 +193,7 @@ class MujocoBatch:
             if derived or not native.changes_derived_constants
             for field in native.fields
         }
-        names |= set(SERIES) if robot.series else set()
+        names |= set(USED_FIELDS) if robot.series else set()
         names -= set() if robot.coupled else {COUPLING_FIELD}
         names -= set() if model.npair else CONTACT_FIELDS
         self.fields: dict[str, Any] = {name: self.batch.expand(name) for name in sorted(names)}
@@ -232,7 +232,7 @@ class MujocoBatch:
             derives = derives or native.changes_derived_constants
         if self.robot.series:
             # This follows the armature effects, since each drive takes its share of the armature.
-            in_series(self.fields, self.robot, acting)
+            write_series_effects(self.fields, self.robot, acting)
             self._changed.update(WRITTEN_FIELDS)
         if derives:
             self.batch.set_const()

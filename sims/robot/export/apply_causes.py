@@ -14,13 +14,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sims import effects as library
-from sims.core.effect import SeriesElement as Transmission
+from sims.core.effect import SeriesElement
 from sims.core.freed_memory import release_free_memory
 from sims.core.simulator import Array
 from sims.extended_simulator import FittedValue
 from sims.robot.contact_pairs import add_contact_pairs
-from sims.robot.coupled_drives import COUPLING_EFFECT as COUPLED
-from sims.robot.coupled_drives import make_coupled_robot
+from sims.robot.coupled_drives import COUPLING_EFFECT, make_coupled_robot
 from sims.robot.dynamics.series_joints import (
     add_series_joints,
     combine_elements,
@@ -29,8 +28,8 @@ from sims.robot.dynamics.series_joints import (
     is_series_effect,
     make_series_element,
     prepare_flanks_for_file,
+    write_elements,
 )
-from sims.robot.dynamics.series_joints import write_elements as state_element
 from sims.robot.export.command_attributes import COMMAND_WRITERS, get_application_order
 from sims.robot.export.mjcf_attributes import (
     ANGLE_ATTRIBUTES,
@@ -130,7 +129,9 @@ def apply_causes(
     """
     fitted_causes = expand_families(robot, causes)
     notes = []
-    couplings = {c.place: float(c.coefficients[0]) for c in fitted_causes if c.effect == COUPLED}
+    couplings = {
+        c.place: float(c.coefficients[0]) for c in fitted_causes if c.effect == COUPLING_EFFECT
+    }
     robot = make_coupled_robot(robot, couplings) if couplings else robot
     robot = add_contact_pairs(robot, [c.place for c in fitted_causes if _is_at_contact(c)])
     series = _combine_series_elements(fitted_causes)
@@ -164,7 +165,7 @@ def apply_causes(
             changed_elements += [] if second in changed_elements else [second]
         for changed_element in changed_elements:
             comments.setdefault(changed_element, []).append(cause.format(recording))
-        if cause.effect == COUPLED:
+        if cause.effect == COUPLING_EFFECT:
             for actuator in (a for a in robot.actuators if a.joint == cause.place):
                 element = ModelElement("actuator", actuator.id)
                 comments.setdefault(element, []).append(cause.format(recording))
@@ -203,23 +204,26 @@ def _is_in_series(cause: FittedCause) -> bool:
     )
 
 
-def _combine_series_elements(causes: Sequence[FittedCause]) -> dict[str, Transmission]:
+def _combine_series_elements(causes: Sequence[FittedCause]) -> dict[str, SeriesElement]:
     """Combine the elements that causes put in series with joints, by joint."""
-    elements: dict[str, list[Transmission]] = {}
+    elements: dict[str, list[SeriesElement]] = {}
     for cause in causes:
         if _is_in_series(cause):
             elements.setdefault(cause.place, []).append(_make_series_element(cause))
     return {place: combine_elements(place_elements) for place, place_elements in elements.items()}
 
 
-def _make_series_element(cause: FittedCause) -> Transmission:
+def _make_series_element(cause: FittedCause) -> SeriesElement:
     """Make the element in series with a joint from the coefficients of a cause."""
     numbers = {name: np.array([number.value]) for name, number in cause.numbers.items()}
     return make_series_element(library.get_effect(cause.effect), numbers)
 
 
 def _write_cause(
-    target_values: Fields, robot: RobotModel, cause: FittedCause, series: Mapping[str, Transmission]
+    target_values: Fields,
+    robot: RobotModel,
+    cause: FittedCause,
+    series: Mapping[str, SeriesElement],
 ) -> str | None:
     """Write a cause into the model fields; return None or a reason.
 
@@ -228,7 +232,7 @@ def _write_cause(
     not yet written.
     """
     # A coupling is an element of the robot, which has been added before.
-    if cause.effect == COUPLED:
+    if cause.effect == COUPLING_EFFECT:
         return None
     if is_gravity_compensated(cause.effect, cause.numbers):
         for body in robot.bodies:
@@ -243,7 +247,7 @@ def _write_cause(
         return None
     if _is_in_series(cause):
         if cause.place in series:
-            state_element(target_values, robot, cause.place, series[cause.place])
+            write_elements(target_values, robot, cause.place, series[cause.place])
         return None
     if cause.effect in COMMAND_WRITERS:
         return COMMAND_WRITERS[cause.effect](target_values, robot, cause)

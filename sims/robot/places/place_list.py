@@ -11,12 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sims.robot.contact_pairs import (
-    find_pair_geoms,
-    get_geom_name,
-    read_contact_parameters,
-)
-from sims.robot.coupled_drives import list_coupling_places as coupled_places
+from sims.robot.contact_pairs import find_pair_geoms, get_geom_name, read_contact_parameters
+from sims.robot.coupled_drives import list_coupling_places
 from sims.robot.places.centre_of_mass_limits import observable_axes, reach
 from sims.robot.places.observable_tilts import observable_tilts
 from sims.robot.robot_model import Actuator, RobotModel
@@ -110,7 +106,7 @@ def list_places(
     places["contact"] = [make_contact_place(robot, pair, robot.contacts) for pair in robot.contacts]
     numbers: dict[str, int] = {}
     mass = sum(body.mass for body in robot.bodies)
-    may_be_coupled = coupled_places(robot)
+    may_be_coupled = list_coupling_places(robot)
     bodies = robot.compiled.jnt_bodyid
     lasts = {int(body): i for i, body in enumerate(bodies)}
     for number, joint in enumerate(j for j in robot.joints if j.has_one_coordinate):
