@@ -118,6 +118,8 @@ class Effect(metaclass=EffectType):
         noun: Noun with article for reports, such as ``linear drag`` or ``a sensor bias``; if empty,
             the name and the beginning of `says` are used.
         says: Description in one sentence, as the end of "the data say that ...".
+        noun_at_place: Noun at a place of a robot, if the effect has another meaning there.
+        says_at_place: Description at a place of a robot, if the effect has another meaning there.
         source: Reference for the law.
         coefficients: Its numbers; if all are zero, the effect is off and must not change anything,
             bit for bit. Those that a kind of system does not have come last and remain zero there;
@@ -146,6 +148,8 @@ class Effect(metaclass=EffectType):
     name: ClassVar[str]
     noun: ClassVar[str] = ""
     says: ClassVar[str]
+    noun_at_place: ClassVar[str] = ""
+    says_at_place: ClassVar[str] = ""
     source: ClassVar[str] = ""
     coefficients: ClassVar[tuple[Coefficient, ...]]
     needs: ClassVar[str] = ""

@@ -62,6 +62,8 @@ class ContactFriction(Contact):
     name = "contact.friction"
     noun = "friction at impacts"
     says = "at each impact, friction reduces the speed along the surface"
+    noun_at_place = "a wrong friction"
+    says_at_place = "the friction coefficient of the contact is not that of the model file"
     source = "R. M. Brach, Mechanical Impact Dynamics: Rigid Body Collisions (1991)"
     needs = "ground"
     at = "contact"

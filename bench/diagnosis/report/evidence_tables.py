@@ -88,8 +88,10 @@ def _get_effect_description(report: DiagnosisReportData, name: str) -> str:
     for cause in report.verdict.causes:
         if cause.effect == name:
             return format_sentence(strip_place(sanitise(cause.says, 400)))
+    base, place = split_effect_name(name)
     try:
-        return format_sentence(effects.get_effect(split_effect_name(name)[0]).says)
+        effect = effects.get_effect(base)
+        return format_sentence((effect.says_at_place if place else "") or effect.says)
     except InputError:
         # The effect belongs to a plugin that is not loaded, or is a time step or integrator.
         return ""

@@ -38,8 +38,6 @@ NUMERICS_NAMES = {
 """Names of a too coarse time step or integrator as causes; they are errors of the model file, not
 effects.
 """
-_NOUNS_AT_PLACES = {"contact.friction": "a wrong friction"}
-"""Nouns of effects that have another meaning at a place of a robot."""
 _WRONG = re.compile(r"an? (wrong|misplaced) ")
 """Pattern of nouns that name a wrong value, not a missing effect."""
 
@@ -63,7 +61,7 @@ def _format_effect_as_noun(name: str) -> str:
         # A verdict may name an effect of a plugin that is not loaded.
         return sanitise(name, 60)
     if effect.noun:
-        noun = sanitise((_NOUNS_AT_PLACES.get(base) if place else None) or effect.noun, 60)
+        noun = sanitise((effect.noun_at_place if place else "") or effect.noun, 60)
         return noun + (
             format_places(get_place_kind(name), [place], is_parameter=is_parameter_error(name))
             if place
@@ -91,13 +89,13 @@ def get_place_kind(effect: str) -> str:
 def is_parameter_error(effect: str) -> bool:
     """Return whether the effect corrects a wrong value instead of adding a missing effect."""
     base, place = split_effect_name(effect)
-    if base in NUMERICS_NAMES or (place and base in _NOUNS_AT_PLACES):
+    if base in NUMERICS_NAMES:
         return True
     try:
-        noun = effects.get_effect(base).noun
+        registered = effects.get_effect(base)
     except InputError:
-        noun = ""
-    return bool(_WRONG.match(noun))
+        return False
+    return bool(_WRONG.match((registered.noun_at_place if place else "") or registered.noun))
 
 
 def format_places(

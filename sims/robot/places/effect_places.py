@@ -29,7 +29,7 @@ from sims.core.effect import (
     Sensor,
 )
 from sims.core.simulator import Array
-from sims.core.system import StateSnapshot, SystemKind
+from sims.core.system import SYSTEM_KINDS, StateSnapshot, SystemKind
 from sims.robot.places.place_list import EffectPlace
 from sims.robot.state_snapshots import RobotSnapshot
 
@@ -69,20 +69,21 @@ SHARED_ACTUATOR_EFFECTS = frozenset({"supply.sag"})
 """Effects at actuators that the actuators may share, such as a battery; one number of the world."""
 POSITION_SENSOR_EFFECTS = frozenset({"sensor.slip"})
 """Effects of position encoders, which act on no other channel."""
-REFERENCE_FORCES = {"hinge": 0.5, "slide": 5.0}
-"""Reference force for the plausible ranges of the effect library: N m on a hinge, N on a slide."""
+REFERENCE_FORCES = {"hinge": 0.5, "slide": 5.0, "contact": 1.0}
+"""Reference force for the plausible ranges of the effect library.
+
+N m on a hinge, N on a slide; no coefficient of a contact is a force.
+"""
 HIDDEN_STATE_SHAPE_COUNT = 6
 """Number of values tried for a shape parameter of a hidden-state effect.
 
 It is small since each value requires an integration over time.
 """
-CONTACT_FRICTION = "the friction coefficient of the contact is not that of the model file"
-"""Description of the friction of a contact; that of the library describes impacts of a ball."""
 MAX_PAYLOAD_SHARE = 0.5
 """Largest plausible payload, as a share of the mass of all moving bodies."""
 MIN_LOAD_FREQUENCY = 15.0
 """Minimum natural frequency of the load on a flexible joint, in rad/s."""
-_KINDS: Mapping[str, SystemKind] = {"hinge": "rotary", "slide": "linear"}
+_KINDS: Mapping[str, SystemKind] = {"hinge": "rotary", "slide": "linear", "contact": "point"}
 
 
 def make_world_effect(effect: type[Effect]) -> type[Effect]:
@@ -101,8 +102,7 @@ def make_placed_effect(effect: type[Effect], effect_place: EffectPlace) -> type[
     observable_coefficients = [c for c in effect.coefficients if tilts is None or c.name in tilts]
     coefficients = [_adapt_to_place(effect, c, effect_place) for c in observable_coefficients]
     changed: dict[str, Any] = {"coordinate": effect_place.coordinate, "signal": effect_place.signal}
-    says = CONTACT_FRICTION if effect.name == "contact.friction" else effect.says
-    changed["says"] = f"{says} (at {effect_place.words})"
+    changed["says"] = f"{effect.says_at_place or effect.says} (at {effect_place.words})"
     changed["pairs"] = effect_place.pairs
     if issubclass(effect, Force):
         changed["force"] = _force_of(effect)
@@ -355,7 +355,7 @@ def _adapt_to_place(effect: type[Effect], c: Coefficient, effect_place: EffectPl
     Ranges of forces are scaled with the typical force of the joint. If the file specifies a
     value, the coefficient is a difference from it, limited so that the total is not negative.
     """
-    i = 0 if effect.at == "contact" else 2 if effect_place.kind == "hinge" else 1
+    i = SYSTEM_KINDS.index(_KINDS[effect_place.kind])
     unit, (low, high) = c.units[i], c.plausible[i]
     lower_limit = c.least
     if c.of.startswith(("input", "error")):

@@ -47,7 +47,7 @@ class EffectPlace(NamedTuple):
 
     Attributes:
         name: name of the joint, actuator, body, channel or pair of geoms.
-        kind: kind of the coordinate whose units apply: hinge or slide.
+        kind: kind of the coordinate whose units apply: hinge or slide; or contact.
         coordinate: index of the coordinate; None if there is none.
         signal: name of the input or channel; empty for a joint or body.
         unit: unit of the signal.
@@ -204,7 +204,7 @@ def make_contact_place(robot: RobotModel, pair: str, pairs: tuple[str, ...]) -> 
     names = [get_geom_name(robot.compiled, geom) for geom in find_pair_geoms(robot, pair)]
     return EffectPlace(
         pair,
-        "hinge",
+        "contact",
         None,
         "",
         "1",
