@@ -26,12 +26,14 @@ ARM_MJCF = """
     <flag contact="disable"/>
   </option>
   <worldbody>
+    <geom name="table" type="plane" pos="0 0 -0.57" size="2 2 1"/>
     <body name="upper">
       <inertial pos="0.01 0 -0.2" mass="1.2" diaginertia="0.02 0.021 0.002"/>
       <joint name="shoulder" axis="0 1 0" damping="0.3 0.02 0" armature="0.01" stiffness="0.2"/>
       <body name="fore" pos="0 0 -0.4">
         <inertial pos="0 0.02 -0.1" mass="0.8" diaginertia="0.01 0.0095 0.001"/>
         <joint name="elbow" axis="0.2 1 0.1" damping="0.1" frictionloss="0.05" armature="0.005"/>
+        <geom name="ball" size="0.02" pos="0 0 -0.2"/>
         <site name="tip" pos="0 0 -0.2"/>
       </body>
     </body>
@@ -45,16 +47,13 @@ ARM_MJCF = """
   </sensor>
 </mujoco>
 """
-"""Model file of the arm. All values differ, so that confusing two places is detected."""
+"""Model file of the arm. All values differ, so that confusing two places is detected.
 
-_CONTACT_GEOMS = (
-    ('<flag contact="disable"/>', ""),
-    ("<worldbody>", '<worldbody><geom name="table" type="plane" pos="0 0 -0.57" size="2 2 1"/>'),
-    ('<site name="tip"', '<geom name="ball" size="0.02" pos="0 0 -0.2"/><site name="tip"'),
-)
-"""Changes of the model file for effects at contacts: the arm's tip slides on a table."""
+The ball at its tip slides on the table where contacts are enabled.
+"""
+
 _CONTACT = "table/ball"
-"""Contact at which these effects act."""
+"""Contact at which effects at contacts act."""
 
 OBSERVED_CHANNELS = ("q.shoulder", "q.elbow", "qd.shoulder", "tau.elbow", "s.wrist.y")
 """Observed channels, one of each kind."""
@@ -65,7 +64,7 @@ _SECONDS = 0.8
 
 @lru_cache(maxsize=1)
 def make_arm_simulator(effect: type[Effect]) -> type[RobotSimulator]:
-    """Make the simulator of the arm, with a table that it touches for effects at contacts.
+    """Make the simulator of the arm, with its contact enabled for effects at contacts.
 
     It is made anew for each effect, because it caches the places of effects by name.
     """
@@ -74,15 +73,12 @@ def make_arm_simulator(effect: type[Effect]) -> type[RobotSimulator]:
     from sims.robot.robot_model import RobotModel
     from sims.robot.robot_simulator import make_robot_simulator
 
-    mjcf, is_contact = ARM_MJCF, effect.at == "contact"
-    if is_contact:
-        for text, replacement in _CONTACT_GEOMS:
-            mjcf = mjcf.replace(text, replacement)
-    spec = mujoco.MjSpec.from_string(mjcf)
-    # Results are cached by the digest.
-    digest = "checks with contacts" if is_contact else "checks"
-    kind = make_robot_simulator(RobotModel(Path("checks.xml"), "mjcf", spec, digest=digest))
-    return kind.with_contacts((_CONTACT,)) if is_contact else kind
+    spec = mujoco.MjSpec.from_string(ARM_MJCF)
+    contacts = (_CONTACT,) if effect.at == "contact" else ()
+    if contacts:
+        spec.option.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+    robot = RobotModel(Path("checks.xml"), "mjcf", spec, digest="checks", contacts=contacts)
+    return make_robot_simulator(robot)
 
 
 def list_effect_places(effect: type[Effect]) -> tuple[type[Effect], ...]:
