@@ -133,7 +133,7 @@ def load_comparisons(folders: Sequence[Path]) -> ComparisonCollection:
     for folder in folders:
         stored = read_comparison(folder, REQUIRED_RUN_COLUMNS)
         if stored.runs.empty:
-            raise InputError(f"{folder}: holds no runs")
+            raise InputError(f"{folder}: contains no runs")
         parts.append(LoadedComparison(compute_statistics(stored), stored.experiment))
     first_labels, *other_labels = (part.statistics.curves.list_tuners() for part in parts)
     tuners = [t for t in first_labels if all(t in labels for labels in other_labels)]

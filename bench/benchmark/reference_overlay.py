@@ -45,7 +45,7 @@ def draw_with_references(
     """
     stored = read_comparison(folder, REQUIRED_RUN_COLUMNS)
     if stored.runs.empty:
-        raise InputError(f"{folder}: holds no runs")
+        raise InputError(f"{folder}: contains no runs")
     check_references_allowed(stored, OVERLAYABLE_FIGURES[0], references)
     problem = TuningProblem(stored.experiment)
     try:

@@ -92,7 +92,7 @@ def write_report(folder: Path, problem: TuningProblem, print_line: Callable[[str
     """
     stored = read_comparison(folder, REQUIRED_RUN_COLUMNS)
     if stored.runs.empty:
-        print_line(f"no run was made; {folder}/status.csv says why")
+        print_line(f"no run was made; {folder}/status.csv has the reasons")
         return 0
     labels, statistics = make_axis_labels(problem), compute_statistics(stored)
     tables = build_tables(stored, statistics)

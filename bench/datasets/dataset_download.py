@@ -50,7 +50,7 @@ def download(
     target = folder / data_set.name
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         raise InputError(
-            f"{target}: exists and does not hold {' and '.join(data_set.provides)}; "
+            f"{target}: exists and does not contain {' and '.join(data_set.provides)}; "
             "delete it, or choose another folder with --out"
         )
     contents = {

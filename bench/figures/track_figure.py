@@ -54,7 +54,7 @@ def draw_track_figure(track: BallTrack, heights: BallHeights, part: slice, title
     _draw_over_time(radius_axis, track, part, track.radius, "radius [px]")
     height_axis.axhline(heights.radius, color="black", linewidth=0.6, linestyle=":")
     height_axis.set_title("dotted: ball on the ground", fontsize=9)
-    radius_axis.set_title("grey: recorded; marks at the foot: no ball seen", fontsize=9)
+    radius_axis.set_title("grey: recorded; marks at the bottom: no ball detected", fontsize=9)
     visible_count, frames = int(np.isfinite(track.u).sum()), len(track.times)
     # A film's name must not be read as mathematics.
     figure.suptitle(f"{title}\n{visible_count} of {frames} frames", parse_math=False, fontsize=10)

@@ -125,9 +125,7 @@ def compute_heights_by_scale(
                 "give the ball's diameter"
             )
         factor = fallen
-        method = (
-            f"scaled by the fall (gravity {DEFAULT_GRAVITY:g} m/s^2; drag would bias the scale)"
-        )
+        method = f"scaled by the fall (gravity {DEFAULT_GRAVITY:g} m/s²; drag would bias the scale)"
         # Without a diameter, assume the radius that a level camera would give.
         ball = diameter / 2 if diameter else factor
     else:
@@ -135,8 +133,8 @@ def compute_heights_by_scale(
         method = "scaled by the ball's diameter, for a horizontal camera"
         if fallen is not None and abs(fallen / factor - 1) > _DIFFER:
             notes.append(
-                f"the fall says {fallen / factor - 1:+.0%} for all heights: the camera is tilted, "
-                "or gravity is not 9.81 m/s^2; the scale 'fall' uses the fall"
+                f"the fall gives {fallen / factor - 1:+.0%} for all heights: the camera is tilted, "
+                "or gravity is not 9.81 m/s²; the scale 'fall' uses the fall"
             )
     return BallHeights(ball + factor * (ground - q), ball, method, tuple(notes))  # Equation (2).
 

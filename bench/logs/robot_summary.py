@@ -117,6 +117,6 @@ def _format_exceeded_range(
             " ..." if len(runs) > MAX_NAMED_RUNS else ""
         )
         states = f"{model} states {low:.4g} to {high:.4g}"
-        yield f"{name} goes from {min_value:.4g} to {max_value:.4g} {unit}".rstrip() + (
+        yield f"{name} ranges from {min_value:.4g} to {max_value:.4g} {unit}".rstrip() + (
             f" in runs {run_names}, and {states}: another unit, sign or zero?"
         )

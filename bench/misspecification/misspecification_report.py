@@ -186,7 +186,7 @@ def _explained(scores: misspecification_scores.StudyScores, folder: Path) -> str
         folder: its result folder, with the verdict of explain.
     """
     hidden = scores.experiment.world.get("fixed", {})
-    world = ", ".join(f"{name} {value}" for name, value in hidden.items()) or "nothing more"
+    world = ", ".join(f"{name} {value}" for name, value in hidden.items()) or "no further effects"
     path = folder / VERDICT_FILE
     answer = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
     causes = ", ".join(str(c["effect"]) for c in answer.get("causes", ())) or "nothing"
@@ -241,7 +241,7 @@ def _tau(row: pd.Series) -> str:
     return (
         f"ranking by {metric_name}: Kendall's tau {row['tau']:.2f} ({row['low']:.2f} to "
         f"{row['high']:.2f}) between the simulators, {row['tau_of_halves']:.2f} between halves of "
-        f"the targets in the plain one; p of no change {row['p_value']:.2g}"
+        f"the targets in the unchanged one; p of no change {row['p_value']:.2g}"
     )
 
 

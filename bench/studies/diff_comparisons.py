@@ -90,7 +90,7 @@ def load_side(folder: Path, metric: str | None = None) -> ComparisonSide:
     """
     stored = read_comparison(folder, [*REQUIRED_RUN_COLUMNS, *_list_target_columns(folder)])
     if stored.runs.empty:
-        raise InputError(f"{folder}: holds no runs")
+        raise InputError(f"{folder}: contains no runs")
     name = metric or select_primary_metric(stored.runs).metric
     if name not in stored.runs or stored.runs[name].isna().all():
         raise InputError(f"{folder}: has no {name}, which the other comparison is ranked by")

@@ -35,7 +35,7 @@ class MassScale(ModelValueEffect):
 
     name = "mass.scale"
     noun = "a wrong mass"
-    says = "the body is heavier or lighter than the model file says"
+    says = "the body is heavier or lighter than the model file states"
     source = _IDENTIFICATION + ", chapter 12"
     at = "body"
     coefficients = (Coefficient("coefficient", _PURE, _HALF, least=_LEAST),)

@@ -334,7 +334,7 @@ def _read_wrapped_channels(
         key = f"channels.{name}.unwrap"
         if not isinstance(value, (bool, str)):
             raise make_error(
-                path, key, "true, or the name of the command that tells the turn", value
+                path, key, "true, or the name of the command that determines the turn", value
             )
         if isinstance(value, str):
             check_known_names(f"{key} of {path}", [value], inputs)

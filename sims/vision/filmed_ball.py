@@ -54,7 +54,7 @@ class FilmedBall(Simulator):
             "camera_azimuth",
             "rad",
             0.0,
-            "where the camera stands around the vertical",
+            "angle of the camera position about the vertical",
             limits=ANGLE_RANGE,
         ),
         Constant(

@@ -74,7 +74,7 @@ def commands():
     listing = [("command", "what it does")]
     listing += [(f"[`{each['name']}`](#simgap-{each['name']})", each["says"]) for each in found]
     codes = [
-        ("exit code", "what it says"),
+        ("exit code", "meaning"),
         *((str(code), says) for code, says in EXIT_CODES.items()),
     ]
     parts = [

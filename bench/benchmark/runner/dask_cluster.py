@@ -216,7 +216,7 @@ class ClusterPool:
                     yield place, result
         except (OSError, TimeoutError, CancelledError) as error:
             raise PoolLostError(
-                f"cluster {self.address}: the scheduler is gone ({type(error).__name__})"
+                f"cluster {self.address}: the scheduler cannot be reached ({type(error).__name__})"
             ) from None
 
     def _wait_for_results(self, futures: list[Any]) -> list[Any]:

@@ -385,7 +385,7 @@ def _validate_part(part: Any, file: str) -> dict[str, Any]:
     """Validate a part of an answer, and convert it to plain values."""
     kinds = [registry.kind for registry in REGISTRIES]
     if not isinstance(part, dict) or part.get("kind") not in kinds or "name" not in part:
-        raise InputError(f"plugin {file}: its process did not say what it holds")
+        raise InputError(f"plugin {file}: its process did not list what it contains")
     keys = ("kind", "name", "trains_as", "says")
     text = {key: to_printable(str(part.get(key, ""))[:500]) for key in keys}
     # The hash contains the file's content, in addition to the plugin's own description.

@@ -32,8 +32,8 @@ def add_diff_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--fail-on",
         choices=("change", "worse"),
-        help="end with exit code 1 where something differs significantly, or where B is "
-        "significantly worse or fails more often; else the exit code says only that it ran",
+        help="exit with code 1 if anything differs significantly (change), or if B is "
+        "significantly worse or fails more often (worse); without it, differences give code 0",
     )
     parser.set_defaults(command=_run_diff)
 

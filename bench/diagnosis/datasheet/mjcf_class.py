@@ -232,8 +232,8 @@ def _map_effects_to_model(
             mean_limit = _compute_mean_friction_limit(facts, setting, effect, numbers)
             dry_friction += mean_limit
             notes.append(
-                f"{name}: MuJoCo has no such law; frictionloss holds its mean over these runs, "
-                f"{mean_limit:.4g} N m"
+                f"{name}: MuJoCo has no such law; frictionloss is its mean over these runs, "
+                f"{mean_limit:.4g} N·m"
             )
             continue
         place = places.get(effect.at, "")

@@ -184,7 +184,7 @@ def _format_message(
     return (
         f"the drives of {noun} {joints} exert no force in some samples, which are excluded "
         f"({where}): "
-        f"{does}, whatever the command is{near}; if a column says when a drive is on, state it: "
+        f"{does}, whatever the command is{near}; if a column shows when a drive is on, state it: "
         f"{line}"
     )
 

@@ -26,7 +26,7 @@ NOTHING_FOUND = (
     "has a finite interval"
 )
 NO_FIELD = (
-    "no code for Isaac Lab and MuJoCo Playground is written: no field of the model holds the "
+    "no code for Isaac Lab and MuJoCo Playground is written: no field of the model has the "
     "numbers of ranges.toml; set them in your environment"
 )
 
@@ -177,7 +177,7 @@ def _find_missing_range_reason(number: FittedValue, entry: _Entry) -> str:
     elif number.low is None or number.high is None:
         reason = f"its value, {number.value:.3g} {number.unit}, has no finite interval"
     elif is_gravity_compensated(entry.cause.effect, entry.cause.numbers):
-        reason = 'gravity is compensated; extended.xml says so with gravcomp="1"'
+        reason = 'gravity is compensated; extended.xml states this with gravcomp="1"'
     else:
         return ""
     return f"{name} is not in the ranges: {reason}"

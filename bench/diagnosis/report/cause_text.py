@@ -143,7 +143,7 @@ def format_causes(causes: Sequence[Cause]) -> str:
 def format_number_error(cause: Cause) -> str:
     """Format how wrong a value of the model file is, as a clause; empty for other causes.
 
-    For example ``the mass of body forearm is 12 % larger than the model file says``.
+    For example ``the mass of body forearm is 12 % larger than the model file states``.
     """
     base, place = split_effect_name(cause.effect)
     if cause.says == GRAVITY_COMPENSATED:
@@ -176,7 +176,7 @@ def _make_percentage_formatter(quantity: str) -> Callable[[str, Sequence[FittedV
     def say(where: str, values: Sequence[FittedValue]) -> str:
         c = values[0].value
         percent = format_percent(abs(c))
-        return f"the {quantity} {where} is {percent} {_MORE[c > 0]} than the model file says"
+        return f"the {quantity} {where} is {percent} {_MORE[c > 0]} than the model file states"
 
     return say
 
@@ -190,7 +190,7 @@ def _make_difference_formatter(quantity: str) -> Callable[[str, Sequence[FittedV
     def say(where: str, values: Sequence[FittedValue]) -> str:
         size = append_unit(format_number(abs(values[0].value), 2), values[0].unit)
         comparison = _MORE[values[0].value > 0]
-        return f"the {quantity} {where} is {size} {comparison} than the model file says"
+        return f"the {quantity} {where} is {size} {comparison} than the model file states"
 
     return say
 
@@ -210,8 +210,7 @@ def _format_joint_zero(place_text: str, values: Sequence[FittedValue]) -> str:
     """Say how far the zero of a joint, for command and reading, is from that of the model file."""
     size = append_unit(format_number(abs(values[0].value), 2), values[0].unit)
     return (
-        f"the zero {place_text}, of command and reading alike, "
-        f"is {size} from that of the model file"
+        f"the zero {place_text}, for commands and readings, is {size} from that of the model file"
     )
 
 
@@ -232,7 +231,7 @@ def _format_link_length(place_text: str, values: Sequence[FittedValue]) -> str:
     percent = format_percent(abs(c))
     return (
         f"the distance {place_text} from its parent is {percent} {_MORE[c > 0]} "
-        "than the model file says"
+        "than the model file states"
     )
 
 

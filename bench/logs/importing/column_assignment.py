@@ -156,7 +156,7 @@ class ColumnAssigner:
             low, high = joint.range or (-np.inf, np.inf)
             range_text = f"{np.nanmin(column.values):.4g} to {np.nanmax(column.values):.4g}"
             self._result.leave_out(
-                column, f"goes from {range_text}, {joint.name} from {low:.4g} to {high:.4g}"
+                column, f"ranges from {range_text}, {joint.name} from {low:.4g} to {high:.4g}"
             )
             return None
         return Signal(column, guessed_unit, placement, f"; in {guessed_unit} by its range")
@@ -301,7 +301,7 @@ class ColumnAssigner:
             if set(np.unique(values[np.isfinite(values)]).tolist()) == {0.0, 1.0}:
                 self._signals.switches.append(column)
                 self._result.guessed.append(
-                    f"extra: {column.file}, column {column.name}, zeros and ones; if it says when "
+                    f"extra: {column.file}, column {column.name}, zeros and ones; if it shows when "
                     f'a drive is on, add [actuators.NAME] enable = "{column.name}"'
                 )
 

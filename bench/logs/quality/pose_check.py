@@ -274,14 +274,14 @@ def _check_servos(recording: Recording, robot: Any) -> Iterator[Anomaly]:
             pair.correlation > MIN_FOLLOWING_CORRELATION
             and DEGREE_SLOPE_RANGE[0] < pair.slope < DEGREE_SLOPE_RANGE[1]
         ):
-            ratio_text = f"{pair.slope:.3g} times as far as {command} says"
+            ratio_text = f"{pair.slope:.3g} times as far as {command} commands"
             message = f"moves {ratio_text}; is its unit degrees?"
             yield Anomaly(f"column {position}: {message}", True)
         elif (
             pair.correlation > MIN_FOLLOWING_CORRELATION
             and 1.0 / DEGREE_SLOPE_RANGE[1] < pair.slope < 1.0 / DEGREE_SLOPE_RANGE[0]
         ):
-            ratio_text = f"1/{1.0 / pair.slope:.3g} of what {command} says"
+            ratio_text = f"1/{1.0 / pair.slope:.3g} of what {command} commands"
             yield Anomaly(
                 f"column {position}: moves {ratio_text}; is the unit of {command} degrees?", False
             )

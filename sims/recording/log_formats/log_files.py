@@ -89,7 +89,7 @@ class LogFile:
                 return values
             last = values.shape[1] - 1
             entries = f"its entries are {name}[0] to {name}[{last}]"
-            raise InputError(f"{self.path}: column '{name}' holds lists; {entries}")
+            raise InputError(f"{self.path}: column '{name}' contains lists; {entries}")
         base, place = self._find_column(name)
         values = self.columns[base]
         if place is None and values.ndim == 1:

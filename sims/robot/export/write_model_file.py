@@ -45,8 +45,8 @@ EQUAL_NUMBERS_TOLERANCE = 1e-12
 """Relative difference between numbers of a compiled model that counts as rounding."""
 
 _SOFT_IN_URDF = (
-    "friction.coulomb: a URDF cannot say that dry friction is stiff, and MuJoCo reads it in its "
-    "soft form; extended.xml holds the stiff form"
+    "friction.coulomb: a URDF cannot state that dry friction is stiff, and MuJoCo reads it in its "
+    "soft form; extended.xml has the stiff form"
 )
 
 
@@ -292,7 +292,7 @@ class MjcfEditor:
                 break
         difference = find_first_difference(model, self.applied.model, EQUAL_NUMBERS_TOLERANCE)
         if difference:
-            raise NotEditableError(f"its attributes do not say all ({difference})")
+            raise NotEditableError(f"its attributes do not state everything ({difference})")
         return text
 
     def _render_document(self, statements: Sequence[AttributeStatement]) -> str:

@@ -132,11 +132,11 @@ class CompileRepairs:
         notes = self.left.notes
         if self.balanced:
             notes.append(
-                "no body has principal moments A + B < C; the nearest are taken (kg m^2): "
+                "no body has principal moments A + B < C; the nearest are taken (kg·m²): "
                 f"{format_item_list(self.balanced)}"
             )
         repair_text = (
-            f"given {DEFAULT_BODY_MASS:g} kg and moments of {inertia_repair.MIN_MOMENT:g} kg m^2"
+            f"given {DEFAULT_BODY_MASS:g} kg and moments of {inertia_repair.MIN_MOMENT:g} kg·m²"
         )
         for has_children, names in self.massless.items():
             childless_note = (
@@ -148,7 +148,7 @@ class CompileRepairs:
                 f"move without a mass{childless_note}; {repair_text}: {format_name_list(names)}"
             )
         if self.slight:
-            min_moment = f"{inertia_repair.MIN_MOMENT:g} kg m^2"
+            min_moment = f"{inertia_repair.MIN_MOMENT:g} kg·m²"
             notes.append(
                 f"move without moments of inertia; given {min_moment}: "
                 f"{format_name_list(self.slight)}"

@@ -115,7 +115,7 @@ def _make_robot(
     if exclusion_notes:
         spec, model = repairs.compile(spec)
     aliases = _map_fused_bodies(parents, {model.body(i).name for i in range(model.nbody)})
-    warning_notes = [f"MuJoCo says: {warning}" for warning in dict.fromkeys(warnings)]
+    warning_notes = [f"MuJoCo warns: {warning}" for warning in dict.fromkeys(warnings)]
     if model.nu == 0:
         warning_notes.insert(0, NO_ACTUATORS_NOTE)
     settings = json.dumps([actuators, engine], sort_keys=True, default=str)

@@ -107,7 +107,7 @@ def _format_repair_notes(
     """
     notes = []
     if point_masses:
-        min_moment = f"{inertia_repair.MIN_MOMENT:g} kg m^2"
+        min_moment = f"{inertia_repair.MIN_MOMENT:g} kg·m²"
         notes.append(
             f"a mass and no moments of inertia, so it is a point mass ({min_moment}): "
             f"{format_name_list(point_masses)}"
@@ -115,7 +115,7 @@ def _format_repair_notes(
     if raised_links:
         notes.append(
             "principal moments that are not positive; the nearest that a body can have are taken "
-            f"(kg m^2): {format_item_list(raised_links)}"
+            f"(kg·m²): {format_item_list(raised_links)}"
         )
     if inferred_links:
         notes.append(

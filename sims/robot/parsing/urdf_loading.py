@@ -283,7 +283,7 @@ def _remove_meaningless_limits(joints: Sequence[Element]) -> list[str]:
     notes = []
     if effort_limits:
         notes.append(
-            "effort limits clamp what actuators exert (N m or N): "
+            "effort limits clamp what actuators exert (N·m or N): "
             f"{format_name_list(effort_limits)}"
         )
     if invalid_efforts:

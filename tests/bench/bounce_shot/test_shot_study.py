@@ -509,8 +509,8 @@ def test_what_is_lost_on_the_way_is_said_and_no_untrained_tuner_is_shot_with(
     begun = shot_study.BounceShotStudy.begin(
         prepare_study(load_experiment(str(path)), folder=tmp_path / "out", jobs=1)
     )
-    made = begun.run(jobs=1, pool=Gone(PoolLostError("the scheduler is gone")))
-    assert (made.finished, made.planned, made.stopped) == (0, 1, "the scheduler is gone")
+    made = begun.run(jobs=1, pool=Gone(PoolLostError("the scheduler cannot be reached")))
+    assert (made.finished, made.planned, made.stopped) == (0, 1, "the scheduler cannot be reached")
     said = []
     assert begun.report(said.append) == 0
     assert said == ["no shot was made"]

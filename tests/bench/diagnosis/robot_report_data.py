@@ -44,7 +44,7 @@ WRISTS = cause(
 HEAVY = cause(
     "mass.scale@elbow_link",
     {"coefficient": number(0.12, "1")},
-    says="the body is heavier or lighter than the model file says (at body elbow_link)",
+    says="the body is heavier or lighter than the model file states (at body elbow_link)",
 )
 EVERYWHERE = cause("friction.coulomb@*", {f"coefficient@{joint}": number(0.3) for joint in ARM6})
 

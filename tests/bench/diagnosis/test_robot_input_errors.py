@@ -63,7 +63,8 @@ SAID = {
     ),
     "degrees of one": (
         scaled(1, 1, 1, 57.3),
-        r"column q.elbow: moves \d\d(\.\d)? times as far as u.m_elbow says; is its unit degrees\?",
+        r"column q.elbow: moves \d\d(\.\d)? times as far as u.m_elbow commands; "
+        r"is its unit degrees\?",
     ),
     "gears": (scaled(1, 1, 4000, 1), r"column q.shoulder: .* found -?\d+; is the unit right\?"),
 }

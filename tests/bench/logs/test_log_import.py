@@ -258,7 +258,7 @@ def test_a_column_of_zeros_and_ones_that_changes_is_kept_as_a_switch(arm, tmp_pa
     columns = {"t": TIMES, "shoulder_pos": WAVES[:, 0], "elbow_pos": WAVES[:, 1]}
     columns |= {"torque_enable": (TIMES < 2.0) * 1.0, "mode": np.ones(TIMES.size)}
     made = simgap.import_logs([written(tmp_path, "log.csv", columns)], arm, tmp_path / "log.toml")
-    assert any("column torque_enable, zeros and ones; if it says" in g for g in made.guessed)
+    assert any("column torque_enable, zeros and ones; if it shows" in g for g in made.guessed)
     assert "column mode: its meaning is unknown; left out" in "\n".join(made.untold)
     recording, _ = load_recording(tmp_path / "log.toml", divide=False)
     np.testing.assert_array_equal(

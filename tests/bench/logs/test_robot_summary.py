@@ -94,8 +94,10 @@ def test_inspect_says_what_is_odd_about_a_robots_log(odd_log, tmp_path, capsys):
     assert "(MJCF): 2 joints, 2 actuators, 2 moving bodies; implicitfast at 5 ms" in said
     assert "warning: not in the log, assumed to be zero: u.m_shoulder" in said
     assert "with initial values from the model file: elbow" in said
-    assert "q.shoulder goes from -30 to 29.72 rad in runs 1, 2, and swinging.xml" in said
-    assert "u.s_elbow goes from 0 to 1.9 in runs 1, 2, and swinging.xml states -0.5 to 0.9" in said
+    assert "q.shoulder ranges from -30 to 29.72 rad in runs 1, 2, and swinging.xml" in said
+    assert (
+        "u.s_elbow ranges from 0 to 1.9 in runs 1, 2, and swinging.xml states -0.5 to 0.9" in said
+    )
 
 
 def test_inspect_says_nothing_odd_of_a_sound_log(tmp_path, capsys):

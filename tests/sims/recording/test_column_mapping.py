@@ -169,8 +169,8 @@ FAULTS = {
     "no such column": ({"toml": TOML.replace("Force", "Push")}, r"commands.csv: unknown column "
                        r"'Push'; there are: stamp, force"),
     "text": ({"toml": TOML.replace("Force", "note")}, r"'note': expected numbers, found text"),
-    "a list": ({"toml": TOML.replace("pos[1]", "pos")}, r"'pos' holds lists; its entries are pos\[0"
-               r"\] to pos\[1\]"),
+    "a list": ({"toml": TOML.replace("pos[1]", "pos")}, r"'pos' contains lists; its entries are "
+               r"pos\[0\] to pos\[1\]"),
     "too far": ({"toml": TOML.replace("pos[1]", "pos[2]")}, r"unknown column 'pos\[2\]'"),
     "no file": ({"toml": TOML.replace("sensors.csv", "sensor.csv")}, r"sensor.csv: no such file"),
     "another format": ({"toml": TOML.replace("sensors.csv", "sensors.bag")}, r"no such file"),

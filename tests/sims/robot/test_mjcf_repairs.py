@@ -75,7 +75,7 @@ def test_inertias_that_mujoco_refuses(write):
     inertial = '<inertial pos="0 0 0" mass="2" diaginertia="0.1 0.2 0.36"/>'
     robot = read_robot(write(mjcf(inside=inertial, geom='size="0.1"')))
     assert robot.notes == (
-        "no body has principal moments A + B < C; the nearest are taken (kg m^2): "
+        "no body has principal moments A + B < C; the nearest are taken (kg·m²): "
         "b 0.1, 0.2, 0.36 -> 0.12, 0.22, 0.34",
         NO_ACTUATORS_NOTE,
     )

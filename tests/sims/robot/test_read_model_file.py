@@ -84,7 +84,7 @@ def test_a_urdf_is_read_with_its_fixed_links_in_what_carries_them(write):
 def test_notes_of_a_urdf(write):
     assert read_robot(write(SWING)).notes == (
         "held to the world, as MuJoCo does with a URDF's root: base",
-        "effort limits clamp what actuators exert (N m or N): pivot 12",
+        "effort limits clamp what actuators exert (N·m or N): pivot 12",
         "links on fixed joints are merged into their parent links: base of world; plate, bob of "
         "rod",
         "no actuators: it is passive unless the [actuators.NAME] of a recording add some",

@@ -156,7 +156,7 @@ def test_what_mujoco_warns_of_is_a_note(write, tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
     robot = read_robot(write(mjcf('<compiler settotalmass="2"/>')))
     (warning,) = [note for note in robot.notes if "actuators" not in note]
-    assert warning.startswith("MuJoCo says: ")
+    assert warning.startswith("MuJoCo warns: ")
     assert "settotalmass" in warning
     assert capfd.readouterr() == ("", "")
     assert os.listdir(tmp_path) == ["robot.xml"]

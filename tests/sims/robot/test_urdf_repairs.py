@@ -35,7 +35,7 @@ def test_nothing_is_reported_where_nothing_is_repaired(mended):
 
 def test_a_point_mass(mended):
     robot, notes = mended(one(inertia=""))
-    assert notes == ["a mass and no moments of inertia, so it is a point mass (1e-09 kg m^2): arm"]
+    assert notes == ["a mass and no moments of inertia, so it is a point mass (1e-09 kg·m²): arm"]
     assert moments(robot) == pytest.approx([1e-9] * 3)
     assert robot.bodies[0].mass == 1
 
@@ -45,7 +45,7 @@ def test_moments_that_are_not_positive_become_the_nearest(mended):
     robot, notes = mended(one(inertia=tensor))
     assert notes == [
         "principal moments that are not positive; the nearest that a body can have are taken "
-        "(kg m^2): arm -0.1, 0.5, 0.5 -> 1e-09, 0.5, 0.5"
+        "(kg·m²): arm -0.1, 0.5, 0.5 -> 1e-09, 0.5, 0.5"
     ]
     assert moments(robot) == pytest.approx([1e-9, 0.5, 0.5])
 
@@ -54,7 +54,7 @@ def test_moments_that_no_body_has_become_the_nearest(mended):
     tensor = '<inertia ixx="0.1" iyy="0.2" izz="0.36" ixy="0" ixz="0" iyz="0"/>'
     robot, notes = mended(one(inertia=tensor))
     assert notes == [
-        "no body has principal moments A + B < C; the nearest are taken (kg m^2): "
+        "no body has principal moments A + B < C; the nearest are taken (kg·m²): "
         "arm 0.1, 0.2, 0.36 -> 0.12, 0.22, 0.34"
     ]
     assert moments(robot) == pytest.approx([0.12, 0.22, 0.34])
@@ -70,7 +70,7 @@ def test_who_asks_for_balanced_inertia_gets_that_of_mujoco(mended):
 
 def test_links_without_a_mass_between_links_that_have_one(mended):
     robot, notes = mended(robot_text(link("base", None), link("yaw", None), link("arm")))
-    assert notes == ["move without a mass; given 1e-06 kg and moments of 1e-09 kg m^2: yaw"]
+    assert notes == ["move without a mass; given 1e-06 kg and moments of 1e-09 kg·m²: yaw"]
     assert {body.name: body.mass for body in robot.bodies} == {"yaw": 1e-6, "arm": 1}
 
 
@@ -85,7 +85,7 @@ def test_a_last_link_without_a_mass_is_said_to_mean_little(mended):
     _, notes = mended(robot_text(link("base", None), link("arm"), link("tip", None)))
     assert notes == [
         "move without a mass, and carry no other bodies, so their joints have little effect; given "
-        "1e-06 kg and moments of 1e-09 kg m^2: tip"
+        "1e-06 kg and moments of 1e-09 kg·m²: tip"
     ]
 
 
@@ -123,7 +123,7 @@ def test_limits_that_leave_no_room(mended, lower, upper):
     assert robot.joints[0].range is None
     assert robot.joints[0].effort == 3
     assert notes == [
-        "effort limits clamp what actuators exert (N m or N): j 3",
+        "effort limits clamp what actuators exert (N·m or N): j 3",
         "a lower limit not below the upper is read as none: j",
     ]
 

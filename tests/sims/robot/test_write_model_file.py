@@ -234,7 +234,7 @@ def test_a_urdf_says_what_it_can(tmp_path: Path) -> None:
     assert "<!-- the elbow -->" in done.urdf
     unsaid = {line.partition(":")[0] for line in done.notes if "not in the URDF" in line}
     assert unsaid == {"inertia.armature@elbow", "inertia.scale@fore"}
-    stiff = "a URDF cannot say that dry friction is stiff"
+    stiff = "a URDF cannot state that dry friction is stiff"
     assert stiff in done.urdf
     soft = write_model_files(arm.with_friction_form("soft"), causes, "log.csv")
     assert soft.urdf is not None

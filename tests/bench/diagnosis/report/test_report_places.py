@@ -111,7 +111,7 @@ def test_a_long_set_says_how_many_more_there_are():
     [
         ([RUB], "The simulation lacks Coulomb friction at joint elbow: a constant friction "
                 "opposes motion."),
-        ([HEAVY], "The mass of body elbow_link is 12 % larger than the model file says."),
+        ([HEAVY], "The mass of body elbow_link is 12 % larger than the model file states."),
         ([RUB, HEAVY], "The simulation lacks Coulomb friction at joint elbow, and has a wrong "
                        "mass of body elbow_link."),
         ([EVERYWHERE], "The simulation lacks Coulomb friction at every joint: "
@@ -119,12 +119,12 @@ def test_a_long_set_says_how_many_more_there_are():
         ([cause("friction.coulomb@elbow", {"coefficient": number(-0.2)})],
          "The simulation has too much Coulomb friction at joint elbow."),
         ([cause("inertia.armature@elbow", {"coefficient": number(-0.0213, "kg*m^2")})],
-         "The armature of joint elbow is 0.021 kg·m² smaller than the model file says."),
+         "The armature of joint elbow is 0.021 kg·m² smaller than the model file states."),
         ([cause("mass.offset@forearm", {n: number(v, "m") for n, v in
                                         zip("xyz", (0.03, 0.0, -0.04), strict=True)})],
          "The centre of mass of body forearm is 0.05 m from where the model file has it."),
         ([cause("actuator.stiffness@m_elbow", {"coefficient": number(-0.25, "1")})],
-         "The stiffness of actuator m_elbow is 25 % smaller than the model file says."),
+         "The stiffness of actuator m_elbow is 25 % smaller than the model file states."),
         ([cause("mass.scale@*", {"coefficient@a": number(0.1, "1")}, says="it weighs otherwise")],
          "The simulation has a wrong mass of every body: it weighs otherwise."),
     ],
@@ -147,7 +147,9 @@ def test_a_headline_of_a_set_names_all_of_it():
 
 def test_a_further_effect_is_missing_although_a_number_is_wrong():
     said = format_headline(robot_story("partial", [HEAVY]))
-    assert said.startswith("The mass of body elbow_link is 12 % larger than the model file says, ")
+    assert said.startswith(
+        "The mass of body elbow_link is 12 % larger than the model file states, "
+    )
     assert said.endswith("and the simulation lacks something else that no known cause explains.")
     both = format_headline(robot_story("partial", [RUB, HEAVY]))
     told = " ".join(format_gain_and_caveats(robot_story("partial", [RUB, HEAVY])))
