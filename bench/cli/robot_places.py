@@ -10,6 +10,7 @@ from bench.cli.output import JsonDocument
 from bench.core.plugin_registries import make_robot_simulator
 from bench.logs.robot_summary import format_robot_summary
 from sims import effects
+from sims.core.unit_text import append_unit, format_unit
 from sims.robot.robot_model import RobotModel
 from sims.robot.robot_simulator import RobotSimulator
 from sims.robot.robot_system import RobotSystem
@@ -25,9 +26,9 @@ def format_places(model: Path) -> Iterator[str]:
         links = f", with {', '.join(body.aliases)}" if body.aliases else ""
         yield f"  {'body':9} {body.name:24} {body.mass:.4g} kg{links}"
     for signal in kind.inputs:
-        yield f"  {'input':9} {signal.name:24} {signal.unit}"
+        yield f"  {'input':9} {signal.name:24} {format_unit(signal.unit)}"
     for channel in kind.channels:
-        yield f"  {'channel':9} {channel.name:24} {channel.unit:9} {channel.says}"
+        yield f"  {'channel':9} {channel.name:24} {format_unit(channel.unit):9} {channel.says}"
     yield from _format_effects_by_place(kind.system)
     yield f"  --free also takes MuJoCo's words: {', '.join(kind.system.list_mujoco_words())}"
 
@@ -69,7 +70,11 @@ def _format_joints(robot: RobotModel) -> Iterator[str]:
     """Yield a line for each joint of a robot: kind, and range of motion and effort if limited."""
     for joint in robot.joints:
         limits = "" if joint.range is None else _format_range(joint.range, joint.unit)
-        effort = "" if joint.effort is None else f", effort {joint.effort:g} {joint.force_unit}"
+        effort = (
+            ""
+            if joint.effort is None
+            else append_unit(f", effort {joint.effort:g}", joint.force_unit)
+        )
         yield f"  {'joint':9} {joint.name:24} {joint.kind}{limits}{effort}"
 
 
@@ -82,7 +87,7 @@ def _format_actuators(kind: type[RobotSimulator]) -> Iterator[str]:
 
 
 def _format_range(limits: tuple[float, float], unit: str) -> str:
-    return f", {limits[0]:.4g} to {limits[1]:.4g} {unit}"
+    return append_unit(f", {limits[0]:.4g} to {limits[1]:.4g}", unit)
 
 
 def _format_effects_by_place(system: type[RobotSystem]) -> Iterator[str]:

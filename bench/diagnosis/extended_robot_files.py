@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from sims.core.freed_memory import release_free_memory
+from sims.core.unit_text import append_unit
 from sims.extended_simulator import ExtendedSimulator, FittedValue
 
 if TYPE_CHECKING:
@@ -96,11 +97,12 @@ def select_written_causes(
             if fitted_value.at_bound is None and not fitted_value.value:
                 continue
             end = {"low": "lower", "high": "upper", None: ""}[fitted_value.at_bound]
-            reason = f"lies at the {end} bound of its range" if end else "has no finite interval"
+            reason = f"is at the {end} bound of its range" if end else "has no finite interval"
             name = effect if not place else f"{effect.partition('@')[0]}@{place}"
+            value_text = append_unit(f"{fitted_value.value:.3g}", fitted_value.unit)
             left_out.append(
-                f"{name} is not written to the model file: its value, {fitted_value.value:.3g} "
-                f"{fitted_value.unit}, {reason} and is not a result"
+                f"{name} is not written to the model file: its value, {value_text}, {reason} and "
+                "is not a result"
             )
     return selected_causes, tuple(left_out)
 

@@ -23,6 +23,7 @@ from sims.core.argument_checks import Expected, Name, Names, check_arguments
 from sims.core.simulator import Array, InputError, Scenario, Simulator
 from sims.core.system import DefaultRecording
 from sims.core.toml_validation import check_known_names
+from sims.core.unit_text import append_unit
 from sims.core.value_limits import (
     MAX_NUMBER,
     MAX_SAMPLING_RATE_HZ,
@@ -397,9 +398,8 @@ def _make_parameters(
     for p in kind.parameters:
         low, high = p.bounds
         if not low <= theta[p.name] <= high:
-            raise InputError(
-                f"parameter {p.name} = {theta[p.name]:g}: expected {low:g} to {high:g} {p.unit}"
-            )
+            span = append_unit(f"{low:g} to {high:g}", p.unit)
+            raise InputError(f"parameter {p.name} = {theta[p.name]:g}: expected {span}")
     return theta
 
 

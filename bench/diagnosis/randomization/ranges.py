@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from bench.diagnosis.extended_robot_files import collect_causes
 from bench.diagnosis.verdict import Verdict
 from bench.pages.text_format import joined
+from sims.core.unit_text import append_unit
 from sims.extended_simulator import ExtendedSimulator, FittedValue
 
 if TYPE_CHECKING:
@@ -169,13 +170,12 @@ def _find_missing_range_reason(number: FittedValue, entry: _Entry) -> str:
     name = entry.cause.name
     if len(entry.cause.numbers) > 1:
         name = f"{name} ({entry.coefficient})"
+    value_text = append_unit(f"{number.value:.3g}", number.unit)
     if number.at_bound is not None:
         end = {"low": "lower", "high": "upper"}[number.at_bound]
-        reason = (
-            f"its value, {number.value:.3g} {number.unit}, lies at the {end} bound of its range"
-        )
+        reason = f"its value, {value_text}, is at the {end} bound of its range"
     elif number.low is None or number.high is None:
-        reason = f"its value, {number.value:.3g} {number.unit}, has no finite interval"
+        reason = f"its value, {value_text}, has no finite interval"
     elif is_gravity_compensated(entry.cause.effect, entry.cause.numbers):
         reason = 'gravity is compensated; extended.xml states this with gravcomp="1"'
     else:

@@ -10,6 +10,7 @@ import numpy as np
 from bench.logs.quality.noise_estimation import estimate_noise
 from bench.logs.quality.quality_finding import QualityFinding, format_names
 from sims.core.simulator import Array, Channel, Simulator
+from sims.core.unit_text import append_unit
 from sims.recording.recording import Recording, Run
 from sims.system_simulator import SystemSimulator
 
@@ -49,18 +50,19 @@ def check_quantisation(recording: Recording, kind: type[Simulator]) -> Iterator[
         stated_noise = recording.noise.get(channel.name)
         # A rounding error is uniformly distributed over a step; its standard deviation follows.
         rounding = step / 12**0.5
-        unit = channel.unit
+        step_text = append_unit(f"{step:.3g}", channel.unit)
+        rounding_text = append_unit(f"{rounding:.2g}", channel.unit)
         if step and stated_noise is not None and stated_noise < rounding / 2:
             yield QualityFinding(
                 "quantisation",
-                f"{channel.name} has steps of {step:.3g} {unit}, whose rounding error alone is "
-                f"{rounding:.2g} {unit}, but the stated noise is {stated_noise:.2g}",
+                f"{channel.name} has steps of {step_text}, whose rounding error alone is "
+                f"{rounding_text}, but the stated noise is {stated_noise:.2g}",
                 f"state noise = {rounding:.2g} or more",
             )
         elif step > QUANTISATION_SHARE_THRESHOLD * spread > 0:
             yield QualityFinding(
                 "quantisation",
-                f"{channel.name} has steps of {step:.3g} {unit}, {step / spread:.0%} of its range",
+                f"{channel.name} has steps of {step_text}, {step / spread:.0%} of its range",
                 "use a larger motion or a finer sensor: changes smaller than a step are hardly "
                 "visible",
             )
@@ -90,9 +92,10 @@ def check_saturation(recording: Recording, kind: type[Simulator]) -> Iterator[Qu
             if flat > MIN_SATURATED_SHARE * total and not all(
                 _is_resting_value(run_values, end) for run_values in values
             ):
+                value_text = append_unit(f"{sign * end:.4g}", channel.unit)
                 yield QualityFinding(
                     "saturation",
-                    f"{channel.name} stays at its {word} value, {sign * end:.4g} {channel.unit}, "
+                    f"{channel.name} stays at its {word} value, {value_text}, "
                     f"in {flat / total:.1%} of the samples",
                     "a sensor or joint at its limit carries no information: leave these samples "
                     "empty, or stay away from the limit",

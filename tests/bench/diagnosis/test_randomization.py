@@ -144,7 +144,7 @@ def test_free_numbers_have_ranges_without_causes(arm, tmp_path):
     assert damping.is_free
     assert [damping.nominal, damping.low, damping.high] == pytest.approx([0.1, 0.11, 0.13])
     assert found.ranges.left_out == (
-        "mass.scale@fore is not in the ranges: its value, 0.4 1, has no finite interval",
+        "mass.scale@fore is not in the ranges: its value, 0.4, has no finite interval",
     )
 
 
@@ -159,7 +159,7 @@ def test_what_is_no_result_is_left_out_and_said(arm):
     assert found.ranges.left_out == (
         "drag.linear@elbow is not in the ranges: these data cannot distinguish it from "
         "drag.quadratic@elbow",
-        "friction.coulomb@elbow is not in the ranges: its value, 9 N*m, lies at the upper bound of "
+        "friction.coulomb@elbow is not in the ranges: its value, 9 N·m, is at the upper bound of "
         "its range",
         "input.lag@m_elbow is not in the ranges: its value, 0.1 s, has no finite interval",
         "no ranges are written: the verdict is named, and neither a named cause nor a free number "

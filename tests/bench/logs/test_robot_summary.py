@@ -116,7 +116,7 @@ def test_repairs_of_a_model_are_reported(tmp_path, capsys):
     assert main(["list", "places", "--model", str(tmp_path / "r.urdf")]) == 0
     said = capsys.readouterr().out
     assert "note: ignored, since MuJoCo has no equivalent: <transmission>" in said
-    assert "hinge, effort 5 N*m" in said
+    assert "hinge, effort 5 N·m" in said
     words = said.partition("MuJoCo's words: ")[2]
     assert "damping" in words
     assert "kp" not in words, "it has no servo"
@@ -128,7 +128,7 @@ def test_places_of_a_robot_are_listed(tmp_path, capsys):
     said = capsys.readouterr().out
     for words in (
         "shoulder                 hinge, -1.5 to 1.5 rad",
-        "m_shoulder               motor on shoulder, -3 to 3 N*m",
+        "m_shoulder               motor on shoulder, -3 to 3 N·m",
         "fore                     0.8 kg",
         "u.s_elbow                rad",
         "tau.elbow",
