@@ -146,17 +146,38 @@ def hash_recording(experiment: Experiment) -> str:
     return hashlib.sha256(table.read_bytes() + table.with_suffix(".toml").read_bytes()).hexdigest()
 
 
-def select_relevant_keys(experiment: Experiment, but: Iterable[str]) -> dict[str, Any]:
+IRRELEVANT_KEYS = {
+    "title": "descriptive text",
+    "says": "descriptive text",
+    "tags": "descriptive text",
+    "identifiable": "descriptive text",
+    "suite": "descriptive text",
+    "problem_hashes": "an experiment that is run names no other experiments",
+    "negligible_error": "used in the ranking, after all runs",
+    "identifiability": "computed separately from the runs",
+    "recording": "path of the file; its content is hashed",
+    "model": "path of the file; its content is hashed",
+    "calibration": "its result is in the settings of the tuned simulator",
+    "shot": "uses the tuned model, after the runs",
+    "diagnosis": "comparison of diagnosers, which tunes nothing",
+    "sweep": "an experiment that is run has single values",
+    "experiments": "an experiment that is run names no other experiments",
+    "nuisance": "affects randomised entries only, and is hashed with them",
+}
+"""Keys of an experiment that change neither runs nor trained weights, each with the reason."""
+
+
+def select_relevant_keys(experiment: Experiment, irrelevant: Iterable[str]) -> dict[str, Any]:
     """Return the configuration without the fields that do not affect a result.
 
     A new field of `Experiment` is included until it is listed with a reason.
 
     Args:
         experiment: configuration of the experiment.
-        but: names of the fields that are left out.
+        irrelevant: names of the fields that are left out.
     """
     document = experiment.document() | {"name": experiment.name}
-    return {name: value for name, value in document.items() if name not in but}
+    return {name: value for name, value in document.items() if name not in irrelevant}
 
 
 def hash_class_source(kind: type) -> str:

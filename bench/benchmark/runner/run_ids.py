@@ -16,6 +16,7 @@ from bench.benchmark.problem.targets import BlindedTarget
 from bench.benchmark.runner.code_digest import (
     BOUNCE_SHOT_SOURCE_FOLDERS,
     EXPLAIN_SOURCE_FOLDERS,
+    IRRELEVANT_KEYS,
     compute_digest,
     hash_class_source,
     hash_effect_sources,
@@ -31,12 +32,7 @@ from bench.core.plugin_registries import PartUnavailableError, tuners
 from sims.core.simulator import InputError
 
 RUN_IRRELEVANT_KEYS = {
-    "title": "descriptive text",
-    "says": "descriptive text",
-    "tags": "descriptive text",
-    "identifiable": "descriptive text",
-    "suite": "descriptive text",
-    "problem_hashes": "an experiment that is run names no other experiments",
+    **IRRELEVANT_KEYS,
     "resolution": "rounds observations, which are hashed with the target",
     "ranges": "selects targets; each run's id covers its own target",
     "targets": "number of targets; each run's id covers its own target",
@@ -45,18 +41,8 @@ RUN_IRRELEVANT_KEYS = {
     "seeds": "number of seeds; each run's id covers its own seed",
     "budget": "each run's id covers its own budget, which the tuner's entry may change",
     "training_budget": "affects learned tuners only, and is hashed with their entries",
-    "negligible_error": "used in the ranking, after all runs",
-    "identifiability": "computed separately from the runs",
-    "recording": "path of the file; its content is hashed",
-    "model": "path of the file; its content is hashed",
-    "calibration": "its result is in the settings of the tuned simulator",
-    "shot": "uses the tuned model, after the runs",
-    "diagnosis": "comparison of diagnosers, which tunes nothing",
     "salt": "selects targets; their scenarios and observations are hashed",
     "salt_sha256": "selects targets; their scenarios and observations are hashed",
-    "sweep": "an experiment that is run has single values",
-    "experiments": "an experiment that is run names no other experiments",
-    "nuisance": "affects randomised entries only, and is hashed with them",
     "tuners": "each run's id covers its own tuner with its options",
 }
 """Keys of an experiment that do not change any run by themselves, each with the reason."""

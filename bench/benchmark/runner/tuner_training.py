@@ -27,6 +27,7 @@ from bench.benchmark.problem.model_file_simulator import get_simulator_class
 from bench.benchmark.problem.training_simulator import CountedTrainingSimulator
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.benchmark.runner.code_digest import (
+    IRRELEVANT_KEYS,
     compute_digest,
     hash_class_source,
     hash_effect_sources,
@@ -98,12 +99,7 @@ def get_weights_folder() -> Path:
 
 
 TRAINING_IRRELEVANT_KEYS = {
-    "title": "descriptive text",
-    "says": "descriptive text",
-    "tags": "descriptive text",
-    "identifiable": "descriptive text",
-    "suite": "descriptive text",
-    "problem_hashes": "an experiment that is run names no other experiments",
+    **IRRELEVANT_KEYS,
     "resolution": "rounds target observations only",
     "error_channel": "selects the reported error",
     "ranges": "describes the targets, which are used after the training",
@@ -115,19 +111,9 @@ TRAINING_IRRELEVANT_KEYS = {
     "budget": "limits a run, not a training",
     "timeout": "limits a run, not a training",
     "memory": "limits a run, not a training",
-    "negligible_error": "used in the ranking, after all runs",
-    "identifiability": "computed separately from the runs",
     "isolation": "applies to runs; a training always has its own process",
     "salt": "describes the targets, which are used after the training",
     "salt_sha256": "describes the targets, which are used after the training",
-    "recording": "path of the file; its content is hashed",
-    "model": "path of the file; its content is hashed",
-    "calibration": "its result is in the settings of the tuned simulator",
-    "shot": "uses the tuned model, after the runs",
-    "diagnosis": "comparison of diagnosers, which tunes nothing",
-    "sweep": "an experiment that is run has single values",
-    "experiments": "an experiment that is run names no other experiments",
-    "nuisance": "affects randomised entries only, and is hashed with them",
     "tuners": "each key covers its own tuner with its options",
 }
 """Keys of an experiment that do not change trained weights, each with the reason."""
