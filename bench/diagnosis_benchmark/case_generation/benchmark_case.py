@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
+import numpy as np
+
 from bench.diagnosis_benchmark.case_generation.recording_conditions import (
     ANY_CONDITIONS,
     RequestedConditions,
@@ -71,3 +73,11 @@ class BenchmarkCase:
         effects = {name: tuple(c) for name, c in document["effects"].items()}
         fields = {**document, "effects": effects, "channels": tuple(document["channels"])}
         return cls(**{**fields, "asked": RequestedConditions(*document.get("asked", ()))})
+
+
+def make_case_rng(name: str, purpose: str) -> np.random.Generator:
+    """Return the random generator of a case for one purpose, such as its noise.
+
+    The stream follows from both names alone, so a case needs no stored data.
+    """
+    return np.random.default_rng(list(f"{name} {purpose}".encode()))

@@ -19,14 +19,12 @@ from bench.diagnosis_benchmark.case_generation import (
     effect_coefficients,
     effect_sizing,
 )
-from bench.diagnosis_benchmark.case_generation.benchmark_case import BenchmarkCase
+from bench.diagnosis_benchmark.case_generation.benchmark_case import BenchmarkCase, make_case_rng
 from bench.diagnosis_benchmark.case_generation.recording_conditions import (
     ANY_CONDITIONS,
     RecordingConditions,
     RequestedConditions,
-)
-from bench.diagnosis_benchmark.case_generation.recording_conditions import (
-    draw_conditions as drawn_setting,
+    draw_conditions,
 )
 from bench.diagnosis_benchmark.case_generation.reference_simulation import (
     SIMULATORS,
@@ -104,7 +102,7 @@ def draw_case(
     seed: int,
     effect: str | None = None,
     size: float | None = None,
-    wanted_so: RequestedConditions = ANY_CONDITIONS,
+    requested: RequestedConditions = ANY_CONDITIONS,
 ) -> BenchmarkCase | None:
     """Draw a case.
 
@@ -114,7 +112,7 @@ def draw_case(
         seed: seed from which everything else follows.
         effect: hidden effect (the first one of a double case); None to draw it.
         size: size in units of the noise; None to draw it.
-        wanted_so: recording conditions that are not drawn.
+        requested: recording conditions that are not drawn.
 
     Returns:
         The case, or None if the sensors cannot show the effect at this size with a strength up to
@@ -127,19 +125,19 @@ def draw_case(
             system,
             *([effect_label] if kind != "clean" else []),
             *([f"{size:g}"] if size else []),
-            *(str(part) for part in wanted_so if part is not None),
+            *(str(part) for part in requested if part is not None),
             str(seed),
         ]
     )
-    rng = _make_rng(name, "cause")
+    rng = make_case_rng(name, "cause")
     hidden = _choose_hidden_causes(kind, system, effect, rng)
-    setting = _draw_conditions(name, system, hidden, wanted_so)
+    setting = _draw_conditions(name, system, hidden, requested)
     item = BenchmarkCase(
         name, system, kind, {}, 0.0, setting.noise.kind, setting.noise.stated, setting.rate,
         setting.seconds,
         len(setting.scenarios), str(rng.choice(["scipy", "mujoco"])), setting.is_driven,
         setting.channels, seed,
-        setting.parameters, asked=wanted_so,
+        setting.parameters, asked=requested,
     )  # fmt: skip
     target_size = size or float(
         np.exp(rng.uniform(np.log(3.0 if kind in ("double", "foreign") else 1.0), np.log(10.0)))
@@ -162,16 +160,12 @@ def count_held_out_runs(item: BenchmarkCase) -> int:
     return max(1, item.runs // 3)
 
 
-def _make_rng(name: str, purpose: str) -> np.random.Generator:
-    return np.random.default_rng(list(f"{name} {purpose}".encode()))
-
-
 @lru_cache(maxsize=16)
 def _draw_conditions(
     name: str, system: str, hidden: tuple[str, ...], requested: RequestedConditions = ANY_CONDITIONS
 ) -> RecordingConditions:
     """Draw the recording conditions of a case from its name, and cache them."""
-    return drawn_setting(system, _make_rng(name, "setting"), hidden, requested=requested)
+    return draw_conditions(system, make_case_rng(name, "setting"), hidden, requested=requested)
 
 
 def restore_conditions(item: BenchmarkCase) -> RecordingConditions:
@@ -435,7 +429,7 @@ def _simulate_runs(item: BenchmarkCase, setting: RecordingConditions) -> tuple[R
         item: the case; it states the simulator of the recording (`source`).
         setting: its recording conditions, with all runs.
     """
-    rng, held_out = _make_rng(item.name, "noise"), count_held_out_runs(item)
+    rng, held_out = make_case_rng(item.name, "noise"), count_held_out_runs(item)
     hidden = {"foreign": item.effects} if item.kind == "foreign" else {"effects": item.effects}
     world, runs = setting.make_true_system(**hidden), []
     for number, scenario in enumerate(setting.scenarios):

@@ -51,9 +51,9 @@ def compute_refitted_residual(
     """
     fit = NuisanceFitter(setting, [name])
     if coefficients is not None:
-        return fit(observed, [*setting.parameters.values(), *coefficients]).left
+        return fit(observed, [*setting.parameters.values(), *coefficients]).rms_residual
     guesses = _rank_starts(setting, observed, name, NuisanceFitter(setting)(observed))
-    return min(fit(observed, guess).left for _, guess in guesses[:STARTS_PER_EFFECT])
+    return min(fit(observed, guess).rms_residual for _, guess in guesses[:STARTS_PER_EFFECT])
 
 
 def find_best_effect(setting: RecordingConditions, observed: Array) -> tuple[str, float]:
@@ -74,11 +74,11 @@ def find_best_effect(setting: RecordingConditions, observed: Array) -> tuple[str
     first = {n: _rank_starts(setting, observed, n, base_fit)[0] for n in names}
     promising_names = sorted(first, key=lambda n: first[n][0])[:MAX_REFITTED_EFFECTS]
     residuals = {
-        n: NuisanceFitter(setting, [n])(observed, first[n][1], base_fit.starts).left
+        n: NuisanceFitter(setting, [n])(observed, first[n][1], base_fit.starts).rms_residual
         for n in promising_names
     }
     name = min(residuals, key=lambda n: residuals[n])
-    return name, min(residuals[name], base_fit.left)
+    return name, min(residuals[name], base_fit.rms_residual)
 
 
 def _rank_starts(

@@ -30,12 +30,12 @@ class ResidualFit:
     """Result of a fit.
 
     Attributes:
-        left: RMS residual over all samples and channels, in units of the noise.
+        rms_residual: RMS residual over all samples and channels, in units of the noise.
         theta: base parameters, then coefficients of effects.
         starts: initial states, (R, S).
     """
 
-    left: float
+    rms_residual: float
     theta: Array
     starts: Array
 
@@ -215,7 +215,7 @@ def make_gap_function(
     fit = NuisanceFitter(setting)
     last: list[tuple[float, ResidualFit]] = []
 
-    def left(strength: float) -> float:
+    def compute_size(strength: float) -> float:
         """Return the size of the cause at a strength: the RMS residual in units of the noise.
 
         The fit starts at the last fitted values, scaled to this strength, which saves iterations.
@@ -227,11 +227,11 @@ def make_gap_function(
             theta = np.clip(theta + share * (fitted.theta - theta), fit.low, fit.high)
             starts = starts + share * (fitted.starts - starts)
         fitted = fit(observed(strength), theta, starts)
-        if np.isfinite(fitted.left):
+        if np.isfinite(fitted.rms_residual):
             last.append((strength, fitted))
-        return fitted.left
+        return fitted.rms_residual
 
-    return left
+    return compute_size
 
 
 def find_strength_for_size(

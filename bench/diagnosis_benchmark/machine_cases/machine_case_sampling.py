@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.diagnosis_benchmark.case_generation.benchmark_case import BenchmarkCase
+from bench.diagnosis_benchmark.case_generation.benchmark_case import BenchmarkCase, make_case_rng
 from bench.diagnosis_benchmark.case_generation.effect_sizing import find_strength_for_size
 from bench.diagnosis_benchmark.case_generation.recording_conditions import (
     ANY_CONDITIONS,
@@ -23,9 +23,7 @@ from bench.diagnosis_benchmark.machine_cases import hidden_causes
 from bench.diagnosis_benchmark.machine_cases.machine_dynamics import MACHINES, Effects
 from bench.diagnosis_benchmark.machine_cases.machine_recording_conditions import (
     MachineRecordingConditions,
-)
-from bench.diagnosis_benchmark.machine_cases.machine_recording_conditions import (
-    draw_conditions as drawn_setting,
+    draw_conditions,
 )
 from bench.diagnosis_benchmark.machine_cases.model_file import MODEL_FILE_NAME, render_arm_mjcf
 from bench.diagnosis_benchmark.machine_cases.reference_motion import (
@@ -62,7 +60,7 @@ def draw_case(
     seed: int,
     effect: str | None = None,
     size: float | None = None,
-    wanted_so: RequestedConditions = ANY_CONDITIONS,
+    requested: RequestedConditions = ANY_CONDITIONS,
 ) -> BenchmarkCase | None:
     """Draw a case; see `bench.diagnosis_benchmark.case_generation.case_sampling.draw_case`.
 
@@ -72,16 +70,16 @@ def draw_case(
         seed: seed from which everything else follows.
         effect: hidden effect (the first one of a double case); None to draw it.
         size: size in units of the noise; None to draw it.
-        wanted_so: recording conditions that are not drawn.
+        requested: recording conditions that are not drawn.
 
     Returns:
         The case, or None if the encoders cannot show the cause, or if another answer explains it
         too well.
     """
     words = [kind, system, effect or "any", *([f"{size:g}"] if size else [])]
-    words += [str(part) for part in wanted_so if part is not None]
+    words += [str(part) for part in requested if part is not None]
     name = "-".join([*words, str(seed)])
-    conditions, rng = restore_conditions(name, system, wanted_so), _make_rng(name, "cause")
+    conditions, rng = restore_conditions(name, system, requested), make_case_rng(name, "cause")
     item = BenchmarkCase(
         name,
         system,
@@ -98,7 +96,7 @@ def draw_case(
         MACHINES[system].channels,
         seed,
         conditions.free_parameters,
-        asked=wanted_so,
+        asked=requested,
     )
     if kind == "clean":
         return item
@@ -112,10 +110,6 @@ def draw_case(
     return hidden(item, conditions, effect, target_size, rng)
 
 
-def _make_rng(name: str, purpose: str) -> np.random.Generator:
-    return np.random.default_rng(list(f"{name} {purpose}".encode()))
-
-
 @lru_cache(maxsize=4)
 def restore_conditions(
     name: str, system: str, requested: RequestedConditions = ANY_CONDITIONS
@@ -127,7 +121,7 @@ def restore_conditions(
         system: servo or arm2.
         requested: conditions that were not drawn.
     """
-    return drawn_setting(system, _make_rng(name, "setting"), requested)
+    return draw_conditions(system, make_case_rng(name, "setting"), requested)
 
 
 def _draw_place(
@@ -192,26 +186,34 @@ def _hide_one_effect(
 
 
 def _find_sized_coefficients(
-    name: str, conditions: MachineRecordingConditions, target_size: float, rng: np.random.Generator
+    name: str,
+    conditions: MachineRecordingConditions,
+    target_size: float,
+    rng: np.random.Generator,
+    is_modelled: bool = True,
 ) -> tuple[float, ...] | None:
     """Find coefficients at which a cause has the requested size, with a strength of at most 1.
 
     Args:
-        name: ``effect@place``, or ``effect`` alone.
+        name: ``cause@place``, or ``cause`` alone.
         conditions: recording conditions.
         target_size: size in units of the noise.
-        rng: random generator for the shape of the effect.
+        rng: random generator for the shape of the cause.
+        is_modelled: whether the cause is an effect of the library.
 
     Returns:
         The coefficients; None if the size is not reached.
     """
-    compute_coefficients = hidden_causes.draw_effect_shape(name, conditions, rng)
+    draw = hidden_causes.draw_effect_shape if is_modelled else hidden_causes.draw_unmodelled_cause
+    compute_coefficients = draw(name, conditions, rng)
     gauge = _ResidualGauge(conditions)
-    strength = find_strength_for_size(
-        lambda s: gauge.left(conditions.simulate_readings({name: compute_coefficients(s)})),
-        target_size,
-        1.0,
-    )
+
+    def compute_size(strength: float) -> float:
+        causes = {name: compute_coefficients(strength)}
+        effects, foreign = (causes, {}) if is_modelled else ({}, causes)
+        return gauge.compute_residual_size(conditions.simulate_readings(effects, foreign))
+
+    strength = find_strength_for_size(compute_size, target_size, 1.0)
     return None if strength is None else compute_coefficients(strength)
 
 
@@ -281,18 +283,10 @@ def _hide_unmodelled_cause(
     chosen_cause = cause or str(rng.choice(hidden_causes.UNMODELLED_CAUSES))
     joint = str(rng.choice(MACHINES[item.system].joints))
     name = f"{chosen_cause}@{joint}" if joint else chosen_cause
-    compute_coefficients, gauge = (
-        hidden_causes.draw_unmodelled_cause(name, conditions, rng),
-        _ResidualGauge(conditions),
-    )
-    strength = find_strength_for_size(
-        lambda s: gauge.left(conditions.simulate_readings(foreign={name: compute_coefficients(s)})),
-        target_size,
-        1.0,
-    )
-    if strength is None:
+    c = _find_sized_coefficients(name, conditions, target_size, rng, is_modelled=False)
+    if c is None:
         return None
-    hidden = {name: compute_coefficients(strength)}
+    hidden = {name: c}
     library_effects = [
         n
         for e in hidden_causes.EFFECTS_BY_MACHINE[item.system]
@@ -337,7 +331,7 @@ def _compute_unexplained_size(
             else {name: compute_coefficients(_PROBE_STRENGTH)}
         )
         direction = conditions.simulate_readings(probe, coarse=_COARSE_STEP_FACTOR) - base_readings
-        residual_sizes.append(gauge.projected(change, direction))
+        residual_sizes.append(gauge.compute_projected_size(change, direction))
     return min(residual_sizes)
 
 
@@ -345,7 +339,7 @@ class _ResidualGauge:
     """Sizes of changes, in units of the noise, with parameters and initial states projected out.
 
     Args:
-        made: recording conditions; only the runs for fitting are used.
+        conditions: recording conditions; only the runs for fitting are used.
 
     Attributes:
         bare: readings without hidden causes, (R, T, N).
@@ -358,7 +352,7 @@ class _ResidualGauge:
         parameters, each of N angles and each of N velocities. A parameter changes all runs, an
         initial state only its own run.
         """
-        self.made = conditions
+        self.conditions = conditions
         runs, joints = conditions.fitted_runs.q.shape
         numbers = list(conditions.free_parameters)
         lanes = 1 + len(numbers) + 2 * joints
@@ -389,7 +383,7 @@ class _ResidualGauge:
         self.bare = readings[:, 0].reshape(runs, len(conditions.runs.times), joints)
         self._basis = _compute_orthonormal_basis(columns)
 
-    def left(self, readings: Array) -> float:
+    def compute_residual_size(self, readings: Array) -> float:
         """Compute the size of the change in readings by a hidden cause; infinite if they diverge.
 
         Args:
@@ -397,7 +391,7 @@ class _ResidualGauge:
         """
         return self._compute_size((readings - self.bare).ravel())
 
-    def projected(self, change: Array, direction: Array) -> float:
+    def compute_projected_size(self, change: Array, direction: Array) -> float:
         """Compute the size of a change after a further direction is projected out.
 
         Args:
@@ -411,14 +405,15 @@ class _ResidualGauge:
             residual = residual - projected_direction * (projected_direction @ residual) / (
                 projected_direction @ projected_direction
             )
-        return float(np.sqrt(np.mean(residual**2)) / self.made.noise_sigmas)
+        return float(np.sqrt(np.mean(residual**2)) / self.conditions.noise_sigmas)
 
     def _compute_size(self, change: Array) -> float:
         """Return the RMS of a flattened change in units of the noise, parameters projected out."""
         if not np.isfinite(change).all():
             return float("inf")
         return float(
-            np.sqrt(np.mean(self._project_out_parameters(change) ** 2)) / self.made.noise_sigmas
+            np.sqrt(np.mean(self._project_out_parameters(change) ** 2))
+            / self.conditions.noise_sigmas
         )
 
     def _project_out_parameters(self, change: Array) -> Array:
@@ -483,7 +478,7 @@ def record_case(item: BenchmarkCase) -> tuple[MachineRecordingConditions, Array]
     foreign = item.kind == "foreign"
     plant = conditions.make_machine({} if foreign else hidden, hidden if foreign else {})
     readings = read_encoders(simulate_machine(plant, conditions.runs), plant, conditions.runs.times)
-    rng = _make_rng(item.name, "noise")
+    rng = make_case_rng(item.name, "noise")
     return conditions, np.array([conditions.noise.add_to(run, rng) for run in readings])
 
 
