@@ -13,7 +13,7 @@ from bench.diagnosis.evaluation.worker_pool import count_available_cores
 from bench.diagnosis.explain_options import ExplainOptions
 from bench.diagnosis.explanation import Explanation
 from bench.diagnosis.score_extended import MODEL_FILES, score_model
-from bench.logs.data_frames import FrameDescription, Units, recording_of
+from bench.logs.data_frames import FrameDescription, Units, read_frame_recording
 from bench.logs.synthetic_recording import SimulatedRecording
 from sims import extended_simulator as extended_file
 from sims.core.argument_checks import Expected, check_arguments
@@ -86,7 +86,7 @@ def list_sources(
     for source in each:
         if isinstance(source, Frame):
             number = f" {len(sources) + 1}" if len(each) > 1 else ""
-            sources.append(recording_of(source, frame_description, f"DataFrame{number}"))
+            sources.append(read_frame_recording(source, frame_description, f"DataFrame{number}"))
         else:
             if not frames:
                 frame_description.refuse_for_files(source)

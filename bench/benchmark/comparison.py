@@ -131,7 +131,7 @@ class Comparison:
         )
         ids = [job.request.run for job in results.plan]
         if not (self.folder / SEGMENTS_FOLDER).exists():
-            results.run_sink.statuses = self._finished_statuses(ids)
+            results.run_sink.statuses = self._index_finished_statuses(ids)
             return
         planned_ids = read_plan(self.folder)
         journal = RunJournal(self.folder)
@@ -168,7 +168,7 @@ class Comparison:
                 runs, file, statuses, partial(_make_status_error, file), "its statuses"
             )
 
-    def _finished_statuses(self, ids: list[str]) -> dict[int, RunStatus]:
+    def _index_finished_statuses(self, ids: list[str]) -> dict[int, RunStatus]:
         """Return the statuses of a finished comparison by their index in the plan.
 
         Raises:

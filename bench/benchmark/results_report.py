@@ -17,7 +17,7 @@ from bench.benchmark.problem.experiment import Experiment
 from bench.benchmark.problem.numeric_warnings import numeric_warnings_silenced
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.benchmark.report_page import headline
-from bench.benchmark.report_page.comparison_conclusion import redraws_text
+from bench.benchmark.report_page.comparison_conclusion import format_redraws
 from bench.benchmark.report_page.comparison_page import render_page
 from bench.benchmark.report_page.comparison_page_data import ComparisonReportData
 from bench.benchmark.statistics.comparison_statistics import ComparisonStatistics
@@ -118,7 +118,7 @@ def write_report(folder: Path, problem: TuningProblem, print_line: Callable[[str
         print_line(text)
     for text in _list_limitations(stored.experiment):
         print_line(text)
-    if redraw_note := redraws_text(results):
+    if redraw_note := format_redraws(results):
         print_line(f"\n{redraw_note}")
     failed = stored.statuses[stored.statuses["status"].isin(FAILED_OR_SKIPPED_STATUSES)]
     for text in format_failures(failed):
@@ -157,13 +157,13 @@ def build_tables(
         ),
         "ranking": statistics.ranking,
         "pairs": compare_all_pairs(statistics.curves, statistics.floor),
-        "break_even": _break_even(experiment.name, statistics),
+        "break_even": _build_break_even_rows(experiment.name, statistics),
         "who_wins": _build_fastest_tuner_table(experiment.name, statistics),
     }
     return {name: add_trust_column(frame, experiment) for name, frame in frames.items()}
 
 
-def _break_even(experiment: str, statistics: ComparisonStatistics) -> pd.DataFrame:
+def _build_break_even_rows(experiment: str, statistics: ComparisonStatistics) -> pd.DataFrame:
     """Build the table of break-even targets for all priced thresholds and ranges.
 
     It says from how many targets on the training of a learned tuner costs less than a search.
@@ -234,12 +234,17 @@ def _describe_best_tuners(view: ComparisonView) -> list[str]:
     statistics, texts = view.statistics, []
     label = view.format_metric_label(view.shown_metric)
     for kind in view.ranges:
-        range_text = f"{headline.WHERE[kind]}, {headline.targets_text(statistics, kind)}"
-        lines = [f"\nbest tuners, {range_text} ({label}; {headline.floor_text(statistics)})"]
-        for verdicts in headline.standings(statistics, kind):
+        range_text = f"{headline.WHERE[kind]}, {headline.format_target_count(statistics, kind)}"
+        lines = [
+            f"\nbest tuners, {range_text} ({label}; {headline.format_error_floor(statistics)})"
+        ]
+        for verdicts in headline.list_standings(statistics, kind):
             lines += _format_ranking(verdicts)
-        lines += [headline.failed_runs(statistics, kind)]
-        lines += [headline.too_few(statistics, kind) or headline.how_decided(statistics, kind)]
+        lines += [headline.list_failed_runs(statistics, kind)]
+        lines += [
+            headline.warn_too_few_targets(statistics, kind)
+            or headline.explain_ranking(statistics, kind)
+        ]
         texts.append("\n".join(line for line in lines if line))
     return texts
 
@@ -299,7 +304,7 @@ def _format_error_table(
     medians["trained on"] = [
         f"{training_simulations[t]:.0f}" if training_simulations[t] else "-" for t in medians.index
     ]
-    return f"{title}\n{_format_frame(medians.rename(index=statistics.labelled))}"
+    return f"{title}\n{_format_frame(medians.rename(index=statistics.format_label))}"
 
 
 def _format_frame(frame: pd.DataFrame) -> str:
@@ -330,9 +335,8 @@ def _format_direction_errors(
     title = "median error along stiff and sloppy directions [training widths]"
     if "heldout_error" in set(part["metric"]):
         title += f" and RMSE of {channel} in unseen scenarios"
-    return (
-        f"{title}, after N simulations\n{_format_frame(medians.rename(index=statistics.labelled))}"
-    )
+    table = _format_frame(medians.rename(index=statistics.format_label))
+    return f"{title}, after N simulations\n{table}"
 
 
 def _format_run_seconds(lines: pd.DataFrame, statistics: ComparisonStatistics) -> str:

@@ -114,7 +114,7 @@ def write_report(study: ReportableShotStudy, print_line: Callable[[str], None]) 
         journal.rmdir()
     print_line("\n" + format_result_table(lines))
     failed = rows[rows["status"].isin(NO_SHOT_STATUSES)]
-    _say_faults(failed, study.skipped_tuners, print_line)
+    _print_failures(failed, study.skipped_tuners, print_line)
     print_line(f"\ntable   {folder / 'table.csv'}\nshots   {folder / 'shots.csv'}")
     for figure in figures:
         print_line(f"figure  {figure}")
@@ -122,7 +122,7 @@ def write_report(study: ReportableShotStudy, print_line: Callable[[str], None]) 
     return int(failed["status"].isin(_FAILED).sum())
 
 
-def _say_faults(
+def _print_failures(
     failed: pd.DataFrame, skipped: Mapping[str, str], print_line: Callable[[str], None]
 ) -> None:
     """Print why tuners were skipped, and each failure of a method with its count and one reason.

@@ -153,22 +153,22 @@ class SearchProgress:
         With a time budget the remaining time is an upper limit; otherwise it is an estimate, or
         missing.
         """
-        elapsed = clock_text(self.elapsed())
+        elapsed = format_clock(self.elapsed())
         if not self._is_searching:
             return elapsed
         if self._budget is not None:
             remaining_seconds = self._budget - self.elapsed()
             remaining_text = (
-                f"at most {clock_text(remaining_seconds)} left"
+                f"at most {format_clock(remaining_seconds)} left"
                 if remaining_seconds > 0
                 else "budget used up, finishing this step"
             )
             return f"{elapsed}, {remaining_text}"
         remaining = self.remaining()
-        return elapsed if remaining is None else f"{elapsed}, about {clock_text(remaining)} left"
+        return elapsed if remaining is None else f"{elapsed}, about {format_clock(remaining)} left"
 
 
-def clock_text(seconds: float) -> str:
+def format_clock(seconds: float) -> str:
     """Return a duration as ``0:07`` or ``1:02:03``."""
     minutes, seconds_part = divmod(round(max(seconds, 0.0)), 60)
     hours, minutes = divmod(minutes, 60)

@@ -99,13 +99,13 @@ class DataSet:
 
         A folder counts only if it contains all files that commands read (`provides`).
         """
-        for parent in search_folders(self.kind):
+        for parent in list_search_folders(self.kind):
             if all((parent / self.name / file).is_file() for file in self.provides):
                 return parent / self.name
         return None
 
 
-def user_folder() -> Path:
+def get_user_folder() -> Path:
     """Return the folder of this user's data sets.
 
     It is simgap/ in $XDG_DATA_HOME, or else in ~/.local/share.
@@ -114,7 +114,7 @@ def user_folder() -> Path:
     return (Path(base) if base else Path.home() / ".local" / "share") / "simgap"
 
 
-def search_folders(kind: str) -> Iterator[Path]:
+def list_search_folders(kind: str) -> Iterator[Path]:
     """Yield the folders in which data sets of a kind are searched, in this order.
 
     They are the one in the environment variable, if it is set, and the user's.
@@ -122,7 +122,7 @@ def search_folders(kind: str) -> Iterator[Path]:
     stated_folder = os.environ.get(FOLDER_VARIABLES[kind])
     if stated_folder:
         yield Path(stated_folder)
-    yield user_folder()
+    yield get_user_folder()
 
 
 def find(kind: str, path: str) -> Path | None:
@@ -135,7 +135,7 @@ def find(kind: str, path: str) -> Path | None:
     Returns:
         The first file found, or None.
     """
-    for folder in search_folders(kind):
+    for folder in list_search_folders(kind):
         try:
             if (folder / path).is_file():
                 return folder / path
@@ -160,7 +160,7 @@ def get(name: str) -> DataSet:
     return _read_catalogue()[name]
 
 
-def providing(kind: str, path: str) -> DataSet | None:
+def find_providing_data_set(kind: str, path: str) -> DataSet | None:
     """Return the data set that provides a file of an experiment, or None.
 
     Args:

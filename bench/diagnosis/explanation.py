@@ -20,7 +20,7 @@ from bench.diagnosis.report.wording import format_fitted_value, format_percent, 
 from bench.diagnosis.search.verdict_rules import VerdictName
 from bench.diagnosis.verdict import Cause, Verdict
 from bench.figures.figure_files import pdf_figures
-from bench.pages.csv_text import csv_text
+from bench.pages.csv_text import format_csv
 from bench.pages.html_page import make_iframe
 from sims import extended_simulator as extending
 from sims.core.argument_checks import check_arguments
@@ -107,7 +107,7 @@ class Explanation:
             folder / "extended.toml": extending.format_extended(self.extended, folder),
         }
         if consistency_rows := build_consistency_rows(self.story):
-            contents[folder / "apart.csv"] = csv_text(AGREEMENT_COLUMNS, consistency_rows)
+            contents[folder / "apart.csv"] = format_csv(AGREEMENT_COLUMNS, consistency_rows)
         contents |= {folder / name: text for name, text in self._robot_files.contents.items()}
         if ranges:
             # This import is needed only if ranges are requested.

@@ -22,7 +22,11 @@ from bench.benchmark.runner.code_digest import (
     hash_plugin_files,
     hash_source_folders,
 )
-from bench.benchmark.runner.experiment_runner import ProgressFactory, no_progress, unreachable
+from bench.benchmark.runner.experiment_runner import (
+    ProgressFactory,
+    make_unreachable_error,
+    no_progress,
+)
 from bench.benchmark.runner.plugin_discovery import (
     inspect_installed_part,
     is_external_part,
@@ -471,7 +475,7 @@ def _refuse_unreachable(names: Sequence[str]) -> None:
     for name in names:
         registered = diagnosers.snapshot().get(name)
         if registered is not None and registered.path is None:
-            raise unreachable("diagnoser", name, registered.part)
+            raise make_unreachable_error("diagnoser", name, registered.part)
 
 
 def _register_stub(name: str, trusted: bool) -> None:

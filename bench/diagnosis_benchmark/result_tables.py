@@ -74,7 +74,7 @@ def compute_share(hits: int, of: int, exact: bool = False) -> TableRow:
     return {"count": hits, "of": of, "share": hits / of, **limits}
 
 
-def _share_of(successes: pd.Series[bool], is_exact: bool = False) -> TableRow:
+def _compute_share(successes: pd.Series[bool], is_exact: bool = False) -> TableRow:
     """Compute the fraction of successes with its 95 % interval; see `compute_share`."""
     return compute_share(int(successes.sum()), len(successes), is_exact)
 
@@ -160,7 +160,7 @@ def _list_metrics(diagnoser_rows: pd.DataFrame) -> Iterator[TableRow]:
     """Yield the lines of table.csv for one diagnoser: the fraction of each metric."""
     for metric in METRICS:
         successes = metric.predicate(metric.select(diagnoser_rows))
-        yield {"metric": metric.name, **_share_of(successes, metric.is_exact)}
+        yield {"metric": metric.name, **_compute_share(successes, metric.is_exact)}
     intervals = compute_share(
         int(diagnoser_rows["holding"].sum()), int(diagnoser_rows["intervals"].sum())
     )
@@ -180,7 +180,7 @@ def _list_groups(diagnoser_rows: pd.DataFrame) -> Iterator[TableRow]:
         for column in columns:
             for value, part in metric.select(diagnoser_rows).groupby(column):
                 place = {"metric": metric.name, "by": column, "value": str(value)}
-                yield {**place, **_share_of(metric.predicate(part), metric.is_exact)}
+                yield {**place, **_compute_share(metric.predicate(part), metric.is_exact)}
 
 
 def _list_power(diagnoser_rows: pd.DataFrame) -> Iterator[TableRow]:
@@ -193,7 +193,7 @@ def _list_power(diagnoser_rows: pd.DataFrame) -> Iterator[TableRow]:
     """
     for size, part in diagnoser_rows[diagnoser_rows["kind"] == "single"].groupby("size"):
         for metric, successes in (("named", _is_named(part)), ("seen", _is_alarm(part))):
-            yield {"size": size, "metric": metric, **_share_of(successes)}
+            yield {"size": size, "metric": metric, **_compute_share(successes)}
 
 
 def _list_calibration(diagnoser_rows: pd.DataFrame) -> Iterator[TableRow]:
@@ -203,7 +203,7 @@ def _list_calibration(diagnoser_rows: pd.DataFrame) -> Iterator[TableRow]:
     """
     p_values = pd.to_numeric(select_clean(diagnoser_rows)["p_value"]).dropna()
     for level in P_VALUE_LEVELS if len(p_values) else ():
-        yield {"level": level, **_share_of(p_values <= level, is_exact=True)}
+        yield {"level": level, **_compute_share(p_values <= level, is_exact=True)}
 
 
 def _list_set_sizes(diagnoser_rows: pd.DataFrame) -> Iterator[TableRow]:
@@ -218,7 +218,7 @@ def _list_set_sizes(diagnoser_rows: pd.DataFrame) -> Iterator[TableRow]:
     single_rows = select_single_effects(diagnoser_rows)
     for label, (low, high) in SET_SIZE_BINS.items():
         part = single_rows[single_rows["largest_set"].between(low, high)]
-        yield {"largest_set": label, **_share_of(_is_in_any_set(part))}
+        yield {"largest_set": label, **_compute_share(_is_in_any_set(part))}
 
 
 def _list_costs(diagnoser_rows: pd.DataFrame) -> Iterator[TableRow]:

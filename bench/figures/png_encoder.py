@@ -20,7 +20,7 @@ _METRE = 39.3701
 """Number of inches in a metre."""
 
 
-def encoded_png(rgba: bytes | memoryview, height: int, width: int, dpi: float) -> bytes:
+def encode_png(rgba: bytes | memoryview, height: int, width: int, dpi: float) -> bytes:
     """Encode an opaque image as the bytes of a PNG file.
 
     Args:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from bench.benchmark.statistics.error_floor import ERROR_FLOOR
 from bench.figures.figure_files import is_pdf_wanted
-from bench.figures.png_encoder import encoded_png
+from bench.figures.png_encoder import encode_png
 from sims.core.atomic_files import write_all_atomically
 from sims.core.simulator import InputError
 
@@ -118,8 +118,12 @@ def get_colour(place: int) -> str:
 
 
 def get_marker(place: int) -> str:
-    """Return the marker of the tuner or diagnoser at this index."""
-    return _get_marker(place)
+    """Return the marker of the tuner or diagnoser at this index.
+
+    Each round of the colours has other markers.
+    """
+    rounds = place // len(_COLOURS)
+    return _MARKERS[(place + 3 * rounds) % len(_MARKERS)]
 
 
 def get_line_style(place: int) -> Any:
@@ -162,17 +166,11 @@ class MarkStyle(NamedTuple):
     marker: str = ""
 
 
-def _get_marker(place: int) -> str:
-    """Return the marker at an index; it is combined with another colour in each round."""
-    rounds = place // len(_COLOURS)
-    return _MARKERS[(place + 3 * rounds) % len(_MARKERS)]
-
-
 def get_mark_style(place: int) -> MarkStyle:
     """Return the style at an index of a list; neighbours differ in greyscale, too."""
     colour, line = _COLOURS[place % len(_COLOURS)], _LINES[place % len(_LINES)]
     dashes = _DASHES[line] if isinstance(line, str) else tuple(map(float, line[1]))
-    return MarkStyle(colour, _DARK[colour], dashes, _get_marker(place))
+    return MarkStyle(colour, _DARK[colour], dashes, get_marker(place))
 
 
 def make_mark_style(colour: str, dashes: tuple[float, ...] = (), marker: str = "") -> MarkStyle:
@@ -216,7 +214,7 @@ class TunerStyles:
         i = self._places[tuner]
         return {
             "color": _COLOURS[i % len(_COLOURS)],
-            "marker": _get_marker(i),
+            "marker": get_marker(i),
             "linestyle": _LINES[i % len(_LINES)],
             "linewidth": 1.6,
             "label": tuner,
@@ -246,7 +244,7 @@ class TunerStyles:
         )
         return {
             "color": REFERENCE_GREYS[self.behind.index(reference)],
-            "marker": _get_marker(i),
+            "marker": get_marker(i),
             "markerfacecolor": "white",
             "markersize": 3.5,
             "linestyle": _LINES[i % len(_LINES)],
@@ -274,7 +272,7 @@ def style_of(
         panels: Metric and range of each panel of curves against simulations; the legend says which
             curves coincide in them.
     """
-    notes = [statistics.notes, statistics.coinciding(panels)]
+    notes = [statistics.notes, statistics.find_coinciding_curves(panels)]
     joined_notes = {t: "\n".join(n[t] for n in notes if t in n) for t in {*notes[0], *notes[1]}}
     return TunerStyles(experiment, statistics.order, behind, joined_notes)
 
@@ -429,7 +427,7 @@ def render_png(figure: Figure, dpi: int = DPI) -> bytes:
     """Render a figure as the bytes of a PNG file."""
     file = _Pixels()
     figure.savefig(file, format="rgba", dpi=dpi)
-    return encoded_png(file.getbuffer(), *file.shape, dpi=dpi)
+    return encode_png(file.getbuffer(), *file.shape, dpi=dpi)
 
 
 class _Pixels(BytesIO):

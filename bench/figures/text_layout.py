@@ -35,7 +35,7 @@ def break_name(name: str, longest: int) -> str:
     )
 
 
-def brief(name: str, most: int) -> str:
+def shorten_name(name: str, most: int) -> str:
     """Shorten a long name of a joint's quantity to the quantity.
 
     Names with more than `most` characters are shortened, such as ``velocity of elbow`` to
@@ -48,7 +48,7 @@ def brief(name: str, most: int) -> str:
     return name if len(name) <= most else re.split(r" of |\.", name, maxsplit=1)[0][:most]
 
 
-def text_width(texts: Sequence[str], size: float, weight: str = "normal") -> float:
+def measure_text_width(texts: Sequence[str], size: float, weight: str = "normal") -> float:
     """Return the width of the longest line of some texts, in inches.
 
     Args:
@@ -65,6 +65,6 @@ def text_width(texts: Sequence[str], size: float, weight: str = "normal") -> flo
     return float(max(widths, default=0.0)) / POINTS
 
 
-def most_lines(texts: Sequence[str]) -> int:
+def count_max_lines(texts: Sequence[str]) -> int:
     """Return the maximum number of lines of the texts."""
     return max((text.count("\n") + 1 for text in texts), default=1)

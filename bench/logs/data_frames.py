@@ -53,7 +53,7 @@ class FrameDescription:
                 )
 
 
-def recording_of(
+def read_frame_recording(
     frame: Frame, frame_description: FrameDescription, name: str = "DataFrame"
 ) -> Recording:
     """Read the recording in a data frame; only runs that are marked so are held out.

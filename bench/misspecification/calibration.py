@@ -157,7 +157,7 @@ def list_coefficients(extended: ExtendedSimulator, kind: type[Simulator]) -> dic
 
 def make_base_experiment(experiment: Experiment) -> Experiment:
     """Make the experiment in the original simulator, which lacks the hidden effects."""
-    return _part(experiment, PLAIN, experiment.settings)
+    return _make_comparison_experiment(experiment, PLAIN, experiment.settings)
 
 
 def make_extended_experiment(experiment: Experiment, effects: dict[str, list[float]]) -> Experiment:
@@ -175,10 +175,12 @@ def make_extended_experiment(experiment: Experiment, effects: dict[str, list[flo
     tuned = {*settings.get("effects", ()), *(p for p in experiment.parameters)}
     fixed_effects = {name: values for name, values in effects.items() if name not in tuned}
     settings["fixed"] = {**settings.get("fixed", {}), **fixed_effects}
-    return _part(experiment, EXTENDED, settings)
+    return _make_comparison_experiment(experiment, EXTENDED, settings)
 
 
-def _part(experiment: Experiment, model: str, settings: Mapping[str, Any]) -> Experiment:
+def _make_comparison_experiment(
+    experiment: Experiment, model: str, settings: Mapping[str, Any]
+) -> Experiment:
     """Make the experiment of one of the two comparisons: the same targets in another simulator.
 
     Args:

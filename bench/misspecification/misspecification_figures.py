@@ -58,10 +58,10 @@ class StudyResult(Protocol):
     def name(self) -> str:
         """A short name of the study."""
 
-    def tuners(self) -> list[str]:
+    def list_tuners(self) -> list[str]:
         """Return the labels of the tuners in the order of the experiment."""
 
-    def targets(self) -> list[str]:
+    def list_targets(self) -> list[str]:
         """Return the names of the targets."""
 
 
@@ -72,22 +72,23 @@ def draw_bias_figure(systems: Sequence[StudyResult], table: pd.DataFrame) -> Fig
         systems: The studies, one panel each.
         table: Rows of their error tables.
     """
-    figure, panels = _panels(len(systems))
+    figure, panels = _make_panels(len(systems))
     for panel, study in zip(panels, systems, strict=False):
         lines = table[(table["experiment"] == study.experiment.name) & (table["metric"] == "bias")]
         parameter = _find_most_biased(lines)
-        _compared(panel, study, lines[lines["parameter"] == parameter])
+        _draw_means(panel, study, lines[lines["parameter"] == parameter])
         panel.axvline(0.0, color=ZERO_LINE_GREY, linewidth=0.8)
-        panel.set_title(f"{study.name}: {parameter}\n{_lacks(study)}", fontsize=9)
+        panel.set_title(f"{study.name}: {parameter}\n{_format_missing_effects(study)}", fontsize=9)
         panel.set_xlabel("mean signed error [training widths]", fontsize=8)
     caption = (
         "The parameter with the largest error of least squares in the simulator as it is. Point: "
-        "mean "
-        f"over {_targets(systems)} of the recommendation after the whole budget minus the true "
-        "value. "
+        f"mean over {_format_target_count(systems)} of the recommendation after the whole budget "
+        "minus the true value. "
         "Bar: 95 % bootstrap interval. Left and right of zero: too small, too large."
     )
-    return _finished(figure, panels[0], "Bias of a parameter where an effect is missing", caption)
+    return _finish_figure(
+        figure, panels[0], "Bias of a parameter where an effect is missing", caption
+    )
 
 
 def draw_prediction_figure(systems: Sequence[StudyResult], table: pd.DataFrame) -> Figure:
@@ -97,19 +98,19 @@ def draw_prediction_figure(systems: Sequence[StudyResult], table: pd.DataFrame) 
         systems: The studies, one panel each.
         table: Rows of their error tables.
     """
-    figure, panels = _panels(len(systems))
+    figure, panels = _make_panels(len(systems))
     for panel, study in zip(panels, systems, strict=False):
         is_of_study = table["experiment"] == study.experiment.name
-        _compared(panel, study, table[is_of_study & (table["metric"] == "heldout_error")])
+        _draw_means(panel, study, table[is_of_study & (table["metric"] == "heldout_error")])
         panel.set_xscale("log")
-        panel.set_title(f"{study.name}\n{_lacks(study)}", fontsize=9)
+        panel.set_title(f"{study.name}\n{_format_missing_effects(study)}", fontsize=9)
         panel.set_xlabel(f"RMSE of {study.channel} in unseen runs [{study.unit}]", fontsize=8)
     caption = (
-        f"Point: mean over {_targets(systems)} of the error of the tuned simulator in runs that no "
-        "tuner saw, without sensor noise. Bar: 95 % bootstrap interval."
+        f"Point: mean over {_format_target_count(systems)} of the error of the tuned simulator in "
+        "runs that no tuner saw, without sensor noise. Bar: 95 % bootstrap interval."
     )
     heading = "Prediction of unseen runs where an effect is missing"
-    return _finished(figure, panels[0], heading, caption)
+    return _finish_figure(figure, panels[0], heading, caption)
 
 
 def draw_rank_slope_figure(
@@ -130,7 +131,7 @@ def draw_rank_slope_figure(
             study_ranks = ranks[
                 (ranks["experiment"] == study.experiment.name) & (ranks["metric"] == metric)
             ]
-            _slope(panel, study, study_ranks)
+            _draw_rank_lines(panel, study, study_ranks)
             agreement = ranking[ranking["experiment"] == study.experiment.name].set_index("metric")
             tau, p = (float(agreement[column].loc[metric]) for column in ("tau", "p_value"))
             panel.set_title(f"{study.name}\nτ = {tau:.2f}, p = {p:.2g}", fontsize=8)
@@ -139,16 +140,16 @@ def draw_rank_slope_figure(
     handles, labels = axes[0][0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside right center", fontsize=8, frameon=False)
     caption = (
-        f"Mean over {_targets(systems)} of a tuner's rank on a target (its mean error over seeds). "
-        "τ: Kendall's between the mean ranks in the two simulators; p: that mean ranks differ as "
-        "much where the simulators are exchanged at random target by target."
+        f"Mean over {_format_target_count(systems)} of a tuner's rank on a target (its mean error "
+        "over seeds). τ: Kendall's between the mean ranks in the two simulators; p: that mean "
+        "ranks differ as much where the simulators are exchanged at random target by target."
     )
     figure.suptitle("Does the ranking of tuners change with a corrected model?", fontsize=11)
     add_caption(figure, caption, letters=15)
     return figure
 
 
-def _panels(count: int) -> tuple[Figure, list[Axes]]:
+def _make_panels(count: int) -> tuple[Figure, list[Axes]]:
     """Make a grid of panels, at most three in a row, one per study.
 
     Args:
@@ -168,7 +169,7 @@ def _panels(count: int) -> tuple[Figure, list[Axes]]:
     return figure, panels
 
 
-def _compared(panel: Axes, study: StudyResult, lines: pd.DataFrame) -> None:
+def _draw_means(panel: Axes, study: StudyResult, lines: pd.DataFrame) -> None:
     """Draw one row per tuner with its mean and 95 % interval in both simulators.
 
     Args:
@@ -176,7 +177,7 @@ def _compared(panel: Axes, study: StudyResult, lines: pd.DataFrame) -> None:
         study: the study, which determines the order of the tuners.
         lines: rows of the score table for one metric and study.
     """
-    tuners = study.tuners()
+    tuners = study.list_tuners()
     # The two simulators are shifted vertically, so that their bars do not overlap.
     for shift, model in zip((-0.16, 0.16), _MODELS, strict=True):
         part = lines[lines["model"] == model].set_index("tuner").reindex(tuners)
@@ -215,7 +216,7 @@ def _find_most_biased(lines: pd.DataFrame) -> str:
     return [str(name) for name in largest.index][int(largest.to_numpy().argmax())]
 
 
-def _slope(panel: Axes, study: StudyResult, ranks: pd.DataFrame) -> None:
+def _draw_rank_lines(panel: Axes, study: StudyResult, ranks: pd.DataFrame) -> None:
     """Draw a line for each tuner between its mean ranks in the original and extended simulator.
 
     Crossing lines are tuners whose order changes. Colours are given by rank in the original
@@ -238,20 +239,20 @@ def _slope(panel: Axes, study: StudyResult, ranks: pd.DataFrame) -> None:
     panel.set_xlim(-0.25, 1.25)
 
 
-def _lacks(study: StudyResult) -> str:
+def _format_missing_effects(study: StudyResult) -> str:
     """Format which effects the original simulator lacks, and the number of targets."""
     names = list(study.experiment.world.get("fixed", {}))
-    return f"lacks {', '.join(names) or 'nothing'}; {len(study.targets())} targets"
+    return f"lacks {', '.join(names) or 'nothing'}; {len(study.list_targets())} targets"
 
 
-def _targets(systems: Sequence[StudyResult]) -> str:
+def _format_target_count(systems: Sequence[StudyResult]) -> str:
     """Format the number of targets of all studies, as one number or a range."""
-    counts = sorted({len(study.targets()) for study in systems})
+    counts = sorted({len(study.list_targets()) for study in systems})
     count_text = " to ".join(str(count) for count in dict.fromkeys((counts[0], counts[-1])))
     return f"{count_text} targets"
 
 
-def _finished(figure: Figure, panel: Axes, heading: str, caption: str) -> Figure:
+def _finish_figure(figure: Figure, panel: Axes, heading: str, caption: str) -> Figure:
     """Add legend, heading and caption to a figure, and return it.
 
     Args:

@@ -47,16 +47,16 @@ def write_report(study: ReportableMisspecificationStudy, print_line: PrintLine) 
         Number of failed runs.
     """
     folder, experiment = study.folder, study.configuration.experiment
-    failed = _comparisons(folder, print_line)
+    failed = _write_comparison_tables(folder, print_line)
     scores = (
         misspecification_scores.load_scores(folder, experiment)
         if has_both_comparisons(folder)
         else None
     )
-    if scores is None or not scores.targets():
+    if scores is None or not scores.list_targets():
         print_line(f"{experiment.name}: no target has results in both simulators yet")
         return failed
-    _written(folder, [scores], print_line, is_joint=False)
+    _write_tables_and_figures(folder, [scores], print_line, is_joint=False)
     return failed
 
 
@@ -73,11 +73,11 @@ def write_joint_report(folder: Path, parts: Sequence[Path], print_line: PrintLin
         misspecification_scores.load_scores(part, read_configuration(part).experiment)
         for part in complete_parts
     ]
-    outcomes = [outcome for outcome in outcomes if outcome.targets()]
+    outcomes = [outcome for outcome in outcomes if outcome.list_targets()]
     if len(outcomes) < 2:
         return
     print_line(f"\ntogether, {len(outcomes)} systems")
-    _written(folder, outcomes, print_line, is_joint=True)
+    _write_tables_and_figures(folder, outcomes, print_line, is_joint=True)
 
 
 def has_both_comparisons(folder: Path) -> bool:
@@ -85,7 +85,7 @@ def has_both_comparisons(folder: Path) -> bool:
     return all((folder / model / "runs.parquet").is_file() for model in MODEL_LABELS)
 
 
-def _comparisons(folder: Path, print_line: PrintLine) -> int:
+def _write_comparison_tables(folder: Path, print_line: PrintLine) -> int:
     """Write the tables of the comparisons that exist.
 
     Returns:
@@ -105,7 +105,7 @@ def _comparisons(folder: Path, print_line: PrintLine) -> int:
     return failed
 
 
-def _written(
+def _write_tables_and_figures(
     folder: Path,
     outcomes: Sequence[misspecification_scores.StudyScores],
     print_line: PrintLine,
@@ -135,7 +135,7 @@ def _written(
         write_atomically(
             folder / f"{name}.csv", add_trust_column(frame, experiment).to_csv(index=False)
         )
-    for text in _said(folder, outcomes, frames, is_joint):
+    for text in _list_summary_texts(folder, outcomes, frames, is_joint):
         print_line(text)
     drawn_figures = {
         "bias": figures.draw_bias_figure(outcomes, frames["table"]),
@@ -149,7 +149,7 @@ def _written(
         print_line(f"figure  {path}")
 
 
-def _said(
+def _list_summary_texts(
     folder: Path,
     outcomes: Sequence[misspecification_scores.StudyScores],
     frames: dict[str, pd.DataFrame],
@@ -169,16 +169,20 @@ def _said(
     texts = []
     for scores in outcomes:
         study_folder = folder / scores.experiment.name if is_joint else folder
-        texts += ["", _explained(scores, study_folder), _table(scores, frames["table"])]
+        texts += [
+            "",
+            _format_verdict(scores, study_folder),
+            _format_error_table(scores, frames["table"]),
+        ]
         rows = frames["ranking"][frames["ranking"]["experiment"] == scores.experiment.name]
-        texts += [_tau(row) for _, row in rows.iterrows()]
+        texts += [_format_rank_agreement(row) for _, row in rows.iterrows()]
     if is_joint:
         for metric in misspecification_scores.RANKED_METRICS:
-            texts += ["", _together(frames["ranks"], metric)]
+            texts += ["", _format_joint_ranks(frames["ranks"], metric)]
     return texts
 
 
-def _explained(scores: misspecification_scores.StudyScores, folder: Path) -> str:
+def _format_verdict(scores: misspecification_scores.StudyScores, folder: Path) -> str:
     """Format which effects the true system has, and which verdict and causes explain gave.
 
     Args:
@@ -196,7 +200,7 @@ def _explained(scores: misspecification_scores.StudyScores, folder: Path) -> str
     )
 
 
-def _table(scores: misspecification_scores.StudyScores, lines: pd.DataFrame) -> str:
+def _format_error_table(scores: misspecification_scores.StudyScores, lines: pd.DataFrame) -> str:
     """Format the errors of parameters and of prediction by tuner, in both simulators.
 
     Args:
@@ -226,7 +230,7 @@ def _table(scores: misspecification_scores.StudyScores, lines: pd.DataFrame) -> 
     return f"{title}\n{errors_by_column.to_string(float_format=lambda value: f'{value:.2g}')}"
 
 
-def _tau(row: pd.Series) -> str:
+def _format_rank_agreement(row: pd.Series) -> str:
     """Format how well the rankings of the tuners in both simulators agree, by one metric.
 
     Kendall's tau is 1 for equal rankings and -1 for reversed ones. The agreement between two halves
@@ -245,7 +249,7 @@ def _tau(row: pd.Series) -> str:
     )
 
 
-def _together(ranked: pd.DataFrame, metric: str) -> str:
+def _format_joint_ranks(ranked: pd.DataFrame, metric: str) -> str:
     """Format the mean ranks over several systems, with tests of Friedman and Nemenyi.
 
     Args:

@@ -93,7 +93,7 @@ class StudyScores:
         """Name of the system, for tables and figures."""
         return self.experiment.name.removeprefix("misspecified-")
 
-    def tuners(self) -> list[str]:
+    def list_tuners(self) -> list[str]:
         """List the labels of the tuners with results in both simulators, as in the experiment."""
         finished_tuners = set(self.errors["tuner"])
         return [e.label for e in self.experiment.tuners if e.label in finished_tuners]
@@ -117,7 +117,7 @@ class StudyScores:
         values: Array = table.reindex(index=list(targets), columns=list(tuners)).to_numpy()
         return values
 
-    def targets(self) -> list[str]:
+    def list_targets(self) -> list[str]:
         """List the names of the targets with results of all tuners in both simulators."""
         return sorted({str(name) for name in self.errors["target"]})
 
@@ -136,12 +136,12 @@ def load_scores(folder: Path, experiment: Experiment) -> StudyScores:
     parameters, widths = problem.cube.parameters, problem.cube.compute_training_widths()
     channel = problem.channels[problem.error_channel]
     problem.close()
-    parts = [_last(folder / model, model, parameters, widths) for model in MODEL_LABELS]
-    errors = _whole(pd.concat(parts, ignore_index=True))
+    parts = [_build_error_rows(folder / model, model, parameters, widths) for model in MODEL_LABELS]
+    errors = _select_complete_targets(pd.concat(parts, ignore_index=True))
     return StudyScores(experiment, channel.unit, channel.name, parameters, errors)
 
 
-def _whole(errors: pd.DataFrame) -> pd.DataFrame:
+def _select_complete_targets(errors: pd.DataFrame) -> pd.DataFrame:
     """Select the targets that every tuner finished in both simulators with all of its seeds.
 
     In an interrupted study, other targets would compare different sets of targets. A tuner that was
@@ -161,7 +161,9 @@ def _whole(errors: pd.DataFrame) -> pd.DataFrame:
     return complete[complete["target"].isin(complete_targets)].reset_index(drop=True)
 
 
-def _last(folder: Path, model: str, parameters: Sequence[Parameter], widths: Array) -> pd.DataFrame:
+def _build_error_rows(
+    folder: Path, model: str, parameters: Sequence[Parameter], widths: Array
+) -> pd.DataFrame:
     """Build the rows of `StudyScores.errors` for one of the comparisons.
 
     The errors are those of the last recommendation of each run. They are averaged over the seeds of
@@ -239,7 +241,7 @@ def build_rank_table(scores: StudyScores) -> pd.DataFrame:
     Args:
         scores: the scores of a study.
     """
-    tuners, targets = scores.tuners(), scores.targets()
+    tuners, targets = scores.list_tuners(), scores.list_targets()
     lines = []
     for metric in RANKED_METRICS:
         mean_ranks = [
@@ -262,7 +264,7 @@ def build_rank_agreement_table(scores: StudyScores) -> pd.DataFrame:
     Args:
         scores: the scores of a study.
     """
-    tuners, targets = scores.tuners(), scores.targets()
+    tuners, targets = scores.list_tuners(), scores.list_targets()
     lines = []
     for metric in RANKED_METRICS:
         base_errors, extended_errors = (
@@ -271,7 +273,7 @@ def build_rank_agreement_table(scores: StudyScores) -> pd.DataFrame:
         agreement = compute_rank_agreement(
             base_errors, extended_errors, scores.experiment.name, metric
         )
-        friedman = [_friedman(errors) for errors in (base_errors, extended_errors)]
+        friedman = [_compute_friedman_p_value(errors) for errors in (base_errors, extended_errors)]
         numbers = (
             agreement.tau,
             agreement.low,
@@ -284,7 +286,7 @@ def build_rank_agreement_table(scores: StudyScores) -> pd.DataFrame:
     return pd.DataFrame(lines, columns=RANK_AGREEMENT_COLUMNS)
 
 
-def _friedman(errors: Array) -> float:
+def _compute_friedman_p_value(errors: Array) -> float:
     """Compute the p-value of Friedman's test that all tuners perform equally, over targets.
 
     A tuner that failed on a target has the worst rank there. Errors are compared as rounded

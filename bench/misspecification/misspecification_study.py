@@ -119,10 +119,10 @@ class MisspecificationStudy:
         try:
             self._extend(jobs, progress or no_progress)
         except KeyboardInterrupt:
-            count = self._planned()
+            count = self._count_planned_runs()
             return StudyOutcome(0, 2 * count, interrupted=True)
         for model in MODEL_LABELS:
-            comparison = self._comparison(model, jobs)
+            comparison = self._open_comparison(model, jobs)
             outcome = comparison.run(jobs, progress, pool)
             finished_count, planned_count = (
                 finished_count + outcome.finished,
@@ -145,7 +145,7 @@ class MisspecificationStudy:
             segments.rmdir()
         return StudyOutcome(finished_count, planned_count)
 
-    def _planned(self) -> int:
+    def _count_planned_runs(self) -> int:
         """Return the number of runs in each simulator: all seeds, times targets and ranges."""
         from bench.benchmark.runner.experiment_runner import count_seeds
 
@@ -170,16 +170,16 @@ class MisspecificationStudy:
         # If only one of the two files exists, the process was killed while writing.
         for file in (table, table.with_suffix(".toml")):
             file.unlink(missing_ok=True)
-        write_calibration_recording(experiment, self._salt(), table)
+        write_calibration_recording(experiment, self._get_salt(), table)
         run_explain(table, experiment, jobs)
         step()
 
-    def _salt(self) -> str:
+    def _get_salt(self) -> str:
         """Return the salt of the calibration recording: the secret one, or else the public one."""
         experiment = self.configuration.experiment
         return read_salt(self.folder, experiment) or experiment.salt
 
-    def _comparison(self, model: str, jobs: int) -> Comparison:
+    def _open_comparison(self, model: str, jobs: int) -> Comparison:
         """Create or resume the comparison in one of the simulators.
 
         Its tuners must read neither its own folder nor the rest of the study.
@@ -238,7 +238,8 @@ class MisspecificationStudy:
         for model in MODEL_LABELS:
             if not (self.folder / model / CONFIGURATION_FILE).is_file():
                 run_ends += [
-                    RunEnd(f"{model} {i}", model, MISSING_STATUS) for i in range(self._planned())
+                    RunEnd(f"{model} {i}", model, MISSING_STATUS)
+                    for i in range(self._count_planned_runs())
                 ]
                 continue
             progress = Comparison(self.folder / model).status()

@@ -7,7 +7,7 @@ import io
 from collections.abc import Iterable, Sequence
 
 
-def csv_text(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+def format_csv(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
     """Format a table as CSV.
 
     Args:
@@ -18,9 +18,9 @@ def csv_text(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(head)
     # A spreadsheet would run text that begins like a formula, and names come from files.
-    writer.writerows([_plain(cell) for cell in row] for row in rows)
+    writer.writerows([_escape_formula(cell) for cell in row] for row in rows)
     return text.getvalue()
 
 
-def _plain(cell: object) -> object:
+def _escape_formula(cell: object) -> object:
     return f"'{cell}" if isinstance(cell, str) and cell.startswith(("=", "+", "-", "@")) else cell

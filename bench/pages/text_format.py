@@ -31,7 +31,7 @@ def sanitise(text: object, most: int = 400) -> str:
     """
     plain = str(text)
     if not plain.isprintable():
-        plain = "".join(_harmless(c) for c in plain)
+        plain = "".join(_replace_unprintable(c) for c in plain)
     plain = plain.strip()
     return plain if len(plain) <= most else plain[: most - 1] + "…"
 
@@ -48,7 +48,7 @@ def joined(parts: Sequence[str], last: str = "and") -> str:
     return f"{', '.join(parts[:-1])} {last} {parts[-1]}"
 
 
-def _harmless(character: str) -> str:
+def _replace_unprintable(character: str) -> str:
     """Return a character if it is printable, else a replacement that cannot change the output."""
     if character.isprintable():
         return character
@@ -70,13 +70,13 @@ def format_number(value: float | None, digits: int = 3) -> str:
         return "0"
     # Rounded first: 0.0009996 is 0.001, which needs no power of ten.
     rounded = float(f"{value:.{digits - 1}e}")
-    exponent = _exponent(abs(rounded))
+    exponent = _get_exponent(abs(rounded))
     decimals = max(0, digits - 1 - floor(log10(abs(rounded))) + exponent)
     text = f"{rounded / 10.0**exponent:.{decimals}f}"
     # Zeros before the decimal point are digits, trailing zeros after it are not needed.
     if "." in text:
         text = text.rstrip("0").rstrip(".")
-    return _signed(text) + _power(exponent)
+    return _format_sign(text) + _format_power(exponent)
 
 
 def format_estimate(value: float, low: float | None, high: float | None) -> str:
@@ -93,13 +93,13 @@ def format_estimate(value: float, low: float | None, high: float | None) -> str:
     if low is None or high is None or not (isfinite(low) and isfinite(high)) or high <= low:
         return f"{format_number(value)} (no interval)"
     # One power of ten for all three numbers makes them comparable at a glance.
-    exponent = _exponent(max(abs(value), abs(low), abs(high)))
+    exponent = _get_exponent(max(abs(value), abs(low), abs(high)))
     half = log10((high - low) / 2) - exponent
     decimals = min(max(0, (half % 1 < _FEW) - floor(half)), 9)
     texts = []
     for x in (value, low, high):
         digits = f"{x / 10.0**exponent:.{decimals}f}"
-        texts.append(_signed(digits) + _power(exponent))
+        texts.append(_format_sign(digits) + _format_power(exponent))
     middle, left, right = texts
     return f"{middle} ({left} to {right})"
 
@@ -111,7 +111,7 @@ def format_percent(share: float | None) -> str:
     size = abs(100 * share)
     # 99.6 % must not become 100 %, nor 0.4 % become 0 %.
     decimals = 1 if 0 < size < 9.95 or 99 < size < 99.95 else 0
-    return _signed(f"{100 * share:.{decimals}f}") + " %"
+    return _format_sign(f"{100 * share:.{decimals}f}") + " %"
 
 
 def format_p_value(p: float | None) -> str:
@@ -122,16 +122,16 @@ def format_p_value(p: float | None) -> str:
     return f"p < {format_number(_LEAST, 1)}" if p < _LEAST else f"p = {format_number(p, 2)}"
 
 
-def _exponent(size: float) -> int:
+def _get_exponent(size: float) -> int:
     """Return the power of ten that a number is written with; 0 for none."""
     return 0 if size == 0 or _SMALL <= size < _LARGE else floor(log10(size))
 
 
-def _power(exponent: int) -> str:
+def _format_power(exponent: int) -> str:
     return f"×10{str(exponent).translate(SUPERSCRIPT_DIGITS)}" if exponent else ""
 
 
-def _signed(text: str) -> str:
+def _format_sign(text: str) -> str:
     """Replace the hyphen by a true minus sign, and remove it from zero."""
     zero = not text.strip("-0.")
     return text.lstrip("-") if zero else text.replace("-", "−")

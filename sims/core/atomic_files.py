@@ -48,6 +48,14 @@ def require_file(path: Path, wanted: str = "") -> None:
     raise InputError(f"{path}: no such file{expected}{_format_similar_names(path)}")
 
 
+def is_existing_file(path: Path) -> bool:
+    """Return whether a path is a file; False for a path that no file can have."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):  # too long, or with a null character
+        return False
+
+
 def _format_similar_names(path: Path) -> str:
     """Format the names of similar files in the folder as the end of a message."""
     from difflib import get_close_matches

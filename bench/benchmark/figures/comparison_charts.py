@@ -18,7 +18,7 @@ from bench.benchmark.statistics.training_amortisation import (
     build_break_even_table,
     build_time_per_target_table,
     find_cheapest_tuners,
-    placed_even,
+    map_break_even_counts,
 )
 from bench.benchmark.storage.result_folder import StoredComparison
 from bench.figures.style import PANEL_TITLES, MarkStyle
@@ -126,7 +126,7 @@ def _make_median_chart(
         # A recording has one range only; its panels differ in the runs.
         if kind == "real":
             title = f"{PANEL_TITLES[metric]} ({statistics.target_counts[kind]} starting points)"
-        floor = statistics.floor_of(metric)
+        floor = statistics.get_error_floor(metric)
         rules: tuple[ReferenceLine, ...] = ()
         if floor is not None:
             rules = (ReferenceLine(floor, f"below {floor:.2g}: count as equal"),)
@@ -137,7 +137,7 @@ def _make_median_chart(
         _select_panels_with_data(panels),
         {table: medians},
         side_by_side,
-        _make_notes(view, statistics.coinciding(keys)),
+        _make_notes(view, statistics.find_coinciding_curves(keys)),
     )
 
 
@@ -250,7 +250,7 @@ def make_amortisation_chart(view: ComparisonView) -> ComparisonChart:
         searching, trained = split_by_training(view, level)
         x_axis = Axis("tuner that searches", names=tuple(searching))
         for kind in view.ranges:
-            break_even_rows = placed_even(
+            break_even_rows = map_break_even_counts(
                 build_break_even_table(view.experiment.name, kind, level, costs[kind])
             )
             break_even_rows = break_even_rows[break_even_rows["learned"].isin(trained)]

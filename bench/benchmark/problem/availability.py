@@ -119,7 +119,7 @@ def _find_missing_data_set(experiment: Experiment) -> DataSet | None:
     if experiment.recording:
         required_files.append(("recording", experiment.recording.path))
     for kind, path in required_files:
-        data_set = datasets.providing(kind, path)
+        data_set = datasets.find_providing_data_set(kind, path)
         if data_set and datasets.find(kind, path) is None:
             return data_set
     return None

@@ -24,6 +24,7 @@ from bench.benchmark.problem.suite_version import (
     compute_problem_hash,
 )
 from bench.benchmark.problem.tuner_entries import TunerEntry, parse_entries
+from sims.core.atomic_files import is_existing_file
 from sims.core.simulator import InputError, make_unknown_name_error
 from sims.core.toml_validation import (
     Range,
@@ -420,14 +421,6 @@ def resolve_model_path(model: str, experiment: Path) -> str:
     return str(file.resolve()) if is_existing_file(file) else model
 
 
-def is_existing_file(file: Path) -> bool:
-    """Return whether a path is a file; False for a path that no file can have."""
-    try:
-        return file.is_file()
-    except (OSError, ValueError):
-        return False
-
-
 def list_experiment_names() -> list[str]:
     """Return the names of the experiments that come with the project."""
     folder = resources.files("bench.experiments")
@@ -519,7 +512,9 @@ def expand_sweep(experiment: Experiment) -> list[Experiment]:
     """
     if experiment.experiments:
         return [
-            expanded for name in experiment.experiments for expanded in _as_in(experiment, name)
+            expanded
+            for name in experiment.experiments
+            for expanded in _load_named_experiments(experiment, name)
         ]
     return _expand_combinations(experiment, Path(f"{experiment.name}.toml"))
 
@@ -542,7 +537,7 @@ _UNHASHED_KEYS = (*SHARED_KEYS, "title", "says", "identifiable", "tags")
 """Keys that do not belong to the definition of a suite's problem: shared ones, and words."""
 
 
-def _as_in(suite: Experiment, name: str) -> list[Experiment]:
+def _load_named_experiments(suite: Experiment, name: str) -> list[Experiment]:
     """Return an experiment that another one names, with the numbers and tuners of the latter.
 
     This is how one file, such as a suite, runs many problems with the same settings. `suite` is

@@ -7,10 +7,11 @@ import os
 from pathlib import Path
 from typing import Any
 
-from bench.benchmark.problem.experiment import Experiment, is_existing_file
+from bench.benchmark.problem.experiment import Experiment
 from bench.benchmark.problem.recorded_runs import find_recording
 from bench.core.plugin_registries import make_robot_simulator, simulators
 from bench.datasets import dataset_catalogue as datasets
+from sims.core.atomic_files import is_existing_file
 from sims.core.registry import PartUnavailableError
 from sims.core.simulator import InputError, Simulator
 from sims.core.value_limits import truncate_text
@@ -96,7 +97,7 @@ def find_model(path: str, name: str) -> Path:
         return robot_path
     if is_existing_file(Path(path)):
         return Path(path)
-    if data_set := datasets.providing("robot", path):
+    if data_set := datasets.find_providing_data_set("robot", path):
         raise PartUnavailableError("experiment", name, f"it {data_set.advice}")
     robots_folder = os.environ.get("SIMGAP_ROBOTS")
     places = (

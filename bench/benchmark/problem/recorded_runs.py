@@ -130,7 +130,7 @@ def find_recording(path: str) -> Path:
         return in_folder
     if Path(path).is_file():
         return Path(path)
-    if data_set := datasets.providing("recording", path):
+    if data_set := datasets.find_providing_data_set("recording", path):
         raise InputError(f"recording {path}: this experiment {data_set.advice}")
     folder = os.environ.get("SIMGAP_DATA")
     places = f"in {folder} (SIMGAP_DATA)" if folder else "here (SIMGAP_DATA is not set)"

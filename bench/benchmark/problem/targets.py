@@ -130,7 +130,7 @@ def draw_target(problem: TargetProblem, kind: str, index: int) -> Target:
     raise _make_divergence_error(problem.experiment, MAX_DRAWS, MAX_DRAWS)
 
 
-def redraws_of(experiment: Experiment, drawn_targets: Sequence[Target]) -> Redraws:
+def count_redraws(experiment: Experiment, drawn_targets: Sequence[Target]) -> Redraws:
     """Count the draws of all targets.
 
     Args:

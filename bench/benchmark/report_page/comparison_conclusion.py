@@ -42,10 +42,10 @@ def list_range_results(view: ComparisonView) -> list[RangeResult]:
     """List the verdicts on the tuners by range of targets."""
     results = []
     for kind in view.ranges:
-        standings = headline.standings(view.statistics, kind)
+        standings = headline.list_standings(view.statistics, kind)
         notes = (
-            headline.failed_runs(view.statistics, kind),
-            headline.how_decided(view.statistics, kind),
+            headline.list_failed_runs(view.statistics, kind),
+            headline.explain_ranking(view.statistics, kind),
         )
         results.append(
             RangeResult(
@@ -61,7 +61,7 @@ def list_range_results(view: ComparisonView) -> list[RangeResult]:
 
 def _format_title(view: ComparisonView, kind: str) -> str:
     text = headline.WHERE[kind]
-    return f"{text[0].upper()}{text[1:]} ({headline.targets_text(view.statistics, kind)})"
+    return f"{text[0].upper()}{text[1:]} ({headline.format_target_count(view.statistics, kind)})"
 
 
 def write_conclusion(view: ComparisonView) -> list[str]:
@@ -74,7 +74,7 @@ def _conclude_range(view: ComparisonView, kind: str) -> str:
 
     `kind` is the range of the targets. Tuners that share the smallest error are not listed here.
     """
-    standings, title = headline.standings(view.statistics, kind), _format_title(view, kind)
+    standings, title = headline.list_standings(view.statistics, kind), _format_title(view, kind)
     if not standings:
         return f"{title}: the errors on the targets do not decide."
     last = standings[-1]
@@ -189,11 +189,11 @@ def list_failures(view: ComparisonView) -> list[Failure]:
 
 def list_small_samples(view: ComparisonView) -> list[str]:
     """List warnings about ranges with too few targets for a significant difference."""
-    texts = (headline.too_few(view.statistics, kind) for kind in view.ranges)
+    texts = (headline.warn_too_few_targets(view.statistics, kind) for kind in view.ranges)
     return list(dict.fromkeys(text for text in texts if text))
 
 
-def redraws_text(results: ComparisonReportData) -> str:
+def format_redraws(results: ComparisonReportData) -> str:
     """Describe how many targets were drawn again; empty for none."""
     redrawn_count, draws = (
         results.environment.get(key, 0) for key in ("redrawn_targets", "target_draws")
@@ -214,7 +214,7 @@ def write_provenance_notes(results: ComparisonReportData) -> Iterator[str]:
         yield f"{TRUSTED_TUNERS_NOTE.capitalize()}."
     if not experiment.salt_sha256:
         yield "The targets have a public salt, so anyone can draw them."
-    if redraw_note := redraws_text(results):
+    if redraw_note := format_redraws(results):
         yield redraw_note
 
 

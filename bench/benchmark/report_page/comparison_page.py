@@ -36,7 +36,7 @@ def render_page(results: ComparisonReportData) -> str:
             page.add_table(name, table, _DIGITS)
     range_results = conclusion.list_range_results(view)
     standings = [result.standings for result in range_results]
-    equal_errors = headline.floor_text(view.statistics)
+    equal_errors = headline.format_error_floor(view.statistics)
     return page.render(
         _TEMPLATE,
         results=results,

@@ -15,7 +15,7 @@ from bench.benchmark.statistics.tuner_ranking import (
     SIGNIFICANCE,
     UNDECIDED,
     WORSE,
-    targets_needed,
+    compute_min_targets,
 )
 from bench.pages.text_format import format_number
 
@@ -49,7 +49,7 @@ class Standing(NamedTuple):
     failed: list[str]
 
 
-def standings(statistics: ComparisonStatistics, kind: str) -> list[Standing]:
+def list_standings(statistics: ComparisonStatistics, kind: str) -> list[Standing]:
     """List the verdicts after 1, 3, 10 and all simulations in one range.
 
     Args:
@@ -110,7 +110,7 @@ def _format_worse_tuner(row: dict[Any, Any]) -> str:
     return f"{row['tuner']}{factor} ({row['targets_worse']}/{row['targets']})"
 
 
-def targets_text(statistics: ComparisonStatistics, kind: str) -> str:
+def format_target_count(statistics: ComparisonStatistics, kind: str) -> str:
     """Format the number of targets of a range: ``10 targets``, or how many of them decide.
 
     Args:
@@ -131,12 +131,12 @@ def targets_text(statistics: ComparisonStatistics, kind: str) -> str:
     )
 
 
-def floor_text(statistics: ComparisonStatistics) -> str:
+def format_error_floor(statistics: ComparisonStatistics) -> str:
     """State which errors count as equal."""
     return f"errors below {statistics.floor * statistics.unit:.2g} count as equal"
 
 
-def how_decided(statistics: ComparisonStatistics, kind: str) -> str:
+def explain_ranking(statistics: ComparisonStatistics, kind: str) -> str:
     """Explain the test of the ranking and the notation.
 
     Args:
@@ -159,7 +159,7 @@ def _count_tested_tuners(statistics: ComparisonStatistics, kind: str) -> int:
     return max(part.loc[part["verdict"] != FAILED, "tuner"].nunique() - 1, 0)
 
 
-def too_few(statistics: ComparisonStatistics, kind: str) -> str:
+def warn_too_few_targets(statistics: ComparisonStatistics, kind: str) -> str:
     """Warn if there are too few targets for any significant difference; empty otherwise.
 
     Args:
@@ -171,7 +171,7 @@ def too_few(statistics: ComparisonStatistics, kind: str) -> str:
         _count_tested_tuners(statistics, kind),
     )
     if not comparison_count or int(ranked.max()) >= (
-        required_targets := targets_needed(comparison_count)
+        required_targets := compute_min_targets(comparison_count)
     ):
         return ""
     targets = int(ranked.max())
@@ -181,7 +181,7 @@ def too_few(statistics: ComparisonStatistics, kind: str) -> str:
     )
 
 
-def failed_runs(statistics: ComparisonStatistics, kind: str) -> str:
+def list_failed_runs(statistics: ComparisonStatistics, kind: str) -> str:
     """List the tuners with failed runs in a range and their numbers; empty for none.
 
     Args:

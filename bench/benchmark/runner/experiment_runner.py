@@ -21,7 +21,7 @@ from bench.benchmark.isolation.tuner_client import TunerSpec
 from bench.benchmark.problem.experiment import Experiment, TunerEntry
 from bench.benchmark.problem.fisher_information import InformationSpectrum
 from bench.benchmark.problem.numeric_warnings import numeric_warnings_silenced
-from bench.benchmark.problem.targets import Redraws, Target, redraws_of
+from bench.benchmark.problem.targets import Redraws, Target, count_redraws
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.benchmark.runner.code_digest import list_effect_names
 from bench.benchmark.runner.plugin_discovery import describe_plugins, must_build_isolated
@@ -219,10 +219,10 @@ def check_classes_importable(experiment: Experiment, workers: bool = True) -> No
     for registry, name in used_parts:
         registered = registry.snapshot().get(name)
         if registered is not None and registered.path is None:
-            raise unreachable(registry.kind, name, registered.part)
+            raise make_unreachable_error(registry.kind, name, registered.part)
 
 
-def unreachable(kind: str, name: str, part: type) -> InputError:
+def make_unreachable_error(kind: str, name: str, part: type) -> InputError:
     """Make the error for a class that worker processes cannot load.
 
     Args:
@@ -267,7 +267,7 @@ def prepare_experiment(experiment: Experiment, salt: str | None = None) -> Exper
     if not experiment.trusted:
         results.tuned = {entry.label: make_tuner_spec(entry) for entry in entries}
     targets = results.problem.draw_targets()
-    results.redraws = redraws_of(experiment, targets)
+    results.redraws = count_redraws(experiment, targets)
     results.plan = list(_iterate_planned_runs(experiment, entries, targets))
     # Workers open their own simulators, and this process does not need one for now.
     results.problem.close()

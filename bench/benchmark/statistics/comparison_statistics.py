@@ -12,12 +12,16 @@ from bench.benchmark.problem.experiment import Experiment
 from bench.benchmark.statistics.error_curves import RunCurves, RunRowTable, select_primary_metric
 from bench.benchmark.statistics.expected_running_time import build_runtime_table, select_thresholds
 from bench.benchmark.statistics.median_curves import (
-    coinciding,
     compute_median_curves,
     compute_medians_by_distance,
+    find_coinciding_curves,
 )
 from bench.benchmark.statistics.training_amortisation import TuningCost, compute_tuning_costs
-from bench.benchmark.statistics.tuner_ranking import failure_notes, final_order, rank_tuners
+from bench.benchmark.statistics.tuner_ranking import (
+    format_failure_notes,
+    rank_after_budget,
+    rank_tuners,
+)
 
 PRICED_LEVEL_COUNT = 3
 """Number of thresholds for which costs are computed, the loosest first.
@@ -92,7 +96,7 @@ class ComparisonStatistics:
 
         Tuners without a run that has the deciding metric come last.
         """
-        order = final_order(self.curves, self._budget, self.floor)
+        order = rank_after_budget(self.curves, self._budget, self.floor)
         return [*order, *(t for t in self._all_runs.keys["tuner"].unique() if t not in order)]
 
     def order_in(self, kind: str) -> list[str]:
@@ -116,11 +120,11 @@ class ComparisonStatistics:
     def notes(self) -> dict[str, str]:
         """Notes of legends and tables about tuners with failed runs, by tuner."""
         failed = pd.Series(self._all_runs.failed).groupby(self._all_runs.keys["tuner"], sort=False)
-        return failure_notes(
+        return format_failure_notes(
             {str(t): (int(is_failed.sum()), len(is_failed)) for t, is_failed in failed}
         )
 
-    def coinciding(self, panels: Sequence[tuple[str, str]]) -> dict[str, str]:
+    def find_coinciding_curves(self, panels: Sequence[tuple[str, str]]) -> dict[str, str]:
         """Find tuners whose curves are hidden below another curve.
 
         Args:
@@ -137,9 +141,9 @@ class ComparisonStatistics:
                 curves_by_tuner.setdefault(str(tuner), []).append(
                     line.set_index("simulations")["median"]
                 )
-        return coinciding(curves_by_tuner)
+        return find_coinciding_curves(curves_by_tuner)
 
-    def floor_of(self, metric: str) -> float | None:
+    def get_error_floor(self, metric: str) -> float | None:
         """Return the error below which tuners count as equal, in the unit of a metric.
 
         Returns:
@@ -150,7 +154,7 @@ class ComparisonStatistics:
         is_deciding_metric = self.metric == "param_error" and metric == "param_abs_error"
         return self.floor * self.unit if is_deciding_metric else None
 
-    def labelled(self, tuner: str) -> str:
+    def format_label(self, tuner: str) -> str:
         """Return the tuner's name, with its number of failed runs if there are any."""
         return f"{tuner} [{self.notes[tuner]}]" if tuner in self.notes else tuner
 

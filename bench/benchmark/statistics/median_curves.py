@@ -97,7 +97,9 @@ def compute_median_curves(curves: RunCurves, metric: str, budget: int) -> pd.Dat
     return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=MEDIAN_COLUMNS)
 
 
-def coinciding(curves_by_tuner: Mapping[str, Sequence[pd.Series[float]]]) -> dict[str, str]:
+def find_coinciding_curves(
+    curves_by_tuner: Mapping[str, Sequence[pd.Series[float]]],
+) -> dict[str, str]:
     """Find curves that cannot be seen because another one is drawn above them.
 
     A curve coincides with a later one up to k if the two differ by less than `_SAME` in every panel

@@ -250,7 +250,7 @@ def build_time_per_target_table(prices: Mapping[str, Mapping[str, TuningCost]]) 
     )
 
 
-def placed_even(table: pd.DataFrame) -> pd.DataFrame:
+def map_break_even_counts(table: pd.DataFrame) -> pd.DataFrame:
     """Map counts of `build_break_even_table` to a logarithmic axis from `AT_ONCE` to `NEVER`."""
     mapped_table = table.copy()
     for column in ("targets", "low", "high"):

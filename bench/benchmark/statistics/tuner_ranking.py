@@ -67,12 +67,12 @@ rank, but the test does not decide. `WORSE`: the test decides. `FAILED`: all run
 """
 
 
-def ranked_after(budget: int) -> list[int]:
+def list_ranking_points(budget: int) -> list[int]:
     """Return the numbers of simulations after which tuners are ranked: 1, 3, 10 and the budget."""
     return [k for k in _RANKED_AFTER if k < budget] + [budget]
 
 
-def targets_needed(comparison_count: int) -> int:
+def compute_min_targets(comparison_count: int) -> int:
     """Return how many targets can decide `comparison_count` comparisons with the best tuner.
 
     The smallest two-sided p-value of Wilcoxon's signed-rank test on n pairs is 2 / 2^n; Holm's
@@ -102,7 +102,7 @@ def rank_tuners(curves: RunCurves, budget: int, floor: float) -> pd.DataFrame:
     return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=RANKING_COLUMNS)
 
 
-def final_order(curves: RunCurves, budget: int, floor: float) -> list[str]:
+def rank_after_budget(curves: RunCurves, budget: int, floor: float) -> list[str]:
     """Rank tuners after the whole budget, over all targets of all ranges; best first.
 
     Tuners come last if all their runs failed.
@@ -130,7 +130,7 @@ class _Ranking(NamedTuple):
 
 
 def _compute_rankings(curves: RunCurves, budget: int, floor: float) -> dict[int, _Ranking]:
-    """Compute the ranking of the tuners after each number of simulations of `ranked_after`.
+    """Compute the ranking of the tuners after each number of simulations of `list_ranking_points`.
 
     Tuners are ordered by median log error, then mean, then earlier ranks; those whose runs all
     failed come last. Errors at or below `floor` count as equal.
@@ -138,7 +138,7 @@ def _compute_rankings(curves: RunCurves, budget: int, floor: float) -> dict[int,
     failed = {t: bool(curves.select(tuner=t).failed.all()) for t in curves.list_tuners()}
     rankings: dict[int, _Ranking] = {}
     earlier_ranks: list[pd.Series[float]] = []
-    for k in ranked_after(budget):
+    for k in list_ranking_points(budget):
         logs = build_log_error_table(curves, k, floor)
         # Rounding gives errors that differ by the last bits the same rank.
         medians, mean_logs = logs.median().round(9), logs.mean().round(9)
@@ -205,7 +205,7 @@ def _compute_median_error(logs: pd.Series[float]) -> float:
     return float(np.exp(middle)) if middle < _NO_ERROR else np.inf
 
 
-def failure_notes(failed: Mapping[str, tuple[int, int]]) -> dict[str, str]:
+def format_failure_notes(failed: Mapping[str, tuple[int, int]]) -> dict[str, str]:
     """Build the notes that follow the names of tuners with failed runs.
 
     Args:

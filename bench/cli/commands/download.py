@@ -91,7 +91,7 @@ def _download_data_set(data_set: DataSet, source: str, target_folder: Path | Non
 
     from tqdm import tqdm
 
-    from bench.datasets.dataset_catalogue import search_folders
+    from bench.datasets.dataset_catalogue import list_search_folders
     from bench.datasets.dataset_download import download
 
     with tqdm(
@@ -108,7 +108,7 @@ def _download_data_set(data_set: DataSet, source: str, target_folder: Path | Non
             bar.update(count)
 
         return download(
-            data_set, target_folder or next(search_folders(data_set.kind)), source, advance
+            data_set, target_folder or next(list_search_folders(data_set.kind)), source, advance
         )
 
 
@@ -122,9 +122,11 @@ def _find_present_folder(data_set: DataSet, target_folder: Path | None) -> Path 
 
 def _explain_folder_lookup(data_set: DataSet, target_folder: Path) -> str:
     """Explain how experiments find a data set in a folder other than the default one."""
-    from bench.datasets.dataset_catalogue import FOLDER_VARIABLES, search_folders
+    from bench.datasets.dataset_catalogue import FOLDER_VARIABLES, list_search_folders
 
-    if target_folder.resolve() in [folder.resolve() for folder in search_folders(data_set.kind)]:
+    if target_folder.resolve() in [
+        folder.resolve() for folder in list_search_folders(data_set.kind)
+    ]:
         return f"{data_set.name}: experiments find it there"
     variable = FOLDER_VARIABLES[data_set.kind]
     return (
@@ -148,7 +150,7 @@ def _format_data_set(data_set: DataSet) -> list[str]:
 def _list_dependent_experiments(data_set: DataSet) -> list[str]:
     """Return the names of the project's experiments that need a data set."""
     from bench.benchmark.problem.experiment import list_experiment_names, load_experiment
-    from bench.datasets.dataset_catalogue import providing
+    from bench.datasets.dataset_catalogue import find_providing_data_set
 
     names = []
     for name in list_experiment_names():
@@ -156,7 +158,7 @@ def _list_dependent_experiments(data_set: DataSet) -> list[str]:
         paths = [("robot", each.model)]
         if each.recording:
             paths.append(("recording", each.recording.path))
-        if data_set in [providing(*path) for path in paths]:
+        if data_set in [find_providing_data_set(*path) for path in paths]:
             names.append(name)
     return names
 

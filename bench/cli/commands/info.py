@@ -62,9 +62,9 @@ def _get_cache_folder() -> Path:
 
 
 def _get_data_set_folder() -> Path:
-    from bench.datasets.dataset_catalogue import user_folder
+    from bench.datasets.dataset_catalogue import get_user_folder
 
-    return user_folder()
+    return get_user_folder()
 
 
 def _read_git_revision() -> str | None:

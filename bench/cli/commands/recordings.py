@@ -224,7 +224,7 @@ def _run_inspect(options: argparse.Namespace, print_line: PrintLine) -> CommandR
     from bench.logs.inspection import format_summary, load_recording
     from bench.logs.quality.floating_base_check import find_missing_base_poses
     from bench.logs.quality.log_quality import check_log_quality
-    from bench.logs.quality.timestamp_check import find_anomalies, odd_logs
+    from bench.logs.quality.timestamp_check import find_anomalies, find_log_anomalies
     from sims.core.simulator import InputError
 
     load_plugins(options.plugin)
@@ -235,7 +235,7 @@ def _run_inspect(options: argparse.Namespace, print_line: PrintLine) -> CommandR
     )
     robot_lines = list(robot_summary.format_robot_summary(kind))
     oddities = [
-        *odd_logs(recording),
+        *find_log_anomalies(recording),
         *find_anomalies(recording, kind),
         *find_missing_base_poses(recording, kind),
     ]

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from bench.diagnosis.report.wording import append_unit
-from bench.pages.csv_text import csv_text
+from bench.pages.csv_text import format_csv
 
 LOGS_TABLE_FILE = "logs.csv"
 """File name of the table, which has one row for each number of each cause of each log."""
@@ -58,7 +58,7 @@ def format_log_table(rows: Sequence[LogResult]) -> str:
                 )
         common_cells = row.gap_closed, row.seconds, row.error
         lines += [(row.log, row.verdict, *cell, *common_cells) for cell in cells or [("",) * 7]]
-    return csv_text(LOG_COLUMNS, lines)
+    return format_csv(LOG_COLUMNS, lines)
 
 
 def summarise_causes(rows: Sequence[LogResult]) -> list[str]:

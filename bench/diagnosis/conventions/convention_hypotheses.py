@@ -16,7 +16,7 @@ import numpy as np
 
 from bench.diagnosis.conventions.unit_check import UNITS, UNITS_IN_WORDS, Signal, Subject
 from bench.diagnosis.identifiability import join_first_names
-from bench.logs.importing.joint_order import least_order
+from bench.logs.importing.joint_order import find_best_order
 from sims.core.simulator import Array
 from sims.recording.angle_unwrapping import unwrapped
 from sims.recording.log_formats.lerobot_calibration import range_scale
@@ -403,7 +403,7 @@ def _find_order_of_commands(joints: Sequence[JointSignals], recording: Recording
         for a, b in np.ndindex(count, count):
             difference = run.channels[joints[b].channels["q"]] - run.inputs[joints[a].inputs[0]]
             costs[a, b] += float(np.nanvar(difference))
-    return dict(enumerate(least_order(costs)))
+    return dict(enumerate(find_best_order(costs)))
 
 
 def _generate_units(

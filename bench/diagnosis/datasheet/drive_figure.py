@@ -31,7 +31,7 @@ from bench.diagnosis.report.wording import (
 )
 from bench.figures import style
 from bench.figures.figure_files import is_pdf_wanted
-from bench.figures.text_layout import POINTS, text_width
+from bench.figures.text_layout import POINTS, measure_text_width
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -194,7 +194,7 @@ def _choose_table_layout(rows: Sequence[Sequence[str]]) -> tuple[float, list[flo
     """Choose the font size of a table, and the left edges of its columns as shares of the width."""
     size = _TABLE_SIZE
     while True:
-        widths = [text_width(column, size, "bold") for column in zip(*rows, strict=True)]
+        widths = [measure_text_width(column, size, "bold") for column in zip(*rows, strict=True)]
         gap = 0.14 * size / _TABLE_SIZE
         if (
             sum(widths) + gap * (len(widths) - 1) <= A4_INCHES[0] * (1 - 2 * _MARGIN)

@@ -18,7 +18,7 @@ from bench.diagnosis.evaluation.noise_floor import (
     MIN_SIGMA,
     compute_value_range,
 )
-from bench.logs.quality.noise_estimation import differences_sigma
+from bench.logs.quality.noise_estimation import estimate_differences_sigma
 from sims.core.simulator import Array
 from sims.recording.recording import Recording, Run
 
@@ -64,7 +64,7 @@ def _compute_added_noise(recording: Recording, name: str) -> float:
     if min_sigma < MIN_SIGMA:
         return 0.0
     # The estimate is not finite if all runs are too short for the differences.
-    return min_sigma if differences_sigma(signals, ORDER) < FREE * min_sigma else 0.0
+    return min_sigma if estimate_differences_sigma(signals, ORDER) < FREE * min_sigma else 0.0
 
 
 def _add_noise(run: Run, sizes: dict[str, float]) -> Run:

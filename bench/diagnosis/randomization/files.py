@@ -9,7 +9,7 @@ from typing import Any
 from bench.diagnosis.randomization.isaac_lab import render_isaac_lab_code
 from bench.diagnosis.randomization.mujoco_playground import render_mujoco_playground_code
 from bench.diagnosis.randomization.ranges import RandomizationRanges
-from bench.pages.csv_text import csv_text
+from bench.pages.csv_text import format_csv
 from sims.extended_simulator import ExtendedSimulator
 
 FORMAT = 1
@@ -47,7 +47,7 @@ def build_range_files(
         "ranges": rows,
     }
     table = [[_format_cell(row.get(column)) for column in COLUMNS] for row in rows]
-    tables = {"ranges.toml": tomli_w.dumps(document), "ranges.csv": csv_text(COLUMNS, table)}
+    tables = {"ranges.toml": tomli_w.dumps(document), "ranges.csv": format_csv(COLUMNS, table)}
     if not any(entry.fields for entry in ranges.ranges):
         return tables
     robot = getattr(extended.kind, "robot", None)

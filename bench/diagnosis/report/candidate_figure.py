@@ -27,7 +27,7 @@ from bench.figures.style import (
     ZERO_LINE_GREY,
     make_panel_grid,
 )
-from bench.figures.text_layout import break_name, most_lines, text_width
+from bench.figures.text_layout import break_name, count_max_lines, measure_text_width
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -88,11 +88,11 @@ def draw_candidates_figure(report: DiagnosisReportData) -> Figure:
     has_shares = any(candidate.heldout_gain is not None for candidate in candidates)
 
     # Names of causes are bold, which is a little wider.
-    left_margin = _EDGE + 0.12 + text_width(names, _NAME_SIZE, "bold")
+    left_margin = _EDGE + 0.12 + measure_text_width(names, _NAME_SIZE, "bold")
     shares_width = _SHARES_WIDTH + _SHARE_TEXTS_WIDTH if has_shares else 0.0
     width = max(left_margin + shares_width + _SCORES_WIDTH + _SCORE_TEXTS_WIDTH + _EDGE, 7.0)
     # All rows have the height of the longest name, so that bars are evenly spaced.
-    row = _ROW + _LINE * most_lines(names)
+    row = _ROW + _LINE * count_max_lines(names)
     handles, labels = _make_legend(report)
     top = _TOP if handles else _TOP_WITHOUT_LEGEND
     height = top + _BOTTOM + row * len(candidates)

@@ -24,7 +24,7 @@ from bench.diagnosis.report.wording import (
     sanitise,
     split_effect_name,
 )
-from bench.figures.text_layout import brief
+from bench.figures.text_layout import shorten_name
 from bench.pages.chart import Axis, Panel, Series
 from bench.pages.page_table import Table
 from sims import effects
@@ -167,7 +167,7 @@ def make_residual_profile_panels(report: DiagnosisReportData) -> list[Panel]:
                 "at",
                 tuple(series),
                 Axis(
-                    format_label(brief(sanitise(variable), MAX_LABEL_LENGTH), profile.unit),
+                    format_label(shorten_name(sanitise(variable), MAX_LABEL_LENGTH), profile.unit),
                     scales=("linear",),
                 ),
                 Axis(value_label, scales=("linear",), holds=(0.0,)),

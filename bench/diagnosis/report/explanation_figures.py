@@ -44,7 +44,7 @@ from bench.figures import style
 from bench.figures.figure_files import is_pdf_wanted
 from bench.figures.robot_figure import compute_joint_positions, draw_robot_figure
 from bench.figures.style import NOISE_BAND_GREY, ZERO_LINE_GREY, make_panel_grid
-from bench.figures.text_layout import most_lines, text_width
+from bench.figures.text_layout import count_max_lines, measure_text_width
 from sims.core.simulator import InputError, make_unknown_name_error
 
 if TYPE_CHECKING:
@@ -297,7 +297,7 @@ class _FigureLayout(NamedTuple):
         """
         # Hinting makes letters wider on the page than their outlines.
         available_width = self.width - inches - 0.3
-        size = _HEADING_SIZE * min(1.0, available_width / text_width([text], _HEADING_SIZE))
+        size = _HEADING_SIZE * min(1.0, available_width / measure_text_width([text], _HEADING_SIZE))
         y = 1 - self.up(_HEADING)
         self.figure.text(self.across(inches), y, text, fontsize=size, va="center")
 
@@ -317,13 +317,15 @@ def _draw_residual_locations(report: DiagnosisReportData) -> Figure:
     rows = min(2, len(profiles))
     columns = -(-len(profiles) // 2)
     names = place_names(places)
-    left_margin = max(_NAMES, 0.25 + text_width(names, _STYLE["font.size"]))
+    left_margin = max(_NAMES, 0.25 + measure_text_width(names, _STYLE["font.size"]))
     profiles_from = left_margin + _PROFILES_AFTER
     # A single column of profiles is wider than one of several columns.
     width = left_margin + 3.3 + (3.1 * columns if columns != 1 else 4.4)
-    row = 0.27 + 0.13 * (most_lines(names) - 1)
+    row = 0.27 + 0.13 * (count_max_lines(names) - 1)
     # Variables of robots have long names, which need several lines below the panels.
-    label_height = 0.15 * (most_lines([format_profile_label(profile) for profile in profiles]) - 1)
+    label_height = 0.15 * (
+        count_max_lines([format_profile_label(profile) for profile in profiles]) - 1
+    )
     height = max(2.6 + row * len(places), 1.5 + (1.9 + label_height) * rows)
     figure, axes = make_panel_grid(1, 1, (width, height), layout=None)
     layout, axis = _FigureLayout(figure, width, height), axes[0, 0]

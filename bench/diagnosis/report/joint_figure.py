@@ -30,7 +30,7 @@ from bench.figures.style import (
     ZERO_LINE_GREY,
     make_panel_grid,
 )
-from bench.figures.text_layout import break_name, text_width
+from bench.figures.text_layout import break_name, measure_text_width
 from sims.core.simulator import Array
 
 if TYPE_CHECKING:
@@ -126,7 +126,7 @@ def draw_joint_figure(report: DiagnosisReportData, view: RunView) -> Figure:
     height = _HEIGHTS.get(len(rows), _LEAST_HEIGHT)
     named_joints = {mark.name for mark in list_place_marks(report)} | _list_marked_joints(report)
     names = [_format_row_name(row, row.name in named_joints) for row in rows]
-    names_width = max(1.95, 0.12 + text_width(names, _NAME_SIZE, "bold") + _BESIDE_NAME)
+    names_width = max(1.95, 0.12 + measure_text_width(names, _NAME_SIZE, "bold") + _BESIDE_NAME)
     width = names_width + 5.15 + 2.6 * len(quantities)
     size = (width, _HEAD + _FOOT + height * len(rows))
     ratios = (4.2, *[3.0] * len(quantities))

@@ -16,7 +16,7 @@ from bench.diagnosis.report.run_selection import select_worst_run
 from bench.diagnosis.report.summary_text import list_data_splits
 from bench.diagnosis.report.wording import format_label, format_number, format_unit, sanitise
 from bench.figures.style import BLACK, BLUE, VERMILION, MarkStyle, make_mark_style
-from bench.figures.text_layout import brief
+from bench.figures.text_layout import shorten_name
 from bench.pages.chart import Axis, AxisSpan, Panel, Series, TooltipLine
 from bench.pages.page_table import Table
 from sims.core.simulator import Array
@@ -299,7 +299,7 @@ def _make_panels(
     quantity = facets.get("quantity", name)
     residual = Axis(f"residual of {quantity} [σ]", scales=("linear",), holds=(-_LEAST, _LEAST))
     value_axis = Axis(
-        format_label(brief(sanitise(channel.name), 24), channel.unit), scales=("linear",)
+        format_label(shorten_name(sanitise(channel.name), 24), channel.unit), scales=("linear",)
     )
     noise_band = (AxisSpan(-2.0, 2.0, "±2σ: 95 % of the noise", along="y"),)
     tooltip_lines = _make_tooltip_lines(format_unit(channel.unit), channel.sigma, extended)

@@ -106,7 +106,7 @@ def _compute_periodic_acceleration(
     return 0.0, 0.0, c[0] * sin(2 * pi * c[2] * t) + c[1] * cos(2 * pi * c[2] * t)
 
 
-def _layer_drag(
+def _compute_layer_drag(
     c: Sequence[float],
     g: float,
     t: float,
@@ -153,7 +153,7 @@ ACCELERATION_LAWS: dict[str, Callable[..., Acceleration]] = {
         0.0,
         c[0] * compute_region_indicator(x, c[1], c[2]),
     ),  # unmodelled: rising air within a region of x
-    "layer": _layer_drag,  # unmodelled: quadratic drag above a height
+    "layer": _compute_layer_drag,  # unmodelled: quadratic drag above a height
 }
 
 

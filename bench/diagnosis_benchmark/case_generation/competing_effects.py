@@ -108,7 +108,7 @@ def _rank_starts(
         result = [(_compute_residual(fit, observed, guess, base_fit), guess) for guess in guesses]
     else:
         result = [
-            _linear_least_squares_step(fit, observed, shape, base_fit)
+            _estimate_linear_step(fit, observed, shape, base_fit)
             for shape in SHAPE_GRIDS.get(name, [()])
         ]
     return sorted(result, key=lambda pair: pair[0])
@@ -153,7 +153,7 @@ def _compute_residual(
     return float(np.sqrt(np.mean(residual**2)))
 
 
-def _linear_least_squares_step(
+def _estimate_linear_step(
     fit: NuisanceFitter, observed: Array, shape: Sequence[float], base_fit: ResidualFit
 ) -> tuple[float, Array]:
     """Estimate the residual by one least-squares step from a zero effect with a fixed shape.

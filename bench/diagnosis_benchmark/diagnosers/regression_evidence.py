@@ -319,10 +319,10 @@ class RegressionEvidence:
                 result[r, :size, c] = operated
                 weights = savgol_coeffs(window, POLYNOMIAL_DEGREE, deriv=order, delta=step)
                 sigma[r, :size, c] = self.noise.sigma[c] * np.sqrt(np.square(weights).sum())
-                is_used[r, :size, c] = self._smooth_at(r, size, window)
+                is_used[r, :size, c] = self._find_smooth_samples(r, size, window)
         return result, sigma, is_used & self.observed_mask
 
-    def _smooth_at(self, run: int, size: int, window: int) -> Mask:
+    def _find_smooth_samples(self, run: int, size: int, window: int) -> Mask:
         """Return a mask (T,) of the samples whose window has no impact and no end of the run.
 
         An impact is a minimum of the height in the simulated or in the observed path. A polynomial

@@ -240,21 +240,21 @@ def _select_by_one_standard_error(
     """
     zero_model = np.zeros(library.shape[1])
     candidates = [zero_model, *models]
-    errors = np.array([_block_mean_squares(residual - library @ c) for c in candidates])
+    errors = np.array([_compute_block_mean_squares(residual - library @ c) for c in candidates])
     best = int(errors.mean(axis=1).argmin())
     gain = errors[0] - errors[best]
-    sigmas = float(gain.mean() / max(_standard_error(gain), 1e-12)) if best else 0.0
+    sigmas = float(gain.mean() / max(_compute_standard_error(gain), 1e-12)) if best else 0.0
     if sigmas < MIN_IMPROVEMENT_STANDARD_ERRORS:
         return zero_model, sigmas
     allowed_models = []
     for c, error in zip(candidates[1:], errors[1:], strict=True):
         excess = error - errors[best]
-        if excess.mean() <= _standard_error(excess):
+        if excess.mean() <= _compute_standard_error(excess):
             allowed_models.append(c)
     return min(allowed_models or [candidates[best]], key=np.count_nonzero), sigmas
 
 
-def _block_mean_squares(error: Array) -> Array:
+def _compute_block_mean_squares(error: Array) -> Array:
     """Compute the mean squared errors of consecutive blocks, (BLOCKS,).
 
     Blocks are used because the errors of neighbouring samples are correlated.
@@ -263,7 +263,7 @@ def _block_mean_squares(error: Array) -> Array:
     return np.array([np.square(error[a:b]).mean() for a, b in pairwise(edges.tolist())])
 
 
-def _standard_error(differences: Array) -> float:
+def _compute_standard_error(differences: Array) -> float:
     """Compute the standard error of the mean of differences."""
     return float(differences.std(ddof=1) / np.sqrt(len(differences)))
 

@@ -14,8 +14,8 @@ from bench.logs.importing.normalised_positions import (
     MAX_NORMALISED,
     UNIT_REMEDY,
     NormalisedPositions,
+    find_position_conversion,
     is_lerobot,
-    normalised_positions,
 )
 from bench.logs.importing.run_logs import RunLogs
 from bench.logs.importing.signal_assignment import (
@@ -104,7 +104,9 @@ class ColumnAssigner:
             for values in (column.values, *self._logs.read_runs(column)[1:])
         )
         calibration = None if options.calibration is None else Path(options.calibration)
-        self.normalised = normalised_positions(path, largest, options.position_unit, calibration)
+        self.normalised = find_position_conversion(
+            path, largest, options.position_unit, calibration
+        )
         if self.normalised is not None:
             self._result.guessed.append(f"positions: {self.normalised.description}")
         elif (
@@ -179,7 +181,7 @@ class ColumnAssigner:
         for column, joint, placement in self._signals.place_columns(
             self._select_by_role("command")
         ):
-            actuator = self._signals.actuator_of(joint.name)
+            actuator = self._signals.get_actuator(joint.name)
             if actuator is not None:
                 self._assign_command(column, joint, placement, actuator)
             elif self._signals.robot.actuators:
@@ -189,7 +191,7 @@ class ColumnAssigner:
 
     def _assign_undriven(self, column: LogColumn, joint: Joint, placement: Placement) -> None:
         """Assign a command of a joint that the model does not drive: a servo or a force."""
-        quantity = column_guessing.commanded_role(column)
+        quantity = column_guessing.get_commanded_role(column)
         if quantity == "force":
             self._assign_force(column, joint, f"force.{joint.name}", placement)
         elif quantity in (None, "position"):
@@ -209,7 +211,7 @@ class ColumnAssigner:
 
         A motor takes a torque or force, a servo a position or velocity.
         """
-        quantity = column_guessing.commanded_role(column)
+        quantity = column_guessing.get_commanded_role(column)
         expected = COMMAND_QUANTITIES.get(actuator.kind)
         if (
             actuator.kind == "motor"
@@ -239,7 +241,7 @@ class ColumnAssigner:
 
     def _resembles_position(self, column: LogColumn, joint: Joint) -> bool:
         """Return whether a command is close to the position, and so a desired position."""
-        position = self._signals.position_of(joint.name)
+        position = self._signals.get_position(joint.name)
         if position is None:
             return False
         u, q = self._logs.hold_command(column, position.column)
@@ -272,7 +274,7 @@ class ColumnAssigner:
         columns = [column for column in self._select_by_role("force") if _is_torque(column)]
         torques: dict[str, list[tuple[LogColumn, Joint, Placement]]] = {}
         for column, joint, placement in signals.place_columns(columns):
-            actuator = signals.actuator_of(joint.name)
+            actuator = signals.get_actuator(joint.name)
             if actuator is not None and actuator.kind == "motor":
                 name = f"u.{actuator.name}"
             elif not signals.robot.actuators and f"m_{joint.name}" not in signals.added_servos:
@@ -341,7 +343,7 @@ class ColumnAssigner:
         missing = [
             joint.name
             for joint in self._signals.joints
-            if self._signals.position_of(joint.name) is None
+            if self._signals.get_position(joint.name) is None
         ]
         if missing:
             self._result.untold.append(f"joints without a position: {', '.join(missing)}")

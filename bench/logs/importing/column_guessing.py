@@ -122,7 +122,7 @@ def guess_role(column: LogColumn) -> Role | None:
     return _guess_measured_role(column_words) or _guess_measured_role(file_words)
 
 
-def commanded_role(column: LogColumn) -> Role | None:
+def get_commanded_role(column: LogColumn) -> Role | None:
     """Return the quantity that a command sets: position, velocity or force; None if unknown.
 
     The column's name and unit are used first, then its file's name.

@@ -72,7 +72,7 @@ class DescriptionWriter:
     def write(self) -> str:
         """Return the description."""
         servos = [self._estimate_added_servo(*item) for item in self._signals.added_servos.items()]
-        body = [*self._time_lines(), *self._run_lines()]
+        body = [*self._list_time_lines(), *self._run_lines()]
         for servo in servos:
             body += [
                 f"[actuators.{toml_key(servo.name)}]",
@@ -102,7 +102,7 @@ class DescriptionWriter:
             head.append(f"free = [{name_list}]  # not known: they are estimated")
         return "\n".join([*head, "", *body]).rstrip("\n") + "\n"
 
-    def _time_lines(self) -> Iterator[str]:
+    def _list_time_lines(self) -> Iterator[str]:
         """Yield the lines of the table `[time]`: a sampling rate (Hz) or the time stamp column."""
         yield "[time]"
         if self._logs.rate is not None:
@@ -192,7 +192,10 @@ class DescriptionWriter:
 
         A command holds until the next one.
         """
-        command, position = self._signals.inputs[f"u.{name}"], self._signals.position_of(joint.name)
+        command, position = (
+            self._signals.inputs[f"u.{name}"],
+            self._signals.get_position(joint.name),
+        )
         samples: list[tuple[Array, Array, Array]] = []
         if position is None:
             return samples

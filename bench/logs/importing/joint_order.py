@@ -37,7 +37,7 @@ def order_of_commands(commands: Sequence[Array], positions: Sequence[Array]) -> 
     distances = _compute_square_distances(commands, positions)
     if distances is None:
         return None
-    order = least_order(distances)
+    order = find_best_order(distances)
     moved_places = [i for i, place in enumerate(order) if place != i]
     if not moved_places:
         return None
@@ -61,7 +61,7 @@ def follow(commands: Sequence[Array], positions: Sequence[Array]) -> bool:
     return bool((np.argmin(distances, axis=1) == np.arange(len(distances))).all())
 
 
-def least_order(distances: Array) -> list[int]:
+def find_best_order(distances: Array) -> list[int]:
     """Return the order that minimises (1), by linear assignment.
 
     Args:

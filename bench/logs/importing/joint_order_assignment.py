@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from bench.logs.importing.import_result import MAX_NAMES, ImportResult
 from bench.logs.importing.joint_order import follow, order_of_commands
-from bench.logs.importing.joint_order_by_model import preferred_order
+from bench.logs.importing.joint_order_by_model import find_order_by_model
 from bench.logs.importing.run_logs import RunLogs
 from bench.logs.importing.signal_assignment import Placement, SignalAssignment
 from sims.core.simulator import Array
@@ -74,11 +74,11 @@ def _collect_servo_signals(logs: RunLogs, signals: SignalAssignment) -> _ServoSi
     joints = [
         joint
         for joint in signals.joints
-        if signals.servo_input(joint.name) in signals.inputs
-        and signals.position_of(joint.name) is not None
+        if signals.get_servo_input(joint.name) in signals.inputs
+        and signals.get_position(joint.name) is not None
     ]
     names = [joint.name for joint in joints]
-    inputs = [signals.servo_input(name) for name in names]
+    inputs = [signals.get_servo_input(name) for name in names]
     pairs = [
         (signals.inputs[u], signals.channels[f"q.{name}"])
         for u, name in zip(inputs, names, strict=True)
@@ -129,7 +129,7 @@ def _prefer_model(
         For each joint, the joint at whose index its column is; empty if the order is not changed.
     """
     joints = servos.joints
-    actuators = [signals.actuator_of(joint) for joint in joints]
+    actuators = [signals.get_actuator(joint) for joint in joints]
     driven = [
         (signals.robot.joint(joint), actuator)
         for joint, actuator in zip(joints, actuators, strict=True)
@@ -139,7 +139,9 @@ def _prefer_model(
     if len(driven) < len(joints) or all(map(signals.has_number_of_joint, joints)):
         return {}
     seconds = logs.seconds[signals.channels[f"q.{joints[0]}"].column.file]
-    preferred = preferred_order(signals.robot, driven, seconds, servos.commands, servos.positions)
+    preferred = find_order_by_model(
+        signals.robot, driven, seconds, servos.commands, servos.positions
+    )
     if preferred is None or not preferred.is_certain():
         return {}
     positions = [signals.channels[f"q.{joint}"] for joint in joints]
@@ -173,7 +175,7 @@ def _report_order(
         for name, signal in table.items():
             if signal.placement not in (Placement.MODEL_ORDER, Placement.COMMANDS):
                 continue
-            joint = signals.joint_of(name)
+            joint = signals.get_joint(name)
             if signal.placement is Placement.MODEL_ORDER and joint in following_joints:
                 table[name] = signal.placed(Placement.CONFIRMED_ORDER)
             guessed.setdefault(name.partition(".")[0], set()).add(joint)

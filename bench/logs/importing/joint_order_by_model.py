@@ -55,7 +55,7 @@ class PreferredOrder(NamedTuple):
         return self.residual < min(EXPLAINED, PREFERRED * self.usual)
 
 
-def preferred_order(
+def find_order_by_model(
     robot: RobotModel,
     driven: Sequence[tuple[Joint, Actuator]],
     times: Array,

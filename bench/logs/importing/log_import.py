@@ -11,7 +11,7 @@ from bench.logs.importing.column_assignment import ColumnAssigner
 from bench.logs.importing.description_text import DescriptionWriter
 from bench.logs.importing.import_result import POSITION_UNITS, ImportOptions, ImportResult
 from bench.logs.importing.joint_order_assignment import assign_order
-from bench.logs.importing.log_runs import runs_of
+from bench.logs.importing.log_runs import group_logs_by_run
 from bench.logs.importing.run_logs import RunLogs
 from bench.logs.importing.signal_assignment import SignalAssignment
 from bench.logs.importing.velocity_assignment import assign_velocities
@@ -47,7 +47,7 @@ def describe_logs(
     )
     if options.rate is not None and not 0 < options.rate < np.inf:
         raise InputError(f"rate {options.rate:g}: expected a number of rows a second, more than 0")
-    runs = runs_of(logs)
+    runs = group_logs_by_run(logs)
     check_known_names("run held out", options.held_out, [name for name in runs if name])
     result = ImportResult("")
     signals = SignalAssignment(robot)

@@ -36,7 +36,7 @@ class RunFiles(NamedTuple):
         return path.relative_to(self.folder).as_posix()
 
 
-def runs_of(logs: Sequence[Path]) -> dict[str, RunFiles]:
+def group_logs_by_run(logs: Sequence[Path]) -> dict[str, RunFiles]:
     """Group logs by run: those of each folder, bag or episode, or the files themselves.
 
     The files of one folder are one run, unless all of them have the same columns: then each file is

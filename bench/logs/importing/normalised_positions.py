@@ -82,7 +82,7 @@ class NormalisedPositions:
         return f"normalised, -100 to 100 (a gripper's 0 to 100) of {ranges}"
 
 
-def normalised_positions(
+def find_position_conversion(
     log: Path, largest: float, stated_unit: str, calibration: Path | None
 ) -> NormalisedPositions | None:
     """Return the conversion of positions to angles; None if they are angles already.
@@ -127,7 +127,7 @@ def is_lerobot(log: Path, columns: Iterable[str]) -> bool:
     )
 
 
-def may_be_normalised(recording: Recording) -> Iterator[Anomaly]:
+def check_normalised_positions(recording: Recording) -> Iterator[Anomaly]:
     """Yield an anomaly if positions of a LeRobot dataset in degrees may be normalised.
 
     That is so if all of them lie within -100 to 100; channels whose description states a `scale`

@@ -94,22 +94,22 @@ class SignalAssignment:
         self.joints = [joint for joint in self.robot.joints if joint.has_one_coordinate]
         self._actuators = {a.joint: a for a in self.robot.actuators if a.joint}
 
-    def actuator_of(self, joint: str) -> Actuator | None:
+    def get_actuator(self, joint: str) -> Actuator | None:
         """Return the actuator of a joint in the model file; None if there is none."""
         return self._actuators.get(joint)
 
-    def position_of(self, joint: str) -> Signal | None:
+    def get_position(self, joint: str) -> Signal | None:
         """Return the position of a joint; None if there is none."""
         return self.channels.get(f"q.{joint}")
 
-    def servo_input(self, joint: str) -> str:
+    def get_servo_input(self, joint: str) -> str:
         """Return the input of a joint's position servo; empty if it has none."""
-        actuator = self.actuator_of(joint)
+        actuator = self.get_actuator(joint)
         if actuator is not None:
             return f"u.{actuator.name}" if actuator.kind == "position" else ""
         return f"u.m_{joint}" if f"m_{joint}" in self.added_servos else ""
 
-    def joint_of(self, signal: str) -> str:
+    def get_joint(self, signal: str) -> str:
         """Return the joint of a channel or an input; the signal's own name if it has none."""
         name = signal.partition(".")[2]
         joint = next((a.joint for a in self.robot.actuators if a.name == name), None)
@@ -149,10 +149,10 @@ class SignalAssignment:
 
     def _get_column_name(self, joint: str) -> str:
         """Return the column name of a joint's position, or else of its command."""
-        position = self.position_of(joint)
+        position = self.get_position(joint)
         if position is not None and position.placement.is_order:
             return position.column.bare
-        signals = (s for name, s in self.inputs.items() if self.joint_of(name) == joint)
+        signals = (s for name, s in self.inputs.items() if self.get_joint(name) == joint)
         return next((signal.column.bare for signal in signals), "")
 
 

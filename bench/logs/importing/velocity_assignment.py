@@ -83,7 +83,7 @@ def assign_velocities(
         if placement is Placement.MODEL_ORDER and joint.name in exchanged:
             column = by_order.get(exchanged[joint.name], own_column)
             placement = Placement.POSITIONS
-        position = signals.position_of(joint.name)
+        position = signals.get_position(joint.name)
         if position is None or position.column.file != column.file:
             result.leave_out(column, f"no position of {joint.name} in the same file shows its unit")
             continue

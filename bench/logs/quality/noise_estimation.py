@@ -61,7 +61,7 @@ def estimate_noise(signals: Iterable[tuple[Array, Array]]) -> NoiseEstimate:
     return NoiseEstimate(max(float(np.nanmin(sigmas)), step / 12**0.5), step)
 
 
-def differences_sigma(signals: Iterable[tuple[Array, Array]], order: int) -> float:
+def estimate_differences_sigma(signals: Iterable[tuple[Array, Array]], order: int) -> float:
     """Estimate white noise (1 sigma) from divided differences (1) of one order, over all runs.
 
     The higher the order, the less a smooth motion contributes.

@@ -22,7 +22,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from bench.core.resource_estimates import FORCE_HINT
-from bench.logs.importing.normalised_positions import may_be_normalised
+from bench.logs.importing.normalised_positions import check_normalised_positions
 from bench.logs.quality import pose_check
 from bench.logs.quality.anomaly import Anomaly
 from bench.logs.quality.floating_base_check import find_missing_base_poses
@@ -68,7 +68,7 @@ def check_recording_plausible(
     """
     # Positions first: their wrong units make stamps look implausible, but not vice versa.
     anomalies = [
-        *odd_logs(recording),
+        *find_log_anomalies(recording),
         *pose_check.check_poses(recording, kind),
         *find_anomalies(recording, kind),
         *find_missing_base_poses(recording, kind),
@@ -83,10 +83,10 @@ def check_recording_plausible(
     return [oddity.text for oddity in anomalies]
 
 
-def odd_logs(recording: Recording) -> Iterator[Anomaly]:
+def find_log_anomalies(recording: Recording) -> Iterator[Anomaly]:
     """Yield the omissions from a recording's logs, and units that they do not state."""
     yield from (Anomaly(note, False) for note in recording.notes)
-    yield from may_be_normalised(recording)
+    yield from check_normalised_positions(recording)
 
 
 def find_anomalies(recording: Recording, kind: type[Simulator]) -> Iterator[Anomaly]:

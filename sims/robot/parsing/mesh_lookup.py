@@ -6,6 +6,7 @@ import os
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
+from sims.core.atomic_files import is_existing_file
 from sims.robot.note_text import format_name_list
 from sims.robot.parsing.xml_files import MAX_ASSET_BYTES, ModelFileReader
 
@@ -45,7 +46,9 @@ class MeshLookup:
         if ending.lower() not in MESH_SUFFIXES:
             return None, f"is of a format that MuJoCo does not read ({ending or 'none'})"
         if name not in self.found:
-            path = next((path for path in self._list_candidate_paths(name) if is_file(path)), None)
+            path = next(
+                (path for path in self._list_candidate_paths(name) if is_existing_file(path)), None
+            )
             if path is None:
                 return None, "is absent"
             self.files.read_content(path, MAX_ASSET_BYTES)
@@ -96,11 +99,3 @@ class MeshLookup:
             f"{format_name_list(names)}"
             for reason, names in self.left.items()
         ]
-
-
-def is_file(path: Path) -> bool:
-    """Return whether the path is an existing file; False for names that the system rejects."""
-    try:
-        return path.is_file()
-    except (OSError, ValueError):
-        return False

@@ -9,8 +9,8 @@ from pathlib import PurePosixPath
 from typing import Any
 from xml.etree.ElementTree import Element
 
+from sims.core.atomic_files import is_existing_file
 from sims.core.value_limits import truncate_text
-from sims.robot.parsing.mesh_lookup import is_file
 from sims.robot.parsing.missing_meshes import OmittedShapes
 from sims.robot.parsing.xml_files import MAX_ASSET_BYTES, ModelFileReader, find_children, parse_tree
 
@@ -156,7 +156,7 @@ def _read_attached_model(files: ModelFileReader, element: Element) -> None:
     """Read an attached model, which MuJoCo opens itself."""
     name = element.get("file") or ""
     path = files.path.parent / name.replace("\\", "/")
-    if not is_file(path):
+    if not is_existing_file(path):
         raise files.make_error(element, f"the attached model {truncate_text(name)} is absent")
     if path.resolve() in files.included:
         raise files.make_error(element, f"{truncate_text(name)} includes itself")
@@ -183,7 +183,7 @@ def _read_asset(files: ModelFileReader, folder: str, name: str, strip: bool) -> 
     """
     file_name = name.replace("\\", "/")
     path = files.path.parent / folder / (PurePosixPath(file_name).name if strip else file_name)
-    if not is_file(path):
+    if not is_existing_file(path):
         return False
     files.read_content(path, MAX_ASSET_BYTES)
     return True

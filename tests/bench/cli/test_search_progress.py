@@ -22,7 +22,7 @@ from bench.cli.search_progress import (
     TERMINAL_INTERVAL,
     ProgressDisplay,
     SearchProgress,
-    clock_text,
+    format_clock,
 )
 from bench.diagnosis.evaluation.search_control import SearchControl
 from tests.bench.diagnosis.explained_samples import recording
@@ -108,7 +108,7 @@ def test_the_estimate_moves_every_two_seconds_without_any_event(clock):
     said = []
     for _ in range(60):
         clock.now += 2.0
-        said.append(clock_text(progress.remaining()))
+        said.append(format_clock(progress.remaining()))
     assert all(one != other for one, other in pairwise(said))
     assert said[4] == "0:50"
 

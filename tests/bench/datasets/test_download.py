@@ -125,7 +125,7 @@ def refused(capsys, *words):
     said = capsys.readouterr()
     assert said.out == ""
     assert len(said.err.splitlines()) == 1, said.err
-    folder = dataset_catalogue.user_folder()
+    folder = dataset_catalogue.get_user_folder()
     assert not folder.exists() or not list(folder.iterdir())
     return said.err
 

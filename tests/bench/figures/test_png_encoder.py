@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from bench.figures.png_encoder import encoded_png
+from bench.figures.png_encoder import encode_png
 from bench.figures.style import make_panel_grid, render_png
 
 
 def test_pixels_and_dots_an_inch_are_kept():
     rgba = np.random.default_rng(0).integers(0, 256, (7, 5, 4), dtype=np.uint8)
-    with Image.open(BytesIO(encoded_png(rgba.tobytes(), 7, 5, 160.0))) as image:
+    with Image.open(BytesIO(encode_png(rgba.tobytes(), 7, 5, 160.0))) as image:
         assert (image.format, image.mode, image.size) == ("PNG", "RGB", (5, 7))
         assert image.info["dpi"] == pytest.approx((160.0, 160.0), abs=0.1)
         np.testing.assert_array_equal(np.asarray(image), rgba[:, :, :3])

@@ -288,11 +288,18 @@ def test_a_calibration_that_cannot_be_is_refused(tmp_path, change, message):
 def test_targets_that_not_all_have_met_are_left_out(folder):
     one = misspecification_scores.load_scores(folder, small()).errors
     lacking = one.drop(one.index[(one["target"] == "in-001") & (one["model"] == "extended")][0])
-    assert set(misspecification_scores._whole(one)["target"]) == {"in-000", "in-001", "in-002"}
-    left = misspecification_scores._whole(lacking)
+    assert set(misspecification_scores._select_complete_targets(one)["target"]) == {
+        "in-000",
+        "in-001",
+        "in-002",
+    }
+    left = misspecification_scores._select_complete_targets(lacking)
     assert set(left["target"]) == {"in-000", "in-002"}
     assert len(left) == 2 * 2 * 2
     # A target with a missing seed counts as incomplete.
     seeds = one.assign(runs=3)
     seeds.loc[seeds.index[0], "runs"] = 2
-    assert set(misspecification_scores._whole(seeds)["target"]) == {"in-001", "in-002"}
+    assert set(misspecification_scores._select_complete_targets(seeds)["target"]) == {
+        "in-001",
+        "in-002",
+    }

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from bench.benchmark.problem.targets import redraws_of
+from bench.benchmark.problem.targets import count_redraws
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.cli.main import main
 from sims.core.simulator import Channel, InputError, Parameter, Simulator
@@ -124,7 +124,7 @@ def test_what_is_not_finite_or_beyond_the_limit_counts_as_diverged(value, monkey
     experiment = spring_experiment(ranges=["in"], targets=30, observe=[], initial={})
     drawn = TuningProblem(experiment, "salt").draw_targets()
     assert max(float(target.truth[0]) for target in drawn) <= 0.5
-    redraws = redraws_of(experiment, drawn)
+    redraws = count_redraws(experiment, drawn)
     assert redraws.redrawn == sum(target.redraws > 0 for target in drawn)
     # Half of all draws fail: 60 draws for 30 targets, with a standard deviation of 8.
     assert 36 <= redraws.draws <= 84

@@ -5,12 +5,12 @@ import pandas as pd
 import pytest
 
 from bench.benchmark.statistics.error_curves import RunCurves
-from bench.benchmark.statistics.median_curves import coinciding
+from bench.benchmark.statistics.median_curves import find_coinciding_curves
 from bench.benchmark.statistics.tuner_ranking import (
-    final_order,
+    compute_min_targets,
+    list_ranking_points,
+    rank_after_budget,
     rank_tuners,
-    ranked_after,
-    targets_needed,
 )
 
 FLOOR = 1e-3
@@ -68,10 +68,10 @@ def test_the_best_is_tested_against_each_other_tuner_and_not_all_pairs():
 
 
 def test_targets_that_are_needed_are_the_first_that_can_decide():
-    assert targets_needed(1) == 6
-    assert targets_needed(9) == 9
+    assert compute_min_targets(1) == 6
+    assert compute_min_targets(9) == 9
     for others in (1, 3, 9):
-        needed = targets_needed(others)
+        needed = compute_min_targets(others)
         for n, verdict in ((needed, "worse"), (needed - 1, "not decided")):
             spread = np.linspace(1.0, 1.5, n)
             errors = {"best": constant(0.01 * spread)}
@@ -88,7 +88,7 @@ def test_a_tuner_whose_runs_all_failed_comes_last_and_is_never_best():
     assert found["verdict"].to_dict() == {"working": "best", "failing": "failed"}
     assert found.loc["failing", "failures"] == n
     assert found.loc["failing", "median"] == np.inf
-    assert final_order(curves, 20, FLOOR) == ["working", "failing"]
+    assert rank_after_budget(curves, 20, FLOOR) == ["working", "failing"]
     both = last(curves_of({"a": good, "b": bad}, failed=("a", "b")))
     assert set(both["verdict"]) == {"failed"}
 
@@ -98,9 +98,9 @@ def test_equal_tuners_stand_in_the_order_in_which_they_got_there():
     late, soon = np.ones((n, budget + 1)), np.ones((n, budget + 1))
     late[:, 15:], soon[:, 2:] = 1e-9, 1e-9
     curves = curves_of({"late": late, "soon": soon})
-    assert final_order(curves, budget, FLOOR) == ["soon", "late"]
+    assert rank_after_budget(curves, budget, FLOOR) == ["soon", "late"]
     ranking = rank_tuners(curves, budget, FLOOR)
-    assert ranked_after(budget) == [1, 3, 10, 20] == sorted(set(ranking["simulations"]))
+    assert list_ranking_points(budget) == [1, 3, 10, 20] == sorted(set(ranking["simulations"]))
     after = ranking.set_index(["simulations", "tuner"])["verdict"]
     assert after[3, "late"] == "worse"
     assert after[20, "late"] == "equal"
@@ -125,10 +125,12 @@ def test_a_covered_curve_is_listed_up_to_where_it_coincides():
     above = pd.Series([1, 0.1, 0.01, 1e-4, 1e-6], index=points)
     flat = pd.Series([1, 1, 1, 0.5, 0.4], index=points)
     drawn = {"tunenet": [below], "search": [flat], "hybrid": [above]}
-    assert coinciding(drawn) == {"tunenet": "same as hybrid up to 2"}
+    assert find_coinciding_curves(drawn) == {"tunenet": "same as hybrid up to 2"}
     # In the second panel, the curves differ after one simulation.
     drawn = {"tunenet": [below, below], "hybrid": [above, above * [1, 1, 2, 1, 1]]}
-    assert coinciding(drawn) == {"tunenet": "same as hybrid up to 1"}
-    assert coinciding({"tunenet": [below], "hybrid": [below]}) == {"tunenet": "same as hybrid"}
+    assert find_coinciding_curves(drawn) == {"tunenet": "same as hybrid up to 1"}
+    assert find_coinciding_curves({"tunenet": [below], "hybrid": [below]}) == {
+        "tunenet": "same as hybrid"
+    }
     # All curves have the same start, so a coincidence there is not reported.
-    assert coinciding({"search": [flat], "other": [flat * [1, 1, 1, 0.1, 0.1]]}) == {}
+    assert find_coinciding_curves({"search": [flat], "other": [flat * [1, 1, 1, 0.1, 0.1]]}) == {}

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from bench.diagnosis.report.explanation_figures import draw_figure, list_figure_names
-from bench.figures.text_layout import break_name, brief, most_lines, text_width
+from bench.figures.text_layout import break_name, count_max_lines, measure_text_width, shorten_name
 from tests.bench.diagnosis.robot_report_data import cause, robot_story
 from tests.bench.diagnosis.sample_report_data import evil, story
 from tests.bench.figures.figure_readability import unreadable
@@ -55,18 +55,18 @@ def test_names_are_broken_behind_underscores_and_units_are_not():
     assert break_name("x" * 25, 10) == "\n".join(["x" * 10, "x" * 10, "x" * 5])
     assert break_name("elbow", 10) == "elbow"
     assert break_name("dry friction: 0.31 N", 16) == "dry friction:\n0.31 N"
-    assert most_lines(["elbow", "left_\narm"]) == 2
+    assert count_max_lines(["elbow", "left_\narm"]) == 2
 
 
 def test_a_long_quantity_of_a_joint_is_called_by_its_kind():
-    assert brief("velocity of left_arm_elbow_flex_joint", 26) == "velocity"
-    assert brief("u.left_arm_elbow_flex_joint_motor", 26) == "u"
-    assert brief("velocity of elbow", 26) == "velocity of elbow"
+    assert shorten_name("velocity of left_arm_elbow_flex_joint", 26) == "velocity"
+    assert shorten_name("u.left_arm_elbow_flex_joint_motor", 26) == "u"
+    assert shorten_name("velocity of elbow", 26) == "velocity of elbow"
 
 
 def test_the_width_of_a_text_is_that_of_its_longest_line():
-    one = text_width(["elbow"], 9)
-    assert text_width(["elbow\nel", "bow"], 9) == one
-    assert text_width(["elbow"], 18) == pytest.approx(2 * one)
-    assert text_width(["elbow"], 9, "bold") > one
-    assert text_width([], 9) == 0.0
+    one = measure_text_width(["elbow"], 9)
+    assert measure_text_width(["elbow\nel", "bow"], 9) == one
+    assert measure_text_width(["elbow"], 18) == pytest.approx(2 * one)
+    assert measure_text_width(["elbow"], 9, "bold") > one
+    assert measure_text_width([], 9) == 0.0
