@@ -43,7 +43,7 @@ from sims.robot.dynamics.applied_inputs import (
     STEP_COUNT_TOLERANCE,
     compute_inputs_over_steps,
 )
-from sims.robot.dynamics.batch_cache import RefusedModelError, bench_cache
+from sims.robot.dynamics.batch_cache import RefusedModelError, get_batch_cache
 from sims.robot.dynamics.batch_work import (
     BatchInputs,
     BatchResult,
@@ -483,7 +483,9 @@ class RobotSimulator(SystemSimulator):
         assert isinstance(engine, RobotEngine)
         settings = dict(engine.numerics.to_model_options())
         settings["timestep"] *= 0.5
-        return bench_cache(self.robot).bench(added, True, LINEARISATION_BATCH_SIZE, settings)
+        return get_batch_cache(self.robot).get_batch(
+            added, True, LINEARISATION_BATCH_SIZE, settings
+        )
 
     def step_batch(
         self, batch: RobotRunBatch, inputs: BatchInputs, extra_fields: Sequence[str] = ()
@@ -531,47 +533,53 @@ class RobotSimulator(SystemSimulator):
         n = len(start.x)
         # A single simulation uses a small batch, so that constants need not be derived for a whole
         # one.
-        bench = self._get_batch(derived, 1 if n == 1 else BATCH_SIZE, added)
-        places, second = bench.places, bench.second
-        bench.write_effects(
-            pad_coefficients(select_model_field_effects(start.acting), n, bench.count)
+        mujoco_batch = self._get_batch(derived, 1 if n == 1 else BATCH_SIZE, added)
+        places, second = mujoco_batch.places, mujoco_batch.second
+        mujoco_batch.write_effects(
+            pad_coefficients(select_model_field_effects(start.acting), n, mujoco_batch.count)
         )
-        initial_second = bench.set_initial_state(start.x, start.v, start.floating_state)
-        bench.activate(inputs.activations)
+        initial_second = mujoco_batch.set_initial_state(start.x, start.v, start.floating_state)
+        mujoco_batch.activate(inputs.activations)
         record = ["qpos", "qvel", *extra_fields]
         if self._reads_sensors():
             record.append("sensordata")
         record = list(dict.fromkeys(record))
         if is_stepwise:
-            stiffness = bench.get_servo_stiffness(places)[:n]
+            stiffness = mujoco_batch.get_servo_stiffness(places)[:n]
             effect_forces = EffectForces(
                 self.robotic, start.acting, inputs.applied_inputs, places, stiffness, self.time_step
             )
-            forces = bench.map_forces(inputs.forces)
+            forces = mujoco_batch.map_forces(inputs.forces)
             compiled = recorded_fields = None
             if inputs.off.any():
                 # Compiled effects assume a constant servo stiffness over all steps.
-                effect_forces.working = working_servos(bench.robot, places.velocities, inputs.off)
+                effect_forces.working = working_servos(
+                    mujoco_batch.robot, places.velocities, inputs.off
+                )
             else:
                 compiled = compile_forces(effect_forces)
             if compiled is not None:
-                recorded_fields = step_in_callback(bench, inputs.controls, forces, compiled, record)
+                recorded_fields = step_in_callback(
+                    mujoco_batch, inputs.controls, forces, compiled, record
+                )
             if recorded_fields is None:
-                recorded_fields = bench.step_with_forces(
+                recorded_fields = mujoco_batch.step_with_forces(
                     inputs.controls, forces, compiled or effect_forces, record, inputs.off
                 )
         else:
-            forces = bench.map_forces(inputs.forces)
-            recorded_fields = bench.step(inputs.controls, forces, record, inputs.off)
+            forces = mujoco_batch.map_forces(inputs.forces)
+            recorded_fields = mujoco_batch.step(inputs.controls, forces, record, inputs.off)
         x = np.concatenate(
             [start.x[:, None], recorded_fields["qpos"][:, :, places.positions]], axis=1
         )
         v = np.concatenate(
             [start.v[:, None], recorded_fields["qvel"][:, :, places.velocities]], axis=1
         )
-        x[bench.failed] = np.nan
+        x[mujoco_batch.failed] = np.nan
         if self._records_drive_forces:
-            sensor_model = DriveSensorModel(self.robot, self.robotic, bench, inputs, self.time_step)
+            sensor_model = DriveSensorModel(
+                self.robot, self.robotic, mujoco_batch, inputs, self.time_step
+            )
             sensor_model.shift_to_step_begin(recorded_fields["sensordata"])
             sensor_model.add_drive_effects(recorded_fields["sensordata"], x, v, start.acting)
         later_second = (
@@ -587,7 +595,7 @@ class RobotSimulator(SystemSimulator):
             v,
             recorded_fields,
             inputs.activations,
-            bench.failed,
+            mujoco_batch.failed,
             (second_states[0], second_states[1]),
         )
 
@@ -596,7 +604,7 @@ class RobotSimulator(SystemSimulator):
         engine = self.engine
         assert isinstance(engine, RobotEngine)
         settings = engine.numerics.to_model_options()
-        return bench_cache(self.robot).bench(added, derived, count, settings)
+        return get_batch_cache(self.robot).get_batch(added, derived, count, settings)
 
     def _compute_observations(
         self, result_of_batch: BatchResult, batch: RobotRunBatch, times: Array, steps: int

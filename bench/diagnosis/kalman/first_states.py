@@ -126,10 +126,10 @@ class _CubatureFilter:
         steps = simulator.count_steps(times) + 1
         self._given = simulator.compute_controls(work, steps)
         self._knots = np.rint(times / simulator.time_step).astype(np.intp)
-        self._bench = simulator.make_linearisation_batch(acting)
+        self._mujoco_batch = simulator.make_linearisation_batch(acting)
         written = slice_active_effects(select_model_field_effects(acting), np.zeros(1, np.intp))
         self._acting = tuple(
-            (effect, np.repeat(c, self._bench.count, axis=1)) for effect, c in written
+            (effect, np.repeat(c, self._mujoco_batch.count, axis=1)) for effect, c in written
         )
         states = [*simulator.system.coordinates, *simulator.system.rates]
         self._columns = [i for i, name in enumerate(evaluator.channels) if name in states]
@@ -150,7 +150,7 @@ class _CubatureFilter:
         log_likelihood = 0.0
         intervals: list[tuple[Array, ...]] = []
         with np.errstate(all="ignore"), capture_mujoco_warnings():
-            self._bench.write_effects(self._acting)
+            self._mujoco_batch.write_effects(self._acting)
             for i, (begin, end) in enumerate(zip(self._knots, self._knots[1:], strict=False)):
                 gained, mean, covariance = self._update(i, mean, covariance)
                 log_likelihood += gained
@@ -196,22 +196,22 @@ class _CubatureFilter:
         Returns:
             (n, 2 D) states at the end.
         """
-        joints, bench = forces.shape[1], self._bench
+        joints, mujoco_batch = forces.shape[1], self._mujoco_batch
         result = states.copy()
         if end == begin:
             return result
-        places, dofs = bench.places.positions, bench.places.velocities
+        places, dofs = mujoco_batch.places.positions, mujoco_batch.places.velocities
         for first in range(0, len(states), LINEARISATION_BATCH_SIZE):
             part = slice(first, first + LINEARISATION_BATCH_SIZE)
             own = states[part]
             n = len(own)
             afloat = FloatingState(np.zeros((n, 0)), np.zeros((n, 0)))
-            bench.set_initial_state(own[:, :joints], own[:, joints:], afloat)
+            mujoco_batch.set_initial_state(own[:, :joints], own[:, joints:], afloat)
             pushed = np.repeat(self._given.forces[:, begin:end], n, axis=0)
             pushed[:, :, dofs] += forces[part, None]
             controls = np.repeat(self._given.controls[:, begin:end], n, axis=0)
-            done = bench.step(controls, pushed, ["qpos", "qvel"])
+            done = mujoco_batch.step(controls, pushed, ["qpos", "qvel"])
             result[part, :joints] = done["qpos"][:, -1, places]
             result[part, joints:] = done["qvel"][:, -1, dofs]
-            result[part][bench.failed] = np.nan
+            result[part][mujoco_batch.failed] = np.nan
         return result

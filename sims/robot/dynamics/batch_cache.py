@@ -33,17 +33,17 @@ class _Variant:
     """A robot with added elements, and its batches by options, kind and size."""
 
     robot: RobotModel
-    benches: dict[tuple[object, ...], MujocoBatch] = field(default_factory=dict)
+    batches: dict[tuple[object, ...], MujocoBatch] = field(default_factory=dict)
 
     @property
     def nbytes(self) -> int:
         """Memory of the models and of the batch elements' own fields, in bytes."""
         # The compiled model of the robot counts twice, since its spec takes about as much memory.
         size = 2 * int(self.robot.compiled.nbuffer)
-        return size + sum(bench.nbytes for bench in self.benches.values())
+        return size + sum(mujoco_batch.nbytes for mujoco_batch in self.batches.values())
 
 
-class BenchCache:
+class BatchCache:
     """Cache of batches by the added elements, the options of the model, and the batch size.
 
     Args:
@@ -63,12 +63,12 @@ class BenchCache:
         self._refused: dict[AddedElements, str] = {}
 
     @property
-    def benches(self) -> list[MujocoBatch]:
+    def batches(self) -> list[MujocoBatch]:
         """All cached batches."""
         variants = [self._own, *self._extended.values()]
-        return [bench for variant in variants for bench in variant.benches.values()]
+        return [mujoco_batch for variant in variants for mujoco_batch in variant.batches.values()]
 
-    def bench(
+    def get_batch(
         self, added: AddedElements, derived: bool, count: int, settings: Mapping[str, float]
     ) -> MujocoBatch:
         """Return a batch from the cache, or create it.
@@ -90,10 +90,10 @@ class BenchCache:
         key = (derived, count, *settings.values())
         try:
             variant = self._get_variant(added)
-            if key not in variant.benches:
-                variant.benches[key] = MujocoBatch(variant.robot, derived, settings, count)
+            if key not in variant.batches:
+                variant.batches[key] = MujocoBatch(variant.robot, derived, settings, count)
                 self._drop_least_recent()
-            return variant.benches[key]
+            return variant.batches[key]
         except ValueError as error:
             if not added:
                 raise
@@ -126,6 +126,6 @@ class BenchCache:
 
 
 @cache_per_robot
-def bench_cache(robot: RobotModel) -> BenchCache:
+def get_batch_cache(robot: RobotModel) -> BatchCache:
     """Return the batch cache of a robot, which is stored with the robot."""
-    return BenchCache(robot)
+    return BatchCache(robot)

@@ -43,7 +43,11 @@ _PROBE = """
 
 
 def step_in_callback(
-    bench: MujocoBatch, controls: Array, forces: Array, compiled: CompiledForces, record: list[str]
+    mujoco_batch: MujocoBatch,
+    controls: Array,
+    forces: Array,
+    compiled: CompiledForces,
+    record: list[str],
 ) -> dict[str, Array] | None:
     """Step n batch elements S times, with effect forces computed in MuJoCo's callback.
 
@@ -51,7 +55,7 @@ def step_in_callback(
     step and is used if this function returns None.
 
     Args:
-        bench: the batch, with initial states and effects in its model.
+        mujoco_batch: the batch, with initial states and effects in its model.
         controls: (n, S, nu) controls.
         forces: (n, S, nv) generalised forces.
         compiled: compiled forces of effects.
@@ -63,33 +67,36 @@ def step_in_callback(
     import mujoco
 
     disable = mujoco.mjtDisableBit
-    lacking = int(disable.mjDSBL_ACTUATION) | int(disable.mjDSBL_FRICTIONLOSS)
+    required_parts = int(disable.mjDSBL_ACTUATION) | int(disable.mjDSBL_FRICTIONLOSS)
     # Loads of transmissions require evaluations within a step.
-    if compiled.loaded.any() or bench.model.opt.disableflags & lacking:
+    if compiled.loaded.any() or mujoco_batch.model.opt.disableflags & required_parts:
         return None
     callback = _get_callback()
     if callback is None or mujoco.get_mjcb_control() is not None:
         return None
     n, steps, _ = controls.shape
-    own_losses = bench.begin_dry_friction(compiled, n)
-    rubs = compiled.has_dry_friction
-    if rubs.any():
-        loss = bench.fields["dof_frictionloss"]
-        lanes, joints = np.nonzero(rubs)
+    own_losses = mujoco_batch.begin_dry_friction(compiled, n)
+    has_friction = compiled.has_dry_friction
+    if has_friction.any():
+        loss = mujoco_batch.fields["dof_frictionloss"]
+        lanes, joints = np.nonzero(has_friction)
         dofs = compiled.addresses.velocities[joints]
         loss[lanes, dofs] = np.maximum(loss[lanes, dofs], MIN_FRICTION)
-    bench.batch.bind("ctrl")[:n] = controls[:, 0]
+    mujoco_batch.batch.bind("ctrl")[:n] = controls[:, 0]
     predictor = MidpointPredictor(
-        bench.batch, compiled.addresses.positions, compiled.addresses.velocities, compiled.loaded
+        mujoco_batch.batch,
+        compiled.addresses.positions,
+        compiled.addresses.velocities,
+        compiled.loaded,
     )
-    bench.batch.forward(None if n == bench.count else np.arange(n))
+    mujoco_batch.batch.forward(None if n == mujoco_batch.count else np.arange(n))
     compiled.begin(predictor.read_joint_states(np.zeros(n, dtype=bool)))
-    contexts = _Contexts(bench, compiled, own_losses, steps)
-    user = bench.batch.bind("userdata")
+    contexts = _Contexts(mujoco_batch, compiled, own_losses, steps)
+    user = mujoco_batch.batch.bind("userdata")
     user[:n, 0] = contexts.addresses
     mujoco.set_mjcb_control(callback)
     try:
-        return bench.step(controls, forces, record, before_call=contexts.renew)
+        return mujoco_batch.step(controls, forces, record, before_call=contexts.renew)
     finally:
         mujoco.set_mjcb_control(None)
         user[:] = 0.0
@@ -99,14 +106,14 @@ class _Contexts:
     """Contexts of the callback for all batch elements, and the arrays that they refer to.
 
     Args:
-        bench: the batch.
+        mujoco_batch: the batch.
         compiled: compiled forces of effects, begun.
         losses: (n, D) dry friction of the model without effects.
         steps: number of steps S.
     """
 
     def __init__(
-        self, bench: MujocoBatch, compiled: CompiledForces, losses: Array, steps: int
+        self, mujoco_batch: MujocoBatch, compiled: CompiledForces, losses: Array, steps: int
     ) -> None:
         """Write one context per batch element: addresses and sizes for the compiled callback.
 
@@ -128,13 +135,13 @@ class _Contexts:
         shared["step"] = np.array([compiled.step])
         self._arrays = list(shared.values())
         self._registers: list[Array] = []
-        self._a = slice(program.a, program.a + joints)
-        self._accelerations: Array = bench.batch.bind("qacc")
+        self._acceleration_registers = slice(program.a, program.a + joints)
+        self._accelerations: Array = mujoco_batch.batch.bind("qacc")
         self._dofs = places.velocities
         common = layout | {name: values.ctypes.data for name, values in shared.items()}
-        rubs = bool(compiled.has_dry_friction.any())
+        has_friction = bool(compiled.has_dry_friction.any())
         inputs = compiled.input_values
-        loss = bench.fields["dof_frictionloss"]
+        loss = mujoco_batch.fields["dof_frictionloss"]
         table = []
         for lane in range(len(losses)):
             registers = np.ascontiguousarray(compiled.registers[:, lane : lane + 1])
@@ -153,11 +160,13 @@ class _Contexts:
                 code_rows=len(program.code),
                 register_count=len(registers),
                 joints=joints,
-                friction_rows=int((loss[lane] > 0).sum()) if rubs else 0,
+                friction_rows=int((loss[lane] > 0).sum()) if has_friction else 0,
                 states=program.next_states.size,
                 inputs=inputs.shape[1],
                 steps=steps,
-                evaluations_per_step=4 if bench.model.opt.integrator == RK4_INTEGRATOR_ID else 1,
+                evaluations_per_step=4
+                if mujoco_batch.model.opt.integrator == RK4_INTEGRATOR_ID
+                else 1,
                 evaluation=0,
                 has_acceleration=0,
             )
@@ -175,7 +184,9 @@ class _Contexts:
         """
         self._words[:, HAS_ACCELERATION] = 0
         for lane, registers in enumerate(self._registers):
-            registers[self._a] = self._accelerations[lane, self._dofs, None] if first else 0.0
+            registers[self._acceleration_registers] = (
+                self._accelerations[lane, self._dofs, None] if first else 0.0
+            )
 
 
 @cache

@@ -47,24 +47,24 @@ class DriveSensorModel:
 
         The readings are changed in place.
         """
-        given, bench = self.given, self.batch
+        given, mujoco_batch = self.given, self.batch
         n = len(readings)
         for actuator in self.robot.actuators:
             apart = given.instant[:, :, actuator.control] - given.controls[:, :, actuator.control]
             apart = np.where(given.off[:, :, actuator.id], 0.0, apart)
-            if actuator.joint not in bench.drives or not apart.any():
+            if actuator.joint not in mujoco_batch.drives or not apart.any():
                 continue
-            column = readings[:, :, bench.drives[actuator.joint]]
+            column = readings[:, :, mujoco_batch.drives[actuator.joint]]
             before = column.copy()
             column += apart * self._by_control(actuator)[:n, None]
             np.clip(column, *self._get_force_limits(actuator), out=column)
-            if actuator.joint in bench.robot.coupled:
+            if actuator.joint in mujoco_batch.robot.coupled:
                 first = find_preceding_joint(self.robot, actuator.joint)
                 assert first is not None
-                arms: Array = bench.fields[COUPLING_FIELD][
-                    :n, get_coupling_address(bench.robot, actuator.joint)
+                arms: Array = mujoco_batch.fields[COUPLING_FIELD][
+                    :n, get_coupling_address(mujoco_batch.robot, actuator.joint)
                 ]
-                readings[:, :, bench.drives[first.name]] += arms[:, None] * (column - before)
+                readings[:, :, mujoco_batch.drives[first.name]] += arms[:, None] * (column - before)
 
     def add_drive_effects(self, readings: Array, x: Array, v: Array, acting: ActiveEffects) -> None:
         """Add the forces of effects in the drives, such as a dead zone or a voltage drop.
@@ -81,8 +81,8 @@ class DriveSensorModel:
         lanes = np.flatnonzero(find_active_elements(acting, len(x), is_in_drive))
         if not lanes.size:
             return
-        bench, given, steps = self.batch, self.given, readings.shape[1]
-        columns = [bench.drives[name.removeprefix("q.")] for name in self.system.coordinates]
+        mujoco_batch, given, steps = self.batch, self.given, readings.shape[1]
+        columns = [mujoco_batch.drives[name.removeprefix("q.")] for name in self.system.coordinates]
         shown = readings[lanes][:, :, columns]
 
         def flat(values: Array) -> Array:
@@ -97,9 +97,13 @@ class DriveSensorModel:
         t = np.tile(self.step * np.arange(float(steps)), lanes.size)[:, None]
         drive = shown.reshape(lanes.size * steps, -1)
         carried = np.stack([drive, np.zeros_like(drive)])
-        stiffness = np.repeat(bench.get_servo_stiffness(bench.places)[lanes], steps, axis=0)
+        stiffness = np.repeat(
+            mujoco_batch.get_servo_stiffness(mujoco_batch.places)[lanes], steps, axis=0
+        )
         if given.off.any():
-            on = working_servos(bench.robot, bench.places.velocities, given.off[lanes, :steps])
+            on = working_servos(
+                mujoco_batch.robot, mujoco_batch.places.velocities, given.off[lanes, :steps]
+            )
             stiffness = stiffness * on.reshape(stiffness.shape)
         moment = make_snapshot(self.system, t, flat(x), flat(v), inputs, carried, stiffness)
         own = slice_active_effects(tuple((e, c) for e, c in acting if is_in_drive(e)), lanes)

@@ -78,7 +78,7 @@ class LinearisationPoints:
     """Linearisation points of one motion.
 
     Args:
-        bench: batch of the robot; its size is the number of points evaluated together.
+        mujoco_batch: batch of the robot; its size is the number of points evaluated together.
         system: system of the robot.
         motion: the motion.
         acting: effects active in it, with coefficients (K, 1, 1).
@@ -100,7 +100,7 @@ class LinearisationPoints:
 
     def __init__(
         self,
-        bench: MujocoBatch,
+        mujoco_batch: MujocoBatch,
         system: RobotSystem,
         motion: RobotMotion,
         acting: ActiveEffects,
@@ -115,35 +115,35 @@ class LinearisationPoints:
         needs them.
         """
         self.motion, self.acting = motion, acting
-        self._bench, self._system = bench, system
+        self._mujoco_batch, self._system = mujoco_batch, system
         self._outputs = tuple(outputs)
         self._places = places
         self._drives = np.array(tuple(drives) or (-1,) * len(self._outputs), dtype=np.intp)
         self._exerted = np.zeros((0, 0))
-        self._floating = bench.floating
+        self._floating = mujoco_batch.floating
         self._dofs = np.append(places.velocities, self._floating.velocities)
         self.every = max(round(held / motion.step), 1)
         self.numbers, self.of = _looked_at(motion, self.every)
         # Fields must be bound before MuJoCo's first call, since later ones are not updated before
         # the next call.
-        self._bind_fields(bench)
+        self._bind_fields(mujoco_batch)
         self.seen = 0
         self._asked = [(e, c) for e, c in acting if is_evaluated_per_step(e)]
-        bench.write_effects(_repeat_coefficients(acting, bench.count))
-        self._stiffness = bench.get_servo_stiffness(places)[:1]
-        self._working = working_servos(bench.robot, places.velocities, motion.off)
+        mujoco_batch.write_effects(_repeat_coefficients(acting, mujoco_batch.count))
+        self._stiffness = mujoco_batch.get_servo_stiffness(places)[:1]
+        self._working = working_servos(mujoco_batch.robot, places.velocities, motion.off)
         self._states = [self.integrate_hidden_state(effect, c) for effect, c in self._asked]
         self.remembering = [
             k for k, (e, _) in enumerate(self._asked) if isinstance(e, HiddenStateEffect)
         ]
         self._after: dict[int, HiddenState] = {}
-        bench.batch.reset(stage=0)
-        self._fresh = bench.batch.state.copy()
+        mujoco_batch.batch.reset(stage=0)
+        self._fresh = mujoco_batch.batch.state.copy()
 
-    def _bind_fields(self, bench: MujocoBatch) -> None:
+    def _bind_fields(self, mujoco_batch: MujocoBatch) -> None:
         """Bind the fields of MuJoCo's data that are read, before MuJoCo's first call."""
         for name in ("qacc", *TRANSMISSION_FORCE_FIELDS, *dict(self._outputs)):
-            bench.batch.bind(name)
+            mujoco_batch.batch.bind(name)
 
     @property
     def reads_drives(self) -> bool:
@@ -167,11 +167,11 @@ class LinearisationPoints:
             steps: number of steps, for a batch with shorter ones.
         """
         states, readings = [], []
-        bind, places, floating = self._bench.batch.bind, self._places, self._floating
+        bind, places, floating = self._mujoco_batch.batch.bind, self._places, self._floating
         begin = 0
         for n, ids in self._place_points(moved, acting):
             for _ in range(steps):
-                self._bench.batch.step(ids)
+                self._mujoco_batch.batch.step(ids)
             parts = [bind("qpos")[:n, places.positions], bind("qvel")[:n, places.velocities]]
             if self.motion.act.shape[1]:
                 parts.append(bind("act")[:n])
@@ -200,14 +200,14 @@ class LinearisationPoints:
             more: (N, E) additional forces; none by default.
         """
         accelerations, readings = [], []
-        applied = self._bench.batch.bind("qfrc_applied")
+        applied = self._mujoco_batch.batch.bind("qfrc_applied")
         dofs, begin = self._dofs, 0
         for n, ids in self._place_points({}, acting):
             if more is not None:
                 applied[:n, dofs] += more[begin : begin + n]
                 begin += n
-            self._bench.batch.forward(ids)
-            accelerations.append(self._bench.batch.bind("qacc")[:n, dofs].copy())
+            self._mujoco_batch.batch.forward(ids)
+            accelerations.append(self._mujoco_batch.batch.bind("qacc")[:n, dofs].copy())
             readings.append(self._read_outputs(n))
         return np.concatenate(accelerations), np.concatenate(readings)
 
@@ -216,7 +216,7 @@ class LinearisationPoints:
 
         To readings of drive forces, the forces that effects exert in the drive are added.
         """
-        bind = self._bench.batch.bind
+        bind = self._mujoco_batch.batch.bind
         rows = [bind(name)[:n, column, None] for name, column in self._outputs]
         if not rows:
             return np.zeros((n, 0))
@@ -241,10 +241,10 @@ class LinearisationPoints:
             Number n of elements in use, and their indices (None if all are in use).
         """
         motion, places, floating = self.motion, self._places, self._floating
-        count = self._bench.count
+        count = self._mujoco_batch.count
         self.seen += self.numbers.size
-        self._bench.write_effects(_repeat_coefficients(acting, count))
-        batch = self._bench.batch
+        self._mujoco_batch.write_effects(_repeat_coefficients(acting, count))
+        batch = self._mujoco_batch.batch
         bind = batch.bind
         qpos, qvel, ctrl = bind("qpos"), bind("qvel"), bind("ctrl")
         applied = bind("qfrc_applied")
@@ -259,7 +259,7 @@ class LinearisationPoints:
         }
         ranges: ForceRanges | None = None
         if motion.off[self.numbers].any():
-            ranges = self._bench.force_ranges()
+            ranges = self._mujoco_batch.force_ranges()
         for begin in range(0, self.numbers.size, count):
             at = self.numbers[begin : begin + count]
             n = at.size
@@ -293,7 +293,7 @@ class LinearisationPoints:
         """
         if not self._asked:
             return
-        bind, places = self._bench.batch.bind, self._places
+        bind, places = self._mujoco_batch.batch.bind, self._places
         motion = self.motion
         x = bind("qpos")[:n, places.positions]
         v = bind("qvel")[:n, places.velocities]
@@ -302,7 +302,9 @@ class LinearisationPoints:
         carried = motion.carried[:, at]
         if any(effect.of in LOAD_DEPENDENT_EFFECTS for effect, _ in self._asked):
             # As in the simulation, a servo's force must follow the perturbed state.
-            self._bench.batch.forward(None if n == self._bench.count else np.arange(n))
+            self._mujoco_batch.batch.forward(
+                None if n == self._mujoco_batch.count else np.arange(n)
+            )
             carried = np.stack(
                 [bind(name)[:n, places.velocities] for name in TRANSMISSION_FORCE_FIELDS]
             )
@@ -328,7 +330,9 @@ class LinearisationPoints:
                 if is_in_drive(effect):
                     self._exerted += force
         for joint, limit in limits.items():
-            self._bench.set_dry_friction(n, int(places.velocities[joint]), np.maximum(limit, 0.0))
+            self._mujoco_batch.set_dry_friction(
+                n, int(places.velocities[joint]), np.maximum(limit, 0.0)
+            )
 
     def get_servo_stiffness(self, at: Places) -> Array:
         """Return the stiffness (n, D) of the position servos, in some steps."""
@@ -336,20 +340,20 @@ class LinearisationPoints:
         return stiffness
 
     @contextmanager
-    def with_batch(self, bench: MujocoBatch) -> Iterator[None]:
+    def with_batch(self, mujoco_batch: MujocoBatch) -> Iterator[None]:
         """Use another batch of the robot within a `with` block, such as one with other masses.
 
         Its coordinates must be the same as those of the own batch.
         """
-        own = self._bench, self._fresh
-        if bench is not self._bench:
-            self._bind_fields(bench)
-            bench.batch.reset(stage=0)
-            self._bench, self._fresh = bench, bench.batch.state.copy()
+        own = self._mujoco_batch, self._fresh
+        if mujoco_batch is not self._mujoco_batch:
+            self._bind_fields(mujoco_batch)
+            mujoco_batch.batch.reset(stage=0)
+            self._mujoco_batch, self._fresh = mujoco_batch, mujoco_batch.batch.state.copy()
         try:
             yield
         finally:
-            self._bench, self._fresh = own
+            self._mujoco_batch, self._fresh = own
 
     @contextmanager
     def every_step(self) -> Iterator[None]:
@@ -369,9 +373,9 @@ class LinearisationPoints:
         valid.
         """
         own = self._outputs, self._drives
-        self._outputs = self._bench.force_limits.outputs
+        self._outputs = self._mujoco_batch.force_limits.outputs
         self._drives = np.full(len(self._outputs), -1)
-        self._bind_fields(self._bench)
+        self._bind_fields(self._mujoco_batch)
         try:
             yield
         finally:
@@ -384,8 +388,10 @@ class LinearisationPoints:
         """
         import mujoco
 
-        self._bench.write_effects(_repeat_coefficients(self.acting, self._bench.count))
-        model = self._bench.batch.get_model(0)
+        self._mujoco_batch.write_effects(
+            _repeat_coefficients(self.acting, self._mujoco_batch.count)
+        )
+        model = self._mujoco_batch.batch.get_model(0)
         data = mujoco.MjData(model)
         places = self._places
         whole = np.zeros((model.nv, model.nv))
@@ -464,7 +470,7 @@ class LinearisationPoints:
         So f changes its sign about 1 / b before v does: 9.5 ms with MuJoCo's defaults, and up to a
         step in the stiff form.
         """
-        motion, robot = self.motion, self._bench.robot
+        motion, robot = self.motion, self._mujoco_batch.robot
         dof, steps = int(self._places.velocities[joint]), len(motion.controls)
         a = np.diff(motion.v[:, joint])[:steps] / motion.step
         b, d = friction_damping(robot, dof)

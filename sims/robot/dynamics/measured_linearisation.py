@@ -217,12 +217,16 @@ class MeasuredLinear(RunLinearisation):
         if not any((e.of or e.name) in LOAD_DEPENDENT_EFFECTS for e in effects):
             return motion
         simulator = self._simulator
-        bench = simulator.make_linearisation_batch(self._work.acting)
+        mujoco_batch = simulator.make_linearisation_batch(self._work.acting)
         outputs = [
-            (name, int(c)) for name in TRANSMISSION_FORCE_FIELDS for c in bench.whole.velocities
+            (name, int(c))
+            for name in TRANSMISSION_FORCE_FIELDS
+            for c in mujoco_batch.whole.velocities
         ]
         acting = self._work.acting
-        at = LinearisationPoints(bench, simulator.robotic, motion, acting, outputs, bench.whole)
+        at = LinearisationPoints(
+            mujoco_batch, simulator.robotic, motion, acting, outputs, mujoco_batch.whole
+        )
         _, loads = at.compute_accelerations(acting)
         size = motion.x.shape[1]
         carried = np.stack([loads[at.of, :size], loads[at.of, size:]])
@@ -275,14 +279,14 @@ class MeasuredLinear(RunLinearisation):
 
     def _compute_limit_jumps(self) -> Array:
         """Return the standard deviations (T - 1, Z) of jumps at force limits of stiff servos."""
-        bench = self._simulator.make_linearisation_batch(self._work.acting)
-        limits = bench.force_limits
+        mujoco_batch = self._simulator.make_linearisation_batch(self._work.acting)
+        limits = mujoco_batch.force_limits
         result = np.zeros((self.knots.size - 1, self._tangent.state_size))
         if not limits.outputs:
             return result
         with np.errstate(all="ignore"), capture_mujoco_warnings():
             reached = np.abs(self._tangent.limited_forces) >= limits.sizes
-        own = limits.jumps[:, bench.places.velocities]
+        own = limits.jumps[:, mujoco_batch.places.velocities]
         for steps, active in self._list_active_intervals():
             result[active, : own.shape[1]] += reached[steps] @ own
         # A position servo returns from a jump of position within the interval or later.

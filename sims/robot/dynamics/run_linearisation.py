@@ -158,17 +158,17 @@ class RunLinearisation:
         """
         simulator = self._simulator
         outputs = [("sensordata", simulator.get_sensor_address(name)) for name in self._names]
-        bench = simulator.make_linearisation_batch(self._work.acting)
+        mujoco_batch = simulator.make_linearisation_batch(self._work.acting)
         sizes = compute_joint_scales(simulator.robot).force
         # A joint in series transmits the force of its joint.
-        second = [self._find_series_joint(name) for name in bench.robot.series]
+        second = [self._find_series_joint(name) for name in mujoco_batch.robot.series]
         at = LinearisationPoints(
-            bench,
+            mujoco_batch,
             simulator.robotic,
             self._motion,
             self._work.acting,
             outputs,
-            bench.whole,
+            mujoco_batch.whole,
             [self._driven_joint(name) for name in self._names],
             self.held,
         )
@@ -279,8 +279,8 @@ class RunLinearisation:
         if key not in self._known:
             acting = (*self._work.acting, (effect, c))
             with capture_mujoco_warnings():
-                bench = self._simulator.make_linearisation_batch(acting)
-                self._known[key] = self._tangent.perturb_model_numbers(0, acting, 1.0, bench)
+                mujoco_batch = self._simulator.make_linearisation_batch(acting)
+                self._known[key] = self._tangent.perturb_model_numbers(0, acting, 1.0, mujoco_batch)
         return [self._known[key]._replace(owner=owner)]
 
     def _is_centred_spring(self, name: str, joint: int | None) -> bool:

@@ -178,7 +178,7 @@ class TangentModel:
     # -- changes
 
     def perturb_model_numbers(
-        self, owner: int, acting: ActiveEffects, change: float, bench: MujocoBatch
+        self, owner: int, acting: ActiveEffects, change: float, mujoco_batch: MujocoBatch
     ) -> Perturbation:
         """Return the change of motion by other model parameters, per unit of `change`.
 
@@ -188,10 +188,10 @@ class TangentModel:
             owner: number of the effect candidate.
             acting: active effects including the one that changes the parameters.
             change: size of the change.
-            bench: batch whose model has the required elements.
+            mujoco_batch: batch whose model has the required elements.
         """
         meant = self._mean_acceleration_forces
-        with self._at.with_batch(bench):
+        with self._at.with_batch(mujoco_batch):
             accelerations, readings = self._at.compute_accelerations(acting, meant)
             # External forces change readings of drives immediately, so the other readings are
             # computed without these forces.

@@ -8,7 +8,7 @@ import pytest
 
 from bench.core.plugin_registries import make_robot_simulator
 from sims.core.simulator import Scenario
-from sims.robot.dynamics.batch_cache import bench_cache
+from sims.robot.dynamics.batch_cache import get_batch_cache
 from sims.robot.parsing.contact_exclusion import can_collide
 
 MODEL = """<mujoco>{option}<worldbody>{floor}
@@ -64,8 +64,8 @@ def test_only_contacts_that_cannot_be_are_not_looked_for(tmp_path):
         path.write_text(ARM.format(floor=shape))
         simulator = make_robot_simulator(path)(observe=["q.shoulder"])
         found[name] = simulator.simulate(np.zeros((1, len(simulator.parameters))), scenario)
-        (bench,) = bench_cache(simulator.robot).benches
-        off = bool(bench.model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT)
+        (mujoco_batch,) = get_batch_cache(simulator.robot).batches
+        off = bool(mujoco_batch.model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT)
         assert off == (name == "none")
     np.testing.assert_array_equal(found["none"], found["far"])
     assert np.abs(found["near"] - found["far"]).max() > 0.1

@@ -9,7 +9,7 @@ import simgap
 from bench.core.plugin_registries import make_robot_simulator
 from sims import effects
 from sims.core.simulator import InputError, Scenario
-from sims.robot.dynamics.batch_cache import RefusedModelError, bench_cache
+from sims.robot.dynamics.batch_cache import RefusedModelError, get_batch_cache
 from tests.sims.robot.sample_arms import ARM
 
 TAKEN = ARM.replace('name="spin"', 'name="elbow_flexibility"').replace(
@@ -75,7 +75,7 @@ def test_elements_of_a_model_that_does_not_compile_are_nan_and_the_others_are_si
     assert said.startswith("simgap: not simulated: joint.flexibility@elbow: MuJoCo does not")
     added = (("elbow", "joint.flexibility"),)
     with pytest.raises(RefusedModelError, match="repeated name"):
-        bench_cache(kind.robot).bench(added, False, 1, {"timestep": 0.001, "integrator": 0})
+        get_batch_cache(kind.robot).get_batch(added, False, 1, {"timestep": 0.001, "integrator": 0})
 
 
 def test_explain_says_what_it_leaves_out_and_goes_on(tmp_path):

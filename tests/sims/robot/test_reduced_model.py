@@ -12,7 +12,7 @@ import pytest
 
 from bench.core.plugin_registries import make_robot_simulator as simulator_of
 from sims.core.simulator import Scenario
-from sims.robot.dynamics.batch_cache import BenchCache, bench_cache
+from sims.robot.dynamics.batch_cache import BatchCache, get_batch_cache
 from sims.robot.dynamics.mujoco_batch import MujocoBatch
 from sims.robot.dynamics.series_joints import add_series_joints
 from sims.robot.integrator_settings import read_integrator_settings
@@ -68,16 +68,20 @@ def stones(tmp_path):
 def moved(robot, derived=False, series=()):
     """Return the motion of eight batch elements from random states, driven by noise."""
     robot = add_series_joints(robot, series) if series else robot
-    bench = MujocoBatch(robot, derived, read_integrator_settings(robot).to_model_options(), 8)
+    mujoco_batch = MujocoBatch(
+        robot, derived, read_integrator_settings(robot).to_model_options(), 8
+    )
     rng = np.random.default_rng(1)
-    bench.write_effects(())
-    bench.batch.reset(stage=0)
-    state = 0.5 * rng.normal(size=(8, 2, bench.places.positions.size))
-    bench.batch.bind("qpos")[:, bench.places.positions] = state[:, 0]
-    bench.batch.bind("qvel")[:, bench.places.velocities] = state[:, 1]
-    controls = 0.5 * rng.normal(size=(8, 150, bench.model.nu))
-    done = bench.step(controls, np.zeros((8, 150, bench.model.nv)), ["qpos", "qvel", "sensordata"])
-    assert not bench.failed.any()
+    mujoco_batch.write_effects(())
+    mujoco_batch.batch.reset(stage=0)
+    state = 0.5 * rng.normal(size=(8, 2, mujoco_batch.places.positions.size))
+    mujoco_batch.batch.bind("qpos")[:, mujoco_batch.places.positions] = state[:, 0]
+    mujoco_batch.batch.bind("qvel")[:, mujoco_batch.places.velocities] = state[:, 1]
+    controls = 0.5 * rng.normal(size=(8, 150, mujoco_batch.model.nu))
+    done = mujoco_batch.step(
+        controls, np.zeros((8, 150, mujoco_batch.model.nv)), ["qpos", "qvel", "sensordata"]
+    )
+    assert not mujoco_batch.failed.any()
     return done
 
 
@@ -181,18 +185,18 @@ def test_simulators_of_a_robot_share_their_batches(tmp_path):
         made = kind(observe=observe)
         made.simulate(np.zeros((1, len(made.parameters))), Scenario(times, {}, {}))
         made.close()
-    assert len(bench_cache(kind.robot).benches) == 1
+    assert len(get_batch_cache(kind.robot).batches) == 1
 
 
 def test_batches_in_series_that_take_too_much_are_dropped(tmp_path):
     (tmp_path / "arm.xml").write_text(ARM)
     robot = read_robot(tmp_path / "arm.xml")
     settings = read_integrator_settings(robot).to_model_options()
-    cache = BenchCache(robot, limit=1)
-    own = cache.bench((), False, 8, settings)
+    cache = BatchCache(robot, limit=1)
+    own = cache.get_batch((), False, 8, settings)
     first, second = ((("elbow", f"joint.{kind}"),) for kind in ("backlash", "flexibility"))
-    one = cache.bench(first, True, 8, settings)
-    assert cache.bench(first, True, 8, settings) is one
-    assert one in cache.benches
-    other = cache.bench(second, True, 8, settings)
-    assert cache.benches == [own, other]
+    one = cache.get_batch(first, True, 8, settings)
+    assert cache.get_batch(first, True, 8, settings) is one
+    assert one in cache.batches
+    other = cache.get_batch(second, True, 8, settings)
+    assert cache.batches == [own, other]

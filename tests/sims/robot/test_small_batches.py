@@ -4,7 +4,7 @@ import numpy as np
 
 from bench.core.plugin_registries import make_robot_simulator
 from sims.core.simulator import Scenario
-from sims.robot.dynamics.batch_cache import bench_cache
+from sims.robot.dynamics.batch_cache import get_batch_cache
 from tests.sims.robot.sample_arms import ARM
 
 TIMES = np.arange(40) / 100.0
@@ -20,5 +20,5 @@ def test_a_single_element_moves_as_in_a_batch_and_costs_no_more(tmp_path):
     alone = np.concatenate([simulator.simulate(row[None], SCENARIO) for row in theta])
     np.testing.assert_array_equal(alone, together)
     assert np.ptp(together[:, -1], axis=0).min() > 1e-4
-    held = {bench.count for bench in bench_cache(kind.robot).benches}
+    held = {mujoco_batch.count for mujoco_batch in get_batch_cache(kind.robot).batches}
     assert held == {1, 64}, "a batch of one, and the largest for twelve"
