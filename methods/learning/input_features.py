@@ -71,14 +71,14 @@ class InputFeatures:
 
     Attributes:
         reading: configuration from which it was made.
-        seen: map from observations to input rows.
-        told: map from scenario information to further inputs; None if scenarios were equal in
-            training.
+        observation_features: map from observations to input rows.
+        scenario_features: map from scenario information to further inputs; None if scenarios were
+            equal in training.
     """
 
     reading: FeatureConfig
-    seen: ObservationFeatures
-    told: ScenarioFeatures | None = None
+    observation_features: ObservationFeatures
+    scenario_features: ScenarioFeatures | None = None
 
     @classmethod
     def fit(cls, data: TrainingData, reading: FeatureConfig) -> InputFeatures:
@@ -108,8 +108,8 @@ class InputFeatures:
     @property
     def feature_count(self) -> int:
         """Length of an input row."""
-        scenario_size = 0 if self.told is None else self.told.centre.size
-        return self.seen.chosen.size + scenario_size
+        scenario_size = 0 if self.scenario_features is None else self.scenario_features.centre.size
+        return self.observation_features.chosen.size + scenario_size
 
     def __call__(
         self,
@@ -134,18 +134,18 @@ class InputFeatures:
         if missing is not None and missing.any():
             observations = np.where(missing, np.nan, observations)
         observations = self.reading.select_channels(observations)
-        rows = self.seen(observations, lengths)
-        if self.told is None:
+        rows = self.observation_features(observations, lengths)
+        if self.scenario_features is None:
             return rows
-        further = self.told(observations, lengths, scene)
+        further = self.scenario_features(observations, lengths, scene)
         return np.concatenate([rows, further], axis=1)
 
     def compute_rows(self, data: TrainingData) -> Array:
         """Compute the input rows (scenarios, each, D) of training simulations."""
-        if self.told is None:
+        if self.scenario_features is None:
             # All scenarios are computed in one call, because the rows do not depend on the
             # scenario.
-            rows = self.seen(
+            rows = self.observation_features(
                 self.reading.select_channels(data.flattened_observations), data.lengths
             )
             return rows.reshape(*data.parameters.shape[:2], -1)
@@ -156,10 +156,12 @@ class InputFeatures:
         """Return everything as plain arrays by name."""
         state: dict[str, Array] = {}
         for name in _OBSERVATION_FEATURE_ARRAYS:
-            state[f"inputs.{name}"] = np.asarray(getattr(self.seen, name))
-        if self.told is not None:
+            state[f"inputs.{name}"] = np.asarray(getattr(self.observation_features, name))
+        if self.scenario_features is not None:
             for name in _SCENARIO_FEATURE_ARRAYS:
-                state[f"told.{name}"] = np.asarray(getattr(self.told, name), dtype=np.float64)
+                state[f"told.{name}"] = np.asarray(
+                    getattr(self.scenario_features, name), dtype=np.float64
+                )
         return state
 
     @classmethod

@@ -51,14 +51,14 @@ class TrainedPairNetwork:
 
     Attributes:
         design: design of the network.
-        read: map from observations and scenarios to input rows of the target's side.
+        features: map from observations and scenarios to input rows of the target's side.
         weights: weight arrays by name.
-        proposed: map to input rows of the proposed side; the object `read` if both sides have the
-            same inputs.
+        proposed: map to input rows of the proposed side; the object `features` if both sides have
+            the same inputs.
     """
 
     design: PairNetworkDesign
-    read: InputFeatures
+    features: InputFeatures
     weights: dict[str, Array]
     proposed: InputFeatures
 
@@ -70,7 +70,7 @@ class TrainedPairNetwork:
         rng: np.random.Generator,
         reading: FeatureConfig,
         alone: bool,
-        look: TrainingMonitor | None,
+        monitor: TrainingMonitor | None,
     ) -> TrainedPairNetwork:
         """Choose the inputs, and train the network on them.
 
@@ -80,7 +80,7 @@ class TrainedPairNetwork:
             rng: random generator.
             reading: configuration of the inputs.
             alone: as in `pair_network.train`.
-            look: monitor of the training; None for none.
+            monitor: monitor of the training; None for none.
         """
         features = InputFeatures.fit(data, reading)
         proposed = (
@@ -89,10 +89,10 @@ class TrainedPairNetwork:
             else features
         )
         validation_monitor = None
-        if look is not None:
-            held_out = look.held_out
+        if monitor is not None:
+            held_out = monitor.held_out
             rows = _compute_input_rows(proposed, features, held_out)
-            validation_monitor = PairValidationMonitor(rows, held_out.parameters, look.epoch)
+            validation_monitor = PairValidationMonitor(rows, held_out.parameters, monitor.epoch)
         rows = _compute_input_rows(proposed, features, data)
         weights = train_pair_network(rows, data.parameters, design, rng, alone, validation_monitor)
         return cls(design, features, weights, proposed)
@@ -111,14 +111,14 @@ class TrainedPairNetwork:
 
         The result is NaN if the simulation failed.
         """
-        is_shared = self.proposed is self.read
+        is_shared = self.proposed is self.features
         # Samples missing in the target are hidden in the simulation too, so that the true
         # parameters give the target's own row.
         hidden = np.isnan(task.observed) if is_shared else None
         row = None
         if is_shared:
             # The target's row is equal for all simulations, unless a simulation fills its gaps.
-            row = self.read(task.observed[None], task.lengths, task.scene, hidden)[0]
+            row = self.features(task.observed[None], task.lengths, task.scene, hidden)[0]
 
         def difference(observations: Array) -> Array:
             """Estimate target - simulation of the parameters (dim,) from one simulation (1, T, C).
@@ -132,15 +132,15 @@ class TrainedPairNetwork:
             target = row
             if target is None:
                 filled_target = _fill_target_gaps(task, observations[0], self)
-                target = self.read(filled_target[None], task.lengths, task.scene)[0]
+                target = self.features(filled_target[None], task.lengths, task.scene)[0]
             return self.predict_difference(proposed, target)
 
         return difference
 
     def to_arrays(self) -> dict[str, Array]:
         """Return weights and input features as plain arrays by name."""
-        state = self.read.to_arrays() | self.weights
-        if self.proposed is self.read:
+        state = self.features.to_arrays() | self.weights
+        if self.proposed is self.features:
             return state
         # The arrays of both sides have the same names.
         arrays = {
@@ -202,7 +202,7 @@ def _fill_target_gaps(task: Task, simulated: Array, network: TrainedPairNetwork)
     run_ends = np.cumsum(task.lengths)
     for first, end in zip(run_ends - task.lengths, run_ends, strict=True):
         # Slices of the copy are filled in place.
-        for channel in network.read.reading.select_channels(filled[first:end]).T:
+        for channel in network.features.reading.select_channels(filled[first:end]).T:
             channel[:] = fill_gaps(channel, sensor[first:end, 0])
     return filled
 

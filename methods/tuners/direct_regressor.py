@@ -95,7 +95,7 @@ class DirectRegressor(PairTuner):
     def tune(self, task: Task, rng: np.random.Generator) -> TunerGenerator:  # noqa: ARG002
         """Propose one estimate from the target, and stop after its simulation."""
         network = self.get_trained_network().select_for(task)
-        target = network.read(task.observed[None], task.lengths, task.scene)[0]
+        target = network.features(task.observed[None], task.lengths, task.scene)[0]
         # The proposed input is zero, so the difference is the parameters themselves.
         zero_input = np.zeros_like(target)
         estimate = np.clip(network.predict_difference(zero_input, target), 0.0, 1.0)

@@ -316,7 +316,7 @@ def differences_figure(study, kept):
     inside = ((points > low) & (points < high)).all(axis=1)
     for ax, (key, title) in zip(axes, names.items(), strict=True):
         network = kept[key].get_trained_network().clean
-        pairs = [network.read(seen[:, i], (seen.shape[2],), EMPTY_SCENE) for i in (0, 1)]
+        pairs = [network.features(seen[:, i], (seen.shape[2],), EMPTY_SCENE) for i in (0, 1)]
         h, true = network.predict_difference(*pairs)[:, 0], points[:, 1] - points[:, 0]
         ax.plot([-1, 1], [-1, 1], color=CONNECTOR_GREY, lw=1)
         ax.plot(

@@ -175,7 +175,9 @@ def test_roughness_is_the_noise_and_sees_no_motion():
 
 def test_same_observation_means_no_difference(one):
     fitted = one._fitted.clean
-    seen = fitted.read.seen(Toy().simulate(np.random.default_rng(0), np.full((3, 1), 0.5)), (60,))
+    seen = fitted.features.observation_features(
+        Toy().simulate(np.random.default_rng(0), np.full((3, 1), 0.5)), (60,)
+    )
     assert (fitted.predict_difference(seen, seen) == 0.0).all()
     assert (
         fitted.predict_difference(seen[0], seen[0] + 1.0)
@@ -205,14 +207,19 @@ def test_published_network_has_the_published_size():
     assert sum(w.size for w in weights.values()) == 27_777
     assert toy.calls == [2] * 20
     assert (
-        tuner._fitted.clean.read.seen(toy.observe(np.ones((1, 1)), [1.0]), (400,))[0, 0] == 1.0
+        tuner._fitted.clean.features.observation_features(
+            toy.observe(np.ones((1, 1)), [1.0]), (400,)
+        )[0, 0]
+        == 1.0
     )  # raw metres
 
 
 def test_published_is_clamped_at_zero_only_and_does_not_settle():
     tuner = TuneNetPublished(points=60)
     tuner.fit(Toy(), np.random.default_rng(0), 400)
-    seen = tuner._fitted.clean.read.seen(Toy().observe(np.array([[0.5]]), [1.5]), (60,))[0]
+    seen = tuner._fitted.clean.features.observation_features(
+        Toy().observe(np.array([[0.5]]), [1.5]), (60,)
+    )[0]
     assert np.abs(tuner._fitted.clean.predict_difference(seen, seen)).max() > 1e-6
     steps = tuner.tune(
         Task(1, np.zeros(1), swing(np.ones((1, 1)), 1.5)[0], np.ones(2), TRAINING[1], 9, (60,)),
@@ -281,7 +288,7 @@ def test_state_survives_a_round_trip_and_is_checked(one, tmp_path):
         with pytest.raises(ValueError, match="expected"):
             copy.restore(broken)
     with pytest.raises(ValueError, match="train on"):
-        one._fitted.clean.read.seen(np.zeros((1, 60, 1)), (60,))
+        one._fitted.clean.features.observation_features(np.zeros((1, 60, 1)), (60,))
     with pytest.raises(RuntimeError, match="not been trained"):
         next(
             TuneNet().tune(

@@ -397,7 +397,7 @@ class MujocoBatch:
         bind = self.batch.bind
         ctrl, applied = bind("ctrl"), bind("qfrc_applied")
         loss = self.fields["dof_frictionloss"]
-        rubs = bool(step_forces.has_dry_friction.any())
+        has_friction = bool(step_forces.has_dry_friction.any())
         own = self.begin_dry_friction(step_forces, n)
         result = self._allocate_records(n, steps, record)
         shown = {name: bind(name)[:n] for name in record}
@@ -427,7 +427,7 @@ class MujocoBatch:
             force, limit = step_forces.compute(k, lanes_at.read_joint_states(changes[:, k]))
             applied[:n] = forces[:, k]
             applied[:n, of] += force
-            if rubs:
+            if has_friction:
                 loss[:n, of] = own + np.maximum(limit, 0.0)
             self.batch.step(ids)
             for name, values in result.items():

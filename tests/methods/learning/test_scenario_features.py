@@ -146,7 +146,7 @@ def test_state_survives_and_is_checked(told, blind):
 
 
 def test_a_scene_of_another_kind_is_refused(told):
-    read = told._fitted.clean.read
+    read = told._fitted.clean.features
     with pytest.raises(ValueError, match="train on"):
         read(
             np.zeros((1, SAMPLES, 1)), (SAMPLES,), ScenarioInfo(np.empty(0), np.zeros((SAMPLES, 2)))
