@@ -22,9 +22,9 @@ from sims.core.toml_validation import format_value
 from sims.core.value_limits import MAX_NAME_LENGTH, MAX_TIMESTAMP_SECONDS, MIN_RUN_SECONDS
 from sims.recording.fast_csv import MIN_FAST_PARSE_BYTES, read_csv_fast
 
-_CHUNK = 1 << 13
+_ROWS_PER_CHUNK = 1 << 13
 """Number of rows that are converted to numbers at once, which limits the memory for their text."""
-_YEAR = 365.25 * 86400
+_SECONDS_PER_YEAR = 365.25 * 86400
 """Seconds per year."""
 _NUMBER = re.compile(r"\s*[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?\s*")
 """Pattern of a number as instruments write it, without `inf` or `1_000`, which float() accepts."""
@@ -62,7 +62,7 @@ def read_table(
     """
     require_file(path)
     try:
-        return Table(path, channels, inputs, extra).read()
+        return RecordingTable(path, channels, inputs, extra).read()
     except UnicodeDecodeError:
         raise _make_encoding_error(path) from None
     except OSError as error:
@@ -93,8 +93,8 @@ def _make_encoding_error(path: Path) -> InputError:
     return InputError(f"{path}: expected UTF-8 text")
 
 
-class Table:
-    """Table of a CSV file, and the checks of runs that apply to every kind of table (`runs`).
+class RecordingTable:
+    """Table of a CSV file, and the checks of runs that apply to every kind of table.
 
     Args:
         path: Path of the table, for messages.
@@ -116,14 +116,14 @@ class Table:
         """Return the runs of the file."""
         records = self._iterate_records()
         header = self._check_header(next(records, []))
-        quick = None
+        parsed = None
         if self.path.stat().st_size >= MIN_FAST_PARSE_BYTES:
-            quick = read_csv_fast(self.path, header, self.wanted[1:], self.gaps)
-            if quick and max(map(len, set(quick[0])), default=0) > MAX_NAME_LENGTH:
-                quick = None
+            parsed = read_csv_fast(self.path, header, self.wanted[1:], self.gaps)
+            if parsed and max(map(len, set(parsed[0])), default=0) > MAX_NAME_LENGTH:
+                parsed = None
         # If the fast reader gives up, read cell by cell to locate the error.
-        names, columns = quick or self._convert_cells(header, records)
-        return self.runs(names, columns)
+        names, columns = parsed or self._convert_cells(header, records)
+        return self.split_into_runs(names, columns)
 
     def _convert_cells(
         self, header: list[str], records: Iterator[list[str]]
@@ -131,7 +131,7 @@ class Table:
         """Convert the rows below the header to run names and numeric columns (T,)."""
         names: list[str] = []
         parts: list[list[Array]] = []
-        while rows := list(islice(records, _CHUNK)):
+        while rows := list(islice(records, _ROWS_PER_CHUNK)):
             padded_rows = self._check_row_widths(rows, len(header), len(names))
             by_column = zip(*padded_rows, strict=True)
             cells = dict(zip(header, by_column, strict=True))
@@ -238,9 +238,11 @@ class Table:
         if not (_NUMBER.fullmatch(cell) and math.isfinite(float(cell))):
             missing = name in self.inputs and not cell.strip()
             note = "; an input has no missing samples" if missing else ""
-            self.fault(record, name, f"expected a finite number, found {format_value(cell)}{note}")
+            self.raise_error(
+                record, name, f"expected a finite number, found {format_value(cell)}{note}"
+            )
 
-    def runs(self, names: list[str], columns: dict[str, Array]) -> list[CsvRun]:
+    def split_into_runs(self, names: list[str], columns: dict[str, Array]) -> list[CsvRun]:
         """Split the rows into runs, each a block of rows with the same name, and check them.
 
         Args:
@@ -263,12 +265,12 @@ class Table:
         for begin, end in pairwise(edges):
             name = names[begin]
             if not name:
-                self.fault(begin, "run", "expected the name of a run, found none")
+                self.raise_error(begin, "run", "expected the name of a run, found none")
             if len(name) > MAX_NAME_LENGTH:
                 expected = f"a name of at most {MAX_NAME_LENGTH} characters"
-                self.fault(begin, "run", f"expected {expected}, found {format_value(name)}")
+                self.raise_error(begin, "run", f"expected {expected}, found {format_value(name)}")
             if name in runs:
-                self.fault(
+                self.raise_error(
                     begin,
                     "run",
                     f"run {format_value(name)} continues after another run began; "
@@ -276,11 +278,11 @@ class Table:
                 )
             part = {c: make_read_only(columns[c][begin:end]) for c in self.wanted[2:]}
             if end - begin < 2:
-                self.fault(
+                self.raise_error(
                     begin, "run", f"run {format_value(name)} has one row; expected at least two"
                 )
             if not any(np.isfinite(part[c]).any() for c in self.channels):
-                self.fault(
+                self.raise_error(
                     begin,
                     self.channels[0],
                     f"run {format_value(name)} has no sample of any channel",
@@ -293,13 +295,13 @@ class Table:
         """Check that the stamps of a run can be seconds, and not milliseconds."""
         latest = max(-t[first], t[last])
         if latest > MAX_TIMESTAMP_SECONDS:
-            years = f"{latest:.4g}, which would be {latest / _YEAR:.2g} years"
-            self.fault(
+            years = f"{latest:.4g}, which would be {latest / _SECONDS_PER_YEAR:.2g} years"
+            self.raise_error(
                 last, "t", f"expected seconds, found {years}; are these milliseconds or less?"
             )
-        lasts = t[last] - t[first]
-        if lasts < MIN_RUN_SECONDS:
-            self.fault(last, "t", f"expected seconds, found a run of {lasts:.3g} s")
+        duration = t[last] - t[first]
+        if duration < MIN_RUN_SECONDS:
+            self.raise_error(last, "t", f"expected seconds, found a run of {duration:.3g} s")
 
     def _check_times_increase(self, t: Array, edges: list[int]) -> None:
         """Check that the times increase within each run.
@@ -314,9 +316,11 @@ class Table:
         is_bad[run_starts - 1] = False
         if is_bad.any():
             i = int(np.argmax(is_bad))
-            self.fault(i + 1, "t", f"expected more than {t[i]:.12g} s, found {t[i + 1]:.12g} s")
+            self.raise_error(
+                i + 1, "t", f"expected more than {t[i]:.12g} s, found {t[i + 1]:.12g} s"
+            )
 
-    def fault(self, record: int, column: str, message: str) -> NoReturn:
+    def raise_error(self, record: int, column: str, message: str) -> NoReturn:
         """Raise the error for a cell.
 
         Args:
@@ -327,9 +331,9 @@ class Table:
         Raises:
             InputError: Always.
         """
-        raise InputError(f"{self.row(record)}, column {column}: {message}")
+        raise InputError(f"{self.format_location(record)}, column {column}: {message}")
 
-    def row(self, record: int) -> str:
+    def format_location(self, record: int) -> str:
         """Return the location of row `record` (counted from 0) for a message."""
         return f"{self.path}, row {self._find_line_number(record)}"
 

@@ -17,7 +17,7 @@ from sims.core.simulator import Array, InputError, make_unknown_name_error, simi
 from sims.core.toml_validation import check_table, format_value
 from sims.core.value_limits import is_plausible_number
 from sims.recording.column_mapping import SignalSource
-from sims.recording.csv_table import CsvRun, Table
+from sims.recording.csv_table import CsvRun, RecordingTable
 from sims.recording.drive_switches import read_switches
 from sims.recording.recording_description import (
     DeclaredSignals,
@@ -199,17 +199,17 @@ def read_frame(path: Path, frame: Frame, description: RecordingDescription) -> l
         raise InputError(f"{path}: expected no file and no folder in the description of a frame")
     return _FrameTable(
         path, list(description.channels), list(description.inputs), list(description.extra)
-    ).of(frame, description)
+    ).read_frame(frame, description)
 
 
-class _FrameTable(Table):
+class _FrameTable(RecordingTable):
     """Table of a recording in a data frame."""
 
-    def row(self, record: int) -> str:
+    def format_location(self, record: int) -> str:
         """Return the location of row `record` (counted from 0) for a message."""
         return f"{self.path}.iloc[{record}]"
 
-    def of(self, frame: Frame, description: RecordingDescription) -> list[CsvRun]:
+    def read_frame(self, frame: Frame, description: RecordingDescription) -> list[CsvRun]:
         """Return the runs of a frame.
 
         Args:
@@ -233,7 +233,7 @@ class _FrameTable(Table):
             columns[name] = source.combine(partial(self._get_values, name, frame))
         if sources.second != 1.0:
             columns["t"] = sources.second * columns["t"]
-        return self.runs(self._run_names(frame, len(columns["t"])), columns)
+        return self.split_into_runs(self._run_names(frame, len(columns["t"])), columns)
 
     def _run_names(self, frame: Any, count: int) -> list[str]:
         """Return the name of the run of each row."""
@@ -242,7 +242,9 @@ class _FrameTable(Table):
         cells = frame["run"]
         missing = cells.isna().to_numpy()
         if missing.any():
-            self.fault(int(np.argmax(missing)), "run", "expected the name of a run, found none")
+            self.raise_error(
+                int(np.argmax(missing)), "run", "expected the name of a run, found none"
+            )
         # A column of integers that once had missing cells has the type float.
         is_float = cells.dtype.kind == "f"
         return [f"{cell:g}" if is_float else str(cell).strip() for cell in cells]
@@ -258,12 +260,14 @@ class _FrameTable(Table):
         if cells.dtype.kind not in "iuf":
             for record, cell in enumerate(cells):
                 if not missing[record] and not is_plausible_number(cell):
-                    self.fault(record, column, f"expected a number, found {format_value(cell)}")
+                    self.raise_error(
+                        record, column, f"expected a number, found {format_value(cell)}"
+                    )
         values: Array = cells.to_numpy(dtype=float, na_value=np.nan)
         is_bad = np.isinf(values) if name in self.gaps else ~np.isfinite(values)
         if is_bad.any():
             record = int(np.argmax(is_bad))
             note = "; an input has no missing samples" if name in self.inputs else ""
             found_text = "none" if missing[record] else f"{values[record]}"
-            self.fault(record, column, f"expected a finite number, found {found_text}{note}")
+            self.raise_error(record, column, f"expected a finite number, found {found_text}{note}")
         return values
