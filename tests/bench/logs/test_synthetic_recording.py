@@ -141,7 +141,7 @@ def test_a_simulator_without_engines_is_a_system_too(tmp_path, spring):
     ("changes", "message"),
     [
         ({"system": "bal"}, "unknown simulator 'bal'; there are: "),
-        ({"theta": ["restitution=2"]}, "parameter restitution = 2: expected 0 to 1 1"),
+        ({"theta": ["restitution=2"]}, "parameter restitution = 2: expected 0 to 1$"),
         ({"theta": ["restituton=0.5"]}, "unknown parameter 'restituton'; there are: restitution"),
         ({"theta": ["0.5,0.6"]}, r"expected 1 values \(restitution\), found 2"),
         ({"theta": ["restitution=high"]}, "--theta restitution=high: expected a number"),
