@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Annotated, Any, TypeAlias, TypeVar, cast
 
 from bench.core.options import with_options
+from bench.core.resource_estimates import count_available_cores
 from bench.diagnosis import explain as explaining
-from bench.diagnosis.evaluation.worker_pool import count_available_cores
 from bench.diagnosis.explain_options import ExplainOptions
 from bench.diagnosis.explanation import Explanation
 from bench.diagnosis.score_extended import MODEL_FILES, score_model

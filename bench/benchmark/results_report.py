@@ -151,8 +151,8 @@ def build_tables(
     statistics = statistics or compute_statistics(stored)
     lines = build_error_table(stored.runs, stored.statuses, experiment.budget, stored.costs)
     frames = {
-        "table": statistics.sorted(add_salt_column(lines, experiment)),
-        "ert": statistics.sorted(
+        "table": statistics.sort_rows(add_salt_column(lines, experiment)),
+        "ert": statistics.sort_rows(
             build_ert_table(statistics.curves, statistics.levels, experiment.budget)
         ),
         "ranking": statistics.ranking,

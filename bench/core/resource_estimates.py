@@ -126,7 +126,15 @@ def get_machine_resources(folder: Path | None = None) -> MachineResources:
         disk = float(shutil.disk_usage(place).free)
     except OSError:
         disk = math.inf
-    return MachineResources(_read_available_memory(), disk, _count_free_inodes(place))
+    return MachineResources(_read_memory_limit(), disk, _count_free_inodes(place))
+
+
+def count_available_cores() -> int:
+    """Return the number of CPU cores that this process may use."""
+    # The CPU affinity is not available on all systems.
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def get_max_step(simulator: Simulator) -> float:
@@ -134,7 +142,7 @@ def get_max_step(simulator: Simulator) -> float:
     return simulator.engine.largest_step if isinstance(simulator, SystemSimulator) else math.inf
 
 
-def _read_available_memory() -> float:
+def _read_memory_limit() -> float:
     """Return the memory in bytes: the machine's, or the limit of a container."""
     limits = [math.inf]
     with suppress(AttributeError, OSError, ValueError):  # a system that does not state it

@@ -102,7 +102,7 @@ class DiagnosisStudy:
         self.folder = folder
         self.configuration = read_configuration(folder)
         self.plugins = self.configuration.plugins
-        self._kept: AnswerStore | None = None
+        self._answer_store: AnswerStore | None = None
 
     @classmethod
     def begin(cls, new: PreparedStudy) -> DiagnosisStudy:
@@ -182,9 +182,9 @@ class DiagnosisStudy:
             progress: makes progress callbacks; None for no progress output.
             pool: worker pool; None to create one.
         """
-        self._kept = AnswerStore(self.folder)
+        self._answer_store = AnswerStore(self.folder)
         try:
-            _EvaluationRun(self, self._kept, progress or no_progress).run(jobs, pool)
+            _EvaluationRun(self, self._answer_store, progress or no_progress).run(jobs, pool)
         except KeyboardInterrupt:
             return self._finish_study(interrupted=True)
         except PoolLostError as error:
@@ -199,9 +199,8 @@ class DiagnosisStudy:
         A secret salt stays hidden as long as answers are missing, because it determines the cases.
 
         Args:
-            **why: reason for which the run ended early (``interrupted`` or ``stopped``); empty if
-                it did
-                not.
+            **why: reason for which the run ended early (``interrupted`` or ``stopped``); empty
+                if it did not.
         """
         run_ends = self.status().ends
         missing = sum(end.status == MISSING_STATUS for end in run_ends)
@@ -212,9 +211,9 @@ class DiagnosisStudy:
 
     def close(self) -> None:
         """Close the answer file and release its lock."""
-        if self._kept is not None:
-            self._kept.close()
-            self._kept = None
+        if self._answer_store is not None:
+            self._answer_store.close()
+            self._answer_store = None
 
     @property
     def answers(self) -> AnswersByCase:
@@ -224,8 +223,8 @@ class DiagnosisStudy:
     def status(self) -> StudyProgress:
         """Return which answers are stored and which are missing, one entry per case and diagnoser.
 
-        Cases whose hidden cause the sensors cannot show count as done, because nothing is asked
-        then.
+        Cases whose hidden cause the sensors cannot show count as done, because no
+        diagnoser is run then.
         """
         answers = self.answers
         run_ends = []
@@ -276,7 +275,7 @@ class _EvaluationRun:
             answer_store: store of the answers, opened for appending.
             progress: makes progress callbacks.
         """
-        self._study, self._kept, self._progress = study, answer_store, progress
+        self._study, self._answer_store, self._progress = study, answer_store, progress
         self._experiment = study.configuration.experiment
         self._hidden = tuple(str(place.resolve()) for place in (study.folder, trained()))
         self._salt = (
@@ -319,7 +318,7 @@ class _EvaluationRun:
         The list is empty if the sensors cannot show the hidden cause: such a case has an empty
         document.
         """
-        answer = self._kept.answered.get(question.name)
+        answer = self._answer_store.answered.get(question.name)
         if answer is not None and not answer["item"]:
             return []
         rows = answer["rows"] if answer else {}
@@ -397,7 +396,7 @@ class _EvaluationRun:
         """
         calls: list[Call] = []
         for question in questions:
-            answer = self._kept.answered.get(question.name)
+            answer = self._answer_store.answered.get(question.name)
             diagnosers_to_run = [evaluated[name] for name in self._list_unanswered(question)]
             known_item = answer["item"] if answer else None
             case_args = (
@@ -415,7 +414,7 @@ class _EvaluationRun:
                 result = _make_failed_answers(
                     questions[place], [answer.label for answer in calls[place][1][4]], result
                 )
-            self._kept.append(result)
+            self._answer_store.append(result)
             step()
 
 

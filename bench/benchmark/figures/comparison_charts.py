@@ -195,7 +195,7 @@ def make_runtime_chart(view: ComparisonView) -> ComparisonChart:
 def make_ert_chart(view: ComparisonView) -> ComparisonChart:
     """Make the chart of the expected running time against the error to be reached."""
     statistics = view.statistics
-    table = statistics.sorted(
+    table = statistics.sort_rows(
         build_ert_table(statistics.curves, statistics.levels, view.experiment.budget)
     )
     x_axis = Axis(f"error to be reached{view.unit_of_levels}", "log")

@@ -121,11 +121,11 @@ def _read_source_files(folder: Path, root: Path) -> list[tuple[str, bytes]]:
 @cache
 def hash_package_versions() -> str:
     """Hash the versions of Python and of the numerical packages."""
-    packages = [get_package_version(name) for name in NUMERICAL_PACKAGES]
+    packages = [_format_package_version(name) for name in NUMERICAL_PACKAGES]
     return compute_digest(platform.python_version(), packages)
 
 
-def get_package_version(name: str) -> str:
+def _format_package_version(name: str) -> str:
     """Return name and version of an installed package, or a note that it is absent."""
     try:
         return f"{name} {version(name)}"

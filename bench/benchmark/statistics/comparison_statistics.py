@@ -105,7 +105,7 @@ class ComparisonStatistics:
         ranked = list(last.loc[last["range"] == kind, "tuner"])
         return [*ranked, *(t for t in self.order if t not in ranked)]
 
-    def sorted(self, frame: pd.DataFrame) -> pd.DataFrame:
+    def sort_rows(self, frame: pd.DataFrame) -> pd.DataFrame:
         """Sort rows that have the columns range and tuner: range by range, the best tuner first."""
         kinds = [str(kind) for kind in dict.fromkeys(self._all_runs.keys["range"])]
         order = [(kind, tuner) for kind in kinds for tuner in self.order_in(kind)]
@@ -261,7 +261,7 @@ class ComparisonStatistics:
         It is the loosest threshold if there is no such threshold.
         """
         for level in sorted(self.tuning_costs):
-            if all(_reached_in_half(by_tuner) for by_tuner in self.tuning_costs[level].values()):
+            if all(_is_reached_by_half(by_tuner) for by_tuner in self.tuning_costs[level].values()):
                 return level
         return max(self.tuning_costs)
 
@@ -275,6 +275,6 @@ def _find_least_median(curves: RunCurves) -> float:
     return min((m for m in medians if np.isfinite(m)), default=0.0)
 
 
-def _reached_in_half(by_tuner: Mapping[str, TuningCost]) -> bool:
+def _is_reached_by_half(by_tuner: Mapping[str, TuningCost]) -> bool:
     reaching = sum(np.isfinite(price.effort.compute_ert()) for price in by_tuner.values())
     return bool(2 * reaching >= len(by_tuner))

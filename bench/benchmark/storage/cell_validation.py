@@ -193,13 +193,13 @@ def check_cells(
     numbers = values.to_numpy(zero_copy_only=False)
     empty = np.isnan(numbers) if column.kind is float else np.zeros(len(numbers), dtype=bool)
 
-    def said(row: int) -> str:
+    def format_cell(row: int) -> str:
         return "nothing" if empty[row] else f"{numbers[row]}"
 
     outside = ~empty & ~((numbers >= column.low) & (numbers <= column.high))
     if not column.infinite:
         outside |= np.isinf(numbers)
-    _raise_for_bad_row(column, outside, said)
+    _raise_for_bad_row(column, outside, format_cell)
     is_empty_required = {
         EmptyCellRule.NEVER: np.zeros(len(numbers), dtype=bool),
         EmptyCellRule.MAY: empty,
@@ -208,8 +208,10 @@ def check_cells(
     }[column.empty]
     if is_empty_required is None:
         return
-    _raise_for_bad_row(column, empty & ~is_empty_required, said)
-    _raise_for_bad_row(column, is_empty_required & ~empty, said, f"nothing {column.empty.value}")
+    _raise_for_bad_row(column, empty & ~is_empty_required, format_cell)
+    _raise_for_bad_row(
+        column, is_empty_required & ~empty, format_cell, f"nothing {column.empty.value}"
+    )
 
 
 def _check_texts(column: ColumnSpec, values: pa.Array) -> None:

@@ -179,6 +179,7 @@ def _run_explain_batch(options: argparse.Namespace, print_line: PrintLine) -> Co
         write_explanation_environment,
     )
     from bench.cli.search_progress import ProgressDisplay
+    from bench.core.resource_estimates import count_available_cores
     from bench.diagnosis.batch.log_rows import (
         LOGS_TABLE_FILE,
         LogResult,
@@ -187,7 +188,6 @@ def _run_explain_batch(options: argparse.Namespace, print_line: PrintLine) -> Co
     )
     from bench.diagnosis.batch.run_batch import explain_batch, list_logs
     from bench.diagnosis.batch.summary_page import BatchPageInput, write_summary_page
-    from bench.diagnosis.evaluation.worker_pool import count_available_cores
     from sims.core.atomic_files import make_timestamped_path
 
     settings = {

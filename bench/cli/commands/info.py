@@ -29,6 +29,7 @@ def collect_info() -> JsonDocument:
     import platform
 
     from bench import __version__
+    from bench.core.resource_estimates import count_available_cores
 
     return {
         "simgap": __version__,
@@ -37,7 +38,7 @@ def collect_info() -> JsonDocument:
         "implementation": platform.python_implementation(),
         "platform": platform.platform(),
         "machine": platform.machine(),
-        "processors": _count_processors(),
+        "processors": count_available_cores(),
         "memory": _read_memory_size(),
         "paths": {
             "simgap": str(_HOME),
@@ -79,18 +80,6 @@ def _read_git_revision() -> str | None:
     except (OSError, subprocess.SubprocessError):
         return None
     return process.stdout.strip() or None
-
-
-def _count_processors() -> int | None:
-    """Return the number of processors that this process may use; None if unknown.
-
-    It can be smaller than that of the machine, for example in a job of a cluster.
-    """
-    import os
-
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count()
 
 
 def _read_memory_size() -> int | None:

@@ -276,14 +276,6 @@ def _is_same_array(evaluators: Sequence[SharedState], evaluator: SharedState) ->
     return any(other_world is evaluator for other_world in evaluators)
 
 
-def count_available_cores() -> int:
-    """Return the number of CPU cores that this process may use."""
-    # The CPU affinity is not available on all systems.
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
-
-
 def can_fork() -> bool:
     """Return whether workers can be forked from this process.
 

@@ -68,7 +68,7 @@ def _compute_gain_p_value(
     from sklearn.gaussian_process import GaussianProcessRegressor
     from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
-    if min(len(fitted.left), len(held_out.left)) < 2 * HELD_OUT_BLOCK_COUNT:
+    if min(len(fitted.residual), len(held_out.residual)) < 2 * HELD_OUT_BLOCK_COUNT:
         return 1.0
     centre, scale = fitted.state.mean(axis=0), fitted.state.std(axis=0)
     moving = scale > 0
@@ -83,9 +83,9 @@ def _compute_gain_p_value(
     process = GaussianProcessRegressor(kernel, normalize_y=True)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        process.fit(inputs[training_indices], fitted.left[training_indices])
+        process.fit(inputs[training_indices], fitted.residual[training_indices])
     predicted = process.predict(unseen)
-    gains = np.square(held_out.left) - np.square(held_out.left - predicted)
+    gains = np.square(held_out.residual) - np.square(held_out.residual - predicted)
     edges = np.linspace(0, len(gains), HELD_OUT_BLOCK_COUNT + 1).astype(int)
     block_means = np.array([gains[a:b].mean() for a, b in pairwise(edges.tolist())])
     spread = float(block_means.std(ddof=1) / np.sqrt(HELD_OUT_BLOCK_COUNT))

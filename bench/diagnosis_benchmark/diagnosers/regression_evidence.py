@@ -64,14 +64,14 @@ class RegressionData:
     """Equation (1) as a linear regression, with each row in units of its noise.
 
     Attributes:
-        left: residual, (N,).
+        residual: residual, (N,).
         base: columns of parameters and initial states, (N, B).
         effects: columns of all directions, (N, K).
         run: index of the run of each row, (N,).
         state: time, channels of the base model and inputs, (N, F).
     """
 
-    left: Array
+    residual: Array
     base: Array
     effects: Array
     run: NDArray[np.intp]
@@ -94,7 +94,7 @@ class RegressionData:
         orthonormal, triangle = np.linalg.qr(basis)
         # Parameters that depend linearly on others have no direction of their own.
         base_directions = orthonormal[:, np.abs(np.diag(triangle)) > 1e-10]
-        residual: Array = self.left - base_directions @ (base_directions.T @ self.left)
+        residual: Array = self.residual - base_directions @ (base_directions.T @ self.residual)
         effects: Array = self.effects - base_directions @ (base_directions.T @ self.effects)
         return residual, effects
 
@@ -381,17 +381,17 @@ class RegressionEvidence:
         }
         clock = (times - times[0])[:, None]
 
-        def accelerated(x: Array, v: Array) -> Array:
+        def compute_acceleration(x: Array, v: Array) -> Array:
             """Return the base model's acceleration (T, D) at positions x and velocities v."""
             moment = StateSnapshot(system(), theta, constants, clock, x, v, inputs)
             force: Array = moment.system.force(moment) / moment.inertia
             return force
 
-        base_acceleration = accelerated(x, v)
+        base_acceleration = compute_acceleration(x, v)
         return (
-            accelerated(x + FINITE_DIFFERENCE_STEP, v) - base_acceleration
+            compute_acceleration(x + FINITE_DIFFERENCE_STEP, v) - base_acceleration
         ) / FINITE_DIFFERENCE_STEP, (
-            accelerated(x, v + FINITE_DIFFERENCE_STEP) - base_acceleration
+            compute_acceleration(x, v + FINITE_DIFFERENCE_STEP) - base_acceleration
         ) / FINITE_DIFFERENCE_STEP
 
 

@@ -98,7 +98,7 @@ class _SparseRegression(Diagnoser):
         rows = evidence.build_acceleration_regression(window)
         fitted, held_out = rows.select_runs(evidence.fitted), rows.select_runs(evidence.held_out)
         if (
-            min(len(fitted.left), len(held_out.left))
+            min(len(fitted.residual), len(held_out.residual))
             <= fitted.base.shape[1] + 2 * HELD_OUT_BLOCK_COUNT
         ):
             return None

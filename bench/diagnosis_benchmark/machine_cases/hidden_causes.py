@@ -172,12 +172,14 @@ def _make_force_drawer(
             is multiplied to give the force, such as the speed for a linear drag.
     """
 
-    def made(typical: dict[str, float], rng: np.random.Generator) -> CoefficientFunction:
+    def draw_coefficients(
+        typical: dict[str, float], rng: np.random.Generator
+    ) -> CoefficientFunction:
         """Draw the effect from the typical scales of its joint; `rng` is not used."""
         coefficient_scale = 2.0 * typical["force"] / bottom(typical)
         return lambda s: (coefficient_scale * s,)
 
-    return made
+    return draw_coefficients
 
 
 def _draw_ripple(typical_scales: dict[str, float], rng: np.random.Generator) -> CoefficientFunction:

@@ -223,7 +223,7 @@ def match_numbered_joints(
     return {name: joints[place] for name, place in order.items()}
 
 
-def clocks(columns: Iterable[LogColumn]) -> list[LogColumn]:
+def list_clock_columns(columns: Iterable[LogColumn]) -> list[LogColumn]:
     """Return the columns that may be time stamps, the most likely first.
 
     The order is: the stamp of a message's header, other columns with a name or unit of time, and

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bench.logs.importing.import_result import ImportOptions, ImportResult
-from bench.logs.importing.run_logs import RunLogs, hold
+from bench.logs.importing.run_logs import RunLogs, hold_signal
 from bench.logs.importing.servo_estimation import ServoResponse, estimate_servo_response
 from bench.logs.importing.signal_assignment import Signal, SignalAssignment
 from sims.core.simulator import Array
@@ -205,7 +205,7 @@ class DescriptionWriter:
             if command_samples is None or measured is None:
                 continue
             times, values = measured
-            u = command.convert(joint.unit, hold(*command_samples, times))
+            u = command.convert(joint.unit, hold_signal(*command_samples, times))
             samples.append((times, u, position.convert(joint.unit, values)))
         return samples
 

@@ -112,11 +112,11 @@ def _follow_commands(
     if are_commands_guessed:
         columns = [signals.inputs[name] for name in servos.inputs]
         for place, signal in zip(order, columns, strict=True):
-            signals.inputs[servos.inputs[place]] = signal.placed(Placement.COMMANDS)
+            signals.inputs[servos.inputs[place]] = signal.with_placement(Placement.COMMANDS)
     else:
         columns = [signals.channels[f"q.{joint}"] for joint in joints]
         for joint, place in zip(joints, order, strict=True):
-            signals.channels[f"q.{joint}"] = columns[place].placed(Placement.COMMANDS)
+            signals.channels[f"q.{joint}"] = columns[place].with_placement(Placement.COMMANDS)
     return {joint: joints[place] for place, joint in zip(order, joints, strict=True)}
 
 
@@ -147,8 +147,8 @@ def _prefer_model(
     positions = [signals.channels[f"q.{joint}"] for joint in joints]
     commands = [signals.inputs[name] for name in servos.inputs]
     for joint, name, place in zip(joints, servos.inputs, preferred.order, strict=True):
-        signals.channels[f"q.{joint}"] = positions[place].placed(Placement.MODEL)
-        signals.inputs[name] = commands[place].placed(Placement.MODEL)
+        signals.channels[f"q.{joint}"] = positions[place].with_placement(Placement.MODEL)
+        signals.inputs[name] = commands[place].with_placement(Placement.MODEL)
     columns = sorted(joints, key=lambda joint: preferred.order[joints.index(joint)])
     result.checks.append(
         "order of joints: the log does not name those of its columns; they are taken in the "
@@ -177,7 +177,7 @@ def _report_order(
                 continue
             joint = signals.get_joint(name)
             if signal.placement is Placement.MODEL_ORDER and joint in following_joints:
-                table[name] = signal.placed(Placement.CONFIRMED_ORDER)
+                table[name] = signal.with_placement(Placement.CONFIRMED_ORDER)
             guessed.setdefault(name.partition(".")[0], set()).add(joint)
     positions, commands = guessed["q"], guessed["u"]
     # A position that follows a named command, and a command that a named position follows, are

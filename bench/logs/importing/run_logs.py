@@ -106,7 +106,7 @@ class RunLogs:
             return command.values, position.values
         offset = self._starts[command.file] - self._starts[position.file]
         stamps = self.seconds[command.file] + offset
-        return hold(stamps, command.values, self.seconds[position.file]), position.values
+        return hold_signal(stamps, command.values, self.seconds[position.file]), position.values
 
     # -- files
 
@@ -219,7 +219,7 @@ class RunLogs:
         clocks: dict[str, list[tuple[LogColumn, str]]] = {}
         errors: list[InputError] = []
         for file, log in logs.items():
-            columns = column_guessing.clocks(_list_all_columns(file, log))
+            columns = column_guessing.list_clock_columns(_list_all_columns(file, log))
             units = [(column, _detect_time_unit(column)) for column in columns]
             candidates = [(column, unit) for column, unit in units if unit is not None]
             if candidates:
@@ -263,7 +263,7 @@ class RunLogs:
         return columns
 
 
-def hold(stamps: Array, values: Array, times: Array) -> Array:
+def hold_signal(stamps: Array, values: Array, times: Array) -> Array:
     """Return a signal at given times (T,) with a zero-order hold; its first value before that.
 
     Args:

@@ -55,7 +55,7 @@ class Signal:
         """Reasons for joint and unit."""
         return f"{self.placement.value}{self.reason}"
 
-    def placed(self, placement: Placement) -> Signal:
+    def with_placement(self, placement: Placement) -> Signal:
         """Return the signal with another reason for its joint."""
         return replace(self, placement=placement)
 

@@ -138,7 +138,7 @@ class SuiteTables:
         curves, columns = self.curves[cell], {}
         for tuner in curves.list_tuners():
             tuner_curves = curves.select(tuner=tuner)
-            share = self._share_of_training(cell, tuner) if training == COUNTED else 0.0
+            share = self._get_training_share(cell, tuner) if training == COUNTED else 0.0
             column = tuner_curves.values[:, max(int(k - share), 0)]
             target_means = pd.Series(column).groupby(tuner_curves.keys["target"]).mean()
             means_array: Array = np.asarray(target_means, dtype=np.float64)
@@ -146,7 +146,7 @@ class SuiteTables:
             columns[tuner] = pd.Series(logs, index=target_means.index)
         return pd.DataFrame(columns)
 
-    def _share_of_training(self, cell: str, tuner: str) -> float:
+    def _get_training_share(self, cell: str, tuner: str) -> float:
         """Return a target's share of the training simulations of a tuner; 0 without training."""
         return self._fit_simulations.get((cell, tuner), 0.0) / TARGETS_SHARING_TRAINING
 
@@ -283,7 +283,7 @@ class SuiteTables:
             )
             for tuner in self.curves[cell].list_tuners():
                 curves = self.curves[cell].select(tuner=tuner)
-                share = self._share_of_training(cell, tuner)
+                share = self._get_training_share(cell, tuner)
                 for number, threshold in enumerate(levels, 1):
                     lines.append(
                         (
@@ -339,22 +339,22 @@ class SuiteTables:
         def pick(mask: pd.Series[bool]) -> list[str]:
             return [str(cell) for cell in cells.loc[mask, "cell"]]
 
-        def tagged(tag: str) -> pd.Series[bool]:
+        def find_tagged(tag: str) -> pd.Series[bool]:
             return tags.map(lambda words: tag in words).astype(bool)
 
         # Once explain has extended a simulator, nothing is missing any more.
-        misspecified = tagged("misspecified") & (kind != "after")
+        misspecified = find_tagged("misspecified") & (kind != "after")
         yield "parameters", "1", pick(dimension == 1)
         yield "parameters", "2 or 3", pick((dimension > 1) & (dimension <= 3))
         yield "parameters", "4 to 10", pick(dimension > 3)
         for tag in ("noise-free", "low-noise", "noisy"):
-            yield "noise", tag, pick(tagged(tag))
+            yield "noise", tag, pick(find_tagged(tag))
         yield "range", "in range", pick(kind.isin(["in", "before", "after"]))
         yield "range", "wide", pick(kind == "wide")
         yield "simulator", "complete", pick(~misspecified & (kind != "real"))
         yield "simulator", "an effect is missing", pick(misspecified & (kind != "real"))
         yield "data", "measured", pick(kind == "real")
-        yield "data", "robot from a model file", pick(tagged("robot"))
+        yield "data", "robot from a model file", pick(find_tagged("robot"))
 
     def find_losses(self, tuner: str, k: int, factor: float = 3.0) -> pd.DataFrame:
         """Find the cells in which a tuner's error is larger than the best one's by a factor.

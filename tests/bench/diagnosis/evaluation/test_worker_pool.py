@@ -13,12 +13,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from bench.core.resource_estimates import count_available_cores
 from bench.diagnosis.evaluation import worker_pool as crews
 from bench.diagnosis.evaluation.search_control import SearchControl
 from bench.diagnosis.evaluation.worker_pool import (
     ForkedWorkerPool,
     can_fork,
-    count_available_cores,
     serialise_message,
 )
 
