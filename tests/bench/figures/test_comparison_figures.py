@@ -112,7 +112,7 @@ def test_tables_can_be_had_without_a_file():
     whole = stored()
     made = build_tables(whole)
     assert list(made) == ["table", "ert", "ranking", "pairs", "break_even", "who_wins"]
-    expected = compute_statistics(whole).sorted(
+    expected = compute_statistics(whole).sort_rows(
         build_error_table(whole.runs, whole.statuses, 12, whole.costs)
     )
     assert list(dict.fromkeys(expected["tuner"])) == ["tunenet", "random"]
