@@ -96,7 +96,7 @@ MAX_EXCESS_SHARE_WITH_RIGHT_UNITS = 0.1
 """Maximum excess over the noise, as a share of that of the base model, with right units."""
 MAX_FORCE_SHARE_AT_CONTACTS = 1.0
 """Maximum missing force of a filter, as a share of the typical force, if the robot has contacts."""
-EXPLAINED = ("adequate", "named", "ambiguous")
+EXPLAINED_VERDICTS = ("adequate", "named", "ambiguous")
 """Verdicts for which the model explains the data down to the noise."""
 RecordingSource: TypeAlias = str | Path | Recording
 
@@ -132,8 +132,8 @@ def _explain_run(
     """Create a diagnosis and its worker pool for a `with` block, and close both at its end."""
     sources = [recording] if isinstance(recording, RecordingSource) else list(recording)
     with (
-        closing(ForkedWorkerPool(options.jobs or 1)) as crew,
-        closing(_ExplainRun(sources, options, crew)) as run,
+        closing(ForkedWorkerPool(options.jobs or 1)) as worker_pool,
+        closing(_ExplainRun(sources, options, worker_pool)) as run,
     ):
         yield run
 
@@ -209,7 +209,7 @@ class _ExplainRun:
         self,
         sources: Sequence[RecordingSource],
         options: ExplainOptions,
-        crew: ForkedWorkerPool,
+        worker_pool: ForkedWorkerPool,
     ) -> None:
         """Load and check the recording, and build the run evaluators, before any fit.
 
@@ -228,7 +228,7 @@ class _ExplainRun:
         self.force = force = options.force
         self.thorough = options.thorough
         self.watch = options.make_search_control()
-        self.crew = crew
+        self.worker_pool = worker_pool
         self.recording, kind = load_joined(
             sources,
             options.system,
@@ -351,8 +351,8 @@ class _ExplainRun:
             kind, self.recording, runs, self.engine, list_hat_effects(kind), self.free
         )
         evaluator.watch = self.watch
-        evaluator.crew = self.crew
-        self.crew.register(evaluator)
+        evaluator.worker_pool = self.worker_pool
+        self.worker_pool.register(evaluator)
         use_bounds(evaluator, {name: bounds for name, (_, bounds) in self.wider.items()})
         evaluator.identified = self.identified
         return evaluator
@@ -508,7 +508,7 @@ class _ExplainRun:
     @staticmethod
     def _is_explained(found: _SearchResult) -> bool:
         """Return whether a result explains the data down to the noise."""
-        return found.finding.verdict in EXPLAINED
+        return found.finding.verdict in EXPLAINED_VERDICTS
 
     def _search_with_soft_friction(
         self, base: BaseFit, before: EffectSearch, likely: FitStart | None = None
@@ -583,7 +583,7 @@ class _ExplainRun:
 
         For a robot, units are usually tested only if no effect has explained the gap before.
         """
-        explained = finding.verdict in EXPLAINED
+        explained = finding.verdict in EXPLAINED_VERDICTS
         if not self._checks_units_late or explained or self.watch.has_abandoned_fits():
             return ()
         left, before = (
@@ -958,7 +958,7 @@ class _ExplainRun:
             Penalised log-likelihood and excess RMS residual of the best model.
         """
         names, fit = finding.model.effects, finding.model.fit
-        slots = self.fitting.slots
+        slots = self.fitting.coefficient_slices
         starts = []
         for count in range(len(names) + 1):
             for some in combinations(names, count):
@@ -1047,12 +1047,18 @@ class _ExplainRun:
             self.fitting,
             self.assessor.collect_parameter_estimates(search, finding.model),
         )
-        own = {p.name: numbers[i] for i, p in enumerate(evaluator.parameters[: evaluator.own])}
+        own = {
+            p.name: numbers[i]
+            for i, p in enumerate(evaluator.parameters[: evaluator.system_parameter_count])
+        }
         # A freed constant becomes a constant of the extended simulator, with its fitted value.
-        freed = {p.name: numbers[evaluator.own + i].value for i, p in enumerate(evaluator.freed)}
+        freed = {
+            p.name: numbers[evaluator.system_parameter_count + i].value
+            for i, p in enumerate(evaluator.freed)
+        }
         added = {}
         # The simulator's order keeps the file independent of the order of the search.
-        for effect, slot in evaluator.slots.items():
+        for effect, slot in evaluator.coefficient_slices.items():
             if effect not in finding.model.effects:
                 continue
             coefficients = evaluator.available_effects[effect].on(evaluator.simulator.system)

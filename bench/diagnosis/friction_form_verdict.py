@@ -141,7 +141,7 @@ def _refit_in(evaluator: RunEvaluator, models: ModelSet, model: FittedModel) -> 
     names, theta = replace_by_stateless_friction(models.evaluator, model.effects, model.fit.theta)
     # The random numbers of these models do not affect the result.
     other_models = ModelSet(
-        evaluator, models.noise, models.frozen, make_rng("friction form"), models.stated
+        evaluator, models.noise, models.frozen, make_rng("friction form"), models.is_noise_stated
     )
     refitted_model = other_models.fit_one(FitStart(names, theta, model.fit.states))
     if models.evaluator.correction is None:

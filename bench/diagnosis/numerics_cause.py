@@ -21,11 +21,11 @@ if TYPE_CHECKING:
 
 Item = TypeVar("Item")
 
-SURE = 20.0
+MIN_FINER_STEP_GAIN = 20.0
 """Minimum gain in twice the log-likelihood of a finer step over the file's own step; it means odds
 of 22,000 to 1.
 """
-PART = 0.5
+MIN_CLOSED_SHARE = 0.5
 """Minimum share of the base model's gap that a finer step must close alone to be used in the
 search. With a smaller share, another missing effect decides which step looks better.
 """
@@ -62,7 +62,7 @@ def is_finer_step_better(gain: float, gap: float, remaining_gap: float) -> bool:
         remaining_gap: Excess RMS residual of the base model with the finer step, in units of the
             noise.
     """
-    return gain >= SURE and gap - max(remaining_gap, 0.0) >= PART * gap
+    return gain >= MIN_FINER_STEP_GAIN and gap - max(remaining_gap, 0.0) >= MIN_CLOSED_SHARE * gap
 
 
 def is_finer_model_better(file: tuple[float, float], finer: tuple[float, float]) -> bool:
@@ -111,7 +111,7 @@ def _list_numerics_causes(coarse: CoarseStepFinding) -> list[Cause]:
     """
     from sims.robot.integrator_settings import INTEGRATOR_IDS
 
-    file_settings, numerics = coarse.refinement.own, coarse.refinement.numerics
+    file_settings, numerics = coarse.refinement.file_settings, coarse.refinement.numerics
     # At most two numbers are chosen, so Wilks' theorem gives this p-value of the gain.
     p_value = float(np.exp(-0.5 * min(coarse.gain, 1400.0)))
     error = (

@@ -54,7 +54,7 @@ def check_identifiability(
     constants = () if kind.has_model else tuple(free)
     with closing(ForkedWorkerPool(jobs)) as worker_pool:
         evaluator = RunEvaluator(kind, recording, recording.training(), engine, (), constants)
-        evaluator.crew = worker_pool
+        evaluator.worker_pool = worker_pool
         worker_pool.register(evaluator)
         floor = compute_noise_floor(evaluator, recording)
         noise = NoiseModel(floor.sigma, np.zeros(len(floor.sigma)))

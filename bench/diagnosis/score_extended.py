@@ -168,7 +168,7 @@ def build_theta(evaluator: RunEvaluator, extended: ExtendedSimulator) -> Array:
     """
     # Missing parameters are nominal, and missing coefficients are off.
     theta = evaluator.get_nominal_theta()
-    base_parameters = evaluator.parameters[: evaluator.own]
+    base_parameters = evaluator.parameters[: evaluator.system_parameter_count]
     for place, parameter in enumerate(base_parameters):
         if parameter.name in extended.parameters:
             number = extended.parameters[parameter.name]

@@ -220,7 +220,7 @@ class VerdictBuilder:
         """
         evaluator, kind = self.fitting_evaluator, cast(Any, self.fitting_evaluator.kind)
         # The free numbers of the user come first, in the order of their effects.
-        places = iter(range(evaluator.own))
+        places = iter(range(evaluator.system_parameter_count))
         for effect in kind.system.freed_effects:
             yield effect, [next(places) for _ in effect.coefficients]
         for name in model.effects:
@@ -332,7 +332,9 @@ class VerdictBuilder:
         # order.
         effect = evaluator.available_effects[evidence.effect]
         coefficients = effect.on(evaluator.simulator.system)
-        places = range(*evaluator.slots[evidence.effect].indices(len(evaluator.parameters)))
+        places = range(
+            *evaluator.coefficient_slices[evidence.effect].indices(len(evaluator.parameters))
+        )
         # A coefficient that cannot be observed is fixed at zero and is not a result.
         by_name = {
             c.name: numbers[i]
@@ -422,7 +424,7 @@ class VerdictBuilder:
                 np.clip(estimate_tail_p_value(scores.null_scores, beyond_chance), 0.0, 1.0)
             )
             share = self._get_closed_share(finding, (effect,))
-            slot = search.evaluator.slots[effect]
+            slot = search.evaluator.coefficient_slices[effect]
             score -= search.parameter_penalty * (slot.stop - slot.start - 1)
             rows.append(Candidate(effect, max(score, 0.0), p_value, share))
         return tuple(sorted(rows, key=lambda row: -row.score))

@@ -72,12 +72,12 @@ def so101(out, explained):
     extended, of_file, _ = open_extended(explained / "extended.toml", simulators.get)
     world = RunEvaluator(of_file, recording, runs, None, candidates=list(extended.effects))
     after = world.get_nominal_theta()
-    for place, parameter in enumerate(world.parameters[: world.own]):
+    for place, parameter in enumerate(world.parameters[: world.system_parameter_count]):
         after[place] = extended.parameters[parameter.name].value
     # A search that its budget ended has no numbers of the base model.
     known = tuned(explained) if (explained / "apart.csv").exists() else {}
     before = world.get_nominal_theta()
-    for place, parameter in enumerate(world.parameters[: world.own]):
+    for place, parameter in enumerate(world.parameters[: world.system_parameter_count]):
         before[place] = known.get(parameter.name, np.nan)
     for name, numbers in extended.effects.items():
         coefficients = world.available_effects[name].on(world.simulator.system)

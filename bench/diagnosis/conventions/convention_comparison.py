@@ -422,7 +422,7 @@ class ConventionComparison:
             groups = selected.groups[:count]
             theta = evaluator.get_nominal_theta()
             for one, numbers in zip(groups, selected.regression.solve(groups)[1], strict=True):
-                theta[evaluator.slots[one.effect]] = group_coefficients(
+                theta[evaluator.coefficient_slices[one.effect]] = group_coefficients(
                     evaluator, probes, one, numbers
                 )
             fitted = _fit_coefficients(followed.with_parameters(theta), groups)

@@ -255,7 +255,7 @@ class HypothesisGenerator:
         groups = positions, commands, [*positions, *commands], self._list_channels("qd")
         for names in (*groups, self._list_channels("tau")):
             signals = [self._signals[name] for name in names]
-            if len({(s.si, s.stated, s.gain) for s in signals}) == 1:
+            if len({(s.si, s.specified_unit, s.gain) for s in signals}) == 1:
                 yield from _generate_units(signals, recording)
 
     def _list_channels(self, quantity: str) -> list[str]:
@@ -419,7 +419,7 @@ def _generate_units(
     for unit, gain in UNITS.get(first.si, {}).items():
         scale = first.scale * gain / first.gain
         if not math.isclose(scale, 1.0, rel_tol=1e-6):
-            words, stated = (UNITS_IN_WORDS.get(one, one) for one in (unit, first.stated))
+            words, stated = (UNITS_IN_WORDS.get(one, one) for one in (unit, first.specified_unit))
             yield ConventionHypothesis(
                 f"the numbers of {text} look like {words}, stated as {stated}",
                 {name: SignalChange(name, scale) for name in names},

@@ -19,7 +19,7 @@ from sims.recording.unit_conversion import compute_unit_scale
 
 KINDS = ("channels", "inputs")
 """Tables of the description that contain signals."""
-SHOWN = ("column", "unit", "scale", "offset", "unwrap")
+CORRECTED_KEYS = ("column", "unit", "scale", "offset", "unwrap")
 """Keys of a signal that a correction changes, in the order in which they are shown."""
 
 
@@ -121,7 +121,7 @@ def list_changed_tables(
         for name in dict.fromkeys(names):
             table = after[kind][name]
             was = before[kind][name]
-            own = [key for key in SHOWN if key in table and table[key] != was.get(key)]
+            own = [key for key in CORRECTED_KEYS if key in table and table[key] != was.get(key)]
             keys = [f"{key} = {_format_value(table[key])}" for key in own]
             yield f"[{kind}.{toml_key(name)}] {', '.join(keys)}"
     if any(one.hypothesis.late for one in differences):

@@ -13,7 +13,7 @@ residual may have other causes, which move the best factor a little. But if a fa
 leaves less than a third of it, the signal has a gain error instead: for example a gain of 6.0,
 close to the 2 pi of turns. Parameters may absorb the scale of an input; then a factor of zero,
 which switches the input off, must fit clearly worse. No hypothesis is tested unless the base model
-misses some channel by more than `GROSS` of its standard deviation.
+misses some channel by more than `MIN_BASE_RESIDUAL_SHARE` of its standard deviation.
 """
 
 from __future__ import annotations
@@ -44,55 +44,55 @@ from sims.recording.recording import Recording, Run
 from sims.recording.recording_description import stated_columns
 from sims.system_simulator import SystemSimulator
 
-GROSS = 0.1
+MIN_BASE_RESIDUAL_SHARE = 0.1
 """Minimum residual of the base model, as a share of the standard deviation of a channel, for which
 units are checked. A gain error of 5 % stays below it.
 """
-REMAINING = 0.3
+MAX_REMAINING_SHARE = 0.3
 """Maximum share of the misfit that remains with a correct unit."""
-STEP = 1.25
+FACTOR_STEP = 1.25
 """Factor by which a hypothesis is changed to test whether another factor fits as well."""
-NEAR = 1.04
+SMALL_FACTOR_STEP = 1.04
 """Factor by which a hypothesis is changed a little, to test whether a factor that is not a unit
 explains the data far better.
 """
-FAR_BETTER = 1.0 / 3.0
+MAX_NEARBY_SHARE = 1.0 / 3.0
 """Maximum share of a hypothesis's misfit that remains with a nearby factor that rejects it."""
-FOLLOWED = 0.2
+MAX_RESIDUAL_SHARE = 0.2
 """Maximum residual that remains with a hypothesis, as a share of the standard deviation of a
 channel.
 """
-EXPLAINED = 1.5
+MAX_EXPLAINED_RESIDUAL = 1.5
 """Maximum RMS residual, in units of the noise, at which a hypothesis explains the data, so that no
 nearby factor is tested.
 """
-EQUAL = 1.05
+MAX_EQUAL_RATIO = 1.05
 """Maximum ratio of two misfits that count as equal."""
-SHARP = 7.0
+MIN_DISTINCT_GAIN = 7.0
 """Minimum gain in twice the log-likelihood of a factor over others near it."""
-OFF = 1e-6
+OFF_FACTOR = 1e-6
 """Factor that switches an input off."""
-WORSE = 3.0
+MIN_RATIO_WITHOUT_INPUT = 3.0
 """Minimum ratio of the misfit without an input to the misfit with it."""
-TRIED = 2
+FITTED_HYPOTHESES = 2
 """Number of hypotheses that are fitted after each of two screenings: by the beginning of the runs,
 and by the whole runs.
 """
-SCREENED = 12
+SCREENED_HYPOTHESES = 12
 """Number of hypotheses that are simulated over whole runs: those that fit the beginning of the runs
 best.
 """
-WORST = 3
+CHECKED_CHANNELS = 3
 """Number of channels of a robot with the largest misfit whose joints are checked."""
-CLOSE = 0.02
+GAIN_TOLERANCE = 0.02
 """Maximum relative difference between a fitted gain and a unit conversion that are taken as equal.
 """
-IGNORED = 0.2
+MIN_SENSOR_GAIN = 0.2
 """Maximum magnitude of a fitted sensor gain at which the reading hardly depends on the simulation;
 it is the lower bound of the gain's range.
 """
 
-BEGINNING = FIT_HORIZONS[0].share
+SCREENING_SHARE = FIT_HORIZONS[0].share
 """First fraction of each run, by which hypotheses are screened."""
 _NAMED = 4
 """Maximum number of signals that a sentence names."""
@@ -150,7 +150,7 @@ class Signal:
         name: Name of the column.
         kind: Table of the signal in the description, ``channels`` or ``inputs``.
         si: SI unit that the simulator uses.
-        stated: Unit that the description specifies.
+        specified_unit: Unit that the description specifies.
         gain: Factor from the values of the column to SI units.
         scale: Part of `gain` that the description specifies as a separate factor.
     """
@@ -158,7 +158,7 @@ class Signal:
     name: str
     kind: str
     si: str
-    stated: str
+    specified_unit: str
     gain: float
     scale: float = 1.0
 
@@ -198,7 +198,7 @@ class Hypothesis:
         factors = self.factors()
         lines = []
         for signal, unit in zip(self.signals, self.units, strict=True):
-            keys = [f'unit = "{unit}"'] * (unit != signal.stated)
+            keys = [f'unit = "{unit}"'] * (unit != signal.specified_unit)
             keys += [f"scale = {self._get_corrected_scale(signal):.9g}"] * (
                 self._get_corrected_scale(signal) != 1.0
             )
@@ -206,7 +206,7 @@ class Hypothesis:
         return RecordingFault(
             tuple(signal.name for signal in self.signals),
             factors[self.signals[0].name],
-            self.units[0] if self.units[0] != self.signals[0].stated else None,
+            self.units[0] if self.units[0] != self.signals[0].specified_unit else None,
             self._format_correction(file, factors),
             tuple(lines),
             before,
@@ -227,12 +227,12 @@ class Hypothesis:
         names = join_first_names([signal.said for signal in self.signals], _NAMED)
         table = f"[{first.kind}.{first.name}]" if len(self.signals) == 1 else "the tables of each"
         scale = f"set scale = {self._get_corrected_scale(first):.9g} in {table} of {file}"
-        if unit == first.stated and self.scale == -1.0:
+        if unit == first.specified_unit and self.scale == -1.0:
             return f"The sign of {names} looks reversed: {scale}"
-        if unit == first.stated:
+        if unit == first.specified_unit:
             return f"The recorded numbers of {names} look converted twice: {scale}"
         turned = f"; the sign is reversed too: {scale}" if self.scale < 0 else ""
-        words, stated = (UNITS_IN_WORDS.get(one, one) for one in (unit, first.stated))
+        words, stated = (UNITS_IN_WORDS.get(one, one) for one in (unit, first.specified_unit))
         wanted = dict.fromkeys(f'unit = "{one}"' for one in self.units)
         return (
             f"The recorded numbers of {names} look like {words}, stated as {stated} "
@@ -310,18 +310,18 @@ def find_wrong_units(
     is_recorded = np.isfinite(evaluator.observed)
     residual = np.where(is_recorded, evaluator.observed - base.fit.simulated, 0.0)
     shares = _compute_residual_shares(evaluator, residual, noise)
-    if not (shares > GROSS).any():
+    if not (shares > MIN_BASE_RESIDUAL_SHARE).any():
         return None
     before = _compute_residual_rms(residual, is_recorded, noise)
     known = before if np.isfinite(before) else None
     signals = subject.signals(evaluator.channels)
     hypotheses = list(_generate_hypotheses(signals, _list_suspected_parts(evaluator, shares)))
-    excess = REMAINING * (before - 1.0)
+    excess = MAX_REMAINING_SHARE * (before - 1.0)
     accepted: list[tuple[Hypothesis, float]] = []
     others: list[str] = []
     for hypothesis in _select_promising(subject, hypotheses):
         after, missed = _fit_rescaled(subject, hypothesis.factors())
-        if after - 1.0 > excess or missed > FOLLOWED:
+        if after - 1.0 > excess or missed > MAX_RESIDUAL_SHARE:
             continue
         distinction = _test_distinctness(subject, hypothesis, after, int(is_recorded.sum()))
         if distinction == "sharp":
@@ -335,7 +335,7 @@ def find_wrong_units(
         return None
     # Among hypotheses that fit equally well, the simplest is preferred.
     lowest_misfit = min(after for _, after in accepted)
-    equally_good = [pair for pair in accepted if pair[1] <= EQUAL * lowest_misfit]
+    equally_good = [pair for pair in accepted if pair[1] <= MAX_EQUAL_RATIO * lowest_misfit]
     equally_good.sort(key=lambda pair: (len(pair[0].signals), pair[0].scale != 1.0))
     (best, after), *others_alike = equally_good
     # Hypotheses that differ only in the sign are not alternatives.
@@ -383,12 +383,12 @@ def find_imitated_unit(
     factor = 1.0 / gain if kind == "channels" else gain
     for hypothesis in _generate_unit_hypotheses((signal,)):
         wanted = hypothesis.factors()[signal.name]
-        if wanted * factor > 0 and abs(math.log(wanted / factor)) < CLOSE:
+        if wanted * factor > 0 and abs(math.log(wanted / factor)) < GAIN_TOLERANCE:
             alternatives = tuple(
                 _BEYOND.format(name) for name in _list_parameters_at_bounds(evaluator, base)
             )
             return replace(hypothesis.fault(subject.file, None, None), alternatives=alternatives)
-    if kind == "channels" and abs(gain) <= IGNORED:
+    if kind == "channels" and abs(gain) <= MIN_SENSOR_GAIN:
         message = (
             f"The fit makes {signal.said} nearly independent of the simulation (a sensor gain of "
             f"{coefficient.value:.4g}), which is not an answer: check the unit, the column and the "
@@ -402,7 +402,7 @@ def find_imitated_unit(
 
 
 def _get_unit_gain(signal: Signal, unit: str) -> float:
-    if unit == signal.stated:
+    if unit == signal.specified_unit:
         return signal.gain
     return signal.scale * UNITS[signal.si][unit]
 
@@ -462,7 +462,7 @@ def _list_suspected_parts(evaluator: RunEvaluator, shares: Array) -> frozenset[s
     """Return the joints and actuators of a robot to check; None for other systems: check all."""
     if not evaluator.kind.has_model:
         return None
-    worst = np.argsort(-shares)[:WORST].tolist()
+    worst = np.argsort(-shares)[:CHECKED_CHANNELS].tolist()
     joints = {evaluator.channels[c].partition(".")[2] for c in worst}
     robot: Any = evaluator.kind
     drives = {a.name for a in robot.robot.actuators if a.joint in joints}
@@ -482,19 +482,19 @@ def _generate_hypotheses(
             yield from _generate_unit_hypotheses((signal,))
     by_unit: dict[tuple[str, str, str], list[Signal]] = {}
     for signal in signals:
-        by_unit.setdefault((signal.kind, signal.si, signal.stated), []).append(signal)
+        by_unit.setdefault((signal.kind, signal.si, signal.specified_unit), []).append(signal)
     for alike in by_unit.values():
         if len(alike) > 1:
             yield from _generate_unit_hypotheses(tuple(alike))
     for units in _TOGETHER:
         either = [s for s in signals if s.si in units]
         for wanted in (units, {si: si for si in units}):
-            those = tuple(s for s in either if s.stated != wanted[s.si])
+            those = tuple(s for s in either if s.specified_unit != wanted[s.si])
             if len({s.si for s in those}) > 1:
                 yield Hypothesis(those, tuple(wanted[s.si] for s in those))
         if len({s.si for s in either}) > 1:
             si = either[0].si
-            stated = tuple(s.stated for s in either)
+            stated = tuple(s.specified_unit for s in either)
             yield Hypothesis(tuple(either), stated, 1.0 / UNITS[si][units[si]])
     yield from _generate_reversed_joints(signals, suspects)
 
@@ -505,19 +505,19 @@ def _generate_unit_hypotheses(signals: tuple[Signal, ...]) -> Iterator[Hypothesi
     Factors that undo a conversion that was made twice are tried as well.
     """
     first = signals[0]
-    stated_units = (first.stated,) * len(signals)
+    stated_units = (first.specified_unit,) * len(signals)
     yield Hypothesis(signals, stated_units, -1.0)
     units = UNITS.get(first.si, {})
     stated = abs(first.gain / first.scale)
     tested_factors = {1.0}
     for unit, gain in units.items():
-        if unit != first.stated and not math.isclose(gain, stated, rel_tol=1e-6):
+        if unit != first.specified_unit and not math.isclose(gain, stated, rel_tol=1e-6):
             yield Hypothesis(signals, (unit,) * len(signals))
             yield Hypothesis(signals, (unit,) * len(signals), -1.0)
             tested_factors.add(gain / stated)
     # These factors undo a conversion that was made twice.
     for factor in [*(1.0 / gain for gain in units.values()), *([1e3, 1e-3] if not units else [])]:
-        if not any(math.isclose(factor, known, rel_tol=CLOSE) for known in tested_factors):
+        if not any(math.isclose(factor, known, rel_tol=GAIN_TOLERANCE) for known in tested_factors):
             yield Hypothesis(signals, stated_units, factor)
             yield Hypothesis(signals, stated_units, -factor)
 
@@ -533,7 +533,9 @@ def _generate_reversed_joints(
             joints.setdefault(joint, []).append(signal)
     for joint, joint_signals in joints.items():
         if len(joint_signals) > 1 and (suspects is None or joint in suspects):
-            yield Hypothesis(tuple(joint_signals), tuple(s.stated for s in joint_signals), -1.0)
+            yield Hypothesis(
+                tuple(joint_signals), tuple(s.specified_unit for s in joint_signals), -1.0
+            )
 
 
 def _select_promising(subject: Subject, hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
@@ -555,8 +557,10 @@ def _select_promising(subject: Subject, hypotheses: Sequence[Hypothesis]) -> lis
             evaluator.close()
         return [those[i] for i in np.argsort(scores, kind="stable").tolist()]
 
-    screened = best(hypotheses, BEGINNING)[:SCREENED]
-    return list(dict.fromkeys([*screened[:TRIED], *best(screened, 1.0)[:TRIED]]))
+    screened = best(hypotheses, SCREENING_SHARE)[:SCREENED_HYPOTHESES]
+    return list(
+        dict.fromkeys([*screened[:FITTED_HYPOTHESES], *best(screened, 1.0)[:FITTED_HYPOTHESES]])
+    )
 
 
 def _build_rescaled_evaluator(
@@ -616,20 +620,28 @@ def _test_distinctness(
             0
         ]
 
-    if hypothesis.scale == -1.0 and hypothesis.units == tuple(s.stated for s in hypothesis.signals):
+    if hypothesis.scale == -1.0 and hypothesis.units == tuple(
+        s.specified_unit for s in hypothesis.signals
+    ):
         return "sharp"
-    if after > EXPLAINED:
-        nearby_residual = min(residual_with_factor(1.0 / NEAR), residual_with_factor(NEAR))
-        if nearby_residual - 1.0 < FAR_BETTER * (after - 1.0):
+    if after > MAX_EXPLAINED_RESIDUAL:
+        nearby_residual = min(
+            residual_with_factor(1.0 / SMALL_FACTOR_STEP), residual_with_factor(SMALL_FACTOR_STEP)
+        )
+        if nearby_residual - 1.0 < MAX_NEARBY_SHARE * (after - 1.0):
             return "none"
-    nearby_residual = min(residual_with_factor(1.0 / STEP), residual_with_factor(STEP))
-    if 2.0 * samples * math.log(nearby_residual / after) > SHARP:
+    nearby_residual = min(
+        residual_with_factor(1.0 / FACTOR_STEP), residual_with_factor(FACTOR_STEP)
+    )
+    if 2.0 * samples * math.log(nearby_residual / after) > MIN_DISTINCT_GAIN:
         return "sharp"
     # A factor that is not a unit cannot be recognised for an input of arbitrary scale.
     is_unit = hypothesis.scale == 1.0 and all(
         signal.kind == "inputs" for signal in hypothesis.signals
     )
     absorbed = (
-        is_unit and nearby_residual * EQUAL > after and residual_with_factor(OFF) > WORSE * after
+        is_unit
+        and nearby_residual * MAX_EQUAL_RATIO > after
+        and residual_with_factor(OFF_FACTOR) > MIN_RATIO_WITHOUT_INPUT * after
     )
     return "absorbed" if absorbed else "none"

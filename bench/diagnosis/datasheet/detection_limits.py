@@ -101,14 +101,14 @@ class DetectionLimits:
     Attributes:
         free: Names of the fitted parameters of the model.
         covariance: (q, q) covariance of these parameters.
-        reaches: Detection limits of absent effects, by effect and coefficient.
+        limits: Detection limits of absent effects, by effect and coefficient.
         prediction_half_widths: Half the 95 % interval of a parameter in a log, or a run, that is
             not yet recorded, by name; only for parameters that several groups identify.
     """
 
     free: tuple[str, ...]
     covariance: Array
-    reaches: Mapping[tuple[str, str], DetectionLimit]
+    limits: Mapping[tuple[str, str], DetectionLimit]
     prediction_half_widths: Mapping[str, float]
 
 
@@ -212,7 +212,10 @@ def _linearise_extended(
     """
     theta = build_theta(evaluator, extended)
     (prediction,) = HeldOutRuns(evaluator, noise).fit_initial_states([theta])
-    known_values = [extended.parameters.get(p.name) for p in evaluator.parameters[: evaluator.own]]
+    known_values = [
+        extended.parameters.get(p.name)
+        for p in evaluator.parameters[: evaluator.system_parameter_count]
+    ]
     # A parameter without an interval was not fitted.
     frozen = {i for i, number in enumerate(known_values) if number is None or number.low is None}
     start = FitStart(tuple(extended.effects), theta, prediction.states)
@@ -235,13 +238,13 @@ class _DetectionLimitCalculator:
         """Compute the information on each candidate coefficient, eq. (1), and its step, eq. (2).
 
         The columns of the least-squares problem are the q fitted parameters, the K candidate
-        directions and the residual. `left` (q + K + 1, q + K + 1) has their inner products after
-        the initial states are projected out by a Schur complement. `along` (K, q) has the
-        coefficients with which the parameters reproduce each direction; `powers` (K,) is the
-        information of eq. (1) that remains, and `leaning` (K,) the estimate after one Gauss-Newton
-        step from zero, eq. (2).
+        directions and the residual. `products` (q + K + 1, q + K + 1) has their inner products
+        after the initial states are projected out by a Schur complement. `projections` (K, q) has
+        the coefficients with which the parameters reproduce each direction; `powers` (K,) is the
+        information of eq. (1) that remains, and `newton_steps` (K,) the estimate after one
+        Gauss-Newton step from zero, eq. (2).
         """
-        self.evaluator, self.found = evaluator, direction_set
+        self.evaluator, self.direction_set = evaluator, direction_set
         self.q = fit.free.size
         self.places = fit.free.tolist()
         self.free = tuple(evaluator.parameters[i].name for i in fit.free.tolist())
@@ -252,28 +255,32 @@ class _DetectionLimitCalculator:
         fisher_blocks = compute_fisher_blocks_from_jacobian(
             evaluator, columns, columns.shape[3] - state_columns.shape[3], noise
         )
-        own_sum = fisher_blocks.own.sum(axis=0)
-        self.left, _ = compute_schur_complement(own_sum, fisher_blocks.cross, fisher_blocks.inner)
+        parameter_block = fisher_blocks.parameters.sum(axis=0)
+        self.products, _ = compute_schur_complement(
+            parameter_block, fisher_blocks.cross, fisher_blocks.states
+        )
         inner = slice(0, self.q)
-        self.covariance = invert_scaled(own_sum[inner, inner], self.left[inner, inner])
-        cross_products = self.left[self.q : -1, : self.q]
-        self.along = along = cross_products @ self.covariance
-        raw_powers = np.diagonal(self.left)[self.q : -1]
+        self.covariance = invert_scaled(parameter_block[inner, inner], self.products[inner, inner])
+        cross_products = self.products[self.q : -1, : self.q]
+        self.projections = projections = cross_products @ self.covariance
+        raw_powers = np.diagonal(self.products)[self.q : -1]
         self.powers = np.maximum(
-            raw_powers - np.einsum("kq,kq->k", along, cross_products), 0.0
+            raw_powers - np.einsum("kq,kq->k", projections, cross_products), 0.0
         )  # (1)
-        pull = self.left[self.q : -1, -1] - along @ self.left[: self.q, -1]
-        self.leaning = pull / np.maximum(self.powers, 1e-300)  # (2)
+        pull = self.products[self.q : -1, -1] - projections @ self.products[: self.q, -1]
+        self.newton_steps = pull / np.maximum(self.powers, 1e-300)  # (2)
 
     def compute_limits(self, prediction_half_widths: Mapping[str, float]) -> DetectionLimits:
         """Compute the detection limit of each coefficient, at the shape that is detected best."""
         shapes: dict[tuple[str, int], list[int]] = {}
         for k in np.argsort(-self.powers, kind="stable").tolist():
-            probe = self.found.candidates[k]
+            probe = self.direction_set.candidates[k]
             if not probe.fixed:
                 shapes.setdefault((probe.effect, probe.place), []).append(k)
         best = {key: probe_indices[0] for key, probe_indices in shapes.items()}
-        limits = dict.fromkeys(probe.effect for probe in self.found.candidates if probe.fixed)
+        limits = dict.fromkeys(
+            probe.effect for probe in self.direction_set.candidates if probe.fixed
+        )
         detection_limits = {}
         for (name, place), probe_indices in shapes.items():
             # At that shape a richer law may be equivalent to a simpler one that it contains.
@@ -303,7 +310,9 @@ class _DetectionLimitCalculator:
         """
         power = self.powers[k]
         size = Z95 / np.sqrt(power) if power > 0 else np.inf
-        parameter = self.evaluator.parameters[self._get_coefficient_index(self.found.candidates[k])]
+        parameter = self.evaluator.parameters[
+            self._get_coefficient_index(self.direction_set.candidates[k])
+        ]
         low, high = parameter.bounds
         # The interval exceeds all plausible values, so the data say nothing about the coefficient.
         if 2.0 * size > MAX_INTERVAL_WIDTH * (high - low):
@@ -311,7 +320,9 @@ class _DetectionLimitCalculator:
                 float(size), confounded_with=self._list_confounded_parameters(k), vague=True
             )
         return DetectionLimit(
-            float(size), float(self.leaning[k]), confounded_with=self._list_confounded_parameters(k)
+            float(size),
+            float(self.newton_steps[k]),
+            confounded_with=self._list_confounded_parameters(k),
         )
 
     def _get_coefficient_index(self, probe: CandidateDirection) -> int:
@@ -320,10 +331,10 @@ class _DetectionLimitCalculator:
     def _list_confounded_parameters(self, k: int) -> tuple[str, ...]:
         """Return the parameters of the model that together have nearly the same influence."""
         i = self.q + k
-        if self.powers[k] > (1.0 - CONFOUNDING_CORRELATION**2) * self.left[i, i]:
+        if self.powers[k] > (1.0 - CONFOUNDING_CORRELATION**2) * self.products[i, i]:
             return ()
         # Contributions are relative to the largest one.
-        parts = np.abs(self.along[k]) * np.sqrt(np.diagonal(self.left)[: self.q])
+        parts = np.abs(self.projections[k]) * np.sqrt(np.diagonal(self.products)[: self.q])
         parts /= max(float(parts.max(initial=0.0)), 1e-300)
         order = np.argsort(-parts).tolist()
         return tuple(self.free[j] for j in order if parts[j] > MIN_CONFOUNDING_SHARE)
@@ -337,13 +348,13 @@ class _DetectionLimitCalculator:
         """
         simpler_effects = set(self.evaluator.available_effects[name].contains)
         other_columns = [self.q + j for (effect, _), j in best.items() if effect in simpler_effects]
-        for effect in simpler_effects & set(self.evaluator.slots):
+        for effect in simpler_effects & set(self.evaluator.coefficient_slices):
             effect_places = self.evaluator.get_coefficient_indices(effect)
             other_columns += [j for j, place in enumerate(self.places) if place in effect_places]
         i = self.q + k
         for j in other_columns:
-            scale = np.sqrt(self.left[i, i] * self.left[j, j])
-            if scale > 0 and abs(self.left[i, j]) / scale > SAME_COEFFICIENT_CORRELATION:
+            scale = np.sqrt(self.products[i, i] * self.products[j, j])
+            if scale > 0 and abs(self.products[i, j]) / scale > SAME_COEFFICIENT_CORRELATION:
                 return True
         return False
 
@@ -355,7 +366,9 @@ class _DetectionLimitCalculator:
         parameters of the model have absorbed what they can.
         """
         probes = [
-            (k, p) for k, p in enumerate(self.found.candidates) if p.effect == name and p.fixed
+            (k, p)
+            for k, p in enumerate(self.direction_set.candidates)
+            if p.effect == name and p.fixed
         ]
         sizes_with_index = sorted((float(p.coefficients[0]), k) for k, p in probes)
         detectable_sizes = [
@@ -365,7 +378,7 @@ class _DetectionLimitCalculator:
         ]
         # A limit has more influence the smaller it is, and backlash the larger it is.
         smallest_information, largest_information = (
-            self.left[self.q + k, self.q + k]
+            self.products[self.q + k, self.q + k]
             for _, k in (sizes_with_index[0], sizes_with_index[-1])
         )
         is_upper_limit = bool(smallest_information > largest_information)

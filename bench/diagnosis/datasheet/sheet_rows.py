@@ -125,16 +125,16 @@ class _Rows:
     subject: SheetSubject
     extended: ExtendedSimulator
     verdict: Verdict
-    shown: DetectionLimits
+    detection_limits: DetectionLimits
 
     def derived(self) -> Iterator[SheetRow]:
         """Yield quantities derived from the system's parameters, by error propagation."""
         parameters = self.extended.parameters
         values = {name: number.value for name, number in parameters.items()}
         values_by_name = {**self.extended.constants, **values}
-        free = [name for name in self.shown.free if name in values]
-        indices = [self.shown.free.index(name) for name in free]
-        covariance = self.shown.covariance[np.ix_(indices, indices)]
+        free = [name for name in self.detection_limits.free if name in values]
+        indices = [self.detection_limits.free.index(name) for name in free]
+        covariance = self.detection_limits.covariance[np.ix_(indices, indices)]
         for derived in self.subject.kind.system.derived:
             try:
                 value = derived.of(values_by_name)
@@ -166,7 +166,10 @@ class _Rows:
                     parameter.name, description, "system", "fitted", number, None
                 )
                 yield replace(
-                    row, prediction_half_width=self.shown.prediction_half_widths.get(parameter.name)
+                    row,
+                    prediction_half_width=self.detection_limits.prediction_half_widths.get(
+                        parameter.name
+                    ),
                 )
             return
         for name, number in self.extended.parameters.items():
@@ -214,7 +217,7 @@ class _Rows:
         it is converted to the unit of that number.
         """
         half_width, file_value = (
-            self.shown.prediction_half_widths.get(parameter),
+            self.detection_limits.prediction_half_widths.get(parameter),
             self.subject.get_model_file_value(effect),
         )
         if half_width is None or file_value is None:
@@ -236,8 +239,8 @@ class _Rows:
 
     def absent(self) -> Iterator[SheetRow]:
         """Yield the effects that are not in the model, with their detection limits."""
-        for (effect, coefficient), detection_limit in self.shown.reaches.items():
-            has_several = len({c for e, c in self.shown.reaches if e == effect}) > 1
+        for (effect, coefficient), detection_limit in self.detection_limits.limits.items():
+            has_several = len({c for e, c in self.detection_limits.limits if e == effect}) > 1
             label = f"{effect} {coefficient}" if has_several else effect
             placed_effect = library.find_effect(effect, self.subject.kind.system)
             c = next(c for c in placed_effect.coefficients if c.name == coefficient)

@@ -17,7 +17,7 @@ from sims.core.simulator import Array, Parameter
 
 MAX_RANGE_FACTOR = 20.0
 """Ratio of the fit bounds to the plausible range, for coefficients of equation-based systems."""
-BEYOND_MODEL = 1000.0
+MAX_RANGE_FACTOR_MODEL_FILE = 1000.0
 """Ratio of the fit bounds to the plausible range, for quantities that a robot model file specifies.
 
 The total of such a quantity has physical limits (`least` and `most` of the coefficient), and its
@@ -36,16 +36,16 @@ MIN_CYCLES_PER_RUN = 1.0
 
 With fewer cycles, any slow change would be called periodic.
 """
-AT_BOUND = 1e-6
+BOUND_TOLERANCE = 1e-6
 """Maximum distance of a value at a bound from this bound, as a share of the range.
 
 A bound of zero is reached exactly or not at all, because ranges are wide compared with small
 coefficients.
 """
-NEAR = 1e-3
+RELATIVE_BOUND_TOLERANCE = 1e-3
 """Maximum distance of a value at a bound from this bound, as a share of the bound itself.
 
-It applies in addition to `AT_BOUND`.
+It applies in addition to `BOUND_TOLERANCE`.
 """
 
 Bound = Literal["low", "high"]
@@ -65,7 +65,9 @@ def compute_coefficient_bounds(evaluator: RunEvaluator, name: str) -> list[tuple
         name: name of the effect.
     """
     effect = evaluator.available_effects[name]
-    pairs = zip(evaluator.parameters[evaluator.slots[name]], effect.coefficients, strict=False)
+    pairs = zip(
+        evaluator.parameters[evaluator.coefficient_slices[name]], effect.coefficients, strict=False
+    )
     return [
         _restrict_to_physical(
             _compute_fit_bounds(parameter, coefficient, effect, evaluator), coefficient
@@ -110,7 +112,7 @@ def is_unusual(value: float, low: float, high: float) -> bool:
         low: lower end of the range.
         high: upper end of the range.
     """
-    tolerance = AT_BOUND * (high - low)
+    tolerance = BOUND_TOLERANCE * (high - low)
     return not low - tolerance <= value <= high + tolerance
 
 
@@ -122,11 +124,11 @@ def bound_of(value: float, low: float, high: float) -> Bound | None:
         low: lower end of the range.
         high: upper end of the range.
     """
-    tolerance = AT_BOUND * (high - low)
+    tolerance = BOUND_TOLERANCE * (high - low)
     # A range may be a thousand times as wide as the distance of its bound from zero.
-    if value <= low + min(tolerance, NEAR * abs(low)):
+    if value <= low + min(tolerance, RELATIVE_BOUND_TOLERANCE * abs(low)):
         return "low"
-    return "high" if value >= high - min(tolerance, NEAR * abs(high)) else None
+    return "high" if value >= high - min(tolerance, RELATIVE_BOUND_TOLERANCE * abs(high)) else None
 
 
 def _restrict_to_physical(
@@ -169,6 +171,6 @@ def _compute_fit_bounds(
     range_factor = MAX_RANGE_FACTOR_DRY_FRICTION if is_dry_friction else MAX_RANGE_FACTOR
     # The limits of a robot coefficient refer to the total with the value of the model file.
     if evaluator.kind.has_model and coefficient.least is not None:
-        range_factor = BEYOND_MODEL
+        range_factor = MAX_RANGE_FACTOR_MODEL_FILE
     # A coefficient whose sign is part of the definition of its effect has a lower bound of zero.
     return range_factor * low, range_factor * high

@@ -53,14 +53,14 @@ class StepRefinement(NamedTuple):
 
     Attributes:
         kind: its simulator with these settings.
-        own: step and integrator of the model file.
+        file_settings: step and integrator of the model file.
         numerics: step and integrator that correct the error.
-        error: RMS discretisation error of `own`, in units of the noise.
+        error: RMS discretisation error of `file_settings`, in units of the noise.
         corrected_error: RMS discretisation error of `numerics`, in units of the noise.
     """
 
     kind: type[RobotSimulator]
-    own: IntegratorSettings
+    file_settings: IntegratorSettings
     numerics: IntegratorSettings
     error: float
     corrected_error: float
@@ -151,7 +151,9 @@ class _ReferenceMotions:
         kind = self._kind.with_integrator_settings(numerics)
         simulator = kind(evaluator.recording.constants, evaluator.channels)
         count = len(self._tracks)
-        theta = np.tile(evaluator.get_nominal_theta()[: evaluator.own], (count, 1))
+        theta = np.tile(
+            evaluator.get_nominal_theta()[: evaluator.system_parameter_count], (count, 1)
+        )
         states = dict(zip(evaluator.states, evaluator.guess[:count].T, strict=True))
         scenarios = [track.scenario for track in self._tracks]
         evaluator.simulations += count

@@ -22,12 +22,12 @@ from bench.logs.quality.noise_estimation import estimate_differences_sigma
 from sims.core.simulator import Array
 from sims.recording.recording import Recording, Run
 
-ORDER = 8
+DIFFERENCE_ORDER = 8
 """Order of the differences that remove the motion from a smooth signal.
 
 At ten samples per period, 2 % of a sine remains; at a hundred samples, 10^-10.
 """
-FREE = 0.02
+MAX_NOISE_FREE_SHARE = 0.02
 """Maximum remainder of a channel without noise, as a share of the noise that would be added.
 
 The remainder due to rounding to six digits is smaller.
@@ -64,7 +64,8 @@ def _compute_added_noise(recording: Recording, name: str) -> float:
     if min_sigma < MIN_SIGMA:
         return 0.0
     # The estimate is not finite if all runs are too short for the differences.
-    return min_sigma if estimate_differences_sigma(signals, ORDER) < FREE * min_sigma else 0.0
+    sigma = estimate_differences_sigma(signals, DIFFERENCE_ORDER)
+    return min_sigma if sigma < MAX_NOISE_FREE_SHARE * min_sigma else 0.0
 
 
 def _add_noise(run: Run, sizes: dict[str, float]) -> Run:

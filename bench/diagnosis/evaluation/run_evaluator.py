@@ -73,11 +73,11 @@ class RunEvaluator:
         extra: effects in addition to the library, as given.
         library: names of the available effects, without the extra ones.
         simulator: simulator with all available effects; its channels are the recorded ones.
-        own: number of base parameters of the system.
+        system_parameter_count: number of base parameters of the system.
         freed: constants that are treated as parameters.
         parameters: (P,) description of each element of theta.
         base: (b,) indices in theta of the base parameters and the estimated constants.
-        slots: slice of theta with the coefficients of each effect.
+        coefficient_slices: slice of theta with the coefficients of each effect.
         states: names of the initial states.
         tracks: the runs, prepared for fitting.
         lengths: (R,) number of samples of each run.
@@ -105,7 +105,7 @@ class RunEvaluator:
             nonlinear filter.
         measured: for runs of a robot, states estimated from readings alone
             (`bench.diagnosis.kalman.measured_states`).
-        crew: worker pool for simulations and fits; by default only this process.
+        worker_pool: worker pool for simulations and fits; by default only this process.
 
     Args:
         kind: class of the simulator.
@@ -156,12 +156,12 @@ class RunEvaluator:
 
         # Theta has three parts: base parameters, freed constants, coefficients.
         system = self.simulator.system
-        self.own = len(system.parameters)
+        self.system_parameter_count = len(system.parameters)
         self.freed = [_make_freed_parameter(name, self.simulator, recording) for name in free]
-        coefficients = self.simulator.parameters[self.own :]
+        coefficients = self.simulator.parameters[self.system_parameter_count :]
         self.parameters: tuple[Parameter, ...] = (*system.parameters, *self.freed, *coefficients)
-        self.base: Indices = np.arange(self.own + len(self.freed))
-        self.slots = _allocate_coefficients(self.simulator, self.base.size)
+        self.base: Indices = np.arange(self.system_parameter_count + len(self.freed))
+        self.coefficient_slices = _allocate_coefficients(self.simulator, self.base.size)
         self._shifting, self._filtering = self._find_delaying_coefficients()
 
         # A system without coordinates provides the names of its states itself.
@@ -189,7 +189,7 @@ class RunEvaluator:
         self.simulations = 0
         self._cache = LaneCache()
         self.watch = SearchControl()
-        self.crew = ForkedWorkerPool()
+        self.worker_pool = ForkedWorkerPool()
         self._parts: dict[float, list[Scenario]] = {}
 
     def _create_simulators(self) -> tuple[SystemSimulator, SystemSimulator]:
@@ -336,7 +336,7 @@ class RunEvaluator:
 
     def get_coefficient_indices(self, effect: str) -> range:
         """Return the indices in theta of the coefficients of an effect."""
-        slot = self.slots[effect]
+        slot = self.coefficient_slices[effect]
         return range(slot.start, slot.stop)
 
     def get_nominal_theta(self) -> Array:
@@ -419,7 +419,7 @@ class RunEvaluator:
             for part in np.array_split(lanes, -(-lanes.size // max_batch_size)):
                 parts.append(part)
                 calls.append((bool(kind >= 2), theta[part], runs[part], states[part], share))
-        for number, simulated in self.crew.map_unordered(self, _simulate_engine_call, calls):
+        for number, simulated in self.worker_pool.map_unordered(self, _simulate_engine_call, calls):
             sample_count = simulated.shape[1]
             result[parts[number], :sample_count] = simulated
             result[parts[number], sample_count:] = np.nan
@@ -450,7 +450,7 @@ class RunEvaluator:
             self._get_channel_range(name)
         evaluator._travels = self._travels
         evaluator.watch = self.watch
-        evaluator.crew = self.crew
+        evaluator.worker_pool = self.worker_pool
         return evaluator
 
     def with_kind(self, kind: type[SystemSimulator]) -> RunEvaluator:
@@ -468,12 +468,12 @@ class RunEvaluator:
             candidates=self.library,
         )
         evaluator.parameters = self.parameters
-        evaluator.watch, evaluator.crew = self.watch, self.crew
+        evaluator.watch, evaluator.worker_pool = self.watch, self.worker_pool
         evaluator.followed, evaluator.guess = self.followed, self.guess
         evaluator.derivatives, evaluator.identified = self.derivatives, self.identified
         evaluator.state_prior = self.state_prior
         evaluator.is_in_contact = self.is_in_contact
-        self.crew.register(evaluator)
+        self.worker_pool.register(evaluator)
         return evaluator
 
     def make_simulator(self, kind: type[SystemSimulator]) -> SystemSimulator:
@@ -536,7 +536,7 @@ class RunEvaluator:
         simulator = self._fine if is_fine else self.simulator
         scenarios = self._make_scenarios(theta, runs, share)
         # The simulator does not treat freed constants as parameters.
-        freed_indices = np.arange(self.own, self.base.size)
+        freed_indices = np.arange(self.system_parameter_count, self.base.size)
         lanes = np.delete(theta, freed_indices, axis=1)
         initial = dict(zip(self.states, states.T, strict=True))
         return simulator.simulate_batch(lanes, scenarios, initial)
@@ -558,7 +558,7 @@ class RunEvaluator:
         length = max(scenario.times.size for scenario in scenarios)
         result = np.full((len(theta), length, len(self.channels)), np.nan)
         max_batch_size = max(MIN_CHUNK_SIZE, MAX_BATCH_SAMPLES // length)
-        freed_indices = np.arange(self.own, self.base.size)
+        freed_indices = np.arange(self.system_parameter_count, self.base.size)
         kinds = self.group_compatible(theta)
         for kind in np.unique(kinds):
             simulator = self._fine if kind >= 2 else self.simulator
@@ -576,7 +576,7 @@ class RunEvaluator:
         """Return a scenario with the freed constants set from parameters (P,)."""
         if not self.freed:
             return scenario
-        values = theta[self.own : self.base.size].tolist()
+        values = theta[self.system_parameter_count : self.base.size].tolist()
         freed_constants = {p.name: value for p, value in zip(self.freed, values, strict=True)}
         return replace(scenario, constants={**scenario.constants, **freed_constants})
 

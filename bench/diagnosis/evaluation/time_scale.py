@@ -4,7 +4,7 @@ With T the duration of the longest run and h the shortest sample interval:
 
 * a delay or a lag is plausible up to T / 20, and a fit may move it up to T: longer ones look
   constant within a run;
-* a decay time constant is at most `LASTING` T;
+* a decay time constant is at most `MAX_DECAY_FACTOR` T;
 * a frequency is at most 1 / (2 h), the Nyquist frequency.
 """
 
@@ -14,11 +14,11 @@ from dataclasses import replace
 
 from sims.core.simulator import Parameter
 
-SHARE = 0.05
+MAX_DELAY_SHARE = 0.05
 """Maximum plausible delay or lag, as a share of the duration of the longest run."""
-LASTING = 3.0
+MAX_DECAY_FACTOR = 3.0
 """Maximum decay time constant, as a multiple of the duration of the longest run."""
-DECADES = 100.0
+FREQUENCY_RANGE_RATIO = 100.0
 """Ratio of the highest to the lowest plausible frequency if the sampling limits the highest one."""
 
 
@@ -35,14 +35,14 @@ def adapt_to_time_scale(parameter: Parameter, longest: float, spacing: float) ->
         return parameter
     if parameter.unit == "s":
         if low > 0:
-            high = max(high, LASTING * longest)
+            high = max(high, MAX_DECAY_FACTOR * longest)
         else:
             # A delay may have either sign, so both ends are scaled by the same factor.
-            factor = max(1.0, SHARE * longest / high)
+            factor = max(1.0, MAX_DELAY_SHARE * longest / high)
             low, high = factor * low, factor * high
     elif parameter.unit == "Hz" and spacing > 0 and 0.5 / spacing < high:
         high = 0.5 / spacing
-        low = min(low, high / DECADES)
+        low = min(low, high / FREQUENCY_RANGE_RATIO)
     if (low, high) == parameter.bounds:
         return parameter
     nominal = min(max(parameter.nominal, low), high)

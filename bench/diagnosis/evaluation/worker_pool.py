@@ -51,7 +51,7 @@ class SharedState(Protocol):
 
     simulations: int
     watch: SearchControl
-    crew: ForkedWorkerPool
+    worker_pool: ForkedWorkerPool
 
 
 class _Worker(NamedTuple):
@@ -361,7 +361,7 @@ def _run_worker(
     for other_pipe in other_pipes:
         other_pipe.close()
     for evaluator in evaluators:
-        evaluator.crew = ForkedWorkerPool()
+        evaluator.worker_pool = ForkedWorkerPool()
     while True:
         try:
             place, task, item = pickle.loads(pipe.recv_bytes())

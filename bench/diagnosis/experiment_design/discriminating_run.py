@@ -47,7 +47,7 @@ INPUT_FACTORS = (0.3, 3.0)
 """Factors of an input that are tried."""
 ROBOT_INPUTS = (0.3, 2.0)
 """Factors of a robot's input that are tried: it may be driven at most twice as hard as before."""
-LARGER = 1.1
+MIN_INPUT_FACTOR = 1.1
 """Minimum factor by which an input must change, up or down, to be a different run."""
 
 
@@ -284,7 +284,7 @@ def _scale_inputs(evaluator: RunEvaluator, first: _Run, limits: StatedLimits) ->
         for share in dict.fromkeys(min(share, largest_share) for share in shares):
             scaled_signal = share * signal
             if (
-                1.0 / LARGER < share < LARGER
+                1.0 / MIN_INPUT_FACTOR < share < MIN_INPUT_FACTOR
                 or scaled_signal.min() < low
                 or scaled_signal.max() > high
             ):
@@ -333,7 +333,7 @@ def _compute_discrimination(
     """
     model_thetas = [model.fit.theta, competing_model.fit.theta]
     # Freed constants are fitted with the parameters, but passed to the simulator as constants.
-    places = evaluator.base[evaluator.own :]
+    places = evaluator.base[evaluator.system_parameter_count :]
     theta = np.delete(np.stack(model_thetas), places, axis=1)
     names = [parameter.name for parameter in evaluator.freed]
     scenarios = []

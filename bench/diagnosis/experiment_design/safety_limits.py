@@ -31,7 +31,7 @@ SPEED_AND_FORCE_FACTOR = 2.0
 """Maximum speed and force of a robot's joint without a specified limit, as a multiple of the
 present maximum.
 """
-STOP = 0.01
+STOP_SHARE = 0.01
 """Share of its range by which a joint may press into its stop if it did so in the present runs:
 stops are soft in MuJoCo.
 """
@@ -201,7 +201,7 @@ def _widen_by_stop(stated_range: Interval, recorded_range: Interval, is_position
     low, high = stated_range
     if not is_position:
         return stated_range
-    max_widening = STOP * (high - low)
+    max_widening = STOP_SHARE * (high - low)
     return max(min(low, recorded_range[0]), low - max_widening), min(
         max(high, recorded_range[1]), high + max_widening
     )

@@ -45,7 +45,7 @@ class Horizon(NamedTuple):
     iterations: int
 
 
-FOLLOWED = (Horizon(1.0, 6),)
+FILTERED_FIT_HORIZONS = (Horizon(1.0, 6),)
 """Fit horizons of a robot whose runs start near their best states, due to a state filter."""
 FIT_HORIZONS = (Horizon(0.2, 6), Horizon(0.45, 6), Horizon(1.0, 20))
 """Fit horizons, used one after another.
@@ -99,7 +99,7 @@ def fit_base_model(
         starts = [starts[i] for i in order[:FITTED_STARTS]]
 
     fits: list[TrajectoryFit] = []
-    for horizon in FIT_HORIZONS if evaluator.followed is None else FOLLOWED:
+    for horizon in FIT_HORIZONS if evaluator.followed is None else FILTERED_FIT_HORIZONS:
         evaluator.watch.report(f"base fit, first {horizon.share:.0%} of the runs")
         fits = TrajectoryFitter(evaluator, noise, share=horizon.share).fit_models(
             starts, horizon.iterations

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.diagnosis.evaluation.coefficient_bounds import BEYOND_MODEL, bound_of
+from bench.diagnosis.evaluation.coefficient_bounds import MAX_RANGE_FACTOR_MODEL_FILE, bound_of
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.base_fit import FINAL_ITERATIONS, BaseFit
@@ -22,9 +22,9 @@ from sims.core.simulator import Array, Parameter
 
 Bounds = tuple[float, float]
 
-FACTOR = 4.0
+WIDENING_FACTOR = 4.0
 """Factor by which a range is widened in one round."""
-ROUNDS = 5
+MAX_WIDENING_ROUNDS = 5
 """Maximum number of rounds: the range is then a thousand times as wide."""
 
 
@@ -59,7 +59,7 @@ def fit_wider(
         The base model, and the new ranges by name; empty if no parameter is at a bound.
     """
     new_bounds: dict[str, Bounds] = {}
-    for _ in range(ROUNDS):
+    for _ in range(MAX_WIDENING_ROUNDS):
         places = list_parameters_at_bounds(evaluator, base)
         if not places or evaluator.watch.has_abandoned_fits():
             break
@@ -77,7 +77,7 @@ def fit_wider(
 def compute_range_around(evaluator: RunEvaluator, place: int, value: float | None = None) -> Bounds:
     """Return the range of a base parameter, widened until it contains a value.
 
-    It is widened at most `ROUNDS` times.
+    It is widened at most `MAX_WIDENING_ROUNDS` times.
 
     Args:
         evaluator: the runs for fitting.
@@ -86,7 +86,7 @@ def compute_range_around(evaluator: RunEvaluator, place: int, value: float | Non
     """
     parameter = evaluator.parameters[place]
     limits = get_physical_limits(evaluator, place)
-    for _ in range(ROUNDS):
+    for _ in range(MAX_WIDENING_ROUNDS):
         low, high = parameter.bounds
         if value is not None and low <= value <= high:
             break
@@ -108,7 +108,7 @@ def use_bounds(evaluator: RunEvaluator, new_bounds: Mapping[str, Bounds]) -> Non
         for p in evaluator.parameters
     )
     # Workers that were forked before still have the narrow ranges.
-    evaluator.crew.forget(evaluator)
+    evaluator.worker_pool.forget(evaluator)
 
 
 def get_physical_limits(evaluator: RunEvaluator, place: int) -> Bounds:
@@ -125,7 +125,9 @@ def get_physical_limits(evaluator: RunEvaluator, place: int) -> Bounds:
             lower_limit, upper_limit = coefficient.least, coefficient.most
             return (
                 -np.inf if lower_limit is None else lower_limit,
-                BEYOND_MODEL * coefficient.plausible[0][1] if upper_limit is None else upper_limit,
+                MAX_RANGE_FACTOR_MODEL_FILE * coefficient.plausible[0][1]
+                if upper_limit is None
+                else upper_limit,
             )
     return _get_physical_limits(parameter)
 
@@ -162,8 +164,10 @@ def widen_range(parameter: Parameter, limits: Bounds) -> Bounds:
     low, high = parameter.bounds
     width = high - low
     # A positive parameter stays positive, so its range grows by a factor on both sides.
-    lower = low / FACTOR if low > 0.0 else low - (FACTOR - 1.0) * width * (low < 0.0)
-    upper = high * FACTOR if low >= 0.0 else high + (FACTOR - 1.0) * width
+    lower = (
+        low / WIDENING_FACTOR if low > 0.0 else low - (WIDENING_FACTOR - 1.0) * width * (low < 0.0)
+    )
+    upper = high * WIDENING_FACTOR if low >= 0.0 else high + (WIDENING_FACTOR - 1.0) * width
     return max(lower, min(limits[0], low)), min(upper, max(limits[1], high))
 
 

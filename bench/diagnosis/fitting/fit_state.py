@@ -51,7 +51,7 @@ for a cost that is not smooth: within a tenth of a standard error.
 # by more than the fit can still gain. These constants end such fits.
 COARSE_SHARE = 1e-3
 """Convergence threshold as a share of the sum of squares, if the model is far from the data."""
-FAR = 2.0
+FAR_MEAN_SQUARE = 2.0
 """Mean squared residual, in units of the noise, above which a model is far from the data."""
 STAGNANT_RATIO = 0.3
 """Maximum gain ratio (1) of a step that ends a fit far from the data."""
@@ -255,7 +255,7 @@ class FitState:
 
         The cost of such a fit changes by jumps that are larger than the remaining gain.
         """
-        return self.rough and cost > FAR * self.samples
+        return self.rough and cost > FAR_MEAN_SQUARE * self.samples
 
     def _is_rough_at(self, decrease: float) -> bool:
         """Return whether the cost is not smooth at the scale of a decrease."""

@@ -41,7 +41,7 @@ def compute_effect_responses(
     keys = [(name, c.tobytes()) for name, c in added]
     missing_indices = [i for i, key in enumerate(keys) if key not in cached_responses]
     calls = [(run, theta, states[run], [added[i] for i in missing_indices]) for run in range(runs)]
-    for run, (values, simulation_count) in evaluator.crew.map_unordered(
+    for run, (values, simulation_count) in evaluator.worker_pool.map_unordered(
         evaluator, _compute_responses, calls
     ):
         # Values that overflow single precision become infinite here.
@@ -110,7 +110,7 @@ def compute_initial_state_derivatives(
     runs, length, channels = evaluator.observed.shape
     result = np.zeros((runs, length, channels, len(evaluator.states)))
     calls = [(run, theta, states[run]) for run in range(runs)]
-    for run, values in evaluator.crew.map_unordered(
+    for run, values in evaluator.worker_pool.map_unordered(
         evaluator, _compute_initial_state_derivatives, calls
     ):
         result[run, : values.shape[1]] = np.moveaxis(values, 0, -1)

@@ -86,7 +86,7 @@ class ModelSet:
         noise: sensor noise.
         frozen: indices of parameters that do not influence the data.
         rng: source of all random numbers.
-        stated: (C,) whether the recording specifies the noise of each channel.
+        is_noise_stated: (C,) whether the recording specifies the noise of each channel.
         models: the best fit for each set of effects.
         null_gains: gain of each effect under the null hypothesis, about the base model.
         derived: fits whose derivatives were recomputed with central differences, each with its
@@ -97,7 +97,7 @@ class ModelSet:
     noise: NoiseModel
     frozen: frozenset[int]
     rng: np.random.Generator
-    stated: Mask
+    is_noise_stated: Mask
     models: dict[frozenset[str], FittedModel] = field(default_factory=dict)
     null_gains: dict[str, float] = field(default_factory=dict)
     derived: dict[int, tuple[TrajectoryFit, TrajectoryFit]] = field(default_factory=dict)
@@ -198,7 +198,7 @@ class ModelSet:
         An effect with many shapes gains likelihood from noise alone. The part of this gain that the
         penalty of its coefficients does not cover is subtracted.
         """
-        slot = self.evaluator.slots[name]
+        slot = self.evaluator.coefficient_slices[name]
         # If there are few shapes, the coefficients alone pay for the gain under the null
         # hypothesis.
         parameter_penalties = (slot.stop - slot.start) * self.parameter_penalty

@@ -165,7 +165,7 @@ class TrajectoryFitter:
                 (self._list_terms(), [problems[i] for i in g], racing_round, race, best)
                 for g in groups
             ]
-            for number, members in self.evaluator.crew.map_unordered(
+            for number, members in self.evaluator.worker_pool.map_unordered(
                 self.evaluator, _advance_group, calls
             ):
                 for i, problem in zip(groups[number], members, strict=True):

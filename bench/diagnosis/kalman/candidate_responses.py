@@ -24,7 +24,7 @@ import numpy as np
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.kalman.filter_and_smoother import (
-    LARGEST,
+    MAX_MAGNITUDE,
     SMALLEST_FORCE,
     Filtered,
     LinearRuns,
@@ -50,9 +50,9 @@ POSITION_PRIOR, VELOCITY_PRIOR = 1.0, 0.3
 That of positions is in rad or m, because an encoder may have an offset; that of velocities is a
 share of the largest velocity.
 """
-LEAST_PRIOR = 1e-4
+MIN_VELOCITY_PRIOR = 1e-4
 """Minimum prior standard deviation of a velocity, rad/s or m/s."""
-LARGEST_PRIOR = 1e3
+MAX_VELOCITY_PRIOR = 1e3
 """Maximum prior standard deviation of a velocity, rad/s or m/s."""
 UNMEASURED_PRIOR, UNMEASURED_SPEED = 0.3, 3.0
 """Prior standard deviations of unrecorded joints: position in rad or m, velocity per second."""
@@ -65,13 +65,13 @@ LINEARISED_GAIN = 10.0
 
 CORRELATIONS = (0.4, 0.6, 0.75, 0.85, 0.92, 0.96)
 """Correlations of AR(1) sensor noise, tried in this order while the likelihood increases."""
-COLOURED = 5.0
+MIN_CORRELATION_GAIN = 5.0
 """Minimum gain in log-likelihood by a larger correlation."""
-UNSOUND = 100.0
+MAX_MEAN_SQUARE_INNOVATION = 100.0
 """Mean square of the whitened innovations above which a linear model does not follow the runs."""
 MIN_LOSS_WITHOUT_FORCE = 20.0
 """Minimum loss in twice the log-likelihood without process noise that shows a missing force."""
-SIDE_BY_SIDE = 256
+COLUMNS_PER_BATCH = 256
 """Number of columns that pass through the filter together, so that they fit in the CPU cache."""
 
 
@@ -412,7 +412,7 @@ class FollowedRuns:
         with np.errstate(all="ignore"):
             result: SingleArray = whitened[..., columns.places] / sizes
         # A candidate with a divergent motion gets a response of zero.
-        result[~(np.abs(result) < LARGEST)] = 0.0
+        result[~(np.abs(result) < MAX_MAGNITUDE)] = 0.0
         return result
 
     def compute_state_sensitivities(self) -> Array:
@@ -464,7 +464,7 @@ class FollowedRuns:
                     s = runs.states[:, i] @ s
                     if columns is not None:
                         s += runs.inputs[:, i] @ columns.pushed[:, i]
-        result[~(np.abs(result) < LARGEST)] = 0.0
+        result[~(np.abs(result) < MAX_MAGNITUDE)] = 0.0
         return result
 
     @property
@@ -472,7 +472,7 @@ class FollowedRuns:
         """True if the filter follows the runs: its innovations have the expected size."""
         with np.errstate(all="ignore"):
             size = float(np.square(self.filtered.whitened).sum()) / max(self.runs.recorded.sum(), 1)
-        return bool(size < UNSOUND)
+        return bool(size < MAX_MEAN_SQUARE_INNOVATION)
 
     def get_state_prior(self) -> Array | None:
         """Return the prior standard deviations (2 D,) of the first positions and velocities.
@@ -535,8 +535,8 @@ class FollowedRuns:
                 last_sample = int(
                     np.flatnonzero(self.runs.recorded[run].any(axis=1)).max(initial=0)
                 )
-                for first_column in range(0, count, SIDE_BY_SIDE):
-                    part = slice(first_column, min(first_column + SIDE_BY_SIDE, count))
+                for first_column in range(0, count, COLUMNS_PER_BATCH):
+                    part = slice(first_column, min(first_column + COLUMNS_PER_BATCH, count))
                     s = np.zeros((a.shape[2], part.stop - part.start), dtype=np.float32)
                     for i in range(last_sample + 1):
                         u = h[run, i] @ s
@@ -587,7 +587,7 @@ def _fit_noise(runs: LinearRuns, noise: NoiseModel, force: Array, typical: Array
             filtered = filter_runs(coloured, best.force, white)
             before, after = best.filtered.log_likelihood.sum(), filtered.log_likelihood.sum()
             # Both are minus infinity if the model diverges.
-            if not after > before + COLOURED:
+            if not after > before + MIN_CORRELATION_GAIN:
                 break
             force = best.force
         best = _NoiseFit(tried_noise, *fit_process_noise(coloured, force, white, typical))
@@ -634,8 +634,8 @@ def _compute_prior_deviations(
     for joint, name in enumerate(coordinates[:joints]):
         if name in evaluator.channels:
             prior[joint] = POSITION_PRIOR
-            speed = VELOCITY_PRIOR * float(speeds[joint]) + LEAST_PRIOR
-            prior[positions + joint] = min(speed, LARGEST_PRIOR)
+            speed = VELOCITY_PRIOR * float(speeds[joint]) + MIN_VELOCITY_PRIOR
+            prior[positions + joint] = min(speed, MAX_VELOCITY_PRIOR)
         else:
             prior[joint], prior[positions + joint] = UNMEASURED_PRIOR, UNMEASURED_SPEED
     return prior

@@ -58,7 +58,7 @@ def propose_contact_effects(search: EffectSearch, evaluators: Sequence[RunEvalua
         low, high = compute_coefficient_bounds(evaluator, name)[0]
         for c in (START_SHARES[0] * low, START_SHARES[1] * high):
             theta = base.theta.copy()
-            theta[evaluator.slots[name]] = c
+            theta[evaluator.coefficient_slices[name]] = c
             starts.append(FitStart((name,), theta, base.states))
     search.refit_models(starts, race=False)
     fits = [search.models[frozenset((name,))] for name in names]

@@ -50,7 +50,7 @@ AR_FLOOR = 1e-3
 """White part of AR(1) noise, as a share of its variance, so that no reading is exact."""
 LARGEST_CHANGE = 10.0
 """Largest factor by which an iteration of (7) changes a variance."""
-LARGEST = 1e12
+MAX_MAGNITUDE = 1e12
 """Maximum magnitude of derivatives and defects; larger ones come from divergence.
 
 They are replaced by zero.
@@ -59,11 +59,11 @@ LARGEST_COVARIANCE = 1e8
 """Maximum variance of predicted states, in SI units squared."""
 LARGEST_LOSS = 1e30
 """Maximum negative log-likelihood of a model that does not diverge."""
-SEGMENT = 80
+SEGMENT_SAMPLES = 80
 """Number of samples of a segment on which the process noise is fitted."""
-ITERATIONS = 12
+MAX_ITERATIONS = 12
 """Maximum number of iterations of (7)."""
-CONVERGED = 0.15
+CONVERGENCE_TOLERANCE = 0.15
 """Maximum relative change of the standard deviations at which (7) has converged."""
 SMALLEST_FORCE = 1e-6
 """Minimum standard deviation of a missing force, as a share of the typical force."""
@@ -147,7 +147,7 @@ class LinearRuns:
             for run, part in enumerate(parts):
                 values[run, : len(part)] = part
             # A step in which the model diverges gives no information on the next one.
-            values[~(np.abs(values) < LARGEST)] = 0.0
+            values[~(np.abs(values) < MAX_MAGNITUDE)] = 0.0
             stacked[name] = values
         residuals = np.zeros(observed.shape)
         for run, own in enumerate(maps):
@@ -323,14 +323,14 @@ def fit_process_noise(
     """
     count = force.size
     # Short segments in parallel need fewer steps, and show the same process noise.
-    long = runs.residuals.shape[1] > 2 * SEGMENT
-    short = runs.segments(SEGMENT) if long else runs
-    for _ in range(ITERATIONS):
+    long = runs.residuals.shape[1] > 2 * SEGMENT_SAMPLES
+    short = runs.segments(SEGMENT_SAMPLES) if long else runs
+    for _ in range(MAX_ITERATIONS):
         filtered = filter_runs(short, force, white)
         smoothed = smooth_runs(short, filtered, force)
         ratio = np.clip(np.sqrt(smoothed.score[:count]), 1.0 / LARGEST_CHANGE, LARGEST_CHANGE)
         changed = np.maximum(force * ratio, SMALLEST_FORCE * typical)
-        done = bool((np.abs(changed / force - 1.0) < CONVERGED).all())
+        done = bool((np.abs(changed / force - 1.0) < CONVERGENCE_TOLERANCE).all())
         if done:
             break
         force = changed

@@ -39,7 +39,7 @@ FORCE_SHARES = (0.001, 0.01, 0.1, 1.0)
 """Standard deviations of the missing force that are tried, as shares of a typical force."""
 POSITION_PRIOR = 1e-2
 """Standard deviation of the first positions about their guess, rad or m."""
-SMALLEST_VARIANCE = 1e-18
+ADDED_VARIANCE = 1e-18
 """Variance added to each component of the state, so that its covariance has a square root."""
 
 
@@ -154,14 +154,14 @@ class _CubatureFilter:
             for i, (begin, end) in enumerate(zip(self._knots, self._knots[1:], strict=False)):
                 gained, mean, covariance = self._update(i, mean, covariance)
                 log_likelihood += gained
-                root = np.linalg.cholesky(covariance + SMALLEST_VARIANCE * np.eye(size))
+                root = np.linalg.cholesky(covariance + ADDED_VARIANCE * np.eye(size))
                 moved = points[:, :size] @ root.T  # (1)
                 ends = self._propagate(mean + moved, points[:, size:] * force, int(begin), int(end))
                 if not np.isfinite(ends).all():
                     return _Smoothed(-np.inf, self._start, covariance)
                 predicted = ends.mean(axis=0)
                 spread = (ends - predicted).T @ (ends - predicted) / len(ends)
-                spread += SMALLEST_VARIANCE * np.eye(size)
+                spread += ADDED_VARIANCE * np.eye(size)
                 crossed = moved.T @ (ends - predicted) / len(ends)
                 intervals.append((mean, covariance, predicted, spread, crossed))
                 mean, covariance = predicted, spread

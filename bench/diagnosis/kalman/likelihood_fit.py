@@ -25,13 +25,13 @@ from sims.core.simulator import Array
 
 Follow: TypeAlias = Callable[[Array, FollowedRuns], FollowedRuns]
 
-ITERATIONS = 8
+MAX_BASE_ITERATIONS = 8
 """Maximum number of Gauss-Newton steps for base parameters."""
-DIFFERENCE = 1e-3
+DIFFERENCE_SHARE = 1e-3
 """Finite-difference step of a parameter, as a share of its plausible range."""
-LEAST_GAIN = 1.0
+MIN_STEP_GAIN = 1.0
 """Minimum gain in log-likelihood by a step for which another step follows."""
-HALVINGS = 3
+MAX_HALVINGS = 3
 """Maximum number of times that a step without gain is halved."""
 RESISTANCE = ("friction.coulomb", "drag.linear", "force.bias")
 """Effects at a joint that are fitted together with base parameters."""
@@ -39,7 +39,7 @@ MAX_JOINTS = 3
 """Maximum number of joints at which resisting effects are fitted with base parameters."""
 RIDGE = 1e-9
 """Ridge of the normal equations, as a share of each parameter's sum of squares."""
-CLEAR = 2.0
+MIN_BASE_GAIN = 2.0
 """Minimum gain in log-likelihood of base parameters over the nominal ones."""
 
 
@@ -71,7 +71,9 @@ def identify_base(
     resisting = get_bounds_by_index(evaluator, _list_resisting_effects(followed))
     found = []
     for further in [resisting] if is_resisted else [{}, resisting]:
-        tried = maximise_innovation_likelihood(followed, limits | further, ITERATIONS, follow)
+        tried = maximise_innovation_likelihood(
+            followed, limits | further, MAX_BASE_ITERATIONS, follow
+        )
         ends = [bound_of(float(tried.theta[i]), *bounds) for i, bounds in limits.items()]
         if tried.is_sound and not any(ends):
             found.append(tried)
@@ -79,7 +81,7 @@ def identify_base(
         if found and not tried.lacks_force:
             break
     best = max(found, key=lambda one: one.log_likelihood, default=followed)
-    if best.log_likelihood - followed.log_likelihood < CLEAR:
+    if best.log_likelihood - followed.log_likelihood < MIN_BASE_GAIN:
         return followed, {}
     values = {i: float(best.theta[i]) for i in places}
     wider = {}
@@ -99,7 +101,7 @@ def _list_resisting_effects(followed: FollowedRuns) -> list[str]:
     coordinates = evaluator.simulator.system.coordinates
     joints = [coordinates[j].removeprefix("q.") for j in followed.joints_by_loss[:MAX_JOINTS]]
     names = [f"{effect}@{joint}" for joint in joints for effect in RESISTANCE]
-    return [name for name in names if name in evaluator.slots]
+    return [name for name in names if name in evaluator.coefficient_slices]
 
 
 def maximise_innovation_likelihood(
@@ -107,7 +109,7 @@ def maximise_innovation_likelihood(
     bounds: Mapping[int, Bounds],
     iterations: int,
     follow: Follow,
-    min_gain: float = LEAST_GAIN,
+    min_gain: float = MIN_STEP_GAIN,
 ) -> FollowedRuns:
     """Maximise the likelihood of the innovations by Gauss-Newton steps with step halving.
 
@@ -129,7 +131,7 @@ def maximise_innovation_likelihood(
         if expected < min_gain:
             break
         gained = 0.0
-        for _ in range(1 + HALVINGS):
+        for _ in range(1 + MAX_HALVINGS):
             tried = follow(best.theta + step, best)
             gained = tried.log_likelihood - best.log_likelihood
             if gained > 0:
@@ -196,7 +198,7 @@ def _compute_innovation_derivative(
     """
     low, high = bounds
     first, last = followed.evaluator.parameters[place].bounds
-    step = DIFFERENCE * min(last - first, high - low)
+    step = DIFFERENCE_SHARE * min(last - first, high - low)
     # A parameter without a range has no derivative.
     if not step > 0:
         return np.zeros_like(target)

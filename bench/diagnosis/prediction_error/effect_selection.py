@@ -25,9 +25,9 @@ from bench.diagnosis.prediction_error.regression_selection import (
 from bench.diagnosis.search.explained_variance import DirectionGroup
 from sims.core.simulator import Array
 
-PASSES = 4
+MAX_REGRESSIONS = 4
 """Maximum number of regressions, each with the process noise of the previous selection."""
-MOST = 8
+MAX_SET_SIZE = 8
 """Maximum number of effects in a set."""
 
 
@@ -79,11 +79,11 @@ def identify(followed: FollowedRuns, columns: Columns, first: Regression | None 
     coefficients: list[Array] = []
     result: Selected | None = None
     numerics = 0.0
-    for _ in range(PASSES):
+    for _ in range(MAX_REGRESSIONS):
         regression = first or regress(refitted, columns, selected_before, coefficients, numerics)
         first = None
         selected = regression.prune(selected_before) if selected_before else []
-        selected = regression.select(MOST, selected)
+        selected = regression.select(MAX_SET_SIZE, selected)
         _, new_coefficients = regression.solve(selected)
         numerics = regression.nuisance(selected)
         refitted = follow_linear_with_effects(

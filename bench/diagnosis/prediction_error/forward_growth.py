@@ -22,7 +22,7 @@ from bench.diagnosis.prediction_error.effect_selection import Selected
 from bench.diagnosis.prediction_error.joint_effects import SERVO_MODEL
 from bench.diagnosis.prediction_error.model_filters import FilteredSet
 from bench.diagnosis.prediction_error.selection_fits import (
-    LEAST_SHARE,
+    MIN_FURTHER_GAIN_SHARE,
     check_filter,
     check_fit,
     is_friction_sufficient,
@@ -142,7 +142,7 @@ def _list_larger_that_pay(context: SearchContext, current: FilteredSet) -> list[
     """
     filters = context.filters
     present = current.followed if current.names else filters.base
-    share = LEAST_SHARE * filters.compute_gain(present)
+    share = MIN_FURTHER_GAIN_SHARE * filters.compute_gain(present)
     return [
         larger
         for larger in try_one_more_effect(context, current)

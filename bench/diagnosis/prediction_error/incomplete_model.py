@@ -30,7 +30,7 @@ from bench.diagnosis.fitting.model_set import FittedModel
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
 from bench.diagnosis.kalman.candidate_responses import Columns, FollowedRuns
 from bench.diagnosis.kalman.likelihood_fit import (
-    LEAST_GAIN,
+    MIN_STEP_GAIN,
     compute_information,
     maximise_innovation_likelihood,
 )
@@ -41,7 +41,10 @@ from bench.diagnosis.prediction_error.library_columns import (
     group_coefficients,
 )
 from bench.diagnosis.prediction_error.model_filters import FilteredSet
-from bench.diagnosis.prediction_error.selection_fits import LEAST_SHARE, MAX_IMPROVED_SIZE
+from bench.diagnosis.prediction_error.selection_fits import (
+    MAX_IMPROVED_SIZE,
+    MIN_FURTHER_GAIN_SHARE,
+)
 from bench.diagnosis.search.candidate_directions import CandidateDirection
 from bench.diagnosis.search.refit_starts import with_effect
 from sims.core.simulator import Array
@@ -62,14 +65,14 @@ The inertia of a body that moves along a straight line has no influence, and is 
 """
 MAX_ADDED = 3
 """Maximum number of effects that are added to the textbook model."""
-NEGLIGIBLE_FORCE = 0.1
+NEGLIGIBLE_FORCE_SHARE = 0.1
 """Maximum missing forces, as a share of those of the base model, at which no effect is added."""
-ITERATIONS = 6
+MAX_SET_ITERATIONS = 6
 """Maximum number of Gauss-Newton steps of a set."""
-CONVERGED_SHARE = 0.003
+MIN_STEP_GAIN_SHARE = 0.003
 """Minimum gain by a Gauss-Newton step for which another step follows, as a share of the gain so
 far."""
-STATE_ITERATIONS = 4
+MAX_STATE_ITERATIONS = 4
 """Maximum number of iterations for the initial states of the simulated runs."""
 
 
@@ -143,7 +146,7 @@ def is_long(evaluator: RunEvaluator) -> bool:
 
 def _is_negligible(context: SearchContext, current: FilteredSet) -> bool:
     """Return whether a set leaves a negligible share of the base model's missing forces."""
-    share = NEGLIGIBLE_FORCE * context.filters.base.force
+    share = NEGLIGIBLE_FORCE_SHARE * context.filters.base.force
     return not current.followed.lacks_force or bool((current.followed.force < share).all())
 
 
@@ -163,9 +166,11 @@ def _fit_set(context: SearchContext, followed: FollowedRuns, names: Sequence[str
         return best.with_parameters(theta)
 
     base_log_likelihood = context.filters.base.log_likelihood
-    min_gain = max(CONVERGED_SHARE * (followed.log_likelihood - base_log_likelihood), LEAST_GAIN)
+    min_gain = max(
+        MIN_STEP_GAIN_SHARE * (followed.log_likelihood - base_log_likelihood), MIN_STEP_GAIN
+    )
     bounds = _get_bounds(context, names)
-    best = maximise_innovation_likelihood(followed, bounds, ITERATIONS, follow, min_gain)
+    best = maximise_innovation_likelihood(followed, bounds, MAX_SET_ITERATIONS, follow, min_gain)
     return FilteredSet(best, tuple(names))
 
 
@@ -198,7 +203,9 @@ def _compute_wald_statistics(
 def _compute_min_gain(context: SearchContext, current: FilteredSet, name: str) -> float:
     """Return the minimum gain of an effect of a set in twice the log-likelihood."""
     filters = context.filters
-    return max(filters.penalty(name), LEAST_SHARE * filters.compute_gain(current.followed))
+    return max(
+        filters.penalty(name), MIN_FURTHER_GAIN_SHARE * filters.compute_gain(current.followed)
+    )
 
 
 def _prune_set(
@@ -225,11 +232,11 @@ def _prune_set(
         return current, gains
     theta = followed.theta.copy()
     for name in set(current.names) - set(names):
-        theta[context.evaluator.slots[name]] = 0.0
+        theta[context.evaluator.coefficient_slices[name]] = 0.0
     if not np.array_equal(theta, followed.theta):
         followed = followed.with_parameters(theta)
     # Effects without influence leave the other coefficients as they are.
-    if lost > 2.0 * LEAST_GAIN:
+    if lost > 2.0 * MIN_STEP_GAIN:
         return _prune_set(context, _fit_set(context, followed, names))
     return FilteredSet(followed, tuple(names)), gains
 
@@ -284,7 +291,7 @@ def _simulate_set(context: SearchContext, current: FilteredSet) -> FittedModel:
     start = FitStart(current.names, theta, states)
     (fitted_states,) = TrajectoryFitter(
         evaluator, search.noise, search.frozen, parameters=False
-    ).fit_models([start], STATE_ITERATIONS)
+    ).fit_models([start], MAX_STATE_ITERATIONS)
     (fit,) = TrajectoryFitter(evaluator, search.noise, search.frozen).fit_models(
         [replace(start, states=fitted_states.states)], 0
     )

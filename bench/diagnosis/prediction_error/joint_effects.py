@@ -108,7 +108,7 @@ def list_at_coupled_joints(evaluator: RunEvaluator, name: str) -> list[str]:
     names = [
         f"{law}@{get_joint_name(evaluator, joint)}" for joint in sorted(others - {joints[place]})
     ]
-    return [other for other in names if other in evaluator.slots]
+    return [other for other in names if other in evaluator.coefficient_slices]
 
 
 def has_series(evaluator: RunEvaluator, names: Iterable[str]) -> bool:

@@ -129,7 +129,9 @@ class LibraryColumns:
         """
         theta, base = self.filters.reference.copy(), self.filters.models.base_model
         for group, solution in zip(groups, coefficients, strict=True):
-            theta[self.filters.evaluator.slots[group.effect]] = self.coefficients(group, solution)
+            theta[self.filters.evaluator.coefficient_slices[group.effect]] = self.coefficients(
+                group, solution
+            )
         return FitStart(tuple(group.effect for group in groups), theta, base.fit.states)
 
     def coefficients(self, group: DirectionGroup, solution: Array) -> Array:
@@ -241,7 +243,7 @@ def _make_tangent_probes(
     The first shows what the effect changes as a whole; the differences of the others from it are
     the derivatives by the coefficients.
     """
-    c = theta[evaluator.slots[name]]
+    c = theta[evaluator.coefficient_slices[name]]
     probes = [CandidateDirection(name, 0, 0, c, signed=True, fixed=True)]
     for place, (low, high) in enumerate(compute_coefficient_bounds(evaluator, name)):
         displaced = c.copy()

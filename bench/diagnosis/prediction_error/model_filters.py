@@ -97,7 +97,7 @@ class ModelFilters:
             c: (k,) its coefficients.
         """
         theta = self.reference.copy()
-        theta[self.evaluator.slots[name]] = c
+        theta[self.evaluator.coefficient_slices[name]] = c
         return theta
 
     @property
@@ -280,6 +280,6 @@ def make_soft_friction_models(
         # The missing force of a sliding joint is about the force of its friction.
         size = np.array([sign * factor * float(followed.force[joint])])
         changed = theta.copy()
-        changed[evaluator.slots[name]] = clip_coefficients(evaluator, name, size)
+        changed[evaluator.coefficient_slices[name]] = clip_coefficients(evaluator, name, size)
         models.append(changed)
     return models

@@ -42,11 +42,11 @@ from sims.core.simulator import Array
 
 Places = NDArray[np.intp]
 
-ALIASED = 1e-7
+COLLINEARITY_TOLERANCE = 1e-7
 """Maximum share of a column's sum of squares that remains if it is collinear with other columns."""
-MAJORITY = 0.5
+MIN_BETTER_RUN_SHARE = 0.5
 """Minimum share of the left-out runs that a larger set must predict better."""
-SHOWN = 7.0
+MIN_VISIBLE_GAIN = 7.0
 """Minimum gain of a column in twice the log-likelihood to be visible in the data."""
 RIDGE = 1e-10
 """Ridge, as a share of each column's sum of squares."""
@@ -112,7 +112,10 @@ class Regression:
         with_it, parts = self._fit_groups([*chosen, self._nuisance])
         rest = DirectionGroup("", self.always[1:], (False,) * (len(self.always) - 1))
         without, _ = self._fit_groups([*chosen, rest])
-        return float(parts[-1][0]) > 0.5 and self.compute_log_ratio(without, with_it) > SHOWN
+        return (
+            float(parts[-1][0]) > 0.5
+            and self.compute_log_ratio(without, with_it) > MIN_VISIBLE_GAIN
+        )
 
     def solve(self, chosen: Sequence[DirectionGroup]) -> tuple[float, list[Array]]:
         """Fit a set of groups, and return the residual sum of squares and all coefficients."""
@@ -187,7 +190,7 @@ class Regression:
             gram = gram - rows.T @ solved[:, :-1]
             cross = cross - rows.T @ solved[:, -1]
             rss, _ = self.solve(chosen)
-        aliased = np.diagonal(gram) <= ALIASED * np.diagonal(self.gram)
+        aliased = np.diagonal(gram) <= COLLINEARITY_TOLERANCE * np.diagonal(self.gram)
         held = set(self._list_contained_effects(chosen))
         result = np.zeros(len(self.groups))
         gram = np.where(aliased[:, None] | aliased[None], 0.0, gram)
@@ -252,7 +255,7 @@ class Regression:
         if len(self.totals) < 2:
             return True
         before, after = self._compute_left_out_rss(smaller), self._compute_left_out_rss(larger)
-        return bool(after.sum() < before.sum() and (after < before).mean() >= MAJORITY)
+        return bool(after.sum() < before.sum() and (after < before).mean() >= MIN_BETTER_RUN_SHARE)
 
     def _compute_left_out_rss(self, chosen: Sequence[DirectionGroup]) -> Array:
         """Return the residual sum of squares (R,) of each run, predicted from the other runs."""
@@ -314,7 +317,7 @@ def group_probes(probes: Sequence[CandidateDirection]) -> list[DirectionGroup]:
     ]
 
 
-DRAWS = 200
+NULL_DRAWS = 200
 """Number of draws from the null distribution."""
 
 
@@ -354,14 +357,14 @@ def score_by_regression(
         null_quantiles.append(
             float(chdtri(degrees_of_freedom, 1.0 - NULL_QUANTILE ** (1.0 / shapes)))
         )
-        uniform = rng.random(DRAWS) ** (1.0 / shapes)
+        uniform = rng.random(NULL_DRAWS) ** (1.0 / shapes)
         null_draws.append(chdtri(degrees_of_freedom, 1.0 - uniform))
         p_values.append(compute_p_value_of_gain(largest_gain, degrees_of_freedom, shapes))
         peak: DirectionGroup = regression.groups[max(group_indices, key=lambda i: gains[i])]
         peaks.append(((peak, regression.solve([peak])[1][0]),))
     order = np.argsort(-score, kind="stable")
     quantiles = np.array(null_quantiles)
-    null_excesses = np.array(null_draws).reshape(len(names), DRAWS) - quantiles[:, None]
+    null_excesses = np.array(null_draws).reshape(len(names), NULL_DRAWS) - quantiles[:, None]
     p_value = min(len(names) * min(p_values, default=1.0), 1.0)
     return CandidateScores(
         effects=tuple(names[i] for i in order),

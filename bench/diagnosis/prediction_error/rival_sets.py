@@ -182,7 +182,7 @@ def _fit_at_coupled_joints(context: SearchContext, size: int) -> None:
     starts: dict[frozenset[str], FitStart] = {}
     for model in _list_models_near_the_best(context, size):
         for name in model.effects:
-            c = model.fit.theta[evaluator.slots[name]]
+            c = model.fit.theta[evaluator.coefficient_slices[name]]
             for other in list_at_coupled_joints(evaluator, name):
                 start = make_replacing_start(evaluator, model, [name], other, c)
                 key = frozenset(start.effects)

@@ -52,12 +52,12 @@ MAX_SLOW_EFFECTS = 2
 """Maximum number of effects in a set that is fitted by simulation although this is slow."""
 FIRST_ITERATIONS = 5
 """Maximum number of steps of the first fit of dry friction."""
-FAR_LIKELIER = 0.1
+MIN_LEAD_SHARE = 0.1
 """Minimum lead in log-likelihood of soft dry friction over a selection that is far less likely.
 
 It is a share of the gain over the base model.
 """
-LEAST_SHARE = 0.01
+MIN_FURTHER_GAIN_SHARE = 0.01
 """Minimum gain of a further effect, as a share of the gain of the set.
 
 The model of a real robot is never complete, and long recordings show this with certainty.
@@ -123,7 +123,7 @@ def drop_surplus_effects(context: SearchContext, selected: Selected) -> Selected
         theta = context.columns.start(groups, coefficients).theta
         gain = 2.0 * (filters.log_likelihood(theta) - base_log_likelihood)
         penalty = sum(filters.penalty(group.effect) for group in groups)
-        min_gain = LEAST_SHARE * max(best_gain, 0.0) * (count - best_count)
+        min_gain = MIN_FURTHER_GAIN_SHARE * max(best_gain, 0.0) * (count - best_count)
         if gain - penalty > best_net_gain and gain - best_gain > min_gain:
             best_net_gain, best_count, best_gain, best_coefficients = (
                 gain - penalty,
@@ -253,7 +253,7 @@ def _is_far_less_likely(context: SearchContext, selected: Selected, log_likeliho
         log_likelihood: log-likelihood of the other model.
     """
     base = context.filters.base.log_likelihood
-    limit = log_likelihood - FAR_LIKELIER * max(log_likelihood - base, 0.0)
+    limit = log_likelihood - MIN_LEAD_SHARE * max(log_likelihood - base, 0.0)
     if not max(base, selected.log_likelihood) < limit:
         return False
     first = context.columns.start(selected.groups[:1], selected.coefficients[:1])
@@ -336,7 +336,7 @@ def make_dry_friction_start(context: SearchContext, selected: Selected) -> FitSt
     names = tuple(name for name in friction if name not in contained)
     theta = filters.reference.copy()
     for name in names:
-        theta[evaluator.slots[name]] = plain_theta[evaluator.slots[name]]
+        theta[evaluator.coefficient_slices[name]] = plain_theta[evaluator.coefficient_slices[name]]
     return FitStart(names, theta, filters.estimate_first_states(filters.base))
 
 

@@ -22,11 +22,11 @@ from bench.diagnosis.search.verdict_rules import INDISTINGUISHABLE_LOG_LIKELIHOO
 from sims.core.effect import members_of
 from sims.core.simulator import Array
 
-NEARBY = (0.8, 0.9, 0.96, 0.98, 0.99, 1.01, 1.02, 1.04, 1.1, 1.2)
+NEARBY_FACTORS = (0.8, 0.9, 0.96, 0.98, 0.99, 1.01, 1.02, 1.04, 1.1, 1.2)
 """Factors of a coefficient at which a fit looks for a lower cost nearby."""
 EXPLAINED_EXCESS = 0.03
 """Maximum excess over the noise of a fitted set that explains the data."""
-NEARLY_EXPLAINED = 0.1
+NEARLY_EXPLAINED_SHARE = 0.1
 """Maximum excess, as a share of that of the base model, at which effects are only added."""
 NEGLIGIBLE, NEGLIGIBLE_SHARE = 0.1, 0.005
 """Maximum excess at which the search ends: absolute, and as a share of that of the base model."""
@@ -94,7 +94,7 @@ def list_nearby_starts(context: SearchContext, model: FittedModel, name: str) ->
     measured = context.filters.estimate_first_states(context.filters.base)
     starts = []
     for place in context.evaluator.get_coefficient_indices(name):
-        for factor in NEARBY:
+        for factor in NEARBY_FACTORS:
             theta = model.fit.theta.copy()
             theta[place] *= factor
             starts += [
@@ -163,7 +163,7 @@ def is_nearly_explained(context: SearchContext, model: FittedModel) -> bool:
         model: the fitted model.
     """
     excess = context.search.compute_excess
-    return excess(model) < NEARLY_EXPLAINED * excess(context.search.base_model)
+    return excess(model) < NEARLY_EXPLAINED_SHARE * excess(context.search.base_model)
 
 
 def select_higher_merit(one: FittedModel, other: FittedModel) -> FittedModel:
@@ -193,7 +193,9 @@ def _merge_into_families(context: SearchContext, model: FittedModel) -> FittedMo
         members = [member.name for member in members_of(evaluator.available_effects[family])]
         if len(members) < 2 or not set(members) <= set(model.effects):
             continue
-        coefficients = np.concatenate([model.fit.theta[evaluator.slots[name]] for name in members])
+        coefficients = np.concatenate(
+            [model.fit.theta[evaluator.coefficient_slices[name]] for name in members]
+        )
         if coefficients.size != len(evaluator.get_coefficient_indices(family)):
             continue
         fitted = context.search.fit_one(
@@ -222,7 +224,7 @@ def make_replacing_start(
     """
     theta = model.fit.theta.copy()
     for name in names:
-        theta[evaluator.slots[name]] = 0.0
-    theta[evaluator.slots[other]] = c
+        theta[evaluator.coefficient_slices[name]] = 0.0
+    theta[evaluator.coefficient_slices[other]] = c
     remaining = (name for name in model.effects if name not in names)
     return FitStart((*remaining, other), theta, model.fit.states)

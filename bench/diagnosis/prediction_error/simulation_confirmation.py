@@ -25,9 +25,9 @@ from bench.diagnosis.search.lack_of_fit import assess_lack_of_fit
 from bench.diagnosis.search.verdict_rules import DiagnosisState, decide_verdict, is_unexplained
 from bench.diagnosis.validation.held_out_runs import Validation
 
-MIMICRY = 0.5
+MIN_REMOVED_SHARE = 0.5
 """Minimum share of the discrepancy that reported effects remove if the cause is unknown."""
-NEAR = 15.0
+MAX_RIVAL_DISTANCE = 15.0
 """Maximum distance in twice the log-likelihood of models that are evaluated on held-out runs."""
 
 
@@ -87,7 +87,7 @@ class Confirmation(Inquiry):
             missed=trial is not None and trial.has_unexplained_gap(model, lack_of_fit),
         )
         verdict = decide_verdict(state)
-        if verdict == "unknown" and state.closed < MIMICRY:
+        if verdict == "unknown" and state.closed < MIN_REMOVED_SHARE:
             # Effects that leave most of the discrepancy only mimic what is missing.
             model, causes = base, ()
         return self._make_result(verdict, base, model, causes, lack_of_fit)
@@ -136,7 +136,9 @@ class Confirmation(Inquiry):
         size = len(names)
         rivals = [m for m in search.models.values() if len(m.effects) == size and m is not model]
         rivals = [
-            m for m in rivals if m.penalised_log_likelihood > model.penalised_log_likelihood - NEAR
+            m
+            for m in rivals
+            if m.penalised_log_likelihood > model.penalised_log_likelihood - MAX_RIVAL_DISTANCE
         ]
         trial = HeldOutValidation(self._held_out)
         trial.evaluate_models([search.base_model, model, *smaller_models, *rivals])
@@ -150,7 +152,7 @@ class _RobotAlternatives(AlternativeFinder):
     """Collects alternatives of a robot's effects; p-values are those of the chi-squared law."""
 
     def _compute_p_value(self, rest: FittedModel, effect: str, gain: float) -> float:  # noqa: ARG002
-        slot = self.search.evaluator.slots[effect]
+        slot = self.search.evaluator.coefficient_slices[effect]
         return compute_p_value_of_gain(
             gain, slot.stop - slot.start, len(self.search.evaluator.library)
         )

@@ -11,7 +11,7 @@ from typing import Any
 from bench.pages.text_format import sanitise
 from sims.extended_simulator import ExtendedSimulator
 
-WIDTH = 96
+COMMENT_WIDTH = 96
 """Maximum number of characters of a comment line."""
 
 
@@ -38,7 +38,7 @@ def comment(texts: str | Sequence[str], indent: str = "") -> str:
     for text in [texts] if isinstance(texts, str) else texts:
         sanitised_text = sanitise(text, 2000)
         lines += textwrap.wrap(
-            sanitised_text, WIDTH, initial_indent=begin, subsequent_indent=begin,
+            sanitised_text, COMMENT_WIDTH, initial_indent=begin, subsequent_indent=begin,
             break_long_words=False, break_on_hyphens=False,
         )  # fmt: skip
     return "\n".join(lines)

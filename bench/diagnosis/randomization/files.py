@@ -12,7 +12,7 @@ from bench.diagnosis.randomization.ranges import RandomizationRanges
 from bench.pages.csv_text import format_csv
 from sims.extended_simulator import ExtendedSimulator
 
-FORMAT = 1
+FORMAT_VERSION = 1
 """Format version of ranges.toml."""
 COLUMNS = (
     "cause", "coefficient", "source", "kind", "name", "field", "address", "sign", "unit",
@@ -40,7 +40,7 @@ def build_range_files(
     rows = [entry.document() for entry in ranges.ranges]
     assert extended.robot is not None
     document: dict[str, Any] = {
-        "format": FORMAT,
+        "format": FORMAT_VERSION,
         "model": extended.robot.to_document(folder)["model"],
         "recording": extended.title,
         "left_out": list(ranges.left_out),

@@ -39,9 +39,9 @@ LINE_LENGTH = 44
 """Maximum number of characters per line of a candidate's name."""
 LONGEST_LINE = 50
 """Maximum number of characters per line of the name of a place."""
-CERTAIN = 1e-3
+MAX_UNPRINTED_P_VALUE = 1e-3
 """Maximum p-value that is not printed next to its bar; a note gives the largest of them."""
-CHANCE = 0.05
+SIGNIFICANCE_LEVEL = 0.05
 """Maximum p-value of a significant score. A candidate above it has a white bar without its p-value,
 and a note explains that.
 """
@@ -228,7 +228,7 @@ def _draw_scores(
         )
         longest_bar = max(longest_bar, size, *other_scores)
         text = format_number(candidate.score)
-        if CERTAIN < candidate.p_value <= CHANCE:
+        if MAX_UNPRINTED_P_VALUE < candidate.p_value <= SIGNIFICANCE_LEVEL:
             text += f"  ({_format_p_value(candidate.p_value)})"
         axis.annotate(
             text,
@@ -248,7 +248,8 @@ def _draw_scores(
 def _is_chance(report: DiagnosisReportData, candidate: Candidate) -> bool:
     """Return whether the score of a candidate that is not a cause is insignificant."""
     return (
-        candidate.p_value > CHANCE and get_candidate_status(report, candidate.effect) == NOT_NEEDED
+        candidate.p_value > SIGNIFICANCE_LEVEL
+        and get_candidate_status(report, candidate.effect) == NOT_NEEDED
     )
 
 
@@ -266,7 +267,7 @@ def _format_notes(report: DiagnosisReportData, candidates: Sequence[Candidate]) 
         counts += f"; held out: {_format_split_size(report.held_out)}"
     notes = [f"{counts}."]
     p_value_note = "p: p-value of the score"
-    certain_p_values = [c.p_value for c in candidates if c.p_value <= CERTAIN]
+    certain_p_values = [c.p_value for c in candidates if c.p_value <= MAX_UNPRINTED_P_VALUE]
     chance_p_values = [c.p_value for c in candidates if _is_chance(report, c)]
     if certain_p_values:
         bars = (

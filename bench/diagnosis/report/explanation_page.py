@@ -92,7 +92,7 @@ _RESIDUALS = {
 """Description of the residual for verdicts that leave something open."""
 MAX_OPEN_CHANGES = 12
 """Maximum number of changes of a model file that are shown unfolded."""
-_FEW = 5
+_MAX_LISTED_NAMES = 5
 """Maximum number of places and candidates in an alternative text."""
 
 
@@ -288,10 +288,10 @@ def _describe_figure(report: DiagnosisReportData, name: str) -> str:
         finite = [place for place in report.places if isfinite(place.before)]
         sizes = [
             f"{place.kind} {sanitise(place.label, 30)} {format_number(place.before, 2)}"
-            for place in sorted(finite, key=lambda place: -place.before)[:_FEW]
+            for place in sorted(finite, key=lambda place: -place.before)[:_MAX_LISTED_NAMES]
         ]
         return f"RMS of the residual in units of the noise, the largest before: {'; '.join(sizes)}."
-    best = report.verdict.candidates[:_FEW]
+    best = report.verdict.candidates[:_MAX_LISTED_NAMES]
     scores = [f"{format_effect_name(c.effect)} {format_number(c.score)}" for c in best]
     return f"Scores of the best candidates: {'; '.join(scores)}."
 

@@ -34,7 +34,7 @@ NOISE_RESOLUTION = 100.0
 MEASURED_STYLE = make_mark_style(BLACK, (), "o")
 BASE_MODEL_STYLE = make_mark_style(VERMILION, (5.0, 2.0))
 EXTENDED_MODEL_STYLE = make_mark_style(BLUE)
-_LEAST = 3.0
+_MIN_HALF_HEIGHT = 3.0
 """Minimum half-height of a residual panel in noise standard deviations, so that noise does not fill
 the panel.
 """
@@ -297,7 +297,11 @@ def _make_panels(
     name = sanitise(channel.name, 40)
     # For the joints of a robot, a common scale makes residuals comparable.
     quantity = facets.get("quantity", name)
-    residual = Axis(f"residual of {quantity} [σ]", scales=("linear",), holds=(-_LEAST, _LEAST))
+    residual = Axis(
+        f"residual of {quantity} [σ]",
+        scales=("linear",),
+        holds=(-_MIN_HALF_HEIGHT, _MIN_HALF_HEIGHT),
+    )
     value_axis = Axis(
         format_label(shorten_name(sanitise(channel.name), 24), channel.unit), scales=("linear",)
     )

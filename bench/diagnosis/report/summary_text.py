@@ -65,7 +65,7 @@ PERFECT_MODEL_NOTE = "the sensor noise alone would give"
 MIN_REPORTED_SHIFT = 0.05
 """Minimum relative change of a parameter that is reported as absorption if its interval is unknown.
 """
-LEAST_MOVE = 1e-3
+MIN_REPORTED_CHANGE = 1e-3
 """Minimum relative change of a parameter that can be reported as absorption, however narrow its
 interval.
 """
@@ -590,8 +590,8 @@ def format_shift(p: ParameterChange) -> str:
     change = p.after[0] - p.before[0]
     if not change:
         return "unchanged"
-    if abs(change) < LEAST_MOVE * abs(p.before[0]):
-        return f"changes by less than {format_percent(LEAST_MOVE)}"
+    if abs(change) < MIN_REPORTED_CHANGE * abs(p.before[0]):
+        return f"changes by less than {format_percent(MIN_REPORTED_CHANGE)}"
     sign = "+" if change > 0 else ""
     # For zero a percentage is undefined, and a very large one is less clear than the number.
     if not p.before[0] or abs(change / p.before[0]) > MAX_PERCENT_SHIFT:
@@ -602,14 +602,17 @@ def format_shift(p: ParameterChange) -> str:
 def has_absorbed_gap(p: ParameterChange) -> bool:
     """Return whether a parameter changes significantly.
 
-    The change must exceed the combined 95 % intervals, and be at least `LEAST_MOVE` of the value.
+    The change must exceed the combined 95 % intervals, and be at least `MIN_REPORTED_CHANGE` of the
+    value.
     """
     change = abs(p.after[0] - p.before[0])
     # Without intervals, a minimum relative change is required instead.
     if not np.isfinite([*p.before, *p.after]).all():
         return change > MIN_REPORTED_SHIFT * abs(p.before[0])
     before, after = ((high - low) / 2.0 for _, low, high in (p.before, p.after))
-    return bool(change > np.hypot(before, after) and change >= LEAST_MOVE * abs(p.before[0]))
+    return bool(
+        change > np.hypot(before, after) and change >= MIN_REPORTED_CHANGE * abs(p.before[0])
+    )
 
 
 def format_next_run(report: DiagnosisReportData) -> str:

@@ -152,7 +152,7 @@ class AlternativeFinder:
         """
         if not self.structure:
             return False
-        slots = self.search.evaluator.slots
+        slots = self.search.evaluator.coefficient_slices
         coefficient_count, other_count = (
             int(slots[name].stop - slots[name].start) for name in (effect, other_effect)
         )
@@ -221,7 +221,7 @@ class AlternativeFinder:
             return model.penalised_log_likelihood
         null_penalties = 0.0
         for name in model.effects:
-            parameters = evaluator.parameters[evaluator.slots[name]]
+            parameters = evaluator.parameters[evaluator.coefficient_slices[name]]
             if not any(parameter.bounds[0] > 0 for parameter in parameters):
                 null_penalties += self.search.get_effect_penalty(name)
         return model.penalised_log_likelihood + null_penalties
@@ -236,8 +236,8 @@ class AlternativeFinder:
         if not models_with_effect:
             return False
         best = max(models_with_effect, key=lambda m: m.penalised_log_likelihood)
-        parameters = evaluator.parameters[evaluator.slots[effect]]
-        values = best.fit.theta[evaluator.slots[effect]]
+        parameters = evaluator.parameters[evaluator.coefficient_slices[effect]]
+        values = best.fit.theta[evaluator.coefficient_slices[effect]]
         for parameter, value in zip(parameters, values, strict=True):
             low, high = parameter.bounds
             if not low <= value <= high:

@@ -27,7 +27,7 @@ from bench.diagnosis.evaluation.coefficient_bounds import (
 )
 from bench.diagnosis.evaluation.noise_model import Mask
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.diagnosis.evaluation.time_scale import LASTING, is_instant
+from bench.diagnosis.evaluation.time_scale import MAX_DECAY_FACTOR, is_instant
 from bench.diagnosis.fitting.finite_differences import is_finite_response
 from bench.diagnosis.fitting.fit_state import FitStart, TrajectoryFit
 from bench.diagnosis.search.initial_values import (
@@ -310,7 +310,7 @@ def _make_shape_grid(
     if parameter.unit == "s":
         # A decay much longer than the runs is constant within them; successive times differ by at
         # most a factor of two.
-        high = max(min(high, LASTING * evaluator.longest), 2.0 * low)
+        high = max(min(high, MAX_DECAY_FACTOR * evaluator.longest), 2.0 * low)
         return np.geomspace(low, high, int(np.ceil(np.log2(high / low))) + 1)
     return np.geomspace(low, high, SHAPE_GRID_SIZE)
 
@@ -335,9 +335,11 @@ def generate_frequency_neighbours(
         fit: the fitted model.
     """
     for name in fit.effects:
-        for c in generate_equal_travel_end_stops(evaluator, name, fit.theta[evaluator.slots[name]]):
+        for c in generate_equal_travel_end_stops(
+            evaluator, name, fit.theta[evaluator.coefficient_slices[name]]
+        ):
             theta = fit.theta.copy()
-            theta[evaluator.slots[name]] = c
+            theta[evaluator.coefficient_slices[name]] = c
             yield FitStart(fit.effects, theta, fit.states)
         bounds = compute_coefficient_bounds(evaluator, name)
         for number, place in enumerate(evaluator.get_coefficient_indices(name)):
@@ -528,7 +530,7 @@ def simulate_with_effect(
     runs = len(evaluator.tracks)
     theta = np.tile(fit.theta, (len(added), 1))
     for row, (name, c) in zip(theta, added, strict=True):
-        row[evaluator.slots[name]] = c
+        row[evaluator.coefficient_slices[name]] = c
     # All candidates and runs are simulated in one engine call, as one batch.
     count = len(added)
     simulated = evaluator.simulate(

@@ -242,7 +242,11 @@ class EffectSearch(ModelMoves):
         # One search on segments serves every size; it decides nothing, and only provides starts.
         if self._sketch is None:
             self._sketch = EffectSearch(
-                segment_evaluator, self.noise, self.frozen, self.make_rng("pieces"), self.stated
+                segment_evaluator,
+                self.noise,
+                self.frozen,
+                self.make_rng("pieces"),
+                self.is_noise_stated,
             )
             self._sketch.refit_models(
                 [FitStart((), self.base_model.fit.theta, segment_evaluator.guess)]

@@ -111,7 +111,7 @@ def compute_explained_squares(
     if not any(positive):
         solution = _solve_subset(gram, cross, list(range(count)))
         best[solution.groups] = solution.gain
-        coefficients[solution.groups] = solution.own
+        coefficients[solution.groups] = solution.coefficients
         remaining_groups = np.setdiff1d(remaining_groups, solution.groups)
     if remaining_groups.size:
         best[remaining_groups], coefficients[remaining_groups] = _solve_best_subset(
@@ -142,7 +142,7 @@ def _solve_best_subset(gram: Array, cross: Array, positive: Sequence[bool]) -> t
         is_improved = is_better[:, 0]
         rows = solution.groups[is_improved]
         coefficients[rows] = 0.0
-        coefficients[rows[:, None], subset] = solution.own[is_improved]
+        coefficients[rows[:, None], subset] = solution.coefficients[is_improved]
     return best, coefficients
 
 
@@ -160,13 +160,13 @@ class _SubsetSolution(NamedTuple):
         groups: (m,) indices of the groups in which the columns are neither absorbed nor collinear.
         gain: (m, S) h'G^-1 h.
         scaled: (m, k, S) G^-1 h in units of the lengths of the columns.
-        own: (m, k) G^-1 h of the first residual.
+        coefficients: (m, k) G^-1 h of the first residual.
     """
 
     groups: Indices
     gain: Array
     scaled: Array
-    own: Array
+    coefficients: Array
 
 
 def _solve_subset(gram: Array, cross: Array, subset: list[int]) -> _SubsetSolution:

@@ -34,7 +34,7 @@ def list_coefficients(evaluator: RunEvaluator, name: str) -> Sequence[Parameter]
         evaluator: the runs.
         name: name of the effect.
     """
-    return evaluator.parameters[evaluator.slots[name]]
+    return evaluator.parameters[evaluator.coefficient_slices[name]]
 
 
 def compute_reachable_levels(evaluator: RunEvaluator, name: str) -> Array:

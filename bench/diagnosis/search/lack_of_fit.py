@@ -158,9 +158,9 @@ def assess_lack_of_fit(models: ModelSet, model: FittedModel) -> LackOfFitResult:
         models: the models of the recording.
         model: the fitted model.
     """
-    evaluator, is_noise_stated = models.evaluator, models.stated
+    evaluator, is_noise_stated = models.evaluator, models.is_noise_stated
     size_result = assess_residual_size(models, model)
-    if not any(probe.name in evaluator.slots for probe in (HatForce, JointHatForce)):
+    if not any(probe.name in evaluator.coefficient_slices for probe in (HatForce, JointHatForce)):
         return size_result
     evaluator.watch.report_and_check("an unmodelled force")
     force_test = models.score_unmodelled_force(model)
@@ -212,7 +212,7 @@ def assess_residual_size(models: ModelSet, model: FittedModel) -> LackOfFitResul
     channels = []
     for c, name in enumerate(models.evaluator.channels):
         error = _compute_sigma_standard_error(models, model, c)
-        if exceeds_noise(excess[c], error, models.stated[c]):
+        if exceeds_noise(excess[c], error, models.is_noise_stated[c]):
             channels.append(name)
     return LackOfFitResult(1.0, "", excess, tuple(channels))
 
@@ -238,9 +238,9 @@ def compute_hat_directions(evaluator: RunEvaluator, model: FittedModel) -> Direc
         model: the fitted model.
     """
     probes, size = list_hat_probes(evaluator)
-    names = [JointHatForce.name if JointHatForce.name in evaluator.slots else HatForce.name] * len(
-        probes
-    )
+    names = [
+        JointHatForce.name if JointHatForce.name in evaluator.coefficient_slices else HatForce.name
+    ] * len(probes)
     added = [(name, probe.coefficients) for name, probe in zip(names, probes, strict=True)]
     changed = compute_responses(evaluator, model.fit, added)
     values = np.nan_to_num(np.moveaxis(changed, 0, -1)) / size
@@ -276,7 +276,7 @@ def _iterate_hat_families(
 
     `size` is the strength of a hat.
     """
-    if JointHatForce.name in evaluator.slots:
+    if JointHatForce.name in evaluator.coefficient_slices:
         for joint in joint_families(evaluator, SIGN_CHANGE_SPEED_SHARE):
             yield joint.label, joint.low, joint.high, partial(_make_joint_hat, joint, size)
         return

@@ -63,7 +63,7 @@ class ModelMoves(ScoredModelSet):
             # Zero coefficients switch the effect off, and they are not fitted; all else starts as
             # it is.
             theta = model.fit.theta.copy()
-            theta[self.evaluator.slots[name]] = 0.0
+            theta[self.evaluator.coefficient_slices[name]] = 0.0
             remaining_effects = tuple(n for n in model.effects if n != name)
             known_jacobian = model.fit.get_known_jacobian().drop_parameters(
                 self.evaluator.get_coefficient_indices(name)
@@ -115,7 +115,7 @@ class ModelMoves(ScoredModelSet):
         They are the simpler laws at the same place, one by one and all together, and the most
         active member of a family.
         """
-        effects, slots = self.evaluator.available_effects, self.evaluator.slots
+        effects, slots = self.evaluator.available_effects, self.evaluator.coefficient_slices
         coefficients = model.fit.theta[slots[name]]
         part_coefficients, begin = EffectStarts(), 0
         for part in effects[name].contains:
@@ -166,9 +166,9 @@ class ModelMoves(ScoredModelSet):
         if is_fit_needed and step not in self._simplified:
             self._simplified.add(step)
             theta = model.fit.theta.copy()
-            theta[self.evaluator.slots[name]] = 0.0
+            theta[self.evaluator.coefficient_slices[name]] = 0.0
             for part, c in parts.items():
-                theta[self.evaluator.slots[part]] += c
+                theta[self.evaluator.coefficient_slices[part]] += c
             return self.fit_one(FitStart(names, theta, model.fit.states))
         return self.models[key]
 

@@ -100,7 +100,7 @@ def _make_swapped_start(
     (added_effect,), (removed_effect,) = (
         set(m.effects) - set(n.effects) for m, n in ((other_model, model), (model, other_model))
     )
-    slots = search.evaluator.slots
+    slots = search.evaluator.coefficient_slices
     theta = model.fit.theta.copy()
     theta[slots[removed_effect]] = 0.0
     theta[slots[added_effect]] = other_model.fit.theta[slots[added_effect]]

@@ -162,10 +162,10 @@ def with_effect(evaluator: RunEvaluator, start: FitStart, name: str, c: Array) -
     contained, theta = effect.contains, start.theta.copy()
     # An effect and one that it contains together would have no unique solution.
     for part in sorted(set(contained) & set(start.effects)):
-        place = evaluator.slots[part]
+        place = evaluator.coefficient_slices[part]
         c = effect.taking(c, part, theta[place])
         theta[place] = 0.0
-    theta[evaluator.slots[name]] = c
+    theta[evaluator.coefficient_slices[name]] = c
     remaining_effects = [n for n in start.effects if n not in contained]
     return FitStart((*remaining_effects, name), theta, start.states)
 
@@ -238,7 +238,7 @@ def _list_start_sizes(
     # With several coefficients, the ranges do not show how the coefficients are related.
     if len(group.column_indices) > 1:
         return
-    place = evaluator.slots[name].start + first.place
+    place = evaluator.coefficient_slices[name].start + first.place
     _, upper_bound = evaluator.parameters[place].bounds
     shares = list(RANGE_SHARES)
     if first.signed:

@@ -194,7 +194,9 @@ class ScoredModelSet(ModelSet):
             further_text = f" added to each of {len(calls)} models" if len(calls) > 1 else ""
             self.evaluator.watch.stage(f"testing {max_effects} effects{further_text}", len(calls))
         scans = {}
-        for number, scan in self.evaluator.crew.map_unordered(self.evaluator, _scan_model, calls):
+        for number, scan in self.evaluator.worker_pool.map_unordered(
+            self.evaluator, _scan_model, calls
+        ):
             scans[number] = scan
             self.evaluator.watch.advance()
         for number, key in enumerate(keys):
@@ -402,7 +404,7 @@ class ScoredModelSet(ModelSet):
         if not is_above_noise.any():
             return True
         # Specified noise is known, so a larger residual is not noise, whatever its spectrum.
-        if (is_above_noise & self.stated).any():
+        if (is_above_noise & self.is_noise_stated).any():
             return False
         # Ljung-Box test, eq. (5) of `bench.diagnosis.evaluation.noise_model`.
         residual = self.compute_residual(model.fit)

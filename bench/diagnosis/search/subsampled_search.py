@@ -58,7 +58,7 @@ def _search_subsampled(search: EffectSearch, thinned_runs: RunEvaluator) -> Fitt
     if search.is_complete(search.base_model, MAX_P_VALUE_FIRST_EFFECT):
         return search.run()
     rng = search.make_rng("fewer samples")
-    search_arguments = thinned_runs, search.noise, search.frozen, rng, search.stated
+    search_arguments = thinned_runs, search.noise, search.frozen, rng, search.is_noise_stated
     subsampled_search = EffectSearch(*search_arguments, thorough=search.thorough)
     subsampled_search.refit_models([search.base_model.fit.make_start()])
     try:

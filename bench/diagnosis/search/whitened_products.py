@@ -157,16 +157,16 @@ class _ReducedDesign(NamedTuple):
         states: (R, s, s) roots of the inverse normal matrices of the initial states.
         by_states: (R s, q + K) L'J'a of eq. (2) for the initial states, of parameters and
             directions.
-        own: (q, q) root for the parameters.
-        by_own: (q, K) L'J'a of eq. (2) for the parameters, of directions.
+        parameter_root: (q, q) root for the parameters.
+        by_parameters: (q, K) L'J'a of eq. (2) for the parameters, of directions.
         grams: (n, k, k) products of directions in each block.
         acting: (K,) mask of directions that are not absorbed.
     """
 
     states: Array
     by_states: Array
-    own: Array
-    by_own: Array
+    parameter_root: Array
+    by_parameters: Array
     grams: list[Array]
     acting: Mask
 
@@ -321,10 +321,10 @@ class WhiteningDesign:
                 for run, run_jacobian in enumerate(np.moveaxis(weighted, 1, 0))
             ]
         )
-        by_states, by_own = _project_residuals(reduced_design, shared)
+        by_states, by_parameters = _project_residuals(reduced_design, shared)
         # Back substitution: first coefficients of the parameters, then of the initial states of
         # each run.
-        parameters = reduced_design.own @ by_own
+        parameters = reduced_design.parameter_root @ by_parameters
         state_products = by_states - reduced_design.by_states[:, :q] @ parameters
         runs, size, _ = reduced_design.states.shape
         states = reduced_design.states @ state_products.reshape(runs, size, len(residuals))
@@ -409,12 +409,12 @@ class InnerProducts:
             block, and products of directions with residuals (K, S).
         """
         reduced_design = self._design.reduce(phi)
-        q = len(reduced_design.own)
-        by_states, by_own = _project_residuals(reduced_design, self._shared.combine(phi))
-        absorbed = np.concatenate([by_states, by_own])
+        q = len(reduced_design.parameter_root)
+        by_states, by_parameters = _project_residuals(reduced_design, self._shared.combine(phi))
+        absorbed = np.concatenate([by_states, by_parameters])
         total = self._squares.combine(phi) - np.einsum("as,as->s", absorbed, absorbed)
         direction_products = np.concatenate(
-            [reduced_design.by_states[:, q:], reduced_design.by_own]
+            [reduced_design.by_states[:, q:], reduced_design.by_parameters]
         )
         cross = self._cross.combine(phi) - direction_products.T @ absorbed
         return (
@@ -436,11 +436,11 @@ def _project_residuals(reduced_design: _ReducedDesign, shared: Array) -> tuple[A
         reduced_design: the whitened design.
         shared: (R, q + s, S) products of the Jacobian with residuals.
     """
-    q = len(reduced_design.own)
+    q = len(reduced_design.parameter_root)
     # First the initial states of each run, then the parameters.
     by_states = _project_directions(reduced_design.states, shared[:, q:])
     parameter_products = shared[:, :q].sum(axis=0) - reduced_design.by_states[:, :q].T @ by_states
-    return by_states, reduced_design.own.T @ parameter_products
+    return by_states, reduced_design.parameter_root.T @ parameter_products
 
 
 def _project_directions(roots: Array, products: Array) -> Array:

@@ -23,7 +23,7 @@ from sims.core.simulator import Array
 
 MAX_STEPS = 8
 """Maximum number of Levenberg-Marquardt steps of a refit, which starts from the fit to all runs."""
-SHOWN = 1.0
+MIN_SUPPORTED_CHANGE = 1.0
 """Minimum change of a fold's runs, as the norm over all samples in noise standard deviations, for
 an effect to be supported by these runs.
 """
@@ -133,7 +133,7 @@ class CrossValidation:
         if self.evaluator.derivatives is not None:
             evaluator.derivatives = self.evaluator.derivatives[rows, :length]
         # Workers that are started for one fold also know the other folds.
-        evaluator.crew.register(evaluator)
+        evaluator.worker_pool.register(evaluator)
         return evaluator
 
     def _refit_fold(self, fold: _Fold, fits: Sequence[TrajectoryFit]) -> list[Array]:
@@ -152,9 +152,11 @@ class CrossValidation:
         length = fold.fitting.observed.shape[1]
         starts = []
         for fit in fits:
-            jacobian = fit.jacobian[fold.others, :length, :, : fit.free.size]
+            jacobian = fit.jacobian[fold.fitted_rows, :length, :, : fit.free.size]
             known_jacobian = KnownJacobian(fit.free, jacobian)
-            starts.append(FitStart(fit.effects, fit.theta, fit.states[fold.others], known_jacobian))
+            starts.append(
+                FitStart(fit.effects, fit.theta, fit.states[fold.fitted_rows], known_jacobian)
+            )
         refits = TrajectoryFitter(fold.fitting, self.noise, frozen).fit_models(starts, MAX_STEPS)
         return self._remove_unsupported(fold.fitting, refits)
 
@@ -164,8 +166,8 @@ class CrossValidation:
         """Return parameters (P,) of each model; effects that the runs do not show are off.
 
         An effect is not shown if switching it off changes the simulated samples by less than
-        `SHOWN`, in units of the noise. Its coefficients are then arbitrary and would spoil the
-        prediction.
+        `MIN_SUPPORTED_CHANGE`, in units of the noise. Its coefficients are then arbitrary and would
+        spoil the prediction.
         """
         thetas = [fit.theta.copy() for fit in fits]
         removals = [(i, name) for i, fit in enumerate(fits) for name in fit.effects]
@@ -184,7 +186,7 @@ class CrossValidation:
         for (i, name), simulated in zip(removals, simulated_without, strict=True):
             change = ((fits[i].simulated - simulated) / self.noise.sigma)[observed_mask]
             # If the simulation fails without the effect, the change is NaN and the effect is kept.
-            if np.linalg.norm(change) < SHOWN:
+            if np.linalg.norm(change) < MIN_SUPPORTED_CHANGE:
                 thetas[i][evaluator.get_coefficient_indices(name)] = 0.0
         return thetas
 
@@ -195,12 +197,12 @@ class _Fold:
 
     Attributes:
         rows: Indices of the runs that are left out.
-        others: Indices of the runs that are fitted.
+        fitted_rows: Indices of the runs that are fitted.
         fitting: Run evaluator of the fitted runs.
         left_out: Run evaluator of the runs that are left out.
     """
 
     rows: Indices
-    others: Indices
+    fitted_rows: Indices
     fitting: RunEvaluator
     left_out: RunEvaluator

@@ -153,10 +153,10 @@ def _widen_bounds(evaluator: RunEvaluator, fit: TrajectoryFit) -> Array:
 def compute_covariance(models: ModelSet, model: FittedModel) -> Array:
     """Compute the covariance (q, q) of the fitted parameters with AR(1) noise, by eq. (2)."""
     fisher_blocks = compute_fisher_blocks(models, model)
-    parameter_curvature = fisher_blocks.own.sum(axis=0)
+    parameter_curvature = fisher_blocks.parameters.sum(axis=0)
     # The Schur complement that solves a step of the fit also eliminates the initial states here.
     schur_complement, _ = compute_schur_complement(
-        parameter_curvature, fisher_blocks.cross, fisher_blocks.inner
+        parameter_curvature, fisher_blocks.cross, fisher_blocks.states
     )
     return invert_scaled(parameter_curvature, schur_complement)
 
@@ -193,16 +193,16 @@ class FisherBlocks(NamedTuple):
     Attributes:
         noise: Noise used for whitening: the residual of the model.
         jacobian: (R, n, q + s) whitened derivatives by parameters and by initial states.
-        own: (R, q, q) A' A.
+        parameters: (R, q, q) A' A.
         cross: (R, q, s) A' B, zero where an initial state is known.
-        inner: (R, s, s) B' B with the prior.
+        states: (R, s, s) B' B with the prior.
     """
 
     noise: NoiseModel
     jacobian: Array
-    own: Array
+    parameters: Array
     cross: Array
-    inner: Array
+    states: Array
 
 
 def compute_fisher_blocks(models: ModelSet, model: FittedModel) -> FisherBlocks:

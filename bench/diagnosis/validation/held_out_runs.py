@@ -23,12 +23,12 @@ from sims.core.simulator import Array
 
 HORIZON_STAGES = ((0.2, 6), (0.45, 6), (0.7, 6), (1.0, 10))
 """Stages of the fit of initial states: fraction of each run, and maximum number of steps."""
-FOLLOWED = ((1.0, 6),)
+FILTERED_HORIZON_STAGES = ((1.0, 6),)
 """Stages of the fit of initial states, as in `HORIZON_STAGES`, for a robot with filtered runs.
 
 These runs begin near their best states.
 """
-FAR = 1.5
+MIN_STAGED_FIT_COST = 1.5
 """Minimum mean square residual of the nearest model, in noise variances, for which models that
 start from filtered states are also fitted in stages.
 """
@@ -133,10 +133,12 @@ class HeldOutRuns:
         guess = self.evaluator.guess
         initial_starts = [FitStart((), theta, guess) for theta in thetas]
         is_filtered = self.evaluator.followed is not None
-        fits = self._fit_initial_states(initial_starts, FOLLOWED if is_filtered else HORIZON_STAGES)
+        fits = self._fit_initial_states(
+            initial_starts, FILTERED_HORIZON_STAGES if is_filtered else HORIZON_STAGES
+        )
         count = max(int(self.seen.sum()), 1)
         # Runs that amplify differences of the initial state need a fit in stages.
-        if is_filtered and not _find_lowest_cost_fit(fits).cost < FAR * count:
+        if is_filtered and not _find_lowest_cost_fit(fits).cost < MIN_STAGED_FIT_COST * count:
             fits = _select_nearer_fits(
                 fits, self._fit_initial_states(initial_starts, HORIZON_STAGES)
             )
@@ -149,7 +151,9 @@ class HeldOutRuns:
         far_indices = [i for i, fit in enumerate(fits) if not fit.cost < limit]
         starts = [replace(fits[i].make_start(), states=nearest_fit.states) for i in far_indices]
         # These initial states are good over the first fraction of the runs already.
-        refits = self._fit_initial_states(starts, FOLLOWED if is_filtered else HORIZON_STAGES[1:])
+        refits = self._fit_initial_states(
+            starts, FILTERED_HORIZON_STAGES if is_filtered else HORIZON_STAGES[1:]
+        )
         for i, fit in zip(far_indices, refits, strict=True):
             fits[i] = _find_lowest_cost_fit([fits[i], fit])
         return [self._predict_runs(fit) for fit in fits]

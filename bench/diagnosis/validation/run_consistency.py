@@ -306,8 +306,8 @@ def _compute_run_normal_equations(models: ModelSet, model: FittedModel) -> tuple
     right_hand_sides = np.concatenate(
         [fisher_blocks.cross.transpose(0, 2, 1), pull[:, q:, None]], 2
     )
-    eliminated = np.linalg.solve(fisher_blocks.inner, right_hand_sides)
-    curvatures = fisher_blocks.own - np.matmul(fisher_blocks.cross, eliminated[..., :-1])
+    eliminated = np.linalg.solve(fisher_blocks.states, right_hand_sides)
+    curvatures = fisher_blocks.parameters - np.matmul(fisher_blocks.cross, eliminated[..., :-1])
     gradients = pull[:, :q] - np.matmul(fisher_blocks.cross, eliminated[..., -1:])[..., 0]  # (1)
     return curvatures, gradients
 

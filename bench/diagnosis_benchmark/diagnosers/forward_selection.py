@@ -376,7 +376,7 @@ def _choose_starts(
             if not probe.fixed:
                 c[probe.place] = np.clip(share * size, *bounds[probe.place])
         theta = current_fit.theta.copy()
-        theta[world.slots[name]] = c
+        theta[world.coefficient_slices[name]] = c
         starts.append(FitStart((*current_fit.effects, name), theta, current_fit.states))
     return starts
 

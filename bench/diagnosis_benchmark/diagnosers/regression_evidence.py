@@ -372,7 +372,7 @@ class RegressionEvidence:
         values = {c.name: c.value for c in world.kind.constants}
         values |= {**world.simulator.constant_values, **track.scenario.constants}
         constants = {key: np.full((size, 1), float(value)) for key, value in values.items()}
-        theta = np.tile(self.base.fit.theta[: world.own], (size, 1))
+        theta = np.tile(self.base.fit.theta[: world.system_parameter_count], (size, 1))
         inputs = {
             channel.name: np.asarray(track.scenario.inputs.get(channel.name, np.zeros(size)))[
                 :size, None

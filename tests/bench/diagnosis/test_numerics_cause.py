@@ -11,7 +11,7 @@ from bench.diagnosis.explain import _ExplainRun, explain
 from bench.diagnosis.explain_options import ExplainOptions
 from bench.diagnosis.fitting.base_fit import fit_base_model
 from bench.diagnosis.numerics_cause import (
-    SURE,
+    MIN_FINER_STEP_GAIN,
     Reusable,
     is_finer_model_better,
     is_finer_step_better,
@@ -76,7 +76,7 @@ def test_a_missing_mass_does_not_make_the_files_own_step_look_worse(tmp_path, no
 def test_a_step_that_is_the_only_thing_wrong_is_found_before_any_cause(tmp_path):
     there = chosen(log(tmp_path, divide=4, integrator="RK4"))
     assert there.coarse is not None
-    assert there.coarse.gain > SURE
+    assert there.coarse.gain > MIN_FINER_STEP_GAIN
     assert there.kind.numerics.integrator == "RK4"
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from bench.diagnosis.evaluation.coefficient_bounds import (
-    BEYOND_MODEL,
+    MAX_RANGE_FACTOR_MODEL_FILE,
     bound_of,
     compute_coefficient_bounds,
     is_unusual,
@@ -141,9 +141,9 @@ def test_a_link_without_inertia_does_not_shrink_the_ranges_of_its_joint(yaw, tmp
 
 
 def test_bounds_far_apart_are_not_met_by_numbers_near_zero():
-    assert bound_of(-0.00099, -0.001, BEYOND_MODEL) is None
-    assert bound_of(-0.001, -0.001, BEYOND_MODEL) == "low"
-    assert bound_of(BEYOND_MODEL, -0.001, BEYOND_MODEL) == "high"
+    assert bound_of(-0.00099, -0.001, MAX_RANGE_FACTOR_MODEL_FILE) is None
+    assert bound_of(-0.001, -0.001, MAX_RANGE_FACTOR_MODEL_FILE) == "low"
+    assert bound_of(MAX_RANGE_FACTOR_MODEL_FILE, -0.001, MAX_RANGE_FACTOR_MODEL_FILE) == "high"
 
 
 @pytest.mark.parametrize(("value", "unusual"), [(0.5, False), (0.6, False), (0.61, True)])

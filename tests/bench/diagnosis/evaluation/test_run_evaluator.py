@@ -21,7 +21,7 @@ def test_a_vector_holds_parameters_constants_set_free_and_coefficients():
         candidates=["drag.linear", "spring.linear"],
     )
     assert [p.name for p in there.parameters[:3]] == ["inertia", "length", "mass"]
-    assert there.slots["drag.linear"] == slice(3, 4)
+    assert there.coefficient_slices["drag.linear"] == slice(3, 4)
     assert list(there.base) == [0, 1, 2]
     np.testing.assert_allclose(there.get_nominal_theta()[:3], [3.3e-3, 0.15, 0.15])
     assert not there.get_nominal_theta()[3:].any()
@@ -88,7 +88,7 @@ def test_effects_may_grow_beyond_what_is_plausible_but_not_change_their_meaning(
         candidates=["drag.linear", "spring.linear", "friction.stribeck"],
     )
     for name in there.library:
-        plausible = [p.bounds for p in there.parameters[there.slots[name]]]
+        plausible = [p.bounds for p in there.parameters[there.coefficient_slices[name]]]
         for (low, high), (wide_low, wide_high) in zip(
             plausible, compute_coefficient_bounds(there, name), strict=True
         ):
@@ -104,7 +104,7 @@ def test_effects_may_grow_beyond_what_is_plausible_but_not_change_their_meaning(
 def test_only_what_sticks_by_itself_has_the_narrow_range_of_dry_friction():
     name = "friction.load_quadratic"
     there = evaluator(recording("servo", runs=1, seconds=0.5), candidates=[name])
-    (_, share), (_, square) = (p.bounds for p in there.parameters[there.slots[name]])
+    (_, share), (_, square) = (p.bounds for p in there.parameters[there.coefficient_slices[name]])
     expected = [(0.0, MAX_RANGE_FACTOR_DRY_FRICTION * share), (0.0, MAX_RANGE_FACTOR * square)]
     assert compute_coefficient_bounds(there, name) == expected
 

@@ -62,7 +62,8 @@ def test_the_run_that_differs_most_is_proposed_and_does_tell_them_apart(free):
         assert found.change["seconds"] == pytest.approx(times[-1])
     seen = [
         Pendulum(
-            fixed={name: m.fit.theta[search.evaluator.slots[name]].tolist()}, time_step=1e-3
+            fixed={name: m.fit.theta[search.evaluator.coefficient_slices[name]].tolist()},
+            time_step=1e-3,
         ).simulate(m.fit.theta[None, :1], Scenario(times, initial))[0]
         for name, m in zip(effects, (model, rival), strict=True)
     ]

@@ -32,7 +32,7 @@ def evaluator():
 
 def theta_of(evaluator, name, c):
     theta = evaluator.get_nominal_theta()
-    theta[evaluator.slots[name]] = c
+    theta[evaluator.coefficient_slices[name]] = c
     return theta
 
 

@@ -40,7 +40,7 @@ def error_in_segments(log, extended_path, seconds):
     runs = recording.held_out()
     evaluator = RunEvaluator(kind, recording, runs, None, candidates=list(extended.effects))
     theta = evaluator.get_nominal_theta()
-    for place, parameter in enumerate(evaluator.parameters[: evaluator.own]):
+    for place, parameter in enumerate(evaluator.parameters[: evaluator.system_parameter_count]):
         theta[place] = extended.parameters[parameter.name].value
     for name, numbers in extended.effects.items():
         coefficients = evaluator.available_effects[name].on(evaluator.simulator.system)

@@ -30,7 +30,7 @@ def evidence(
     slots = {name: slice(0, size) for name, size in zip("abc", sizes, strict=True)}
     effects = {name: placed() for name in "abc"}
     search.evaluator = SimpleNamespace(
-        available_effects=effects, slots=slots, has_linearisation=False
+        available_effects=effects, coefficient_slices=slots, has_linearisation=False
     )
     monkeypatch.setattr(
         AlternativeFinder, "_is_plausible", lambda self, effect: effect in plausible
@@ -120,7 +120,7 @@ def test_the_null_gain_of_one_of_two_signs_does_not_count_for_a_robot(
         available_effects={"a": placed(), "b": placed()},
         has_linearisation=True,
         parameters=[SimpleNamespace(bounds=(least, 1.0))] * 2,
-        slots={"a": slice(0, 1), "b": slice(1, 2)},
+        coefficient_slices={"a": slice(0, 1), "b": slice(1, 2)},
     )
     search.get_effect_penalty = {"a": 0.0, "b": 3.0 * INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO}.get
     monkeypatch.setattr(AlternativeFinder, "_is_plausible", lambda self, effect: True)

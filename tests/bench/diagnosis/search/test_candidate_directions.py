@@ -262,11 +262,11 @@ def test_a_harder_stop_that_turns_back_at_the_same_place_is_met_later():
     fit = fitted(there)
     _, high = there.get_coordinate_range("state.limit")
     theta = fit.theta.copy()
-    theta[there.slots["state.limit"]] = [40.0, 0.5 * high, 0.1]
+    theta[there.coefficient_slices["state.limit"]] = [40.0, 0.5 * high, 0.1]
     starts = list(
         generate_frequency_neighbours(there, replace(fit, effects=("state.limit",), theta=theta))
     )
-    stops = np.array([s.theta[there.slots["state.limit"]] for s in starts])
+    stops = np.array([s.theta[there.coefficient_slices["state.limit"]] for s in starts])
     np.testing.assert_allclose(stops[:, 0] / 40.0, REFIT_STIFFNESS_FACTORS)
     # All stops need the same work k d^(5/2) up to the end of the travel.
     np.testing.assert_allclose(stops[:, 0] * (high - stops[:, 1]) ** 2.5, 40 * (high / 2) ** 2.5)

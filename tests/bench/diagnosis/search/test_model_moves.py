@@ -28,7 +28,7 @@ def fitted(made, names, values):
     """Return the model with these effects, fitted from these coefficients."""
     theta = made.evaluator.get_nominal_theta()
     for name in names:
-        theta[made.evaluator.slots[name]] = values[name]
+        theta[made.evaluator.coefficient_slices[name]] = values[name]
     made.refit_models([FitStart(names, theta, made.evaluator.guess)])
     return made.models[frozenset(names)]
 
@@ -49,7 +49,7 @@ def test_the_richer_law_stands_where_it_comes_nearer(truth, richer, kept):
     plainer = made.simplify_laws(model)
     assert set(plainer.effects) == {"force.bias", kept}
     if kept != richer:
-        place = made.evaluator.slots[kept].start
+        place = made.evaluator.coefficient_slices[kept].start
         assert plainer.fit.theta[place] == pytest.approx(truth[kept], rel=0.05)
 
 
@@ -68,7 +68,7 @@ def test_a_law_whose_time_the_data_do_not_show_gives_way_to_the_sum_of_its_parts
     plainer = made.simplify_laws(fitted(made, ("force.bias", "friction.warming"), values))
     assert set(plainer.effects) == {"force.bias", *kept}
     for name in truth:
-        c = plainer.fit.theta[made.evaluator.slots[name]]
+        c = plainer.fit.theta[made.evaluator.coefficient_slices[name]]
         np.testing.assert_allclose(c, truth[name], rtol=0.05)
 
 

@@ -71,7 +71,7 @@ def test_a_competitor_of_a_pair_also_starts_from_the_shared_effects(monkeypatch)
     rival = replace(rival, fit=replace(rival.fit, theta=np.array([1.1, 2.2, 0.0, 4.0])))
     search = search_of(best, rival, model("a"), model("b"))
     slots = {"a": slice(1, 2), "b": slice(2, 3), "c": slice(3, 4)}
-    search.evaluator = SimpleNamespace(library=["a", "b", "c"], slots=slots)
+    search.evaluator = SimpleNamespace(library=["a", "b", "c"], coefficient_slices=slots)
     begun = []
     search.refit_models, search.refit_extensions = (
         lambda s, noise: begun.extend(s),

@@ -109,7 +109,7 @@ def test_an_effect_that_the_other_runs_do_not_show_predicts_nothing():
         ],
         20,
     )
-    assert fits[1].theta[there.slots["input.gain"]] == pytest.approx([0.5], abs=0.1)
+    assert fits[1].theta[there.coefficient_slices["input.gain"]] == pytest.approx([0.5], abs=0.1)
     base, gain = CrossValidation(there, noise).validate(fits)
     np.testing.assert_allclose(gain.simulated[1], base.simulated[1], atol=0.2 * SIGMA)
     assert np.abs(gain.simulated[1] - there.observed[1]).max() > 20 * SIGMA
