@@ -633,9 +633,9 @@ class _ExplainRun:
         for cause in finding.causes:
             rest = {name for name in finding.model.effects if name != cause.effect}
             keys = [frozenset({*rest, other}) for other in cause.alternatives]
-            rivals = [search.models[key] for key in keys if key in search.models]
-            if rivals:
-                return design_next_run(search, finding.model, rivals, seconds, longest)
+            competing_models = [search.models[key] for key in keys if key in search.models]
+            if competing_models:
+                return design_next_run(search, finding.model, competing_models, seconds, longest)
         return design_next_run(search, finding.model, (), seconds, longest)
 
     def _create_search(

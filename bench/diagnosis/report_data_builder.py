@@ -123,9 +123,9 @@ class DiagnosisReportDataBuilder:
             if self.finding.model.effects
             else before
         )
-        return ConsistencySummary(before, after, self._estimate_rival_by_group())
+        return ConsistencySummary(before, after, self._estimate_parameters_by_group())
 
-    def _estimate_rival_by_group(self) -> tuple[ParameterConsistency, ...]:
+    def _estimate_parameters_by_group(self) -> tuple[ParameterConsistency, ...]:
         """Return the estimates by run, log or load of the best effect other than a single cause.
 
         They let the report compare how consistent the cause and its best competitor are.

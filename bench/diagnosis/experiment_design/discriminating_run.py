@@ -5,7 +5,7 @@ Fedorov, Biometrika 62(1), 57, 1975, doi:10.1093/biomet/62.1.57), with the compe
 parameters fixed at their fit to the present data. On a run x with T samples of C channels the two
 models differ by
 
-    apart(x) = sqrt(mean over t, c of ((y_model - y_rival) / sigma_c)^2)                       (1)
+    apart(x) = sqrt(mean over t, c of ((y_model - y_other) / sigma_c)^2)                       (1)
 
 For a robot no run is proposed that exceeds a limit of the model file
 (`diagnosis.experiment_design`): commands

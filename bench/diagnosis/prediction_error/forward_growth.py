@@ -45,7 +45,7 @@ MAX_FIRST_EFFECTS = 2
 """Number of the likeliest trials that are fitted by simulation, at any distance from the best."""
 ALL_SERVOS_STEPS = 6
 """Maximum number of Gauss-Newton steps for the coefficients of all servos."""
-RIVAL_MARGIN = 20.0
+COMPETING_MODEL_MARGIN = 20.0
 """Maximum distance in twice the log-likelihood of sets that are compared by simulation."""
 LINEARISATION_ERROR = 0.03
 """Maximum relative error of a gain that is computed from linear responses."""
@@ -184,7 +184,7 @@ def _is_settled(context: SearchContext, best: FilteredSet, other: FilteredSet) -
     """Return whether a set explains the runs, and another one is far worse."""
     behind = _compute_criterion(context, other) - _compute_criterion(context, best)
     gain = context.filters.compute_gain(best.followed)
-    return behind > RIVAL_MARGIN + SETTLED_SHARE * gain and not best.followed.lacks_force
+    return behind > COMPETING_MODEL_MARGIN + SETTLED_SHARE * gain and not best.followed.lacks_force
 
 
 def _select_nearly_as_likely(
@@ -198,7 +198,7 @@ def _select_nearly_as_likely(
     if not larger_sets:
         return ()
     error = LINEARISATION_ERROR * context.filters.compute_gain(larger_sets[0].followed)
-    limit = _compute_criterion(context, larger_sets[0]) + RIVAL_MARGIN + error
+    limit = _compute_criterion(context, larger_sets[0]) + COMPETING_MODEL_MARGIN + error
     near_sets = [one for one in larger_sets if _compute_criterion(context, one) <= limit]
     return [*near_sets, *larger_sets[len(near_sets) : MAX_FIRST_EFFECTS]]
 

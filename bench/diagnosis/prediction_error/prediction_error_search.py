@@ -13,13 +13,13 @@ is only noise. The order is:
     4. Select again, with effects of many shapes at the joints where a force is missing
        (`selection_fits`).
     5. Simulate elasticity and backlash between a drive and its links (`selection_fits`).
-    6. Try one effect in place of several (`rival_sets`).
+    6. Try one effect in place of several (`competing_models`).
 
 If a long recording shows that the model stays incomplete, filters alone identify its effects
 (`incomplete_model`), and nothing of the above is done.
 
-`PredictionErrorSearch.fit_rivals` then fits the sets that are nearly as good, because they may be
-equivalent. All steps share filters with effects in the model (`model_filters`), columns of
+`PredictionErrorSearch.fit_competing_models` then fits the sets that are nearly as good, because
+they may be equivalent. All steps share filters with effects in the model (`model_filters`), columns of
 regressions (`library_columns`) and fits (`simulated_fits`).
 """
 
@@ -32,6 +32,10 @@ import numpy as np
 
 from bench.diagnosis.fitting.fit_state import FitStart, TrajectoryFit
 from bench.diagnosis.fitting.model_set import FittedModel
+from bench.diagnosis.prediction_error.competing_models import (
+    fit_competing_models,
+    fit_single_in_place,
+)
 from bench.diagnosis.prediction_error.effect_proposals import SearchContext
 from bench.diagnosis.prediction_error.effect_selection import Selected
 from bench.diagnosis.prediction_error.forward_growth import (
@@ -47,7 +51,6 @@ from bench.diagnosis.prediction_error.regression_selection import (
     compute_p_value_of_gain,
     score_by_regression,
 )
-from bench.diagnosis.prediction_error.rival_sets import fit_rivals, fit_single_in_place
 from bench.diagnosis.prediction_error.selection_fits import (
     check_fit,
     check_selection,
@@ -175,9 +178,9 @@ class PredictionErrorSearch(EffectSearch):
             best = select_higher_merit(best, select_in_model(context))
         return best
 
-    def fit_rivals(self, best: FittedModel) -> FittedModel:
+    def fit_competing_models(self, best: FittedModel) -> FittedModel:
         """Fit the sets that are nearly as good, and return the best of all."""
-        return fit_rivals(self._search_context, best)
+        return fit_competing_models(self._search_context, best)
 
     def take_over(self, other: PredictionErrorSearch) -> None:
         """Reuse the filter and the responses of another search of the same base model.

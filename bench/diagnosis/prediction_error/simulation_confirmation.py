@@ -27,7 +27,7 @@ from bench.diagnosis.validation.held_out_runs import Validation
 
 MIN_REMOVED_SHARE = 0.5
 """Minimum share of the discrepancy that reported effects remove if the cause is unknown."""
-MAX_RIVAL_DISTANCE = 15.0
+COMPARED_MODEL_MARGIN = 15.0
 """Maximum distance in twice the log-likelihood of models that are evaluated on held-out runs."""
 
 
@@ -60,13 +60,13 @@ class Confirmation(Inquiry):
         if search.identified is not None:
             return self._build_filter_result(search.identified)
         watch.begin_question("rivals")
-        self._model = search.fit_rivals(self._model)
+        self._model = search.fit_competing_models(self._model)
         size = len(self._model.effects)
         self._evaluate_on_held_out_runs()
         if 0 < len(self._model.effects) < size:
             # The competing models of the remaining effects were fitted together with the removed
             # ones, so fit them again.
-            self._model = search.fit_rivals(self._model)
+            self._model = search.fit_competing_models(self._model)
             self._evaluate_on_held_out_runs()
         watch.begin_question("structure")
         self._model = search.fit_to_convergence(self._model)
@@ -134,14 +134,16 @@ class Confirmation(Inquiry):
                 search.remove_effect(model, name)
         smaller_models = [m for m in search.models.values() if set(m.effects) < names and m.effects]
         size = len(names)
-        rivals = [m for m in search.models.values() if len(m.effects) == size and m is not model]
-        rivals = [
+        competing_models = [
+            m for m in search.models.values() if len(m.effects) == size and m is not model
+        ]
+        competing_models = [
             m
-            for m in rivals
-            if m.penalised_log_likelihood > model.penalised_log_likelihood - MAX_RIVAL_DISTANCE
+            for m in competing_models
+            if m.penalised_log_likelihood > model.penalised_log_likelihood - COMPARED_MODEL_MARGIN
         ]
         trial = HeldOutValidation(self._held_out)
-        trial.evaluate_models([search.base_model, model, *smaller_models, *rivals])
+        trial.evaluate_models([search.base_model, model, *smaller_models, *competing_models])
         self._watch.check_not_stopped()
         self._trial = trial
         self._model = trial.drop_unhelpful_effects(search, model)

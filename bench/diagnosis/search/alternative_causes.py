@@ -74,9 +74,9 @@ class AlternativeFinder:
         reduced_model = self._get_model_without(model, effect)
         gain = model.likelihood.value - reduced_model.likelihood.value
         p_value = self._compute_p_value(reduced_model, effect, gain)
-        competing_effects = self._list_rivals(model, effect)
+        competing_effects = self._list_competing_effects(model, effect)
         # Effects with implausible coefficients come last in their set.
-        competing_effects.sort(key=lambda rival: (not self._is_plausible(rival[1]), rival))
+        competing_effects.sort(key=lambda pair: (not self._is_plausible(pair[1]), pair))
         ordered_effects = [name for _, name in competing_effects]
         alternatives = tuple(name for name in ordered_effects if name != effect)
         # With structure in the residual, indistinguishable does not mean equally likely, so the
@@ -120,7 +120,7 @@ class AlternativeFinder:
         by_score = search.best_p_values.get(key, 1.0)
         return min(by_score, by_refit)
 
-    def _list_rivals(self, model: FittedModel, effect: str) -> list[tuple[float, str]]:
+    def _list_competing_effects(self, model: FittedModel, effect: str) -> list[tuple[float, str]]:
         """List the effects that explain the data as well as the given one, with their distance.
 
         A competing effect is tested by the fitted models in which it replaces the effect and
@@ -162,7 +162,7 @@ class AlternativeFinder:
         )
 
     def _remove_richer(self, competing_effects: list[tuple[float, str]]) -> list[tuple[float, str]]:
-        """Return the rivals without those that contain another rival.
+        """Return the competing effects without those that contain another of them.
 
         These are families of which one member explains as much, and richer laws of which the
         simpler one does.

@@ -110,7 +110,7 @@ class EffectSearch(ModelMoves):
         return best
 
     def correct_step_errors(self, model: FittedModel) -> FittedModel:
-        """Correct the discretisation error about a model, and refit its close rivals.
+        """Correct the discretisation error about a model, and refit its close competing models.
 
         Returns:
             The best model of the same size after the correction, which may be a simpler one.

@@ -1,7 +1,7 @@
 """Refit the model found by the search and its close competing models to convergence.
 
 The search tests few candidates about each model, and stops fits that fall behind. A diagnosed cause
-must be compared with all rivals, each at its own optimum.
+must be compared with all competing models, each at its own optimum.
 """
 
 from __future__ import annotations

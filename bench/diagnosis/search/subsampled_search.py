@@ -111,7 +111,7 @@ def _collect_full_fit_starts(
 def _select_full_model(search: EffectSearch, subsampled_model: FittedModel) -> FittedModel:
     """Return the fit to all samples of the model that was found.
 
-    Near the noise, return the best model of its size, because thinned runs distinguish rivals less
+    Near the noise, return the best model of its size, because thinned runs distinguish models less
     well.
     """
     model = search.models[frozenset(subsampled_model.effects)]

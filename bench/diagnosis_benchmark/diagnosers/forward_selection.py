@@ -81,8 +81,8 @@ class _ForwardSelection(Diagnoser):
         The search stops if the model is sufficient, if no effect improves it, or at `MAX_EFFECTS`
         effects.
 
-        In each round, `rivals` are the models with one more effect, ordered by the criterion. The
-        best becomes the new model; rivals within the tolerance `near_limit` of it are its
+        In each round, `candidates` are the models with one more effect, ordered by the criterion.
+        The best becomes the new model; candidates within the tolerance `near_limit` of it are its
         alternatives (`alternatives`).
 
         Args:
@@ -90,25 +90,27 @@ class _ForwardSelection(Diagnoser):
         """
         samples = int(evidence.observed_mask.sum())
         best = _add_refit(evidence, evidence.base.fit)
-        first, rivals = best, list[RefittedModel]()
+        first, candidates = best, list[RefittedModel]()
         causes: list[tuple[str, tuple[str, ...]]] = []
         while len(causes) < MAX_EFFECTS and not self.is_sufficient(best, samples):
-            rivals = [
+            candidates = [
                 _add_refit(evidence, fit) for fit in _refit_with_one_more_effect(evidence, best.fit)
             ]
-            rivals = [candidate for candidate in rivals if np.isfinite(candidate.squares)]
-            if not rivals:
+            candidates = [candidate for candidate in candidates if np.isfinite(candidate.squares)]
+            if not candidates:
                 break
-            rivals.sort(key=lambda candidate: self.compute_criterion(candidate, samples))
-            if self.compute_criterion(rivals[0], samples) >= self.compute_criterion(best, samples):
+            candidates.sort(key=lambda candidate: self.compute_criterion(candidate, samples))
+            if self.compute_criterion(candidates[0], samples) >= self.compute_criterion(
+                best, samples
+            ):
                 break
-            near_limit = self.compute_criterion(rivals[0], samples) + self.near
+            near_limit = self.compute_criterion(candidates[0], samples) + self.near
             alternatives = [
                 candidate.fit.effects[-1]
-                for candidate in rivals[1:]
+                for candidate in candidates[1:]
                 if self.compute_criterion(candidate, samples) <= near_limit
             ]
-            best = rivals[0]
+            best = candidates[0]
             causes.append((best.fit.effects[-1], tuple(alternatives)))
         return self._make_answer(evidence, first, best, causes, samples)
 

@@ -178,8 +178,8 @@ def _hide_one_effect(
     unexplained = None
     if effect in SIMPLER_EFFECTS and target_size >= 1.0:
         simpler_effect = f"{SIMPLER_EFFECTS[effect]}@{place}" if place else SIMPLER_EFFECTS[effect]
-        rivals = [simpler_effect, f"drag.linear@{place}" if place else "drag.quadratic"]
-        unexplained = _compute_unexplained_size(conditions, {name: c}, {}, rivals, rng)
+        other_effects = [simpler_effect, f"drag.linear@{place}" if place else "drag.quadratic"]
+        unexplained = _compute_unexplained_size(conditions, {name: c}, {}, other_effects, rng)
         if unexplained < MIN_SIMPLER_RESIDUAL:
             return None
     return replace(item, effects={name: c}, size=target_size, beyond=unexplained)

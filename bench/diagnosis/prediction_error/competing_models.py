@@ -14,8 +14,8 @@ from bench.diagnosis.fitting.model_set import MAX_ITERATIONS, FittedModel
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
 from bench.diagnosis.prediction_error.effect_proposals import SearchContext
 from bench.diagnosis.prediction_error.forward_growth import (
+    COMPETING_MODEL_MARGIN,
     LINEARISATION_ERROR,
-    RIVAL_MARGIN,
     try_one_more_effect,
 )
 from bench.diagnosis.prediction_error.joint_effects import (
@@ -35,7 +35,7 @@ from bench.diagnosis.prediction_error.simulated_fits import (
 )
 from sims.core.simulator import Array
 
-MAX_RIVALS = 5
+MAX_COMPETING_EFFECTS = 5
 """Maximum number of competing models of each effect that are fitted by simulation."""
 ALIKE_SHARE = 0.5
 """Minimum gain of an effect at the same joint that is tried as a replacement.
@@ -44,7 +44,7 @@ It is a share of the gain by regression of the effect that it replaces.
 """
 
 
-class _Rival(NamedTuple):
+class _CompetingEffect(NamedTuple):
     """An effect that may replace another one.
 
     Attributes:
@@ -81,12 +81,14 @@ def fit_single_in_place(context: SearchContext, best: FittedModel) -> FittedMode
     (name,) = single_sets[0].names
     penalty = sum(filters.penalty(one) for one in best.effects) - filters.penalty(name)
     loss = filters.get_filter(best).log_likelihood - single_sets[0].followed.log_likelihood
-    if 2.0 * loss > penalty + RIVAL_MARGIN:
+    if 2.0 * loss > penalty + COMPETING_MODEL_MARGIN:
         return best
-    return select_higher_merit(fit_rivals(context, fit_filtered(context, single_sets[0])), best)
+    return select_higher_merit(
+        fit_competing_models(context, fit_filtered(context, single_sets[0])), best
+    )
 
 
-def fit_rivals(context: SearchContext, best: FittedModel) -> FittedModel:
+def fit_competing_models(context: SearchContext, best: FittedModel) -> FittedModel:
     """Fit the sets that are nearly as good by the regression, and return the best of all.
 
     Args:
@@ -97,14 +99,16 @@ def fit_rivals(context: SearchContext, best: FittedModel) -> FittedModel:
     has_no_fit = not best.effects or not np.isfinite(best.fit.cost)
     if has_no_fit or has_series(evaluator, best.effects):
         return best
-    starts, rivals = list[FitStart](), set[str]()
+    starts, competing_effects = list[FitStart](), set[str]()
     for name in best.effects:
-        for rival in _find_rivals(context, best, name):
-            rivals.add(rival.effect)
-            start = make_replacing_start(evaluator, best, [name], rival.effect, rival.c)
+        for competing_effect in _find_competing_effects(context, best, name):
+            competing_effects.add(competing_effect.effect)
+            start = make_replacing_start(
+                evaluator, best, [name], competing_effect.effect, competing_effect.c
+            )
             if frozenset(start.effects) in search.models:
                 continue
-            confirmed = _confirm_by_filter(context, best, rival, start)
+            confirmed = _confirm_by_filter(context, best, competing_effect, start)
             starts += [confirmed] if confirmed is not None else []
     if starts:
         search.refit_models(starts, race=False)
@@ -112,7 +116,7 @@ def fit_rivals(context: SearchContext, best: FittedModel) -> FittedModel:
     if size == 1 and context.filters.base.runs.jumps.any():
         # Fits at force limits may stop in local minima.
         laws = JOINT_MODEL + SERVO_MODEL
-        plain = [name for name in rivals if name.partition("@")[0] in laws]
+        plain = [name for name in competing_effects if name.partition("@")[0] in laws]
         fitted = [
             search.models[frozenset([name])] for name in plain if frozenset([name]) in search.models
         ]
@@ -123,7 +127,9 @@ def fit_rivals(context: SearchContext, best: FittedModel) -> FittedModel:
     return best if likeliest is None else likeliest
 
 
-def _find_rivals(context: SearchContext, model: FittedModel, name: str) -> list[_Rival]:
+def _find_competing_effects(
+    context: SearchContext, model: FittedModel, name: str
+) -> list[_CompetingEffect]:
     """Return the effects that are nearly as good by the regression in place of the given one."""
     evaluator = context.evaluator
     regression, columns = context.columns.regression(model)
@@ -132,14 +138,15 @@ def _find_rivals(context: SearchContext, model: FittedModel, name: str) -> list[
     gains = remaining.compute_net_gains()
     own_gain = remaining.compute_gain(columns[name]) - context.filters.penalty(name)
     same_joint = list_joint_model_effects(evaluator, name)
-    rivals, near_count = dict[str, _Rival](), 0
+    competing_effects, near_count = dict[str, _CompetingEffect](), 0
     for i in np.argsort(-gains, kind="stable").tolist():
         group = remaining.groups[i]
         effect, behind = group.effect, own_gain - float(gains[i])
-        if effect not in evaluator.library or effect in (*model.effects, *rivals):
+        if effect not in evaluator.library or effect in (*model.effects, *competing_effects):
             continue
         is_near = (
-            behind <= RIVAL_MARGIN + LINEARISATION_ERROR * own_gain and near_count < MAX_RIVALS
+            behind <= COMPETING_MODEL_MARGIN + LINEARISATION_ERROR * own_gain
+            and near_count < MAX_COMPETING_EFFECTS
         )
         # Regression is inaccurate for a large effect, so effects at the same joint are tried.
         is_alike = effect in same_joint and gains[i] > ALIKE_SHARE * own_gain
@@ -147,22 +154,22 @@ def _find_rivals(context: SearchContext, model: FittedModel, name: str) -> list[
         if (is_near or is_alike) and name not in evaluator.available_effects[effect].contains:
             near_count += is_near
             c = context.columns.coefficients(group, remaining.solve([group])[1][0])
-            rivals[effect] = _Rival(effect, c, behind)
-    return list(rivals.values())
+            competing_effects[effect] = _CompetingEffect(effect, c, behind)
+    return list(competing_effects.values())
 
 
 def _confirm_by_filter(
-    context: SearchContext, best: FittedModel, rival: _Rival, start: FitStart
+    context: SearchContext, best: FittedModel, competing_effect: _CompetingEffect, start: FitStart
 ) -> FitStart | None:
     """Return a start with a competing model that a filter confirms, else None.
 
     A filter is used only if the competing model is far behind by the regression, which is linear.
     """
-    if rival.behind <= RIVAL_MARGIN:
+    if competing_effect.behind <= COMPETING_MODEL_MARGIN:
         return start
     filters = context.filters
     has_few_coefficients = (
-        len(context.evaluator.get_coefficient_indices(rival.effect)) <= MAX_IMPROVED_SIZE
+        len(context.evaluator.get_coefficient_indices(competing_effect.effect)) <= MAX_IMPROVED_SIZE
     )
     steps = GAUSS_NEWTON_STEPS if has_few_coefficients else 0
     # Better coefficients do not help an effect with which the filter follows the runs worse.
@@ -173,7 +180,11 @@ def _confirm_by_filter(
         return None
     followed, names = filters.follow_with_effects(start.theta, start.effects, steps)
     loss = filters.get_filter(best).log_likelihood - followed.log_likelihood
-    return None if 2.0 * loss > RIVAL_MARGIN else FitStart(names, followed.theta, start.states)
+    return (
+        None
+        if 2.0 * loss > COMPETING_MODEL_MARGIN
+        else FitStart(names, followed.theta, start.states)
+    )
 
 
 def _fit_at_coupled_joints(context: SearchContext, size: int) -> None:
@@ -211,4 +222,8 @@ def _list_models_near_the_best(context: SearchContext, size: int) -> list[Fitted
     """Return the models with `size` effects whose merit is close to the highest."""
     of_size = [m for m in context.search.models.values() if len(m.effects) == size]
     highest = max((model.penalised_log_likelihood for model in of_size), default=-np.inf)
-    return [model for model in of_size if model.penalised_log_likelihood > highest - RIVAL_MARGIN]
+    return [
+        model
+        for model in of_size
+        if model.penalised_log_likelihood > highest - COMPETING_MODEL_MARGIN
+    ]
