@@ -19,8 +19,8 @@ If a long recording shows that the model stays incomplete, filters alone identif
 (`incomplete_model`), and nothing of the above is done.
 
 `PredictionErrorSearch.fit_competing_models` then fits the sets that are nearly as good, because
-they may be equivalent. All steps share filters with effects in the model (`model_filters`), columns of
-regressions (`library_columns`) and fits (`simulated_fits`).
+they may be equivalent. All steps share filters with effects in the model (`model_filters`), columns
+of regressions (`library_columns`) and fits (`simulated_fits`).
 """
 
 from __future__ import annotations
