@@ -117,7 +117,7 @@ def test_the_residual_may_be_noise_up_to_the_floor_or_if_its_correlation_decays(
     made = search(monkeypatch, compute_residual=np.zeros((1, 1, 1)))
     made.evaluator = SimpleNamespace(observed=np.zeros((1, 1, 1)))
     made.noise = SimpleNamespace(sigma=np.array([2.0]))
-    made.stated = np.array([stated])
+    made.is_noise_stated = np.array([stated])
     asked = SimpleNamespace(fit=None, likelihood=Likelihood(0.0, 2.0 * np.array([sigma]), None))
     assert made.is_noise_like(asked) is quiet
 

@@ -93,7 +93,7 @@ def test_noise_that_is_larger_than_stated_is_structure():
     assert found.channels_above_noise == ("q",)
     assert found.has_structure
     assert found.excess[0] == pytest.approx(1.5, rel=0.08)
-    loud[0].stated = np.array([False, True])
+    loud[0].is_noise_stated = np.array([False, True])
     found = assess_lack_of_fit(*loud)
     assert not found.has_structure, "half as much again as an estimated noise is none"
     assert (found.p_value_threshold, assess_lack_of_fit(*quiet).p_value_threshold) == (
