@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from sims.core.simulator import Array, InputError
 from sims.robot.robot_model import Joint, RobotModel
 
-Places = NDArray[np.intp]
+IndexArray = NDArray[np.intp]
 AXES, TURN, SPIN = ("x", "y", "z"), ("qw", "qx", "qy", "qz"), ("wx", "wy", "wz")
 MIN_QUATERNION_NORM = 1e-6
 """Minimum length of a valid quaternion, and of a rotation vector that is not treated as zero."""
@@ -63,8 +63,8 @@ class FloatingJoints:
     """
 
     joints: tuple[Joint, ...]
-    positions: Places
-    velocities: Places
+    positions: IndexArray
+    velocities: IndexArray
 
     @classmethod
     def from_robot(cls, robot: RobotModel) -> FloatingJoints:

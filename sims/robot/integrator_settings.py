@@ -10,6 +10,8 @@ from sims.robot.robot_model import RobotModel
 
 INTEGRATOR_IDS = {"Euler": 0, "RK4": 1, "implicit": 2, "implicitfast": 3}
 """Numbers of MuJoCo's integrators (mjtIntegrator), by their names in a model file."""
+RK4_INTEGRATOR_ID = INTEGRATOR_IDS["RK4"]
+"""MuJoCo's number of the Runge-Kutta 4 integrator."""
 
 
 class IntegratorSettings(NamedTuple):

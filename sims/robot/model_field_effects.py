@@ -28,27 +28,18 @@ import numpy as np
 
 from sims.core.simulator import Array
 from sims.robot.contact_pairs import find_pair
+from sims.robot.friction_constraint import write_friction_form
+from sims.robot.inertia_tensors import (
+    compute_inertia_tensors,
+    compute_point_inertias,
+    compute_quaternions,
+)
 from sims.robot.places.observable_tilts import observable_tilts
 from sims.robot.robot_model import COUPLING_TENDON_SUFFIX, RobotModel
-
-FRICTION_SOLIMP = (0.9999, 0.9999, 0.001, 0.5, 2.0)
-"""Parameter `solimp` of stiff dry friction: the hardest value that MuJoCo allows.
-
-With it a joint at rest hardly creeps.
-"""
-SOLREF_PLACEHOLDER_STIFFNESS = -1e-9
-"""Placeholder for the stiffness in `solref` of dry friction, which has no stiffness.
-
-The negative value makes MuJoCo read the second number as a damping.
-"""
-RK4_INTEGRATOR_ID = 1
-"""MuJoCo's number of the Runge-Kutta 4 integrator."""
 
 MIN_FACTOR = 1e-6
 """Minimum factor of a mass or a gain, so that none becomes zero or negative."""
 
-GRAVCOMP_PLACEHOLDER = 1e-200
-"""Gravity compensation that changes no force, since it is smaller than any rounding error."""
 
 Fields = Mapping[str, Any]
 """Model fields of L batch elements by name, arrays (L, ...)."""
@@ -74,80 +65,7 @@ class ModelFieldEffect:
     changes_derived_constants: bool = False
 
 
-def compile_batch_model(robot: RobotModel) -> Any:
-    """Compile the model such that masses and centres of mass can differ between batch elements.
-
-    MuJoCo stores less for a body that turns about its centre of mass, and then rejects changes of
-    its centre of mass. Here it stores everything. The motion is the same.
-    """
-    return robot.compile(make_batch_spec(robot))
-
-
-def make_batch_spec(robot: RobotModel) -> Any:
-    """Make the mujoco.MjSpec of `compile_batch_model`, with all fields that effects may change.
-
-    MuJoCo omits computations whose numbers are zero or simple in the file. Here no body counts
-    as simple, and gravity compensation is always computed.
-    """
-    spec = robot.spec.copy()
-    for body in spec.bodies:
-        body.simple = False
-    # MuJoCo computes no gravity compensation if no body of the compiled model has any.
-    if not any(body.gravcomp for body in spec.bodies):
-        spec.bodies[-1].gravcomp = GRAVCOMP_PLACEHOLDER
-    return spec
-
-
-def get_friction_solref(timestep: float, integrator: int) -> tuple[float, float]:
-    """Return `solref` of stiff dry friction, which stops a velocity within one step.
-
-    Friction acts with a time constant 1 / b. A step of Euler or of the implicit integrators stops
-    the velocity completely with b = 1 / h, and overshoots beyond it. The four evaluations of RK4
-    tolerate b = 2.5 / h, and 3 / h chatters. MuJoCo's default time constant, 0.02 s, creeps at
-    rest.
-
-    Args:
-        timestep: time step h in seconds.
-        integrator: MuJoCo's number of the integrator.
-    """
-    return (
-        (SOLREF_PLACEHOLDER_STIFFNESS, -2.5 / timestep)
-        if integrator == RK4_INTEGRATOR_ID
-        else (2.0 * timestep, 1.0)
-    )
-
-
-def get_friction_solref_of_batch(fields: Fields, robot: RobotModel) -> tuple[float, float]:
-    """Return `solref` of stiff dry friction for a batch.
-
-    Time step and integrator are taken from the fields if they contain them, else from the file.
-
-    Args:
-        fields: model fields of the batch elements.
-        robot: robot with the model file.
-    """
-    option = robot.compiled.opt
-    step = fields["opt.timestep"][0] if "opt.timestep" in fields else option.timestep
-    kind = fields["opt.integrator"][0] if "opt.integrator" in fields else option.integrator
-    return get_friction_solref(float(step), int(kind))
-
-
-def write_friction_form(fields: Fields, robot: RobotModel, lanes: Any, dofs: Any) -> None:
-    """Set the solver parameters of dry friction that effects add, in the form of the robot.
-
-    Args:
-        fields: model fields of the batch elements, changed in place.
-        robot: its `friction_form` decides; ``soft`` keeps the parameters of the file.
-        lanes: index of the batch elements.
-        dofs: index of the joints' velocities.
-    """
-    if robot.friction_form == "soft":
-        return
-    fields["dof_solref"][lanes, dofs] = get_friction_solref_of_batch(fields, robot)
-    fields["dof_solimp"][lanes, dofs] = FRICTION_SOLIMP
-
-
-def add_to_stated(file_value: Any, c: Any) -> Any:
+def add_to_file_value(file_value: Any, c: Any) -> Any:
     """Add a coefficient to a value by eq. (1), at least zero; a negative file value may remain."""
     return np.maximum(file_value + c, np.minimum(file_value, 0.0))
 
@@ -162,7 +80,7 @@ def _add_dof(field: str) -> FieldWriter:
 
     def write(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
         column = robot.joint(place).velocity
-        fields[field][:, column] = add_to_stated(fields[field][:, column], c[0])
+        fields[field][:, column] = add_to_file_value(fields[field][:, column], c[0])
 
     return write
 
@@ -171,7 +89,7 @@ def _add_quadratic(fields: Fields, robot: RobotModel, place: str, c: Array) -> N
     """Add c to the quadratic damping of a joint, force = -c |v| v, by eq. (1)."""
     # The first number of the polynomial multiplies |v| v.
     column = fields["dof_dampingpoly"][:, robot.joint(place).velocity]
-    column[:, 0] = add_to_stated(column[:, 0], c[0])
+    column[:, 0] = add_to_file_value(column[:, 0], c[0])
 
 
 def _add_friction(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
@@ -184,7 +102,7 @@ def _add_friction(fields: Fields, robot: RobotModel, place: str, c: Array) -> No
     loss = fields["dof_frictionloss"]
     # A reduced friction keeps the solver parameters of the file.
     has_added_friction = c[0] > 0
-    loss[:, column] = add_to_stated(loss[:, column], c[0])
+    loss[:, column] = add_to_file_value(loss[:, column], c[0])
     write_friction_form(fields, robot, has_added_friction, column)
 
 
@@ -192,7 +110,7 @@ def _add_spring(fields: Fields, robot: RobotModel, place: str, c: Array) -> None
     """Add c to the linear stiffness of a joint by eq. (1), in N m/rad or N/m."""
     column = fields["jnt_stiffness"]
     number = robot.joint(place).id
-    column[:, number] = add_to_stated(column[:, number], c[0])
+    column[:, number] = add_to_file_value(column[:, number], c[0])
 
 
 def _add_cubic(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
@@ -331,7 +249,9 @@ def _compensate_gravity(fields: Fields, robot: RobotModel, place: str, c: Array)
     """Add c to the gravity compensation of a body (1 means weightless) where c is not zero."""
     column = fields["body_gravcomp"]
     number = robot.body(place).id
-    column[:, number] = np.where(c[0], add_to_stated(column[:, number], c[0]), column[:, number])
+    column[:, number] = np.where(
+        c[0], add_to_file_value(column[:, number], c[0]), column[:, number]
+    )
 
 
 def _add_payload(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
@@ -358,43 +278,7 @@ def _add_payload(fields: Fields, robot: RobotModel, place: str, c: Array) -> Non
     fields["body_mass"][loaded, number] = total
     fields["body_ipos"][loaded, number] = middle
     fields["body_inertia"][loaded, number] = moments
-    fields["body_iquat"][loaded, number] = _compute_quaternions(axes)
-
-
-def compute_point_inertias(arms: Array) -> Array:
-    """Return J(d) = |d|^2 1 - d d' of eq. (7), the inertia tensors of unit masses at d.
-
-    Args:
-        arms: (L, 3) vectors d from the reference point, in m.
-
-    Returns:
-        (L, 3, 3) tensors in m^2.
-    """
-    squares = np.sum(arms**2, axis=1)[:, None, None]
-    result: Array = squares * np.eye(3) - arms[:, :, None] * arms[:, None, :]
-    return result
-
-
-def compute_inertia_tensors(quaternions: Array, moments: Array) -> Array:
-    """Compute inertia tensors (L, 3, 3) in the axes of the bodies.
-
-    Args:
-        quaternions: (L, 4) orientations of the principal axes, MuJoCo's w first.
-        moments: (L, 3) principal moments.
-    """
-    from scipy.spatial.transform import Rotation
-
-    axes = Rotation.from_quat(np.roll(quaternions, -1, axis=1)).as_matrix()
-    result: Array = np.einsum("lij,lj,lkj->lik", axes, moments, axes)
-    return result
-
-
-def _compute_quaternions(matrices: Array) -> Array:
-    """Return unit quaternions (L, 4), MuJoCo's w first, of rotation matrices (L, 3, 3)."""
-    from scipy.spatial.transform import Rotation
-
-    result: Array = np.roll(Rotation.from_matrix(matrices).as_quat(), 1, axis=1)
-    return result
+    fields["body_iquat"][loaded, number] = compute_quaternions(axes)
 
 
 def _limit_force(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
@@ -416,7 +300,7 @@ def _limit_force(fields: Fields, robot: RobotModel, place: str, c: Array) -> Non
 def _add_contact_friction(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
     """Add c to the sliding friction coefficients of a pair of geoms by (1)."""
     sliding = fields["pair_friction"][:, find_pair(robot, place), :2]
-    sliding[:] = add_to_stated(sliding, c[0][:, None])
+    sliding[:] = add_to_file_value(sliding, c[0][:, None])
 
 
 def _soften(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:

@@ -25,9 +25,9 @@ from sims.engines.time_grid import ScenarioGroups, group_scenarios
 from sims.robot.dynamics.activation_filters import (
     ActivationFilter,
     activation_filters,
+    extend_into_past,
     is_fourth_order,
-    stated_activations,
-    with_history,
+    select_initial_activations,
 )
 from sims.robot.dynamics.active_effects import (
     changes_derived_constants,
@@ -54,10 +54,10 @@ from sims.robot.dynamics.batch_work import (
 )
 from sims.robot.dynamics.callback_stepping import step_in_callback
 from sims.robot.dynamics.compiled_forces import compile_forces
-from sims.robot.dynamics.disabled_drives import off_steps, working_servos
+from sims.robot.dynamics.disabled_drives import compute_off_steps, find_working_servos
 from sims.robot.dynamics.drive_sensors import DriveSensorModel
 from sims.robot.dynamics.effect_forces import EffectForces, compute_time_dependent_forces
-from sims.robot.dynamics.midpoint_state import Mask, Places
+from sims.robot.dynamics.midpoint_state import IndexArray, Mask
 from sims.robot.dynamics.mujoco_batch import BATCH_SIZE, JointAddresses, MujocoBatch
 from sims.robot.dynamics.sensor_sampling import sample_readings
 from sims.robot.floating_joints import FloatingJoints, FloatingState
@@ -396,7 +396,7 @@ class RobotSimulator(SystemSimulator):
                 **applied_inputs,
                 f"u.{activation_filter.actuator.name}": activations[:, :-1],
             }
-        off_mask = off_steps(self.robot, batch.scenario, self.time_step, steps)
+        off_mask = compute_off_steps(self.robot, batch.scenario, self.time_step, steps)
         return BatchInputs(
             controls,
             forces,
@@ -420,13 +420,13 @@ class RobotSimulator(SystemSimulator):
             batch: batch elements of the run.
             controls: (n, S) controls of the filter.
         """
-        file_activations = stated_activations(self.robot, batch.scenario.initial)
+        file_activations = select_initial_activations(self.robot, batch.scenario.initial)
         if activation_filter.state in file_activations:
             return np.full(len(batch.x), file_activations[activation_filter.state])
         settled_activation: Array = np.clip(
-            activation_filter.clipped(controls[:, 0]), *activation_filter.limits
+            activation_filter.clip_controls(controls[:, 0]), *activation_filter.limits
         )
-        history = with_history(batch.scenario, self.time_step)
+        history = extend_into_past(batch.scenario, self.time_step)
         if history is None:
             return settled_activation
         scenario, steps = history
@@ -437,7 +437,9 @@ class RobotSimulator(SystemSimulator):
         )
         earlier_controls = applied_inputs[f"u.{activation_filter.actuator.name}"]
         last_activation: Array = self._integrate_activations(
-            activation_filter, earlier_controls, activation_filter.clipped(earlier_controls[:, 0])
+            activation_filter,
+            earlier_controls,
+            activation_filter.clip_controls(earlier_controls[:, 0]),
         )[:, -1]
         return last_activation
 
@@ -461,7 +463,7 @@ class RobotSimulator(SystemSimulator):
 
     def run_initial(self, scenario: Scenario) -> dict[str, float]:
         """Return initial states, see `Simulator`; filter activations are not estimated states."""
-        file_activations = stated_activations(self.robot, scenario.initial)
+        file_activations = select_initial_activations(self.robot, scenario.initial)
         state_values = {
             name: v for name, v in scenario.initial.items() if name not in file_activations
         }
@@ -534,7 +536,7 @@ class RobotSimulator(SystemSimulator):
         # A single simulation uses a small batch, so that constants need not be derived for a whole
         # one.
         mujoco_batch = self._get_batch(derived, 1 if n == 1 else BATCH_SIZE, added)
-        places, second = mujoco_batch.places, mujoco_batch.second
+        places, second = mujoco_batch.file_joints, mujoco_batch.series_joints
         mujoco_batch.write_effects(
             pad_coefficients(select_model_field_effects(start.acting), n, mujoco_batch.count)
         )
@@ -553,7 +555,7 @@ class RobotSimulator(SystemSimulator):
             compiled = recorded_fields = None
             if inputs.off.any():
                 # Compiled effects assume a constant servo stiffness over all steps.
-                effect_forces.working = working_servos(
+                effect_forces.working = find_working_servos(
                     mujoco_batch.robot, places.velocities, inputs.off
                 )
             else:
@@ -654,7 +656,7 @@ class RobotSimulator(SystemSimulator):
 
 def _group_batch_elements(
     acting: ActiveEffects, derived: Mask, is_stepwise: Mask
-) -> Iterator[tuple[AddedElements, int, Places]]:
+) -> Iterator[tuple[AddedElements, int, IndexArray]]:
     """Group batch elements that can be simulated together.
 
     Yields:

@@ -27,9 +27,9 @@ from bench.diagnosis.kalman.filter_and_smoother import (
     MAX_MAGNITUDE,
     SMALLEST_FORCE,
     Filtered,
+    IndexArray,
     LinearRuns,
     Mask,
-    Places,
     Smoothed,
     add_noise_states,
     filter_runs,
@@ -88,7 +88,7 @@ class Columns:
     """
 
     probes: tuple[CandidateDirection, ...]
-    places: Places
+    places: IndexArray
     sizes: Array
     pushed: SingleArray
     readings: SingleArray

@@ -44,7 +44,7 @@ from sims.core.simulator import Array
 from sims.robot.dynamics.measured_linearisation import IntervalMaps
 
 Mask = NDArray[np.bool_]
-Places = NDArray[np.intp]
+IndexArray = NDArray[np.intp]
 
 AR_FLOOR = 1e-3
 """White part of AR(1) noise, as a share of its variance, so that no reading is exact."""
@@ -99,7 +99,7 @@ class LinearRuns:
     step_errors: Array
     jumps: Array
 
-    def subset(self, chosen: Places) -> LinearRuns:
+    def subset(self, chosen: IndexArray) -> LinearRuns:
         """Return some of the runs."""
         return self._map_arrays(lambda values: values[chosen])
 
@@ -179,7 +179,7 @@ class Filtered:
     whiteners: Array
     log_likelihood: Array
 
-    def subset(self, chosen: Places) -> Filtered:
+    def subset(self, chosen: IndexArray) -> Filtered:
         """Return some of the runs."""
         return Filtered(*(getattr(self, one.name)[chosen] for one in fields(self)))
 

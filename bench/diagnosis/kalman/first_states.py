@@ -200,7 +200,7 @@ class _CubatureFilter:
         result = states.copy()
         if end == begin:
             return result
-        places, dofs = mujoco_batch.places.positions, mujoco_batch.places.velocities
+        places, dofs = mujoco_batch.file_joints.positions, mujoco_batch.file_joints.velocities
         for first in range(0, len(states), LINEARISATION_BATCH_SIZE):
             part = slice(first, first + LINEARISATION_BATCH_SIZE)
             own = states[part]

@@ -120,7 +120,7 @@ def _compute_controls(robot: RobotModel, run: Run) -> tuple[Array, Array]:
             controls[:, actuator.control] = _compute_mean_input(run, name)
     steps = np.diff(run.times)
     for one in activation_filters(robot):
-        taken = one.clipped(controls[:, one.actuator.control])
+        taken = one.clip_controls(controls[:, one.actuator.control])
         now = float(taken[0])
         for k, kept in enumerate(np.exp(-np.append(steps, 0.0) / max(one.seconds, 1e-9)).tolist()):
             activations[k, one.address] = now

@@ -40,7 +40,7 @@ from bench.diagnosis.search.explained_variance import (
 from bench.diagnosis.search.score_test import NULL_QUANTILE, CandidateScores
 from sims.core.simulator import Array
 
-Places = NDArray[np.intp]
+IndexArray = NDArray[np.intp]
 
 COLLINEARITY_TOLERANCE = 1e-7
 """Maximum share of a column's sum of squares that remains if it is collinear with other columns."""
@@ -290,7 +290,7 @@ class Regression:
         return left
 
 
-def _normalise_gram(gram: Array, columns: Places) -> tuple[Array, Array]:
+def _normalise_gram(gram: Array, columns: IndexArray) -> tuple[Array, Array]:
     """Return the scaled normal matrix of some columns, and the lengths of these columns.
 
     Its diagonal is one plus the ridge.
@@ -301,7 +301,7 @@ def _normalise_gram(gram: Array, columns: Places) -> tuple[Array, Array]:
     return normal, scale
 
 
-def list_columns(groups: Sequence[DirectionGroup]) -> Places:
+def list_columns(groups: Sequence[DirectionGroup]) -> IndexArray:
     """Return the columns of some groups, one group after another."""
     return np.array([c for group in groups for c in group.column_indices], dtype=np.intp)
 

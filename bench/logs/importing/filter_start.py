@@ -38,14 +38,14 @@ def leave_out_settling(recording: Recording, kind: type[Simulator]) -> tuple[Rec
     robot: Any = kind
     if robot.system.afloat or not robot.system.activations:
         return recording, ""
-    from sims.robot.dynamics.activation_filters import activation_filters, longest_settling
+    from sims.robot.dynamics.activation_filters import activation_filters, compute_settling_time
 
     runs: list[Run] = []
     seconds = 0.0
-    longest = longest_settling(robot.robot, {})
+    longest = compute_settling_time(robot.robot, {})
     for run in recording.runs:
         run = replace(run, memory=max(run.memory, longest))
-        settling = 0.0 if run.before else longest_settling(robot.robot, run.initial)
+        settling = 0.0 if run.before else compute_settling_time(robot.robot, run.initial)
         first = int(np.searchsorted(run.times, run.times[0] + settling))
         if settling > 0 and settling <= LARGEST_SHARE * (run.times[-1] - run.times[0]):
             seconds = max(seconds, settling)

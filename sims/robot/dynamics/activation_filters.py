@@ -20,14 +20,14 @@ import numpy as np
 
 from sims.core.simulator import Array, Scenario
 from sims.effects.first_order_lag import apply_recursion
-from sims.robot.model_field_effects import RK4_INTEGRATOR_ID
+from sims.robot.integrator_settings import RK4_INTEGRATOR_ID
 from sims.robot.robot_model import Actuator, RobotModel, cache_per_robot, filters
 
-STATE = "act."
+ACTIVATION_PREFIX = "act."
 """Prefix of the names under which a recording specifies activations."""
-SHORTEST = 1e-15
+MIN_TIME_CONSTANT = 1e-15
 """Smallest time constant in seconds, MuJoCo's mjMINVAL."""
-SETTLED = 10.0
+SETTLING_TIME_CONSTANTS = 10.0
 """Number of time constants after which a wrong initial activation has no effect.
 
 The remaining share exp(-10) is less than the accuracy of a simulation.
@@ -54,36 +54,38 @@ class ActivationFilter(NamedTuple):
     @property
     def state(self) -> str:
         """Name under which a recording specifies the activation."""
-        return STATE + self.actuator.name
+        return ACTIVATION_PREFIX + self.actuator.name
 
-    def clipped(self, controls: Array) -> Array:
+    def clip_controls(self, controls: Array) -> Array:
         """Return controls limited to the control range, as the filter receives them."""
         if self.actuator.range is None:
             return controls
         clipped: Array = np.clip(controls, *self.actuator.range)
         return clipped
 
-    def activations(self, controls: Array, begun: Array, step: float, fourth: bool) -> Array:
+    def activations(self, controls: Array, initial: Array, step: float, fourth: bool) -> Array:
         """Compute activations at the beginnings of steps, by Euler's method (1) or exactly (2).
 
         Args:
             controls: (n, S) controls of the steps.
-            begun: (n,) initial activations.
+            initial: (n,) initial activations.
             step: step length in seconds.
             fourth: whether the integrator is of fourth order, for which (1) and (2) agree.
 
         Returns:
             (n, S + 1) activations; the last one is after the last step.
         """
-        ratio = step / max(self.seconds, SHORTEST)
-        kept = float(np.exp(-ratio)) if self.exact or fourth else 1.0 - ratio
-        taken = self.clipped(controls)
-        decay = np.full_like(taken, kept)
-        ends = apply_recursion(decay, (1.0 - decay) * taken, begun[:, None])
+        ratio = step / max(self.seconds, MIN_TIME_CONSTANT)
+        retained_share = float(np.exp(-ratio)) if self.exact or fourth else 1.0 - ratio
+        inputs = self.clip_controls(controls)
+        decay = np.full_like(inputs, retained_share)
+        end_activations = apply_recursion(decay, (1.0 - decay) * inputs, initial[:, None])
         # MuJoCo applies a limit within the recursion. But commands that reach the limit stay beyond
         # it for longer than a step, so the difference only lasts as long as the filter's time
         # constant.
-        result: Array = np.clip(np.concatenate([begun[:, None], ends], axis=1), *self.limits)
+        result: Array = np.clip(
+            np.concatenate([initial[:, None], end_activations], axis=1), *self.limits
+        )
         return result
 
 
@@ -94,14 +96,14 @@ def activation_filters(robot: RobotModel) -> tuple[ActivationFilter, ...]:
 
     model = robot.compiled
     exact = int(mujoco.mjtDyn.mjDYN_FILTEREXACT)
-    found = []
+    filters_found = []
     for actuator in robot.actuators:
         i = actuator.id
         if int(model.actuator_dyntype[i]) not in filters() or actuator.controls != 1:
             continue
         limited = bool(model.actuator_actlimited[i])
         low, high = model.actuator_actrange[i] if limited else (-np.inf, np.inf)
-        found.append(
+        filters_found.append(
             ActivationFilter(
                 actuator,
                 int(model.actuator_actadr[i]),
@@ -110,7 +112,7 @@ def activation_filters(robot: RobotModel) -> tuple[ActivationFilter, ...]:
                 (float(low), float(high)),
             )
         )
-    return tuple(found)
+    return tuple(filters_found)
 
 
 def is_fourth_order(integrator: int) -> bool:
@@ -118,7 +120,7 @@ def is_fourth_order(integrator: int) -> bool:
     return integrator == RK4_INTEGRATOR_ID
 
 
-def stated_activations(robot: RobotModel, initial: Mapping[str, float]) -> dict[str, float]:
+def select_initial_activations(robot: RobotModel, initial: Mapping[str, float]) -> dict[str, float]:
     """Return the activations among the initial states of a run, by name.
 
     Args:
@@ -129,7 +131,7 @@ def stated_activations(robot: RobotModel, initial: Mapping[str, float]) -> dict[
     return {name: value for name, value in initial.items() if name in names}
 
 
-def longest_settling(robot: RobotModel, initial: Mapping[str, float]) -> float:
+def compute_settling_time(robot: RobotModel, initial: Mapping[str, float]) -> float:
     """Return the time in seconds after which no filter depends on its initial activation.
 
     Filters whose initial activation is specified are ignored.
@@ -139,10 +141,10 @@ def longest_settling(robot: RobotModel, initial: Mapping[str, float]) -> float:
         initial: initial states of the run, by name.
     """
     unknown = [one for one in activation_filters(robot) if one.state not in initial]
-    return SETTLED * max((one.seconds for one in unknown), default=0.0)
+    return SETTLING_TIME_CONSTANTS * max((one.seconds for one in unknown), default=0.0)
 
 
-def with_history(scenario: Scenario, step: float) -> tuple[Scenario, int] | None:
+def extend_into_past(scenario: Scenario, step: float) -> tuple[Scenario, int] | None:
     """Extend a scenario into the time before the run for which its inputs are known.
 
     Args:
@@ -154,22 +156,26 @@ def with_history(scenario: Scenario, step: float) -> tuple[Scenario, int] | None
         inputs before the run are not known for at least one step.
     """
     names = [name for name in scenario.inputs if name in scenario.before]
-    stamps = scenario.before[names[0]][0] if names else np.empty(0)
-    steps = int(np.floor(-stamps[0] / step)) if stamps.size else 0
+    earlier_times = scenario.before[names[0]][0] if names else np.empty(0)
+    steps = int(np.floor(-earlier_times[0] / step)) if earlier_times.size else 0
     # The inputs of one run must be known at equal times.
-    alike = all(np.array_equal(scenario.before[name][0], stamps) for name in names)
-    if steps < 1 or len(names) < len(scenario.inputs) or not alike:
+    have_equal_times = all(
+        np.array_equal(scenario.before[name][0], earlier_times) for name in names
+    )
+    if steps < 1 or len(names) < len(scenario.inputs) or not have_equal_times:
         return None
     first = -steps * step
-    later = stamps > first
-    times = np.concatenate([[first], stamps[later], scenario.times - scenario.times[0]])
+    is_included = earlier_times > first
+    times = np.concatenate(
+        [[first], earlier_times[is_included], scenario.times - scenario.times[0]]
+    )
     inputs = {}
     for name, values in scenario.inputs.items():
-        own = scenario.before[name][1]
+        earlier_values = scenario.before[name][1]
         if name in scenario.linear:
-            ends = np.append(stamps, 0.0), np.append(own, values[0])
-            begun = float(np.interp(first, *ends))
+            ends = np.append(earlier_times, 0.0), np.append(earlier_values, values[0])
+            initial = float(np.interp(first, *ends))
         else:
-            begun = float(own[np.flatnonzero(stamps <= first)[-1]])
-        inputs[name] = np.concatenate([[begun], own[later], values])
+            initial = float(earlier_values[np.flatnonzero(earlier_times <= first)[-1]])
+        inputs[name] = np.concatenate([[initial], earlier_values[is_included], values])
     return replace(scenario, times=times - first, inputs=inputs, before={}, off={}), steps

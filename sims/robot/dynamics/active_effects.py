@@ -8,15 +8,15 @@ import numpy as np
 
 from sims.core.effect import ActiveEffects, Effect
 from sims.robot.dynamics.effect_forces import TIME_DEPENDENT_EFFECTS
-from sims.robot.dynamics.midpoint_state import Mask, Places
+from sims.robot.dynamics.midpoint_state import IndexArray, Mask
 from sims.robot.dynamics.series_joints import is_series_effect
 from sims.robot.model_field_effects import MODEL_FIELD_EFFECTS
 
 
 def is_model_field_effect(effect: Effect) -> bool:
     """Return whether the engine writes the effect into fields of the MuJoCo model."""
-    written = (effect.of or effect.name) in MODEL_FIELD_EFFECTS
-    return is_series_effect(effect) or (written and effect.hook in ("value", "force", "contact"))
+    has_field = (effect.of or effect.name) in MODEL_FIELD_EFFECTS
+    return is_series_effect(effect) or (has_field and effect.hook in ("value", "force", "contact"))
 
 
 def changes_derived_constants(effect: Effect) -> bool:
@@ -59,24 +59,24 @@ def find_active_elements(
     Returns:
         (L,) whether any selected effect has a nonzero coefficient.
     """
-    there = np.zeros(count, dtype=bool)
+    is_active = np.zeros(count, dtype=bool)
     for effect, c in acting:
         if which(effect):
-            there |= (c != 0).any(axis=0)[:, 0]
-    return there
+            is_active |= (c != 0).any(axis=0)[:, 0]
+    return is_active
 
 
-def slice_active_effects(acting: ActiveEffects, lanes: Places) -> ActiveEffects:
+def slice_active_effects(acting: ActiveEffects, batch_indices: IndexArray) -> ActiveEffects:
     """Restrict active effects to some batch elements, and drop effects that are zero there.
 
     Args:
         acting: effects with their coefficients (K, L, 1).
-        lanes: indices of the batch elements.
+        batch_indices: indices of the batch elements.
 
     Returns:
         The effects that are active there, with their coefficients for these batch elements.
     """
-    parts = tuple((e, c[:, lanes]) for e, c in acting)
+    parts = tuple((e, c[:, batch_indices]) for e, c in acting)
     return tuple((e, c) for e, c in parts if c.any())
 
 

@@ -52,12 +52,14 @@ def group_by_added_elements(acting: ActiveEffects, count: int) -> dict[AddedElem
         for e, c in acting
         if (added := list_added_elements(e))
     ]
-    lanes: dict[AddedElements, list[int]] = {}
-    for lane in range(count):
+    batch_indices: dict[AddedElements, list[int]] = {}
+    for batch_index in range(count):
         # Effects may share an element.
-        elements = dict.fromkeys(one for added, is_on in needs if is_on[lane] for one in added)
-        lanes.setdefault(tuple(elements), []).append(lane)
-    return lanes
+        elements = dict.fromkeys(
+            element for added, is_on in needs if is_on[batch_index] for element in added
+        )
+        batch_indices.setdefault(tuple(elements), []).append(batch_index)
+    return batch_indices
 
 
 def add_elements(robot: RobotModel, added: AddedElements) -> RobotModel:

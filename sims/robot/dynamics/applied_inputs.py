@@ -14,7 +14,7 @@ from sims.core.effect import ActiveEffects, Input
 from sims.core.simulator import Array, Scenario
 from sims.engines.time_grid import ScenarioGroups, TimeGrid, compute_applied_inputs
 from sims.robot.dynamics.active_effects import slice_active_effects
-from sims.robot.dynamics.midpoint_state import Mask, Places
+from sims.robot.dynamics.midpoint_state import IndexArray, Mask
 
 SAME_INSTANT_SHARE = 1e-6
 """Share of a step, from its beginning, over which the input counts as its initial value."""
@@ -85,7 +85,7 @@ class RunInputs(NamedTuple):
     n: int
     steps: int
 
-    def cuts(self, step: float, share: float, is_changed: bool) -> Array:
+    def get_step_fractions(self, step: float, share: float, is_changed: bool) -> Array:
         """Return the fractions of a step at which it is divided.
 
         Args:
@@ -96,25 +96,29 @@ class RunInputs(NamedTuple):
         if share < 1.0:
             return np.array([share, 1.0])
         # If commands change only at step ends, the mean describes each step completely.
-        places = self._sample_places(step)
-        is_aligned = bool((np.abs(places - np.rint(places)) < STEP_COUNT_TOLERANCE).all())
+        sample_times = self._get_sample_times_in_steps(step)
+        is_aligned = bool(
+            (np.abs(sample_times - np.rint(sample_times)) < STEP_COUNT_TOLERANCE).all()
+        )
         return NO_SUBDIVISION if is_aligned and not is_changed else STEP_SUBDIVISION
 
-    def seen(self, step: float) -> Mask:
+    def find_steps_with_sample(self, step: float) -> Mask:
         """Return whether a sample is at the beginning of the first step and each step end (S + 1,).
 
         Args:
             step: step length in seconds.
         """
-        seen = np.zeros(self.steps + 1, dtype=bool)
-        seen[np.clip(np.rint(self._sample_places(step)).astype(np.intp), 0, self.steps)] = True
-        return seen
+        has_sample = np.zeros(self.steps + 1, dtype=bool)
+        has_sample[
+            np.clip(np.rint(self._get_sample_times_in_steps(step)).astype(np.intp), 0, self.steps)
+        ] = True
+        return has_sample
 
-    def _sample_places(self, step: float) -> Array:
+    def _get_sample_times_in_steps(self, step: float) -> Array:
         """Return the times of the samples (T,) in steps."""
         scenario = self.scenario
-        places: Array = (scenario.times - scenario.times[0] + scenario.offset) / step
-        return places
+        sample_times: Array = (scenario.times - scenario.times[0] + scenario.offset) / step
+        return sample_times
 
 
 def compute_inputs_over_steps(
@@ -145,25 +149,34 @@ def compute_inputs_over_steps(
         Applied inputs (n, S) by name.
     """
     run = RunInputs(scenario, commands, acting, n, steps)
-    cuts, seen = run.cuts(step, share, is_changed=False), run.seen(step)
+    fractions, has_sample = (
+        run.get_step_fractions(step, share, is_changed=False),
+        run.find_steps_with_sample(step),
+    )
     applied_inputs: dict[str, Array] = {}
     for name, signal in commands.items():
         earlier = scenario.before[name].tobytes() if name in scenario.before else b""
-        read = name in scenario.linear, scenario.offset, earlier
-        key = step, steps, cuts.tobytes(), *read, _compute_signal_digest(scenario.times, signal)
-        bare = _InputRequest(0, scenario, name, signal, np.zeros(1, dtype=np.intp), ())
-        plain = _applied_input_cache.get(
-            key, partial(_compute_applied_inputs, step, [bare], steps, seen, cuts)
+        interpolation = name in scenario.linear, scenario.offset, earlier
+        key = (
+            step,
+            steps,
+            fractions.tobytes(),
+            *interpolation,
+            _compute_signal_digest(scenario.times, signal),
         )
-        applied_inputs[name] = np.repeat(plain, n, axis=0)
-    for _, name, lanes, values in compute_changed_inputs(step, [run], share):
-        applied_inputs[name][lanes] = values
+        request = _InputRequest(0, scenario, name, signal, np.zeros(1, dtype=np.intp), ())
+        unchanged = _applied_input_cache.get(
+            key, partial(_compute_applied_inputs, step, [request], steps, has_sample, fractions)
+        )
+        applied_inputs[name] = np.repeat(unchanged, n, axis=0)
+    for _, name, batch_indices, values in compute_changed_inputs(step, [run], share):
+        applied_inputs[name][batch_indices] = values
     return applied_inputs
 
 
 def compute_changed_inputs(
     step: float, runs: Sequence[RunInputs], share: float = 1.0
-) -> Iterator[tuple[int, str, Places, Array]]:
+) -> Iterator[tuple[int, str, IndexArray, Array]]:
     """Compute the inputs that effects change, of several runs together.
 
     Effects with a state are integrated step by step, and a step costs about the same for few and
@@ -177,27 +190,35 @@ def compute_changed_inputs(
     Yields:
         Number of the run, name of the input, batch elements (L,), and their applied inputs (L, S).
     """
-    alike: dict[tuple[int, bytes, bytes], list[_InputRequest]] = {}
+    requests_by_grid: dict[tuple[int, bytes, bytes], list[_InputRequest]] = {}
     for number, run in enumerate(runs):
-        cuts, seen = run.cuts(step, share, is_changed=True), run.seen(step)
-        requests = alike.setdefault((run.steps, cuts.tobytes(), seen.tobytes()), [])
+        fractions, has_sample = (
+            run.get_step_fractions(step, share, is_changed=True),
+            run.find_steps_with_sample(step),
+        )
+        requests = requests_by_grid.setdefault(
+            (run.steps, fractions.tobytes(), has_sample.tobytes()), []
+        )
         for name, signal in run.commands.items():
-            passed = tuple(
+            input_effects = tuple(
                 (e, c) for e, c in run.acting if isinstance(e, Input) and e.signal == name
             )
             # Inputs are grouped by effects, so that the value of a batch element does not depend on
             # others.
             requests += [
                 _InputRequest(number, run.scenario, name, signal, *part)
-                for part in _by_kinds(passed, run.n)
+                for part in _group_by_active_effects(input_effects, run.n)
             ]
-    for (steps, cut_bytes, seen_bytes), requests in alike.items():
-        cuts, seen = np.frombuffer(cut_bytes), np.frombuffer(seen_bytes, dtype=bool)
+    for (steps, fraction_bytes, sample_bytes), requests in requests_by_grid.items():
+        fractions, has_sample = (
+            np.frombuffer(fraction_bytes),
+            np.frombuffer(sample_bytes, dtype=bool),
+        )
         for group in _group_requests(requests):
-            values = _compute_applied_inputs(step, group, steps, seen, cuts)
-            ends = np.cumsum([one.lanes.size for one in group])
-            for one, rows in zip(group, np.split(values, ends[:-1]), strict=True):
-                yield one.run, one.name, one.lanes, rows
+            values = _compute_applied_inputs(step, group, steps, has_sample, fractions)
+            ends = np.cumsum([request.batch_indices.size for request in group])
+            for request, rows in zip(group, np.split(values, ends[:-1]), strict=True):
+                yield request.run, request.name, request.batch_indices, rows
 
 
 class _InputRequest(NamedTuple):
@@ -208,7 +229,7 @@ class _InputRequest(NamedTuple):
         scenario: scenario of the run.
         name: name of the input.
         signal: (T,) commanded values.
-        lanes: batch elements in which input effects are active.
+        batch_indices: batch elements in which input effects are active.
         acting: these effects, with coefficients for the batch elements.
     """
 
@@ -216,7 +237,7 @@ class _InputRequest(NamedTuple):
     scenario: Scenario
     name: str
     signal: Array
-    lanes: Places
+    batch_indices: IndexArray
     acting: ActiveEffects
 
 
@@ -230,36 +251,42 @@ def _restrict_to_input(scenario: Scenario, name: str) -> Scenario:
     )
 
 
-def _by_kinds(passed: ActiveEffects, n: int) -> Iterator[tuple[Places, ActiveEffects]]:
+def _group_by_active_effects(
+    input_effects: ActiveEffects, n: int
+) -> Iterator[tuple[IndexArray, ActiveEffects]]:
     """Group n batch elements by the effects that act on them, without elements on which none acts.
 
     Yields: Indices of a group's elements, and the effects with the coefficients of these
     elements.
     """
-    there = np.array([(c != 0).any(axis=(0, 2)) for _, c in passed], dtype=bool).reshape(-1, n)
-    kinds, of = np.unique(there, axis=1, return_inverse=True)
-    for number, kind in enumerate(kinds.T):
-        if kind.any():
-            lanes = np.flatnonzero(of.ravel() == number)
-            yield lanes, slice_active_effects(passed, lanes)
+    is_active = np.array([(c != 0).any(axis=(0, 2)) for _, c in input_effects], dtype=bool).reshape(
+        -1, n
+    )
+    patterns, pattern_of_element = np.unique(is_active, axis=1, return_inverse=True)
+    for number, pattern in enumerate(patterns.T):
+        if pattern.any():
+            batch_indices = np.flatnonzero(pattern_of_element.ravel() == number)
+            yield batch_indices, slice_active_effects(input_effects, batch_indices)
 
 
-def _group_requests(asked: Sequence[_InputRequest]) -> Iterator[list[_InputRequest]]:
+def _group_requests(requests: Sequence[_InputRequest]) -> Iterator[list[_InputRequest]]:
     """Group requests with equal types of effects, at most `MAX_BATCH_SIZE` elements each."""
-    alike: dict[tuple[str, ...], list[_InputRequest]] = {}
-    for one in asked:
-        alike.setdefault(tuple(e.of or e.name for e, _ in one.acting), []).append(one)
-    for group in alike.values():
-        sizes = np.cumsum([one.lanes.size for one in group])
+    requests_by_effects: dict[tuple[str, ...], list[_InputRequest]] = {}
+    for request in requests:
+        requests_by_effects.setdefault(tuple(e.of or e.name for e, _ in request.acting), []).append(
+            request
+        )
+    for group in requests_by_effects.values():
+        sizes = np.cumsum([request.batch_indices.size for request in group])
         parts = (sizes - 1) // MAX_BATCH_SIZE
         for part in np.unique(parts):
             yield [group[k] for k in np.flatnonzero(parts == part)]
 
 
-def _concatenate_effects(asked: Sequence[_InputRequest]) -> ActiveEffects:
+def _concatenate_effects(requests: Sequence[_InputRequest]) -> ActiveEffects:
     """Concatenate the effects of a group of requests along the batch elements."""
-    first = [effect for effect, _ in asked[0].acting]
-    rows = zip(*([c for _, c in one.acting] for one in asked), strict=True)
+    first = [effect for effect, _ in requests[0].acting]
+    rows = zip(*([c for _, c in request.acting] for request in requests), strict=True)
     return tuple((effect, np.concatenate(c, axis=1)) for effect, c in zip(first, rows, strict=True))
 
 
@@ -267,37 +294,50 @@ def _compute_applied_inputs(
     step: float,
     requests: Sequence[_InputRequest],
     steps: int,
-    seen: Mask,
-    cuts: Array,
+    has_sample: Mask,
+    fractions: Array,
 ) -> Array:
     """Compute the input that each request applies over each step, (N, S) for N batch elements.
 
-    Delays and filters act within a step. `cuts` are the times in a step, as shares of its length,
-    at which it is divided for them. With the cuts of `STEP_SUBDIVISION` the parts are combined to
-    one value per step; with fewer cuts, the first part is returned.
+    Delays and filters act within a step. `fractions` are the times in a step, as shares of its
+    length, at which it is divided for them. With those of `STEP_SUBDIVISION` the parts are combined
+    to one value per step; with fewer fractions, the first part is returned.
     """
     acting = _concatenate_effects(requests)
-    of = np.repeat(np.arange(len(requests)), [one.lanes.size for one in requests])
-    runs = ScenarioGroups(tuple(_restrict_to_input(one.scenario, one.name) for one in requests), of)
-    plan = _parts_of_steps(step, steps, of.size, cuts, alike=not acting)
-    commands = [{SINGLE_INPUT_NAME: one.signal} for one in requests]
+    run_of_element = np.repeat(
+        np.arange(len(requests)), [request.batch_indices.size for request in requests]
+    )
+    runs = ScenarioGroups(
+        tuple(_restrict_to_input(request.scenario, request.name) for request in requests),
+        run_of_element,
+    )
+    plan = _make_subdivided_grid(
+        step, steps, run_of_element.size, fractions, has_uniform_steps=not acting
+    )
+    commands = [{SINGLE_INPUT_NAME: request.signal} for request in requests]
     values = compute_applied_inputs(plan, runs, commands, acting)[SINGLE_INPUT_NAME]
-    parts = values.reshape(of.size, steps, cuts.size)
-    return parts[:, :, 0] if cuts.size < STEP_SUBDIVISION.size else compute_step_inputs(parts, seen)
+    parts = values.reshape(run_of_element.size, steps, fractions.size)
+    return (
+        parts[:, :, 0]
+        if fractions.size < STEP_SUBDIVISION.size
+        else compute_step_inputs(parts, has_sample)
+    )
 
 
-def _parts_of_steps(step: float, steps: int, n: int, cuts: Array, alike: bool) -> TimeGrid:
+def _make_subdivided_grid(
+    step: float, steps: int, n: int, fractions: Array, has_uniform_steps: bool
+) -> TimeGrid:
     """Make the plan of steps that are subdivided at the given fractions."""
     begins: Array = step * np.arange(float(steps))
-    ends = (begins[:, None] + step * cuts).ravel()
+    ends = (begins[:, None] + step * fractions).ravel()
     lengths = np.diff(ends, prepend=0.0)
     rows = np.zeros((n, 1), dtype=np.intp)
     shape = n, ends.size
     whole = np.broadcast_to(lengths, shape), np.broadcast_to(ends, shape)
-    return TimeGrid(*whole, 1, rows, has_uniform_steps=alike)
+    return TimeGrid(*whole, 1, rows, has_uniform_steps=has_uniform_steps)
 
 
-def compute_step_inputs(parts: Array, seen: Mask) -> Array:
+def compute_step_inputs(parts: Array, has_sample: Mask) -> Array:
     """Compute the inputs of steps (n, S) from their means (n, S, 4) over the quarters of each step.
 
     A step of length h has one constant control. Its mean is that of the command. The first moment
@@ -312,15 +352,16 @@ def compute_step_inputs(parts: Array, seen: Mask) -> Array:
 
     Args:
         parts: (n, S, 4) means over the quarters.
-        seen: (S + 1,) whether a sample is at the beginning of the first step and at each step end.
+        has_sample: (S + 1,) whether a sample is at the beginning of the first step and at each step
+            end.
     """
     weights = (np.arange(4.0) + 0.5) / 4.0 - 0.5
     moments = (parts * weights).mean(axis=2)  # (1)
-    given: Array = parts.mean(axis=2)
+    means: Array = parts.mean(axis=2)
     last = parts.shape[1] - 1
-    for way, allowed in ((1, ~seen[1:]), (-1, seen[1:] & ~seen[:-1])):
+    for direction, allowed in ((1, ~has_sample[1:]), (-1, has_sample[1:] & ~has_sample[:-1])):
         steps = np.flatnonzero(allowed)
-        steps = steps[(steps + way >= 0) & (steps + way <= last)]
-        given[:, steps] -= way * moments[:, steps]
-        given[:, steps + way] += way * moments[:, steps]
-    return given
+        steps = steps[(steps + direction >= 0) & (steps + direction <= last)]
+        means[:, steps] -= direction * moments[:, steps]
+        means[:, steps + direction] += direction * moments[:, steps]
+    return means

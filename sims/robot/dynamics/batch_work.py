@@ -11,15 +11,16 @@ from numpy.typing import NDArray
 from sims.core.effect import ActiveEffects, Sensor
 from sims.core.simulator import Array, Scenario
 from sims.engines.time_grid import ScenarioGroups
-from sims.robot.dynamics.midpoint_state import Mask, Places
+from sims.robot.dynamics.midpoint_state import IndexArray, Mask
 from sims.robot.floating_joints import FloatingState
 
 Number = TypeVar("Number", bound=np.generic)
 
-BEYOND, LATE = 1.1, 0.2
+MAX_DURATION_FACTOR, MAX_EXTRA_SECONDS = 1.1, 0.2
 """Maximum simulated time after the last time stamp if sensors sample early.
 
-A run is simulated for at most `BEYOND` times its duration plus `LATE` seconds.
+A run is simulated for at most `MAX_DURATION_FACTOR` times its duration plus `MAX_EXTRA_SECONDS`
+seconds.
 """
 
 
@@ -58,7 +59,7 @@ def list_last_read_times(work: RobotRunBatch) -> Array:
         if isinstance(effect, Sensor):
             latest = max(latest, float(np.max(effect.times(c, np.broadcast_to(end, c[0].shape)))))
     # Implausible values that a fit tries must not cost thousands of steps.
-    return np.array([min(latest, BEYOND * float(end[0]) + LATE)])
+    return np.array([min(latest, MAX_DURATION_FACTOR * float(end[0]) + MAX_EXTRA_SECONDS)])
 
 
 class BatchStart(NamedTuple):
@@ -124,26 +125,28 @@ class BatchInputs(NamedTuple):
 
 def _extend_to_steps(values: NDArray[Number], steps: int) -> NDArray[Number]:
     """Extend values (n, S', ...) to S steps by repeating the last one."""
-    more = steps - values.shape[1]
-    if not more:
+    missing = steps - values.shape[1]
+    if not missing:
         return values
-    return np.concatenate([values, np.repeat(values[:, -1:], more, axis=1)], axis=1)
+    return np.concatenate([values, np.repeat(values[:, -1:], missing, axis=1)], axis=1)
 
 
-def group_by_run(runs: ScenarioGroups, lanes: Places) -> list[tuple[int, Places]]:
+def group_by_run(runs: ScenarioGroups, batch_indices: IndexArray) -> list[tuple[int, IndexArray]]:
     """Group consecutive batch elements by their runs.
 
     Args:
         runs: runs of all batch elements.
-        lanes: indices of the batch elements.
+        batch_indices: indices of the batch elements.
 
     Returns:
         For each group, the number of the run and the indices of its batch elements.
     """
-    if not lanes.size:
+    if not batch_indices.size:
         return []
-    borders = np.flatnonzero(np.diff(runs.scenario_index[lanes])) + 1
-    return [(int(runs.scenario_index[own[0]]), own) for own in np.split(lanes, borders)]
+    borders = np.flatnonzero(np.diff(runs.scenario_index[batch_indices])) + 1
+    return [
+        (int(runs.scenario_index[group[0]]), group) for group in np.split(batch_indices, borders)
+    ]
 
 
 class BatchResult(NamedTuple):
@@ -165,9 +168,9 @@ class BatchResult(NamedTuple):
     failed: Mask
     series: tuple[Array, Array]
 
-    def select(self, lanes: slice) -> BatchResult:
+    def select(self, batch_indices: slice) -> BatchResult:
         """Return the results of some batch elements."""
-        fields = {name: values[lanes] for name, values in self.fields.items()}
-        series = self.series[0][lanes], self.series[1][lanes]
-        rest = self.initial_activations[lanes], self.failed[lanes], series
-        return BatchResult(self.x[lanes], self.v[lanes], fields, *rest)
+        fields = {name: values[batch_indices] for name, values in self.fields.items()}
+        series = self.series[0][batch_indices], self.series[1][batch_indices]
+        rest = self.initial_activations[batch_indices], self.failed[batch_indices], series
+        return BatchResult(self.x[batch_indices], self.v[batch_indices], fields, *rest)

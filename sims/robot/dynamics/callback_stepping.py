@@ -25,7 +25,7 @@ from sims.engines.compiled.mujoco_callback import (
 from sims.robot.dynamics.compiled_forces import CompiledForces
 from sims.robot.dynamics.midpoint_state import MidpointPredictor
 from sims.robot.dynamics.mujoco_batch import MujocoBatch
-from sims.robot.model_field_effects import RK4_INTEGRATOR_ID
+from sims.robot.integrator_settings import RK4_INTEGRATOR_ID
 
 MIN_FRICTION = 1e-12
 """Dry friction in N or N·m of the model where effects add friction.
@@ -75,13 +75,13 @@ def step_in_callback(
     if callback is None or mujoco.get_mjcb_control() is not None:
         return None
     n, steps, _ = controls.shape
-    own_losses = mujoco_batch.begin_dry_friction(compiled, n)
+    friction_without_effects = mujoco_batch.begin_dry_friction(compiled, n)
     has_friction = compiled.has_dry_friction
     if has_friction.any():
         loss = mujoco_batch.fields["dof_frictionloss"]
-        lanes, joints = np.nonzero(has_friction)
+        batch_indices, joints = np.nonzero(has_friction)
         dofs = compiled.addresses.velocities[joints]
-        loss[lanes, dofs] = np.maximum(loss[lanes, dofs], MIN_FRICTION)
+        loss[batch_indices, dofs] = np.maximum(loss[batch_indices, dofs], MIN_FRICTION)
     mujoco_batch.batch.bind("ctrl")[:n] = controls[:, 0]
     predictor = MidpointPredictor(
         mujoco_batch.batch,
@@ -91,18 +91,18 @@ def step_in_callback(
     )
     mujoco_batch.batch.forward(None if n == mujoco_batch.count else np.arange(n))
     compiled.begin(predictor.read_joint_states(np.zeros(n, dtype=bool)))
-    contexts = _Contexts(mujoco_batch, compiled, own_losses, steps)
+    contexts = _CallbackContexts(mujoco_batch, compiled, friction_without_effects, steps)
     user = mujoco_batch.batch.bind("userdata")
     user[:n, 0] = contexts.addresses
     mujoco.set_mjcb_control(callback)
     try:
-        return mujoco_batch.step(controls, forces, record, before_call=contexts.renew)
+        return mujoco_batch.step(controls, forces, record, before_call=contexts.reset_accelerations)
     finally:
         mujoco.set_mjcb_control(None)
         user[:] = 0.0
 
 
-class _Contexts:
+class _CallbackContexts:
     """Contexts of the callback for all batch elements, and the arrays that they refer to.
 
     Args:
@@ -117,16 +117,16 @@ class _Contexts:
     ) -> None:
         """Write one context per batch element: addresses and sizes for the compiled callback.
 
-        Entries in `shared` are the same for all elements; those in `own` belong to one
-        element (`lane`). `self._arrays` keeps all of them alive, because the callback holds
+        Entries in `shared` are the same for all elements; those in `element_arrays` belong to one
+        element (`batch_index`). `self._arrays` keeps all of them alive, because the callback holds
         only their addresses. The table of contexts has one row of 64-bit integers per
         element.
         """
         program = compiled.program_layout
-        places = compiled.addresses
-        joints = places.velocities.size
+        joint_addresses = compiled.addresses
+        joints = joint_addresses.velocities.size
         layout = program._asdict()
-        layout |= {"positions": places.positions, "velocities": places.velocities}
+        layout |= {"positions": joint_addresses.positions, "velocities": joint_addresses.velocities}
         shared: dict[str, NDArray[Any]] = {
             name: np.ascontiguousarray(values, dtype=np.int64)
             for name, values in layout.items()
@@ -137,30 +137,30 @@ class _Contexts:
         self._registers: list[Array] = []
         self._acceleration_registers = slice(program.a, program.a + joints)
         self._accelerations: Array = mujoco_batch.batch.bind("qacc")
-        self._dofs = places.velocities
+        self._dofs = joint_addresses.velocities
         common = layout | {name: values.ctypes.data for name, values in shared.items()}
         has_friction = bool(compiled.has_dry_friction.any())
         inputs = compiled.input_values
         loss = mujoco_batch.fields["dof_frictionloss"]
         table = []
-        for lane in range(len(losses)):
-            registers = np.ascontiguousarray(compiled.registers[:, lane : lane + 1])
-            own = {
+        for batch_index in range(len(losses)):
+            registers = np.ascontiguousarray(compiled.registers[:, batch_index : batch_index + 1])
+            element_arrays = {
                 "registers": registers,
-                "losses": np.ascontiguousarray(losses[lane]),
-                "input_values": np.ascontiguousarray(inputs[:, :, lane]),
+                "losses": np.ascontiguousarray(losses[batch_index]),
+                "input_values": np.ascontiguousarray(inputs[:, :, batch_index]),
                 "scratch": np.zeros(joints + program.next_states.size + 1),
             }
             self._registers.append(registers)
-            self._arrays += own.values()
-            addresses = {name: values.ctypes.data for name, values in own.items()}
+            self._arrays += element_arrays.values()
+            addresses = {name: values.ctypes.data for name, values in element_arrays.items()}
             context = CallbackContext(
                 **common,
                 **addresses,
                 code_rows=len(program.code),
                 register_count=len(registers),
                 joints=joints,
-                friction_rows=int((loss[lane] > 0).sum()) if has_friction else 0,
+                friction_rows=int((loss[batch_index] > 0).sum()) if has_friction else 0,
                 states=program.next_states.size,
                 inputs=inputs.shape[1],
                 steps=steps,
@@ -171,21 +171,21 @@ class _Contexts:
                 has_acceleration=0,
             )
             table.append(context)
-        self._words = np.array(table, dtype=np.int64)
-        row = self._words.strides[0]
-        self.addresses: Array = self._words.ctypes.data + row * np.arange(float(len(table)))
+        self._table = np.array(table, dtype=np.int64)
+        row = self._table.strides[0]
+        self.addresses: Array = self._table.ctypes.data + row * np.arange(float(len(table)))
 
-    def renew(self, first: int) -> None:
+    def reset_accelerations(self, first: int) -> None:
         """Set the previous accelerations of all batch elements before a call of MuJoCo.
 
         Args:
             first: number of the first step of the call. The initial acceleration lacks the applied
                 forces, so it is not used.
         """
-        self._words[:, HAS_ACCELERATION] = 0
-        for lane, registers in enumerate(self._registers):
+        self._table[:, HAS_ACCELERATION] = 0
+        for batch_index, registers in enumerate(self._registers):
             registers[self._acceleration_registers] = (
-                self._accelerations[lane, self._dofs, None] if first else 0.0
+                self._accelerations[batch_index, self._dofs, None] if first else 0.0
             )
 
 
@@ -210,16 +210,16 @@ def find_data_offsets() -> dict[str, int] | None:
     model = mujoco.MjModel.from_xml_string(_PROBE)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    wanted = {getattr(data, name).ctypes.data: name for name in DATA_FIELDS}
-    if not hasattr(data, "_address") or len(wanted) < len(DATA_FIELDS):
+    field_at_address = {getattr(data, name).ctypes.data: name for name in DATA_FIELDS}
+    if not hasattr(data, "_address") or len(field_at_address) < len(DATA_FIELDS):
         return None
-    words = (ctypes.c_int64 * MAX_DATA_WORDS).from_address(data._address)
-    found: dict[str, int] = {}
+    data_words = (ctypes.c_int64 * MAX_DATA_WORDS).from_address(data._address)
+    offsets: dict[str, int] = {}
     for i in range(MAX_DATA_WORDS):
-        name = wanted.get(words[i])
+        name = field_at_address.get(data_words[i])
         if name is not None:
-            found[name] = i
+            offsets[name] = i
         # Nothing is read beyond the last of the fields.
         if name == LAST_FIELD:
             break
-    return found if len(found) == len(DATA_FIELDS) else None
+    return offsets if len(offsets) == len(DATA_FIELDS) else None

@@ -46,7 +46,7 @@ MAX_CACHED_PROGRAMS = 500
 """Maximum number of cached programs for one robot and set of inputs."""
 
 
-class _Asked(NamedTuple):
+class _TracedEffect(NamedTuple):
     """An effect prepared for tracing.
 
     Attributes:
@@ -64,15 +64,15 @@ class _Program(NamedTuple):
     """Forces of effects as instructions.
 
     Attributes:
-        written: instructions on groups of registers: time at the beginning and at the middle of a
-            step, step length, integration interval of hidden states, motion, inputs, stiffness,
-            coefficients, hidden states.
+        instructions: instructions on groups of registers: time at the beginning and at the middle
+            of a step, step length, integration interval of hidden states, motion, inputs,
+            stiffness, coefficients, hidden states.
         force: (D,) registers of the forces.
         limit: (D,) registers of the limits of dry friction.
         states: (2 H,) registers of the hidden states after the step.
     """
 
-    written: InstructionList
+    instructions: InstructionList
     force: NDArray[np.intp]
     limit: NDArray[np.intp]
     states: NDArray[np.intp]
@@ -133,27 +133,31 @@ class _Tracing:
         graph = ExpressionGraph()
         joints = len(system.coordinates)
         self._graph = graph
-        self._t, self._after, self._step, self._past = (
+        self._t, self._midpoint_time, self._step, self._state_interval = (
             make_input_vector(graph, 1, MOMENT) for _ in range(4)
         )
-        parts = [make_input_vector(graph, joints, MOMENT) for _ in JointStates._fields]
-        self._motion = parts
+        motion = [make_input_vector(graph, joints, MOMENT) for _ in JointStates._fields]
+        self._motion = motion
         self._inputs = {name: make_input_vector(graph, 1, MOMENT) for name in inputs}
         self._stiffness = make_input_vector(graph, joints, LANE)
-        look = JointStates(*parts)
-        instants = [(self._t, look.x, look.v, look.transmission_loads)]
+        joint_states = JointStates(*motion)
+        instants = [(self._t, joint_states.x, joint_states.v, joint_states.transmission_loads)]
         instants.append(
-            (self._after, *predict_midpoint(look.x, look.v, look.a, self._step), look.at_midpoint)
+            (
+                self._midpoint_time,
+                *predict_midpoint(joint_states.x, joint_states.v, joint_states.a, self._step),
+                joint_states.at_midpoint,
+            )
         )
         self._begin, self._middle = (
             make_snapshot(system, t, x, v, dict(self._inputs), np.stack(sides), self._stiffness)
             for t, x, v, sides in instants
         )
-        self._asked: dict[tuple[type[Effect], int], _Asked] = {}
+        self._traced_effects: dict[tuple[type[Effect], int], _TracedEffect] = {}
         self._programs: dict[tuple[type[Effect], ...], _Program] = {}
-        self.known: dict[type[Effect], bool] = {}
+        self.is_compilable: dict[type[Effect], bool] = {}
 
-    def program(self, effects: Sequence[Sequence[Effect]]) -> _Program:
+    def get_program(self, effects: Sequence[Sequence[Effect]]) -> _Program:
         """Return the program for forces, frictions and effects with hidden states.
 
         Raises:
@@ -172,45 +176,55 @@ class _Tracing:
         The three groups of `effects` are forces, dry frictions and effects with hidden
         states. Outputs are the total force and the friction limit of each joint, and the
         hidden states after the step. The order of `groups` fixes the order of the input
-        registers, see `_Program.written`.
+        registers, see `_Program.instructions`.
         """
-        before: Counter[type[Effect]] = Counter()
-        asked: list[list[_Asked]] = []
+        counts: Counter[type[Effect]] = Counter()
+        traced: list[list[_TracedEffect]] = []
         for group in effects:
-            asked.append([])
+            traced.append([])
             for effect in group:
                 # An effect may occur twice: alone, and as a member of a family in other batch
                 # elements.
-                asked[-1].append(self._make_graph_effect(effect, before[type(effect)]))
-                before[type(effect)] += 1
-        forces, frictions, hidden = ([(one.effect, one.c) for one in group] for group in asked)
-        states = [one.state for one in asked[2] if one.state is not None]
+                traced[-1].append(self._make_graph_effect(effect, counts[type(effect)]))
+                counts[type(effect)] += 1
+        forces, frictions, hidden = (
+            [(traced_effect.effect, traced_effect.c) for traced_effect in group] for group in traced
+        )
+        states = [
+            traced_effect.state for traced_effect in traced[2] if traced_effect.state is not None
+        ]
         force: Any = compute_effect_forces(forces, self._middle)  # type: ignore[arg-type]
-        later: list[HiddenState] = []
+        later_states: list[HiddenState] = []
         if hidden:
             moments = self._begin, self._middle
-            more, later = compute_hidden_state_forces(hidden, moments, states, self._past)  # type: ignore[arg-type]
-            force = force + more
+            hidden_force, later_states = compute_hidden_state_forces(
+                hidden,  # type: ignore[arg-type]
+                moments,
+                states,
+                self._state_interval,
+            )
+            force = force + hidden_force
         limit: Any = compute_friction_limits(frictions, self._middle)  # type: ignore[arg-type]
-        after: Any = [part for state in later for part in (state.x, state.v)]
-        outputs = [self._get_nodes(values) for values in (force, limit, *after)]
-        begun: Any = [part for state in states for part in (state.x, state.v)]
-        coefficients = [one.c for group in asked for one in group]
-        clock = self._t, self._after, self._step, self._past
+        later_parts: Any = [part for state in later_states for part in (state.x, state.v)]
+        outputs = [self._get_nodes(values) for values in (force, limit, *later_parts)]
+        state_inputs: Any = [part for state in states for part in (state.x, state.v)]
+        coefficients = [traced_effect.c for group in traced for traced_effect in group]
+        clock = self._t, self._midpoint_time, self._step, self._state_interval
         groups = [*((part,) for part in clock), *((part,) for part in self._motion)]
         groups += [tuple(self._inputs.values()), (self._stiffness,), tuple(coefficients)]
-        groups.append(tuple(begun))
-        written = emit_instructions(
+        groups.append(tuple(state_inputs))
+        instructions = emit_instructions(
             [collect_nodes(*group) for group in groups],
             [node for nodes in outputs for node in nodes],
         )
-        places = [
-            np.array([written.place[node] for node in nodes], dtype=np.intp) for nodes in outputs
+        registers = [
+            np.array([instructions.place[node] for node in nodes], dtype=np.intp)
+            for nodes in outputs
         ]
-        after_all = np.concatenate([np.empty(0, dtype=np.intp), *places[2:]])
-        return _Program(written, places[0], places[1], after_all)
+        state_registers = np.concatenate([np.empty(0, dtype=np.intp), *registers[2:]])
+        return _Program(instructions, registers[0], registers[1], state_registers)
 
-    def _make_graph_effect(self, effect: Effect, number: int) -> _Asked:
+    def _make_graph_effect(self, effect: Effect, number: int) -> _TracedEffect:
         """Return an effect with graph inputs for its coefficients and its hidden state.
 
         `number` counts earlier occurrences of the same class in a program, each with inputs
@@ -220,15 +234,15 @@ class _Tracing:
             NotTraceableError: the effect has attributes, which a compiled program would freeze.
         """
         kind = type(effect), number
-        if kind not in self._asked:
+        if kind not in self._traced_effects:
             if getattr(effect, "__dict__", None):
                 raise NotTraceableError("it has instance attributes, which a trace cannot follow")
             c = make_input_vector(self._graph, len(effect.coefficients), LANE).T[:, :, None]
             state = None
             if isinstance(effect, HiddenStateEffect):
                 state = HiddenState(*(make_input_vector(self._graph, 1, MOMENT) for _ in range(2)))
-            self._asked[kind] = _Asked(effect, c, state)
-        return self._asked[kind]
+            self._traced_effects[kind] = _TracedEffect(effect, c, state)
+        return self._traced_effects[kind]
 
     @staticmethod
     def _get_nodes(values: Any) -> list[Any]:
@@ -261,63 +275,66 @@ class CompiledForces:
         self.has_dry_friction = forces.has_dry_friction
         self.addresses = forces.addresses
         self.loaded = forces.loaded
-        self._of = forces
+        self._source = forces
         self._program = program
-        written = program.written
-        lanes, joints = forces.stiffness.shape
-        self._r = r = np.zeros((len(written.place), lanes))
-        r[written.first : written.first + written.values.size] = written.values[:, None]
-        *clock, u, stiffness, c, states = written.rows
-        self._t, self._after, step, self._past, *motion = clock
+        instructions = program.instructions
+        batch_size, joints = forces.stiffness.shape
+        self._registers = r = np.zeros((len(instructions.place), batch_size))
+        r[instructions.first : instructions.first + instructions.values.size] = instructions.values[
+            :, None
+        ]
+        # First registers of the input groups, in the order of `_compose_program`.
+        *clock, u, stiffness, c, states = instructions.rows
+        self._t, self._midpoint_time, step, self._state_interval, *motion = clock
         self._motion = [slice(first, first + joints) for first in motion]
         self._u = slice(u, stiffness)
-        self._states = slice(states, written.first)
+        self._states = slice(states, instructions.first)
         r[step] = forces.step
         r[stiffness:c] = forces.stiffness.T
         coefficients = [own[:, :, 0] for _, own in _list_effects(forces)]
         r[c:states] = np.concatenate(coefficients)
-        first, moment, end, _ = written.ends.tolist()
+        first, moment, end, _ = instructions.ends.tolist()
         kernel = get_kernel()
-        kernel.make_instruction_runner(written.code, first, moment, r)()
-        self._run = kernel.make_instruction_runner(written.code, moment, end, r)
+        kernel.make_instruction_runner(instructions.code, first, moment, r)()
+        self._run = kernel.make_instruction_runner(instructions.code, moment, end, r)
 
     @cached_property
     def _stacked_inputs(self) -> Array:
         """Applied inputs (S, U, L)."""
         return np.ascontiguousarray(
-            np.stack(list(self._of.applied_inputs.values())).transpose(2, 0, 1)
+            np.stack(list(self._source.applied_inputs.values())).transpose(2, 0, 1)
         )
 
     @property
     def registers(self) -> Array:
         """Registers (registers, L) of the program."""
-        return self._r
+        return self._registers
 
     @property
     def input_values(self) -> Array:
         """Applied inputs (S, U, L) over S steps: U inputs of L batch elements."""
-        if not self._of.applied_inputs:
-            return np.zeros((1, 0, self._r.shape[1]))
+        if not self._source.applied_inputs:
+            return np.zeros((1, 0, self._registers.shape[1]))
         return self._stacked_inputs
 
     @property
     def step(self) -> float:
         """Step length in seconds."""
-        return self._of.step
+        return self._source.step
 
     @property
     def program_layout(self) -> ProgramLayout:
         """Instructions of a step, and the registers of its inputs and outputs."""
-        written = self._program.written
-        _, begin, end, _ = written.ends.tolist()
+        instructions = self._program.instructions
+        _, begin, end, _ = instructions.ends.tolist()
         x, v, a, *_ = (rows.start for rows in self._motion)
         return ProgramLayout(
-            code=written.code,
+            code=instructions.code,
             begin=begin,
             end=end,
             t=self._t,
-            midpoint=self._after,
-            past=self._past,
+            midpoint=self._midpoint_time,
+            past=self._state_interval,
             x=x,
             v=v,
             a=a,
@@ -334,36 +351,36 @@ class CompiledForces:
         Args:
             joint_states: joint states at the beginning.
         """
-        hidden = self._of.hidden
+        hidden = self._source.hidden
         if not hidden:
             return
-        snapshot = self._of.make_step_snapshot(0, joint_states)
+        snapshot = self._source.make_step_snapshot(0, joint_states)
         states = [effect.begin(c, snapshot) for effect, c in hidden]
-        begun = [part for state in states for part in (state.x, state.v)]
-        self._r[self._states] = np.concatenate(begun, axis=1).T
+        initial = [part for state in states for part in (state.x, state.v)]
+        self._registers[self._states] = np.concatenate(initial, axis=1).T
 
-    def compute(self, k: int, look: JointStates) -> tuple[Array, Array]:
+    def compute(self, k: int, joint_states: JointStates) -> tuple[Array, Array]:
         """Run the program for step k of all batch elements; see `EffectForces.compute`.
 
         Args:
             k: number of the step.
-            look: states of the joints at the beginning of the step.
+            joint_states: states of the joints at the beginning of the step.
 
         Returns:
             Forces (L, D) and limits of dry friction (L, D), in N or N m.
         """
-        r = self._r
-        for rows, values in zip(self._motion, look, strict=True):
+        r = self._registers
+        for rows, values in zip(self._motion, joint_states, strict=True):
             r[rows] = values.T
-        r[self._t] = k * self._of.step
-        r[self._after] = (k + 0.5) * self._of.step
-        if self._of.applied_inputs:
+        r[self._t] = k * self._source.step
+        r[self._midpoint_time] = (k + 0.5) * self._source.step
+        if self._source.applied_inputs:
             r[self._u] = self._stacked_inputs[k]
-        hidden = self._of.hidden
+        hidden = self._source.hidden
         if hidden and k < 2:
-            r[self._past] = self._of.step if k else 0.5 * self._of.step
+            r[self._state_interval] = self._source.step if k else 0.5 * self._source.step
         if not k:
-            self.begin(look)
+            self.begin(joint_states)
         self._run()
         if hidden:
             r[self._states] = r[self._program.states]
@@ -387,7 +404,7 @@ def compile_forces(forces: EffectForces) -> CompiledForces | None:
     if not all(_can_compile(tracing, forces, effect) for effect, _ in _list_effects(forces)):
         return None
     try:
-        return CompiledForces(forces, tracing.program(groups))
+        return CompiledForces(forces, tracing.get_program(groups))
     except NotTraceableError:  # The program is too large; the effects themselves are valid.
         return None
 
@@ -401,11 +418,11 @@ def _can_compile(tracing: _Tracing, forces: EffectForces, effect: Effect) -> boo
     if not effect.is_traceable:
         return False
     kind = type(effect)
-    if kind not in tracing.known:
-        tracing.known[kind] = False
+    if kind not in tracing.is_compilable:
+        tracing.is_compilable[kind] = False
         try:
             _check_against_numpy(tracing, _select_effect(forces, effect))
-            tracing.known[kind] = True
+            tracing.is_compilable[kind] = True
         # An effect of a user may raise any exception when it is evaluated with traced values.
         except Exception as reason:
             text = str(reason) or type(reason).__name__
@@ -413,7 +430,7 @@ def _can_compile(tracing: _Tracing, forces: EffectForces, effect: Effect) -> boo
                 f"simgap: effect {effect.name} is evaluated with NumPy, "
                 f"since it cannot be compiled: {text}\n"
             )
-    return tracing.known[kind]
+    return tracing.is_compilable[kind]
 
 
 def _check_against_numpy(tracing: _Tracing, forces: EffectForces) -> None:
@@ -425,17 +442,23 @@ def _check_against_numpy(tracing: _Tracing, forces: EffectForces) -> None:
     Raises:
         NotTraceableError: the results differ.
     """
-    program = tracing.program([[effect for effect, _ in group] for group in _list_groups(forces)])
-    quick = CompiledForces(forces, program)
+    program = tracing.get_program(
+        [[effect for effect, _ in group] for group in _list_groups(forces)]
+    )
+    compiled = CompiledForces(forces, program)
     rng = np.random.default_rng(0)
     steps = min([CHECKED_INSTANTS, *(u.shape[1] for u in forces.applied_inputs.values())])
     for k in range(steps):
-        seen = (len(JointStates._fields), *forces.stiffness.shape)
-        look = JointStates(*(rng.normal(size=seen) * rng.choice([0.01, 1.0, 10.0])))
-        for found, expected in zip(quick.compute(k, look), forces.compute(k, look), strict=True):
-            close = MAX_PROGRAM_DEVIATION * np.abs(expected[np.isfinite(expected)]).max(initial=0.0)
+        shape = (len(JointStates._fields), *forces.stiffness.shape)
+        joint_states = JointStates(*(rng.normal(size=shape) * rng.choice([0.01, 1.0, 10.0])))
+        for result, expected in zip(
+            compiled.compute(k, joint_states), forces.compute(k, joint_states), strict=True
+        ):
+            tolerance = MAX_PROGRAM_DEVIATION * np.abs(expected[np.isfinite(expected)]).max(
+                initial=0.0
+            )
             if not np.allclose(
-                found, expected, rtol=MAX_PROGRAM_DEVIATION, atol=close, equal_nan=True
+                result, expected, rtol=MAX_PROGRAM_DEVIATION, atol=tolerance, equal_nan=True
             ):
                 raise NotTraceableError("compiled it gives other numbers")
 

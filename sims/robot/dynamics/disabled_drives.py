@@ -20,11 +20,11 @@ Mask = NDArray[np.bool_]
 
 FORCE_FIELDS = ("actuator_forcelimited", "actuator_forcerange")
 """Model fields that switch an actuator off: whether its force is limited, and its force range."""
-MIDDLE = 0.5
+SAMPLED_STEP_FRACTION = 0.5
 """Fraction of a step after which the on/off state of an actuator is sampled for the whole step."""
 
 
-def off_steps(robot: RobotModel, scenario: Scenario, step: float, steps: int) -> Mask:
+def compute_off_steps(robot: RobotModel, scenario: Scenario, step: float, steps: int) -> Mask:
     """Compute in which steps of a run each actuator is switched off.
 
     The state is held from one sample of the recording to the next.
@@ -42,14 +42,14 @@ def off_steps(robot: RobotModel, scenario: Scenario, step: float, steps: int) ->
     if not scenario.off:
         return result
     stamps = scenario.times - scenario.times[0] + scenario.offset
-    middles = step * (np.arange(float(steps)) + MIDDLE)
+    middles = step * (np.arange(float(steps)) + SAMPLED_STEP_FRACTION)
     rows = np.clip(np.searchsorted(stamps, middles, side="right") - 1, 0, stamps.size - 1)
     for name, off in scenario.off.items():
         result[:, robot.actuator(name).id] = off[rows]
     return result
 
 
-def constant_stretches(off: Mask) -> Iterator[slice]:
+def iterate_constant_stretches(off: Mask) -> Iterator[slice]:
     """Yield the slices of steps within which no element of an on/off mask (n, S, K) changes."""
     changes = np.flatnonzero((off[:, 1:] != off[:, :-1]).any(axis=(0, 2))) + 1
     edges = [0, *changes.tolist(), off.shape[1]]
@@ -66,24 +66,24 @@ class ForceRanges:
 
     def __init__(self, fields: Mapping[str, Any]) -> None:
         self._limited, self._range = (fields[name] for name in FORCE_FIELDS)
-        self._own = self._limited.copy(), self._range.copy()
+        self._initial = self._limited.copy(), self._range.copy()
 
     def write(self, off: Mask) -> None:
         """Switch actuators of the first n batch elements off where `off` (n, K) is true.
 
         All their other actuators are switched on.
         """
-        limited, limits = self._own
+        limited, ranges = self._initial
         n = len(off)
         self._limited[:n] = np.where(off, True, limited[:n])
-        self._range[:n] = np.where(off[..., None], 0.0, limits[:n])
+        self._range[:n] = np.where(off[..., None], 0.0, ranges[:n])
 
     def restore(self) -> None:
         """Switch all actuators on."""
-        self._limited[...], self._range[...] = self._own
+        self._limited[...], self._range[...] = self._initial
 
 
-def working_servos(robot: RobotModel, velocities: Any, off: Mask) -> Array:
+def find_working_servos(robot: RobotModel, velocities: Any, off: Mask) -> Array:
     """Return 0 for coordinates whose position servo is switched off, and 1 for all others.
 
     Args:

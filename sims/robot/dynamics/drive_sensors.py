@@ -12,7 +12,7 @@ from sims.robot.coupled_drives import find_preceding_joint
 from sims.robot.dynamics.activation_filters import activation_filters
 from sims.robot.dynamics.active_effects import find_active_elements, slice_active_effects
 from sims.robot.dynamics.batch_work import BatchInputs
-from sims.robot.dynamics.disabled_drives import working_servos
+from sims.robot.dynamics.disabled_drives import find_working_servos
 from sims.robot.dynamics.effect_forces import (
     compute_drive_effect_forces,
     is_in_drive,
@@ -50,21 +50,25 @@ class DriveSensorModel:
         given, mujoco_batch = self.given, self.batch
         n = len(readings)
         for actuator in self.robot.actuators:
-            apart = given.instant[:, :, actuator.control] - given.controls[:, :, actuator.control]
-            apart = np.where(given.off[:, :, actuator.id], 0.0, apart)
-            if actuator.joint not in mujoco_batch.drives or not apart.any():
+            control_change = (
+                given.instant[:, :, actuator.control] - given.controls[:, :, actuator.control]
+            )
+            control_change = np.where(given.off[:, :, actuator.id], 0.0, control_change)
+            if actuator.joint not in mujoco_batch.drives or not control_change.any():
                 continue
             column = readings[:, :, mujoco_batch.drives[actuator.joint]]
-            before = column.copy()
-            column += apart * self._by_control(actuator)[:n, None]
+            unshifted = column.copy()
+            column += control_change * self._compute_force_per_control(actuator)[:n, None]
             np.clip(column, *self._get_force_limits(actuator), out=column)
             if actuator.joint in mujoco_batch.robot.coupled:
-                first = find_preceding_joint(self.robot, actuator.joint)
-                assert first is not None
-                arms: Array = mujoco_batch.fields[COUPLING_FIELD][
+                preceding_joint = find_preceding_joint(self.robot, actuator.joint)
+                assert preceding_joint is not None
+                coupling_coefficients: Array = mujoco_batch.fields[COUPLING_FIELD][
                     :n, get_coupling_address(mujoco_batch.robot, actuator.joint)
                 ]
-                readings[:, :, mujoco_batch.drives[first.name]] += arms[:, None] * (column - before)
+                readings[:, :, mujoco_batch.drives[preceding_joint.name]] += coupling_coefficients[
+                    :, None
+                ] * (column - unshifted)
 
     def add_drive_effects(self, readings: Array, x: Array, v: Array, acting: ActiveEffects) -> None:
         """Add the forces of effects in the drives, such as a dead zone or a voltage drop.
@@ -78,40 +82,46 @@ class DriveSensorModel:
             v: (n, S + 1, D) velocities.
             acting: active effects with their coefficients.
         """
-        lanes = np.flatnonzero(find_active_elements(acting, len(x), is_in_drive))
-        if not lanes.size:
+        batch_indices = np.flatnonzero(find_active_elements(acting, len(x), is_in_drive))
+        if not batch_indices.size:
             return
         mujoco_batch, given, steps = self.batch, self.given, readings.shape[1]
         columns = [mujoco_batch.drives[name.removeprefix("q.")] for name in self.system.coordinates]
-        shown = readings[lanes][:, :, columns]
+        drive_readings = readings[batch_indices][:, :, columns]
 
-        def flat(values: Array) -> Array:
+        def flatten(values: Array) -> Array:
             """Stack all sample times of the selected batch elements into one axis."""
-            return values[lanes, :steps].reshape(lanes.size * steps, -1)
+            return values[batch_indices, :steps].reshape(batch_indices.size * steps, -1)
 
-        inputs = {name: flat(u) for name, u in given.applied_inputs.items()}
-        for one in self.robot.actuators:
+        inputs = {name: flatten(u) for name, u in given.applied_inputs.items()}
+        for actuator in self.robot.actuators:
             # The output of an activation filter does not change within a step.
-            if not self._is_filtered(one):
-                inputs[f"u.{one.name}"] = flat(given.instant[:, :, one.control])
-        t = np.tile(self.step * np.arange(float(steps)), lanes.size)[:, None]
-        drive = shown.reshape(lanes.size * steps, -1)
+            if not self._is_filtered(actuator):
+                inputs[f"u.{actuator.name}"] = flatten(given.instant[:, :, actuator.control])
+        t = np.tile(self.step * np.arange(float(steps)), batch_indices.size)[:, None]
+        drive = drive_readings.reshape(batch_indices.size * steps, -1)
         carried = np.stack([drive, np.zeros_like(drive)])
         stiffness = np.repeat(
-            mujoco_batch.get_servo_stiffness(mujoco_batch.places)[lanes], steps, axis=0
+            mujoco_batch.get_servo_stiffness(mujoco_batch.file_joints)[batch_indices], steps, axis=0
         )
         if given.off.any():
-            on = working_servos(
-                mujoco_batch.robot, mujoco_batch.places.velocities, given.off[lanes, :steps]
+            is_servo_on = find_working_servos(
+                mujoco_batch.robot,
+                mujoco_batch.file_joints.velocities,
+                given.off[batch_indices, :steps],
             )
-            stiffness = stiffness * on.reshape(stiffness.shape)
-        moment = make_snapshot(self.system, t, flat(x), flat(v), inputs, carried, stiffness)
-        own = slice_active_effects(tuple((e, c) for e, c in acting if is_in_drive(e)), lanes)
-        every = tuple((e, np.repeat(c, steps, axis=1)) for e, c in own)
-        shown += compute_drive_effect_forces(every, moment).reshape(shown.shape)
-        readings[lanes[:, None, None], np.arange(steps)[:, None], columns] = shown
+            stiffness = stiffness * is_servo_on.reshape(stiffness.shape)
+        snapshot = make_snapshot(self.system, t, flatten(x), flatten(v), inputs, carried, stiffness)
+        selected = slice_active_effects(
+            tuple((e, c) for e, c in acting if is_in_drive(e)), batch_indices
+        )
+        repeated = tuple((e, np.repeat(c, steps, axis=1)) for e, c in selected)
+        drive_readings += compute_drive_effect_forces(repeated, snapshot).reshape(
+            drive_readings.shape
+        )
+        readings[batch_indices[:, None, None], np.arange(steps)[:, None], columns] = drive_readings
 
-    def _by_control(self, actuator: Actuator) -> Array:
+    def _compute_force_per_control(self, actuator: Actuator) -> Array:
         """Return the immediate joint force per unit of an actuator's control, (N,)."""
         gear = float(self.robot.compiled.actuator_gear[actuator.id, 0])
         gain: Array = self.batch.fields["actuator_gainprm"][:, actuator.id, 0]

@@ -63,7 +63,7 @@ def make_snapshot(
 
 
 def compute_time_dependent_forces(
-    system: RobotSystem, acting: ActiveEffects, t: Array, size: int, lanes: int
+    system: RobotSystem, acting: ActiveEffects, t: Array, size: int, batch_size: int
 ) -> Array:
     """Compute the forces (L, S, D) of effects that depend on time alone.
 
@@ -75,22 +75,22 @@ def compute_time_dependent_forces(
         acting: active effects with their coefficients (K, L, 1).
         t: (S,) beginnings of the steps in seconds; forces are evaluated half a step later.
         size: number D of coordinates.
-        lanes: number L of batch elements.
+        batch_size: number L of batch elements.
     """
-    result = np.zeros((lanes, t.size, size))
+    result = np.zeros((batch_size, t.size, size))
     half = 0.5 * (t[1] - t[0]) if t.size > 1 else 0.0
-    nothing = np.zeros((t.size, size))
+    at_rest = np.zeros((t.size, size))
     # The force at the middle of a step gives the momentum of the force over the step, to second
     # order.
-    moment = make_snapshot(
-        system, (t + half)[:, None], nothing, nothing, {}, np.stack([nothing] * 2)
+    snapshots = make_snapshot(
+        system, (t + half)[:, None], at_rest, at_rest, {}, np.stack([at_rest] * 2)
     )
     for effect, c in acting:
         if effect.of not in TIME_DEPENDENT_EFFECTS or not isinstance(effect, Force):
             continue
-        for lane in np.flatnonzero((c != 0).any(axis=0)[:, 0]):
-            own = np.repeat(c[:, lane : lane + 1], t.size, axis=1)
-            result[lane] += effect.force(own, moment)
+        for batch_index in np.flatnonzero((c != 0).any(axis=0)[:, 0]):
+            coefficients = np.repeat(c[:, batch_index : batch_index + 1], t.size, axis=1)
+            result[batch_index] += effect.force(coefficients, snapshots)
     return result
 
 
@@ -140,14 +140,18 @@ class EffectForces:
         self.addresses = addresses
         self.stiffness = stiffness
         self.step = step
-        asked = [
+        force_effects = [
             (e, c) for e, c in acting if e.hook == "force" and e.of not in TIME_DEPENDENT_EFFECTS
         ]
         self.forces = [
-            (e, c) for e, c in asked if isinstance(e, Force) and e.of not in MODEL_FIELD_EFFECTS
+            (e, c)
+            for e, c in force_effects
+            if isinstance(e, Force) and e.of not in MODEL_FIELD_EFFECTS
         ]
         self.frictions = [
-            (e, c) for e, c in asked if isinstance(e, Friction) and e.of not in MODEL_FIELD_EFFECTS
+            (e, c)
+            for e, c in force_effects
+            if isinstance(e, Friction) and e.of not in MODEL_FIELD_EFFECTS
         ]
         self.has_dry_friction: Mask = np.zeros(
             (len(stiffness), len(addresses.velocities)), dtype=bool
@@ -160,36 +164,38 @@ class EffectForces:
             if isinstance(e, HiddenStateEffect) and not is_series_effect(e)
         ]
         self.loaded: Mask = np.zeros(len(stiffness), dtype=bool)
-        for loading, c in asked:
+        for loading, c in force_effects:
             if loading.of in LOAD_DEPENDENT_EFFECTS:
                 self.loaded |= (c != 0).any(axis=0)[:, 0]
         self.working: Array | None = None
         self._states: list[HiddenState] = []
 
-    def compute(self, k: int, look: JointStates) -> tuple[Array, Array]:
+    def compute(self, k: int, joint_states: JointStates) -> tuple[Array, Array]:
         """Compute forces and dry friction limits (L, D) at the middle of step k.
 
         Args:
             k: number of the step; must increase by one from call to call.
-            look: joint states at the beginning of the step.
+            joint_states: joint states at the beginning of the step.
         """
-        x, v = predict_midpoint(look.x, look.v, look.a, self.step)
-        moment = self._make_snapshot(k + 0.5, k, (x, v, *look.at_midpoint))
-        force = compute_effect_forces(self.forces, moment)
+        x, v = predict_midpoint(joint_states.x, joint_states.v, joint_states.a, self.step)
+        midpoint = self._make_snapshot(k + 0.5, k, (x, v, *joint_states.at_midpoint))
+        force = compute_effect_forces(self.forces, midpoint)
         if self.hidden:
-            begun = self.make_step_snapshot(k, look)
-            self._states = self._states or [e.begin(c, begun) for e, c in self.hidden]
+            start = self.make_step_snapshot(k, joint_states)
+            self._states = self._states or [e.begin(c, start) for e, c in self.hidden]
             # Hidden states advance from the middle of the previous step to the middle of this one.
             step = self.step if k else 0.5 * self.step
-            more, self._states = compute_hidden_state_forces(
-                self.hidden, (begun, moment), self._states, step
+            hidden_force, self._states = compute_hidden_state_forces(
+                self.hidden, (start, midpoint), self._states, step
             )
-            force += more
-        return force, compute_friction_limits(self.frictions, moment)
+            force += hidden_force
+        return force, compute_friction_limits(self.frictions, midpoint)
 
-    def make_step_snapshot(self, k: int, look: JointStates) -> RobotSnapshot:
+    def make_step_snapshot(self, k: int, joint_states: JointStates) -> RobotSnapshot:
         """Return the snapshot at the beginning of step k."""
-        return self._make_snapshot(k, k, (look.x, look.v, *look.transmission_loads))
+        return self._make_snapshot(
+            k, k, (joint_states.x, joint_states.v, *joint_states.transmission_loads)
+        )
 
     def _make_snapshot(self, steps: float, k: int, motion: Sequence[Array]) -> RobotSnapshot:
         """Return the snapshot after a number of steps, with the inputs of step k."""
@@ -209,44 +215,44 @@ def is_in_drive(effect: Effect) -> bool:
     )
 
 
-def compute_drive_effect_forces(acting: ActiveEffects, moment: RobotSnapshot) -> Array:
+def compute_drive_effect_forces(acting: ActiveEffects, snapshot: RobotSnapshot) -> Array:
     """Compute the forces (L, D) that effects in drives add to the drives."""
     return compute_effect_forces(
-        [(e, c) for e, c in acting if isinstance(e, Force) and is_in_drive(e)], moment
+        [(e, c) for e, c in acting if isinstance(e, Force) and is_in_drive(e)], snapshot
     )
 
 
-def compute_effect_forces(forces: Sequence[tuple[Force, Array]], moment: RobotSnapshot) -> Array:
+def compute_effect_forces(forces: Sequence[tuple[Force, Array]], snapshot: RobotSnapshot) -> Array:
     """Add up the forces of all effects, (L, D) in N or N m.
 
     Args:
         forces: effects with their coefficients (K, L, 1).
-        moment: state at which the effects are evaluated.
+        snapshot: state at which the effects are evaluated.
     """
-    total = np.zeros_like(moment.x)
+    total = np.zeros_like(snapshot.x)
     for effect, c in forces:
-        total = total + effect.force(c, moment)
+        total = total + effect.force(c, snapshot)
     return total
 
 
 def compute_friction_limits(
-    frictions: Sequence[tuple[Friction, Array]], moment: RobotSnapshot
+    frictions: Sequence[tuple[Friction, Array]], snapshot: RobotSnapshot
 ) -> Array:
     """Add up the limits of dry friction of all effects, (L, D) in N or N m.
 
     MuJoCo's solver then finds the friction force within these limits.
     """
-    limit = np.zeros_like(moment.x)
+    limit = np.zeros_like(snapshot.x)
     for effect, c in frictions:
         joint = effect.coordinate
         assert joint is not None
-        limit[:, joint] = limit[:, joint] + effect.limit(c, moment)[:, 0]
+        limit[:, joint] = limit[:, joint] + effect.limit(c, snapshot)[:, 0]
     return limit
 
 
 def compute_hidden_state_forces(
     hidden: Sequence[tuple[HiddenStateEffect, Array]],
-    moments: tuple[RobotSnapshot, RobotSnapshot],
+    snapshots: tuple[RobotSnapshot, RobotSnapshot],
     states: Sequence[HiddenState],
     step: float,
 ) -> tuple[Array, list[HiddenState]]:
@@ -254,19 +260,19 @@ def compute_hidden_state_forces(
 
     Args:
         hidden: effects with their coefficients.
-        moments: snapshots at the middle and at the end of the interval.
+        snapshots: snapshots at the middle and at the end of the interval.
         states: hidden states at the beginning.
         step: length of the interval in seconds.
 
     Returns:
         Total force (L, D) and hidden states at the end of the interval.
     """
-    between, end = moments
+    midpoint, end = snapshots
     total = np.zeros_like(end.x)
-    later = []
+    later_states = []
     for (effect, c), state in zip(hidden, states, strict=True):
-        after = advance_state(effect, c, between, state, step)
+        after = advance_state(effect, c, midpoint, state, step)
         force, _ = effect.act(c, end, after)
         total = total + np.where(c[0] > 0, force, 0.0)
-        later.append(after)
-    return total, later
+        later_states.append(after)
+    return total, later_states

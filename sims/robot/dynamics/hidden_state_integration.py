@@ -24,7 +24,7 @@ STATE_STEP = 1e-6
 
 
 def advance_state(
-    effect: HiddenStateEffect, c: Array, moment: StateSnapshot, state: HiddenState, step: float
+    effect: HiddenStateEffect, c: Array, snapshot: StateSnapshot, state: HiddenState, step: float
 ) -> HiddenState:
     """Advance a hidden state by one exponential Rosenbrock-Euler step (1).
 
@@ -33,24 +33,24 @@ def advance_state(
     Args:
         effect: effect with the hidden state.
         c: (K, L, 1) coefficients of the effect.
-        moment: state of the system, constant over the step.
+        snapshot: state of the system, constant over the step.
         state: hidden state at the beginning of the step, (L, 1).
         step: step length in seconds.
 
     Returns:
         The hidden state at the end of the step, (L, 1).
     """
-    _, rate = effect.act(c, moment, state)
-    _, nudged = effect.act(c, moment, HiddenState(state.x, state.v + STATE_STEP))
-    z = step * (nudged - rate) / STATE_STEP
-    near = np.abs(z) < 1e-6
-    phi = np.where(near, 1.0 + 0.5 * z, np.expm1(z) / np.where(near, 1.0, z))
+    _, rate = effect.act(c, snapshot, state)
+    _, perturbed_rate = effect.act(c, snapshot, HiddenState(state.x, state.v + STATE_STEP))
+    z = step * (perturbed_rate - rate) / STATE_STEP
+    is_small = np.abs(z) < 1e-6
+    phi = np.where(is_small, 1.0 + 0.5 * z, np.expm1(z) / np.where(is_small, 1.0, z))
     v = state.v + step * phi * rate  # (1)
     return HiddenState(state.x + 0.5 * step * (state.v + v), v)
 
 
 def integrate_state(
-    effect: HiddenStateEffect, c: Array, moment: RobotSnapshot, step: float
+    effect: HiddenStateEffect, c: Array, snapshots: RobotSnapshot, step: float
 ) -> HiddenState:
     """Integrate a hidden state along a known motion.
 
@@ -60,46 +60,50 @@ def integrate_state(
     Args:
         effect: effect at its place.
         c: (K, 1, 1) coefficients of the effect.
-        moment: system states at the middle of each of the S steps, stored as S batch elements.
+        snapshots: system states at the middle of each of the S steps, stored as S batch elements.
         step: step length in seconds.
 
     Returns:
         Hidden states (S + 1, 1): at the beginning of each step, and at the end of the motion.
     """
-    steps = len(moment.x)
-    state = effect.begin(c, moment.select_element(0))
-    own = np.repeat(c, steps, axis=1)
+    steps = len(snapshots.x)
+    state = effect.begin(c, snapshots.select_element(0))
+    coefficients = np.repeat(c, steps, axis=1)
     zero = np.zeros((steps, 1))
 
     def rate(w: float, x: float) -> Array:
-        return effect.act(own, moment, HiddenState(zero + x, zero + w))[1]
+        return effect.act(coefficients, snapshots, HiddenState(zero + x, zero + w))[1]
 
-    none, whole, half = rate(0.0, 0.0), rate(1.0, 0.0), rate(0.5, 1.0)
-    if np.allclose(half, 0.5 * (none + whole), rtol=1e-9, atol=0.0):
-        return _integrate_linear_state(state, step * none, step * (whole - none))
+    rate_at_zero, rate_at_one, rate_at_half = rate(0.0, 0.0), rate(1.0, 0.0), rate(0.5, 1.0)
+    if np.allclose(rate_at_half, 0.5 * (rate_at_zero + rate_at_one), rtol=1e-9, atol=0.0):
+        return _integrate_linear_state(
+            state, step * rate_at_zero, step * (rate_at_one - rate_at_zero)
+        )
     states = [state]
     for k in range(steps):
-        states.append(advance_state(effect, c, moment.select_element(k), states[-1], step))
+        states.append(advance_state(effect, c, snapshots.select_element(k), states[-1], step))
     return HiddenState(np.concatenate([s.x for s in states]), np.concatenate([s.v for s in states]))
 
 
-def _integrate_linear_state(state: HiddenState, grown: Array, z: Array) -> HiddenState:
+def _integrate_linear_state(state: HiddenState, change_at_zero: Array, z: Array) -> HiddenState:
     """Integrate a hidden state whose rate is linear in the state throughout the motion.
 
     Args:
         state: initial state, (1, 1).
-        grown: (S, 1) h r(0) of each step, with r and h as in (1).
+        change_at_zero: (S, 1) h r(0) of each step, with r and h as in (1).
         z: (S, 1) h dr/dw of each step.
 
     Returns:
         Hidden states (S + 1, 1).
     """
-    near = np.abs(z) < 1e-6
-    added = grown * np.where(near, 1.0 + 0.5 * z, np.expm1(z) / np.where(near, 1.0, z))
+    is_small = np.abs(z) < 1e-6
+    changes = change_at_zero * np.where(
+        is_small, 1.0 + 0.5 * z, np.expm1(z) / np.where(is_small, 1.0, z)
+    )
     w = float(state.v[0, 0])
-    gone = [w]
-    for kept, more in zip(np.exp(z[:, 0]).tolist(), added[:, 0].tolist(), strict=True):
-        w = kept * w + more
-        gone.append(w)
-    v = np.array(gone)[:, None]
+    values = [w]
+    for factor, change in zip(np.exp(z[:, 0]).tolist(), changes[:, 0].tolist(), strict=True):
+        w = factor * w + change
+        values.append(w)
+    v = np.array(values)[:, None]
     return HiddenState(np.zeros_like(v) + state.x, v)

@@ -16,7 +16,7 @@ import numpy as np
 from sims.core.effect import ActiveEffects, Effect, Force, Friction, HiddenState, HiddenStateEffect
 from sims.core.simulator import Array
 from sims.robot.dynamics.active_effects import is_evaluated_per_step, select_model_field_effects
-from sims.robot.dynamics.disabled_drives import ForceRanges, Mask, working_servos
+from sims.robot.dynamics.disabled_drives import ForceRanges, Mask, find_working_servos
 from sims.robot.dynamics.effect_forces import (
     LOAD_DEPENDENT_EFFECTS,
     compute_drive_effect_forces,
@@ -24,11 +24,10 @@ from sims.robot.dynamics.effect_forces import (
     make_snapshot,
 )
 from sims.robot.dynamics.hidden_state_integration import advance_state, integrate_state
-from sims.robot.dynamics.midpoint_state import Places
+from sims.robot.dynamics.midpoint_state import IndexArray
 from sims.robot.dynamics.mujoco_batch import JointAddresses, MujocoBatch
 from sims.robot.floating_joints import FloatingState
-from sims.robot.model_field_effects import FRICTION_SOLIMP, get_friction_solref
-from sims.robot.robot_model import RobotModel
+from sims.robot.friction_constraint import get_friction_constraint
 from sims.robot.robot_system import RobotSystem
 from sims.robot.state_snapshots import RobotSnapshot
 
@@ -83,7 +82,7 @@ class LinearisationPoints:
         motion: the motion.
         acting: effects active in it, with coefficients (K, 1, 1).
         outputs: fields of MuJoCo's data and their columns that are read, in addition to the state.
-        places: addresses of the joints.
+        joints: addresses of the joints.
         drives: for each output, the number of the joint whose drive force it is; -1 for other
             outputs.
         held: interval of the linearisation in seconds.
@@ -91,11 +90,12 @@ class LinearisationPoints:
     Attributes:
         motion: the given motion.
         acting: the given effects.
-        numbers: (N,) steps that begin at the points.
-        of: (S,) index of the point that applies to each step.
-        every: number of steps between two points while no command changes.
-        seen: number of batch elements that have been placed so far.
-        remembering: numbers of the effects with hidden states, in the order of their state columns.
+        point_steps: (N,) steps that begin at the points.
+        point_of_step: (S,) index of the point that applies to each step.
+        point_spacing: number of steps between two points while no command changes.
+        placed_count: number of batch elements that have been placed so far.
+        hidden_state_effects: numbers of the effects with hidden states, in the order of their
+            state columns.
     """
 
     def __init__(
@@ -105,40 +105,44 @@ class LinearisationPoints:
         motion: RobotMotion,
         acting: ActiveEffects,
         outputs: Sequence[tuple[str, int]],
-        places: JointAddresses,
+        joints: JointAddresses,
         drives: Sequence[int] = (),
         held: float = LINEARISATION_INTERVAL_SECONDS,
     ) -> None:
         """Choose the points of the motion, and prepare the batch (fields, effects, state).
 
         Also integrate the hidden states of the effects along the motion, since each point
-        needs them.
+        needs them. `self._stepwise_effects` are the effects whose forces are evaluated here,
+        because no model field represents them, and `self._drive_effect_forces` (n, D) are the
+        forces that they exert in drives.
         """
         self.motion, self.acting = motion, acting
         self._mujoco_batch, self._system = mujoco_batch, system
         self._outputs = tuple(outputs)
-        self._places = places
+        self._joints = joints
         self._drives = np.array(tuple(drives) or (-1,) * len(self._outputs), dtype=np.intp)
-        self._exerted = np.zeros((0, 0))
+        self._drive_effect_forces = np.zeros((0, 0))
         self._floating = mujoco_batch.floating
-        self._dofs = np.append(places.velocities, self._floating.velocities)
-        self.every = max(round(held / motion.step), 1)
-        self.numbers, self.of = _looked_at(motion, self.every)
+        self._dofs = np.append(joints.velocities, self._floating.velocities)
+        self.point_spacing = max(round(held / motion.step), 1)
+        self.point_steps, self.point_of_step = _choose_points(motion, self.point_spacing)
         # Fields must be bound before MuJoCo's first call, since later ones are not updated before
         # the next call.
         self._bind_fields(mujoco_batch)
-        self.seen = 0
-        self._asked = [(e, c) for e, c in acting if is_evaluated_per_step(e)]
+        self.placed_count = 0
+        self._stepwise_effects = [(e, c) for e, c in acting if is_evaluated_per_step(e)]
         mujoco_batch.write_effects(_repeat_coefficients(acting, mujoco_batch.count))
-        self._stiffness = mujoco_batch.get_servo_stiffness(places)[:1]
-        self._working = working_servos(mujoco_batch.robot, places.velocities, motion.off)
-        self._states = [self.integrate_hidden_state(effect, c) for effect, c in self._asked]
-        self.remembering = [
-            k for k, (e, _) in enumerate(self._asked) if isinstance(e, HiddenStateEffect)
+        self._stiffness = mujoco_batch.get_servo_stiffness(joints)[:1]
+        self._is_servo_on = find_working_servos(mujoco_batch.robot, joints.velocities, motion.off)
+        self._hidden_states = [
+            self.integrate_hidden_state(effect, c) for effect, c in self._stepwise_effects
         ]
-        self._after: dict[int, HiddenState] = {}
+        self.hidden_state_effects = [
+            k for k, (e, _) in enumerate(self._stepwise_effects) if isinstance(e, HiddenStateEffect)
+        ]
+        self._next_hidden_states: dict[int, HiddenState] = {}
         mujoco_batch.batch.reset(stage=0)
-        self._fresh = mujoco_batch.batch.state.copy()
+        self._reset_state = mujoco_batch.batch.state.copy()
 
     def _bind_fields(self, mujoco_batch: MujocoBatch) -> None:
         """Bind the fields of MuJoCo's data that are read, before MuJoCo's first call."""
@@ -167,19 +171,19 @@ class LinearisationPoints:
             steps: number of steps, for a batch with shorter ones.
         """
         states, readings = [], []
-        bind, places, floating = self._mujoco_batch.batch.bind, self._places, self._floating
-        begin = 0
+        bind, joints, floating = self._mujoco_batch.batch.bind, self._joints, self._floating
+        begin = 0  # number of points in earlier batches
         for n, ids in self._place_points(moved, acting):
             for _ in range(steps):
                 self._mujoco_batch.batch.step(ids)
-            parts = [bind("qpos")[:n, places.positions], bind("qvel")[:n, places.velocities]]
+            parts = [bind("qpos")[:n, joints.positions], bind("qvel")[:n, joints.velocities]]
             if self.motion.act.shape[1]:
                 parts.append(bind("act")[:n])
-            parts += [state.v for state in self._after.values()]
+            parts += [state.v for state in self._next_hidden_states.values()]
             if floating:
-                reached = self.motion.afloat.pose[self.numbers[begin : begin + n] + 1]
+                unperturbed = self.motion.afloat.pose[self.point_steps[begin : begin + n] + 1]
                 parts.append(
-                    floating.compute_displacement(bind("qpos")[:n, floating.positions], reached)
+                    floating.compute_displacement(bind("qpos")[:n, floating.positions], unperturbed)
                 )
                 parts.append(bind("qvel")[:n, floating.velocities])
             begin += n
@@ -188,7 +192,7 @@ class LinearisationPoints:
         return np.concatenate(states), np.concatenate(readings)
 
     def compute_accelerations(
-        self, acting: ActiveEffects, more: Array | None = None
+        self, acting: ActiveEffects, extra_forces: Array | None = None
     ) -> tuple[Array, Array]:
         """Compute accelerations (N, E) and readings (N, O) at each point.
 
@@ -197,14 +201,14 @@ class LinearisationPoints:
 
         Args:
             acting: effects whose elements are in the model.
-            more: (N, E) additional forces; none by default.
+            extra_forces: (N, E) additional forces; none by default.
         """
         accelerations, readings = [], []
         applied = self._mujoco_batch.batch.bind("qfrc_applied")
         dofs, begin = self._dofs, 0
         for n, ids in self._place_points({}, acting):
-            if more is not None:
-                applied[:n, dofs] += more[begin : begin + n]
+            if extra_forces is not None:
+                applied[:n, dofs] += extra_forces[begin : begin + n]
                 begin += n
             self._mujoco_batch.batch.forward(ids)
             accelerations.append(self._mujoco_batch.batch.bind("qacc")[:n, dofs].copy())
@@ -217,18 +221,18 @@ class LinearisationPoints:
         To readings of drive forces, the forces that effects exert in the drive are added.
         """
         bind = self._mujoco_batch.batch.bind
-        rows = [bind(name)[:n, column, None] for name, column in self._outputs]
-        if not rows:
+        columns = [bind(name)[:n, column, None] for name, column in self._outputs]
+        if not columns:
             return np.zeros((n, 0))
-        read = np.concatenate(rows, axis=1)
-        if self._exerted.size:
-            of = self._drives
-            read[:, of >= 0] += self._exerted[:, of[of >= 0]]
-        return read
+        readings = np.concatenate(columns, axis=1)
+        if self._drive_effect_forces.size:
+            is_drive = self._drives >= 0
+            readings[:, is_drive] += self._drive_effect_forces[:, self._drives[is_drive]]
+        return readings
 
     def _place_points(
         self, moved: Mapping[str, tuple[int, float]], acting: ActiveEffects
-    ) -> Iterator[tuple[int, Places | None]]:
+    ) -> Iterator[tuple[int, IndexArray | None]]:
         """Place the points in the elements of the batch, as many at a time as it has elements.
 
         Args:
@@ -240,103 +244,111 @@ class LinearisationPoints:
         Yields:
             Number n of elements in use, and their indices (None if all are in use).
         """
-        motion, places, floating = self.motion, self._places, self._floating
+        motion, joints, floating = self.motion, self._joints, self._floating
         count = self._mujoco_batch.count
-        self.seen += self.numbers.size
+        self.placed_count += self.point_steps.size
         self._mujoco_batch.write_effects(_repeat_coefficients(acting, count))
         batch = self._mujoco_batch.batch
         bind = batch.bind
         qpos, qvel, ctrl = bind("qpos"), bind("qvel"), bind("ctrl")
         applied = bind("qfrc_applied")
         na = motion.act.shape[1]
-        targets = {
-            "q": lambda k: qpos[:, places.positions[k]],
-            "v": lambda k: qvel[:, places.velocities[k]],
+        columns = {
+            "q": lambda k: qpos[:, joints.positions[k]],
+            "v": lambda k: qvel[:, joints.velocities[k]],
             "f": lambda k: applied[:, self._dofs[k]],
             "u": lambda k: ctrl[:, k],
             "a": lambda k: bind("act")[:, k],
             "r": lambda k: qvel[:, floating.velocities[k]],
         }
         ranges: ForceRanges | None = None
-        if motion.off[self.numbers].any():
+        if motion.off[self.point_steps].any():
             ranges = self._mujoco_batch.force_ranges()
-        for begin in range(0, self.numbers.size, count):
-            at = self.numbers[begin : begin + count]
-            n = at.size
+        for begin in range(0, self.point_steps.size, count):
+            steps = self.point_steps[begin : begin + count]
+            n = steps.size
             if ranges is not None:
-                ranges.write(motion.off[at])
-            batch.state[:] = self._fresh
-            qpos[:n, places.positions] = motion.x[at]
-            qvel[:n, places.velocities] = motion.v[at]
-            qpos[:n, floating.positions] = motion.afloat.pose[at]
-            qvel[:n, floating.velocities] = motion.afloat.rate[at]
-            ctrl[:n] = motion.controls[at]
-            applied[:n] = motion.forces[at]
+                ranges.write(motion.off[steps])
+            batch.state[:] = self._reset_state
+            qpos[:n, joints.positions] = motion.x[steps]
+            qvel[:n, joints.velocities] = motion.v[steps]
+            qpos[:n, floating.positions] = motion.afloat.pose[steps]
+            qvel[:n, floating.velocities] = motion.afloat.rate[steps]
+            ctrl[:n] = motion.controls[steps]
+            applied[:n] = motion.forces[steps]
             if na:
-                bind("act")[:n] = motion.act[at]
+                bind("act")[:n] = motion.act[steps]
             for name, (k, size) in moved.items():
                 if name == "p":
-                    poses = floating.displace(motion.afloat.pose[at], k, size)
+                    poses = floating.displace(motion.afloat.pose[steps], k, size)
                     qpos[:n, floating.positions] = poses
                 elif name != "w":
-                    targets[name](k)[:n] += size
-            self._add_effect_forces(at, n, dict([moved["w"]]) if "w" in moved else {})
+                    columns[name](k)[:n] += size
+            self._add_effect_forces(steps, n, dict([moved["w"]]) if "w" in moved else {})
             yield n, None if n == count else np.arange(n)
 
-    def _add_effect_forces(self, at: Places, n: int, remembered: Mapping[int, float]) -> None:
+    def _add_effect_forces(
+        self, steps: IndexArray, n: int, state_changes: Mapping[int, float]
+    ) -> None:
         """Add state-dependent effect forces at the states of the batch elements.
 
         Args:
-            at: steps of the points.
+            steps: steps of the points.
             n: number of batch elements in use.
-            remembered: perturbations of hidden states, by number of the effect.
+            state_changes: perturbations of hidden states, by number of the effect.
         """
-        if not self._asked:
+        if not self._stepwise_effects:
             return
-        bind, places = self._mujoco_batch.batch.bind, self._places
+        bind, joints = self._mujoco_batch.batch.bind, self._joints
         motion = self.motion
-        x = bind("qpos")[:n, places.positions]
-        v = bind("qvel")[:n, places.velocities]
-        inputs = {name: u[at][:, None] for name, u in motion.inputs.items()}
-        t: Array = motion.step * at[:, None].astype(np.float64)
-        carried = motion.carried[:, at]
-        if any(effect.of in LOAD_DEPENDENT_EFFECTS for effect, _ in self._asked):
+        x = bind("qpos")[:n, joints.positions]
+        v = bind("qvel")[:n, joints.velocities]
+        inputs = {name: u[steps][:, None] for name, u in motion.inputs.items()}
+        t: Array = motion.step * steps[:, None].astype(np.float64)
+        carried = motion.carried[:, steps]
+        if any(effect.of in LOAD_DEPENDENT_EFFECTS for effect, _ in self._stepwise_effects):
             # As in the simulation, a servo's force must follow the perturbed state.
             self._mujoco_batch.batch.forward(
                 None if n == self._mujoco_batch.count else np.arange(n)
             )
             carried = np.stack(
-                [bind(name)[:n, places.velocities] for name in TRANSMISSION_FORCE_FIELDS]
+                [bind(name)[:n, joints.velocities] for name in TRANSMISSION_FORCE_FIELDS]
             )
-        moment = make_snapshot(self._system, t, x, v, inputs, carried, self.get_servo_stiffness(at))
-        self._exerted = np.zeros_like(x)
+        snapshot = make_snapshot(
+            self._system, t, x, v, inputs, carried, self.get_servo_stiffness(steps)
+        )
+        self._drive_effect_forces = np.zeros_like(x)
         limits: dict[int, Array] = {}
-        for k, (effect, c) in enumerate(self._asked):
-            own = np.repeat(c, n, axis=1)
+        for k, (effect, c) in enumerate(self._stepwise_effects):
+            coefficients = np.repeat(c, n, axis=1)
             if isinstance(effect, HiddenStateEffect):
-                known = self._states[k]
-                state = HiddenState(known.x[at], known.v[at] + remembered.get(k, 0.0))
-                ahead = advance_state(effect, own, moment, state, 0.5 * motion.step)
-                self._after[k] = advance_state(effect, own, moment, state, motion.step)
-                force, _ = effect.act(own, moment, ahead)
-                bind("qfrc_applied")[:n, places.velocities] += force
+                hidden = self._hidden_states[k]
+                state = HiddenState(hidden.x[steps], hidden.v[steps] + state_changes.get(k, 0.0))
+                midpoint_state = advance_state(
+                    effect, coefficients, snapshot, state, 0.5 * motion.step
+                )
+                self._next_hidden_states[k] = advance_state(
+                    effect, coefficients, snapshot, state, motion.step
+                )
+                force, _ = effect.act(coefficients, snapshot, midpoint_state)
+                bind("qfrc_applied")[:n, joints.velocities] += force
             elif isinstance(effect, Friction):
                 assert effect.coordinate is not None
-                limit = effect.limit(own, moment)[:, 0]
+                limit = effect.limit(coefficients, snapshot)[:, 0]
                 limits[effect.coordinate] = limits.get(effect.coordinate, 0.0) + limit
             elif isinstance(effect, Force):
-                force = effect.force(own, moment)
-                bind("qfrc_applied")[:n, places.velocities] += force
+                force = effect.force(coefficients, snapshot)
+                bind("qfrc_applied")[:n, joints.velocities] += force
                 if is_in_drive(effect):
-                    self._exerted += force
+                    self._drive_effect_forces += force
         for joint, limit in limits.items():
             self._mujoco_batch.set_dry_friction(
-                n, int(places.velocities[joint]), np.maximum(limit, 0.0)
+                n, int(joints.velocities[joint]), np.maximum(limit, 0.0)
             )
 
-    def get_servo_stiffness(self, at: Places) -> Array:
-        """Return the stiffness (n, D) of the position servos, in some steps."""
-        stiffness: Array = self._stiffness * self._working[at]
+    def get_servo_stiffness(self, steps: IndexArray) -> Array:
+        """Return the stiffness (n, D) of the position servos in the given n steps."""
+        stiffness: Array = self._stiffness * self._is_servo_on[steps]
         return stiffness
 
     @contextmanager
@@ -345,25 +357,25 @@ class LinearisationPoints:
 
         Its coordinates must be the same as those of the own batch.
         """
-        own = self._mujoco_batch, self._fresh
+        previous = self._mujoco_batch, self._reset_state
         if mujoco_batch is not self._mujoco_batch:
             self._bind_fields(mujoco_batch)
             mujoco_batch.batch.reset(stage=0)
-            self._mujoco_batch, self._fresh = mujoco_batch, mujoco_batch.batch.state.copy()
+            self._mujoco_batch, self._reset_state = mujoco_batch, mujoco_batch.batch.state.copy()
         try:
             yield
         finally:
-            self._mujoco_batch, self._fresh = own
+            self._mujoco_batch, self._reset_state = previous
 
     @contextmanager
     def every_step(self) -> Iterator[None]:
         """Evaluate every step, instead of the linearisation points only."""
-        own = self.numbers
-        self.numbers = np.arange(len(self.motion.controls))
+        previous = self.point_steps
+        self.point_steps = np.arange(len(self.motion.controls))
         try:
             yield
         finally:
-            self.numbers = own
+            self.point_steps = previous
 
     @contextmanager
     def limited_forces(self) -> Iterator[None]:
@@ -372,14 +384,14 @@ class LinearisationPoints:
         They show at which points a force limit is reached, where the linear model is not
         valid.
         """
-        own = self._outputs, self._drives
+        previous = self._outputs, self._drives
         self._outputs = self._mujoco_batch.force_limits.outputs
         self._drives = np.full(len(self._outputs), -1)
         self._bind_fields(self._mujoco_batch)
         try:
             yield
         finally:
-            self._outputs, self._drives = own
+            self._outputs, self._drives = previous
 
     def compute_mass_matrices(self) -> Array:
         """Compute the inertia matrix (N, E, E) at each point, by MuJoCo's composite-body algorithm.
@@ -393,21 +405,21 @@ class LinearisationPoints:
         )
         model = self._mujoco_batch.batch.get_model(0)
         data = mujoco.MjData(model)
-        places = self._places
-        whole = np.zeros((model.nv, model.nv))
-        found = []
-        poses = self.motion.afloat.pose[self.numbers]
-        for x, pose in zip(self.motion.x[self.numbers], poses, strict=True):
-            data.qpos[places.positions] = x
+        joints = self._joints
+        full_matrix = np.zeros((model.nv, model.nv))
+        matrices = []
+        poses = self.motion.afloat.pose[self.point_steps]
+        for x, pose in zip(self.motion.x[self.point_steps], poses, strict=True):
+            data.qpos[joints.positions] = x
             data.qpos[self._floating.positions] = pose
             mujoco.mj_kinematics(model, data)
             mujoco.mj_comPos(model, data)
             mujoco.mj_crb(model, data)
-            mujoco.mj_fullM(model, data, whole)
-            found.append(whole[np.ix_(self._dofs, self._dofs)])
-        return np.array(found)
+            mujoco.mj_fullM(model, data, full_matrix)
+            matrices.append(full_matrix[np.ix_(self._dofs, self._dofs)])
+        return np.array(matrices)
 
-    def compute_drive_reading_changes(self, effect: Effect, c: Array, read: Array) -> Array:
+    def compute_drive_reading_changes(self, effect: Effect, c: Array, readings: Array) -> Array:
         """Compute the changes of drive readings (N, O) by an effect in a drive.
 
         Such an effect is a force at an actuator, for example that of a supply that sags. A sensor
@@ -416,19 +428,20 @@ class LinearisationPoints:
         Args:
             effect: effect in a drive.
             c: coefficients (K, 1, 1).
-            read: (N, O) readings without the effect.
+            readings: (N, O) readings without the effect.
         """
-        motion, at, of = self.motion, self.numbers, self._drives
+        motion, steps, joint_of_output = self.motion, self.point_steps, self._drives
+        is_drive = joint_of_output >= 0
         # Drive forces that are read are known at the beginning of the step, so they replace the
         # midpoint forces.
-        carried = motion.carried[:, at].copy()
-        carried[0][:, of[of >= 0]] = read[:, of >= 0]
-        inputs = {name: u[at, None] for name, u in motion.inputs.items()}
-        t: Array = motion.step * at[:, None].astype(np.float64)
-        x, v, stiff = motion.x[at], motion.v[at], self.get_servo_stiffness(at)
-        moment = make_snapshot(self._system, t, x, v, inputs, carried, stiff)
-        force = compute_drive_effect_forces(((effect, np.repeat(c, at.size, axis=1)),), moment)
-        result: Array = np.where(of >= 0, force[:, of], 0.0)
+        carried = motion.carried[:, steps].copy()
+        carried[0][:, joint_of_output[is_drive]] = readings[:, is_drive]
+        inputs = {name: u[steps, None] for name, u in motion.inputs.items()}
+        t: Array = motion.step * steps[:, None].astype(np.float64)
+        x, v, stiff = motion.x[steps], motion.v[steps], self.get_servo_stiffness(steps)
+        snapshot = make_snapshot(self._system, t, x, v, inputs, carried, stiff)
+        force = compute_drive_effect_forces(((effect, np.repeat(c, steps.size, axis=1)),), snapshot)
+        result: Array = np.where(is_drive, force[:, joint_of_output], 0.0)
         return result
 
     def compute_effect_force(self, effect: Effect, c: Array) -> Array:
@@ -441,21 +454,21 @@ class LinearisationPoints:
             effect: effect with a force, a friction or a hidden state.
             c: coefficients (K, 1, 1).
         """
-        own = np.repeat(c, len(self.motion.controls), axis=1)
+        coefficients = np.repeat(c, len(self.motion.controls), axis=1)
         if isinstance(effect, HiddenStateEffect):
             state = self.integrate_hidden_state(effect, c)
-            ahead = HiddenState(*(0.5 * (u[1:] + u[:-1]) for u in (state.x, state.v)))
-            return effect.act(own, self.snapshot, ahead)[0]
+            midpoint_state = HiddenState(*(0.5 * (u[1:] + u[:-1]) for u in (state.x, state.v)))
+            return effect.act(coefficients, self.snapshot, midpoint_state)[0]
         if isinstance(effect, Force):
-            return effect.force(own, self.snapshot)
+            return effect.force(coefficients, self.snapshot)
         assert isinstance(effect, Friction)
         assert effect.coordinate is not None
-        limit = effect.limit(own, self.snapshot)[:, 0]
+        limit = effect.limit(coefficients, self.snapshot)[:, 0]
         result = np.zeros_like(self.snapshot.x)
-        result[:, effect.coordinate] = self._friction_force(effect.coordinate, limit)
+        result[:, effect.coordinate] = self._compute_dry_friction(effect.coordinate, limit)
         return result
 
-    def _friction_force(self, joint: int, limit: Array) -> Array:
+    def _compute_dry_friction(self, joint: int, limit: Array) -> Array:
         """Return the force that dry friction of at most `limit` (S,) adds in each step, (S,).
 
         It is that of MuJoCo's constraint for friction loss
@@ -471,9 +484,9 @@ class LinearisationPoints:
         step in the stiff form.
         """
         motion, robot = self.motion, self._mujoco_batch.robot
-        dof, steps = int(self._places.velocities[joint]), len(motion.controls)
+        dof, steps = int(self._joints.velocities[joint]), len(motion.controls)
         a = np.diff(motion.v[:, joint])[:steps] / motion.step
-        b, d = friction_damping(robot, dof)
+        b, d = get_friction_constraint(robot, dof)
         load = d * (a + b * motion.v[:steps, joint]) / float(robot.compiled.dof_invweight0[dof])
         force: Array = -np.clip(load, -limit, limit)
         return force
@@ -497,45 +510,14 @@ class LinearisationPoints:
         return make_snapshot(self._system, t[:, None], x, v, inputs, motion.carried, stiffness)
 
 
-def friction_damping(robot: RobotModel, dof: int) -> tuple[float, float]:
-    """Return damping b (1/s) and impedance d of MuJoCo's constraint for friction loss.
-
-    They are those of the form in which effects add friction to the robot
-    (`LinearisationPoints._friction_force`).
-
-    Args:
-        robot: robot with the time step and the integrator in use.
-        dof: index of the joint's velocity.
-    """
-    import mujoco
-
-    model = robot.compiled
-    solref, solimp = model.dof_solref[dof], model.dof_solimp[dof]
-    if robot.friction_form == "stiff":
-        solref, solimp = (
-            get_friction_solref(float(model.opt.timestep), int(model.opt.integrator)),
-            FRICTION_SOLIMP,
-        )
-    timeconst, ratio = (float(value) for value in solref)
-    limits = np.clip(solimp[:2], mujoco.mjMINIMP, mujoco.mjMAXIMP)
-    (at_rest, largest), width = limits.tolist(), float(solimp[2])
-    # Friction has no constraint violation. For a constant impedance, MuJoCo takes the mean.
-    d = at_rest if width > mujoco.mjMINVAL else 0.5 * (at_rest + largest)
-    if timeconst <= 0:
-        return -ratio / largest, d
-    if not model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_REFSAFE):
-        timeconst = max(timeconst, 2.0 * float(model.opt.timestep))
-    return 2.0 / (largest * timeconst), d
-
-
-def _looked_at(motion: RobotMotion, every: int) -> tuple[Places, Places]:
-    """Choose the steps at which the model is linearised, one after every `every` steps.
+def _choose_points(motion: RobotMotion, spacing: int) -> tuple[IndexArray, IndexArray]:
+    """Choose the steps at which the model is linearised, one after every `spacing` steps.
 
     The count begins again where a piecewise constant command jumps or an actuator is switched.
 
     Args:
         motion: the motion.
-        every: regular number of steps between two points.
+        spacing: regular number of steps between two points.
 
     Returns:
         Steps of the points (N,), and for each step the index of the point that applies (S,).
@@ -545,13 +527,13 @@ def _looked_at(motion: RobotMotion, every: int) -> tuple[Places, Places]:
     changes[1:] = (np.diff(motion.controls, axis=0) != 0).any(axis=1)
     # A new point begins when a piecewise constant command changes. A command that changes in almost
     # every step is as smooth as the motion and needs no extra points.
-    if changes.mean() > 1.0 / every:
+    if changes.mean() > 1.0 / spacing:
         changes[1:] = False
     changes[1:] |= (motion.off[1:] != motion.off[:-1]).any(axis=1)
     numbers = np.arange(steps)
-    begins = np.maximum.accumulate(np.where(changes, numbers, 0))
-    looked = (numbers - begins) % every == 0
-    return np.flatnonzero(looked), np.cumsum(looked) - 1
+    last_change = np.maximum.accumulate(np.where(changes, numbers, 0))
+    is_point = (numbers - last_change) % spacing == 0
+    return np.flatnonzero(is_point), np.cumsum(is_point) - 1
 
 
 def _repeat_coefficients(acting: ActiveEffects, count: int) -> ActiveEffects:

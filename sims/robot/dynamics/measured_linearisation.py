@@ -39,7 +39,7 @@ from sims.robot.dynamics.linearisation_points import (
     LinearisationPoints,
     RobotMotion,
 )
-from sims.robot.dynamics.midpoint_state import Places, forces_are_at_step_end
+from sims.robot.dynamics.midpoint_state import IndexArray, forces_are_at_step_end
 from sims.robot.dynamics.run_linearisation import (
     EffectWithCoefficients,
     RunLinearisation,
@@ -136,23 +136,25 @@ class MeasuredLinear(RunLinearisation):
         `LINEARISATION_INTERVAL_SECONDS` or more than `LONGEST_HELD`. `knots` (T,) are the
         numbers of the steps at the samples.
         """
-        self._given, self._measured, self._nearby = trajectory, measured or {}, nearby
+        self._trajectory, self._measured, self._nearby = trajectory, measured or {}, nearby
         if nearby is not None and is_alike:
             self.quotients = nearby._tangent.quotients
         spacing = float(np.median(np.diff(scenario.times))) if scenario.times.size > 1 else 0.0
         self.held = float(np.clip(spacing, LINEARISATION_INTERVAL_SECONDS, LONGEST_HELD))
         super().__init__(simulator, theta, scenario, *start)
-        if self._names:
+        if self._sensor_channels:
             # The readings belong to the given motion, not to the simulated one.
             with np.errstate(all="ignore"), capture_mujoco_warnings():
                 read = self._tangent.motion_readings
-            self._readings = {name: read[:, i] for i, name in enumerate(self._names)}
-        nothing = np.zeros((1, *self._motion.x.shape[:1], self._tangent.state_size))
-        unread = np.zeros((1, self._motion.x.shape[0], len(self._names)))
+            self._readings = {name: read[:, i] for i, name in enumerate(self._sensor_channels)}
+        unchanged_states = np.zeros((1, *self._motion.x.shape[:1], self._tangent.state_size))
+        unchanged_readings = np.zeros((1, self._motion.x.shape[0], len(self._sensor_channels)))
         with np.errstate(all="ignore"), capture_mujoco_warnings():
-            self.observed = self._compute_observations(nothing, unread, [()])[0]
+            self.observed = self._compute_observations(unchanged_states, unchanged_readings, [()])[
+                0
+            ]
         knots = np.rint(self._times / self._simulator.time_step).astype(np.intp)
-        self.knots: Places = np.clip(knots, 0, self._steps)
+        self.knots: IndexArray = np.clip(knots, 0, self._steps)
 
     @property
     def step(self) -> float:
@@ -176,24 +178,26 @@ class MeasuredLinear(RunLinearisation):
         motion of `nearby`.
         """
         motion = self._get_nearby_motion() or super()._simulate_nominal_motion()
-        given = self._given or self._from_samples(motion)
+        trajectory = self._trajectory or self._interpolate_samples(motion)
         # Joints in series are not measured, so they keep the simulated motion.
-        own = given.x.shape[1]
+        joints = trajectory.x.shape[1]
         x, v = motion.x.copy(), motion.v.copy()
-        x[:, :own], v[:, :own] = given.x, given.v
-        return self._with_loads(replace(motion, x=x, v=v, afloat=given.afloat))
+        x[:, :joints], v[:, :joints] = trajectory.x, trajectory.v
+        return self._add_transmission_loads(replace(motion, x=x, v=v, afloat=trajectory.afloat))
 
     def _get_nearby_motion(self) -> RobotMotion | None:
         """Return the motion of `nearby` with the commands of this model, which saves a simulation.
 
         The result is None if there is no such motion, or if more than the given joints moves.
         """
-        if self._nearby is None or self._given is None:
+        if self._nearby is None or self._trajectory is None:
             return None
         motion, steps = self._nearby._motion, self._steps + 1
         joints = len(self._simulator.addresses.positions)
-        alone = motion.x.shape[1] == joints and not motion.act.size and not motion.afloat.pose.size
-        if not alone or any(is_series_effect(effect) for effect, _ in self._work.acting):
+        only_file_joints = (
+            motion.x.shape[1] == joints and not motion.act.size and not motion.afloat.pose.size
+        )
+        if not only_file_joints or any(is_series_effect(effect) for effect, _ in self._work.acting):
             return None
         self._readings = dict(self._nearby._readings)
         return replace(
@@ -201,17 +205,17 @@ class MeasuredLinear(RunLinearisation):
             **self._compute_command_fields(self._simulator.compute_controls(self._work, steps)),
         )
 
-    def _from_samples(self, motion: RobotMotion) -> Trajectory:
+    def _interpolate_samples(self, motion: RobotMotion) -> Trajectory:
         """Interpolate the measured joints between samples by quintic Hermite polynomials."""
         # Joints that are not recorded may diverge in the simulation.
         x, v = (np.clip(np.nan_to_num(u), -FARTHEST, FARTHEST) for u in (motion.x, motion.v))
         steps: Array = self._simulator.time_step * np.arange(float(len(x)))
         for joint, samples in self._measured.items():
-            x[:, joint], v[:, joint] = quintic(self._times, samples, steps)
-        own = len(self._simulator.addresses.positions)
-        return Trajectory(x[:, :own], v[:, :own], motion.afloat)
+            x[:, joint], v[:, joint] = interpolate_quintic(self._times, samples, steps)
+        joints = len(self._simulator.addresses.positions)
+        return Trajectory(x[:, :joints], v[:, :joints], motion.afloat)
 
-    def _with_loads(self, motion: RobotMotion) -> RobotMotion:
+    def _add_transmission_loads(self, motion: RobotMotion) -> RobotMotion:
         """Return the motion with the loads of the transmissions, if any effect depends on them."""
         effects = [m for effect in self._simulator.effects for m in members_of(effect)]
         if not any((e.of or e.name) in LOAD_DEPENDENT_EFFECTS for e in effects):
@@ -221,15 +225,17 @@ class MeasuredLinear(RunLinearisation):
         outputs = [
             (name, int(c))
             for name in TRANSMISSION_FORCE_FIELDS
-            for c in mujoco_batch.whole.velocities
+            for c in mujoco_batch.all_joints.velocities
         ]
         acting = self._work.acting
-        at = LinearisationPoints(
-            mujoco_batch, simulator.robotic, motion, acting, outputs, mujoco_batch.whole
+        points = LinearisationPoints(
+            mujoco_batch, simulator.robotic, motion, acting, outputs, mujoco_batch.all_joints
         )
-        _, loads = at.compute_accelerations(acting)
-        size = motion.x.shape[1]
-        carried = np.stack([loads[at.of, :size], loads[at.of, size:]])
+        _, loads = points.compute_accelerations(acting)
+        joints = motion.x.shape[1]
+        carried = np.stack(
+            [loads[points.point_of_step, :joints], loads[points.point_of_step, joints:]]
+        )
         return replace(motion, carried=carried)
 
     # -- the model from sample to sample
@@ -240,32 +246,38 @@ class MeasuredLinear(RunLinearisation):
         The maps give the deviation at the next sample from that at a sample, which a Kalman
         smoother needs. The defect of each step is composed in the same way.
         """
-        tangent, size = self._tangent, self._tangent.state_size
+        tangent, state_size = self._tangent, self._tangent.state_size
         forces = tangent.quotients.forces.shape[2]
         intervals = self.knots.size - 1
         with np.errstate(all="ignore"), capture_mujoco_warnings():
             defects = self._tangent.defects
-        states = np.tile(np.eye(size), (intervals, 1, 1))
-        defect = np.zeros((intervals, size))
-        force = np.zeros((intervals, size, forces))
-        missed = np.zeros((intervals, size))
-        errors = self._step_errors()
-        of, quotients = tangent.looked_at, tangent.quotients
+        states = np.tile(np.eye(state_size), (intervals, 1, 1))
+        defect = np.zeros((intervals, state_size))
+        force = np.zeros((intervals, state_size, forces))
+        step_errors = np.zeros((intervals, state_size))
+        point_errors = self._estimate_step_errors()
+        points, quotients = tangent.point_of_step, tangent.quotients
         for steps, active in self._list_active_intervals():
-            a = quotients.states[of[steps]]
+            a = quotients.states[points[steps]]
             states[active] = a @ states[active]
             defect[active] = np.einsum("izy,iy->iz", a, defect[active]) + defects[steps]
-            force[active] = a @ force[active] + quotients.forces[of[steps]]
-            missed[active] = np.einsum("izy,iy->iz", a, missed[active]) + errors[of[steps]]
+            force[active] = a @ force[active] + quotients.forces[points[steps]]
+            step_errors[active] = (
+                np.einsum("izy,iy->iz", a, step_errors[active]) + point_errors[points[steps]]
+            )
         count = self._motion.x.shape[0]
-        moved = np.broadcast_to(SMALL * np.eye(size)[:, None, :], (size, count, size))
-        read = np.zeros((size, count, len(self._names)))
-        if self._names:
-            rows = of[np.minimum(np.arange(count), of.size - 1)]
-            read = SMALL * np.moveaxis(quotients.read_states[rows], 2, 0)
+        unit_changes = np.broadcast_to(
+            SMALL * np.eye(state_size)[:, None, :], (state_size, count, state_size)
+        )
+        reading_changes = np.zeros((state_size, count, len(self._sensor_channels)))
+        if self._sensor_channels:
+            rows = points[np.minimum(np.arange(count), points.size - 1)]
+            reading_changes = SMALL * np.moveaxis(quotients.read_states[rows], 2, 0)
         with np.errstate(all="ignore"), capture_mujoco_warnings():
-            seen = self._compute_observations(moved, read, [()] * size)
-        readings = np.moveaxis((seen - self.observed) / SMALL, 0, 2)
+            observations = self._compute_observations(
+                unit_changes, reading_changes, [()] * state_size
+            )
+        readings = np.moveaxis((observations - self.observed) / SMALL, 0, 2)
         return IntervalMaps(
             states,
             defect,
@@ -273,7 +285,7 @@ class MeasuredLinear(RunLinearisation):
             self._input_responses,
             readings,
             self.observed,
-            missed,
+            step_errors,
             self._compute_limit_jumps(),
         )
 
@@ -286,24 +298,24 @@ class MeasuredLinear(RunLinearisation):
             return result
         with np.errstate(all="ignore"), capture_mujoco_warnings():
             reached = np.abs(self._tangent.limited_forces) >= limits.sizes
-        own = limits.jumps[:, mujoco_batch.places.velocities]
+        jumps = limits.jumps[:, mujoco_batch.file_joints.velocities]
         for steps, active in self._list_active_intervals():
-            result[active, : own.shape[1]] += reached[steps] @ own
+            result[active, : jumps.shape[1]] += reached[steps] @ jumps
         # A position servo returns from a jump of position within the interval or later.
         lengths = np.maximum(np.diff(self.knots), 1)[:, None] * self._simulator.time_step
-        moved = self.positions
-        result[:, moved : 2 * moved] = result[:, :moved] / lengths
+        position_count = self.positions
+        result[:, position_count : 2 * position_count] = result[:, :position_count] / lengths
         return result
 
-    def _step_errors(self) -> Array:
+    def _estimate_step_errors(self) -> Array:
         """Return the discretisation errors (N, Z); zero for the fourth-order Runge-Kutta."""
         simulator, tangent = self._simulator, self._tangent
         if forces_are_at_step_end(simulator.make_linearisation_batch(self._work.acting).model):
-            return np.zeros((tangent.looks_at, tangent.state_size))
+            return np.zeros((tangent.point_count, tangent.state_size))
         with np.errstate(all="ignore"), capture_mujoco_warnings():
             return tangent.step_errors(simulator.half_steps(self._work.acting))
 
-    def _list_active_intervals(self) -> list[tuple[Places, Places]]:
+    def _list_active_intervals(self) -> list[tuple[IndexArray, IndexArray]]:
         """Return the active intervals of the first step, then of the second, and so on.
 
         Each entry contains the step numbers, and the numbers of the intervals that have such a
@@ -346,32 +358,38 @@ class MeasuredLinear(RunLinearisation):
         if driven is None:
             (driven,) = compute_control_changes([self], effects)
         for begin in range(0, count, BLOCK):
-            part = range(begin, min(begin + BLOCK, count))
+            block = range(begin, min(begin + BLOCK, count))
             changes: list[Perturbation] = []
             sensors: list[ActiveEffects] = []
-            for owner, number in enumerate(part):
+            for owner, number in enumerate(block):
                 effect, c = effects[number]
                 parts = effect.parts(c[:, None, None])
                 sensors.append(tuple((e, k) for e, k in parts if isinstance(e, Sensor)))
-                for one, k in parts:
-                    known = isinstance(one, (Sensor, Input)) or is_series_effect(one)
-                    if not known and k.any():
-                        changes += self._list_perturbations(owner, one, k)
+                for part, k in parts:
+                    is_handled_otherwise = isinstance(part, (Sensor, Input)) or is_series_effect(
+                        part
+                    )
+                    if not is_handled_otherwise and k.any():
+                        changes += self._list_perturbations(owner, part, k)
                 changes += [c._replace(owner=owner) for c in driven.get(number, ())]
-            own = slice(begin, part.stop)
+            columns = slice(begin, block.stop)
             with np.errstate(all="ignore"):
-                pushed, read = self._tangent.pushed(changes, len(part))
-                means[:, :, own] = self._compute_interval_means(pushed)
-                readings[:, :, own] = self._read_directly(read, sensors, predicted)
+                stepwise_inputs, direct_readings = self._tangent.sum_inputs_and_readings(
+                    changes, len(block)
+                )
+                means[:, :, columns] = self._compute_interval_means(stepwise_inputs)
+                readings[:, :, columns] = self._compute_direct_readings(
+                    direct_readings, sensors, predicted
+                )
         return means, readings
 
-    def _compute_interval_means(self, pushed: Array) -> Array:
+    def _compute_interval_means(self, inputs: Array) -> Array:
         """Return interval means (T - 1, E + nu, K) of forces and controls (S, E + nu, K)."""
         lengths = np.diff(self.knots)
-        some = np.flatnonzero(lengths)
-        result = np.zeros((lengths.size, *pushed.shape[1:]))
-        sums = np.add.reduceat(pushed[: self.knots[-1]], self.knots[:-1][some], axis=0)
-        result[some] = sums / lengths[some][:, None, None]
+        non_empty = np.flatnonzero(lengths)
+        result = np.zeros((lengths.size, *inputs.shape[1:]))
+        sums = np.add.reduceat(inputs[: self.knots[-1]], self.knots[:-1][non_empty], axis=0)
+        result[non_empty] = sums / lengths[non_empty][:, None, None]
         return result
 
     @cached_property
@@ -382,15 +400,15 @@ class MeasuredLinear(RunLinearisation):
         interval.
         """
         tangent = self._tangent
-        of, quotients = tangent.looked_at, tangent.quotients
-        by = np.concatenate([quotients.forces, quotients.controls], axis=2)
-        result = np.zeros((self.knots.size - 1, *by.shape[1:]))
+        point_of_step, quotients = tangent.point_of_step, tangent.quotients
+        input_matrices = np.concatenate([quotients.forces, quotients.controls], axis=2)
+        result = np.zeros((self.knots.size - 1, *input_matrices.shape[1:]))
         for steps, active in self._list_active_intervals():
-            looked = of[steps]
-            result[active] = quotients.states[looked] @ result[active] + by[looked]
+            points = point_of_step[steps]
+            result[active] = quotients.states[points] @ result[active] + input_matrices[points]
         return result
 
-    def _read_directly(
+    def _compute_direct_readings(
         self, read: Array, sensors: Sequence[ActiveEffects], predicted: Array
     ) -> Array:
         """Compute the direct changes ψ (T, C, K) of readings by K candidates, in (4).
@@ -405,22 +423,26 @@ class MeasuredLinear(RunLinearisation):
             predicted: (T, Z) predicted deviations, to whose readings sensor effects are applied.
         """
         result = np.zeros((self.knots.size, self.observed.shape[1], len(sensors)))
-        some = [k for k, acting in enumerate(sensors) if acting or read[:, :, k].any()]
-        if not some:
+        changing = [k for k, acting in enumerate(sensors) if acting or read[:, :, k].any()]
+        if not changing:
             return result
-        sensed = np.array([bool(sensors[k]) for k in some])
+        has_sensor_effect = np.array([bool(sensors[k]) for k in changing])
         # The last row has no sensor effects; it is the reference for the others.
-        states = np.zeros((len(some) + 1, self._motion.x.shape[0], self._tangent.state_size))
-        if sensed.any():
+        states = np.zeros((len(changing) + 1, self._motion.x.shape[0], self._tangent.state_size))
+        if has_sensor_effect.any():
             forces = self._tangent.quotients.forces.shape[2]
             unforced = np.zeros((self.knots.size - 1, forces))
-            states[np.append(sensed, True)] = self.propagated(predicted, unforced)
+            states[np.append(has_sensor_effect, True)] = self.propagated(predicted, unforced)
         changes = np.concatenate(
-            [np.moveaxis(read[:, :, some], 2, 0), np.zeros((1, *read.shape[:2]))]
+            [np.moveaxis(read[:, :, changing], 2, 0), np.zeros((1, *read.shape[:2]))]
         )
-        seen = self._compute_observations(states, changes, [*(sensors[k] for k in some), ()])
-        plain = np.where(sensed[:, None, None], seen[-1], self.observed)
-        result[:, :, some] = np.moveaxis(seen[:-1] - plain, 0, 2)
+        observations = self._compute_observations(
+            states, changes, [*(sensors[k] for k in changing), ()]
+        )
+        without_effects = np.where(
+            has_sensor_effect[:, None, None], observations[-1], self.observed
+        )
+        result[:, :, changing] = np.moveaxis(observations[:-1] - without_effects, 0, 2)
         return result
 
     def propagated(self, begun: Array, forces: Array) -> Array:
@@ -431,17 +453,17 @@ class MeasuredLinear(RunLinearisation):
             forces: f (T - 1, E), constant between samples.
         """
         tangent = self._tangent
-        of, quotients = tangent.looked_at, tangent.quotients
+        points, quotients = tangent.point_of_step, tangent.quotients
         with np.errstate(all="ignore"), capture_mujoco_warnings():
             defects = tangent.defects
         result = np.zeros((self._motion.x.shape[0], tangent.state_size))
-        now = begun[:-1].copy()
+        state = begun[:-1].copy()
         with np.errstate(all="ignore"):
             for steps, active in self._list_active_intervals():
-                result[steps] = now[active]
-                ahead = np.einsum("izy,iy->iz", quotients.states[of[steps]], now[active])
-                push = np.einsum("ize,ie->iz", quotients.forces[of[steps]], forces[active])
-                now[active] = ahead - defects[steps] + push
+                result[steps] = state[active]
+                ahead = np.einsum("izy,iy->iz", quotients.states[points[steps]], state[active])
+                forced = np.einsum("ize,ie->iz", quotients.forces[points[steps]], forces[active])
+                state[active] = ahead - defects[steps] + forced
         result[self.knots[-1] :] = begun[-1]
         return result
 
@@ -449,23 +471,28 @@ class MeasuredLinear(RunLinearisation):
         """Return the motion plus deviations (S + 1, Z) of its states, such as a smoother's."""
         # The motion is not changed where the linear model diverges.
         deviations = np.where(np.abs(deviations) < FARTHEST, deviations, 0.0)
-        own, motion = len(self._simulator.addresses.positions), self._motion
+        joints, motion = len(self._simulator.addresses.positions), self._motion
         size, na = motion.x.shape[1], motion.act.shape[1]
         floating = self._simulator.make_linearisation_batch(self._work.acting).floating
-        first = 2 * size + na + len(self._tangent.remembering)
-        moves = motion.afloat.rate.shape[1]
+        first_floating = 2 * size + na + len(self._tangent.hidden_state_effects)
+        floating_count = motion.afloat.rate.shape[1]
         pose = motion.afloat.pose
-        if moves:
-            pose = floating.displaced(pose, deviations[:, first : first + moves])
-        rate = motion.afloat.rate + deviations[:, first + moves : first + 2 * moves]
+        if floating_count:
+            pose = floating.displaced(
+                pose, deviations[:, first_floating : first_floating + floating_count]
+            )
+        rate = (
+            motion.afloat.rate
+            + deviations[:, first_floating + floating_count : first_floating + 2 * floating_count]
+        )
         return Trajectory(
-            motion.x[:, :own] + deviations[:, :own],
-            motion.v[:, :own] + deviations[:, size : size + own],
+            motion.x[:, :joints] + deviations[:, :joints],
+            motion.v[:, :joints] + deviations[:, size : size + joints],
             FloatingState(pose, rate),
         )
 
 
-def quintic(times: Array, samples: Array, instants: Array) -> tuple[Array, Array]:
+def interpolate_quintic(times: Array, samples: Array, instants: Array) -> tuple[Array, Array]:
     """Interpolate by quintic Hermite polynomials, and extrapolate linearly.
 
     The polynomial of fifth degree between two samples has the given value, first and second

@@ -21,9 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sims.core.simulator import Array
-from sims.robot.model_field_effects import RK4_INTEGRATOR_ID
+from sims.robot.integrator_settings import RK4_INTEGRATOR_ID
 
-Places = NDArray[np.intp]
+IndexArray = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 
 
@@ -82,7 +82,7 @@ class MidpointPredictor:
     later are not updated.
 
     Attributes:
-        of: addresses of the joints' velocities.
+        dof_indices: addresses of the joints' velocities, as a slice if they are contiguous.
 
     Args:
         batch: the mujoco.batch.Batch.
@@ -91,65 +91,71 @@ class MidpointPredictor:
         loaded: (L,) whether the load of transmissions matters; L is the number of elements in use.
     """
 
-    def __init__(self, batch: Any, positions: Places, velocities: Places, loaded: Mask) -> None:
+    def __init__(
+        self, batch: Any, positions: IndexArray, velocities: IndexArray, loaded: Mask
+    ) -> None:
         """Bind MuJoCo's fields of joint states and joint forces, for the first L elements.
 
         `self._last` (2, L, D) holds the transmission loads at the beginning of the previous
         step.
         """
         self._batch = batch
-        self._ends = forces_are_at_step_end(batch.model)
-        self._loaded, self._any = loaded, bool(loaded.any())
+        self._forces_are_at_end = forces_are_at_step_end(batch.model)
+        self._loaded, self._needs_loads = loaded, bool(loaded.any())
         self._first = True
-        self.of = to_slice_if_contiguous(velocities)
+        self.dof_indices = to_slice_if_contiguous(velocities)
         self._fields = [(batch.bind("qpos")[: len(loaded)], to_slice_if_contiguous(positions))]
         for name in ("qvel", "qacc", "qfrc_actuator", "qfrc_bias"):
-            self._fields.append((batch.bind(name)[: len(loaded)], self.of))
+            self._fields.append((batch.bind(name)[: len(loaded)], self.dof_indices))
         self._last = np.zeros((2, len(loaded), len(velocities)))
         # Factor of the load change in (2), zero where loads do not matter.
         self._share = 0.5 * loaded[:, None]
 
-    def read_joint_states(self, anew: Mask) -> JointStates:
+    def read_joint_states(self, has_new_command: Mask) -> JointStates:
         """Return the joint states at the beginning of a step.
 
         Args:
-            anew: (L,) whether commands have changed since the previous step; they are already set.
+            has_new_command: (L,) whether commands have changed since the previous step; they are
+                already set.
         """
         x, v, a, drive, bias = self._get_field_values()
         # The initial acceleration lacks the applied forces, so it is not used for prediction.
         first, self._first = self._first, False
         a = np.zeros_like(a) if first else a
-        if not self._any:
+        if not self._needs_loads:
             return JointStates(x, v, a, drive, bias, drive, bias)
-        begun, later = self._compute_transmission_loads(anew, first)
-        return JointStates(x, v, a, *begun, *later)
+        loads, midpoint_loads = self._compute_transmission_loads(has_new_command, first)
+        return JointStates(x, v, a, *loads, *midpoint_loads)
 
     def _get_field_values(self) -> list[Array]:
         """Return the present values of the fields, (L, D) each."""
         return [field[:, places] for field, places in self._fields]
 
-    def _compute_transmission_loads(self, anew: Mask, first: bool) -> tuple[Array, Array]:
+    def _compute_transmission_loads(
+        self, has_new_command: Mask, first: bool
+    ) -> tuple[Array, Array]:
         """Return the transmission loads (2, L, D) at the beginning and at the middle of a step."""
-        ended = self._copy_forces()
-        begun, last = ended, self._last
-        asked = self._loaded & anew if self._ends else self._loaded
-        # At the first step MuJoCo has already evaluated the batch.
-        if not first and asked.any():
+        end_loads = self._copy_forces()
+        start_loads, previous_loads = end_loads, self._last
+        to_evaluate = self._loaded & has_new_command if self._forces_are_at_end else self._loaded
+        # The fields hold the forces of the previous step's last evaluation. At the first step
+        # MuJoCo has already evaluated the batch.
+        if not first and to_evaluate.any():
             # Only these batch elements are evaluated, so that no element depends on others.
-            self._batch.forward(np.flatnonzero(asked))
-            begun = self._copy_forces()
-        self._last = begun
-        if first or not self._ends:
-            return begun, begun
-        return begun, begun + self._share * (ended - last)  # (2)
+            self._batch.forward(np.flatnonzero(to_evaluate))
+            start_loads = self._copy_forces()
+        self._last = start_loads
+        if first or not self._forces_are_at_end:
+            return start_loads, start_loads
+        return start_loads, start_loads + self._share * (end_loads - previous_loads)  # (2)
 
     def _copy_forces(self) -> Array:
         """Return a copy of the drive and bias forces, (2, L, D)."""
-        (drive, of), (bias, _) = self._fields[3:]
-        lanes, joints = len(self._loaded), self._last.shape[-1]
-        result = np.empty((2, lanes, joints))
-        result[0] = drive[:, of]
-        result[1] = bias[:, of]
+        (drive, dofs), (bias, _) = self._fields[3:]
+        batch_size, joints = len(self._loaded), self._last.shape[-1]
+        result = np.empty((2, batch_size, joints))
+        result[0] = drive[:, dofs]
+        result[1] = bias[:, dofs]
         return result
 
 
@@ -162,26 +168,26 @@ def forces_are_at_step_end(model: Any) -> bool:
     return bool(model.opt.integrator == RK4_INTEGRATOR_ID)
 
 
-def compute_midpoint_loads(ended: Array, controls: Array) -> Array:
+def compute_midpoint_loads(end_loads: Array, controls: Array) -> Array:
     """Compute transmission loads (2, S, D) at the middle of every step of a motion.
 
     Args:
-        ended: (2, S, D) loads at the ends of the steps, each with its own command.
+        end_loads: (2, S, D) loads at the ends of the steps, each with its own command.
         controls: (S, nu) commands.
     """
-    grown = np.diff(ended, axis=1, prepend=ended[:, :1])
-    jumps: Mask = np.any(np.diff(controls, axis=0, prepend=np.nan) != 0, axis=1)
+    growth = np.diff(end_loads, axis=1, prepend=end_loads[:, :1])
+    has_jump: Mask = np.any(np.diff(controls, axis=0, prepend=np.nan) != 0, axis=1)
     # A jump with a command is no growth within the step, so the growth of the next step is used.
-    after = np.append(jumps[1:], True)
-    grown[:, jumps & after] = 0.0
-    then = np.flatnonzero(jumps & ~after)
-    grown[:, then] = grown[:, then + 1]
-    result: Array = ended - 0.5 * grown
+    next_has_jump = np.append(has_jump[1:], True)
+    growth[:, has_jump & next_has_jump] = 0.0
+    replaced = np.flatnonzero(has_jump & ~next_has_jump)
+    growth[:, replaced] = growth[:, replaced + 1]
+    result: Array = end_loads - 0.5 * growth
     return result
 
 
-def to_slice_if_contiguous(places: Places) -> Places | slice:
+def to_slice_if_contiguous(indices: IndexArray) -> IndexArray | slice:
     """Return indices as a slice if they are contiguous, since numpy does not copy slices."""
-    first = int(places[0]) if places.size else 0
-    alike = np.array_equal(places, np.arange(first, first + places.size))
-    return slice(first, first + places.size) if alike else places
+    first = int(indices[0]) if indices.size else 0
+    is_contiguous = np.array_equal(indices, np.arange(first, first + indices.size))
+    return slice(first, first + indices.size) if is_contiguous else indices

@@ -16,8 +16,12 @@ import numpy as np
 
 from sims.core.effect import ActiveEffects
 from sims.core.simulator import Array
-from sims.robot.dynamics.disabled_drives import FORCE_FIELDS, ForceRanges, constant_stretches
-from sims.robot.dynamics.midpoint_state import JointStates, Mask, MidpointPredictor, Places
+from sims.robot.dynamics.disabled_drives import (
+    FORCE_FIELDS,
+    ForceRanges,
+    iterate_constant_stretches,
+)
+from sims.robot.dynamics.midpoint_state import IndexArray, JointStates, Mask, MidpointPredictor
 from sims.robot.dynamics.series_joints import (
     USED_FIELDS,
     WRITTEN_FIELDS,
@@ -26,15 +30,14 @@ from sims.robot.dynamics.series_joints import (
     is_series_effect,
     write_series_effects,
 )
-from sims.robot.dynamics.servo_force_limits import ForceLimits, stiff_force_limits
+from sims.robot.dynamics.servo_force_limits import ForceLimits, find_stiff_force_limits
 from sims.robot.floating_joints import FloatingJoints, FloatingState
+from sims.robot.friction_constraint import write_friction_form
 from sims.robot.model_field_effects import (
     CONTACT_FIELDS,
     COUPLING_FIELD,
     MODEL_FIELD_EFFECTS,
     get_write_order,
-    make_batch_spec,
-    write_friction_form,
 )
 from sims.robot.parsing import contact_exclusion
 from sims.robot.robot_model import RobotModel
@@ -65,12 +68,14 @@ class JointAddresses:
 
     def __init__(self, robot: RobotModel, series: bool = False, both: bool = False) -> None:
         """Collect the addresses of the selected hinge and slide joints, in file order."""
-        singles = [joint for joint in robot.joints if joint.has_one_coordinate]
-        own = [joint for joint in singles if joint.name not in robot.series]
-        second = [robot.joint(name) for name in robot.series]
-        joints = [*own, *second] if both else second if series else own
-        self.positions: Places = np.array([j.position for j in joints], dtype=np.intp)
-        self.velocities: Places = np.array([j.velocity for j in joints], dtype=np.intp)
+        one_coordinate_joints = [joint for joint in robot.joints if joint.has_one_coordinate]
+        file_joints = [joint for joint in one_coordinate_joints if joint.name not in robot.series]
+        series_joints = [robot.joint(name) for name in robot.series]
+        joints = (
+            [*file_joints, *series_joints] if both else series_joints if series else file_joints
+        )
+        self.positions: IndexArray = np.array([j.position for j in joints], dtype=np.intp)
+        self.velocities: IndexArray = np.array([j.velocity for j in joints], dtype=np.intp)
 
 
 class StepwiseForces(Protocol):
@@ -80,13 +85,33 @@ class StepwiseForces(Protocol):
     addresses: JointAddresses
     loaded: Mask
 
-    def compute(self, k: int, look: JointStates) -> tuple[Array, Array]:
+    def compute(self, k: int, joint_states: JointStates) -> tuple[Array, Array]:
         """Compute forces and limits of dry friction over step k."""
         ...
 
 
 DRIVE_SENSOR_PREFIX = "simgap.drive."
 """Prefix of the names of sensors that are added to a model."""
+
+
+GRAVCOMP_PLACEHOLDER = 1e-200
+"""Gravity compensation that changes no force, since it is smaller than any rounding error."""
+
+
+def make_batch_spec(robot: RobotModel) -> Any:
+    """Make a mujoco.MjSpec with which masses and centres of mass can differ between batch elements.
+
+    MuJoCo stores less for a body that turns about its centre of mass, and then rejects changes of
+    its centre of mass; it also omits gravity compensation that is zero in the file. Here no body
+    counts as simple, and gravity compensation is always computed. The motion is the same.
+    """
+    spec = robot.spec.copy()
+    for body in spec.bodies:
+        body.simple = False
+    # MuJoCo computes no gravity compensation if no body of the compiled model has any.
+    if not any(body.gravcomp for body in spec.bodies):
+        spec.bodies[-1].gravcomp = GRAVCOMP_PLACEHOLDER
+    return spec
 
 
 def compile_batch_model(robot: RobotModel, derived: bool) -> Any:
@@ -117,9 +142,9 @@ def compile_batch_model(robot: RobotModel, derived: bool) -> Any:
 
 def find_drive_sensors(model: Any, robot: RobotModel) -> dict[str, int]:
     """Return the addresses of actuator forces in the sensor data of a batch model, by joint."""
-    own = [joint.name for joint in robot.joints if joint.has_one_coordinate]
-    singles = [name for name in own if name not in robot.series]
-    return {name: int(model.sensor(DRIVE_SENSOR_PREFIX + name).adr[0]) for name in singles}
+    one_coordinate_joints = [joint.name for joint in robot.joints if joint.has_one_coordinate]
+    file_joints = [name for name in one_coordinate_joints if name not in robot.series]
+    return {name: int(model.sensor(DRIVE_SENSOR_PREFIX + name).adr[0]) for name in file_joints}
 
 
 def with_integrator_settings(robot: RobotModel, settings: Mapping[str, float]) -> RobotModel:
@@ -144,9 +169,9 @@ class MujocoBatch:
     Attributes:
         fields: present model fields of the batch elements, (N, ...) by name.
         batch: the mujoco.batch.Batch.
-        places: addresses of the joints of the robot's file.
-        second: addresses of the joints in series with them.
-        whole: addresses of all these joints, in this order.
+        file_joints: addresses of the joints of the robot's file.
+        series_joints: addresses of the joints in series with them.
+        all_joints: addresses of all these joints, in this order.
         floating: free and ball joints.
         drives: columns of the sensor data with actuator forces, by joint.
 
@@ -166,7 +191,7 @@ class MujocoBatch:
     ) -> None:
         """Compile the model, create MuJoCo's batch, and expand the model fields that effects write.
 
-        Expanded fields have separate values for each batch element. `self._stated` keeps
+        Expanded fields have separate values for each batch element. `self._file_values` keeps
         the values of the model file, which are restored before other effects are written.
         """
         import mujoco
@@ -176,8 +201,11 @@ class MujocoBatch:
         self.robot = robot = with_integrator_settings(robot, settings)
         self.derived = derived
         self.count = count
-        self.places, self.second = JointAddresses(robot), JointAddresses(robot, series=True)
-        self.whole = JointAddresses(robot, both=True)
+        self.file_joints, self.series_joints = (
+            JointAddresses(robot),
+            JointAddresses(robot, series=True),
+        )
+        self.all_joints = JointAddresses(robot, both=True)
         self.floating = FloatingJoints.from_robot(robot)
         model = compile_batch_model(robot, derived)
         # A failed simulation must become NaN; an automatic reset by MuJoCo would hide the failure.
@@ -187,18 +215,20 @@ class MujocoBatch:
             model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
         self.drives = find_drive_sensors(model, robot)
         self.batch: Any = batch.Batch(model, count, 1)
-        names = {
+        field_names = {
             field
             for native in MODEL_FIELD_EFFECTS.values()
             if derived or not native.changes_derived_constants
             for field in native.fields
         }
-        names |= set(USED_FIELDS) if robot.series else set()
-        names -= set() if robot.coupled else {COUPLING_FIELD}
-        names -= set() if model.npair else CONTACT_FIELDS
-        self.fields: dict[str, Any] = {name: self.batch.expand(name) for name in sorted(names)}
-        self._stated = {name: values[:1].copy() for name, values in self.fields.items()}
-        self._changed: set[str] = set()
+        field_names |= set(USED_FIELDS) if robot.series else set()
+        field_names -= set() if robot.coupled else {COUPLING_FIELD}
+        field_names -= set() if model.npair else CONTACT_FIELDS
+        self.fields: dict[str, Any] = {
+            name: self.batch.expand(name) for name in sorted(field_names)
+        }
+        self._file_values = {name: values[:1].copy() for name, values in self.fields.items()}
+        self._changed_fields: set[str] = set()
 
     @property
     def model(self) -> Any:
@@ -208,33 +238,33 @@ class MujocoBatch:
     @cached_property
     def force_limits(self) -> ForceLimits:
         """Force limits of stiff servos."""
-        return stiff_force_limits(self.model)
+        return find_stiff_force_limits(self.model)
 
     @property
     def nbytes(self) -> int:
         """Memory in bytes of the batch's model, and of its elements' fields and states."""
-        own = [*self.fields.values(), *self._stated.values(), self.batch.state]
+        own = [*self.fields.values(), *self._file_values.values(), self.batch.state]
         return int(self.model.nbuffer + sum(values.nbytes for values in own))
 
     def write_effects(self, acting: ActiveEffects) -> None:
         """Write model-field effects, with coefficients (K, N, 1), into the batch's fields."""
-        for name in self._changed:
-            self.fields[name][...] = self._stated[name]
-        was_derived = any(self._needs_recomputed_constants(name) for name in self._changed)
-        self._changed.clear()
-        derives = was_derived or bool(self.robot.series)
+        for name in self._changed_fields:
+            self.fields[name][...] = self._file_values[name]
+        was_derived = any(self._needs_recomputed_constants(name) for name in self._changed_fields)
+        self._changed_fields.clear()
+        needs_constants = was_derived or bool(self.robot.series)
         for effect, c in sorted(acting, key=lambda one: get_write_order(one[0].of)):
             if not c.any() or is_series_effect(effect):
                 continue
-            native = MODEL_FIELD_EFFECTS[effect.of or effect.name]
-            native.write(self.fields, self.robot, effect.place, c[:, :, 0])
-            self._changed.update(native.fields)
-            derives = derives or native.changes_derived_constants
+            field_effect = MODEL_FIELD_EFFECTS[effect.of or effect.name]
+            field_effect.write(self.fields, self.robot, effect.place, c[:, :, 0])
+            self._changed_fields.update(field_effect.fields)
+            needs_constants = needs_constants or field_effect.changes_derived_constants
         if self.robot.series:
             # This follows the armature effects, since each drive takes its share of the armature.
             write_series_effects(self.fields, self.robot, acting)
-            self._changed.update(WRITTEN_FIELDS)
-        if derives:
+            self._changed_fields.update(WRITTEN_FIELDS)
+        if needs_constants:
             self.batch.set_const()
         if self.robot.series:
             convert_flank_parameters(self.fields, self.robot)
@@ -248,8 +278,8 @@ class MujocoBatch:
         joints.
         """
         return any(
-            field in native.fields and native.changes_derived_constants
-            for native in MODEL_FIELD_EFFECTS.values()
+            field in field_effect.fields and field_effect.changes_derived_constants
+            for field_effect in MODEL_FIELD_EFFECTS.values()
         )
 
     def set_initial_state(
@@ -272,29 +302,29 @@ class MujocoBatch:
         self.batch.reset(stage=0)
         qpos, qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
         n = len(positions)
-        qpos[:n, self.places.positions] = positions
-        qvel[:n, self.places.velocities] = velocities
+        qpos[:n, self.file_joints.positions] = positions
+        qvel[:n, self.file_joints.velocities] = velocities
         qpos[:n, self.floating.positions] = afloat.pose
         qvel[:n, self.floating.velocities] = afloat.rate
-        second = self.second
-        begun = np.zeros((n, second.positions.size))
-        if begun.size:
+        series = self.series_joints
+        series_positions = np.zeros((n, series.positions.size))
+        if series_positions.size:
             passive, bias = self.batch.bind("qfrc_passive"), self.batch.bind("qfrc_bias")
             self.batch.forward(self._get_element_ids(n))
-            pulls = (passive - bias)[:n, second.velocities].T
-            begun[:] = np.stack(
-                compute_rest_positions(self.fields, self.robot, list(pulls)), axis=1
+            loads = (passive - bias)[:n, series.velocities].T
+            series_positions[:] = np.stack(
+                compute_rest_positions(self.fields, self.robot, list(loads)), axis=1
             )
-            qpos[:n, second.positions] = begun
-        return begun, np.zeros_like(begun)
+            qpos[:n, series.positions] = series_positions
+        return series_positions, np.zeros_like(series_positions)
 
     def map_forces(self, forces: Array) -> Array:
         """Map generalised forces (..., nv) of the file's model to this batch's model."""
         if self.model.nv == forces.shape[-1]:
             return forces
-        own = np.setdiff1d(np.arange(self.model.nv), self.second.velocities)
+        file_dofs = np.setdiff1d(np.arange(self.model.nv), self.series_joints.velocities)
         result = np.zeros((*forces.shape[:-1], self.model.nv))
-        result[..., own] = forces
+        result[..., file_dofs] = forces
         return result
 
     def activate(self, activations: Array) -> None:
@@ -328,24 +358,24 @@ class MujocoBatch:
         import mujoco
 
         state = mujoco.mjtState
-        spec = int(state.mjSTATE_CTRL)
-        given = controls
+        input_kinds = int(state.mjSTATE_CTRL)
+        inputs = controls
         if forces.any() or before_call is not None:
-            spec |= int(state.mjSTATE_QFRC_APPLIED)
-            given = np.concatenate([controls, forces], axis=2)
+            input_kinds |= int(state.mjSTATE_QFRC_APPLIED)
+            inputs = np.concatenate([controls, forces], axis=2)
         n, steps, _ = controls.shape
         result = self._allocate_records(n, steps, record)
         for part in self._split_at_switches(n, steps, off):
             if before_call is not None:
                 before_call(part.start)
-            done = self.batch.rollout(
+            recorded = self.batch.rollout(
                 part.stop - part.start,
-                given[:, part],
-                spec,
+                inputs[:, part],
+                input_kinds,
                 tuple(record),
                 self._get_element_ids(n),
             )
-            for name, values in done.items():
+            for name, values in recorded.items():
                 result[name][:, part] = values
         self._record_failures(n)
         return result
@@ -361,7 +391,7 @@ class MujocoBatch:
             yield from self._split_for_interrupts(n, steps)
             return
         ranges = self.force_ranges()
-        for stretch in constant_stretches(off):
+        for stretch in iterate_constant_stretches(off):
             ranges.write(off[:, stretch.start])
             for part in self._split_for_interrupts(n, stretch.stop - stretch.start):
                 yield slice(stretch.start + part.start, stretch.start + part.stop)
@@ -369,7 +399,7 @@ class MujocoBatch:
 
     def force_ranges(self) -> ForceRanges:
         """Return the force ranges, to switch actuators off until the next `write_effects`."""
-        self._changed.update(FORCE_FIELDS)
+        self._changed_fields.update(FORCE_FIELDS)
         return ForceRanges(self.fields)
 
     def step_with_forces(
@@ -398,22 +428,24 @@ class MujocoBatch:
         ctrl, applied = bind("ctrl"), bind("qfrc_applied")
         loss = self.fields["dof_frictionloss"]
         has_friction = bool(step_forces.has_dry_friction.any())
-        own = self.begin_dry_friction(step_forces, n)
+        file_friction = self.begin_dry_friction(step_forces, n)
         result = self._allocate_records(n, steps, record)
-        shown = {name: bind(name)[:n] for name in record}
+        data_fields = {name: bind(name)[:n] for name in record}
         ids = self._get_element_ids(n)
         # This precedes MuJoCo's first evaluation, since fields that are bound later would not
         # contain it.
-        lanes_at = MidpointPredictor(
+        predictor = MidpointPredictor(
             self.batch, step_forces.addresses.positions, dofs, step_forces.loaded
         )
         changes: Mask = np.any(np.diff(controls, axis=1, prepend=controls[:, :1]) != 0, axis=2)
-        of = lanes_at.of
+        dofs_in_use = predictor.dof_indices
         ctrl[:n] = controls[:, 0]
         switches = (
             {}
             if off is None or not off.any()
-            else {stretch.start: off[:, stretch.start] for stretch in constant_stretches(off)}
+            else {
+                stretch.start: off[:, stretch.start] for stretch in iterate_constant_stretches(off)
+            }
         )
         ranges = self.force_ranges() if switches else None
         if ranges is not None:
@@ -424,14 +456,14 @@ class MujocoBatch:
             if ranges is not None and k in switches:
                 ranges.write(switches[k])
                 changes[:, k] = True
-            force, limit = step_forces.compute(k, lanes_at.read_joint_states(changes[:, k]))
+            force, limit = step_forces.compute(k, predictor.read_joint_states(changes[:, k]))
             applied[:n] = forces[:, k]
-            applied[:n, of] += force
+            applied[:n, dofs_in_use] += force
             if has_friction:
-                loss[:n, of] = own + np.maximum(limit, 0.0)
+                loss[:n, dofs_in_use] = file_friction + np.maximum(limit, 0.0)
             self.batch.step(ids)
             for name, values in result.items():
-                values[:, k] = shown[name]
+                values[:, k] = data_fields[name]
         if ranges is not None:
             ranges.restore()
         self._record_failures(n)
@@ -452,23 +484,23 @@ class MujocoBatch:
         dofs = step_forces.addresses.velocities
         file_friction: Array = self.fields["dof_frictionloss"][:n, dofs].copy()
         if step_forces.has_dry_friction.any():
-            lanes, joints = np.nonzero(step_forces.has_dry_friction)
-            write_friction_form(self.fields, self.robot, lanes, dofs[joints])
-            self._changed.update(MODEL_FIELD_EFFECTS["friction.coulomb"].fields)
+            batch_indices, joints = np.nonzero(step_forces.has_dry_friction)
+            write_friction_form(self.fields, self.robot, batch_indices, dofs[joints])
+            self._changed_fields.update(MODEL_FIELD_EFFECTS["friction.coulomb"].fields)
         return file_friction
 
-    def get_servo_stiffness(self, places: JointAddresses) -> Array:
+    def get_servo_stiffness(self, joints: JointAddresses) -> Array:
         """Return the force of position servos per unit of their errors, with effects.
 
         Args:
-            places: addresses of D joints.
+            joints: addresses of D joints.
 
         Returns:
             (N, D) stiffness; zero for joints without a position servo.
         """
         robot = self.robot
-        result = np.zeros((self.count, len(places.velocities)))
-        columns = {int(place): i for i, place in enumerate(places.velocities)}
+        result = np.zeros((self.count, len(joints.velocities)))
+        columns = {int(address): i for i, address in enumerate(joints.velocities)}
         for actuator in robot.actuators:
             if actuator.kind == "position" and actuator.joint is not None:
                 gear = float(robot.compiled.actuator_gear[actuator.id, 0])
@@ -488,8 +520,8 @@ class MujocoBatch:
         """
         loss = self.fields["dof_frictionloss"]
         changed = MODEL_FIELD_EFFECTS["friction.coulomb"].fields
-        if not self._changed.issuperset(changed):
-            self._changed.update(changed)
+        if not self._changed_fields.issuperset(changed):
+            self._changed_fields.update(changed)
         loss[:n, dof] = self._loaded_friction[:n, dof] + limit
         write_friction_form(self.fields, self.robot, slice(n), dof)
 
@@ -497,7 +529,7 @@ class MujocoBatch:
         """Allocate arrays for recorded fields."""
         return {name: np.empty((n, steps, *self.batch.bind(name).shape[1:])) for name in record}
 
-    def _get_element_ids(self, n: int) -> Places | None:
+    def _get_element_ids(self, n: int) -> IndexArray | None:
         return None if n == self.count else np.arange(n)
 
     def _record_failures(self, n: int) -> None:
@@ -505,8 +537,8 @@ class MujocoBatch:
         self.failed = (self.batch.warning[:n, :, 1] > 0).any(axis=1)
 
     @staticmethod
-    def _split_for_interrupts(lanes: int, steps: int) -> Iterator[slice]:
+    def _split_for_interrupts(batch_size: int, steps: int) -> Iterator[slice]:
         """Yield parts of all steps that take a fraction of a second, to allow Ctrl-C between."""
-        largest = max(MAX_UNINTERRUPTED_STEPS // max(lanes, 1), 1)
-        for begin in range(0, steps, largest):
-            yield slice(begin, min(begin + largest, steps))
+        steps_per_part = max(MAX_UNINTERRUPTED_STEPS // max(batch_size, 1), 1)
+        for begin in range(0, steps, steps_per_part):
+            yield slice(begin, min(begin + steps_per_part, steps))

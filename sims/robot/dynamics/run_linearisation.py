@@ -74,9 +74,9 @@ class RunLinearisation:
     ) -> None:
         """Simulate the run, and prepare the tangent linear model about its motion.
 
-        `self._names` are the channels that observe MuJoCo's sensors: drive forces (tau.)
-        and sensors (s.). `self._built` is the number of batch elements that the preparation
-        took; it is part of the cost.
+        `self._sensor_channels` are the channels that observe MuJoCo's sensors: drive forces
+        (tau.) and sensors (s.). `self._preparation_count` is the number of batch elements that the
+        preparation took; it is part of the cost.
         """
         assert isinstance(simulator, RobotSimulator), "a robot"
         self._simulator = simulator
@@ -86,15 +86,19 @@ class RunLinearisation:
         acting = simulator.get_active_effects(theta[None])
         commands = simulator.run_inputs(scenario)
         self._work = RobotRunBatch(scenario, commands, acting, x[None], v[None])
-        self._names = [c.name for c in simulator.channels if c.name.startswith(("tau.", "s."))]
+        self._sensor_channels = [
+            c.name for c in simulator.channels if c.name.startswith(("tau.", "s."))
+        ]
         with np.errstate(all="ignore"), capture_mujoco_warnings():
             self._motion = self._simulate_nominal_motion()
             self._tangent = self._make_tangent_model()
-            self._built = self._tangent.placed_element_count
-        self._known: dict[tuple[str, bytes], Perturbation] = {}
-        nothing = np.zeros((1, *self._motion.x.shape[:1], self._tangent.state_size))
-        unread = np.zeros((1, self._motion.x.shape[0], len(self._names)))
-        self.observed: Array = self._compute_observations(nothing, unread, [()])[0]
+            self._preparation_count = self._tangent.placed_element_count
+        self._perturbation_cache: dict[tuple[str, bytes], Perturbation] = {}
+        unchanged_states = np.zeros((1, *self._motion.x.shape[:1], self._tangent.state_size))
+        unchanged_readings = np.zeros((1, self._motion.x.shape[0], len(self._sensor_channels)))
+        self.observed: Array = self._compute_observations(
+            unchanged_states, unchanged_readings, [()]
+        )[0]
         # The joints of the file come first; joints in series follow them.
         self._joints = len(simulator.addresses.positions)
 
@@ -102,51 +106,55 @@ class RunLinearisation:
         """Simulate the motion of the run, plus one step that begins at the run's end."""
         simulator = self._simulator
         steps = self._steps + 1
-        given = simulator.compute_controls(self._work, steps)
-        more = ("qfrc_actuator", "qfrc_bias", "act")
-        made = simulator.step_batch(self._work, given, more)
-        wide = simulator.make_linearisation_batch(self._work.acting)
-        dofs = wide.whole.velocities
+        inputs = simulator.compute_controls(self._work, steps)
+        extra_fields = ("qfrc_actuator", "qfrc_bias", "act")
+        simulated = simulator.step_batch(self._work, inputs, extra_fields)
+        mujoco_batch = simulator.make_linearisation_batch(self._work.acting)
+        dofs = mujoco_batch.all_joints.velocities
         sides = ("qfrc_actuator", "qfrc_bias")
-        controls = given.controls[0]
-        left = np.stack([made.fields[name][0][:, dofs] for name in sides])
+        controls = inputs.controls[0]
+        forces_at_start = np.stack([simulated.fields[name][0][:, dofs] for name in sides])
         carried = (
-            compute_midpoint_loads(left, controls) if forces_are_at_step_end(wide.model) else left
+            compute_midpoint_loads(forces_at_start, controls)
+            if forces_are_at_step_end(mujoco_batch.model)
+            else forces_at_start
         )
-        act = made.fields["act"][0]
-        first = made.initial_activations[0][None]
-        data = made.fields["sensordata"][0] if self._names else np.zeros((steps, 0))
-        self._readings = {name: data[:, simulator.get_sensor_address(name)] for name in self._names}
+        act = simulated.fields["act"][0]
+        first = simulated.initial_activations[0][None]
+        data = simulated.fields["sensordata"][0] if self._sensor_channels else np.zeros((steps, 0))
+        self._readings = {
+            name: data[:, simulator.get_sensor_address(name)] for name in self._sensor_channels
+        }
         return RobotMotion(
-            x=np.concatenate([made.x[0], made.series[0][0]], axis=1),
-            v=np.concatenate([made.v[0], made.series[1][0]], axis=1),
+            x=np.concatenate([simulated.x[0], simulated.series[0][0]], axis=1),
+            v=np.concatenate([simulated.v[0], simulated.series[1][0]], axis=1),
             act=np.concatenate([first, act[:-1]]),
             carried=carried,
-            afloat=self._get_floating_states(made.fields),
+            afloat=self._get_floating_states(simulated.fields),
             step=simulator.time_step,
-            **self._compute_command_fields(given),
+            **self._compute_command_fields(inputs),
         )
 
-    def _compute_command_fields(self, given: BatchInputs) -> dict[str, Any]:
+    def _compute_command_fields(self, inputs: BatchInputs) -> dict[str, Any]:
         """Return the fields of a motion that follow from the commands of the run."""
         return {
-            "controls": given.controls[0],
+            "controls": inputs.controls[0],
             "forces": self._simulator.make_linearisation_batch(self._work.acting).map_forces(
-                given.forces[0]
+                inputs.forces[0]
             ),
-            "instant": given.instant[0],
-            "inputs": {name: u[0] for name, u in given.applied_inputs.items()},
-            "off": given.off[0],
+            "instant": inputs.instant[0],
+            "inputs": {name: u[0] for name, u in inputs.applied_inputs.items()},
+            "off": inputs.off[0],
         }
 
     def _get_floating_states(self, fields: Mapping[str, Array]) -> FloatingState:
         """Return states of floating bodies, at the beginnings of steps and at the end."""
-        begun = self._simulator.get_floating_start(self._work)
+        start = self._simulator.get_floating_start(self._work)
         floating = self._simulator.make_linearisation_batch(self._work.acting).floating
         pose = fields["qpos"][0][:, floating.positions]
         rate = fields["qvel"][0][:, floating.velocities]
         return FloatingState(
-            np.concatenate([begun.pose[None], pose]), np.concatenate([begun.rate[None], rate])
+            np.concatenate([start.pose[None], pose]), np.concatenate([start.rate[None], rate])
         )
 
     def _make_tangent_model(self) -> TangentModel:
@@ -157,25 +165,29 @@ class RunLinearisation:
         of forces.
         """
         simulator = self._simulator
-        outputs = [("sensordata", simulator.get_sensor_address(name)) for name in self._names]
+        outputs = [
+            ("sensordata", simulator.get_sensor_address(name)) for name in self._sensor_channels
+        ]
         mujoco_batch = simulator.make_linearisation_batch(self._work.acting)
         sizes = compute_joint_scales(simulator.robot).force
         # A joint in series transmits the force of its joint.
-        second = [self._find_series_joint(name) for name in mujoco_batch.robot.series]
-        at = LinearisationPoints(
+        series_joints = [self._find_series_joint(name) for name in mujoco_batch.robot.series]
+        points = LinearisationPoints(
             mujoco_batch,
             simulator.robotic,
             self._motion,
             self._work.acting,
             outputs,
-            mujoco_batch.whole,
-            [self._driven_joint(name) for name in self._names],
+            mujoco_batch.all_joints,
+            [self._find_driven_joint(name) for name in self._sensor_channels],
             self.held,
         )
-        sizes = np.concatenate([sizes, sizes[second], compute_floating_forces(simulator.robot)])
-        return TangentModel(at, sizes, self.quotients)
+        sizes = np.concatenate(
+            [sizes, sizes[series_joints], compute_floating_forces(simulator.robot)]
+        )
+        return TangentModel(points, sizes, self.quotients)
 
-    def _driven_joint(self, channel: str) -> int:
+    def _find_driven_joint(self, channel: str) -> int:
         """Return the number of the joint whose drive force a channel observes; -1 if none."""
         kind, _, joint = channel.partition(".")
         return self._simulator.system.coordinates.index(f"q.{joint}") if kind == "tau" else -1
@@ -199,37 +211,39 @@ class RunLinearisation:
             (K, T, C) changes of the observations, and the approximate cost as a number of
             simulations of the run, including the linearisation itself.
         """
-        before = self._tangent.placed_element_count - self._built
+        before = self._tangent.placed_element_count - self._preparation_count
         # The cost must not depend on earlier calls.
-        self._known.clear()
+        self._perturbation_cache.clear()
         result = np.zeros((len(added), *self.observed.shape))
-        (driven,) = compute_control_changes([self], added)
-        apart = [i for i, (effect, _) in enumerate(added) if is_series_effect(effect)]
-        if apart:
-            result[apart] = self._simulate_with_effects([added[i] for i in apart]) - self.observed
+        (control_changes,) = compute_control_changes([self], added)
+        in_series = [i for i, (effect, _) in enumerate(added) if is_series_effect(effect)]
+        if in_series:
+            result[in_series] = (
+                self._simulate_with_effects([added[i] for i in in_series]) - self.observed
+            )
         for begin in range(0, len(added), MAX_SIMULTANEOUS_CHANGES):
-            part = range(begin, min(begin + MAX_SIMULTANEOUS_CHANGES, len(added)))
+            block = range(begin, min(begin + MAX_SIMULTANEOUS_CHANGES, len(added)))
             changes: list[Perturbation] = []
             sensors: list[ActiveEffects] = []
-            for owner, number in enumerate(part):
+            for owner, number in enumerate(block):
                 effect, c = added[number]
                 parts = effect.parts(c[:, None, None])
                 sensors.append(tuple((e, k) for e, k in parts if isinstance(e, Sensor)))
-                for one, k in parts:
-                    if isinstance(one, Sensor) or not k.any():
+                for part, k in parts:
+                    if isinstance(part, Sensor) or not k.any():
                         continue
-                    if isinstance(one, Input) or is_series_effect(one):
+                    if isinstance(part, Input) or is_series_effect(part):
                         continue
-                    changes += self._list_perturbations(owner, one, k)
-                changes += [c._replace(owner=owner) for c in driven.get(number, ())]
+                    changes += self._list_perturbations(owner, part, k)
+                changes += [c._replace(owner=owner) for c in control_changes.get(number, ())]
             # A change that overflows is one that a fit could not follow.
             with np.errstate(all="ignore"):
-                states, readings = self._tangent.propagate(changes, len(part))
-                seen = self._compute_observations(states, readings, sensors)
-            own = np.setdiff1d(part, apart).astype(np.intp)
-            result[own] = (seen - self.observed)[own - part.start]
-        looks = self._tangent.placed_element_count - before
-        return result, 1 + len(apart) + looks // len(self._motion.controls)
+                states, readings = self._tangent.propagate(changes, len(block))
+                observations = self._compute_observations(states, readings, sensors)
+            not_in_series = np.setdiff1d(block, in_series).astype(np.intp)
+            result[not_in_series] = (observations - self.observed)[not_in_series - block.start]
+        placed_count = self._tangent.placed_element_count - before
+        return result, 1 + len(in_series) + placed_count // len(self._motion.controls)
 
     def _simulate_with_effects(self, added: Sequence[EffectWithCoefficients]) -> Array:
         """Simulate observations (K, T, C) of the run with each effect added.
@@ -238,17 +252,17 @@ class RunLinearisation:
         """
         count, work = len(added), self._work
         acting = [(e, np.repeat(c, count, axis=1)) for e, c in work.acting]
-        for lane, (effect, c) in enumerate(added):
+        for element, (effect, c) in enumerate(added):
             for simpler, k in acting[: len(work.acting)]:
-                if simpler.name in effect.contains and k[:, lane].any():
-                    c = effect.taking(c, simpler.name, k[:, lane, 0].copy())
-                    k[:, lane] = 0.0
-            own = np.zeros((len(c), count, 1))
-            own[:, lane, 0] = c
-            acting.append((effect, own))
-        lanes = np.repeat(work.x, count, axis=0), np.repeat(work.v, count, axis=0)
+                if simpler.name in effect.contains and k[:, element].any():
+                    c = effect.taking(c, simpler.name, k[:, element, 0].copy())
+                    k[:, element] = 0.0
+            coefficients = np.zeros((len(c), count, 1))
+            coefficients[:, element, 0] = c
+            acting.append((effect, coefficients))
+        starts = np.repeat(work.x, count, axis=0), np.repeat(work.v, count, axis=0)
         return self._simulator.simulate_observations(
-            work._replace(acting=tuple(acting), x=lanes[0], v=lanes[1])
+            work._replace(acting=tuple(acting), x=starts[0], v=starts[1])
         )
 
     def compute_initial_state_responses(self) -> Array:
@@ -256,11 +270,13 @@ class RunLinearisation:
         with np.errstate(all="ignore"):
             states, readings = self._tangent.propagate_initial_state()
         # The changes are small enough for nonlinear sensor effects to be linear.
-        small = 1e-4
-        seen = self._compute_observations(small * states, small * readings, [()] * len(states))
-        result: Array = (seen - self.observed) / small
-        half, own = len(result) // 2, self._joints
-        return np.concatenate([result[:own], result[half : half + own]])
+        scale = 1e-4
+        observations = self._compute_observations(
+            scale * states, scale * readings, [()] * len(states)
+        )
+        result: Array = (observations - self.observed) / scale
+        velocity_column, joints = len(result) // 2, self._joints  # joints in series are left out
+        return np.concatenate([result[:joints], result[velocity_column : velocity_column + joints]])
 
     def _list_perturbations(self, owner: int, effect: Effect, c: Array) -> list[Perturbation]:
         """Return the perturbations by an effect that acts on neither inputs nor sensors."""
@@ -276,12 +292,14 @@ class RunLinearisation:
         ):
             return self._tangent.perturb_by_force(owner, effect, c)
         key = effect.name, c.tobytes()
-        if key not in self._known:
+        if key not in self._perturbation_cache:
             acting = (*self._work.acting, (effect, c))
             with capture_mujoco_warnings():
                 mujoco_batch = self._simulator.make_linearisation_batch(acting)
-                self._known[key] = self._tangent.perturb_model_numbers(0, acting, 1.0, mujoco_batch)
-        return [self._known[key]._replace(owner=owner)]
+                self._perturbation_cache[key] = self._tangent.perturb_model_numbers(
+                    0, acting, 1.0, mujoco_batch
+                )
+        return [self._perturbation_cache[key]._replace(owner=owner)]
 
     def _is_centred_spring(self, name: str, joint: int | None) -> bool:
         """Return whether an effect is a spring about zero, equal to a joint stiffness.
@@ -296,20 +314,20 @@ class RunLinearisation:
         rest = simulator.robot.compiled.qpos_spring[simulator.addresses.positions[joint]]
         return bool(rest == 0.0)
 
-    def _inputs_with(self, rows: Sequence[tuple[int, Effect, Array]]) -> RunInputs:
+    def _get_inputs_with_effects(self, rows: Sequence[tuple[int, Effect, Array]]) -> RunInputs:
         """Return the inputs of the run, with one more input effect in each batch element."""
         count = len(rows)
         acting: dict[str, tuple[Effect, Array]] = {}
         for e, c in self._work.acting:
             if isinstance(e, Input):
                 acting[e.name] = e, np.repeat(c, count, axis=1)
-        for lane, (_, one, k) in enumerate(rows):
-            if one.name not in acting:
-                acting[one.name] = one, np.zeros((len(k), count, 1))
-            acting[one.name][1][:, lane] = k[:, 0]
+        for element, (_, effect, k) in enumerate(rows):
+            if effect.name not in acting:
+                acting[effect.name] = effect, np.zeros((len(k), count, 1))
+            acting[effect.name][1][:, element] = k[:, 0]
         steps = len(self._motion.controls)
-        given = self._work.scenario, self._work.commands, tuple(acting.values())
-        return RunInputs(*given, count, steps)
+        run_inputs = self._work.scenario, self._work.commands, tuple(acting.values())
+        return RunInputs(*run_inputs, count, steps)
 
     def _compute_observations(
         self, states: Array, readings: Array, sensors: Sequence[ActiveEffects]
@@ -322,29 +340,31 @@ class RunLinearisation:
             sensors: further sensor effects of each of the n batch elements.
         """
         simulator, count = self._simulator, len(states)
-        upto = self._steps + 1
+        step_count = self._steps + 1
         size = self._motion.x.shape[1]
-        own = tuple((e, np.repeat(c, count, axis=1)) for e, c in self._work.acting)
+        run_effects = tuple((e, np.repeat(c, count, axis=1)) for e, c in self._work.acting)
         columns = []
-        at_ends = find_sample_steps(simulator.time_step, self._times, upto)
+        at_ends = find_sample_steps(simulator.time_step, self._times, step_count)
         for channel in simulator.channels:
-            acting = _select_sensor_effects(channel.name, own, sensors)
-            # Most channels are needed at the sample times only.
-            some = at_ends if preserves_time(acting) else None
-            rows: slice | NDArray[np.intp] = slice(upto) if some is None else some
-            kind, _, of = channel.name.partition(".")
+            acting = _select_sensor_effects(channel.name, run_effects, sensors)
+            # A sensor effect that shifts time needs all steps, other channels the samples only.
+            needed_steps = at_ends if preserves_time(acting) else None
+            rows: slice | NDArray[np.intp] = (
+                slice(step_count) if needed_steps is None else needed_steps
+            )
+            kind, _, joint_name = channel.name.partition(".")
             slopes = None
             if kind in ("q", "qd"):
-                j = simulator.system.coordinates.index(f"q.{of}")
-                place = j if kind == "q" else size + j
+                j = simulator.system.coordinates.index(f"q.{joint_name}")
+                column = j if kind == "q" else size + j
                 motion = self._motion.x if kind == "q" else self._motion.v
-                values = motion[rows, j] + states[:, rows, place]
-                if kind == "q" and some is None:
+                values = motion[rows, j] + states[:, rows, column]
+                if kind == "q" and needed_steps is None:
                     slopes = self._motion.v[rows, j] + states[:, rows, size + j]
             else:
-                place = self._names.index(channel.name)
-                values = self._readings[channel.name][rows] + readings[:, rows, place]
-            if some is None:
+                column = self._sensor_channels.index(channel.name)
+                values = self._readings[channel.name][rows] + readings[:, rows, column]
+            if needed_steps is None:
                 step, times = simulator.time_step, self._times
                 columns.append(sample_readings(values, slopes, step, times, acting, self._clock))
             else:
@@ -359,7 +379,9 @@ def compute_control_changes(
 
     Input effects act before the robot, so their changes are computed exactly and only propagated
     to first order. `rows` lists the effects at one place each as (number, effect, coefficients),
-    one batch element for each.
+    one batch element for each. Each changed input is averaged over the whole step, which moves
+    the robot, and, if drive forces are observed, over an instant at its beginning, which a sensor
+    shows; `shares` are these two shares of a step.
 
     Args:
         runs: linearisations of runs of one simulator.
@@ -371,57 +393,59 @@ def compute_control_changes(
     result: list[dict[int, list[Perturbation]]] = [{} for _ in runs]
     rows: list[tuple[int, Effect, Array]] = []
     for number, (effect, c) in enumerate(added):
-        for one, k in effect.parts(c[:, None, None]):
-            if isinstance(one, Input) and k.any():
-                rows.append((number, one, k))
+        for part, k in effect.parts(c[:, None, None]):
+            if isinstance(part, Input) and k.any():
+                rows.append((number, part, k))
     if not rows:
         return result
-    simulator, names = runs[0]._simulator, runs[0]._names
-    inputs = [run._inputs_with(rows) for run in runs]
+    simulator, names = runs[0]._simulator, runs[0]._sensor_channels
+    inputs = [run._get_inputs_with_effects(rows) for run in runs]
     shares = [1.0]
     if any(name.startswith("tau.") for name in names):
         shares.append(SAME_INSTANT_SHARE)
     numbers = {f"u.{a.name}": a.control for a in simulator.robot.actuators}
     series: dict[tuple[int, int], list[Array]] = {}
     for share in shares:
-        for run, name, lanes, values in compute_changed_inputs(simulator.time_step, inputs, share):
-            for lane, row in zip(lanes.tolist(), values, strict=True):
-                if rows[lane][1].signal == name:
-                    series.setdefault((run, lane), []).append(row)
-    for (run, lane), of_shares in sorted(series.items()):
-        number, one, _ = rows[lane]
-        if one.signal not in numbers:
+        for run, name, elements, values in compute_changed_inputs(
+            simulator.time_step, inputs, share
+        ):
+            for element, series_row in zip(elements.tolist(), values, strict=True):
+                if rows[element][1].signal == name:
+                    series.setdefault((run, element), []).append(series_row)
+    for (run, element), values_by_share in sorted(series.items()):
+        number, part, _ = rows[element]
+        if part.signal not in numbers:
             continue
-        column, motion = numbers[one.signal], runs[run]._motion
+        column, motion = numbers[part.signal], runs[run]._motion
         change = Perturbation(
             number,
             actuator=column,
-            series=of_shares[0] - motion.controls[:, column],
-            instant=of_shares[-1]
-            - (motion.controls, motion.instant)[len(of_shares) - 1][:, column],
+            series=values_by_share[0] - motion.controls[:, column],
+            instant=values_by_share[-1]
+            - (motion.controls, motion.instant)[len(values_by_share) - 1][:, column],
         )
         result[run].setdefault(number, []).append(change)
     return result
 
 
 def _select_sensor_effects(
-    channel: str, own: ActiveEffects, more: Sequence[ActiveEffects]
+    channel: str, run_effects: ActiveEffects, extra_effects: Sequence[ActiveEffects]
 ) -> ActiveEffects:
     """Return the sensor effects on a channel: those of the run, then the additional ones.
 
     Args:
         channel: name of the channel.
-        own: effects that are active in the run.
-        more: additional effects for each batch element; the result has coefficients (K, L, 1) that
-            are zero in all other elements.
+        run_effects: effects that are active in the run.
+        extra_effects: additional effects for each batch element; the result has coefficients (K, L,
+            1) that are zero in all other elements.
     """
-    acting = [(e, c) for e, c in own if isinstance(e, Sensor) and e.signal in ("", channel)]
+    acting = [(e, c) for e, c in run_effects if isinstance(e, Sensor) and e.signal in ("", channel)]
     added: dict[str, tuple[Effect, Array]] = {}
-    for lane, parts in enumerate(more):
+    for element, parts in enumerate(extra_effects):
         for effect, c in parts:
             if effect.signal not in ("", channel):
                 continue
             if effect.name not in added:
-                added[effect.name] = effect, np.zeros((len(c), len(more), 1))
-            added[effect.name][1][:, lane] = c[:, 0]
+                added[effect.name] = effect, np.zeros((len(c), len(extra_effects), 1))
+            added[effect.name][1][:, element] = c[:, 0]
     return (*acting, *added.values())

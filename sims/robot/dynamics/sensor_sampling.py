@@ -43,21 +43,21 @@ def sample_readings(
         sensors: effects on this channel in the order in which a signal passes them.
         clock: first recorded time stamp in seconds.
     """
-    lanes, count = values.shape
-    ends = step * np.arange(count)
-    instants = np.broadcast_to(times, (lanes, times.size))
+    batch_size, count = values.shape
+    step_ends = step * np.arange(count)
+    instants = np.broadcast_to(times, (batch_size, times.size))
     for effect, c in sensors:
         assert isinstance(effect, Sensor)
         if type(effect).times is not Sensor.times:
             instants = np.where(is_active(c), effect.times(c, instants), instants)
-    instants = np.clip(instants, 0.0, ends[-1])
+    instants = np.clip(instants, 0.0, step_ends[-1])
     result = _interpolate(values, slopes, step, instants)
-    for some, filters in _iterate_filters(sensors):
-        grid = np.broadcast_to(ends, (some.size, count))
+    for filtered_elements, filters in _iterate_filters(sensors):
+        grid = np.broadcast_to(step_ends, (filtered_elements.size, count))
         steps = np.diff(grid, axis=1, prepend=0.0)
-        filtered = apply_sensor_effects(filters, values[some], steps, grid, clock)
+        filtered = apply_sensor_effects(filters, values[filtered_elements], steps, grid, clock)
         # The slope of a filtered signal is unknown.
-        result[some] = _interpolate(filtered, None, step, instants[some])
+        result[filtered_elements] = _interpolate(filtered, None, step, instants[filtered_elements])
     return apply_effects_to_readings(result, times, sensors, clock)
 
 
@@ -81,9 +81,15 @@ def apply_effects_to_readings(
         assert isinstance(effect, Sensor)
         if effect.filters or type(effect).read is Sensor.read:
             continue
-        on = np.flatnonzero(is_active(c))
-        signal = Signal(result[on], np.zeros_like(result[on]), result[on, :1], stamps[on], clock)
-        result[on] = effect.read(c[:, on], signal)
+        active_elements = np.flatnonzero(is_active(c))
+        signal = Signal(
+            result[active_elements],
+            np.zeros_like(result[active_elements]),
+            result[active_elements, :1],
+            stamps[active_elements],
+            clock,
+        )
+        result[active_elements] = effect.read(c[:, active_elements], signal)
     return result
 
 
@@ -100,25 +106,25 @@ def find_sample_steps(step: float, times: Array, count: int) -> NDArray[np.intp]
     Returns:
         (T,) indices of the step ends; None if any sample is between two of them.
     """
-    place = np.clip(times / step, 0.0, count - 1.0)
-    nearest = np.rint(place)
-    near = bool((np.abs(place - nearest) < TIME_TOLERANCE_SHARE).all())
-    return nearest.astype(np.intp) if near else None
+    position_in_steps = np.clip(times / step, 0.0, count - 1.0)
+    nearest = np.rint(position_in_steps)
+    is_at_step_end = bool((np.abs(position_in_steps - nearest) < TIME_TOLERANCE_SHARE).all())
+    return nearest.astype(np.intp) if is_at_step_end else None
 
 
 def preserves_time(sensors: ActiveEffects) -> bool:
     """Return whether the readings depend on the value at the sample time alone."""
-    shown = [e for e, _ in sensors if isinstance(e, Sensor)]
-    return all(type(e).times is Sensor.times and not e.filters for e in shown)
+    sensor_effects = [e for e, _ in sensors if isinstance(e, Sensor)]
+    return all(type(e).times is Sensor.times and not e.filters for e in sensor_effects)
 
 
 def _iterate_filters(sensors: ActiveEffects) -> Iterator[tuple[NDArray[np.intp], ActiveEffects]]:
     """Yield the batch elements with an active filter, and the filters there, if any."""
     filters = tuple((e, c) for e, c in sensors if isinstance(e, Sensor) and e.filters)
     on = [is_active(c)[:, 0] for _, c in filters]
-    lanes = np.flatnonzero(np.any(on, axis=0)) if filters else np.empty(0, dtype=np.intp)
-    if lanes.size:
-        yield lanes, tuple((e, c[:, lanes]) for e, c in filters)
+    batch_indices = np.flatnonzero(np.any(on, axis=0)) if filters else np.empty(0, dtype=np.intp)
+    if batch_indices.size:
+        yield batch_indices, tuple((e, c[:, batch_indices]) for e, c in filters)
 
 
 def _interpolate(values: Array, slopes: Array | None, step: float, instants: Array) -> Array:
@@ -126,31 +132,31 @@ def _interpolate(values: Array, slopes: Array | None, step: float, instants: Arr
 
     With slopes, the cubic Hermite polynomial (1) is used, otherwise a straight line.
     """
-    place = instants / step
-    nearest = np.rint(place)
-    near = np.abs(place - nearest) < TIME_TOLERANCE_SHARE
-    if near.all():
-        chosen: Array = np.take_along_axis(values, nearest.astype(np.intp), axis=1)
-        return chosen
+    position_in_steps = instants / step
+    nearest = np.rint(position_in_steps)
+    is_at_step_end = np.abs(position_in_steps - nearest) < TIME_TOLERANCE_SHARE
+    if is_at_step_end.all():
+        stored: Array = np.take_along_axis(values, nearest.astype(np.intp), axis=1)
+        return stored
     # A sample at the end of a step returns the stored value bit for bit, whatever times other batch
     # elements use.
-    place = np.where(near, nearest, place)
+    position_in_steps = np.where(is_at_step_end, nearest, position_in_steps)
     last = values.shape[1] - 2
-    below = np.clip(np.floor(place), 0, max(last, 0)).astype(np.intp)
-    s = place - below
+    below = np.clip(np.floor(position_in_steps), 0, max(last, 0)).astype(np.intp)
+    s = position_in_steps - below
     a = np.take_along_axis(values, below, axis=1)
     b = np.take_along_axis(values, below + 1, axis=1)
     if slopes is None:
         linear: Array = a + s * (b - a)
         return linear
-    begin = step * np.take_along_axis(slopes, below, axis=1)
-    end = step * np.take_along_axis(slopes, below + 1, axis=1)
-    r = 1.0 - s
+    start_change = step * np.take_along_axis(slopes, below, axis=1)
+    end_change = step * np.take_along_axis(slopes, below + 1, axis=1)
+    rest = 1.0 - s
     # (1)
     cubic: Array = (
-        (1.0 + 2.0 * s) * r * r * a
-        + s * r * r * begin
+        (1.0 + 2.0 * s) * rest * rest * a
+        + s * rest * rest * start_change
         + s * s * (3.0 - 2.0 * s) * b
-        - s * s * r * end
+        - s * s * rest * end_change
     )
     return cubic

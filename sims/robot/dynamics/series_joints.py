@@ -38,7 +38,7 @@ from sims.core.effect import ActiveEffects, Effect, HiddenStateEffect, SeriesEle
 from sims.core.simulator import Array
 from sims.robot.coupled_drives import name_unnamed_elements
 from sims.robot.dynamics.inertia_matrix import inertia_matrix
-from sims.robot.model_field_effects import RK4_INTEGRATOR_ID
+from sims.robot.integrator_settings import RK4_INTEGRATOR_ID
 from sims.robot.robot_model import RobotModel, cache_per_robot
 
 MIN_DRIVE_INERTIA_SHARE = 0.01
@@ -48,7 +48,7 @@ Without inertia of the drive, x in (1) is undetermined.
 """
 COMPILE_INERTIA_SHARE = 1e-4
 """Minimum inertia of a drive while a model is compiled, as a share of the joint's inertia."""
-RESOLVED, RESOLVED_BY_RK4 = 1.2, 2.0
+MAX_PHASE, MAX_PHASE_RK4 = 1.2, 2.0
 """Maximum phase, in radians per step, of the oscillation between drive and links.
 
 The second value applies to the Runge-Kutta 4 integrator, the first one to all others.
@@ -107,7 +107,7 @@ def add_series_joints(robot: RobotModel, added: SeriesJoints) -> RobotModel:
     """Add joints in series to a robot, without changing element names.
 
     The second joint is in the same body, with the axis and position of the first one. All its
-    numbers are zero; `write_elements` sets them for each batch element.
+    numbers are zero; `write_series_element` sets them for each batch element.
 
     Args:
         robot: robot as read from its model file.
@@ -121,21 +121,21 @@ def add_series_joints(robot: RobotModel, added: SeriesJoints) -> RobotModel:
     for name, effects in group_by_joint(added).items():
         first = joints[robot.joint(name).id]
         # Default classes of the file apply to the first joint only.
-        nothing = {"damping": 0.0, "frictionloss": 0.0, "armature": 0.0, "stiffness": 0.0}
+        zero_attributes = {"damping": 0.0, "frictionloss": 0.0, "armature": 0.0, "stiffness": 0.0}
         second = first.parent.add_joint(
             name=make_series_joint_name(name, effects),
             type=first.type,
             axis=first.axis,
             pos=first.pos,
         )
-        for attribute, value in nothing.items():
+        for attribute, value in zero_attributes.items():
             setattr(second, attribute, np.full_like(getattr(second, attribute), value))
         second.springdamper = (0.0, 0.0)
         second.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
-        play = any(effect.endswith("backlash") for effect in effects)
+        has_backlash = any(effect.endswith("backlash") for effect in effects)
         limited = mujoco.mjtLimited
-        second.limited = limited.mjLIMITED_TRUE if play else limited.mjLIMITED_FALSE
-        if play:
+        second.limited = limited.mjLIMITED_TRUE if has_backlash else limited.mjLIMITED_FALSE
+        if has_backlash:
             second.range = (-1.0, 1.0)
         # The simulation writes the actual armature; this minimum makes the model compile.
         first.armature = max(first.armature, COMPILE_INERTIA_SHARE * inertias[name])
@@ -174,14 +174,18 @@ def write_series_effects(
         robot: robot of `add_series_joints`.
         acting: effects with coefficients (K, L, 1); other effects are ignored.
     """
-    made: dict[str, list[SeriesElement]] = {}
+    elements_by_joint: dict[str, list[SeriesElement]] = {}
     for effect, c in acting:
         if not is_series_effect(effect) or not (c[0] > 0).any():
             continue
-        numbers = dict(zip((one.name for one in effect.coefficients), c[:, :, 0], strict=True))
-        made.setdefault(effect.place, []).append(make_series_element(type(effect), numbers))
-    for place, elements in made.items():
-        write_elements(fields, robot, place, combine_elements(elements))
+        numbers = dict(
+            zip((coefficient.name for coefficient in effect.coefficients), c[:, :, 0], strict=True)
+        )
+        elements_by_joint.setdefault(effect.place, []).append(
+            make_series_element(type(effect), numbers)
+        )
+    for joint, elements in elements_by_joint.items():
+        write_series_element(fields, robot, joint, combine_elements(elements))
 
 
 def make_series_element(kind: type[Effect], numbers: Mapping[str, Array]) -> SeriesElement:
@@ -203,8 +207,8 @@ def combine_elements(elements: Sequence[SeriesElement]) -> SeriesElement:
     return SeriesElement(*(np.sum([getattr(e, name) for e in elements], axis=0) for name in names))
 
 
-def write_elements(
-    fields: Mapping[str, Any], robot: RobotModel, place: str, made: SeriesElement
+def write_series_element(
+    fields: Mapping[str, Any], robot: RobotModel, place: str, element: SeriesElement
 ) -> None:
     """Write the numbers of elements in series, of L batch elements, into model fields.
 
@@ -215,38 +219,38 @@ def write_elements(
         fields: model fields of the batch elements.
         robot: robot of `add_series_joints`.
         place: joint with which they are in series.
-        made: the elements.
+        element: the elements.
     """
     second = robot.joint(find_series_joint(robot, place))
     inertia = robot.series[second.name]
     dof = robot.joint(place).velocity
-    stated = fields["dof_armature"][:, dof]
-    drive = np.maximum(stated + made.drive * inertia, MIN_DRIVE_INERTIA_SHARE * inertia)
+    file_armature = fields["dof_armature"][:, dof]
+    drive = np.maximum(file_armature + element.drive * inertia, MIN_DRIVE_INERTIA_SHARE * inertia)
     fields["dof_armature"][:, dof] = drive
     option = robot.compiled.opt
     step = float(fields["opt.timestep"][0] if "opt.timestep" in fields else option.timestep)
-    number = fields["opt.integrator"][0] if "opt.integrator" in fields else option.integrator
-    stiffness, damping = _limit_for_step(
-        made, inertia, drive, step, int(number) == RK4_INTEGRATOR_ID
+    integrator = fields["opt.integrator"][0] if "opt.integrator" in fields else option.integrator
+    stiffness, damping = _limit_to_stable_values(
+        element, inertia, drive, step, int(integrator) == RK4_INTEGRATOR_ID
     )
-    give = is_compliant_flank(made)
-    fields["jnt_stiffness"][:, second.id] = np.where(give, 0.0, stiffness)
-    fields["dof_damping"][:, second.velocity] = np.where(give, 0.0, damping)
+    is_compliant = is_compliant_flank(element)
+    fields["jnt_stiffness"][:, second.id] = np.where(is_compliant, 0.0, stiffness)
+    fields["dof_damping"][:, second.velocity] = np.where(is_compliant, 0.0, damping)
     if "jnt_range" in fields:
-        half = 0.5 * made.gap
+        half = 0.5 * element.gap
         fields["jnt_range"][:, second.id] = np.stack([-half, half], axis=1)
-        soft = np.stack([-stiffness, -damping], axis=1)
+        compliant_solref = np.stack([-stiffness, -damping], axis=1)
         fields["jnt_solref"][:, second.id] = np.where(
-            give[:, None], soft, _compute_rigid_solref(step)
+            is_compliant[:, None], compliant_solref, _compute_rigid_solref(step)
         )
         fields["jnt_solimp"][:, second.id] = np.where(
-            give[:, None], COMPLIANT_FLANK_SOLIMP, RIGID_FLANK_SOLIMP
+            is_compliant[:, None], COMPLIANT_FLANK_SOLIMP, RIGID_FLANK_SOLIMP
         )
 
 
-def is_compliant_flank(made: SeriesElement) -> Flags:
+def is_compliant_flank(elements: SeriesElement) -> Flags:
     """Return whether elements (L,) are compliant flanks: a gap with a spring."""
-    return (made.gap > 0) & (made.stiffness > 0)
+    return (elements.gap > 0) & (elements.stiffness > 0)
 
 
 def convert_flank_parameters(fields: Mapping[str, Any], robot: RobotModel) -> None:
@@ -258,9 +262,9 @@ def convert_flank_parameters(fields: Mapping[str, Any], robot: RobotModel) -> No
     """
     for name in robot.series:
         second = robot.joint(name)
-        soft = fields["jnt_solimp"][:, second.id, 0] == COMPLIANT_FLANK_SOLIMP[0]
-        inverse = fields["dof_invweight0"][soft, second.velocity, None]
-        fields["jnt_solref"][soft, second.id] *= inverse  # (6)
+        is_compliant = fields["jnt_solimp"][:, second.id, 0] == COMPLIANT_FLANK_SOLIMP[0]
+        inverse = fields["dof_invweight0"][is_compliant, second.velocity, None]
+        fields["jnt_solref"][is_compliant, second.id] *= inverse  # (6)
 
 
 def _compute_rigid_solref(step: float) -> tuple[float, float]:
@@ -269,7 +273,7 @@ def _compute_rigid_solref(step: float) -> tuple[float, float]:
 
 
 def prepare_flanks_for_file(
-    robot: RobotModel, made: Mapping[str, SeriesElement], model: Any = None
+    robot: RobotModel, elements: Mapping[str, SeriesElement], model: Any = None
 ) -> RobotModel:
     """Set the joint limits that represent flanks, for writing a model file.
 
@@ -279,25 +283,27 @@ def prepare_flanks_for_file(
 
     Args:
         robot: robot of `add_series_joints`.
-        made: elements of one batch element, by the joint with which they are in series.
+        elements: elements of one batch element, by the joint with which they are in series.
         model: model compiled from the robot with all effects; required for compliant flanks.
     """
     spec, option = robot.spec.copy(), (model or robot.compiled).opt
     joints = {joint.name: joint for joint in spec.joints}
     step, explicit = float(option.timestep), int(option.integrator) == RK4_INTEGRATOR_ID
-    for place, one in made.items():
+    for place, element in elements.items():
         joint = joints[find_series_joint(robot, place)]
-        half = 0.5 * float(one.gap[0])
+        half = 0.5 * float(element.gap[0])
         if not half:
             continue
-        turns = robot.joint(joint.name).kind == "hinge" and spec.compiler.degree
-        half = float(np.rad2deg(half)) if turns else half
+        is_in_degrees = robot.joint(joint.name).kind == "hinge" and spec.compiler.degree
+        half = float(np.rad2deg(half)) if is_in_degrees else half
         joint.range = (-half, half)
         joint.solref_limit, joint.solimp_limit = _compute_rigid_solref(step), RIGID_FLANK_SOLIMP
-        if model is not None and is_compliant_flank(one)[0]:
+        if model is not None and is_compliant_flank(element)[0]:
             inertia, drive = robot.series[joint.name], model.dof_armature
             drive = drive[[robot.joint(place).velocity]]
-            numbers = np.stack(_limit_for_step(one, inertia, drive, step, explicit))[:, 0]
+            numbers = np.stack(_limit_to_stable_values(element, inertia, drive, step, explicit))[
+                :, 0
+            ]
             inverse = model.dof_invweight0[robot.joint(joint.name).velocity]
             joint.solref_limit, joint.solimp_limit = (
                 -numbers * inverse,
@@ -306,29 +312,31 @@ def prepare_flanks_for_file(
     return replace(robot, spec=spec)
 
 
-def _limit_for_step(
-    made: SeriesElement, inertia: float, drive: Array, step: float, explicit: bool
+def _limit_to_stable_values(
+    elements: SeriesElement, inertia: float, drive: Array, step: float, explicit: bool
 ) -> tuple[Array, Array]:
     """Limit stiffness and damping (L,) to values that are stable for a time step.
 
     Args:
-        made: elements in series.
+        elements: elements in series.
         inertia: inertia of the joint.
         drive: (L,) inertia of the drive.
         step: time step in seconds.
         explicit: whether the integrator treats damping explicitly (Runge-Kutta 4).
     """
-    softened = 1.0 / drive + 1.0 / inertia
-    most = ((RESOLVED_BY_RK4 if explicit else RESOLVED) / step) ** 2 / softened
-    stiffness = np.minimum(made.stiffness, most)
-    damping = 2.0 * made.damping * np.sqrt(stiffness * inertia)
-    borne = np.minimum(damping, RESOLVED / step / softened)
+    inverse_inertia = 1.0 / drive + 1.0 / inertia
+    max_stiffness = ((MAX_PHASE_RK4 if explicit else MAX_PHASE) / step) ** 2 / inverse_inertia
+    stiffness = np.minimum(elements.stiffness, max_stiffness)
+    damping = 2.0 * elements.damping * np.sqrt(stiffness * inertia)
+    stable_damping = np.minimum(damping, MAX_PHASE / step / inverse_inertia)
     if explicit:
-        return stiffness, borne
+        return stiffness, stable_damping
     # If damping is implicit, so is this stiffness, by the backward Euler rule: k (d + h d').
-    give = is_compliant_flank(made)
-    backward = damping + step * (made.stiffness - stiffness)
-    return np.where(give, stiffness, made.stiffness), np.where(give, borne, backward)
+    is_compliant = is_compliant_flank(elements)
+    implicit_damping = damping + step * (elements.stiffness - stiffness)
+    return np.where(is_compliant, stiffness, elements.stiffness), np.where(
+        is_compliant, stable_damping, implicit_damping
+    )
 
 
 def compute_rest_positions(
@@ -341,17 +349,19 @@ def compute_rest_positions(
         robot: robot of `add_series_joints`.
         loads: (n,) load at each of these joints.
     """
-    places = []
+    positions = []
     for (name, inertia), load in zip(robot.series.items(), loads, strict=True):
         second, n = robot.joint(name), len(load)
         stiffness = fields["jnt_stiffness"][:n, second.id]
-        soft = fields["jnt_solimp"][:n, second.id, 0] == COMPLIANT_FLANK_SOLIMP[0]
+        is_compliant = fields["jnt_solimp"][:n, second.id, 0] == COMPLIANT_FLANK_SOLIMP[0]
         inverse = fields["dof_invweight0"][:n, second.velocity]
-        pressed = np.where(
-            soft, -fields["jnt_solref"][:n, second.id, 0] / inverse, stiffness
+        effective_stiffness = np.where(
+            is_compliant, -fields["jnt_solref"][:n, second.id, 0] / inverse, stiffness
         )  # (6)
         half = fields["jnt_range"][:n, second.id, 1]
         on_flank = half * np.clip(load / (UNLOADED_FORCE_SHARE * inertia), -1.0, 1.0)
-        away = np.where(pressed > 0, load / np.maximum(pressed, 1e-300), 0.0)
-        places.append(away + np.where(soft | (stiffness <= 0), on_flank, 0.0))
-    return places
+        deflection = np.where(
+            effective_stiffness > 0, load / np.maximum(effective_stiffness, 1e-300), 0.0
+        )
+        positions.append(deflection + np.where(is_compliant | (stiffness <= 0), on_flank, 0.0))
+    return positions

@@ -20,9 +20,9 @@ import numpy as np
 from sims.core.simulator import Array
 from sims.robot.dynamics.inertia_matrix import inertia_matrix
 
-STIFF = 0.1
+MIN_STIFF_RATIO = 0.1
 """Minimum r (see the module) of a stiff servo."""
-NEAR = 0.9
+NEAR_LIMIT_SHARE = 0.9
 """Share of a force limit from which the limit counts as possibly reached.
 
 It is below 1 since the state is not known exactly.
@@ -43,7 +43,7 @@ class ForceLimits(NamedTuple):
     jumps: Array
 
 
-def stiff_force_limits(model: Any) -> ForceLimits:
+def find_stiff_force_limits(model: Any) -> ForceLimits:
     """Find the force limits of stiff servos, at which a linearised motion jumps.
 
     An implicit integrator takes the servo's damping into account within the step. At its force
@@ -54,6 +54,7 @@ def stiff_force_limits(model: Any) -> ForceLimits:
 
     kinds = mujoco.mjtIntegrator
     implicit = (int(kinds.mjINT_IMPLICIT), int(kinds.mjINT_IMPLICITFAST))
+    # Degree of freedom, output (field and column), limit in its units, and limit at the joint.
     rows: list[tuple[int, tuple[str, int], float, float]] = []
     gains = np.zeros(model.nv)
     if model.opt.integrator in implicit:
@@ -75,7 +76,7 @@ def stiff_force_limits(model: Any) -> ForceLimits:
     jumps = [_compute_jump(model, dof, force, gains) for dof, *_, force in rows]
     return ForceLimits(
         tuple(output for _, output, *_ in rows),
-        NEAR * np.array([limit for *_, limit, _ in rows]),
+        NEAR_LIMIT_SHARE * np.array([limit for *_, limit, _ in rows]),
         np.array(jumps).reshape(-1, model.nv),
     )
 
@@ -91,13 +92,13 @@ def _compute_jump(model: Any, dof: int, force: float, gains: Array) -> Array:
         force: force limit at the joint, in N or N m.
         gains: (nv,) velocity gains of the servos at the joints.
     """
-    inertia, step, others = inertia_matrix(model), model.opt.timestep, gains.copy()
-    others[dof] = 0.0
-    unit = np.zeros(model.nv)
-    unit[dof] = force
-    free = np.linalg.solve(inertia + step * np.diag(others), unit)
-    damped = np.linalg.solve(inertia + step * np.diag(gains), unit)
-    jump: Array = step**2 * np.abs(free - damped)
+    inertia, step, other_gains = inertia_matrix(model), model.opt.timestep, gains.copy()
+    other_gains[dof] = 0.0
+    force_vector = np.zeros(model.nv)
+    force_vector[dof] = force
+    undamped = np.linalg.solve(inertia + step * np.diag(other_gains), force_vector)
+    damped = np.linalg.solve(inertia + step * np.diag(gains), force_vector)
+    jump: Array = step**2 * np.abs(undamped - damped)
     return jump
 
 
@@ -114,4 +115,4 @@ def _find_dof(model: Any, actuator: int) -> int | None:
 
 
 def _is_stiff(model: Any, dof: int, gain: float) -> bool:
-    return bool(model.opt.timestep * gain > STIFF * model.dof_M0[dof])
+    return bool(model.opt.timestep * gain > MIN_STIFF_RATIO * model.dof_M0[dof])

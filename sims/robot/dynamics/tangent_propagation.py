@@ -32,7 +32,7 @@ from sims.core.effect import ActiveEffects, Effect
 from sims.core.simulator import Array
 from sims.robot.dynamics.effect_forces import is_in_drive
 from sims.robot.dynamics.linearisation_points import LinearisationPoints
-from sims.robot.dynamics.midpoint_state import Mask, Places
+from sims.robot.dynamics.midpoint_state import IndexArray, Mask
 from sims.robot.dynamics.mujoco_batch import MujocoBatch
 
 POSITION, VELOCITY, CONTROL, SHARE = 1e-6, 1e-5, 1e-5, 1e-3
@@ -113,23 +113,25 @@ class TangentModel:
         self._sizes = sizes
         self._steps = len(at.motion.controls)
         numbers = np.arange(self._steps)
-        self._share: Array = (numbers - at.numbers[at.of]) / at.every
-        self._earlier, self._later = _find_neighbours(at.numbers, at.every)[:, at.of]
-        self._base, self._read = at.step_displaced({}, at.acting)
+        self._share: Array = (numbers - at.point_steps[at.point_of_step]) / at.point_spacing
+        self._earlier, self._later = _find_neighbours(at.point_steps, at.point_spacing)[
+            :, at.point_of_step
+        ]
+        self._base_states, self._base_readings = at.step_displaced({}, at.acting)
         # If commands change at other times, the linearisation points differ.
-        if quotients is None or quotients.states.shape[:2] != self._base.shape:
+        if quotients is None or quotients.states.shape[:2] != self._base_states.shape:
             quotients = self._compute_difference_quotients()
         self.quotients = quotients
 
     @cached_property
-    def _still(self) -> tuple[Array, Array]:
+    def _base_accelerations(self) -> tuple[Array, Array]:
         """Accelerations (N, E) and readings (N, O) of the unperturbed motion."""
         return self._at.compute_accelerations(self._at.acting)
 
     @property
     def placed_element_count(self) -> int:
         """Number of batch elements that were placed at linearisation points so far."""
-        return self._at.seen
+        return self._at.placed_count
 
     @property
     def state_size(self) -> int:
@@ -138,42 +140,46 @@ class TangentModel:
         They are positions, velocities, activations, hidden states of effects, and displacements and
         velocities of floating bodies.
         """
-        return int(self._base.shape[1])
+        return int(self._base_states.shape[1])
 
     def _compute_difference_quotients(self) -> DifferenceQuotients:
         """Compute the matrices A, B and C of (1) by forward differences at all points.
 
-        `moves` lists the displacements as (quantity, index, size). The quantities are q
+        `displacements` lists the displacements as (quantity, index, size). The quantities are q
         position, v velocity, a activation, w hidden state of an effect, p and r
-        displacement and velocity of floating bodies, f force, u control. `found` has the
-        quotients of states and readings by z, f, u.
+        displacement and velocity of floating bodies, f force, u control. `quotients` has those
+        of states and readings by the state z, the forces f and the controls u.
         """
-        size = self._motion.x.shape[1]
-        afloat = self._sizes.size - size
+        joint_count = self._motion.x.shape[1]
+        floating_count = self._sizes.size - joint_count
         na, nu = self._motion.act.shape[1], self._motion.controls.shape[1]
-        moves: dict[str, list[tuple[str, int, float]]] = {
-            "z": [("q", j, POSITION) for j in range(size)]
-            + [("v", j, VELOCITY) for j in range(size)]
+        displacements: dict[str, list[tuple[str, int, float]]] = {
+            "z": [("q", j, POSITION) for j in range(joint_count)]
+            + [("v", j, VELOCITY) for j in range(joint_count)]
             + [("a", j, CONTROL) for j in range(na)]
-            + [("w", k, CONTROL) for k in self._at.remembering]
-            + [("p", j, POSITION) for j in range(afloat)]
-            + [("r", j, VELOCITY) for j in range(afloat)],
-            "f": [("f", j, SHARE * float(self._sizes[j])) for j in range(size + afloat)],
+            + [("w", k, CONTROL) for k in self._at.hidden_state_effects]
+            + [("p", j, POSITION) for j in range(floating_count)]
+            + [("r", j, VELOCITY) for j in range(floating_count)],
+            "f": [
+                ("f", j, SHARE * float(self._sizes[j])) for j in range(joint_count + floating_count)
+            ],
             "u": [("u", j, CONTROL) for j in range(nu)],
         }
-        found: dict[str, tuple[Array, Array]] = {}
-        for kind, columns in moves.items():
+        quotients: dict[str, tuple[Array, Array]] = {}
+        for kind, columns in displacements.items():
             states, readings = [], []
-            for name, j, by in columns:
-                state, reading = self._at.step_displaced({name: (j, by)}, self._at.acting)
-                states.append((state - self._base) / by)
-                readings.append((reading - self._read) / by)
-            rows = self._at.numbers.size
-            found[kind] = (
-                np.stack(states, axis=2) if states else np.zeros((rows, self.state_size, 0)),
-                np.stack(readings, axis=2) if readings else np.zeros((*self._read.shape, 0)),
+            for name, j, difference in columns:
+                state, reading = self._at.step_displaced({name: (j, difference)}, self._at.acting)
+                states.append((state - self._base_states) / difference)
+                readings.append((reading - self._base_readings) / difference)
+            point_count = self._at.point_steps.size
+            quotients[kind] = (
+                np.stack(states, axis=2) if states else np.zeros((point_count, self.state_size, 0)),
+                np.stack(readings, axis=2)
+                if readings
+                else np.zeros((*self._base_readings.shape, 0)),
             )
-        return DifferenceQuotients(*(found[k][i] for i in range(2) for k in ("z", "f", "u")))
+        return DifferenceQuotients(*(quotients[k][i] for i in range(2) for k in ("z", "f", "u")))
 
     # -- changes
 
@@ -190,17 +196,19 @@ class TangentModel:
             change: size of the change.
             mujoco_batch: batch whose model has the required elements.
         """
-        meant = self._mean_acceleration_forces
+        step_mean_forces = self._mean_acceleration_forces
         with self._at.with_batch(mujoco_batch):
-            accelerations, readings = self._at.compute_accelerations(acting, meant)
+            accelerations, readings = self._at.compute_accelerations(acting, step_mean_forces)
             # External forces change readings of drives immediately, so the other readings are
             # computed without these forces.
             if self._at.reads_others:
                 _, readings = self._at.compute_accelerations(acting)
         # A change of the acceleration is equivalent to a force.
-        apart = (accelerations - self.accelerations[self._at.numbers]) / change
-        force = np.einsum("nij,nj->ni", self._compute_inertias, apart)
-        return Perturbation(owner, forces=force, readings=(readings - self._still[1]) / change)
+        difference = (accelerations - self.accelerations[self._at.point_steps]) / change
+        force = np.einsum("nij,nj->ni", self._mass_matrices, difference)
+        return Perturbation(
+            owner, forces=force, readings=(readings - self._base_accelerations[1]) / change
+        )
 
     @cached_property
     def _mean_acceleration_forces(self) -> Array:
@@ -209,8 +217,8 @@ class TangentModel:
         They represent the damping of an implicit integrator, and the motion of other joints within
         the step.
         """
-        apart = self.accelerations[self._at.numbers] - self._still[0]
-        forces: Array = np.einsum("nij,nj->ni", self._compute_inertias, apart)
+        difference = self.accelerations[self._at.point_steps] - self._base_accelerations[0]
+        forces: Array = np.einsum("nij,nj->ni", self._mass_matrices, difference)
         return forces
 
     def perturb_by_force(self, owner: int, effect: Effect, c: Array) -> list[Perturbation]:
@@ -227,13 +235,14 @@ class TangentModel:
         if is_in_drive(effect) and self._at.reads_drives:
             changes.append(
                 Perturbation(
-                    owner, readings=self._at.compute_drive_reading_changes(effect, c, self._read)
+                    owner,
+                    readings=self._at.compute_drive_reading_changes(effect, c, self._base_readings),
                 )
             )
         return changes
 
     @cached_property
-    def _compute_inertias(self) -> Array:
+    def _mass_matrices(self) -> Array:
         return self._at.compute_mass_matrices()
 
     @cached_property
@@ -259,23 +268,27 @@ class TangentModel:
             Changes of states (n, S + 1, Z) and of readings (n, S, O).
         """
         q = self.quotients
-        size = q.forces.shape[1]
+        state_size = q.forces.shape[1]
         steps = self._steps
-        pushed, read = self.pushed(changes, count)
+        inputs, readings = self.sum_inputs_and_readings(changes, count)
         # States, forces and controls are stacked, so that a step is one matrix product.
-        whole = np.zeros((steps + 1, size + pushed.shape[1], count))
-        whole[:-1, size:] = pushed
-        step = list(np.concatenate([q.states, q.forces, q.controls], axis=2))
-        rows = list(whole)
-        for t, look in enumerate(self._at.of.tolist()):
-            np.matmul(step[look], rows[t], out=rows[t + 1][:size])  # (2)
-        if read.shape[1]:
-            read += np.matmul(q.read_states[self._at.of], whole[:-1, :size])
-        states = whole[:, :size]
-        return np.moveaxis(states, 2, 0), np.moveaxis(read, 2, 0)
+        stacked = np.zeros((steps + 1, state_size + inputs.shape[1], count))
+        stacked[:-1, state_size:] = inputs
+        step_matrices = list(np.concatenate([q.states, q.forces, q.controls], axis=2))
+        stacked_steps = list(stacked)
+        for t, point in enumerate(self._at.point_of_step.tolist()):
+            np.matmul(
+                step_matrices[point], stacked_steps[t], out=stacked_steps[t + 1][:state_size]
+            )  # (2)
+        if readings.shape[1]:
+            readings += np.matmul(q.read_states[self._at.point_of_step], stacked[:-1, :state_size])
+        states = stacked[:, :state_size]
+        return np.moveaxis(states, 2, 0), np.moveaxis(readings, 2, 0)
 
-    def pushed(self, changes: Sequence[Perturbation], count: int) -> tuple[Array, Array]:
-        """Compute what changes add to forces and controls, and to readings directly.
+    def sum_inputs_and_readings(
+        self, changes: Sequence[Perturbation], count: int
+    ) -> tuple[Array, Array]:
+        """Add up the forces and controls of changes, and their direct changes of readings.
 
         Args:
             changes: changes with owners from 0 to `count` - 1.
@@ -285,59 +298,67 @@ class TangentModel:
             Forces and controls (S, E + nu, n); readings (S, O, n) at unchanged states.
         """
         q = self.quotients
-        joints = q.forces.shape[2]
-        steps, actuators, outputs = self._steps, q.controls.shape[2], self._read.shape[1]
+        force_count = q.forces.shape[2]
+        steps, control_count, reading_count = (
+            self._steps,
+            q.controls.shape[2],
+            self._base_readings.shape[1],
+        )
         # The series of one owner are contiguous in memory while they are added up.
-        pushed = np.zeros((joints + actuators, count, steps))
-        at_once = np.zeros((actuators, count, steps)) if outputs else pushed[joints:]
-        read = np.zeros((steps, outputs, count))
+        inputs = np.zeros((force_count + control_count, count, steps))
+        instant_inputs = (
+            np.zeros((control_count, count, steps)) if reading_count else inputs[force_count:]
+        )
+        readings = np.zeros((steps, reading_count, count))
         for change in changes:
             owner = change.owner
             if change.joint >= 0 and change.series is not None:
-                pushed[change.joint, owner] += change.series
+                inputs[change.joint, owner] += change.series
             if change.actuator >= 0 and change.series is not None:
-                pushed[joints + change.actuator, owner] += change.series
+                inputs[force_count + change.actuator, owner] += change.series
                 instant = change.series if change.instant is None else change.instant
-                if outputs:
-                    at_once[change.actuator, owner] += instant
+                if reading_count:
+                    instant_inputs[change.actuator, owner] += instant
             if change.forces is not None:
-                pushed[:joints, owner] += self._interpolate_to_steps(change.forces).T
+                inputs[:force_count, owner] += self._interpolate_to_steps(change.forces).T
             if change.readings is not None:
-                read[:, :, owner] += self._interpolate_to_steps(change.readings)
-        whole = np.ascontiguousarray(pushed.transpose(2, 0, 1))
-        if outputs:
-            forces = whole[:, :joints].copy()
+                readings[:, :, owner] += self._interpolate_to_steps(change.readings)
+        stepwise_inputs = np.ascontiguousarray(inputs.transpose(2, 0, 1))
+        if reading_count:
+            forces = stepwise_inputs[:, :force_count].copy()
             # Changes of model parameters already contain their effect on readings.
             forces[:, :, self._find_parameter_changes(changes, count)] = 0.0
-            read += np.matmul(q.read_forces[self._at.of], forces)
-            instants = np.ascontiguousarray(at_once.transpose(2, 0, 1))
-            read += np.matmul(q.read_controls[self._at.of], instants)
-        return whole, read
+            readings += np.matmul(q.read_forces[self._at.point_of_step], forces)
+            instants = np.ascontiguousarray(instant_inputs.transpose(2, 0, 1))
+            readings += np.matmul(q.read_controls[self._at.point_of_step], instants)
+        return stepwise_inputs, readings
 
     @property
-    def looked_at(self) -> Places:
+    def point_of_step(self) -> IndexArray:
         """Index of the linearisation point whose quotients apply to each step, (S,)."""
-        return self._at.of
+        return self._at.point_of_step
 
     @property
-    def looks_at(self) -> int:
+    def point_count(self) -> int:
         """Number N of linearisation points."""
-        return int(self._at.numbers.size)
+        return int(self._at.point_steps.size)
 
     @property
-    def remembering(self) -> Sequence[int]:
+    def hidden_state_effects(self) -> Sequence[int]:
         """Numbers of the effects with hidden states."""
-        return self._at.remembering
+        return self._at.hidden_state_effects
 
     @property
     def motion_readings(self) -> Array:
         """Readings (S, O) of the motion at the beginnings of steps, as computed by the model."""
-        motion, of = self._motion, self._at.of
+        motion, points = self._motion, self._at.point_of_step
         with self._at.every_step():
             _, read = self._at.compute_accelerations(self._at.acting)
         # A step applies the mean of a command, while a sensor shows its value at the beginning.
-        apart = motion.instant - motion.controls
-        result: Array = read + np.einsum("sou,su->so", self.quotients.read_controls[of], apart)
+        difference = motion.instant - motion.controls
+        result: Array = read + np.einsum(
+            "sou,su->so", self.quotients.read_controls[points], difference
+        )
         return result
 
     def step_errors(self, finer: MujocoBatch) -> Array:
@@ -351,7 +372,7 @@ class TangentModel:
         """
         with self._at.with_batch(finer):
             state, _ = self._at.step_displaced({}, self._at.acting, steps=2)
-        return 2.0 * (state - self._base)
+        return 2.0 * (state - self._base_states)
 
     @cached_property
     def defects(self) -> Array:
@@ -390,7 +411,7 @@ class TangentModel:
         last point.
         """
         slope = values[self._later] - values[self._earlier]
-        result: Array = values[self._at.of] + self._share[:, None] * slope
+        result: Array = values[self._at.point_of_step] + self._share[:, None] * slope
         return result
 
     @staticmethod
@@ -409,30 +430,30 @@ class TangentModel:
         Returns:
             Changes of states (2 D, S + 1, Z) and of readings (2 D, S, O).
         """
-        size = 2 * self._motion.x.shape[1]
+        count = 2 * self._motion.x.shape[1]
         q = self.quotients
-        states = np.zeros((self._steps + 1, self._base.shape[1], size))
-        readings = np.zeros((self._steps, self._read.shape[1], size))
-        states[0, :size] = np.eye(size)
+        states = np.zeros((self._steps + 1, self._base_states.shape[1], count))
+        readings = np.zeros((self._steps, self._base_readings.shape[1], count))
+        states[0, :count] = np.eye(count)
         for t in range(self._steps):
-            readings[t] = q.read_states[self._at.of[t]] @ states[t]
-            states[t + 1] = q.states[self._at.of[t]] @ states[t]
+            readings[t] = q.read_states[self._at.point_of_step[t]] @ states[t]
+            states[t + 1] = q.states[self._at.point_of_step[t]] @ states[t]
         return np.moveaxis(states, 2, 0), np.moveaxis(readings, 2, 0)
 
 
-def _find_neighbours(looks: Places, every: int) -> Places:
+def _find_neighbours(point_steps: IndexArray, spacing: int) -> IndexArray:
     """Find the pairs of linearisation points for interpolation, (2, N).
 
-    A pair is `every` steps apart: a point and the next one, or the previous one and the point if a
-    command changes in between. If neither exists, the point itself is given twice.
+    A pair is `spacing` steps apart: a point and the next one, or the previous one and the point if
+    a command changes in between. If neither exists, the point itself is given twice.
 
     Args:
-        looks: (N,) steps of the linearisation points.
-        every: regular number of steps between two points.
+        point_steps: (N,) steps of the linearisation points.
+        spacing: regular number of steps between two points.
     """
-    numbers = np.arange(looks.size)
-    after = np.append(np.diff(looks) == every, False)
-    before = np.append(False, np.diff(looks) == every)
-    earlier = np.where(after, numbers, np.where(before, numbers - 1, numbers))
-    later = np.where(after, numbers + 1, numbers)
+    numbers = np.arange(point_steps.size)
+    has_next = np.append(np.diff(point_steps) == spacing, False)
+    has_previous = np.append(False, np.diff(point_steps) == spacing)
+    earlier = np.where(has_next, numbers, np.where(has_previous, numbers - 1, numbers))
+    later = np.where(has_next, numbers + 1, numbers)
     return np.stack([earlier, later])

@@ -28,7 +28,7 @@ from sims.robot.dynamics.series_joints import (
     is_series_effect,
     make_series_element,
     prepare_flanks_for_file,
-    write_elements,
+    write_series_element,
 )
 from sims.robot.export.command_attributes import COMMAND_WRITERS, get_application_order
 from sims.robot.export.mjcf_attributes import (
@@ -247,7 +247,7 @@ def _write_cause(
         return None
     if _is_in_series(cause):
         if cause.place in series:
-            write_elements(target_values, robot, cause.place, series[cause.place])
+            write_series_element(target_values, robot, cause.place, series[cause.place])
         return None
     if cause.effect in COMMAND_WRITERS:
         return COMMAND_WRITERS[cause.effect](target_values, robot, cause)

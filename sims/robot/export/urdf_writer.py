@@ -30,10 +30,10 @@ from sims.robot.export.xml_editing import (
     format_numbers,
 )
 from sims.robot.fitted_causes import FittedCause
+from sims.robot.inertia_tensors import compute_point_inertias
 from sims.robot.model_field_effects import (
-    add_to_stated,
+    add_to_file_value,
     compute_factor,
-    compute_point_inertias,
 )
 from sims.robot.robot_model import RobotModel
 
@@ -99,7 +99,9 @@ class UrdfWriter:
         dynamics = _get_or_add_child(joint, "dynamics")
         before = float(dynamics.get_attribute(attribute) or 0.0)
         self._add_comment(dynamics, cause)
-        dynamics.new[attribute] = format_number(float(add_to_stated(before, cause.coefficients[0])))
+        dynamics.new[attribute] = format_number(
+            float(add_to_file_value(before, cause.coefficients[0]))
+        )
         return None
 
     def _add_comment(self, tag: XmlElement, cause: FittedCause) -> None:

@@ -10,7 +10,7 @@ from xml.etree.ElementTree import Element, SubElement
 
 from sims.core.simulator import InputError, make_unknown_name_error
 from sims.core.value_limits import truncate_text
-from sims.robot.model_field_effects import FRICTION_SOLIMP
+from sims.robot.friction_constraint import FRICTION_SOLIMP
 from sims.robot.mujoco_messages import format_mujoco_error
 from sims.robot.note_text import format_name_list
 from sims.robot.parsing.urdf_links import (

@@ -17,9 +17,9 @@ from sims.extended_simulator import (
     read_extended,
     write_extended,
 )
-from sims.robot.dynamics.linearisation_points import friction_damping
 from sims.robot.dynamics.run_linearisation import RunLinearisation
 from sims.robot.export.write_model_file import write_model_files
+from sims.robot.friction_constraint import get_friction_constraint
 from sims.robot.integrator_settings import INTEGRATOR_IDS
 from sims.robot.parsing.read_model_file import read_robot
 from sims.robot.robot_model import RobotModel
@@ -106,10 +106,10 @@ def test_friction_damping_is_that_of_the_constraint(tmp_path):
         data.qvel[:] = (0.0, 0.3)
         mujoco.mj_forward(model, data)
         assert data.efc_type.tolist() == [mujoco.mjtConstraint.mjCNSTR_FRICTION_DOF]
-        damping, impedance = friction_damping(robot.with_friction_form("soft"), 1)
+        damping, impedance = get_friction_constraint(robot.with_friction_form("soft"), 1)
         assert -damping * 0.3 == pytest.approx(data.efc_aref[0])
         assert impedance == pytest.approx(data.efc_KBIP[0, 2])
-        assert friction_damping(robot, 1) == pytest.approx((1 / 0.002 / 0.9999, 0.9999))
+        assert get_friction_constraint(robot, 1) == pytest.approx((1 / 0.002 / 0.9999, 0.9999))
 
 
 @pytest.mark.parametrize("integrator", ["Euler", "implicitfast", "RK4"])

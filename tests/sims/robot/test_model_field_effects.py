@@ -13,6 +13,7 @@ from mujoco.batch import Batch
 from sims.robot import model_field_effects
 from sims.robot.coupled_drives import COUPLING_PLACEHOLDER
 from sims.robot.dynamics.added_elements import add_elements
+from sims.robot.dynamics.mujoco_batch import make_batch_spec
 from sims.robot.robot_model import RobotModel
 from tests.sims.robot.sample_arms import ARM, robot
 
@@ -93,7 +94,7 @@ def lanes(robot: RobotModel, effect: str, place: str, c: tuple[float, ...]) -> A
     of = model_field_effects.MODEL_FIELD_EFFECTS[effect]
     if effect == COUPLING_PLACEHOLDER[1]:
         robot = add_elements(robot, (COUPLING_PLACEHOLDER,))
-    batch = Batch(model_field_effects.compile_batch_model(robot), 2, 1)
+    batch = Batch(robot.compile(make_batch_spec(robot)), 2, 1)
     fields = {name: batch.expand(name) for name in of.fields}
     of.write(fields, robot, place, np.array([[0.0, value] for value in c]))
     if of.changes_derived_constants:

@@ -74,9 +74,9 @@ def moved(robot, derived=False, series=()):
     rng = np.random.default_rng(1)
     mujoco_batch.write_effects(())
     mujoco_batch.batch.reset(stage=0)
-    state = 0.5 * rng.normal(size=(8, 2, mujoco_batch.places.positions.size))
-    mujoco_batch.batch.bind("qpos")[:, mujoco_batch.places.positions] = state[:, 0]
-    mujoco_batch.batch.bind("qvel")[:, mujoco_batch.places.velocities] = state[:, 1]
+    state = 0.5 * rng.normal(size=(8, 2, mujoco_batch.file_joints.positions.size))
+    mujoco_batch.batch.bind("qpos")[:, mujoco_batch.file_joints.positions] = state[:, 0]
+    mujoco_batch.batch.bind("qvel")[:, mujoco_batch.file_joints.velocities] = state[:, 1]
     controls = 0.5 * rng.normal(size=(8, 150, mujoco_batch.model.nu))
     done = mujoco_batch.step(
         controls, np.zeros((8, 150, mujoco_batch.model.nv)), ["qpos", "qvel", "sensordata"]

@@ -2,7 +2,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from sims.robot.dynamics.servo_force_limits import stiff_force_limits
+from sims.robot.dynamics.servo_force_limits import find_stiff_force_limits
 
 STEP, INERTIA, KP, KV, LIMIT = 0.002, 0.02, 2000.0, 100.0, 28.0
 SERVO = """
@@ -36,7 +36,7 @@ def moved(model, share):
 @pytest.mark.parametrize("where", WHERE)
 def test_the_jump_is_that_of_a_step_on_either_side_of_the_limit(where):
     model = servo(where)
-    found = stiff_force_limits(model)
+    found = find_stiff_force_limits(model)
     ratio = STEP * KV / INERTIA
     assert found.jumps.shape == (1, 1)
     assert found.jumps[0, 0] == pytest.approx(STEP**2 * LIMIT / INERTIA * ratio / (1 + ratio))
@@ -48,7 +48,7 @@ def test_the_jump_is_that_of_a_step_on_either_side_of_the_limit(where):
 @pytest.mark.parametrize("settings", [{"integrator": "Euler"}, {"kv": 0.5}])
 def test_other_servos_have_none(settings):
     model = servo(**settings)
-    assert stiff_force_limits(model).sizes.size == 0
+    assert find_stiff_force_limits(model).sizes.size == 0
     measured = moved(model, 1.0001) - moved(model, 0.9999)
     assert abs(measured) < 0.1 * STEP**2 * LIMIT / INERTIA
 
@@ -69,5 +69,5 @@ def test_a_coupled_joint_moves_the_other_as_well():
         mujoco.mj_step(model, data)
         ends.append(data.qpos.copy())
     np.testing.assert_allclose(
-        stiff_force_limits(model).jumps[0], np.abs(ends[1] - ends[0]), rtol=1e-2
+        find_stiff_force_limits(model).jumps[0], np.abs(ends[1] - ends[0]), rtol=1e-2
     )

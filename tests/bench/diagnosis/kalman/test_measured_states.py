@@ -8,7 +8,11 @@ import pytest
 
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.logs.joined_recordings import load_joined
-from sims.robot.dynamics.measured_linearisation import MeasuredLinear, Trajectory, quintic
+from sims.robot.dynamics.measured_linearisation import (
+    MeasuredLinear,
+    Trajectory,
+    interpolate_quintic,
+)
 from sims.robot.dynamics.run_linearisation import compute_control_changes
 from sims.robot.floating_joints import FloatingState
 
@@ -156,10 +160,10 @@ def test_a_quintic_goes_through_values_and_derivatives():
         return np.stack([value, slope, curve], axis=1)
 
     between = np.linspace(0.0, 0.4, 37)
-    value, slope = quintic(times, samples(times), between)
+    value, slope = interpolate_quintic(times, samples(times), between)
     np.testing.assert_allclose(value, samples(between)[:, 0], atol=1e-12)
     np.testing.assert_allclose(slope, samples(between)[:, 1], atol=1e-10)
-    beyond, rate = quintic(times, samples(times), np.array([0.6]))
+    beyond, rate = interpolate_quintic(times, samples(times), np.array([0.6]))
     assert rate[0] == pytest.approx(slope[-1])
     assert beyond[0] == pytest.approx(value[-1] + 0.2 * slope[-1])
 
