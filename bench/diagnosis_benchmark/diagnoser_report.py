@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
 
 import pandas as pd
 
-from bench.benchmark.problem.experiment import Experiment
 from bench.benchmark.results_report import REPORT_FILE
 from bench.benchmark.storage.result_folder import FolderConfiguration
 from bench.diagnosis_benchmark import diagnoser_figures
@@ -88,22 +88,22 @@ def write_report(study: ReportableDiagnosisStudy, print_line: Callable[[str], No
     tables = build_all_tables(rows, order, training)
     for name, frame in {**tables, "failures": build_failure_table(rows, order)}.items():
         write_atomically(study.folder / f"{name}.csv", format_csv(frame))
-    pictures = draw_figures(study.configuration.experiment, rows, tables, order)
-    for name, picture in pictures.items():
-        write_figure_files(study.folder / "figures" / name, picture.png, picture.pdf)
-    report_data = DiagnoserReportData(
+    data = DiagnoserReportData(
         study.configuration.experiment,
         str(study.folder),
         order,
         rows,
         tables,
         training,
-        pictures,
+        {},
         study.skipped_diagnosers,
         len(study.cases),
         left_out,
     )
-    write_atomically(study.folder / REPORT_FILE, render_page(report_data))
+    data = replace(data, pictures=draw_figures(data))
+    for name, picture in data.pictures.items():
+        write_figure_files(study.folder / "figures" / name, picture.png, picture.pdf)
+    write_atomically(study.folder / REPORT_FILE, render_page(data))
     for line in format_summary(tables, order):
         print_line(line)
     for name, reason, count in summarise_unsupported(left_out):
@@ -118,7 +118,7 @@ def write_report(study: ReportableDiagnosisStudy, print_line: Callable[[str], No
         f"written: {study.folder}/ with {ANSWERS_TABLE_FILE}, "
         f"{', '.join(f'{n}.csv' for n in tables)}"
     )
-    print_line(f"figures: {', '.join(f'{name}.png' for name in sorted(pictures))}")
+    print_line(f"figures: {', '.join(f'{name}.png' for name in sorted(data.pictures))}")
     print_line(f"report: {study.folder / REPORT_FILE}")
     failed = rows[rows["status"] != "done"]
     for _, row in failed.head(_MAX_LISTED_FAILURES).iterrows():
@@ -138,48 +138,24 @@ def format_csv(frame: pd.DataFrame) -> str:
     return text
 
 
-def draw_figures(
-    experiment: Experiment,
-    rows: pd.DataFrame,
-    tables: Mapping[str, pd.DataFrame],
-    order: Sequence[str],
-) -> dict[str, FigureFiles]:
+def draw_figures(data: DiagnoserReportData) -> dict[str, FigureFiles]:
     """Draw every figure for which there is data.
 
-    Most figures need clean cases and cases with one effect: they compare false alarms with causes
-    found.
+    Outcomes and confusion need clean cases and cases with one effect.
 
     Args:
-        experiment: the experiment, for the title.
-        rows: one row per answer.
-        tables: tables by name.
-        order: names of the diagnosers, in the order of their colours.
+        data: the data of the report; its printed figures are not used.
 
     Returns:
         Figures by name.
     """
-    title = experiment.title or experiment.name
-    figures = {}
-    counted = (
-        index_by_diagnoser(tables["table"], metric) for metric in ("false alarms", "named, alone")
-    )
-    if all(any(line["of"] for line in lines.values()) for lines in counted):
-        figures["board"] = diagnoser_figures.draw_leaderboard(tables["table"], order, title)
-        figures["outcomes"] = diagnoser_figures.draw_outcomes(
-            select_single_effects(rows), order, title
-        )
-        figures["confusion"] = draw_confusion_matrices(rows, order, title)
-        figures["cost"] = diagnoser_figures.draw_cost(
-            tables["costs"], tables["table"], order, title
-        )
-    if not tables["power"].empty:
-        figures["power"] = diagnoser_figures.draw_power(tables["power"], order, title)
-    if not tables["calibration"].empty:
-        figures["calibration"] = diagnoser_figures.draw_p_value_calibration(
-            tables["calibration"], order, title
-        )
+    figures = diagnoser_figures.draw_chart_figures(data)
+    if data.counts["clean_count"] and data.counts["single_count"]:
+        singles = select_single_effects(data.rows)
+        figures["outcomes"] = diagnoser_figures.draw_outcomes(singles, data.order, data.title)
+        figures["confusion"] = draw_confusion_matrices(data.rows, data.order, data.title)
     return {
-        name: render_all_formats(add_trust_note(figure, experiment.trusted))
+        name: render_all_formats(add_trust_note(figure, data.experiment.trusted))
         for name, figure in figures.items()
     }
 

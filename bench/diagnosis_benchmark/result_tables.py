@@ -21,6 +21,8 @@ MIN_GRADED_SIZE = 1.0
 """Minimum size of an effect that must be diagnosed, in units of the noise."""
 P_VALUE_LEVELS = (0.01, 0.05, 0.1, 0.2, 0.5)
 """Significance levels at which p-values of clean recordings are counted."""
+TARGET_FALSE_ALARM_RATE = 0.01
+"""Maximum acceptable fraction of false alarms, drawn as a reference line."""
 REFERENCE_DIAGNOSER = "simgap"
 """Diagnoser with which all others are compared."""
 SET_SIZE_BINS = {"1": (1, 1), "2": (2, 2), "3 to 4": (3, 4), "5 or more": (5, 10**6)}

@@ -7,7 +7,12 @@ from dataclasses import replace
 import pandas as pd
 
 from bench.diagnosis_benchmark.report_page.diagnoser_page_data import DiagnoserReportData
-from bench.diagnosis_benchmark.result_tables import P_VALUE_LEVELS, PRIMARY_METRIC, SET_SIZE_LABELS
+from bench.diagnosis_benchmark.result_tables import (
+    P_VALUE_LEVELS,
+    PRIMARY_METRIC,
+    SET_SIZE_LABELS,
+    TARGET_FALSE_ALARM_RATE,
+)
 from bench.figures.style import GREY, make_mark_style
 from bench.pages.chart import Axis, Panel, ReferenceLine, Series
 
@@ -91,7 +96,8 @@ def _make_board(data: DiagnoserReportData) -> list[Panel]:
         ends=(-0.15, 110.0),
     )
     y_axis = Axis("single causes named [%]", scales=("linear",), ends=(-3.0, 103.0))
-    series, rules = data.make_interval_series("share"), (ReferenceLine(1.0, "1 %", "x"),)
+    series, percent = data.make_interval_series("share"), 100 * TARGET_FALSE_ALARM_RATE
+    rules = (ReferenceLine(percent, f"{percent:g} %", "x"),)
     return [Panel("", "board", "alarms", series, x_axis, y_axis, rules=rules)]
 
 

@@ -7,11 +7,11 @@ from typing import Any, NamedTuple
 
 import pandas as pd
 
-from bench.diagnosis_benchmark.diagnoser_figures import TARGET_FALSE_ALARM_RATE
 from bench.diagnosis_benchmark.report_page.diagnoser_page_data import DiagnoserReportData
 from bench.diagnosis_benchmark.result_tables import (
     PRIMARY_METRIC,
     REFERENCE_DIAGNOSER,
+    TARGET_FALSE_ALARM_RATE,
     index_by_diagnoser,
 )
 from bench.diagnosis_benchmark.wrong_answers import is_correct, select_graded_answers

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from bench.diagnosis_benchmark.diagnoser_figures import TARGET_FALSE_ALARM_RATE
 from bench.diagnosis_benchmark.report_page import diagnoser_charts as charts
 from bench.diagnosis_benchmark.report_page import diagnoser_conclusion as conclusion
 from bench.diagnosis_benchmark.report_page.diagnoser_page_data import DiagnoserReportData
-from bench.diagnosis_benchmark.result_tables import PRIMARY_METRIC, REFERENCE_DIAGNOSER
+from bench.diagnosis_benchmark.result_tables import (
+    PRIMARY_METRIC,
+    REFERENCE_DIAGNOSER,
+    TARGET_FALSE_ALARM_RATE,
+)
 from bench.diagnosis_benchmark.wrong_answers import build_failure_table
 from bench.pages.html_page import HtmlPage
 
@@ -32,9 +35,7 @@ def render_page(data: DiagnoserReportData) -> str:
     for name, table in tables.items():
         if len(table):
             page.add_table(name, table, _DIGITS)
-    table, power, groups = (data.tables[name] for name in ("table", "power", "groups"))
-    confusion, costs = data.tables["confusion"], data.tables["costs"]
-    counts = power[power["metric"] == "named"].drop_duplicates("size")
+    groups, confusion, costs = (data.tables[name] for name in ("groups", "confusion", "costs"))
     metrics = list(dict.fromkeys(groups["metric"]))
     confused = list(dict.fromkeys(confusion["diagnoser"]))
     better_diagnosers = conclusion.list_better_diagnosers(data)
@@ -52,14 +53,7 @@ def render_page(data: DiagnoserReportData) -> str:
         warnings=list(conclusion.write_warnings(data)),
         has_own_failures=bool((failures["diagnoser"] == REFERENCE_DIAGNOSER).any()),
         charts=charts.make_charts(data),
-        clean_count=int(table.loc[table["metric"] == "false alarms", "of"].max()),
-        single_count=int(table.loc[table["metric"] == PRIMARY_METRIC, "of"].max()),
-        power_counts=", ".join(
-            f"{int(count)} of {size:g} noises" for size, count in counts[["size", "of"]].to_numpy()
-        ),
-        calibration_count=int(data.tables["calibration"]["of"].max())
-        if len(data.tables["calibration"])
-        else 0,
+        **data.counts,
         trained=list(
             trained[["diagnoser", "training_simulations"]].itertuples(index=False, name=None)
         ),

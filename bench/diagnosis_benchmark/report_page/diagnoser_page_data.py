@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import pandas as pd
 
 from bench.benchmark.problem.experiment import Experiment
+from bench.diagnosis_benchmark.result_tables import PRIMARY_METRIC
 from bench.figures.style import FigureFiles, MarkStyle, get_mark_style
 from bench.pages.chart import PrintedFigure, Series
 
@@ -39,6 +40,28 @@ class DiagnoserReportData:
     skipped: Mapping[str, str]
     planned: int
     left_out: pd.DataFrame
+
+    @property
+    def title(self) -> str:
+        """Title of the experiment."""
+        return self.experiment.title or self.experiment.name
+
+    @property
+    def counts(self) -> dict[str, int | str]:
+        """Numbers of recordings behind the charts, for their captions."""
+        table, power, calibration = (
+            self.tables[name] for name in ("table", "power", "calibration")
+        )
+        sizes = power[power["metric"] == "named"].drop_duplicates("size")
+        return {
+            "clean_count": int(table.loc[table["metric"] == "false alarms", "of"].max()),
+            "single_count": int(table.loc[table["metric"] == PRIMARY_METRIC, "of"].max()),
+            "power_counts": ", ".join(
+                f"{int(count)} of {size:g} noises"
+                for size, count in sizes[["size", "of"]].to_numpy()
+            ),
+            "calibration_count": int(calibration["of"].max()) if len(calibration) else 0,
+        }
 
     @property
     def case_count(self) -> int:

@@ -2,11 +2,13 @@
 
 import re
 
+import numpy as np
 import pytest
 from scipy.stats import beta
 
 from bench.benchmark.problem.experiment import load_experiment
 from bench.diagnosis_benchmark.confusion_figure import draw_confusion_matrices
+from bench.diagnosis_benchmark.diagnoser_figures import draw_chart_figures
 from bench.diagnosis_benchmark.report_page.diagnoser_page import render_page
 from bench.diagnosis_benchmark.report_page.diagnoser_page_data import DiagnoserReportData
 from bench.diagnosis_benchmark.result_tables import build_all_tables
@@ -159,6 +161,21 @@ def test_failures_list_the_diagnosers_that_are_right():
         said = frame.loc[("simgap", question), "right_by"]
         right = [name for name in ORDER if question not in right_by_one[name]]
         assert said == (" ".join(right) or "nobody")
+
+
+def test_the_printed_charts_have_the_numbers_of_the_page():
+    data = shown(answers())
+    figures = draw_chart_figures(data)
+    assert set(figures) == {"board", "power", "calibration", "cost"}
+    table = data.tables["table"].set_index(["metric", "diagnoser"])["share"]
+    points = [bar[0].get_xydata()[0] for bar in figures["board"].axes[0].containers]
+    alarms, named = table["false alarms"], table["the same, up to equivalence"]
+    assert points == [pytest.approx(100 * np.array([alarms[k], named[k]])) for k in ORDER]
+    lines = figures["power"].axes[1].get_lines()
+    power = data.tables["power"].set_index(["diagnoser", "metric"])
+    for name, line in zip(ORDER, lines, strict=True):
+        own = power.loc[(name, "seen")]
+        assert line.get_xydata() == pytest.approx(own[["size", "share"]].to_numpy())
 
 
 def test_the_confusion_of_families_counts_each_recording_once():
