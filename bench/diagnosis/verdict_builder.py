@@ -189,14 +189,14 @@ class VerdictBuilder:
         if not kind.has_model:
             return numbers
         # This import is needed for robots only.
-        from sims.robot.export.model_file_totals import totals
+        from sims.robot.export.model_file_totals import compute_file_totals
 
         placed_effects = list(self._iterate_fitted_effects(model))
         fitted_effects = [
             (effect, [numbers[i].value for i in places]) for effect, places in placed_effects
         ]
         for (effect, places), effect_totals in zip(
-            placed_effects, totals(kind.robot, fitted_effects), strict=True
+            placed_effects, compute_file_totals(kind.robot, fitted_effects), strict=True
         ):
             # The model file keeps its gravity if the bodies are gravity-compensated.
             is_compensated = is_gravity_compensated(effect.name, {"": numbers[places[0]]})

@@ -60,32 +60,32 @@ def find_pair_geoms(robot: RobotModel, pair: str) -> tuple[int, int]:
     parts = pair.split(PAIR_SEPARATOR)
     for count in range(1, len(parts)):
         names = (PAIR_SEPARATOR.join(part) for part in (parts[:count], parts[count:]))
-        one, other = (numbers.get(name) for name in names)
-        if one is not None and other is not None:
-            return one, other
+        first, second = (numbers.get(name) for name in names)
+        if first is not None and second is not None:
+            return first, second
     unknown = next((name for name in parts if name not in numbers), pair)
     raise make_unknown_name_error(f"geom of {robot.path.name}", unknown, list(numbers) or ["none"])
 
 
 def combine_contact_parameters(model: Any, geoms: tuple[int, int]) -> ContactParameters:
     """Return the parameters that MuJoCo gives to a contact of two geoms."""
-    rows = np.array(geoms)
-    margin, gap = float(model.geom_margin[rows].sum()), float(model.geom_gap[rows].sum())
-    priority = model.geom_priority[rows]
-    rows = rows[priority == priority.max()]
-    mixes = np.where(model.geom_solmix[rows] < MIN_MIX, 0.0, model.geom_solmix[rows])
+    geom_rows = np.array(geoms)
+    margin, gap = float(model.geom_margin[geom_rows].sum()), float(model.geom_gap[geom_rows].sum())
+    priority = model.geom_priority[geom_rows]
+    geom_rows = geom_rows[priority == priority.max()]
+    mixes = np.where(model.geom_solmix[geom_rows] < MIN_MIX, 0.0, model.geom_solmix[geom_rows])
     if not mixes.any():
-        mixes = np.ones(len(rows))
+        mixes = np.ones(len(geom_rows))
     weights = mixes / mixes.sum()
-    solref = model.geom_solref[rows]
+    solref = model.geom_solref[geom_rows]
     # Stiffness and damping, as negative numbers, are not averaged.
-    direct = (solref[:, 0] <= 0).any()
-    sliding, torsional, rolling = model.geom_friction[rows].max(axis=0)
+    has_direct_form = (solref[:, 0] <= 0).any()
+    sliding, torsional, rolling = model.geom_friction[geom_rows].max(axis=0)
     return ContactParameters(
-        int(model.geom_condim[rows].max()),
+        int(model.geom_condim[geom_rows].max()),
         np.array([sliding, sliding, torsional, rolling, rolling]),
-        solref.min(axis=0) if direct else weights @ solref,
-        weights @ model.geom_solimp[rows],
+        solref.min(axis=0) if has_direct_form else weights @ solref,
+        weights @ model.geom_solimp[geom_rows],
         margin,
         gap,
     )
@@ -118,11 +118,11 @@ def read_contact_parameters(robot: RobotModel, pair: str) -> tuple[float, Array]
     """Return the sliding friction coefficient and `solref` of a pair in the model file."""
     geoms = find_pair_geoms(robot, pair)
     if has_pair(robot, geoms):
-        number = find_pair(robot, pair)
+        pair_index = find_pair(robot, pair)
         model = robot.compiled
-        return float(model.pair_friction[number, 0]), model.pair_solref[number]
-    found = combine_contact_parameters(robot.compiled, geoms)
-    return float(found.friction[0]), found.solref
+        return float(model.pair_friction[pair_index, 0]), model.pair_solref[pair_index]
+    combined = combine_contact_parameters(robot.compiled, geoms)
+    return float(combined.friction[0]), combined.solref
 
 
 def add_contact_pairs(robot: RobotModel, pairs: Collection[str]) -> RobotModel:
@@ -133,9 +133,9 @@ def add_contact_pairs(robot: RobotModel, pairs: Collection[str]) -> RobotModel:
         pairs: names of the pairs; those with an element are left out.
     """
     model = robot.compiled
-    wanted = [find_pair_geoms(robot, pair) for pair in sorted(set(pairs))]
-    wanted = [geoms for geoms in wanted if not has_pair(robot, geoms)]
-    if not wanted:
+    missing_pairs = [find_pair_geoms(robot, pair) for pair in sorted(set(pairs))]
+    missing_pairs = [geoms for geoms in missing_pairs if not has_pair(robot, geoms)]
+    if not missing_pairs:
         return robot
     spec = robot.spec.copy()
     if not all(geom.name for geom in spec.geoms):
@@ -144,8 +144,8 @@ def add_contact_pairs(robot: RobotModel, pairs: Collection[str]) -> RobotModel:
             spec.compile()
         for geom, number in [(geom, geom.id) for geom in spec.geoms]:
             geom.name = geom.name or f"{UNNAMED_PREFIX}geom{number}"
-    for geoms in wanted:
-        found = combine_contact_parameters(model, geoms)
+    for geoms in missing_pairs:
+        parameters = combine_contact_parameters(model, geoms)
         names = [
             model.geom(geom).name or UNNAMED_PREFIX + get_geom_name(model, geom) for geom in geoms
         ]
@@ -153,6 +153,6 @@ def add_contact_pairs(robot: RobotModel, pairs: Collection[str]) -> RobotModel:
             name=make_pair_name(model, geoms),
             geomname1=names[0],
             geomname2=names[1],
-            **found._asdict(),
+            **parameters._asdict(),
         )
     return replace(robot, spec=spec)

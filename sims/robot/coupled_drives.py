@@ -101,11 +101,11 @@ def make_coupled_robot(robot: RobotModel, coefficients: Mapping[str, float]) -> 
     spec = robot.spec.copy()
     name_unnamed_elements(spec, robot)
     for name, c in coefficients.items():
-        first = find_preceding_joint(robot, name)
-        assert first is not None
+        preceding_joint = find_preceding_joint(robot, name)
+        assert preceding_joint is not None
         tendon = spec.add_tendon(name=name + COUPLING_TENDON_SUFFIX)
         tendon.wrap_joint(name, 1.0)
-        tendon.wrap_joint(first.name, c)
+        tendon.wrap_joint(preceding_joint.name, c)
         for actuator in spec.actuators:
             if robot.actuators[actuator.id].joint == name:
                 actuator.trntype = mujoco.mjtTrn.mjTRN_TENDON

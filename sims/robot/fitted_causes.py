@@ -27,7 +27,7 @@ _AXES: Mapping[str, tuple[str, ...]] = {
 """Names of the coefficients of effects with several coefficients, in their order."""
 
 
-COMPENSATED = 0.02
+MAX_COMPENSATED_GRAVITY_SHARE = 0.02
 """Largest remaining share of gravity at which a robot counts as gravity-compensated."""
 
 GRAVITY_COMPENSATED = "gravity is compensated: the real robot or its controller carries its weight"
@@ -44,7 +44,7 @@ def is_gravity_compensated(effect: str, numbers: Mapping[str, FittedValue]) -> b
         numbers: fitted numbers by coefficient.
     """
     return effect == "gravity.scale" and any(
-        abs(1.0 + number.value) < COMPENSATED for number in numbers.values()
+        abs(1.0 + number.value) < MAX_COMPENSATED_GRAVITY_SHARE for number in numbers.values()
     )
 
 

@@ -19,22 +19,22 @@ from sims.robot.mujoco_messages import capture_mujoco_warnings
 from sims.robot.parsing import contact_exclusion
 from sims.robot.parsing.collision_hulls import (
     MIN_FACES,
-    TESTED,
+    TESTED_VERSION_PREFIX,
     CollisionShapes,
     Hull,
     add_hull,
-    add_reserve,
-    has_room,
+    add_memory_reserve,
+    has_large_enough_buffers,
     read_hull,
 )
 from sims.robot.robot_model import RobotModel, cache_per_robot
 
-RAYS = frozenset(
+SHAPE_SENSORS = frozenset(
     f"mjSENS_{name}"
     for name in ("RANGEFINDER", "GEOMDIST", "GEOMNORMAL", "GEOMFROMTO", "TACTILE", "PLUGIN")
 )
 """Sensor types that measure shapes which need not collide."""
-SHAPES = (
+IGNORED_FIELD_PREFIXES = (
     "geom_", "mesh_", "mat_", "tex_", "skin_", "hfield_", "bvh_", "oct_", "vis", "stat",
     "dof_length", "body_margin",
 )  # fmt: skip
@@ -50,9 +50,9 @@ GEOM_FIELDS = (
 )  # fmt: skip
 """Fields on which contacts of a geom depend, in addition to its mesh and its contact partners."""
 
-POSES = 20
+COMPARED_POSE_COUNT = 20
 """Number of poses in which contacts of whole meshes and of their hulls are compared."""
-FREE_RANGE = (-1.0, 1.0)
+DEFAULT_JOINT_RANGE = (-1.0, 1.0)
 """Positions of joints without a range in these poses, in rad or m."""
 
 
@@ -87,7 +87,12 @@ def strip_assets(robot: RobotModel) -> RobotModel:
 
 
 def _strip_model(robot: RobotModel) -> RobotModel:
-    """Remove the elements of a robot's model that do not influence its motion, see `strip_assets`.
+    """Remove the elements of a robot's model that do not influence its motion, if it stays equal.
+
+    Visual shapes and geoms that cannot collide are deleted; a colliding mesh is replaced by its
+    convex hull. The hull's data are copied from the whole model, for which the spec gets extra
+    meshes that reserve memory. If any field of the smaller model that matters, or any contact in
+    random poses, differs from the whole model, the robot itself is returned.
 
     Raises:
         ValueError: MuJoCo rejects the smaller model.
@@ -96,8 +101,8 @@ def _strip_model(robot: RobotModel) -> RobotModel:
     spec = robot.spec.copy()
     with capture_mujoco_warnings():
         spec.compile()  # Compilation assigns numbers to the elements.
-    _state_inertials(spec, model)
-    hulls, numbers = _reduce_geoms(spec, model)
+    _write_inertials(spec, model)
+    hull_by_mesh, geom_numbers = _reduce_geoms(spec, model)
     name_unnamed_elements(spec, robot)
     spec.discard_visual()
     spec.compiler.discardvisual = False
@@ -106,14 +111,18 @@ def _strip_model(robot: RobotModel) -> RobotModel:
     for asset in [*spec.skins, *unused_fields]:
         spec.delete(asset)
     stripped = replace(robot, spec=spec)
-    if hulls:
-        add_reserve(spec, stripped.compile(spec), model, hulls)
-        geoms = {geom.name: numbers[geom.name] for geom in spec.geoms if geom.meshname in hulls}
-        stripped = replace(stripped, shapes=CollisionShapes.read(model, hulls, geoms))
-    is_equal = _has_equal_motion(model, stripped.compiled, numbers)
-    if is_equal and hulls:
-        is_equal = has_room(stripped.compiled, model)
-        is_equal = is_equal and _touches_alike(robot, stripped.compiled, numbers)
+    if hull_by_mesh:
+        add_memory_reserve(spec, stripped.compile(spec), model, hull_by_mesh)
+        hull_geoms = {
+            geom.name: geom_numbers[geom.name]
+            for geom in spec.geoms
+            if geom.meshname in hull_by_mesh
+        }
+        stripped = replace(stripped, shapes=CollisionShapes.read(model, hull_by_mesh, hull_geoms))
+    is_equal = _has_equal_motion(model, stripped.compiled, geom_numbers)
+    if is_equal and hull_by_mesh:
+        is_equal = has_large_enough_buffers(stripped.compiled, model)
+        is_equal = is_equal and _has_equal_contacts(robot, stripped.compiled, geom_numbers)
     return stripped if is_equal else robot
 
 
@@ -144,14 +153,21 @@ def _needs_shapes(model: Any) -> bool:
     """Return whether non-contact quantities depend on geoms, or contacts on more than hulls."""
     import mujoco
 
-    kinds = {mujoco.mjtSensor(int(kind)).name for kind in model.sensor_type}
-    sdf = int(mujoco.mjtGeom.mjGEOM_SDF) in model.geom_type
+    sensor_types = {mujoco.mjtSensor(int(kind)).name for kind in model.sensor_type}
+    has_sdf_geom = int(mujoco.mjtGeom.mjGEOM_SDF) in model.geom_type
     has_sleep = model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP
-    fluid = model.geom_fluid.any()
-    return bool(kinds & RAYS or model.nflex or model.nplugin or sdf or fluid or has_sleep)
+    has_fluid_forces = model.geom_fluid.any()
+    return bool(
+        sensor_types & SHAPE_SENSORS
+        or model.nflex
+        or model.nplugin
+        or has_sdf_geom
+        or has_fluid_forces
+        or has_sleep
+    )
 
 
-def _state_inertials(spec: Any, model: Any) -> None:
+def _write_inertials(spec: Any, model: Any) -> None:
     """Write the masses and inertias of the compiled model into a spec.
 
     The masses then no longer depend on geoms, which can be removed without changing the motion.
@@ -182,14 +198,14 @@ def _reduce_geoms(spec: Any, model: Any) -> tuple[dict[str, Hull], dict[str, int
     """
     import mujoco
 
-    collision_mask = contact_exclusion.touching(model)
-    is_tested_version = mujoco.__version__.startswith(TESTED)
-    hulls: dict[str, Hull] = {}
-    numbers: dict[str, int] = {}
+    collision_mask = contact_exclusion.find_colliding_geoms(model)
+    is_tested_version = mujoco.__version__.startswith(TESTED_VERSION_PREFIX)
+    hull_by_mesh: dict[str, Hull] = {}
+    geom_numbers: dict[str, int] = {}
     # The numbers are collected first, since a spec loses them when it is edited.
     for geom, i in [(geom, geom.id) for geom in spec.geoms]:
         geom.name = geom.name or f"simgap.geom{i}"
-        numbers[geom.name] = i
+        geom_numbers[geom.name] = i
         if not collision_mask[i]:
             geom.contype = geom.conaffinity = 0
         mesh = int(model.geom_dataid[i]) if geom.meshname else -1
@@ -200,20 +216,20 @@ def _reduce_geoms(spec: Any, model: Any) -> tuple[dict[str, Hull], dict[str, int
         if kind != mujoco.mjtGeom.mjGEOM_MESH:
             geom.type, geom.size, geom.meshname = kind, model.geom_size[i], ""
         elif is_tested_version and collision_mask[i] and model.mesh_facenum[mesh] > MIN_FACES:
-            hull = hulls.get(geom.meshname) or read_hull(model, mesh)
+            hull = hull_by_mesh.get(geom.meshname) or read_hull(model, mesh)
             if hull is None:
                 continue
-            hulls[geom.meshname] = hull
+            hull_by_mesh[geom.meshname] = hull
         else:
             continue
         geom.set_frame(geom.parent.add_frame())
         geom.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
         geom.pos, geom.quat = model.geom_pos[i], model.geom_quat[i]
-    for mesh in [mesh for mesh in spec.meshes if mesh.name in hulls]:
+    for mesh in [mesh for mesh in spec.meshes if mesh.name in hull_by_mesh]:
         name = mesh.name
         spec.delete(mesh)
-        add_hull(spec, name, hulls[name])
-    return hulls, numbers
+        add_hull(spec, name, hull_by_mesh[name])
+    return hull_by_mesh, geom_numbers
 
 
 def _has_equal_motion(model: Any, reduced_model: Any, numbers: Mapping[str, int]) -> bool:
@@ -226,7 +242,9 @@ def _has_equal_motion(model: Any, reduced_model: Any, numbers: Mapping[str, int]
     """
     geom_numbers = [numbers[reduced_model.geom(i).name] for i in range(reduced_model.ngeom)]
     fields = {
-        name: getattr(model, name) for name in dir(model) if not name.startswith(("_", *SHAPES))
+        name: getattr(model, name)
+        for name in dir(model)
+        if not name.startswith(("_", *IGNORED_FIELD_PREFIXES))
     }
     for name, values in fields.items():
         is_number = isinstance(values, np.ndarray) and values.dtype.kind == "f"
@@ -240,7 +258,7 @@ def _has_equal_motion(model: Any, reduced_model: Any, numbers: Mapping[str, int]
     )
 
 
-def _touches_alike(robot: RobotModel, reduced_model: Any, numbers: Mapping[str, int]) -> bool:
+def _has_equal_contacts(robot: RobotModel, reduced_model: Any, numbers: Mapping[str, int]) -> bool:
     """Return whether contacts are equal in random poses within the ranges of the joints.
 
     The test is needed since other versions of MuJoCo may read more of a mesh than hulls contain.
@@ -258,11 +276,11 @@ def _touches_alike(robot: RobotModel, reduced_model: Any, numbers: Mapping[str, 
     geom_numbers = np.array(
         [numbers[reduced_model.geom(i).name] for i in range(reduced_model.ngeom)]
     )
-    for _ in range(POSES):
+    for _ in range(COMPARED_POSE_COUNT):
         data.qpos[:] = model.qpos0
         for joint in robot.joints:
             if joint.has_one_coordinate:
-                data.qpos[joint.position] = rng.uniform(*(joint.range or FREE_RANGE))
+                data.qpos[joint.position] = rng.uniform(*(joint.range or DEFAULT_JOINT_RANGE))
         reduced_data.qpos[:] = data.qpos
         for posed_model, posed_data in ((model, data), (reduced_model, reduced_data)):
             mujoco.mj_fwdPosition(posed_model, posed_data)

@@ -418,7 +418,7 @@ def cache_per_robot(
     """
 
     @wraps(function)
-    def asked(robot: RobotModel, /, *args: _P.args, **kwargs: _P.kwargs) -> _T:
+    def cached_function(robot: RobotModel, /, *args: _P.args, **kwargs: _P.kwargs) -> _T:
         """Return the result stored in the robot, or call the function and store its result."""
         key = (function, *args, *kwargs.items())
         if key not in robot.function_cache:
@@ -426,7 +426,7 @@ def cache_per_robot(
         result: _T = robot.function_cache[key]
         return result
 
-    return asked
+    return cached_function
 
 
 def _get_limit(values: Any, is_limited: bool) -> tuple[float, float] | None:
@@ -438,17 +438,17 @@ def _detect_actuator_kind(model: Any, i: int) -> ActuatorKind:
     import mujoco
 
     gain, bias = model.actuator_gainprm[i], model.actuator_biasprm[i]
-    fixed = int(model.actuator_gaintype[i]) == int(mujoco.mjtGain.mjGAIN_FIXED)
-    affine = int(model.actuator_biastype[i]) == int(mujoco.mjtBias.mjBIAS_AFFINE)
+    has_constant_gain = int(model.actuator_gaintype[i]) == int(mujoco.mjtGain.mjGAIN_FIXED)
+    has_affine_bias = int(model.actuator_biastype[i]) == int(mujoco.mjtBias.mjBIAS_AFFINE)
     dynamics = int(model.actuator_dyntype[i])
     # A filter changes when a control acts, but not its meaning.
-    direct = dynamics == int(mujoco.mjtDyn.mjDYN_NONE) or dynamics in filters()
+    has_no_lag = dynamics == int(mujoco.mjtDyn.mjDYN_NONE) or dynamics in filters()
     pid = getattr(mujoco.mjtGain, "mjGAIN_PID", None)  # Available since MuJoCo 4.
     if pid is not None and int(model.actuator_gaintype[i]) == int(pid):
         return "pid"
-    if not fixed or not direct:
+    if not has_constant_gain or not has_no_lag:
         return "other"
-    if not affine or not np.any(bias[:3]):
+    if not has_affine_bias or not np.any(bias[:3]):
         return "motor"
     if bias[0] == 0 and bias[1] == -gain[0] and gain[0] != 0:
         return "position"

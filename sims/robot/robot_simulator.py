@@ -12,7 +12,8 @@ import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
-from typing import Any, ClassVar
+from itertools import product
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -26,7 +27,7 @@ from sims.robot.dynamics.activation_filters import (
     ActivationFilter,
     activation_filters,
     extend_into_past,
-    is_fourth_order,
+    is_rk4_integrator,
     select_initial_activations,
 )
 from sims.robot.dynamics.active_effects import (
@@ -175,11 +176,11 @@ class RobotSimulator(SystemSimulator):
     def _make_active_effects(self, theta: Array) -> ActiveEffects:
         """Return active effects (`SystemSimulator`): free parameters first, families expanded."""
         acting: list[tuple[Effect, Array]] = []
-        place = 0
+        column = 0
         for effect in self._freed:
             count = len(effect.coefficients)
-            acting.append((effect, theta[:, place : place + count].T[:, :, None]))
-            place += count
+            acting.append((effect, theta[:, column : column + count].T[:, :, None]))
+            column += count
         acting += super()._make_active_effects(theta)
         parts = [part for effect, c in acting if c.any() for part in effect.parts(c)]
         return tuple((effect, c) for effect, c in parts if c.any())
@@ -225,33 +226,38 @@ class RobotSimulator(SystemSimulator):
         is_stepwise = find_active_elements(acting, len(x), is_evaluated_per_step)
         # A diverging batch element becomes NaN, so floating-point warnings are suppressed.
         with np.errstate(all="ignore"), capture_mujoco_warnings():
-            for added, kind, lanes in _group_batch_elements(acting, derived, is_stepwise):
+            for group in _group_batch_elements(acting, derived, is_stepwise):
                 # Batch elements are sorted by run, so that data common to a run are computed once.
-                lanes = lanes[np.argsort(runs.scenario_index[lanes], kind="stable")]
-                for part in np.array_split(lanes, max(-(-lanes.size // BATCH_SIZE), 1)):
+                order = np.argsort(runs.scenario_index[group.indices], kind="stable")
+                sorted_indices = group.indices[order]
+                batch_count = max(-(-sorted_indices.size // BATCH_SIZE), 1)
+                for part in np.array_split(sorted_indices, batch_count):
                     run_batches = [
                         RobotRunBatch(
                             runs.unique_scenarios[run],
                             commands[run],
-                            slice_active_effects(acting, run_lanes),
-                            x[run_lanes],
-                            v[run_lanes],
+                            slice_active_effects(acting, run_indices),
+                            x[run_indices],
+                            v[run_indices],
                         )
-                        for run, run_lanes in group_by_run(runs, part)
+                        for run, run_indices in group_by_run(runs, part)
                     ]
-                    bits = bool(kind & 1), bool(kind & 2)
                     try:
                         run_observations = self._simulate_run_batch(
-                            run_batches, slice_active_effects(acting, part), *bits, added
+                            run_batches,
+                            slice_active_effects(acting, part),
+                            group.derived,
+                            group.is_stepwise,
+                            group.added,
                         )
                     except RefusedModelError:
                         # These elements stay NaN, like those of a diverging motion; the others are
                         # simulated.
                         continue
-                    for (_, run_lanes), observations in zip(
+                    for (_, run_indices), observations in zip(
                         group_by_run(runs, part), run_observations, strict=True
                     ):
-                        result[run_lanes, : observations.shape[1]] = observations
+                        result[run_indices, : observations.shape[1]] = observations
         # Negative zeros become positive, so that results do not depend on their origin.
         result += 0.0
         return result
@@ -296,9 +302,9 @@ class RobotSimulator(SystemSimulator):
         observations = []
         first = 0
         for batch, size in zip(run_batches, sizes, strict=True):
-            run_lanes = slice(first, first + len(batch.x))
+            run_elements = slice(first, first + len(batch.x))
             observations.append(
-                self._compute_observations(result.select(run_lanes), batch, batch.times, size)
+                self._compute_observations(result.select(run_elements), batch, batch.times, size)
             )
             first += len(batch.x)
         return observations
@@ -348,10 +354,10 @@ class RobotSimulator(SystemSimulator):
             steps: number of steps.
         """
         n = len(batch.x)
-        of_run = self.time_step, batch.scenario, batch.commands, batch.acting, n, steps
-        applied_inputs = compute_inputs_over_steps(*of_run)
+        run_arguments = self.time_step, batch.scenario, batch.commands, batch.acting, n, steps
+        applied_inputs = compute_inputs_over_steps(*run_arguments)
         instant = (
-            compute_inputs_over_steps(*of_run, SAME_INSTANT_SHARE)
+            compute_inputs_over_steps(*run_arguments, SAME_INSTANT_SHARE)
             if self._records_drive_forces
             else applied_inputs
         )
@@ -383,7 +389,7 @@ class RobotSimulator(SystemSimulator):
         initial_activations = np.zeros((n, model.na))
         for activation_filter in activation_filters(self.robot):
             filter_controls = controls[:, :, activation_filter.actuator.control]
-            initial_activations[:, activation_filter.address] = self._first_activation(
+            initial_activations[:, activation_filter.address] = self._compute_initial_activation(
                 activation_filter, batch, filter_controls
             )
             # The servo's effective set point is the activation instead of the command.
@@ -406,7 +412,7 @@ class RobotSimulator(SystemSimulator):
             np.broadcast_to(off_mask, (n, *off_mask.shape)),
         )
 
-    def _first_activation(
+    def _compute_initial_activation(
         self, activation_filter: ActivationFilter, batch: RobotRunBatch, controls: Array
     ) -> Array:
         """Return the activation (n,) of a filter at the start of a run.
@@ -458,8 +464,10 @@ class RobotSimulator(SystemSimulator):
         """
         engine = self.engine
         assert isinstance(engine, RobotEngine)
-        fourth = is_fourth_order(int(engine.numerics.to_model_options()["integrator"]))
-        return activation_filter.activations(controls, initial_activations, self.time_step, fourth)
+        is_rk4 = is_rk4_integrator(int(engine.numerics.to_model_options()["integrator"]))
+        return activation_filter.compute_activations(
+            controls, initial_activations, self.time_step, is_rk4
+        )
 
     def run_initial(self, scenario: Scenario) -> dict[str, float]:
         """Return initial states, see `Simulator`; filter activations are not estimated states."""
@@ -478,7 +486,7 @@ class RobotSimulator(SystemSimulator):
         (added,) = group_by_added_elements(acting, 1)
         return self._get_batch(True, LINEARISATION_BATCH_SIZE, added)
 
-    def half_steps(self, acting: ActiveEffects = ()) -> MujocoBatch:
+    def make_half_step_batch(self, acting: ActiveEffects = ()) -> MujocoBatch:
         """Return the batch of `make_linearisation_batch` with half the time step."""
         (added,) = group_by_added_elements(acting, 1)
         engine = self.engine
@@ -536,46 +544,46 @@ class RobotSimulator(SystemSimulator):
         # A single simulation uses a small batch, so that constants need not be derived for a whole
         # one.
         mujoco_batch = self._get_batch(derived, 1 if n == 1 else BATCH_SIZE, added)
-        places, second = mujoco_batch.file_joints, mujoco_batch.series_joints
+        joints, series_joints = mujoco_batch.file_joints, mujoco_batch.series_joints
         mujoco_batch.write_effects(
             pad_coefficients(select_model_field_effects(start.acting), n, mujoco_batch.count)
         )
-        initial_second = mujoco_batch.set_initial_state(start.x, start.v, start.floating_state)
+        initial_series = mujoco_batch.set_initial_state(start.x, start.v, start.floating_state)
         mujoco_batch.activate(inputs.activations)
-        record = ["qpos", "qvel", *extra_fields]
+        field_names = ["qpos", "qvel", *extra_fields]
         if self._reads_sensors():
-            record.append("sensordata")
-        record = list(dict.fromkeys(record))
+            field_names.append("sensordata")
+        field_names = list(dict.fromkeys(field_names))
         if is_stepwise:
-            stiffness = mujoco_batch.get_servo_stiffness(places)[:n]
+            stiffness = mujoco_batch.get_servo_stiffness(joints)[:n]
             effect_forces = EffectForces(
-                self.robotic, start.acting, inputs.applied_inputs, places, stiffness, self.time_step
+                self.robotic, start.acting, inputs.applied_inputs, joints, stiffness, self.time_step
             )
             forces = mujoco_batch.map_forces(inputs.forces)
             compiled = recorded_fields = None
             if inputs.off.any():
                 # Compiled effects assume a constant servo stiffness over all steps.
                 effect_forces.working = find_working_servos(
-                    mujoco_batch.robot, places.velocities, inputs.off
+                    mujoco_batch.robot, joints.velocities, inputs.off
                 )
             else:
                 compiled = compile_forces(effect_forces)
             if compiled is not None:
                 recorded_fields = step_in_callback(
-                    mujoco_batch, inputs.controls, forces, compiled, record
+                    mujoco_batch, inputs.controls, forces, compiled, field_names
                 )
             if recorded_fields is None:
                 recorded_fields = mujoco_batch.step_with_forces(
-                    inputs.controls, forces, compiled or effect_forces, record, inputs.off
+                    inputs.controls, forces, compiled or effect_forces, field_names, inputs.off
                 )
         else:
             forces = mujoco_batch.map_forces(inputs.forces)
-            recorded_fields = mujoco_batch.step(inputs.controls, forces, record, inputs.off)
+            recorded_fields = mujoco_batch.step(inputs.controls, forces, field_names, inputs.off)
         x = np.concatenate(
-            [start.x[:, None], recorded_fields["qpos"][:, :, places.positions]], axis=1
+            [start.x[:, None], recorded_fields["qpos"][:, :, joints.positions]], axis=1
         )
         v = np.concatenate(
-            [start.v[:, None], recorded_fields["qvel"][:, :, places.velocities]], axis=1
+            [start.v[:, None], recorded_fields["qvel"][:, :, joints.velocities]], axis=1
         )
         x[mujoco_batch.failed] = np.nan
         if self._records_drive_forces:
@@ -584,13 +592,13 @@ class RobotSimulator(SystemSimulator):
             )
             sensor_model.shift_to_step_begin(recorded_fields["sensordata"])
             sensor_model.add_drive_effects(recorded_fields["sensordata"], x, v, start.acting)
-        later_second = (
-            recorded_fields["qpos"][:, :, second.positions],
-            recorded_fields["qvel"][:, :, second.velocities],
+        later_series = (
+            recorded_fields["qpos"][:, :, series_joints.positions],
+            recorded_fields["qvel"][:, :, series_joints.velocities],
         )
-        second_states = [
+        series_states = [
             np.concatenate([first[:, None], later_values], axis=1)
-            for first, later_values in zip(initial_second, later_second, strict=True)
+            for first, later_values in zip(initial_series, later_series, strict=True)
         ]
         return BatchResult(
             x,
@@ -598,7 +606,7 @@ class RobotSimulator(SystemSimulator):
             recorded_fields,
             inputs.activations,
             mujoco_batch.failed,
-            (second_states[0], second_states[1]),
+            (series_states[0], series_states[1]),
         )
 
     def _get_batch(self, derived: bool, count: int, added: AddedElements = ()) -> MujocoBatch:
@@ -654,21 +662,38 @@ class RobotSimulator(SystemSimulator):
         return next(s for s in self.robot.sensors if s.name == element_name).address
 
 
+class _ElementGroup(NamedTuple):
+    """Batch elements that can be simulated together, since they need the same kind of simulation.
+
+    Attributes:
+        added: elements that effects add to the model.
+        derived: whether effects change constants that MuJoCo derives.
+        is_stepwise: whether forces are evaluated in every step.
+        indices: indices of the batch elements.
+    """
+
+    added: AddedElements
+    derived: bool
+    is_stepwise: bool
+    indices: IndexArray
+
+
 def _group_batch_elements(
     acting: ActiveEffects, derived: Mask, is_stepwise: Mask
-) -> Iterator[tuple[AddedElements, int, IndexArray]]:
+) -> Iterator[_ElementGroup]:
     """Group batch elements that can be simulated together.
 
-    Yields:
-        Elements added to the model, a bit field (1: derived constants change, 2: forces are
-        evaluated in every step), and the indices of the batch elements.
+    Args:
+        acting: active effects, with coefficients (K, L, 1).
+        derived: (L,) whether effects change constants that MuJoCo derives.
+        is_stepwise: (L,) whether forces are evaluated in every step.
     """
-    for added, group_lanes in group_by_added_elements(acting, len(derived)).items():
-        is_in_group = np.zeros(len(derived), dtype=bool)
-        is_in_group[group_lanes] = True
-        for kind in range(4):
-            of_kind = is_in_group & (derived == bool(kind & 1)) & (is_stepwise == bool(kind & 2))
-            yield added, kind, np.flatnonzero(of_kind)
+    for added, element_indices in group_by_added_elements(acting, len(derived)).items():
+        has_model = np.zeros(len(derived), dtype=bool)
+        has_model[element_indices] = True
+        for stepwise, changed in product((False, True), repeat=2):
+            is_in_group = has_model & (derived == changed) & (is_stepwise == stepwise)
+            yield _ElementGroup(added, changed, stepwise, np.flatnonzero(is_in_group))
 
 
 def make_robot_simulator(
@@ -696,7 +721,9 @@ def make_robot_simulator(
         "robot": robot,
         "numerics": numerics,
         "free": tuple(free),
-        "made_of": tuple(library.get_effect(n) for n in {e.of: 0 for e in system.freed_effects}),
+        "made_of": tuple(
+            library.get_effect(n) for n in dict.fromkeys(e.of for e in system.freed_effects)
+        ),
         "source_digest": hashlib.sha256(identity_text.encode()).hexdigest(),
         "__module__": __name__,
         "__doc__": f"The robot of {robot.path.name}.",

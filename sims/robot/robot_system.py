@@ -29,7 +29,7 @@ from sims.robot.places.place_list import (
 from sims.robot.robot_model import RobotModel
 from sims.robot.state_snapshots import SingleJointSystem, SingleSlideSystem
 
-INTEGRATES = (
+INTEGRATOR_ACTUATOR_REASON = (
     "the actuator integrates its control (dyntype integrator), and the initial value of its "
     "integral "
     "is not recorded; expected a position servo, whose input is the integral"
@@ -294,7 +294,11 @@ def make_robot_system(robot: RobotModel, free: Sequence[str] = ()) -> type[Robot
             activation_filter.state for activation_filter in activation_filters(robot)
         ),
         "refused_inputs": MappingProxyType(
-            {f"u.{a.name}": INTEGRATES for a in robot.actuators if robot.integrates(a)}
+            {
+                f"u.{a.name}": INTEGRATOR_ACTUATOR_REASON
+                for a in robot.actuators
+                if robot.integrates(a)
+            }
         ),
     }
     system: type[RobotSystem] = type("RobotSystemOfFile", (RobotSystem,), attributes)

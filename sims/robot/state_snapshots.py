@@ -110,18 +110,18 @@ class RobotSnapshot(StateSnapshot):
     servos: dict[int, str] = field(default_factory=dict)
     stiffness: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
-    def select_element(self, lane: int) -> RobotSnapshot:
+    def select_element(self, batch_index: int) -> RobotSnapshot:
         """Select one batch element."""
-        element_slice = slice(lane, lane + 1)
+        selected = slice(batch_index, batch_index + 1)
         return replace(
             self,
-            theta=self.theta[element_slice],
-            t=self.t[element_slice],
-            x=self.x[element_slice],
-            v=self.v[element_slice],
-            inputs={name: u[element_slice] for name, u in self.inputs.items()},
-            carried=self.carried[:, element_slice],
-            stiffness=self.stiffness[element_slice],
+            theta=self.theta[selected],
+            t=self.t[selected],
+            x=self.x[selected],
+            v=self.v[selected],
+            inputs={name: u[selected] for name, u in self.inputs.items()},
+            carried=self.carried[:, selected],
+            stiffness=self.stiffness[selected],
         )
 
     def get_joint_snapshot(self, joint: int) -> JointSnapshot:

@@ -205,7 +205,7 @@ class _Totals:
             coefficient: Coefficient of the cause that is changed.
             value: Value of the coefficient.
         """
-        from sims.robot.export.model_file_totals import totals
+        from sims.robot.export.model_file_totals import compute_file_totals
 
         values = [dict(coefficients) for coefficients in self.values]
         values[number][coefficient] = value
@@ -215,7 +215,7 @@ class _Totals:
         ]
         effect = self.effects[number]
         index = [c.name for c in effect.coefficients].index(coefficient)
-        reading = totals(self.robot, fitted)[number][index]
+        reading = compute_file_totals(self.robot, fitted)[number][index]
         if reading is not None:
             return reading.stated, reading.total, reading.unit
         return None, value, effect.coefficients[index].units[0] or "1"

@@ -63,20 +63,22 @@ class ActivationFilter(NamedTuple):
         clipped: Array = np.clip(controls, *self.actuator.range)
         return clipped
 
-    def activations(self, controls: Array, initial: Array, step: float, fourth: bool) -> Array:
+    def compute_activations(
+        self, controls: Array, initial: Array, step: float, is_rk4: bool
+    ) -> Array:
         """Compute activations at the beginnings of steps, by Euler's method (1) or exactly (2).
 
         Args:
             controls: (n, S) controls of the steps.
             initial: (n,) initial activations.
             step: step length in seconds.
-            fourth: whether the integrator is of fourth order, for which (1) and (2) agree.
+            is_rk4: whether the integrator is of fourth order, for which (1) and (2) agree.
 
         Returns:
             (n, S + 1) activations; the last one is after the last step.
         """
         ratio = step / max(self.seconds, MIN_TIME_CONSTANT)
-        retained_share = float(np.exp(-ratio)) if self.exact or fourth else 1.0 - ratio
+        retained_share = float(np.exp(-ratio)) if self.exact or is_rk4 else 1.0 - ratio
         inputs = self.clip_controls(controls)
         decay = np.full_like(inputs, retained_share)
         end_activations = apply_recursion(decay, (1.0 - decay) * inputs, initial[:, None])
@@ -95,7 +97,7 @@ def activation_filters(robot: RobotModel) -> tuple[ActivationFilter, ...]:
     import mujoco
 
     model = robot.compiled
-    exact = int(mujoco.mjtDyn.mjDYN_FILTEREXACT)
+    filterexact_id = int(mujoco.mjtDyn.mjDYN_FILTEREXACT)
     filters_found = []
     for actuator in robot.actuators:
         i = actuator.id
@@ -108,14 +110,14 @@ def activation_filters(robot: RobotModel) -> tuple[ActivationFilter, ...]:
                 actuator,
                 int(model.actuator_actadr[i]),
                 float(model.actuator_dynprm[i, 0]),
-                int(model.actuator_dyntype[i]) == exact,
+                int(model.actuator_dyntype[i]) == filterexact_id,
                 (float(low), float(high)),
             )
         )
     return tuple(filters_found)
 
 
-def is_fourth_order(integrator: int) -> bool:
+def is_rk4_integrator(integrator: int) -> bool:
     """Return whether MuJoCo's integrator of this number is of fourth order."""
     return integrator == RK4_INTEGRATOR_ID
 

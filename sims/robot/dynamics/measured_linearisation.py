@@ -313,7 +313,7 @@ class MeasuredLinear(RunLinearisation):
         if forces_are_at_step_end(simulator.make_linearisation_batch(self._work.acting).model):
             return np.zeros((tangent.point_count, tangent.state_size))
         with np.errstate(all="ignore"), capture_mujoco_warnings():
-            return tangent.step_errors(simulator.half_steps(self._work.acting))
+            return tangent.step_errors(simulator.make_half_step_batch(self._work.acting))
 
     def _list_active_intervals(self) -> list[tuple[IndexArray, IndexArray]]:
         """Return the active intervals of the first step, then of the second, and so on.

@@ -118,8 +118,8 @@ _NOT_LINEAR = "its actuator is not a gain and a bias of one control"
 def _write_input_gain(fields: Fields, robot: RobotModel, cause: FittedCause) -> UnstatableReason:
     """Write an input gain into the actuator: scale its gain, eq. (1), and its range, eq. (2)."""
     actuator, (a,) = _Actuator(fields, robot, cause.place), cause.coefficients
-    scaled = actuator.single and actuator.fixed and (actuator.direct or actuator.filtered)
-    if not scaled:
+    can_scale = actuator.single and actuator.fixed and (actuator.direct or actuator.filtered)
+    if not can_scale:
         return _NOT_LINEAR
     if 1.0 + a < MIN_GAIN_FACTOR:
         return "a control range cannot express a factor of zero or less"
@@ -133,15 +133,15 @@ def _write_input_gain(fields: Fields, robot: RobotModel, cause: FittedCause) -> 
 def _write_input_bias(fields: Fields, robot: RobotModel, cause: FittedCause) -> UnstatableReason:
     """Write an input bias into the actuator: shift its force, eq. (1), and its range, eq. (2).
 
-    `share` is the factor 1 + a of an input gain that is in the fields already.
+    `input_factor` is the factor 1 + a of an input gain that is in the fields already.
     """
     actuator, (b,) = _Actuator(fields, robot, cause.place), cause.coefficients
     if not actuator.linear:
         return _NOT_LINEAR
-    share, _ = actuator.command
+    input_factor, _ = actuator.command
     low, high = actuator.limits()
-    actuator.limit(low - b / share, high - b / share)  # (2)
-    actuator.shift(float(actuator.gain[0] / share * b))  # (1)
+    actuator.limit(low - b / input_factor, high - b / input_factor)  # (2)
+    actuator.shift(float(actuator.gain[0] / input_factor * b))  # (1)
     actuator.command[1] += b
     return None
 
@@ -156,9 +156,9 @@ def _write_saturation(fields: Fields, robot: RobotModel, cause: FittedCause) -> 
         return None
     if not actuator.linear:
         return _NOT_LINEAR
-    share, b = actuator.command
+    input_factor, b = actuator.command
     low, high = actuator.limits()
-    low, high = max(low, (-s - b) / share), min(high, (s - b) / share)
+    low, high = max(low, (-s - b) / input_factor), min(high, (s - b) / input_factor)
     if low >= high:
         return "the control range would be empty"
     actuator.limit(low, high)  # (2)

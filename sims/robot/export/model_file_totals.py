@@ -62,7 +62,7 @@ def _get_force_limit(f: Fields, robot: RobotModel, place: str) -> Sequence[float
     return [f["actuator_forcerange"][0, number, 1]] if is_limited else [np.inf]
 
 
-def _solref(index: int) -> Read:
+def _make_solref_reader(index: int) -> Read:
     """Return a reader of the time constant (0) or damping ratio (1) of a contact.
 
     It is infinite, thus no number of the file, if the file states stiffness and damping.
@@ -106,11 +106,11 @@ _TOTALS: Mapping[str, Reading] = {
     "inertia.scale": Reading(
         lambda f, r, place: [np.max(f["body_inertia"][0, r.body(place).id])], "kg*m^2"
     ),
-    "contact.damping": Reading(_solref(1)),
+    "contact.damping": Reading(_make_solref_reader(1)),
     "contact.friction": Reading(
         lambda f, r, place: [f["pair_friction"][0, find_pair(r, place), 0]]
     ),
-    "contact.softness": Reading(_solref(0), "s"),
+    "contact.softness": Reading(_make_solref_reader(0), "s"),
     "joint.zero": Reading(
         lambda f, r, place: [f["qpos0"][0, r.joint(place).position]],
     ),
@@ -127,7 +127,7 @@ Fitted = Sequence[tuple[type[Effect], Sequence[float]]]
 """Effects, each at one place or of the world, with their coefficients."""
 
 
-def totals(robot: RobotModel, fitted: Fitted) -> list[list[Total | None]]:
+def compute_file_totals(robot: RobotModel, fitted: Fitted) -> list[list[Total | None]]:
     """Return the numbers of the model file before and after all effects are applied.
 
     Several effects may change one number, such as the mass and the inertia of one body; a total

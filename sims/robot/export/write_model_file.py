@@ -114,21 +114,21 @@ def render_with_series_joints(applied: ModifiedModel) -> bytes:
     """
     robot = applied.robot
     text = robot.path.read_bytes()
-    fixed = robot.engine_table.get("fix_base", False)
-    if not robot.series and not robot.coupled and not fixed and not robot.spec.pairs:
+    has_fixed_base = robot.engine_table.get("fix_base", False)
+    if not robot.series and not robot.coupled and not has_fixed_base and not robot.spec.pairs:
         return text
     document = MjcfDocument(text, robot.path)
-    if fixed:
+    if has_fixed_base:
         _fix_base(document)
     if robot.coupled:
         _write_couplings(document, applied)
     _add_pairs(document, robot)
     tags = {tag.attributes.get("name"): tag for tag in document.walk() if tag.name == "joint"}
-    for second in (joint for joint in robot.spec.joints if joint.name in robot.series):
-        first = tags.get(second.name.rpartition("_")[0])
-        if first is None:
-            raise NotEditableError(f"no joint of its text is in series with {second.name}")
-        first.after.append(_render_series_joint(second))
+    for series_joint in (joint for joint in robot.spec.joints if joint.name in robot.series):
+        joint_tag = tags.get(series_joint.name.rpartition("_")[0])
+        if joint_tag is None:
+            raise NotEditableError(f"no joint of its text is in series with {series_joint.name}")
+        joint_tag.after.append(_render_series_joint(series_joint))
     return document.to_text().encode()
 
 
@@ -174,11 +174,11 @@ def _add_pairs(document: MjcfDocument, robot: RobotModel) -> None:
     Raises:
         NotEditableError: a geom has no name in the text.
     """
-    stated = document.find_pairs()
+    existing_pairs = document.find_pairs()
     names = {tag.attributes.get("name") for tag in document.walk() if tag.name == "geom"}
     for pair in robot.spec.pairs:
         geoms = [pair.geomname1, pair.geomname2]
-        if frozenset(geoms) in stated:
+        if frozenset(geoms) in existing_pairs:
             continue
         if not set(geoms) <= names:
             raise NotEditableError(f"a geom of the contact {pair.name} has no name in its text")

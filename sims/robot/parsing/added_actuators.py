@@ -47,7 +47,7 @@ GAIN_KEYS_BY_KIND: Mapping[str, tuple[str, ...]] = {
 """Gains by kind of actuator; the first one is required."""
 INTEGRATORS = ("Euler", "RK4", "implicit", "implicitfast")
 """Names of integrators, in the order of MuJoCo's mjtIntegrator."""
-SHORTEST, LONGEST = 1e-9, 1.0
+MIN_TIME_STEP, MAX_TIME_STEP = 1e-9, 1.0
 """Smallest and largest allowed time step, in seconds."""
 
 
@@ -207,9 +207,9 @@ def apply_engine_settings(spec: Any, table: Mapping[str, Any], source: str) -> l
     )
     if "timestep" in settings:
         step = toml_validation.check_finite(source, "engine.timestep", settings["timestep"])
-        if not SHORTEST <= step <= LONGEST:
+        if not MIN_TIME_STEP <= step <= MAX_TIME_STEP:
             raise toml_validation.make_error(
-                source, "engine.timestep", f"{SHORTEST:g} to {LONGEST:g} s", step
+                source, "engine.timestep", f"{MIN_TIME_STEP:g} to {MAX_TIME_STEP:g} s", step
             )
         spec.option.timestep = step
     if "integrator" in settings:

@@ -23,27 +23,27 @@ from sims.core.simulator import Array
 
 MIN_FACES = 200
 """Minimum number of faces of a mesh that is replaced by its hull to save memory."""
-CORE = 2.0**-6
+CORE_SIZE_SHARE = 2.0**-6
 """Size of the box inside a hull that replaces its faces, as a share of the hull's half sizes."""
 CORE_FACES = (
     (0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1),
     (2, 3, 7), (2, 7, 6), (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3),
 )  # fmt: skip
 """Triangles of a box whose corners are numbered by the signs of x, y and z."""
-RESERVE = "simgap.reserve"
+RESERVE_PREFIX = "simgap.reserve"
 """Prefix of the names of meshes that reserve memory for hulls that are copied into a model."""
-LARGEST = ("npolygonmax", "nmeshdegmax")
+BUFFER_SIZE_FIELDS = ("npolygonmax", "nmeshdegmax")
 """Size fields by which MuJoCo allocates buffers.
 
 They are the maximum number of corners of a polygon, and of polygons at a vertex.
 """
-TESTED = "4.0."
+TESTED_VERSION_PREFIX = "4.0."
 """Version prefix of MuJoCo whose compiled meshes have the layout that `write_hulls` writes.
 
 With other versions, colliding meshes are kept unchanged.
 """
 
-MEASURED = ("geom_size", "geom_aabb", "geom_rbound")
+DOUBLE_PRECISION_GEOM_FIELDS = ("geom_size", "geom_aabb", "geom_rbound")
 """Geom fields that MuJoCo computes from vertices before it rounds them to single precision."""
 
 Integers = NDArray[np.int32]
@@ -96,28 +96,39 @@ def read_hull(model: Any, mesh: int, keeps_all_vertices: bool = False) -> Hull |
     Returns:
         The hull; None if the mesh has none, since no geom with it collides.
     """
+    # MuJoCo's graph: the numbers of vertices and faces, then per vertex the address of its edges
+    # and its number in the mesh, then the edges, then three vertices for each face.
     begin = int(model.mesh_graphadr[mesh])
     if begin < 0:
         return None
-    count, faces = model.mesh_graph[begin : begin + 2].tolist()
-    graph: Integers = model.mesh_graph[begin : begin + 2 + 3 * count + 6 * faces].copy()
+    vertex_count, face_count = model.mesh_graph[begin : begin + 2].tolist()
+    graph: Integers = model.mesh_graph[begin : begin + 2 + 3 * vertex_count + 6 * face_count].copy()
     all_vertices = np.arange(model.mesh_vertnum[mesh], dtype=np.int32)
     # The vertices keep their order, as MuJoCo may compare the numbers of two vertices.
-    ids = all_vertices if keeps_all_vertices else np.sort(graph[2 + count : 2 + 2 * count])
+    kept_vertices = (
+        all_vertices
+        if keeps_all_vertices
+        else np.sort(graph[2 + vertex_count : 2 + 2 * vertex_count])
+    )
     new_numbers = np.full(all_vertices.size, -1, dtype=np.int32)
-    new_numbers[ids] = np.arange(ids.size)
-    for part in (slice(2 + count, 2 + 2 * count), slice(graph.size - 3 * faces, graph.size)):
-        graph[part] = new_numbers[graph[part]]
+    new_numbers[kept_vertices] = np.arange(kept_vertices.size)
+    for vertex_entries in (
+        slice(2 + vertex_count, 2 + 2 * vertex_count),
+        slice(graph.size - 3 * face_count, graph.size),
+    ):
+        graph[vertex_entries] = new_numbers[graph[vertex_entries]]
     first = int(model.mesh_polyadr[mesh])
-    rows = slice(first, first + int(model.mesh_polynum[mesh]))
-    vertex_rows = int(model.mesh_vertadr[mesh]) + ids
+    polygon_rows = slice(first, first + int(model.mesh_polynum[mesh]))
+    vertex_rows = int(model.mesh_vertadr[mesh]) + kept_vertices
     polygons = _gather_lists(
-        model.mesh_polyvert, model.mesh_polyvertadr[rows], model.mesh_polyvertnum[rows]
+        model.mesh_polyvert,
+        model.mesh_polyvertadr[polygon_rows],
+        model.mesh_polyvertnum[polygon_rows],
     )
     return Hull(
         vertices=model.mesh_vert[vertex_rows],
         graph=graph,
-        normals=model.mesh_polynormal[rows].copy(),
+        normals=model.mesh_polynormal[polygon_rows].copy(),
         polygons=polygons._replace(values=new_numbers[polygons.values]),
         around=_gather_lists(
             model.mesh_polymap,
@@ -152,7 +163,7 @@ class CollisionShapes:
             geoms: numbers of the geoms in that model, by geom name.
         """
         fields = {
-            name: {field: getattr(model, field)[i].copy() for field in MEASURED}
+            name: {field: getattr(model, field)[i].copy() for field in DOUBLE_PRECISION_GEOM_FIELDS}
             for name, i in geoms.items()
         }
         bodies = {int(model.geom_bodyid[i]) for i in geoms.values()}
@@ -161,7 +172,7 @@ class CollisionShapes:
         )
 
     def write(self, model: Any) -> None:
-        """Write the data into a model compiled with meshes of `add_hull` and `add_reserve`."""
+        """Write the data into a model with meshes of `add_hull` and `add_memory_reserve`."""
         write_hulls(model, self.hulls)
         for name, fields in self.geoms.items():
             for field, values in fields.items():
@@ -194,7 +205,7 @@ def add_hull(spec: Any, name: str, hull: Hull) -> None:
     """
     import mujoco
 
-    core_size = float(np.abs(hull.vertices).max()) * CORE
+    core_size = float(np.abs(hull.vertices).max()) * CORE_SIZE_SHARE
     # The principal moments must decrease from x to z, else MuJoCo would exchange the axes.
     sides = 2.0 ** np.floor(np.log2(core_size)) * np.array([0.25, 0.5, 1.0])
     signs = [(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
@@ -204,7 +215,7 @@ def add_hull(spec: Any, name: str, hull: Hull) -> None:
     mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_EXACT
 
 
-def add_reserve(spec: Any, model: Any, full_model: Any, hulls: Mapping[str, Hull]) -> None:
+def add_memory_reserve(spec: Any, model: Any, full_model: Any, hulls: Mapping[str, Hull]) -> None:
     """Add meshes that reserve memory for `write_hulls` in compiled models, if there is too little.
 
     Args:
@@ -221,19 +232,19 @@ def add_reserve(spec: Any, model: Any, full_model: Any, hulls: Mapping[str, Hull
         # A hull of n vertices in general position has 2 n - 4 triangles, and so 15 n - 22 integers
         # in its graph, 2 n - 4 polygons and 6 n - 12 corners. MuJoCo merges some of them.
         count = int(1.5 * np.max(missing_sizes / (15, 2, 6))) + 8
-        height = 1.0 - 2.0 * (np.arange(count) + 0.5) / count
-        x, y = np.sqrt(1.0 - height**2) * _compute_rotations(
+        z = 1.0 - 2.0 * (np.arange(count) + 0.5) / count
+        x, y = np.sqrt(1.0 - z**2) * _compute_rotations(
             np.arange(count) * np.pi * (3.0 - np.sqrt(5.0))
         )
-        sphere = np.stack([x, y, height], axis=1)
-        spec.add_mesh(name=f"{RESERVE}.sphere", uservert=sphere.ravel())
-    if any(getattr(model, size) < getattr(full_model, size) for size in LARGEST):
+        sphere = np.stack([x, y, z], axis=1)
+        spec.add_mesh(name=f"{RESERVE_PREFIX}.sphere", uservert=sphere.ravel())
+    if any(getattr(model, size) < getattr(full_model, size) for size in BUFFER_SIZE_FIELDS):
         # The base of a pyramid is a polygon with as many corners as the apex has sides.
-        count = 8 + max(getattr(full_model, size) for size in LARGEST)
+        count = 8 + max(getattr(full_model, size) for size in BUFFER_SIZE_FIELDS)
         x, y = _compute_rotations(2.0 * np.pi * np.arange(count) / count)
         base = np.stack([x, y, np.zeros(count)], axis=1)
         pyramid = np.concatenate([base, [[0.0, 0.0, 1.0]]])
-        spec.add_mesh(name=f"{RESERVE}.pyramid", uservert=pyramid.ravel())
+        spec.add_mesh(name=f"{RESERVE_PREFIX}.pyramid", uservert=pyramid.ravel())
 
 
 def _compute_rotations(angles: Array) -> Array:
@@ -241,7 +252,7 @@ def _compute_rotations(angles: Array) -> Array:
     return np.stack([np.cos(angles), np.sin(angles)])
 
 
-def has_room(model: Any, full_model: Any) -> bool:
+def has_large_enough_buffers(model: Any, full_model: Any) -> bool:
     """Return whether MuJoCo's contact buffers for a model are at least those for the whole meshes.
 
     With smaller buffers MuJoCo would write beyond their ends.
@@ -261,7 +272,7 @@ def write_hulls(model: Any, hulls: Mapping[str, Hull]) -> None:
     digit from those of the original meshes.
 
     Args:
-        model: model compiled from a spec with meshes of `add_hull` and `add_reserve`.
+        model: model compiled from a spec with meshes of `add_hull` and `add_memory_reserve`.
         hulls: hulls by name of the mesh.
     """
     names = [model.mesh(i).name for i in range(model.nmesh)]
@@ -270,27 +281,33 @@ def write_hulls(model: Any, hulls: Mapping[str, Hull]) -> None:
         hulls.get(name) or read_hull(model, i, keeps_all_vertices=True)
         for i, name in enumerate(names)
     ]
-    graph = polygon = corner = mapped = 0
+    # Ends of the data written so far in MuJoCo's arrays of graphs, polygons, polygon corners and
+    # lists of the polygons at each vertex.
+    graph_end = polygon_end = corner_end = polygon_list_end = 0
     for i, (name, hull) in enumerate(zip(names, target_hulls, strict=True)):
         model.mesh_graphadr[i] = -1
-        model.mesh_polyadr[i], model.mesh_polynum[i] = polygon, 0
-        if hull is None or name.startswith(RESERVE):
+        model.mesh_polyadr[i], model.mesh_polynum[i] = polygon_end, 0
+        if hull is None or name.startswith(RESERVE_PREFIX):
             continue
-        model.mesh_graphadr[i] = graph
+        model.mesh_graphadr[i] = graph_end
         model.mesh_extrema[i] = hull.extrema
-        model.mesh_graph[graph : graph + hull.graph.size] = hull.graph
-        graph += hull.graph.size
-        rows = slice(polygon, polygon + hull.polygons.sizes.size)
+        model.mesh_graph[graph_end : graph_end + hull.graph.size] = hull.graph
+        graph_end += hull.graph.size
+        rows = slice(polygon_end, polygon_end + hull.polygons.sizes.size)
         model.mesh_polynum[i] = hull.polygons.sizes.size
         model.mesh_polynormal[rows] = hull.normals
         first_indices, counts = model.mesh_polyvertadr[rows], model.mesh_polyvertnum[rows]
-        corner = _write_lists(model.mesh_polyvert, first_indices, counts, hull.polygons, corner)
-        polygon = rows.stop
+        corner_end = _write_lists(
+            model.mesh_polyvert, first_indices, counts, hull.polygons, corner_end
+        )
+        polygon_end = rows.stop
         first_vertex = int(model.mesh_vertadr[i])
         model.mesh_polymapnum[first_vertex : first_vertex + int(model.mesh_vertnum[i])] = 0
         rows = slice(first_vertex, first_vertex + hull.around.sizes.size)
         first_indices, counts = model.mesh_polymapadr[rows], model.mesh_polymapnum[rows]
-        mapped = _write_lists(model.mesh_polymap, first_indices, counts, hull.around, mapped)
+        polygon_list_end = _write_lists(
+            model.mesh_polymap, first_indices, counts, hull.around, polygon_list_end
+        )
 
 
 def _count_hull_elements(hulls: Iterable[Hull]) -> Array:
@@ -303,10 +320,10 @@ def _count_hull_elements(hulls: Iterable[Hull]) -> Array:
 def _gather_lists(values: Integers, first_indices: Integers, sizes: Integers) -> Lists:
     """Copy lists of the given begins and sizes out of a flat array."""
     list_ends = np.cumsum(sizes)
-    places = np.repeat(first_indices - list_ends + sizes, sizes) + np.arange(
+    indices = np.repeat(first_indices - list_ends + sizes, sizes) + np.arange(
         list_ends[-1] if list_ends.size else 0
     )
-    return Lists(values[places], sizes.copy())
+    return Lists(values[indices], sizes.copy())
 
 
 def _write_lists(

@@ -57,8 +57,8 @@ class CompileRepairs:
         """
         for _ in range(2 * (len(spec.bodies) + len(spec.meshes) + len(spec.textures)) + 2):
             try:
-                before = spec.copy()
-                return before, spec.compile()
+                uncompiled = spec.copy()
+                return uncompiled, spec.compile()
             except InputError:
                 raise
             except Exception as error:

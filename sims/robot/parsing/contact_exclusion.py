@@ -69,10 +69,10 @@ def exclude_spurious_contacts(spec: Any, model: Any) -> list[str]:
 
 def can_collide(model: Any) -> bool:
     """Return whether any two shapes of a compiled model can collide."""
-    return bool(model.nflex or touching(model).any())
+    return bool(model.nflex or find_colliding_geoms(model).any())
 
 
-def touching(model: Any) -> NDArray[np.bool_]:
+def find_colliding_geoms(model: Any) -> NDArray[np.bool_]:
     """Find the geoms of a compiled model that can collide with another geom.
 
     The pairs are filtered by MuJoCo's own rules (its documentation, "Computation", collision
@@ -88,18 +88,22 @@ def touching(model: Any) -> NDArray[np.bool_]:
 
     weld = np.asarray(model.body_weldid)
     bodies = np.asarray(model.geom_bodyid)
-    rows = (bodies, model.geom_contype, model.geom_conaffinity)
+    geom_rows = (bodies, model.geom_contype, model.geom_conaffinity)
     # Many geoms of a body have equal masks; equal rows are merged to keep the matrices small.
-    (body, kind, affinity), row_indices = np.unique(np.stack(rows), axis=1, return_inverse=True)
-    masks = kind[:, None] & affinity
+    (body, contype, affinity), row_indices = np.unique(
+        np.stack(geom_rows), axis=1, return_inverse=True
+    )
+    masks = contype[:, None] & affinity
     can_collide = (masks | masks.T) != 0
     weld_ids = weld[body]
     can_collide &= weld_ids[:, None] != weld_ids
     if not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FILTERPARENT:
         # MuJoCo excludes contacts between a body and its parent, except if the parent is the world.
-        carrier = weld[np.asarray(model.body_parentid)[weld_ids]]
-        carried = (carrier[:, None] == weld_ids) & (weld_ids != 0) & (weld_ids[:, None] != 0)
-        can_collide &= ~(carried | carried.T)
+        parent_weld = weld[np.asarray(model.body_parentid)[weld_ids]]
+        is_parent_pair = (
+            (parent_weld[:, None] == weld_ids) & (weld_ids != 0) & (weld_ids[:, None] != 0)
+        )
+        can_collide &= ~(is_parent_pair | is_parent_pair.T)
     first, second = np.minimum(body[:, None], body), np.maximum(body[:, None], body)
     can_collide &= ~np.isin((first << 16) + second, model.exclude_signature)
     result: NDArray[np.bool_] = can_collide.any(axis=1)[row_indices.reshape(-1)]

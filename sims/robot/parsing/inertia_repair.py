@@ -33,13 +33,15 @@ def find_nearest_valid_moments(moments: Array) -> Array:
     raised_moments: Array = np.maximum(
         moments, np.where(moments < NEGLIGIBLE_MOMENT, MIN_MOMENT, 0.0)
     )
-    third = (
+    correction = (
         compute_triangle_violation(raised_moments) + ROUNDING_SHARE * np.max(raised_moments)
     ) / 3
-    if third <= ROUNDING_SHARE * np.max(raised_moments) / 3:
+    if correction <= ROUNDING_SHARE * np.max(raised_moments) / 3:
         return raised_moments
     return np.where(
-        raised_moments == np.max(raised_moments), raised_moments - third, raised_moments + third
+        raised_moments == np.max(raised_moments),
+        raised_moments - correction,
+        raised_moments + correction,
     )
 
 

@@ -154,8 +154,8 @@ def _check_model(files: ModelFileReader, model: Any) -> None:
     if model.njnt == 0:
         raise InputError(f"{files.path}: it has no movable joint")
     step = float(model.opt.timestep)
-    if not added_actuators.SHORTEST <= step <= added_actuators.LONGEST:
-        span = f"{added_actuators.SHORTEST:g} to {added_actuators.LONGEST:g} s"
+    if not added_actuators.MIN_TIME_STEP <= step <= added_actuators.MAX_TIME_STEP:
+        span = f"{added_actuators.MIN_TIME_STEP:g} to {added_actuators.MAX_TIME_STEP:g} s"
         raise InputError(f"{files.path}: option timestep: expected {span}, found {step:g}")
     for field in CHECKED_MODEL_FIELDS:
         values = np.asarray(getattr(model, field), dtype=float)

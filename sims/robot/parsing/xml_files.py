@@ -205,9 +205,9 @@ def _expand_includes(files: ModelFileReader, parent: Element) -> list[Element]:
             raise files.make_error(
                 child, f"{name} is included already: MuJoCo takes each file once"
             )
-        inner = parse_tree(files, path)
-        resolve_includes(files, inner)
-        children += list(inner)
+        included_root = parse_tree(files, path)
+        resolve_includes(files, included_root)
+        children += list(included_root)
     return children
 
 

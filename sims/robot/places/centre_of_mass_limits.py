@@ -11,20 +11,20 @@ import numpy as np
 from sims.core.simulator import Array
 from sims.robot.robot_model import RobotModel
 
-THINNEST = 0.25
+MIN_THICKNESS_SHARE = 0.25
 """Minimum half width of a link's box, as a share of its longest side.
 
 Motors and cables protrude from a thin rod.
 """
-MARGIN = 0.1
+MARGIN_SHARE = 0.1
 """Margin of a link's box on each face, as a share of its longest side."""
-PARALLEL = 1.0 - 1e-9
+MIN_PARALLEL_COSINE = 1.0 - 1e-9
 """Absolute cosine above which two joint axes count as parallel."""
 UNKNOWN_LENGTH = 0.1
 """Assumed longest side, in metres, of a link in a robot whose file specifies no lengths."""
 
 
-def reach(robot: RobotModel, body: str) -> Array:
+def compute_centre_of_mass_limits(robot: RobotModel, body: str) -> Array:
     """Return the limits of the offset of a body's centre of mass.
 
     The limits are a box that contains the geoms of the link and the joints of its child links. A
@@ -43,10 +43,13 @@ def reach(robot: RobotModel, body: str) -> Array:
     points = np.array(list(_iterate_link_points(model, data, number)))
     low, high = points.min(axis=0), points.max(axis=0)
     longest_side = float((high - low).max()) or _estimate_link_length(model, number)
-    half_size = np.maximum(0.5 * (high - low), THINNEST * longest_side) + MARGIN * longest_side
+    half_sizes = (
+        np.maximum(0.5 * (high - low), MIN_THICKNESS_SHARE * longest_side)
+        + MARGIN_SHARE * longest_side
+    )
     middle, stated_centre = 0.5 * (low + high), model.body_ipos[number]
     box: Array = np.stack(
-        [middle - half_size - stated_centre, middle + half_size - stated_centre], axis=1
+        [middle - half_sizes - stated_centre, middle + half_sizes - stated_centre], axis=1
     )
     return box
 
@@ -138,7 +141,7 @@ def _compute_observable_axes(model: Any, number: int) -> tuple[int, ...]:
         body = int(model.body_parentid[body])
     if not axes:
         return ()
-    if any(abs(float(axis @ axes[0])) < PARALLEL for axis in axes):
+    if any(abs(float(axis @ axes[0])) < MIN_PARALLEL_COSINE for axis in axes):
         return (0, 1, 2)
     along = data.xmat[number].reshape(3, 3).T @ axes[0]
     # For a diagonal direction the nearest frame axis is omitted, since the two others suffice.

@@ -22,29 +22,29 @@ def coupled_joints(model: Any, dofs: Sequence[int]) -> list[set[int]]:
     """
     import mujoco
 
-    number = {int(dof): joint for joint, dof in enumerate(dofs)}
-    kinds, objects = mujoco.mjtEq, mujoco.mjtObj
+    joint_of_dof = {int(dof): joint for joint, dof in enumerate(dofs)}
+    constraint_types, object_types = mujoco.mjtEq, mujoco.mjtObj
     groups: list[set[int]] = []
     for k in range(model.neq):
         kind = int(model.eq_type[k])
         first, second = int(model.eq_obj1id[k]), int(model.eq_obj2id[k])
-        if kind == int(kinds.mjEQ_JOINT):
-            ends = [int(model.jnt_dofadr[joint]) for joint in (first, second) if joint >= 0]
-        elif kind in (int(kinds.mjEQ_CONNECT), int(kinds.mjEQ_WELD)):
-            if int(model.eq_objtype[k]) == int(objects.mjOBJ_SITE):
+        if kind == int(constraint_types.mjEQ_JOINT):
+            coupled_dofs = [int(model.jnt_dofadr[joint]) for joint in (first, second) if joint >= 0]
+        elif kind in (int(constraint_types.mjEQ_CONNECT), int(constraint_types.mjEQ_WELD)):
+            if int(model.eq_objtype[k]) == int(object_types.mjOBJ_SITE):
                 first, second = (int(model.site_bodyid[site]) for site in (first, second))
             first_ancestors, second_ancestors = (
                 _list_ancestors(model, first),
                 _list_ancestors(model, second),
             )
-            ends = [
+            coupled_dofs = [
                 dof
                 for body in set(first_ancestors) ^ set(second_ancestors)
                 for dof in _get_dofs(model, body)
             ]
         else:
             continue
-        group = {number[dof] for dof in ends if dof in number}
+        group = {joint_of_dof[dof] for dof in coupled_dofs if dof in joint_of_dof}
         overlapping_groups = [other_group for other_group in groups if other_group & group]
         groups = [other_group for other_group in groups if not other_group & group]
         groups.append(group.union(*overlapping_groups))

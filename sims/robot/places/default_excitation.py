@@ -79,10 +79,12 @@ def make_default_recording(robot: RobotModel) -> DefaultRecording:
     """
     joints = [joint for joint in robot.joints if joint.has_one_coordinate]
     commands = _make_commands(robot, joints)
-    shares = [0.5**k for k in range(MAX_AMPLITUDE_HALVINGS)]
+    amplitude_shares = [0.5**k for k in range(MAX_AMPLITUDE_HALVINGS)]
     with capture_mujoco_warnings():
         # If joints leave their ranges at any amplitude, their commands are not the cause.
-        share = next((s for s in shares if _stays_within_ranges(robot, joints, commands, s)), 1.0)
+        share = next(
+            (s for s in amplitude_shares if _stays_within_ranges(robot, joints, commands, s)), 1.0
+        )
     observe = tuple(f"q.{joint.name}" for joint in joints)
     return DefaultRecording(
         observe=observe, inputs={c.name: c.to_signal_text(share) for c in commands}
@@ -120,14 +122,16 @@ def _compute_reference_forces(
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     bias = data.qfrc_bias - data.qfrc_passive
-    sizes = compute_joint_scales(robot)
+    scales = compute_joint_scales(robot)
     holding, forces = {}, {}
     for number, joint in enumerate(joints):
         holding[joint.name] = float(bias[joint.velocity])
         amplitude = _choose_amplitude(joint, float(model.qpos0[joint.position]))
         # The inertia force of a free joint at the centre frequency; gravity restrains other joints.
-        free = sizes.inertia[number] * CENTRE_FREQUENCY**2 * amplitude
-        forces[joint.name] = float(max(free, MIN_GRAVITY_FORCE_SHARE * sizes.force[number]))
+        inertia_force = scales.inertia[number] * CENTRE_FREQUENCY**2 * amplitude
+        forces[joint.name] = float(
+            max(inertia_force, MIN_GRAVITY_FORCE_SHARE * scales.force[number])
+        )
     return holding, forces
 
 
@@ -158,23 +162,23 @@ def _make_command(
     start = float(model.qpos0[joint.position])
     amplitude = _choose_amplitude(joint, start)
     if actuator.kind in ("position", "pid"):
-        centre, size = start, amplitude
+        centre, command_amplitude = start, amplitude
     elif actuator.kind == "velocity":
-        centre, size = 0.0, CENTRE_FREQUENCY * amplitude
+        centre, command_amplitude = 0.0, CENTRE_FREQUENCY * amplitude
     else:
         gain = float(model.actuator_gear[actuator.id, 0] * model.actuator_gainprm[actuator.id, 0])
         gain = gain or 1.0
-        centre, size = holding / gain, force / abs(gain)
+        centre, command_amplitude = holding / gain, force / abs(gain)
     if actuator.range is not None:
         low, high = actuator.range
         centre = min(max(centre, low), high)
         margin = min(centre - low, high - centre)
         # A set point at the end of the control range is moved to its middle.
-        if margin < MAX_RANGE_SHARE * size:
+        if margin < MAX_RANGE_SHARE * command_amplitude:
             centre = 0.5 * (low + high)
             margin = 0.5 * (high - low)
-        size = min(size, margin)
-    return ExcitationCommand(f"u.{actuator.name}", centre, size, actuator.control)
+        command_amplitude = min(command_amplitude, margin)
+    return ExcitationCommand(f"u.{actuator.name}", centre, command_amplitude, actuator.control)
 
 
 def _stays_within_ranges(
@@ -186,22 +190,25 @@ def _stays_within_ranges(
     model = robot.compiled
     data = mujoco.MjData(model)
     limited_joints = [joint for joint in joints if joint.range is not None]
-    places = [joint.position for joint in limited_joints]
+    addresses_of_joints = [joint.position for joint in limited_joints]
     low, high = np.array([joint.range for joint in limited_joints]).reshape(-1, 2).T
     # The reference pose of a file may violate the file's limits, so limits include it.
-    low, high = np.minimum(low, model.qpos0[places]), np.maximum(high, model.qpos0[places])
+    low, high = (
+        np.minimum(low, model.qpos0[addresses_of_joints]),
+        np.maximum(high, model.qpos0[addresses_of_joints]),
+    )
     control_array: Any = (
         data.ctrl if any(c.name.startswith("u.") for c in commands) else data.qfrc_applied
     )
     addresses = [c.address for c in commands]
     centres = np.array([c.centre for c in commands])
-    sizes = share * np.array([c.size for c in commands])
+    amplitudes = share * np.array([c.size for c in commands])
     for k in range(int(TRIAL_SECONDS / model.opt.timestep)):
-        control_array[addresses] = centres + sizes * np.sin(
+        control_array[addresses] = centres + amplitudes * np.sin(
             CENTRE_FREQUENCY * k * model.opt.timestep
         )
         mujoco.mj_step(model, data)
-        positions = data.qpos[places]
+        positions = data.qpos[addresses_of_joints]
         if not np.isfinite(data.qpos).all() or (positions < low).any() or (positions > high).any():
             return False
     return True

@@ -355,8 +355,8 @@ def _adapt_to_place(effect: type[Effect], c: Coefficient, effect_place: EffectPl
     Ranges of forces are scaled with the typical force of the joint. If the file specifies a
     value, the coefficient is a difference from it, limited so that the total is not negative.
     """
-    i = SYSTEM_KINDS.index(_KINDS[effect_place.kind])
-    unit, (low, high) = c.units[i], c.plausible[i]
+    system_kind = SYSTEM_KINDS.index(_KINDS[effect_place.kind])
+    unit, (low, high) = c.units[system_kind], c.plausible[system_kind]
     lower_limit = c.least
     if c.of.startswith(("input", "error")):
         unit = c.of.replace("error", "input").replace("input", effect_place.unit)
@@ -365,11 +365,11 @@ def _adapt_to_place(effect: type[Effect], c: Coefficient, effect_place: EffectPl
     # Plausible ranges of the library refer to small joints, so forces are scaled with the joint.
     if unit is None:
         unit = "1"
-    share = effect_place.size / REFERENCE_FORCES[effect_place.kind]
+    force_ratio = effect_place.size / REFERENCE_FORCES[effect_place.kind]
     if unit.startswith("N"):
-        low, high = share * low, share * high
+        low, high = force_ratio * low, force_ratio * high
     elif unit.startswith(("1/N", "1/(N")):
-        low, high = low / share, high / share
+        low, high = low / force_ratio, high / force_ratio
     if effect.name == "inertia.armature":
         high = 3.0 * effect_place.inertia
     if c.of == "give":

@@ -12,7 +12,7 @@ from sims.robot.robot_model import Joint, RobotModel, cache_per_robot
 
 POSE_COUNT = 4
 """Number of random poses and velocities in which forces are compared."""
-TILT = 1e-4
+TILT_STEP = 1e-4
 """Finite difference of a tilt in rad."""
 MAX_UNOBSERVABLE_SHARE = 1e-6
 """Largest change of forces per rad, as a share of the forces, that counts as none."""
@@ -40,12 +40,12 @@ def observable_tilts(robot: RobotModel, name: str) -> tuple[int, ...]:
     observable = []
     for axis in (axis for axis in range(3) if axis != nearest_axis):
         tilt_direction = np.cross(np.eye(3)[axis], file_axis)
-        sides = []
+        forces_by_sign = []
         for sign in (1.0, -1.0):
-            model.jnt_axis[joint.id] = _normalise(file_axis + sign * TILT * tilt_direction)
-            sides.append(_compute_random_state_forces(model, robot.joints))
-        change = (sides[0] - sides[1]) / (2.0 * TILT)
-        if (np.abs(change) > MAX_UNOBSERVABLE_SHARE * np.abs(sides[0]).max()).any():
+            model.jnt_axis[joint.id] = _normalise(file_axis + sign * TILT_STEP * tilt_direction)
+            forces_by_sign.append(_compute_random_state_forces(model, robot.joints))
+        change = (forces_by_sign[0] - forces_by_sign[1]) / (2.0 * TILT_STEP)
+        if (np.abs(change) > MAX_UNOBSERVABLE_SHARE * np.abs(forces_by_sign[0]).max()).any():
             observable.append(axis)
     return tuple(observable)
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from sims.robot.contact_pairs import find_pair_geoms, get_geom_name, read_contact_parameters
 from sims.robot.coupled_drives import list_coupling_places
-from sims.robot.places.centre_of_mass_limits import observable_axes, reach
+from sims.robot.places.centre_of_mass_limits import compute_centre_of_mass_limits, observable_axes
 from sims.robot.places.observable_tilts import observable_tilts
 from sims.robot.robot_model import Actuator, RobotModel
 
@@ -100,17 +100,17 @@ def list_places(
     """
     from sims.robot.places.typical_forces import coefficient_scales
 
-    sizes = coefficient_scales(robot)
+    scales = coefficient_scales(robot)
     kinds = ("joint", "actuator", "body", "channel")
     places: dict[str, list[EffectPlace]] = {kind: [] for kind in kinds}
     places["contact"] = [make_contact_place(robot, pair, robot.contacts) for pair in robot.contacts]
-    numbers: dict[str, int] = {}
+    joint_numbers: dict[str, int] = {}
     mass = sum(body.mass for body in robot.bodies)
     may_be_coupled = list_coupling_places(robot)
     bodies = robot.compiled.jnt_bodyid
-    lasts = {int(body): i for i, body in enumerate(bodies)}
+    last_joint_of_body = {int(body): i for i, body in enumerate(bodies)}
     for number, joint in enumerate(j for j in robot.joints if j.has_one_coordinate):
-        numbers[joint.name] = number
+        joint_numbers[joint.name] = number
         places["joint"].append(
             EffectPlace(
                 joint.name,
@@ -118,11 +118,11 @@ def list_places(
                 number,
                 "",
                 joint.unit,
-                sizes.force[number],
-                sizes.inertia[number],
+                scales.force[number],
+                scales.inertia[number],
                 _get_file_values(robot, joint.velocity, joint.id),
                 f"joint {joint.name}",
-                last=lasts[int(bodies[joint.id])] == joint.id,
+                last=last_joint_of_body[int(bodies[joint.id])] == joint.id,
                 coupled=joint.name in may_be_coupled,
                 tilts=tuple("xyz"[axis] for axis in observable_tilts(robot, joint.name)),
             )
@@ -146,14 +146,20 @@ def list_places(
     longest_link = float(np.linalg.norm(robot.compiled.body_pos[1:], axis=1).max(initial=0.0))
     for body in robot.bodies:
         description = f"body {body.name}"
-        box = reach(robot, body.name)
-        axes = observable_axes(robot, body.name)
-        ends = np.where(np.isin(range(3), axes)[:, None], box, 0.0).tolist()
-        offsets = {axis: (low, high) for axis, (low, high) in zip("xyz", ends, strict=True)}
-        middle = box.mean(axis=1).tolist()
-        distance = max(float(np.ptp(box, axis=1).max()), 0.5 * longest_link)
-        loads = {
-            axis: (middle[k] - distance, middle[k] + distance) if k in axes else (0.0, 0.0)
+        offset_limits = compute_centre_of_mass_limits(robot, body.name)
+        observed_axes = observable_axes(robot, body.name)
+        observable_limits = np.where(
+            np.isin(range(3), observed_axes)[:, None], offset_limits, 0.0
+        ).tolist()
+        offsets = {
+            axis: (low, high) for axis, (low, high) in zip("xyz", observable_limits, strict=True)
+        }
+        box_centre = offset_limits.mean(axis=1).tolist()
+        payload_reach = max(float(np.ptp(offset_limits, axis=1).max()), 0.5 * longest_link)
+        payload_limits = {
+            axis: (box_centre[k] - payload_reach, box_centre[k] + payload_reach)
+            if k in observed_axes
+            else (0.0, 0.0)
             for k, axis in enumerate("xyz")
         }
         body_place = EffectPlace(
@@ -166,13 +172,15 @@ def list_places(
             1.0,
             _get_body_file_values(robot, body.id),
             description,
-            limits={"mass.offset": offsets, "payload": loads},
+            limits={"mass.offset": offsets, "payload": payload_limits},
             mass=mass,
         )
         places["body"].append(body_place)
     for name, unit in channels:
         _, _, joint_name = name.partition(".")
-        coordinate = numbers.get(joint_name) if name.startswith(("q.", "qd.", "tau.")) else None
+        coordinate = (
+            joint_numbers.get(joint_name) if name.startswith(("q.", "qd.", "tau.")) else None
+        )
         joint_place = places["joint"][coordinate] if coordinate is not None else None
         kind, size = (joint_place.kind, joint_place.size) if joint_place else ("hinge", 1.0)
         description = f"channel {name}"
@@ -196,11 +204,13 @@ def make_contact_place(robot: RobotModel, pair: str, pairs: tuple[str, ...]) -> 
     import mujoco
 
     friction, solref = read_contact_parameters(robot, pair)
-    option = robot.compiled.opt
-    least = -MAX_REDUCTION
-    if not option.disableflags & mujoco.mjtDisableBit.mjDSBL_REFSAFE and solref[0] > 0:
+    options = robot.compiled.opt
+    min_softness_change = -MAX_REDUCTION
+    if not options.disableflags & mujoco.mjtDisableBit.mjDSBL_REFSAFE and solref[0] > 0:
         # MuJoCo uses no smaller time constant than two time steps.
-        least = max(least, min(2.0 * option.timestep / float(solref[0]) - 1.0, 0.0))
+        min_softness_change = max(
+            min_softness_change, min(2.0 * options.timestep / float(solref[0]) - 1.0, 0.0)
+        )
     names = [get_geom_name(robot.compiled, geom) for geom in find_pair_geoms(robot, pair)]
     return EffectPlace(
         pair,
@@ -212,7 +222,7 @@ def make_contact_place(robot: RobotModel, pair: str, pairs: tuple[str, ...]) -> 
         1.0,
         {"contact.friction": friction},
         f"the contact of {names[0]} and {names[1]}",
-        limits={"contact.softness": {"coefficient": (least, np.inf)}},
+        limits={"contact.softness": {"coefficient": (min_softness_change, np.inf)}},
         pairs=pairs,
     )
 
@@ -247,10 +257,10 @@ def _get_body_file_values(robot: RobotModel, body: int) -> dict[str, float]:
     The distance is zero if no moving body carries it: then it moves the whole robot.
     """
     model = robot.compiled
-    carried = int(model.body_weldid[model.body_parentid[body]]) != 0
+    has_moving_parent = int(model.body_weldid[model.body_parentid[body]]) != 0
     return {
         "gravity.compensation": float(model.body_gravcomp[body]),
-        "link.length": float(np.linalg.norm(model.body_pos[body])) if carried else 0.0,
+        "link.length": float(np.linalg.norm(model.body_pos[body])) if has_moving_parent else 0.0,
     }
 
 

@@ -19,7 +19,7 @@ TYPICAL_ACCELERATION = 5.0
 """Typical acceleration of a joint, in rad/s^2 or m/s^2."""
 MIN_FORCE = 1e-4
 """Minimum typical force of a joint, in N or N m."""
-NEIGHBOUR = 0.01
+MIN_PARENT_SHARE = 0.01
 """Minimum ratio of a joint's typical force and inertia to those of its parent joint.
 
 It applies to the ranges of coefficients. A smaller value more likely means that the file omits an
@@ -49,7 +49,7 @@ def compute_joint_scales(robot: RobotModel) -> JointScales:
     model = robot.compiled
     data = mujoco.MjData(model)
     joints = [joint for joint in robot.joints if joint.has_one_coordinate]
-    places = [joint.velocity for joint in joints]
+    dofs = [joint.velocity for joint in joints]
     rng = np.random.default_rng(7)
     weights, inertias = [], []
     mass_matrix = np.zeros((model.nv, model.nv))
@@ -62,8 +62,8 @@ def compute_joint_scales(robot: RobotModel) -> JointScales:
             data.qpos[joint.position] = rng.uniform(low, high)
         mujoco.mj_forward(model, data)
         mujoco.mj_fullM(model, data, mass_matrix)
-        weights.append(np.abs(data.qfrc_bias[places]))
-        inertias.append(np.diagonal(mass_matrix)[places])
+        weights.append(np.abs(data.qfrc_bias[dofs]))
+        inertias.append(np.diagonal(mass_matrix)[dofs])
     inertia = np.mean(inertias, axis=0)
     force = np.maximum(np.max(weights, axis=0), TYPICAL_ACCELERATION * inertia)
     return JointScales(np.maximum(force, MIN_FORCE), np.maximum(inertia, 1e-9))
@@ -72,8 +72,8 @@ def compute_joint_scales(robot: RobotModel) -> JointScales:
 def coefficient_scales(robot: RobotModel) -> JointScales:
     """Compute the forces and inertias of each joint (D,) that set the ranges of coefficients.
 
-    The values are those of `compute_joint_scales`, but at least `NEIGHBOUR` times the values of the
-    parent joint
+    The values are those of `compute_joint_scales`, but at least `MIN_PARENT_SHARE` times the values
+    of the parent joint
     of the same kind. So a link whose inertia the file omits (1e-9 kg m^2) does not make the ranges
     of its joint vanish.
     """
@@ -81,18 +81,18 @@ def coefficient_scales(robot: RobotModel) -> JointScales:
     force, inertia = joint_scales.force.copy(), joint_scales.inertia.copy()
     model = robot.compiled
     joints = [joint for joint in robot.joints if joint.has_one_coordinate]
-    latest_joints: dict[tuple[int, str], int] = {}
+    last_joint_of_body: dict[tuple[int, str], int] = {}
     # Bodies are numbered from the base outwards, so a parent joint has its final value already.
     for number, joint in enumerate(joints):
         body = int(model.jnt_bodyid[joint.id])
-        parent = latest_joints.get((body, joint.kind))
+        parent = last_joint_of_body.get((body, joint.kind))
         while parent is None and body:
             body = int(model.body_parentid[body])
-            parent = latest_joints.get((body, joint.kind))
+            parent = last_joint_of_body.get((body, joint.kind))
         if parent is not None:
-            force[number] = max(force[number], NEIGHBOUR * force[parent])
-            inertia[number] = max(inertia[number], NEIGHBOUR * inertia[parent])
-        latest_joints[int(model.jnt_bodyid[joint.id]), joint.kind] = number
+            force[number] = max(force[number], MIN_PARENT_SHARE * force[parent])
+            inertia[number] = max(inertia[number], MIN_PARENT_SHARE * inertia[parent])
+        last_joint_of_body[int(model.jnt_bodyid[joint.id]), joint.kind] = number
     return JointScales(force, inertia)
 
 

@@ -6,7 +6,7 @@ import pytest
 
 from sims.extended_simulator import FittedValue
 from sims.robot.export.apply_causes import apply_causes
-from sims.robot.export.model_file_totals import totals
+from sims.robot.export.model_file_totals import compute_file_totals
 from sims.robot.robot_simulator import make_robot_simulator
 from tests.sims.robot.sample_arms import robot
 
@@ -53,7 +53,7 @@ def system(tmp_path_factory):
     ],
 )
 def test_stated_and_total(system, effect, values, expected):
-    (found,) = totals(system.robot, [(system.effect(effect), values)])
+    (found,) = compute_file_totals(system.robot, [(system.effect(effect), values)])
     for one, (stated, total, unit) in zip(found, expected, strict=True):
         assert (one.stated, one.total) == pytest.approx((stated, total))
         assert one.unit == unit
@@ -61,17 +61,19 @@ def test_stated_and_total(system, effect, values, expected):
 
 @pytest.mark.parametrize("effect", ["sensor.bias@q.elbow", "input.delay@m_elbow"])
 def test_what_the_file_does_not_state_has_no_total(system, effect):
-    assert totals(system.robot, [(system.effect(effect), [0.1])]) == [[None]]
+    assert compute_file_totals(system.robot, [(system.effect(effect), [0.1])]) == [[None]]
 
 
 def test_an_actuator_without_limit_has_no_total(system):
-    assert totals(system.robot, [(system.effect("actuator.limit@m_lift"), [1.0])]) == [[None]]
+    assert compute_file_totals(system.robot, [(system.effect("actuator.limit@m_lift"), [1.0])]) == [
+        [None]
+    ]
 
 
 def test_the_total_is_what_the_extended_file_compiles_to(system):
     names = {"mass.scale@fore": 0.25, "inertia.scale@fore": -0.3}
     fitted = [(system.effect(name), [value]) for name, value in names.items()]
-    ((mass,), (inertia,)) = totals(system.robot, fitted)
+    ((mass,), (inertia,)) = compute_file_totals(system.robot, fitted)
     causes = {n: {"coefficient": FittedValue(value, "1", 0.2, 0.3)} for n, value in names.items()}
     model = apply_causes(system.robot, causes).model
     number = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, "fore")

@@ -13,7 +13,7 @@ from bench.diagnosis.evaluation.coefficient_bounds import (
     is_unusual,
 )
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from sims.robot.places.centre_of_mass_limits import observable_axes, reach
+from sims.robot.places.centre_of_mass_limits import compute_centre_of_mass_limits, observable_axes
 from sims.robot.places.typical_forces import coefficient_scales, compute_joint_scales
 from sims.robot.robot_simulator import make_robot_simulator
 from tests.bench.diagnosis.explained_samples import recorded
@@ -84,9 +84,9 @@ def test_a_centre_of_mass_stays_within_its_link(yaw, bounds):
     assert -0.25 < x[0] < -0.15
     assert 0.15 < x[1] < 0.25
     assert max(*np.abs(y), *np.abs(z)) < 0.15
-    assert np.all(reach(yaw, "upper")[:, 0] < 0.0)
+    assert np.all(compute_centre_of_mass_limits(yaw, "upper")[:, 0] < 0.0)
     # Without geoms and children it counts as long as its parent link.
-    assert np.abs(reach(yaw, "last")).max() < 0.4
+    assert np.abs(compute_centre_of_mass_limits(yaw, "last")).max() < 0.4
 
 
 def test_an_offset_along_the_only_axis_of_rotation_is_fixed(yaw, bounds):
