@@ -17,7 +17,7 @@ class InterruptHandler:
 
     def __init__(self, print_line: Callable[[str], None] | None = None) -> None:
         self._asked = False
-        self._say = print_line or _print_line
+        self._print_line = print_line or _print_line
 
     def is_stop_requested(self) -> bool:
         """Return whether a stop has been requested."""
@@ -39,7 +39,7 @@ class InterruptHandler:
     def _announce_early_end(self, *_: object) -> None:
         self._asked = True
         signal.signal(signal.SIGINT, signal.default_int_handler)
-        self._say("stopping with the results so far; Ctrl-C again stops at once")
+        self._print_line("stopping with the results so far; Ctrl-C again stops at once")
 
 
 def _print_line(text: str) -> None:

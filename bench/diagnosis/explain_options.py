@@ -11,7 +11,7 @@ from bench.logs.data_frames import FrameDescription
 from sims.core.argument_checks import Count, Name, Names, Seconds
 
 
-def _say_nothing(_line: str) -> None:
+def _discard_note(_line: str) -> None:
     """Discard a note."""
 
 
@@ -65,7 +65,7 @@ class ExplainOptions(FrameDescription):
     pieces: Seconds | None = None
     thorough: bool = False
     force: bool = False
-    say: Callable[[str], None] = _say_nothing
+    say: Callable[[str], None] = _discard_note
     stop: Callable[[], bool] = _never_stop
     progress: Callable[[float, str], None] | None = None
     listener: ProgressListener | None = None

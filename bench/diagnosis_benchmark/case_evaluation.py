@@ -145,7 +145,7 @@ def _evaluate_case(
     Args:
         diagnoser: the diagnoser.
         request: request of the diagnoser, with the texts of the recording; it does not contain the
-            truth.
+            true causes.
         question: name of the case.
         limits: limits of the answer.
         hidden: folders that the diagnoser may not read.

@@ -140,7 +140,7 @@ class SimulatedRecording:
         import tomli_w
 
         table_path = Path(path)
-        truth = _make_truth_path(table_path)
+        truth = _make_true_parameters_path(table_path)
         truth_file = {truth: tomli_w.dumps(dict(self.truth))}
         write_recording(
             table_path, self.recording, type(self.simulator), digits=_DIGITS, beside=truth_file
@@ -154,10 +154,10 @@ def check_output_path(out: Path) -> None:
     Raises:
         InputError: It does not end in ``.csv``, or a file exists already.
     """
-    check_absent([out, out.with_suffix(".toml"), _make_truth_path(out)])
+    check_absent([out, out.with_suffix(".toml"), _make_true_parameters_path(out)])
 
 
-def _make_truth_path(table_path: Path) -> Path:
+def _make_true_parameters_path(table_path: Path) -> Path:
     if table_path.suffix != ".csv":
         raise InputError(f"{table_path}: expected a name that ends in .csv")
     return table_path.with_suffix(".truth.toml")

@@ -45,6 +45,8 @@ _NAME_PART = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+")
 _PROSE_WORD = re.compile(r"(?<![\w./-])[A-Za-z]+(?![\w/-])")
 """A word of prose; parts of options, paths, attributes and hyphenated compounds are not words."""
 _CODE = re.compile(r"^```.*?^```|``.+?``|`[^`\n]+`", re.MULTILINE | re.DOTALL)
+_CODE_OR_LABEL = re.compile(rf"{_CODE.pattern}|^ +\w+:(?=\s)", _CODE.flags)
+"""Code, or the name of an argument before its description; names are checked as identifiers."""
 _STRING_OR_COMMENT = re.compile(
     r'"""(?:[^"\\]|\\.|"(?!""))*"""|' + r"'''(?:[^'\\]|\\.|'(?!''))*'''|"
     r'"(?:[^"\\\n]|\\.)*"|' + r"'(?:[^'\\\n]|\\.)*'|(?P<comment>\#[^\n]*)",
@@ -80,20 +82,16 @@ class Term:
 
 @dataclass(frozen=True)
 class AllowedUse:
-    """A legitimate use of some words (`*`: of all) in files that match a pattern."""
+    """Legitimate identifiers in files that match a pattern (`*`: all words, also in texts)."""
 
-    words: tuple[str, ...]
+    names: tuple[str, ...]
     files: tuple[str, ...]
-    checks: tuple[str, ...]
     reason: str
 
     def covers(self, finding: Finding) -> bool:
         """Return whether the finding is this legitimate use."""
-        return (
-            bool({"*", finding.check} & {*self.checks})
-            and bool({"*", finding.rule} & {*self.words})
-            and any(fnmatch(finding.path, pattern) for pattern in self.files)
-        )
+        is_named = "*" in self.names or finding.name in self.names
+        return is_named and any(fnmatch(finding.path, pattern) for pattern in self.files)
 
 
 class Glossary:
@@ -102,12 +100,7 @@ class Glossary:
     def __init__(self, document: dict[str, Any]) -> None:
         """Read the content of a `glossary.toml`."""
         self.allowed = tuple(
-            AllowedUse(
-                tuple(entry["words"]),
-                tuple(entry["files"]),
-                tuple(entry.get("checks", ["*"])),
-                entry["reason"],
-            )
+            AllowedUse(tuple(entry["names"]), tuple(entry["files"]), entry["reason"])
             for entry in document.get("allowed", [])
         )
         phrases = document.get("standard", {}).get("phrases", [])
@@ -276,7 +269,8 @@ def _find_in_text(
     text: str, first: int, last: int | None, check: str, path: str, glossary: Glossary
 ) -> Iterator[Finding]:
     """Find private words in the prose of a text that occupies lines `first` to `last`."""
-    prose = _CODE.sub(lambda code: "\n" * code.group().count("\n") or " ", text)
+    code = _CODE_OR_LABEL if check == "docstrings" else _CODE
+    prose = code.sub(lambda match: "\n" * match.group().count("\n") or " ", text)
     for position, found, term in glossary.find(prose, check):
         line = first + prose.count("\n", 0, position)
         found = " ".join(found.split())
