@@ -65,7 +65,7 @@ _MISSPECIFICATION_TABLE_COLUMNS = {
 _EXPERIMENT_OPTIONS = ("targets", "budget", "training_budget", "timeout", "memory")
 """Options that change the key of the same name in an experiment."""
 DEFAULTS = ComparisonOptions()
-_ROWS = 200
+_MAX_NOTEBOOK_ROWS = 200
 """Maximum number of table rows that a notebook shows."""
 
 
@@ -500,7 +500,7 @@ class ComparisonResult:
         names = [behind] if isinstance(behind, str) else behind
         references = [find_reference(reference) for reference in names]
         return comparison_figures.draw_figure(
-            self._stored_comparison, self._axis_labels, name, behind=references
+            self._stored_comparison, self._axis_labels, name, references=references
         )
 
     def summary(self) -> pd.DataFrame:
@@ -537,7 +537,7 @@ class ComparisonResult:
         """Return the summary as an HTML table, which a notebook shows for this object."""
         html: str = (
             self.summary()
-            .head(_ROWS)
+            .head(_MAX_NOTEBOOK_ROWS)
             .to_html(index=False, float_format=lambda value: f"{value:.3g}")
         )
         return html

@@ -22,16 +22,17 @@ from sims.recording.recording import Recording
 from sims.recording.recording_frame import Frame
 
 SearchOptions = TypeVar("SearchOptions", bound=ExplainOptions)
-_RECORDING = (
+_EXPECTED_RECORDING = (
     "the path of NAME.csv, a Recording (of read_recording), a SimulatedRecording (of simulate) or "
     "a pandas DataFrame"
 )
 RecordingSource: TypeAlias = Annotated[
-    str | Path | Recording | SimulatedRecording | Frame, Expected(_RECORDING)
+    str | Path | Recording | SimulatedRecording | Frame, Expected(_EXPECTED_RECORDING)
 ]
 """A source of one recording."""
 Sources: TypeAlias = Annotated[
-    RecordingSource | Sequence[RecordingSource], Expected(f"{_RECORDING}, or a list of these")
+    RecordingSource | Sequence[RecordingSource],
+    Expected(f"{_EXPECTED_RECORDING}, or a list of these"),
 ]
 """A source of one recording, or several."""
 
@@ -80,7 +81,7 @@ def list_sources(
     single = isinstance(recording, str | Path | Recording | SimulatedRecording | Frame)
     each: list[Any] = [recording] if single else [*cast(Sequence[RecordingSource], recording)]
     if not each:
-        raise InputError(f"recording: expected {_RECORDING}, found an empty list")
+        raise InputError(f"recording: expected {_EXPECTED_RECORDING}, found an empty list")
     frames = [source for source in each if isinstance(source, Frame)]
     sources: list[str | Path | Recording] = []
     for source in each:

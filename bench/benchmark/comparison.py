@@ -284,7 +284,7 @@ class Comparison:
             "runs finished",
             configuration.fingerprint,
             run_ends,
-            self._under_way,
+            self._is_unfinished,
         )
 
     def _list_run_ends(self) -> list[RunEnd]:
@@ -294,7 +294,7 @@ class Comparison:
         segments (the journal and its parts), which are checked against the plan; a planned run that
         has not ended has no status.
         """
-        if not self._under_way:
+        if not self._is_unfinished:
             return [_find_run_end(status.run, status) for status in self._list_finished_statuses()]
         planned_ids, experiment = read_plan(self.folder), self.configuration.experiment
         if planned_ids is not None:
@@ -310,7 +310,7 @@ class Comparison:
         ]
 
     @property
-    def _under_way(self) -> bool:
+    def _is_unfinished(self) -> bool:
         """True if the comparison is unfinished: its journal is deleted when all is written."""
         return (self.folder / SEGMENTS_FOLDER).exists()
 

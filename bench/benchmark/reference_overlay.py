@@ -59,7 +59,7 @@ def draw_with_references(
     files = []
     for name in comparison_figures.list_figure_names(stored):
         if name in OVERLAYABLE_FIGURES:
-            figure = comparison_figures.draw_figure(stored, labels, name, behind=references)
+            figure = comparison_figures.draw_figure(stored, labels, name, references=references)
             files += write_figure(figure, out / "figures" / f"{before}{FIGURE_FILES[name]}-behind")
             print_line(f"figure  {files[-2]}")
     return [reference.to_document(stored.experiment, files) for reference in references]

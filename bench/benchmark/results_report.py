@@ -12,7 +12,7 @@ import pandas as pd
 from bench.benchmark.figures import comparison_figures
 from bench.benchmark.figures.comparison_figures import compute_statistics
 from bench.benchmark.figures.comparison_view import AxisLabels, ComparisonView, make_axis_labels
-from bench.benchmark.isolation.process_exit import ISOLATED, without_isolation
+from bench.benchmark.isolation.process_exit import ISOLATION_NOTE, without_isolation
 from bench.benchmark.problem.experiment import Experiment
 from bench.benchmark.problem.numeric_warnings import numeric_warnings_silenced
 from bench.benchmark.problem.tuning_problem import TuningProblem
@@ -69,9 +69,9 @@ REQUIRED_RUN_COLUMNS = (
 REPORT_FILE = "report.html"
 """File name of the report page in the folder of a comparison."""
 WINNER_COLUMNS = ["experiment", "range", "threshold", "from_seconds", "to_seconds", "tuner"]
-_WIDTH = 120
+_LINE_WIDTH = 120
 """Width of a line on the terminal in characters."""
-_SHOWN = (3, 10)
+_PRINTED_CHECKPOINTS = (3, 10)
 """Numbers of simulations for printed errors along directions, in addition to the budget."""
 
 
@@ -238,18 +238,18 @@ def _describe_best_tuners(view: ComparisonView) -> list[str]:
         lines = [
             f"\nbest tuners, {range_text} ({label}; {headline.format_error_floor(statistics)})"
         ]
-        for verdicts in headline.list_standings(statistics, kind):
+        for verdicts in headline.rank_at_checkpoints(statistics, kind):
             lines += _format_ranking(verdicts)
         lines += [headline.list_failed_runs(statistics, kind)]
         lines += [
-            headline.warn_too_few_targets(statistics, kind)
+            headline.warn_about_target_count(statistics, kind)
             or headline.explain_ranking(statistics, kind)
         ]
         texts.append("\n".join(line for line in lines if line))
     return texts
 
 
-def _format_ranking(verdicts: headline.Standing) -> list[str]:
+def _format_ranking(verdicts: headline.TunerRanking) -> list[str]:
     """Format the lines of one number of simulations; verdicts without tuners are left out."""
     best = (
         f"{', '.join(verdicts.best)} ({verdicts.error})"
@@ -264,7 +264,7 @@ def _format_ranking(verdicts: headline.Standing) -> list[str]:
     }
     lines = [
         textwrap.fill(
-            f"{verdict}: {names}", _WIDTH, initial_indent=" " * 12, subsequent_indent=" " * 14
+            f"{verdict}: {names}", _LINE_WIDTH, initial_indent=" " * 12, subsequent_indent=" " * 14
         )
         for verdict, names in parts.items()
         if names
@@ -325,7 +325,7 @@ def _format_direction_errors(
     if kind == "real" or part.empty:
         return ""
     budget = part["simulations"].max()
-    shown_counts = [k for k in (*_SHOWN, budget) if k <= budget]
+    shown_counts = [k for k in (*_PRINTED_CHECKPOINTS, budget) if k <= budget]
     part = part[part["simulations"].isin(shown_counts)]
     part = part.assign(column=part["metric"].map(titles) + " " + part["simulations"].astype(str))
     order = [f"{t} {k}" for t in titles.values() for k in sorted(part["simulations"].unique())]
@@ -377,23 +377,23 @@ def format_failures(failed: pd.DataFrame) -> list[str]:
         f"{tuner:{a}}  {runs:>{b}}  {status:{c}}  {reason}".rstrip()
         for tuner, runs, status, reason in lines
     ]
-    refused = [reason.endswith(ISOLATED) for reason in failed["reason"].astype(str)]
+    refused = [reason.endswith(ISOLATION_NOTE) for reason in failed["reason"].astype(str)]
     isolated_tuners = list(dict.fromkeys(failed["tuner"][refused].astype(str)))
-    note = [f"{', '.join(isolated_tuners)}: {ISOLATED}"] if isolated_tuners else []
+    note = [f"{', '.join(isolated_tuners)}: {ISOLATION_NOTE}"] if isolated_tuners else []
     return ["", "failures", *laid_out, *note]
 
 
-_FRAME = re.compile(r'File "(?P<file>[^"]+)", line (?P<line>\d+), in (?P<function>\S+)')
+_TRACEBACK_FRAME = re.compile(r'File "(?P<file>[^"]+)", line (?P<line>\d+), in (?P<function>\S+)')
 
 
 def format_failure_reason(reason: str) -> str:
     """Return error and location from a reason, which may be a traceback."""
     lines = without_isolation(reason.strip()).splitlines() or [""]
-    frames = [i for i, line in enumerate(lines) if _FRAME.search(line)]
+    frames = [i for i, line in enumerate(lines) if _TRACEBACK_FRAME.search(line)]
     if not frames:
         return lines[-1].strip()
     # The error message is the first line without indentation after the last frame; it may be
     # followed by pages of text.
     words = next((line for line in lines[frames[-1] + 1 :] if line[:1].strip()), lines[-1])
-    file, number, function = _FRAME.findall(lines[frames[-1]])[0]
+    file, number, function = _TRACEBACK_FRAME.findall(lines[frames[-1]])[0]
     return f"{words} ({Path(file).name}, line {number}, in {function})"

@@ -25,7 +25,7 @@ import numpy as np
 
 from sims.core.simulator import make_unknown_name_error
 
-_SLOWEST = 1e-3
+_MIN_IMPACT_SPEED = 1e-3
 """Impact speed in m/s below which the restitution is constant, because (2) is unbounded."""
 
 
@@ -59,7 +59,7 @@ class BallKind:
 
     def compute_restitution(self, speed: float) -> float:
         """Return the restitution at an impact speed in m/s; at most 1."""
-        ratio = max(speed, _SLOWEST) / self.speed
+        ratio = max(speed, _MIN_IMPACT_SPEED) / self.speed
         return min(1.0, self.restitution * float(ratio**self.exponent))  # (2)
 
     def draw_ball(self, rng: np.random.Generator) -> BallKind:

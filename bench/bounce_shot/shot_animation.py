@@ -164,7 +164,7 @@ def _draw_shot_panel(axis: Any, setup: ShotSetup, method: str, shot: ExampleShot
     line = axis.lines[-1]
     line.set_data([], [])
     (ball,) = axis.plot([], [], marker="o", color=VERMILION, markeredgecolor="black", markersize=7)
-    path = shot.throws[method].flown
+    path = shot.results[method].flown
     return _Moving(path, find_path_end(path, setup.scene), line, ball)
 
 

@@ -43,14 +43,14 @@ if TYPE_CHECKING:
 
 _GROUPS = {"untuned": (GREY, "s"), "tuned": (BLUE, "o"), "extended": (VERMILION, "D")}
 """Colour and marker of each group of methods."""
-_WORDS = {
+_GROUP_LABELS = {
     "untuned": "untuned simulator",
     "tuned": "restitution tuned to one recorded drop",
     "extended": "simulator extended by explain from the same drop",
 }
-_MAX_SHOWN_RADII = 6
+_MAX_MISS_RADII = 6
 """Range of the shown misses, in radii of the hoop."""
-_BELOW = 0.12
+_MIN_DRAWN_DEPTH = 0.12
 """Distance below the hoop down to which paths are drawn, m."""
 
 
@@ -137,7 +137,7 @@ def _draw_legend(figure: Figure, methods: Sequence[str]) -> None:
     handles = []
     for group, (colour, marker) in _GROUPS.items():
         if group in present_groups:
-            handles.append(Line2D([], [], color=colour, marker=marker, label=_WORDS[group]))
+            handles.append(Line2D([], [], color=colour, marker=marker, label=_GROUP_LABELS[group]))
     columns = len(handles)
     figure.legend(
         handles=handles, loc="outside lower center", ncols=columns, fontsize=8, frameon=False
@@ -166,9 +166,9 @@ def draw_miss_figure(settings: ShotConfig, rows: pd.DataFrame) -> Figure:
     miss_axis.axvline(0, color=CAPTION_GREY, linewidth=0.8)
     miss_axis.set_xlabel(
         "where shots met the hoop's plane, from its centre [cm]\n"
-        f"grey: the hoop; beyond {_MAX_SHOWN_RADII} of its radii not shown"
+        f"grey: the hoop; beyond {_MAX_MISS_RADII} of its radii not shown"
     )
-    miss_axis.set_xlim(-_MAX_SHOWN_RADII * radius, _MAX_SHOWN_RADII * radius)
+    miss_axis.set_xlim(-_MAX_MISS_RADII * radius, _MAX_MISS_RADII * radius)
     error_axis.set_xlabel("mean distance between planned and flown path [cm]")
     error_axis.set_xscale("log")
     error_axis.set_xticks([1, 2, 5, 10, 20, 50], ["1", "2", "5", "10", "20", "50"])
@@ -263,12 +263,12 @@ class ExampleShot(NamedTuple):
 
     Attributes:
         models: tuned models by method.
-        throws: executed shots by method.
+        results: executed shots by method.
         top: upper limit of the height axis, m.
     """
 
     models: dict[str, TunedModel]
-    throws: dict[str, ShotResult]
+    results: dict[str, ShotResult]
     top: float
 
 
@@ -328,7 +328,7 @@ def draw_shot_panel(axis: Axes, setup: ShotSetup, method: str, shot: ExampleShot
         method: name of the method.
         shot: the executed example.
     """
-    scene, flight = setup.scene, shot.throws[method]
+    scene, flight = setup.scene, shot.results[method]
     slope = np.array([-0.25, min(0.55 * scene.hoop_x, 0.45)])
     axis.fill_between(slope, -slope * np.tan(scene.angle), -0.35, color=INCLINE_GREY, linewidth=0)
     rim = [scene.hoop_x - scene.hoop_radius, scene.hoop_x + scene.hoop_radius]
@@ -366,5 +366,5 @@ def find_path_end(path: Array, scene: ShotGeometry) -> int:
     # Before the bounce, the ball falls through the same heights.
     has_risen = np.concatenate([[False], np.logical_or.accumulate(z[1:] > z[:-1])])
     is_falling = np.concatenate([[0], np.diff(z)]) < 0
-    indices_below = np.flatnonzero(has_risen & (z < scene.hoop_z - _BELOW) & is_falling)
+    indices_below = np.flatnonzero(has_risen & (z < scene.hoop_z - _MIN_DRAWN_DEPTH) & is_falling)
     return int(indices_below[0]) if indices_below.size else len(z)

@@ -11,11 +11,11 @@ from bench.bounce_shot.shot_geometry import ShotGeometry, compute_rim_margins
 from sims.core.simulator import Array, InputError, Scenario
 from sims.systems.bounce_shot import BounceShot
 
-_GRID = 48
+_FIRST_GRID_SIZE = 48
 """Number of heights of the first grid, over the whole range."""
-_ROUNDS = 4
+_GRID_COUNT = 4
 """Number of successive grids, each around the best height of the previous one."""
-_ZOOM = 9
+_LATER_GRID_SIZE = 9
 """Number of heights of each later grid, which covers two intervals of the previous one."""
 
 
@@ -71,9 +71,9 @@ def plan_shot(
     if not 0 < low < high:
         raise InputError(f"expected drop heights above 0, the first the lower, found {heights}")
     times = np.arange(round(seconds * rate) + 1) / rate
-    grid = np.linspace(low, high, _GRID)
+    grid = np.linspace(low, high, _FIRST_GRID_SIZE)
     best = float("nan")
-    for _ in range(_ROUNDS):
+    for _ in range(_GRID_COUNT):
         margins = compute_rim_margins(
             simulate_flights(simulator, theta, scene, constants, grid, times), scene
         )
@@ -82,7 +82,7 @@ def plan_shot(
         best = float(grid[np.nanargmax(margins)])
         reach = float(grid[1] - grid[0])
         # Up to the neighbours of the best height: the maximum is between them.
-        grid = np.linspace(max(low, best - reach), min(high, best + reach), _ZOOM)
+        grid = np.linspace(max(low, best - reach), min(high, best + reach), _LATER_GRID_SIZE)
     if not np.isfinite(best):
         return ShotPlan(best, float("nan"), times, np.full((times.size, 3), np.nan))
     path = simulate_flights(simulator, theta, scene, constants, np.array([best]), times)

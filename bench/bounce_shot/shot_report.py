@@ -29,7 +29,7 @@ from sims.core.atomic_files import write_atomically
 
 SIMULATOR_NAME = "bounce-shot"
 """Name of the simulator in status.csv."""
-_NUMBERS = (
+_NULLABLE_NUMBERS = (
     "off",
     "margin",
     "planned_margin",
@@ -39,7 +39,7 @@ _NUMBERS = (
     "seconds",
 )
 """Numeric columns of the shots that may be empty."""
-_FAILED = ("crashed", "timeout")
+_FAILED_STATUSES = ("crashed", "timeout")
 """Failures of the method and not of its plan, which make the command fail."""
 
 
@@ -88,7 +88,7 @@ def write_report(study: ReportableShotStudy, print_line: Callable[[str], None]) 
         print_line("no shot was made")
         return 0
     rows = pd.DataFrame([row for shot in stored.values() for row in shot["rows"]])
-    for name in _NUMBERS:
+    for name in _NULLABLE_NUMBERS:
         # A column that is empty has no numeric type.
         rows[name] = pd.to_numeric(rows[name])
     lines = add_trust_column(build_result_table(rows), study.experiment)
@@ -119,7 +119,7 @@ def write_report(study: ReportableShotStudy, print_line: Callable[[str], None]) 
     for figure in figures:
         print_line(f"figure  {figure}")
     print_line(f"report  {folder / REPORT_FILE}")
-    return int(failed["status"].isin(_FAILED).sum())
+    return int(failed["status"].isin(_FAILED_STATUSES).sum())
 
 
 def _print_failures(

@@ -30,7 +30,7 @@ from sims.core.simulator import InputError
 SHOTS_FOLDER = "shots"
 """Name of the folder of finished shots, in the folder of a study."""
 _REMEDY = "damaged; delete it, and resume to repeat it"
-_NUMBERS = ("height", "margin", "restitution", "seconds")
+_NULLABLE_NUMBERS = ("height", "margin", "restitution", "seconds")
 """Numbers of a model that may be missing."""
 
 
@@ -105,7 +105,7 @@ def read_shot(folder: Path, setup: ShotSetup) -> dict[str, Any] | None:
         raise InputError(f"{path}: {message}; {_REMEDY}")
     for model in document["models"]:
         # JSON has no NaN, so missing numbers are stored as null.
-        model.update({name: math.nan for name in _NUMBERS if model[name] is None})
+        model.update({name: math.nan for name in _NULLABLE_NUMBERS if model[name] is None})
     return document
 
 

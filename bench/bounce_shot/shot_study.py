@@ -260,14 +260,14 @@ class _ShotStages:
             (self._study.folder / name).mkdir(exist_ok=True)
         # These workers know the true balls and run no tuner; other workers run the tuners.
         with make_pool(jobs) as workers:
-            faults = self._record_drops(workers)
+            recording_errors = self._record_drops(workers)
         # The true balls are in the memory of this process, and a tuner's process may run as the
         # same user.
         hidden = nullcontext() if self._experiment.trusted else not_dumpable()
         with hidden, pool or make_pool(jobs) as workers:
             workers.load_plugins(describe_plugins(self._study.plugins, self._experiment))
             weights = self._train_tuners(workers)
-            self._run_shots(workers, faults, weights)
+            self._run_shots(workers, recording_errors, weights)
 
     def _record_drops(self, workers: Pool) -> dict[int, BaseException]:
         """Record every drop.
@@ -280,12 +280,12 @@ class _ShotStages:
             for setup, path in zip(self._left, self._paths, strict=True)
         ]
         step = self._progress("dropping", len(calls))
-        faults: dict[int, BaseException] = {}
+        recording_errors: dict[int, BaseException] = {}
         for index, error in workers.iterate_results(calls, self._experiment.timeout):
             if isinstance(error, BaseException):
-                faults[index] = error
+                recording_errors[index] = error
             step()
-        return faults
+        return recording_errors
 
     def _train_tuners(self, workers: Pool) -> dict[str, Path]:
         """Train the tuners that need training.
@@ -318,16 +318,16 @@ class _ShotStages:
         return weights
 
     def _run_shots(
-        self, workers: Pool, faults: dict[int, BaseException], weights: dict[str, Path]
+        self, workers: Pool, recording_errors: dict[int, BaseException], weights: dict[str, Path]
     ) -> None:
         """Tune and plan with every method, and execute and store the shots.
 
         Args:
             workers: pool of worker processes.
-            faults: errors of drops that could not be recorded, by index of the shot.
+            recording_errors: errors of drops that could not be recorded, by index of the shot.
             weights: files of trained weights, by label of the tuner.
         """
-        recorded = [index for index in range(len(self._left)) if index not in faults]
+        recorded = [index for index in range(len(self._left)) if index not in recording_errors]
         calls: list[Call] = []
         for index in recorded:
             setup = self._left[index]
@@ -336,7 +336,7 @@ class _ShotStages:
             )
             calls.append((shot_planning.tune_and_plan, (self._experiment, self._settings, inputs)))
         step = self._progress("shooting", len(self._left))
-        for index, error in faults.items():
+        for index, error in recording_errors.items():
             status = "no recording" if isinstance(error, InputError) else "crashed"
             self._execute_and_store(
                 index, _make_failed_models(self._experiment, error, status), 0.0

@@ -41,9 +41,9 @@ GRAVITY = 9.81
 """Gravitational acceleration, downward, m/s^2."""
 CONTACT_SECONDS = 3e-3
 """Duration of an impact in seconds; it is 5 ms for tennis balls and 0.5 ms for golf balls."""
-_FLIGHT = 1e-3
+_FLIGHT_STEP = 1e-3
 """Length of a step in flight, s."""
-_IMPACT = 3e-5
+_CONTACT_STEP = 3e-5
 """Length of a step in contact in seconds, a hundredth of an impact."""
 _IMPEDANCE = 0.9999
 """Constraint impedance of the contact, the largest that MuJoCo allows."""
@@ -156,13 +156,13 @@ class _Flight:
         gap = self.gap(*position)
         rate = velocity[0] * self._normal[0] + velocity[2] * self._normal[1]
         # Look two steps ahead: a step of flight must not penetrate the ground.
-        is_near_impact = gap <= 0.0 or (rate < 0.0 and gap < -2.0 * _FLIGHT * rate)
-        self._model.opt.timestep = _IMPACT if is_near_impact else _FLIGHT
+        is_near_impact = gap <= 0.0 or (rate < 0.0 and gap < -2.0 * _FLIGHT_STEP * rate)
+        self._model.opt.timestep = _CONTACT_STEP if is_near_impact else _FLIGHT_STEP
         if gap > 0.0:
             self._touches = False
         # Set the damping once per impact, at its initial speed: restitution refers to the whole
         # impact.
-        if not self._touches and rate < 0.0 and gap + rate * _IMPACT <= 0.0:
+        if not self._touches and rate < 0.0 and gap + rate * _CONTACT_STEP <= 0.0:
             self._set_contact_damping(-rate)
         self._apply_forces(velocity)
         self._step(self._model, data)

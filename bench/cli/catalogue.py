@@ -13,7 +13,7 @@ from typing import Any
 
 from bench.cli.output import EXIT_CODES, JsonDocument
 
-_TYPES = {
+_OPTION_TYPES = {
     "_StoreTrueAction": "flag",
     "parse_positive_int": "whole number",
     "parse_non_negative_int": "whole number",
@@ -59,12 +59,12 @@ def _describe_option(action: argparse.Action) -> JsonDocument:
     """Describe an argument or option of a command by plain values, for `simgap list commands`."""
     default = None if action.default in ([], "") else action.default
     type_name = getattr(action.type, "__name__", "")
-    flag = _TYPES.get(type(action).__name__)
+    flag = _OPTION_TYPES.get(type(action).__name__)
     return {
         "name": action.dest,
         "flags": list(action.option_strings),
         "metavar": action.metavar or action.dest.upper(),
-        "type": flag or _TYPES.get(type_name, "text"),
+        "type": flag or _OPTION_TYPES.get(type_name, "text"),
         "choices": list(action.choices) if action.choices else None,
         "default": default,
         "required": action.required,
@@ -76,7 +76,7 @@ def _describe_option(action: argparse.Action) -> JsonDocument:
 
 def is_path_argument(action: argparse.Action) -> bool:
     """Return whether an argument is the path of a file or folder."""
-    return _TYPES.get(getattr(action.type, "__name__", "")) == "path"
+    return _OPTION_TYPES.get(getattr(action.type, "__name__", "")) == "path"
 
 
 def list_tuners() -> list[JsonDocument]:

@@ -16,28 +16,28 @@ class InterruptHandler:
     """
 
     def __init__(self, print_line: Callable[[str], None] | None = None) -> None:
-        self._asked = False
+        self._is_stop_requested = False
         self._print_line = print_line or _print_line
 
     def is_stop_requested(self) -> bool:
         """Return whether a stop has been requested."""
-        return self._asked
+        return self._is_stop_requested
 
     def __enter__(self) -> InterruptHandler:
         """Handle Ctrl-C from now on, unless another handler is set or this is no main thread."""
         # Python handles signals in the main thread only.
-        self._answers = threading.current_thread() is threading.main_thread()
+        self._is_main_thread = threading.current_thread() is threading.main_thread()
         # Keep ignoring SIGINT if it is ignored, as for background jobs of a shell.
-        if self._answers and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        if self._is_main_thread and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
             signal.signal(signal.SIGINT, self._announce_early_end)
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._answers and signal.getsignal(signal.SIGINT) == self._announce_early_end:
+        if self._is_main_thread and signal.getsignal(signal.SIGINT) == self._announce_early_end:
             signal.signal(signal.SIGINT, signal.default_int_handler)
 
     def _announce_early_end(self, *_: object) -> None:
-        self._asked = True
+        self._is_stop_requested = True
         signal.signal(signal.SIGINT, signal.default_int_handler)
         self._print_line("stopping with the results so far; Ctrl-C again stops at once")
 

@@ -213,12 +213,14 @@ class _Parser(argparse.ArgumentParser):
 
         from sims.core.value_limits import truncate_text
 
-        similar_names = get_close_matches(name[:_LONGEST_NAME], list(known_names), cutoff=0.5)
+        similar_names = get_close_matches(
+            name[:_MAX_COMPARED_CHARACTERS], list(known_names), cutoff=0.5
+        )
         hint = f"; did you mean {', '.join(similar_names)}?" if similar_names else ""
         self.error(f"unknown {kind} '{truncate_text(name)}'{hint}")
 
 
-_LONGEST_NAME = 100
+_MAX_COMPARED_CHARACTERS = 100
 """Number of characters of an unknown name that are compared with the known ones."""
 
 

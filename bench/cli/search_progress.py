@@ -16,14 +16,14 @@ TERMINAL_INTERVAL = 0.2
 """Minimum time between two updates of the live line, in seconds."""
 LOG_INTERVAL = 10.0
 """Minimum time between two lines if stderr is not a terminal, in seconds."""
-TICK = 0.5
+UPDATE_INTERVAL = 0.5
 """Interval of the timer that updates the display between two events, in seconds."""
 HINT_AFTER = 20.0
 """Elapsed time after which `HINT` is printed, in seconds."""
 HINT = "add --budget 60 to stop after a minute with the best result so far"
-LEAST_SHARE = 0.02
+MIN_SHARE_FOR_ESTIMATE = 0.02
 """Minimum share of the search that must be done before the remaining time is estimated."""
-OVERDUE = 0.5
+MIN_REMAINING_RATIO = 0.5
 """Minimum ratio of the estimated remaining time to the time since the last event."""
 BAR_WIDTH = 10
 """Width of the bar, in characters."""
@@ -80,7 +80,7 @@ class SearchProgress:
             return
         self._share = min(share, 1.0)
         self._estimated_at = self._clock()
-        if self._share >= LEAST_SHARE:
+        if self._share >= MIN_SHARE_FOR_ESTIMATE:
             self._estimate = self.elapsed() * (1.0 - self._share) / self._share
 
     def elapsed(self) -> float:
@@ -96,7 +96,7 @@ class SearchProgress:
         if self._estimate is None or not self._is_searching:
             return None
         estimate_age = self._clock() - self._estimated_at
-        return max(self._estimate - estimate_age, OVERDUE * estimate_age)
+        return max(self._estimate - estimate_age, MIN_REMAINING_RATIO * estimate_age)
 
     def finish(self, name: str) -> None:
         """End the search and begin a stage that follows it, such as drawing figures."""
@@ -224,7 +224,7 @@ class ProgressDisplay(SearchProgress):
             signal.signal(signal.SIGALRM, lambda *_: self._redraw_if_due())
             # System calls of libraries continue after the signal.
             signal.siginterrupt(signal.SIGALRM, False)
-            signal.setitimer(signal.ITIMER_REAL, TICK, TICK)
+            signal.setitimer(signal.ITIMER_REAL, UPDATE_INTERVAL, UPDATE_INTERVAL)
             self._has_timer = True
         return self
 

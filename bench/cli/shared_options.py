@@ -32,9 +32,9 @@ def add_options(
     for option in sorted(fields(options), key=lambda each: each.name not in vars(options)):
         kind = str(option.type).removesuffix(" | None")
         metadata = {"in_command": True, **option.metadata}
-        if kind not in _PARSERS or not metadata["in_command"]:
+        if kind not in _PARSERS_BY_ANNOTATION or not metadata["in_command"]:
             continue
-        parse, metavar = _PARSERS[kind]
+        parse, metavar = _PARSERS_BY_ANNOTATION[kind]
         flags = metadata.get("flags") or [f"--{option.name.replace('_', '-')}"]
         text = texts[option.name].rstrip(".").replace("`", "").replace("%", "%%")
         settings: dict[str, Any] = {"help": text[0].lower() + text[1:]}
@@ -210,7 +210,7 @@ def parse_name_list(text: str) -> list[str]:
     return [name.strip() for name in text.split(",") if name.strip()]
 
 
-_PARSERS: Mapping[str, tuple[Callable[[str], Any], str]] = {
+_PARSERS_BY_ANNOTATION: Mapping[str, tuple[Callable[[str], Any], str]] = {
     "Count": (parse_positive_int, "N"),
     "Natural": (parse_non_negative_int, "N"),
     "Seconds": (parse_seconds, "S"),

@@ -190,8 +190,8 @@ class TunerStyles:
     Args:
         experiment: The experiment.
         order: Tuners that have runs, in the order of the legend: best first.
-        behind: Reference results drawn behind the curves; at most as many as `REFERENCE_GREYS` has
-            colours.
+        references: Reference results drawn behind the curves; at most as many as `REFERENCE_GREYS`
+            has colours.
         notes: Text of the legend below a tuner's name.
     """
 
@@ -199,11 +199,11 @@ class TunerStyles:
         self,
         experiment: Experiment,
         order: Sequence[str],
-        behind: Sequence[ReferenceResult] = (),
+        references: Sequence[ReferenceResult] = (),
         notes: Mapping[str, str] | None = None,
     ) -> None:
         """Map each tuner with runs to its index in the experiment, which sets colour and marker."""
-        self.experiment, self.behind, self.notes = experiment, behind, notes or {}
+        self.experiment, self.references, self.notes = experiment, references, notes or {}
         present = set(order)
         # Tuners without runs count, too, so that a colour means the same tuner in every figure.
         self._places = {e.label: i for i, e in enumerate(experiment.tuners) if e.label in present}
@@ -243,7 +243,7 @@ class TunerStyles:
             else first_free + further_tuners.index(tuner)
         )
         return {
-            "color": REFERENCE_GREYS[self.behind.index(reference)],
+            "color": REFERENCE_GREYS[self.references.index(reference)],
             "marker": get_marker(i),
             "markerfacecolor": "white",
             "markersize": 3.5,
@@ -260,7 +260,7 @@ class TunerStyles:
 def style_of(
     experiment: Experiment,
     statistics: ComparisonStatistics,
-    behind: Sequence[ReferenceResult] = (),
+    references: Sequence[ReferenceResult] = (),
     panels: Sequence[tuple[str, str]] = (),
 ) -> TunerStyles:
     """Return the styles of a comparison's tuners, in the order of its ranking.
@@ -268,13 +268,13 @@ def style_of(
     Args:
         experiment: The experiment.
         statistics: Its statistics.
-        behind: Reference results drawn behind the curves.
+        references: Reference results drawn behind the curves.
         panels: Metric and range of each panel of curves against simulations; the legend says which
             curves coincide in them.
     """
     notes = [statistics.notes, statistics.find_coinciding_curves(panels)]
     joined_notes = {t: "\n".join(n[t] for n in notes if t in n) for t in {*notes[0], *notes[1]}}
-    return TunerStyles(experiment, statistics.order, behind, joined_notes)
+    return TunerStyles(experiment, statistics.order, references, joined_notes)
 
 
 def make_panel_grid(
@@ -347,7 +347,7 @@ def finish_figure(
         for label in style.order
         if label in handles
     ]
-    for reference in style.behind:
+    for reference in style.references:
         legend_entries += _make_reference_entries(axes, style, reference)
         caption += _format_reference_caption(reference, style.experiment)
     size = 9.0 if len(legend_entries) <= _ROWS else 7.0

@@ -234,7 +234,7 @@ class MisspecificationStudy:
         """
         configuration = self.configuration
         run_ends: list[RunEnd] = []
-        under_way = (self.folder / SEGMENTS_FOLDER).exists()
+        is_unfinished = (self.folder / SEGMENTS_FOLDER).exists()
         for model in MODEL_LABELS:
             if not (self.folder / model / CONFIGURATION_FILE).is_file():
                 run_ends += [
@@ -243,14 +243,14 @@ class MisspecificationStudy:
                 ]
                 continue
             progress = Comparison(self.folder / model).status()
-            under_way = under_way or progress.under_way
+            is_unfinished = is_unfinished or progress.is_unfinished
             run_ends += [
                 RunEnd(f"{model} {e.name}", f"{model} {e.group}", e.status, e.reason)
                 for e in progress.ends
             ]
         name = configuration.experiment.name
         return StudyProgress(
-            name, "runs finished", configuration.fingerprint, tuple(run_ends), under_way
+            name, "runs finished", configuration.fingerprint, tuple(run_ends), is_unfinished
         )
 
     def report(self, print_line: PrintLine) -> int:

@@ -24,8 +24,8 @@ from bench.pages.page_template import load_template
 if TYPE_CHECKING:
     import pandas as pd
 
-_HERE = Path(__file__).parent
-_LIBRARY = _HERE / "vendor" / "uplot"
+_PAGES_FOLDER = Path(__file__).parent
+_CHART_LIBRARY = _PAGES_FOLDER / "vendor" / "uplot"
 _SCRIPTS = (
     "text_format", "table_data", "view_state", "ticks", "theme", "plot_drawing", "panel",
     "downloads", "figure", "data_grid", "page",
@@ -111,7 +111,7 @@ class HtmlPage:
         name: str,
         static: PrintedFigure | None,
         tables: Sequence[str] = (),
-        spots: Sequence[tuple[str, float, float]] = (),
+        markers: Sequence[tuple[str, float, float]] = (),
         *,
         caller: Callable[[], Markup],
     ) -> Markup:
@@ -121,13 +121,13 @@ class HtmlPage:
             name: Name in the page's address: letters, digits and hyphens.
             static: The figure; None if it was not drawn.
             tables: Names of the page's tables with its numbers.
-            spots: Names to highlight with their positions, as fractions of width and height from
+            markers: Names to highlight with their positions, as fractions of width and height from
                 the top left.
             caller: Caption, as the body of a template's call block.
         """
         if static is None:
             return Markup()
-        return Markup(self._parts.figure(name, static, Markup(caller().strip()), tables, spots))
+        return Markup(self._parts.figure(name, static, Markup(caller().strip()), tables, markers))
 
     def grid(
         self, name: str, title: str, table: str, columns: Sequence[Any], **options: Any
@@ -158,10 +158,10 @@ class HtmlPage:
             **values: Values of the template, in addition to `page`, which is this object.
         """
         content: Any = load_template(template).make_module({"page": self, **values})
-        library = (_LIBRARY / "uPlot.iife.min.js").read_text(encoding="utf-8")
+        library = (_CHART_LIBRARY / "uPlot.iife.min.js").read_text(encoding="utf-8")
         own = "\n".join(_read(f"script/{name}.js") for name in _SCRIPTS)
         script = f'{library}\n(() => {{\n"use strict";\n{own}\n}})();\n'
-        styles = (_LIBRARY / "uPlot.min.css").read_text(encoding="utf-8"), _read("page.css")
+        styles = (_CHART_LIBRARY / "uPlot.min.css").read_text(encoding="utf-8"), _read("page.css")
         data = {"tables": self._tables, "charts": self._charts, "grids": self._grids}
         return load_template(Path("page.html")).render(
             title=content.title,
@@ -200,4 +200,4 @@ def make_iframe(html: str) -> str:
 
 
 def _read(name: str) -> str:
-    return (_HERE / name).read_text(encoding="utf-8")
+    return (_PAGES_FOLDER / name).read_text(encoding="utf-8")

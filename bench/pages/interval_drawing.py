@@ -76,7 +76,7 @@ def draw_intervals(
         )
         for i, (kind, value, begin, end) in enumerate(intervals)
     )
-    behind = None
+    band_extent = None
     if band is not None:
-        behind = place(band[0]), max(place(band[1]) - place(band[0]), 1.5)
-    return IntervalDrawing(rows, distance * len(rows) + 2, distance / 4 + 0.5, behind)
+        band_extent = place(band[0]), max(place(band[1]) - place(band[0]), 1.5)
+    return IntervalDrawing(rows, distance * len(rows) + 2, distance / 4 + 0.5, band_extent)

@@ -91,14 +91,14 @@ def quote_words(words: Iterable[object]) -> Markup:
     return escape(shlex.join(sanitise(word, 500) for word in words))
 
 
-def format_document(text: str, most: int = MAX_DOCUMENT_LENGTH) -> Markup:
+def format_document(text: str, max_length: int = MAX_DOCUMENT_LENGTH) -> Markup:
     """Format a text of several lines with its indentation, as HTML.
 
     Args:
         text: Text.
-        most: Maximum number of characters.
+        max_length: Maximum number of characters.
     """
-    shown = text if len(text) <= most else f"{text[:most]} …"
+    shown = text if len(text) <= max_length else f"{text[:max_length]} …"
     lines = shown.strip("\n").replace("\t", "    ").split("\n")
     # `sanitise` removes leading spaces, so they are added again.
     indented = (" " * (len(line) - len(line.lstrip())) + sanitise(line, 1000) for line in lines)

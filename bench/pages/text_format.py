@@ -7,33 +7,33 @@ from math import floor, isfinite, log10
 
 from sims.core.unit_text import SUPERSCRIPT_DIGITS
 
-_SMALL = 1e-3
+_MIN_FIXED_POINT = 1e-3
 """Magnitude below which numbers are written with a power of ten."""
-_LARGE = 1e5
+_MAX_FIXED_POINT = 1e5
 """Magnitude from which on numbers are written with a power of ten."""
-_FEW = log10(3.55)
+_LOG_MAX_TWO_DIGIT_MANTISSA = log10(3.55)
 """Logarithm of the mantissa below which an interval is written with two digits.
 
 This is the rule of the Particle Data Group.
 """
-_LEAST = 1e-12
+_MIN_WRITTEN_P_VALUE = 1e-12
 """Smallest p-value that is written as a number."""
 
 
-def sanitise(text: object, most: int = 400) -> str:
+def sanitise(text: object, max_length: int = 400) -> str:
     """Clean text from a file or plugin for one line of output.
 
     Control characters are written as escapes, and long text is shortened.
 
     Args:
         text: Text or another value.
-        most: Maximum length in characters.
+        max_length: Maximum length in characters.
     """
     plain = str(text)
     if not plain.isprintable():
         plain = "".join(_replace_unprintable(c) for c in plain)
     plain = plain.strip()
-    return plain if len(plain) <= most else plain[: most - 1] + "…"
+    return plain if len(plain) <= max_length else plain[: max_length - 1] + "…"
 
 
 def joined(parts: Sequence[str], last: str = "and") -> str:
@@ -95,7 +95,7 @@ def format_estimate(value: float, low: float | None, high: float | None) -> str:
     # One power of ten for all three numbers makes them comparable at a glance.
     exponent = _get_exponent(max(abs(value), abs(low), abs(high)))
     half = log10((high - low) / 2) - exponent
-    decimals = min(max(0, (half % 1 < _FEW) - floor(half)), 9)
+    decimals = min(max(0, (half % 1 < _LOG_MAX_TWO_DIGIT_MANTISSA) - floor(half)), 9)
     texts = []
     for x in (value, low, high):
         digits = f"{x / 10.0**exponent:.{decimals}f}"
@@ -119,12 +119,16 @@ def format_p_value(p: float | None) -> str:
     if p is None or not isfinite(p):
         return "p unknown"
     # In such an extreme tail the exact number has no meaning.
-    return f"p < {format_number(_LEAST, 1)}" if p < _LEAST else f"p = {format_number(p, 2)}"
+    return (
+        f"p < {format_number(_MIN_WRITTEN_P_VALUE, 1)}"
+        if p < _MIN_WRITTEN_P_VALUE
+        else f"p = {format_number(p, 2)}"
+    )
 
 
 def _get_exponent(size: float) -> int:
     """Return the power of ten that a number is written with; 0 for none."""
-    return 0 if size == 0 or _SMALL <= size < _LARGE else floor(log10(size))
+    return 0 if size == 0 or _MIN_FIXED_POINT <= size < _MAX_FIXED_POINT else floor(log10(size))
 
 
 def _format_power(exponent: int) -> str:

@@ -271,7 +271,9 @@ def verify_archive(
             f"{archive}: {description['kind']} of simgap {description['simgap']}, {count} files, "
             f"{size} bytes"
         )
-        doubts = [VerificationFailure(fault.file, 0, fault.says) for fault in unpacked.faults]
+        doubts = [
+            VerificationFailure(mismatch.file, 0, mismatch.says) for mismatch in unpacked.mismatches
+        ]
         if doubts:
             _format_result(doubts, archive, print_line)
             return ArchiveVerification(description, doubts, [], None)

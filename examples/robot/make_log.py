@@ -29,7 +29,7 @@ TORQUES = (1.0, 0.3)
 """Root mean square of the commands at shoulder and elbow, N m."""
 FRICTION = 0.03
 """Hidden cause: dry friction at the elbow, N m."""
-HAIR = 1e-9
+EVENT_TOLERANCE = 1e-9
 """Offset that delays an event, N m or rad/s, so that rounding does not repeat it."""
 
 
@@ -100,21 +100,21 @@ class Arm:
             return np.array([v[0], 0.0, forces[0] / inertias[0, 0], 0.0])
         return np.append(v, np.linalg.solve(inertias, forces - [0.0, slide * self.friction]))
 
-    def pushed(self, state: Array, torque: Array) -> float:
+    def compute_stick_torque(self, state: Array, torque: Array) -> float:
         """Return the torque on a sticking elbow, N m."""
         inertias = self.inertias(state[:2])
         forces = self.forces(state[:2], state[2:], torque)
         return float(forces[1] - inertias[1, 0] * forces[0] / inertias[0, 0])
 
-    def grip(self, state: Array, torque: Array) -> float:
+    def compute_stick_margin(self, state: Array, torque: Array) -> float:
         """Return the margin of a sticking elbow before break-away, N m; it slides below 0."""
-        return self.friction - abs(self.pushed(state, torque))
+        return self.friction - abs(self.compute_stick_torque(state, torque))
 
-    def released(self, state: Array, torque: Array) -> int:
+    def find_sliding_direction(self, state: Array, torque: Array) -> int:
         """Return how an elbow at rest continues: 0 if it sticks, else the sliding direction."""
-        if self.grip(state, torque) > HAIR:
+        if self.compute_stick_margin(state, torque) > EVENT_TOLERANCE:
             return 0
-        return 1 if self.pushed(state, torque) > 0 else -1
+        return 1 if self.compute_stick_torque(state, torque) > 0 else -1
 
     def advance(self, state: Array, slide: int, torque: Array, seconds: float) -> tuple[Array, int]:
         """Integrate over a time of constant torque.
@@ -131,11 +131,15 @@ class Arm:
         now = 0.0
         while now < seconds:
             if slide == 0:
-                slide = self.released(state, torque)
+                slide = self.find_sliding_direction(state, torque)
 
             def change(_: float, y: Array, slide: int = slide) -> float:
                 """Return a value that crosses zero just after the elbow stops or breaks away."""
-                return slide * float(y[3]) + HAIR if slide else self.grip(y, torque)
+                return (
+                    slide * float(y[3]) + EVENT_TOLERANCE
+                    if slide
+                    else self.compute_stick_margin(y, torque)
+                )
 
             change.terminal, change.direction = True, -1  # type: ignore[attr-defined]
             piece = solve_ivp(

@@ -16,13 +16,13 @@ import numpy as np
 
 from methods.tuner import Array
 
-_ROUNDS = 15
+_ITERATIONS = 15
 """Number of iterations of reweighted least squares."""
 _MIN_SEEN_SAMPLES = 8
 """Minimum number of available samples for filling gaps."""
-_OUTLYING = 2.0
+_CAUCHY_WIDTH = 2.0
 """Width of Cauchy's weight function, in median absolute residuals of the map."""
-_FINEST = 1e-6
+_MIN_CAUCHY_WIDTH = 1e-6
 """Minimum width of Cauchy's weight function, in standard deviations of the channel.
 
 A closer agreement counts as exact.
@@ -78,11 +78,11 @@ def _fit_camera_line(table: Array, values: Array) -> Array:
     """
     weights: Array = np.ones(len(table))
     numbers: Array = np.zeros(3)
-    for _ in range(_ROUNDS):
+    for _ in range(_ITERATIONS):
         solution = np.linalg.lstsq(table * weights[:, None], values * weights, rcond=None)[0]
         numbers = solution.astype(np.float64)
         residual: Array = values - table @ numbers
-        width = max(_OUTLYING * float(np.median(np.abs(residual))), _FINEST)
+        width = max(_CAUCHY_WIDTH * float(np.median(np.abs(residual))), _MIN_CAUCHY_WIDTH)
         # This is the root of Cauchy's weight, because it multiplies both sides of (2).
         weights = 1 / np.sqrt(1 + (residual / width) ** 2)
     return numbers

@@ -80,7 +80,7 @@ class GaussianProcess:
         self.hyper = self._centre if hyper is None else hyper
         # Two points, or equal values, give no information about a length scale.
         if fit and len(points) > 2 and np.ptp(values) > 0.0:
-            self.hyper = self._find_most_probable()
+            self.hyper = self._maximise_posterior()
         k, _ = self._compute_correlation(self._squares)
         self._lower = _compute_cholesky_factor(k, float(np.exp(self.hyper[-1])))
         self.mean, self.variance, self._alpha = _compute_mean_and_variance(self._lower, values)
@@ -110,7 +110,7 @@ class GaussianProcess:
         # The derivative by the squared distance avoids a division by zero at zero distance.
         return k, -5.0 / 6.0 * (1.0 + root) * decay
 
-    def _find_most_probable(self) -> Array:
+    def _maximise_posterior(self) -> Array:
         """Return the most probable hyper-parameters (dim + 1,), found by L-BFGS.
 
         These maximise likelihood times prior. They are searched within four standard deviations of

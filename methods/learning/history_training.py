@@ -28,18 +28,18 @@ from methods.tuner import Array
 if TYPE_CHECKING:
     import torch
 
-_SPREAD = 1.7
+_INITIAL_WEIGHT_LIMIT = 1.7
 """Limit of initial weights times the root of the number of inputs of a layer.
 
 It gives a variance close to 1 / inputs.
 """
-_SMALL = 0.3
+_RESIDUAL_WEIGHT_FACTOR = 0.3
 """Factor of the initial weights of layers whose output is added to another value.
 
 With small weights these layers initially change the sum only a little.
 """
-_SUMMED = ("mixed", "outer", "guess", "next")
-_TAMED = 1.0 / 3.0
+_RESIDUAL_LAYERS = ("mixed", "outer", "guess", "next")
+_ERROR_FACTOR = 1.0 / 3.0
 """Factor of relative squared errors, compared with the errors of the first guess."""
 
 
@@ -114,15 +114,15 @@ def _draw_initial_weights(
     """Draw initial weights uniform in +- gain / sqrt(inputs); biases are zero.
 
     `shapes_by_name` has the shape of each array. Layers whose output is added to another value
-    (names that begin with one of `_SUMMED`) get a smaller gain.
+    (names that begin with one of `_RESIDUAL_LAYERS`) get a smaller gain.
     """
     import torch
 
     w: dict[str, Any] = {}
     for name, shape in shapes_by_name.items():
-        gain = _SPREAD if name.endswith("weight") else 0.0
-        if name.startswith(_SUMMED):
-            gain *= _SMALL
+        gain = _INITIAL_WEIGHT_LIMIT if name.endswith("weight") else 0.0
+        if name.startswith(_RESIDUAL_LAYERS):
+            gain *= _RESIDUAL_WEIGHT_FACTOR
         limit = gain / shape[0] ** 0.5
         uniform = torch.rand(shape, generator=generator) * 2 - 1
         w[name] = (uniform * limit).requires_grad_()
@@ -195,5 +195,5 @@ def _compute_loss(
     squares = ((proposals - truth) ** 2).sum(dim=-1)
     # Small distances matter in the last steps of tuning, so they must have enough weight.
     distances = ((proposed - truth) ** 2).sum(dim=-1) + design.relative**2
-    parts = [squares[:, :, :1], squares[:, :, 1:] / distances * _TAMED]
+    parts = [squares[:, :, :1], squares[:, :, 1:] / distances * _ERROR_FACTOR]
     return torch.cat(parts, dim=2).mean()  # (1)

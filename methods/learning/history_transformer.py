@@ -26,7 +26,7 @@ import numpy as np
 
 _SIGMA_ZERO = 0.01
 """Constant s0 in (3): differences far below those of the training give equal tokens."""
-_STILL = 1e-9
+_MIN_STEP_LENGTH = 1e-9
 """Minimum divisor, so that zero divided by zero is finite."""
 _CAUSAL_MASK_OFFSET = 1e9
 """Value subtracted from attention scores of later tokens (causal mask)."""
@@ -116,7 +116,7 @@ def predict_proposals(
     """
     target_row = target[..., None, :]
     differences = simulations - target_row
-    size = xp.sqrt((differences**2).mean(axis=-1, keepdims=True) + _STILL**2)
+    size = xp.sqrt((differences**2).mean(axis=-1, keepdims=True) + _MIN_STEP_LENGTH**2)
     unit = differences / size  # (1)
     base_features = [
         unit,
@@ -153,13 +153,13 @@ def _compute_step_features(xp: Any, differences: Any, proposed: Any) -> tuple[An
     per simulation. The slope is returned as arsinh, because it can be very large.
     """
     step = proposed[..., 1:, :] - proposed[..., :-1, :]
-    length = xp.sqrt((step**2).sum(axis=-1, keepdims=True) + _STILL**2)
+    length = xp.sqrt((step**2).sum(axis=-1, keepdims=True) + _MIN_STEP_LENGTH**2)
     slope = (differences[..., 1:, :] - differences[..., :-1, :]) / length  # (2)
 
-    def begun(like: Any, later_values: Any) -> Any:
+    def prepend_zeros(like: Any, later_values: Any) -> Any:
         return xp.concatenate([xp.zeros_like(like[..., :1, :]), later_values], axis=-2)
 
-    return begun(proposed, step / length), begun(differences, xp.arcsinh(slope))
+    return prepend_zeros(proposed, step / length), prepend_zeros(differences, xp.arcsinh(slope))
 
 
 def _compute_causal_attention(xp: Any, w: dict[str, Any], block: int, h: Any) -> Any:

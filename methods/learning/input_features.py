@@ -19,7 +19,7 @@ _OBSERVATION_FEATURE_ARRAYS = ("chosen", "centre", "gain")
 """Names of the arrays of `ObservationFeatures` that are stored."""
 _SCENARIO_FEATURE_ARRAYS = ("centre", "spread", "initial")
 """Names of the arrays of `ScenarioFeatures` that are stored."""
-_NONE = np.empty(0)
+_MISSING_ARRAY = np.empty(0)
 """Replacement of a missing array."""
 
 
@@ -188,7 +188,8 @@ class InputFeatures:
             names += [f"told.{name}" for name in _SCENARIO_FEATURE_ARRAYS]
         # The shape of one array of each part determines the shapes of the others.
         sizes = {
-            part: remaining_arrays.get(f"{part}.centre", _NONE).shape for part in ("inputs", "told")
+            part: remaining_arrays.get(f"{part}.centre", _MISSING_ARRAY).shape
+            for part in ("inputs", "told")
         }
         for name in names:
             shape = () if name == "told.initial" else sizes[name.partition(".")[0]]

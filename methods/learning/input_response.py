@@ -26,11 +26,11 @@ _BUMPS_PER_RUN = 12
 
 They overlap: successive bumps are shifted by an eighth of their width.
 """
-_LEAST = 7
+_MIN_SAMPLES = 7
 """Minimum number of samples of a run, for a bump of half width 3."""
 _STEEPNESS = 10.0
 """Factor in the smoothed sign: it saturates at a fraction of the mean rate of change."""
-_ZERO = 1e-300
+_MIN_DIVISOR = 1e-300
 """Minimum divisor, so that a zero signal stays zero."""
 _RIDGE = 1e-6
 """Ridge parameter, per mean square of a regressor.
@@ -59,7 +59,7 @@ def compute_response_coefficients(
     for length in lengths:
         run = slice(first, first + length)
         first += length
-        if length < _LEAST:
+        if length < _MIN_SAMPLES:
             continue
         # Resampling to the run's own length fills missing samples and changes nothing else.
         resampled = resample_runs(observations[:, run], (length,), length)
@@ -105,7 +105,7 @@ def _compute_smoothed_velocity_signs(series: Array) -> Array:
     line = offsets / (offsets**2).sum()
     padded = np.pad(series, ((0, 0), (3, 3), (0, 0)), mode="edge")
     rates = sliding_window_view(padded, len(offsets), axis=1) @ line
-    mean_rate = np.abs(rates).mean(axis=1, keepdims=True) + _ZERO
+    mean_rate = np.abs(rates).mean(axis=1, keepdims=True) + _MIN_DIVISOR
     # tanh replaces the sign function, which would jump where noise crosses zero.
     return np.asarray(np.tanh(_STEEPNESS * rates / mean_rate), dtype=np.float64)
 
@@ -116,7 +116,7 @@ def _fit_ridge_regression(regressors: Array, values: Array) -> Array:
     Each of the n observations is fitted separately.
     """
     # Scaled to mean square 1, so that the ridge has the same effect on every regressor.
-    size = np.sqrt((regressors**2).mean(axis=1, keepdims=True)) + _ZERO
+    size = np.sqrt((regressors**2).mean(axis=1, keepdims=True)) + _MIN_DIVISOR
     scaled = regressors / size
     transposed = scaled.transpose(0, 2, 1)
     count = scaled.shape[1]

@@ -24,22 +24,22 @@ from numpy.typing import NDArray
 from methods.learning.training_data import TrainingData
 from methods.tuner import Array
 
-_PARTS = 8
+_MAX_PARTS = 8
 """Maximum number of parts of a run for the noise estimate."""
-_LEAST_PART = 16
+_MIN_PART_DIFFERENCES = 16
 """Minimum number of third differences in a part."""
-_NORMAL = 0.6745
+_NORMAL_MAD = 0.6745
 """Median absolute value of a normal variable, in standard deviations."""
-_THIRD: float = 20.0**0.5
+_THIRD_DIFFERENCE_STD: float = 20.0**0.5
 """Standard deviation of third differences of white noise with variance 1.
 
 The variance is 1 + 9 + 9 + 1 = 20.
 """
-_EXACT = 1e-9
+_ROUNDING_SHARE = 1e-9
 """Threshold of rounding errors, as a share of the largest deviation."""
-_LEAST_DEVIATION = 1e-3
+_MIN_DEVIATION_SHARE = 1e-3
 """Minimum deviation, as a share of the largest one; smaller ones are not scaled up further."""
-_ZERO = 1e-300
+_MIN_DIVISOR = 1e-300
 """Minimum divisor, so that zero divided by zero is finite."""
 
 
@@ -138,11 +138,11 @@ def estimate_noise_sigma(observations: Array, lengths: tuple[int, ...]) -> Array
     for run in np.split(observations, np.cumsum(lengths)[:-1], axis=1):
         # Third differences of a parabola are zero, so those of smooth motion are small.
         thirds = np.abs(np.diff(run, n=3, axis=1))
-        count = min(_PARTS, max(1, thirds.shape[1] // _LEAST_PART))
+        count = min(_MAX_PARTS, max(1, thirds.shape[1] // _MIN_PART_DIFFERENCES))
         parts = np.array_split(thirds, count, axis=1)
         for i, c in np.ndindex(sigmas.shape):
             min_median = _compute_min_part_median([part[i, :, c] for part in parts])
-            noise = min_median / (_NORMAL * _THIRD)
+            noise = min_median / (_NORMAL_MAD * _THIRD_DIFFERENCE_STD)
             sigmas[i, c] = max(float(sigmas[i, c]), noise)
     return sigmas
 
@@ -225,7 +225,7 @@ def make_raw_features(
 
 
 def make_weighted_features(
-    data: TrainingData, points: int, most: int, strictness: float
+    data: TrainingData, points: int, max_inputs: int, strictness: float
 ) -> ObservationFeatures:
     """Choose and scale inputs by how closely they follow the parameters.
 
@@ -239,7 +239,7 @@ def make_weighted_features(
     Args:
         data: training simulations.
         points: number of points to which each run is resampled.
-        most: maximum number of inputs, those with the largest weights; 0 for none.
+        max_inputs: maximum number of inputs, those with the largest weights; 0 for none.
         strictness: factor s of the residual in (2) and (4).
 
     Returns:
@@ -250,7 +250,7 @@ def make_weighted_features(
     spread, explained, unexplained = _compute_sensitivities(data.parameters, grouped)
     deviation = rows.std(axis=0)
     scenario_spread = grouped.mean(axis=1).std(axis=0)
-    floor = _EXACT * max(float(deviation.max()), _ZERO)
+    floor = _ROUNDING_SHARE * max(float(deviation.max()), _MIN_DIVISOR)
     reliability = explained / (explained + strictness * unexplained + floor)  # (2)
     best = reliability.max(axis=1, keepdims=True)
     share = reliability / np.where(best > 0, best, 1.0)
@@ -258,14 +258,14 @@ def make_weighted_features(
     context = (scenario_spread / (scenario_spread + strictness * spread + floor)) ** 2  # (4)
     # A stable sort chooses the same numbers on every machine if weights are equal.
     order = np.argsort(-np.maximum(parameter_weight, context), kind="stable")
-    chosen_numbers = np.sort(order[:most])
+    chosen_numbers = np.sort(order[:max_inputs])
     by_parameters = _compute_weight_per_deviation(
         parameter_weight[chosen_numbers], spread[chosen_numbers]
     )
     by_context = _compute_weight_per_deviation(context[chosen_numbers], deviation[chosen_numbers])
     gain = np.maximum(by_parameters, by_context)
     # The network's initial weights and learning rate assume inputs of mean square 1.
-    size = np.sqrt(np.mean((gain * deviation[chosen_numbers]) ** 2)) if most else 1.0
+    size = np.sqrt(np.mean((gain * deviation[chosen_numbers]) ** 2)) if max_inputs else 1.0
     return ObservationFeatures(
         points,
         False,
@@ -277,8 +277,8 @@ def make_weighted_features(
 
 def _compute_weight_per_deviation(weight: Array, deviation: Array) -> Array:
     """Return the weight per unit of deviation, limited for small deviations."""
-    min_deviation = _LEAST_DEVIATION * deviation.max(initial=0.0)
-    scaled: Array = weight / (deviation + min_deviation + _ZERO)
+    min_deviation = _MIN_DEVIATION_SHARE * deviation.max(initial=0.0)
+    scaled: Array = weight / (deviation + min_deviation + _MIN_DIVISOR)
     return scaled
 
 

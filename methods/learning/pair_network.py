@@ -37,7 +37,7 @@ _SOFTPLUS_AT_ZERO = float(np.log(2.0))
 """Softplus at zero; it is subtracted, so that a unit with input zero has output zero."""
 _LOSS_SCALE = 30.0
 """Divisor of relative squared errors; for Adam only their ratio to the penalty matters."""
-_SPREAD = 1.7
+_INITIAL_WEIGHT_LIMIT = 1.7
 """Limit of initial weights times the root of the number of inputs of a layer.
 
 It gives a variance close to 1 / inputs.
@@ -273,7 +273,7 @@ def _draw_initial_weights(
         fan_in = shape[0] if is_weight else fan_in
         gain = 1.0
         if design.adam:
-            gain = _SPREAD if is_weight else 0.0
+            gain = _INITIAL_WEIGHT_LIMIT if is_weight else 0.0
         limit = gain / fan_in**0.5
         uniform = torch.rand(shape, generator=generator) * 2 - 1
         weights[name] = (uniform * limit).requires_grad_()

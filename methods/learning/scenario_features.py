@@ -17,9 +17,9 @@ import numpy as np
 from methods.learning.input_response import compute_response_coefficients
 from methods.tuner import Array, ScenarioInfo
 
-_ROUNDING = 1e-9
+_EQUALITY_TOLERANCE = 1e-9
 """Relative difference below which numbers count as equal."""
-_NORMAL = 1.4826
+_STD_PER_MAD = 1.4826
 """Standard deviations of a normal distribution per median absolute deviation."""
 
 
@@ -70,7 +70,7 @@ class ScenarioFeatures:
         # Medians are used, because a fitted coefficient can be far off if a run hardly moves.
         centre = np.median(table, axis=0)
         distances = np.abs(table - centre)
-        return cls(centre, _NORMAL * np.median(distances, axis=0), count)
+        return cls(centre, _STD_PER_MAD * np.median(distances, axis=0), count)
 
     @property
     def has_varying_inputs(self) -> bool:
@@ -129,4 +129,4 @@ def _differs_between_scenarios(numbers: Array) -> bool:
     if not numbers.size:
         return False
     sizes = np.abs(numbers).max(axis=0)
-    return bool(np.any(np.ptp(numbers, axis=0) > _ROUNDING * sizes))
+    return bool(np.any(np.ptp(numbers, axis=0) > _EQUALITY_TOLERANCE * sizes))

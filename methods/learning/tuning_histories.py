@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from methods.tuner import Array, TrainingSimulator
 
-_CENTRED = 2.0
+_BETA_PARAMETER = 2.0
 """Parameter a of (2), which the paper does not state; 1 would be a uniform distribution."""
 
 
@@ -39,7 +39,7 @@ def draw_binary_search(simulator: TrainingSimulator, rng: np.random.Generator, c
         is_below = last < target
         lower = np.where(is_below, last, lower)  # (1)
         upper = np.where(is_below, upper, last)
-        share = rng.beta(_CENTRED, _CENTRED, size=last.size)
+        share = rng.beta(_BETA_PARAMETER, _BETA_PARAMETER, size=last.size)
         points.append(lower + share * (upper - lower))  # (2)
     return np.array(points[:count])
 

@@ -53,7 +53,7 @@ from methods.learning.tuning_histories import (
 from methods.tuner import Array, Proposal, Task, TrainingSimulator, Tuner, TunerGenerator
 from methods.tuners.tunenet import MIN_STEP
 
-_BOX = "box"
+_RANGE_ARRAY = "box"
 """Name of the array with the training range."""
 
 
@@ -100,7 +100,7 @@ class TrainedHistoryNetwork:
 
     def to_arrays(self) -> dict[str, Array]:
         """Return everything as plain arrays by name."""
-        return self.input_features.to_arrays() | self.weights | {_BOX: self.training_range}
+        return self.input_features.to_arrays() | self.weights | {_RANGE_ARRAY: self.training_range}
 
     @classmethod
     def from_arrays(
@@ -118,9 +118,9 @@ class TrainedHistoryNetwork:
         """
         features, arrays = InputFeatures.from_arrays(state, reading)
         dim = arrays.get("guess.bias", np.empty(0)).size
-        expected = get_weight_shapes(features.feature_count, dim, design) | {_BOX: (2, dim)}
+        expected = get_weight_shapes(features.feature_count, dim, design) | {_RANGE_ARRAY: (2, dim)}
         weights = check_shapes(arrays, expected)
-        return cls(design, features, weights, weights.pop(_BOX))
+        return cls(design, features, weights, weights.pop(_RANGE_ARRAY))
 
 
 @dataclass(eq=False)

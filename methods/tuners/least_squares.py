@@ -59,7 +59,7 @@ _MIN_DAMPING_SENSITIVITY = 1e-6
 
 A parameter with a smaller sensitivity is damped as if it had this one.
 """
-_CANDIDATES = 64
+_START_CANDIDATES = 64
 """Number of random points per parameter, from which a new start is chosen."""
 
 
@@ -374,7 +374,7 @@ class EvaluationHistory:
     def find_untried_point(self, rng: np.random.Generator) -> Array:
         """Return the random candidate point that is farthest from all simulated points."""
         dim = self.task.dim
-        candidates = rng.uniform(size=(_CANDIDATES * dim, dim))
+        candidates = rng.uniform(size=(_START_CANDIDATES * dim, dim))
         squares = [((candidates - point) ** 2).sum(1) for point in self.tried]
         farthest_point: Array = candidates[np.min(squares, axis=0).argmax()]
         return farthest_point

@@ -12,7 +12,7 @@ from methods.learning.input_features import FeatureConfig
 from methods.learning.pair_network import PairNetworkDesign
 from methods.tuners.tunenet import TuneNet
 
-_LAST = 1_000_000
+_LAST_CHANNEL = 1_000_000
 """Index of the last channel, larger than any number of channels."""
 
 
@@ -42,7 +42,7 @@ class TuneNetVision(TuneNet):
     strictness: float = 100.0
     noise: float = 0.02
     told: bool = False
-    channels: tuple[int, int] | None = (1, _LAST)
+    channels: tuple[int, int] | None = (1, _LAST_CHANNEL)
     clean: bool = False
 
     def make_network_design(self) -> PairNetworkDesign:

@@ -31,13 +31,13 @@ _MIN_FAILURES_TO_SHRINK = 4
 """Minimum number of successive failures after which the side length is halved."""
 _MAX_PERTURBED_COORDINATES = 20.0
 """Maximum mean number of coordinates in which a candidate differs from the centre."""
-_SHORTEST_SCALE = 0.005
+_MIN_LENGTH_SCALE = 0.005
 """Minimum length scale of the process, in the unit cube."""
-_LONGEST_SCALE = 4.0
+_MAX_LENGTH_SCALE = 4.0
 """Maximum length scale of the process, in the unit cube."""
-_LEAST_NOISE = 1e-8
+_MIN_NOISE_VARIANCE = 1e-8
 """Minimum variance of the noise, for losses scaled to variance 1."""
-_MOST_NOISE = 1e-3
+_MAX_NOISE_VARIANCE = 1e-3
 """Maximum variance of the noise, for losses scaled to variance 1.
 
 It is small, because simulations are reproducible.
@@ -217,9 +217,11 @@ def _fit_gaussian_process(points: Array, values: Array) -> Any:
     kernel = MaternKernel(
         nu=2.5,
         ard_num_dims=points.shape[1],
-        lengthscale_constraint=Interval(_SHORTEST_SCALE, _LONGEST_SCALE),
+        lengthscale_constraint=Interval(_MIN_LENGTH_SCALE, _MAX_LENGTH_SCALE),
     )
-    likelihood = GaussianLikelihood(noise_constraint=Interval(_LEAST_NOISE, _MOST_NOISE))
+    likelihood = GaussianLikelihood(
+        noise_constraint=Interval(_MIN_NOISE_VARIANCE, _MAX_NOISE_VARIANCE)
+    )
     x = torch.from_numpy(points)
     y = torch.from_numpy(values)[:, None]
     model = SingleTaskGP(

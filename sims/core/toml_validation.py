@@ -158,20 +158,20 @@ def check_table(source: Source, where: str, value: Any, words: str = "") -> dict
 
 
 def check_text(
-    source: Source, where: str, value: Any, words: str = "", most: int = MAX_TITLE_LENGTH
+    source: Source, where: str, value: Any, words: str = "", max_length: int = MAX_TITLE_LENGTH
 ) -> str:
-    """Check that `value` is a text of at most `most` characters.
+    """Check that `value` is a text of at most `max_length` characters.
 
     Args:
         source: File or name with which the message begins.
         where: Entry of the value.
         value: Value from the file.
         words: Description of the expected value; the default one if empty.
-        most: Maximum number of characters.
+        max_length: Maximum number of characters.
     """
     text = str(check_type(source, where, value, str, words))
-    if len(text) > most:
-        raise make_error(source, where, f"at most {most} characters, not {len(text)}", value)
+    if len(text) > max_length:
+        raise make_error(source, where, f"at most {max_length} characters, not {len(text)}", value)
     return text
 
 

@@ -31,14 +31,14 @@ MAX_QUOTED_NAME_LENGTH = 60
 """Maximum number of characters of a name that a message quotes."""
 
 
-def truncate_text(text: str, most: int = MAX_QUOTED_NAME_LENGTH) -> str:
+def truncate_text(text: str, max_length: int = MAX_QUOTED_NAME_LENGTH) -> str:
     """Truncate a text for a message.
 
     Args:
         text: Text.
-        most: Maximum number of characters.
+        max_length: Maximum number of characters.
     """
-    return text if len(text) <= most else f"{text[:most]}…"
+    return text if len(text) <= max_length else f"{text[:max_length]}…"
 
 
 def is_plausible_number(value: Any) -> bool:

@@ -359,7 +359,7 @@ def test_inputs_prefer_what_follows_the_parameters():
     )  # one channel each, a single sample
     observations = np.repeat(observations, 2, axis=2)
     data = TrainingData(parameters, observations, (2,), (EMPTY_SCENE,) * 20)
-    inputs = make_weighted_features(data, 2, most=3 * 6, strictness=1000.0)
+    inputs = make_weighted_features(data, 2, max_inputs=3 * 6, strictness=1000.0)
     gain = {int(number): gain for number, gain in zip(inputs.chosen, inputs.gain, strict=True)}
     assert gain[0] * np.std(parameters) > 1e3 * gain[6] * np.std(jumping)
     assert gain[12] * np.std(circumstance) > 1e3 * gain[6] * np.std(jumping)

@@ -126,7 +126,7 @@ def draw_figure(
     labels: AxisLabels,
     name: str,
     statistics: ComparisonStatistics | None = None,
-    behind: Sequence[ReferenceResult] = (),
+    references: Sequence[ReferenceResult] = (),
 ) -> Figure:
     """Draw one figure of a comparison.
 
@@ -135,7 +135,7 @@ def draw_figure(
         labels: Axis labels, see `make_axis_labels`.
         name: One of `list_figure_names(stored)`.
         statistics: Result of `compute_statistics(stored)`, to share it between several figures.
-        behind: Reference results that are drawn in grey, if the figure is one of
+        references: Reference results that are drawn in grey, if the figure is one of
             `OVERLAYABLE_FIGURES`.
 
     Raises:
@@ -143,26 +143,26 @@ def draw_figure(
     """
     if name not in (figure_names := list_figure_names(stored)):
         raise make_unknown_name_error("figure", name, figure_names)
-    if behind:
-        check_references_allowed(stored, name, behind)
+    if references:
+        check_references_allowed(stored, name, references)
     if name == "spectra":
         assert stored.spectra is not None
         figure = draw_spectra_figure(stored.experiment, stored.spectra)
     else:
         view = ComparisonView(stored, labels, statistics or compute_statistics(stored))
-        figure = _draw_chart_figure(view, name, behind)
+        figure = _draw_chart_figure(view, name, references)
     return add_trust_note(figure, stored.experiment.trusted)
 
 
 def check_references_allowed(
-    stored: StoredComparison, name: str, behind: Sequence[ReferenceResult]
+    stored: StoredComparison, name: str, references: Sequence[ReferenceResult]
 ) -> None:
     """Reject references that cannot be drawn in a figure.
 
     Args:
         stored: The comparison.
         name: Name of the figure.
-        behind: Reference results.
+        references: Reference results.
 
     Raises:
         InputError: They are of another problem, there are too many, or the figure shows no errors
@@ -172,9 +172,11 @@ def check_references_allowed(
         raise InputError(
             f"figure {name}: expected one of {', '.join(OVERLAYABLE_FIGURES)} before a reference"
         )
-    if len(behind) > len(REFERENCE_GREYS):
-        raise InputError(f"expected {len(REFERENCE_GREYS)} references at most, found {len(behind)}")
-    for reference in behind:
+    if len(references) > len(REFERENCE_GREYS):
+        raise InputError(
+            f"expected {len(REFERENCE_GREYS)} references at most, found {len(references)}"
+        )
+    for reference in references:
         reference.find_mismatches(stored.experiment)
 
 

@@ -23,13 +23,13 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_MIN_SHOWN_SIGMA = 1e-6
+_MIN_DRAWN_SIGMA = 1e-6
 """Standard deviation in training widths below which values are drawn at the edge."""
-_MAX_SHOWN_SIGMA = 1e4
+_MAX_DRAWN_SIGMA = 1e4
 """Standard deviation in training widths above which values are drawn at the edge."""
-_LEAST_SHARE = 0.05
+_MIN_LABELLED_SHARE = 0.05
 """Minimum share of a parameter in a direction that is written."""
-_WHERE = {
+_RANGE_LABELS = {
     "in": "true parameters in training range",
     "wide": "true parameters in bounds",
     "real": "recording, at nominal values",
@@ -82,13 +82,13 @@ def _draw_spectra(axis: Axes, table: pd.DataFrame, directions: int) -> None:
         axis.plot(
             x_values,
             # A direction without effect on the data has an infinite sigma and is drawn at the edge.
-            part["sigma"].clip(_MIN_SHOWN_SIGMA, _MAX_SHOWN_SIGMA),
+            part["sigma"].clip(_MIN_DRAWN_SIGMA, _MAX_DRAWN_SIGMA),
             marker,
             color=colour,
             markersize=3.5,
             alpha=0.75,
             linestyle="none",
-            label=_WHERE.get(kind, kind) + ("" if kind == "real" else f" (n = {targets})"),
+            label=_RANGE_LABELS.get(kind, kind) + ("" if kind == "real" else f" (n = {targets})"),
         )
     axis.axhline(STIFF_SIGMA_THRESHOLD, color=CAPTION_GREY, linewidth=0.8, linestyle="--")
     for name, text_offset in (("sloppy", 3), ("stiff", -9)):
@@ -116,7 +116,7 @@ def _draw_direction_shares(axis: Axes, table: pd.DataFrame, names: list[str]) ->
     squares = table.set_index("direction")[names] ** 2
     shares = squares.groupby(level=0).mean().to_numpy().T
     axis.imshow(shares, cmap="Greys", vmin=0.0, vmax=1.0, aspect="auto")
-    for row, column in np.argwhere(shares >= _LEAST_SHARE):
+    for row, column in np.argwhere(shares >= _MIN_LABELLED_SHARE):
         share = float(shares[row, column])
         axis.text(
             column,

@@ -34,9 +34,9 @@ ISOLATION_LAYERS = {
 
 MAX_FOLDER_BYTES = 64 << 20
 """Size of a tuner's own folder in bytes."""
-_FILES = 512
+_MAX_OPEN_FILES = 512
 """Maximum number of open files of a tuner."""
-_THREADS = 1024
+_MAX_THREADS = 1024
 """Maximum number of threads of a user's tuners; those of a superuser are not counted."""
 
 PROJECT_ROOT = Path(__file__).resolve().parents[3]
@@ -202,9 +202,9 @@ def _set_resource_limits(has_user_namespace: bool) -> None:
     """
     limits = {
         resource.RLIMIT_CORE: 0,
-        resource.RLIMIT_NOFILE: _FILES,
+        resource.RLIMIT_NOFILE: _MAX_OPEN_FILES,
         resource.RLIMIT_FSIZE: MAX_FOLDER_BYTES,
-        **({resource.RLIMIT_NPROC: _THREADS} if has_user_namespace else {}),
+        **({resource.RLIMIT_NPROC: _MAX_THREADS} if has_user_namespace else {}),
     }
     for limit, maximum in limits.items():
         hard_limit = resource.getrlimit(limit)[1]

@@ -20,18 +20,18 @@ from numpy.typing import NDArray
 
 from methods.tuner import Array
 
-_HEAD = struct.Struct("<cBxxIQ")
+_HEADER = struct.Struct("<cBxxIQ")
 """Head of a message: kind, flags, size, number of bytes in the body."""
-_BUFFER = 1 << 20
+_MAX_READ_BYTES = 1 << 20
 """Maximum number of bytes per read."""
-_TYPES = ("<f8", "<f4", "<i8", "<i4", "|u1", "|b1")
+_ARRAY_TYPES = ("<f8", "<f4", "<i8", "<i4", "|u1", "|b1")
 """Permitted types of the arrays of a trained tuner."""
-_ARRAYS = 10_000
+_MAX_ARRAYS = 10_000
 """Maximum number of arrays in a message."""
-_NAMES = 1 << 20
+_MAX_NAMES_BYTES = 1 << 20
 """Maximum size of the names and shapes of the arrays in bytes."""
 
-_LONGEST = float((1 << 31) - 1)
+_MAX_POLL_MILLISECONDS = float((1 << 31) - 1)
 """Maximum timeout of `poll` in milliseconds."""
 
 MAX_TEXT_BYTES = 1 << 16
@@ -115,7 +115,7 @@ class MessageChannel:
         Polling is needed so that every read and write can have a deadline.
         """
         self._reading, self._writing = reading, writing
-        self._buffer = bytearray(_BUFFER)
+        self._buffer = bytearray(_MAX_READ_BYTES)
         self._view = memoryview(self._buffer)
         self._incoming, self._outgoing = select.poll(), select.poll()
         self._incoming.register(reading, select.POLLIN)
@@ -155,7 +155,7 @@ class MessageChannel:
             TimeoutError: the other side does not read in time.
         """
         body = b"".join([part if isinstance(part, bytes) else bytes(part) for part in parts])
-        self._write_message(_HEAD.pack(kind, flags, size, len(body)) + body, deadline)
+        self._write_message(_HEADER.pack(kind, flags, size, len(body)) + body, deadline)
 
     def send_document(self, kind: bytes, document: Any, flags: int = 0) -> None:
         """Send a message whose body is JSON.
@@ -196,26 +196,26 @@ class MessageChannel:
             TimeoutError: there is no message in time.
         """
         received = self._read_available_bytes(self._view, deadline)
-        while received < _HEAD.size:
+        while received < _HEADER.size:
             received += self._read_available_bytes(self._view[received:], deadline)
-        kind, flags, size, length = _HEAD.unpack_from(self._buffer)
+        kind, flags, size, length = _HEADER.unpack_from(self._buffer)
         if length > limit:
             raise ProtocolError(f"it sent {length} bytes at once, {limit} are allowed")
-        if received > _HEAD.size + length:
+        if received > _HEADER.size + length:
             raise ProtocolError("it sent a message without a request")
-        received -= _HEAD.size
-        if _HEAD.size + length > _BUFFER:
+        received -= _HEADER.size
+        if _HEADER.size + length > _MAX_READ_BYTES:
             return Message(kind, flags, size, self._read_long_body(received, length, deadline))
-        body = self._view[_HEAD.size : _HEAD.size + length]
+        body = self._view[_HEADER.size : _HEADER.size + length]
         while received < length:
             received += self._read_available_bytes(body[received:], deadline)
         return Message(kind, flags, size, body)
 
     def _read_long_body(self, received: int, length: int, deadline: float) -> memoryview:
         """Read a body that is longer than the buffer; memory grows only with the data received."""
-        body = bytearray(self._view[_HEAD.size : _HEAD.size + received])
+        body = bytearray(self._view[_HEADER.size : _HEADER.size + received])
         while len(body) < length:
-            part = self._view[: min(_BUFFER, length - len(body))]
+            part = self._view[: min(_MAX_READ_BYTES, length - len(body))]
             body += part[: self._read_available_bytes(part, deadline)]
         return memoryview(body)
 
@@ -240,7 +240,7 @@ class MessageChannel:
 def _compute_poll_timeout(deadline: float) -> float | None:
     remaining = (deadline - perf_counter()) * 1e3
     # A larger timeout exceeds the range of `poll`, and is replaced by no timeout.
-    return None if remaining > _LONGEST else max(0.0, remaining)
+    return None if remaining > _MAX_POLL_MILLISECONDS else max(0.0, remaining)
 
 
 def pack_arrays(arrays: Mapping[str, NDArray[Any]]) -> tuple[bytes, ...]:
@@ -251,7 +251,7 @@ def pack_arrays(arrays: Mapping[str, NDArray[Any]]) -> tuple[bytes, ...]:
     """
     contiguous = {name: np.asarray(array, order="C") for name, array in arrays.items()}
     for name, array in contiguous.items():
-        if array.dtype.str not in _TYPES:
+        if array.dtype.str not in _ARRAY_TYPES:
             raise ValueError(f"array {name!r:.80}: expected numbers, found {array.dtype}")
     descriptions = [[name, array.dtype.str, array.shape] for name, array in contiguous.items()]
     return json.dumps(descriptions).encode() + b"\n", *(
@@ -265,17 +265,17 @@ def unpack_arrays(body: memoryview) -> dict[str, NDArray[Any]]:
     Raises:
         ProtocolError: the body is not valid.
     """
-    line, _, _ = bytes(body[:_NAMES]).partition(b"\n")
+    line, _, _ = bytes(body[:_MAX_NAMES_BYTES]).partition(b"\n")
     payload = body[len(line) + 1 :]
     try:
         descriptions = json.loads(line)
         arrays, offset = {}, 0
-        for name, kind, shape in descriptions[:_ARRAYS]:
+        for name, kind, shape in descriptions[:_MAX_ARRAYS]:
             array, offset = _read_array(payload, offset, kind, shape)
             arrays[_check_array_name(name)] = array
     except (ValueError, TypeError, KeyError, RecursionError):
         raise ProtocolError("it sent invalid arrays") from None
-    if offset != len(payload) or not len(arrays) == len(descriptions) <= _ARRAYS:
+    if offset != len(payload) or not len(arrays) == len(descriptions) <= _MAX_ARRAYS:
         raise ProtocolError("its message does not match the arrays that it lists")
     return arrays
 
@@ -312,7 +312,7 @@ def _read_array(
     Raises:
         ValueError: type or shape are not valid.
     """
-    if kind not in _TYPES or not all(type(n) is int and 0 <= n < 1 << 40 for n in shape):
+    if kind not in _ARRAY_TYPES or not all(type(n) is int and 0 <= n < 1 << 40 for n in shape):
         raise ValueError
     size = int(np.dtype(kind).itemsize)
     for n in shape:

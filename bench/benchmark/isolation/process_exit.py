@@ -5,9 +5,11 @@ from __future__ import annotations
 import re
 import signal
 
-ISOLATED = "tuners run isolated: no files, no processes, no network; use --trust while developing"
+ISOLATION_NOTE = (
+    "tuners run isolated: no files, no processes, no network; use --trust while developing"
+)
 """Note that is added to an error that the isolation of the tuner may have caused."""
-_REFUSED = re.compile(
+_REFUSED_ACCESS_PATTERN = re.compile(
     r"^[\w.]*(PermissionError|BlockingIOError|FileNotFoundError|Connection\w*Error|gaierror"
     r"|BrokenProcessPool|TerminatedWorkerError)\b"
     r"|Permission denied|Operation not permitted|Read-only file system|No such file or directory"
@@ -35,20 +37,22 @@ class RunEndedError(Exception):
 
 
 def with_isolation(reason: str) -> str:
-    """Return a reason with `ISOLATED` at its end, if the isolation may be the cause.
+    """Return a reason with `ISOLATION_NOTE` at its end, if the isolation may be the cause.
 
     Args:
         reason: traceback of an isolated tuner.
     """
     # Lines without indentation are those of exceptions; the others are frames and source code.
-    if any(_REFUSED.search(line) for line in reason.splitlines() if line[:1].strip()):
-        return f"{reason.rstrip()}; {ISOLATED}"
+    if any(
+        _REFUSED_ACCESS_PATTERN.search(line) for line in reason.splitlines() if line[:1].strip()
+    ):
+        return f"{reason.rstrip()}; {ISOLATION_NOTE}"
     return reason
 
 
 def without_isolation(reason: str) -> str:
     """Return a reason without the text that `with_isolation` has added."""
-    return reason.removesuffix(f"; {ISOLATED}")
+    return reason.removesuffix(f"; {ISOLATION_NOTE}")
 
 
 class KilledExternallyError(Exception):

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from sims.core.file_lock import lock_file
 
-_PREFIX = "simgap-tuner-"
+_FOLDER_PREFIX = "simgap-tuner-"
 
 
 class LockedFolder(NamedTuple):
@@ -37,7 +37,7 @@ def create_locked_folder() -> LockedFolder:
     """Create a new locked folder."""
     remove_stale_folders()
     while True:
-        path = tempfile.mkdtemp(prefix=_PREFIX)
+        path = tempfile.mkdtemp(prefix=_FOLDER_PREFIX)
         lock = _lock_folder(path, is_blocking=True)
         # Between creation and lock another process may have removed the folder as unused.
         if lock is not None and os.path.isdir(path):
@@ -46,7 +46,7 @@ def create_locked_folder() -> LockedFolder:
 
 def remove_stale_folders() -> None:
     """Delete the folders of processes that were killed."""
-    for path in Path(tempfile.gettempdir()).glob(f"{_PREFIX}*"):
+    for path in Path(tempfile.gettempdir()).glob(f"{_FOLDER_PREFIX}*"):
         lock = _lock_folder(str(path), is_blocking=False)
         if lock is not None:
             LockedFolder(str(path), lock).remove()

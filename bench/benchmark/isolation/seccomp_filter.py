@@ -26,7 +26,7 @@ from bench.benchmark.isolation.linux_syscalls import (
 _PR_SET_SECCOMP = 22
 """Option of prctl: install a filter of system calls."""
 
-_NUMBERS: Mapping[str, Mapping[str, int]] = {
+_SYSCALL_NUMBERS: Mapping[str, Mapping[str, int]] = {
     "x86_64": {
         "fork": 57, "vfork": 58, "clone": 56, "clone3": 435, "execve": 59, "execveat": 322,
         "ptrace": 101, "process_vm_readv": 310, "process_vm_writev": 311, "unshare": 272,
@@ -75,11 +75,11 @@ The last one is combined with an error number; with 0 the call does nothing and 
 """
 _EPERM, _ENOMEM, _ENOSYS = _FAIL | 1, _FAIL | 12, _FAIL | 38
 """Verdicts for the errors EPERM, ENOMEM and ENOSYS."""
-_THREAD = 0x00010000
+_CLONE_THREAD = 0x00010000
 """CLONE_THREAD: the new task is a thread of this process."""
-_STREAMS = tuple(1 | flags for flags in (0, 0x800, 0x80000, 0x80800))
+_STREAM_SOCKET_TYPES = tuple(1 | flags for flags in (0, 0x800, 0x80000, 0x80800))
 """SOCK_STREAM with its flags; a pair of sockets of another type can be given names."""
-_LOCKS = (6, 7, 37, 38)
+_LOCK_COMMANDS = (6, 7, 37, 38)
 """F_SETLK, F_SETLKW and their forms for open file descriptions (fcntl commands).
 
 They succeed without any effect. A real lock on a file that others read would pass information to
@@ -119,18 +119,18 @@ def list_rules(process: int, has_memory_limit: bool) -> dict[str, int | Argument
     """
     itself = ArgumentRule(0, {process: _ALLOW}, _EPERM)
     rules: dict[str, int | ArgumentRule] = {
-        **dict.fromkeys(_NUMBERS["x86_64"], _EPERM),
+        **dict.fromkeys(_SYSCALL_NUMBERS["x86_64"], _EPERM),
         # Libraries try these first, and use other calls if the kernel reports that they are absent.
         **dict.fromkeys(("clone3", "io_uring_setup"), _ENOSYS),
-        "clone": ArgumentRule(0, {_THREAD: _ALLOW}, _EPERM, mask=_THREAD),
+        "clone": ArgumentRule(0, {_CLONE_THREAD: _ALLOW}, _EPERM, mask=_CLONE_THREAD),
         "kill": itself,
         "tgkill": itself,
         "prlimit64": ArgumentRule(0, {0: _ALLOW, process: _ALLOW}, _EPERM),
         "prctl": ArgumentRule(0, {PR_SET_PDEATHSIG: _EPERM}, _ALLOW),
-        "socketpair": ArgumentRule(1, dict.fromkeys(_STREAMS, _ALLOW), _EPERM),
+        "socketpair": ArgumentRule(1, dict.fromkeys(_STREAM_SOCKET_TYPES, _ALLOW), _EPERM),
         "fcntl": ArgumentRule(
-            1, {**dict.fromkeys(_LOCKS, _FAIL), **dict.fromkeys(_BLOCKED_FCNTL_COMMANDS, _EPERM)},
-            _ALLOW,
+            1, {**dict.fromkeys(_LOCK_COMMANDS, _FAIL), **dict.fromkeys(_BLOCKED_FCNTL_COMMANDS,
+            _EPERM)}, _ALLOW,
         ),
         "flock": _FAIL,
         "capset": _ALLOW,  # capabilities can only be given up
@@ -204,7 +204,7 @@ def build_filter(machine: str, rules: Mapping[str, int | ArgumentRule]) -> list[
         BpfInstruction(_LOAD, _NUMBER_OFFSET),
         *_emit_conditional(_AT_LEAST, _X32, _emit_rule(_ENOSYS)),
     ]
-    for name, number in _NUMBERS[machine].items():
+    for name, number in _SYSCALL_NUMBERS[machine].items():
         program += _emit_conditional(_EQUAL, number, _emit_rule(rules[name]))
     return [*program, *_emit_rule(_ALLOW)]
 
@@ -225,7 +225,7 @@ def install_syscall_filter(has_memory_limit: bool = False) -> None:
     if not IS_LINUX or machine not in _ARCHITECTURES or sys.byteorder != "little":
         raise OSError(f"no filter for {machine}")
     version_3 = struct.pack("<Ii", 0x20080522, 0)
-    call_system(_NUMBERS[machine]["capset"], version_3, bytes(24))
+    call_system(_SYSCALL_NUMBERS[machine]["capset"], version_3, bytes(24))
     program = build_filter(machine, list_rules(os.getpid(), has_memory_limit))
     packed = b"".join(struct.pack("<HBBI", i[0], i[2], i[3], i[1]) for i in program)
     buffer = ctypes.create_string_buffer(packed)

@@ -139,7 +139,7 @@ class IsolatedSteps:
         self._child, self._task, self._stream = child, task, stream
         self._deadline = perf_counter() + seconds
         self._farewell = min(seconds, _CLOSE_TIMEOUT_SECONDS)
-        self._pace = AffinityController()
+        self._affinity_controller = AffinityController()
         self._waits = False
         self._limit = min(MAX_PROPOSAL_BYTES, 8 * task.dim * (task.budget + 2))
 
@@ -171,7 +171,7 @@ class IsolatedSteps:
         It has the losses and observations of the last proposal. The flags tell the process on which
         processor to run, see `AffinityController`.
         """
-        flags = self._pace.record_exchange()
+        flags = self._affinity_controller.record_exchange()
         # False until the next proposal: if this fails, the process has been ended.
         self._waits = False
         self._child.send(
@@ -218,7 +218,7 @@ class IsolatedSteps:
         Raises:
             RunEndedError: the tuner failed while it was closed.
         """
-        self._pace.release_affinity()
+        self._affinity_controller.release_affinity()
         if self._waits:
             self._waits = False
             deadline = perf_counter() + self._farewell

@@ -40,7 +40,7 @@ _BOOTSTRAP_CODE = (
     "serve_fork_requests({descriptor})"
 )
 _PRELOADED = ("numpy.random", "bench.benchmark.isolation.tuner_server")
-_NUMERICAL = ("OPENBLAS_", "MKL_", "OMP_", "NPY_")
+_NUMERICAL_VARIABLE_PREFIXES = ("OPENBLAS_", "MKL_", "OMP_", "NPY_")
 """Prefixes of environment variables that determine how numerical libraries compute."""
 START_TIMEOUT_SECONDS = 60.0
 """Timeout in seconds for the start of a process and for building a tuner."""
@@ -216,7 +216,11 @@ def _make_environment(folder: str) -> dict[str, str]:
     )
     variables = {name: os.environ[name] for name in inherited_names if name in os.environ}
     # Libraries would otherwise compute differently, and results would differ in the last digits.
-    variables |= {name: value for name, value in os.environ.items() if name.startswith(_NUMERICAL)}
+    variables |= {
+        name: value
+        for name, value in os.environ.items()
+        if name.startswith(_NUMERICAL_VARIABLE_PREFIXES)
+    }
     # Compiled steps are loaded from the cache folder before the process is isolated.
     variables["SIMGAP_COMPILED"] = str(compiled.get_cache_folder())
     single_thread = dict.fromkeys(

@@ -43,7 +43,7 @@ from methods.tuner import (
     TunerGenerator,
 )
 
-_LIMIT = 1 << 40
+_MAX_MESSAGE_BYTES = 1 << 40
 """Maximum size of a message from the harness in bytes; practically unlimited, as it is trusted."""
 
 
@@ -63,7 +63,7 @@ def serve_requests(channel: MessageChannel, policy: AccessPolicy, active_layers:
         tuner = None
         reported_paths: set[str] = set()
         while True:
-            message = channel.receive(_LIMIT)
+            message = channel.receive(_MAX_MESSAGE_BYTES)
             if message.kind == b"N":
                 _report_written_files(channel, policy.folder, reported_paths)
                 continue
@@ -84,7 +84,7 @@ def _report_written_files(channel: MessageChannel, folder: str, reported_paths: 
     """
     new = [
         path
-        for path in islice(_iterate_written_files(folder), _MOST_FILES)
+        for path in islice(_iterate_written_files(folder), _MAX_COUNTED_FILES)
         if path not in reported_paths
     ]
     reported_paths.update(new)
@@ -92,7 +92,7 @@ def _report_written_files(channel: MessageChannel, folder: str, reported_paths: 
     channel.send_document(b"N", {"count": len(new), "names": names})
 
 
-_MOST_FILES = 10_000
+_MAX_COUNTED_FILES = 10_000
 """Maximum number of files that are counted."""
 
 
@@ -224,7 +224,7 @@ def _exchange_evaluations(channel: MessageChannel, steps: TunerGenerator, task: 
         # One point beyond the budget is enough for the harness to see that the budget is exceeded.
         points = points[: max(task.budget - used_simulations, 0) + 1]
         channel.send(b"A", recommendation, points, flags=len(recommendation) > 0, size=len(points))
-        answer = channel.receive(_LIMIT)
+        answer = channel.receive(_MAX_MESSAGE_BYTES)
         if answer.kind != b"E":
             raise GeneratorExit
         if answer.flags:
@@ -257,7 +257,7 @@ class _RemoteTrainingSimulator:
     def __init__(self, channel: MessageChannel, which: int) -> None:
         self._channel, self._which = channel, which
         channel.send(b"P", flags=which)
-        self._read_properties(channel.receive(_LIMIT))
+        self._read_properties(channel.receive(_MAX_MESSAGE_BYTES))
 
     def _read_properties(self, answer: Message) -> dict[str, NDArray[Any]]:
         """Store the properties of the training simulator from an answer, and return its arrays.
@@ -304,7 +304,7 @@ class _RemoteTrainingSimulator:
         requested = np.array(points, dtype=np.float64).reshape(-1, self.dim)
         request = pack_arrays({"rng": encode_rng_state(rng_state), "points": requested})
         self._channel.send(b"P", *request, flags=2 + self._which)
-        arrays = self._read_properties(self._channel.receive(_LIMIT))
+        arrays = self._read_properties(self._channel.receive(_MAX_MESSAGE_BYTES))
         if is_sendable:
             rng.bit_generator.state = decode_rng_state(arrays["rng"])
         return arrays["observations"]
@@ -322,7 +322,7 @@ class _RemoteTrainingCallback:
 
     def epoch(self, stage: str, epoch: int, epochs: int, loss: float, held_out: float) -> None:
         self._channel.send_document(b"W", [stage, epoch, epochs, float(loss), float(held_out)])
-        self._channel.receive(_LIMIT)
+        self._channel.receive(_MAX_MESSAGE_BYTES)
 
 
 def _train_tuner(channel: MessageChannel, message: Message, tuner: Tuner) -> None:

@@ -53,9 +53,9 @@ __all__ = [
 RANGES = ("in", "wide", "real")
 """Origin of targets: the training range, the bounds, or a recording."""
 
-_LONGEST = 1e9
+_MAX_TIMEOUT_SECONDS = 1e9
 """Maximum finite time limit in seconds; a longer one overflows timers. Infinity means no limit."""
-_MOST_MEMORY = 10**9
+_MAX_MEMORY_MIB = 10**9
 """Maximum memory limit in MiB; no machine has more memory."""
 ISOLATION_MODES = ("run", "tuner")
 """Lifetimes of a tuner's process: one run, or all runs of the tuner."""
@@ -285,9 +285,10 @@ class Experiment:
                 )
         if self.memory < 0 or not self.timeout > 0:  # negated, so that NaN is refused too
             raise InputError(f"{subject}: expected timeout > 0 and memory >= 0")
-        if self.memory > _MOST_MEMORY or _LONGEST < self.timeout < math.inf:
+        if self.memory > _MAX_MEMORY_MIB or _MAX_TIMEOUT_SECONDS < self.timeout < math.inf:
             expected = (
-                f"timeout of at most {_LONGEST:g} s and memory of at most {_MOST_MEMORY:g} MiB"
+                f"timeout of at most {_MAX_TIMEOUT_SECONDS:g} s and "
+                f"memory of at most {_MAX_MEMORY_MIB:g} MiB"
             )
             raise InputError(f"{subject}: expected {expected}")
         check_known_names("range", self.ranges, RANGES)
@@ -319,18 +320,18 @@ class Experiment:
     def _check_words(self, subject: str) -> None:
         """Raise an error for texts that do not fit into figures, tables or paths."""
         check_text(subject, "title", self.title)
-        check_text(subject, "says", self.says, most=MAX_DESCRIPTION_LENGTH)
-        check_text(subject, "identifiable", self.identifiable, most=MAX_DESCRIPTION_LENGTH)
-        check_text(subject, "suite", self.suite, most=MAX_NAME_LENGTH)
+        check_text(subject, "says", self.says, max_length=MAX_DESCRIPTION_LENGTH)
+        check_text(subject, "identifiable", self.identifiable, max_length=MAX_DESCRIPTION_LENGTH)
+        check_text(subject, "suite", self.suite, max_length=MAX_NAME_LENGTH)
         check_text(subject, "same_targets_as", self.same_targets_as)
-        check_text(subject, "model", self.model, most=MAX_DESCRIPTION_LENGTH)
+        check_text(subject, "model", self.model, max_length=MAX_DESCRIPTION_LENGTH)
         for word in self.free:
-            check_text(subject, "free", word, most=MAX_NAME_LENGTH)
+            check_text(subject, "free", word, max_length=MAX_NAME_LENGTH)
         for word in self.experiments:
             check_text(subject, "experiments", word)
-        check_text(subject, "tags", ", ".join(self.tags), most=MAX_DESCRIPTION_LENGTH)
+        check_text(subject, "tags", ", ".join(self.tags), max_length=MAX_DESCRIPTION_LENGTH)
         for entry in self.tuners:
-            check_text(subject, "tuners: label", entry.label, most=MAX_NAME_LENGTH)
+            check_text(subject, "tuners: label", entry.label, max_length=MAX_NAME_LENGTH)
 
     def _check_numbers(self, subject: str) -> None:
         """Raise an error for numbers that are not finite or out of range."""

@@ -13,7 +13,7 @@ from typing import Any
 from sims.core.simulator import InputError
 from sims.core.toml_validation import make_error
 
-_UNFIT = re.compile(r"[^\w.+-]+")
+_INVALID_CHARACTERS = re.compile(r"[^\w.+-]+")
 """Characters that are not valid in folder names and in command lines without quotes."""
 MAX_EXPERIMENTS = 10_000
 """Maximum number of experiments of one file.
@@ -84,7 +84,7 @@ def _format_swept_value(path: Path, key: str, value: Any) -> str:
         return "_".join(_format_swept_value(path, key, item) for item in value)
     if isinstance(value, bool):  # as TOML writes it
         return str(value).lower()
-    return _UNFIT.sub("-", str(value))
+    return _INVALID_CHARACTERS.sub("-", str(value))
 
 
 def _insert_value(path: Path, document: dict[str, Any], key: str, value: Any) -> None:

@@ -18,7 +18,7 @@ from sims.core.simulator import InputError
 
 PUBLIC_SALT = "public"
 """Salt of targets that everybody can reproduce."""
-_HASH = re.compile(r"[0-9a-f]{64}$")
+_HASH_PATTERN = re.compile(r"[0-9a-f]{64}$")
 MAX_SALT_LENGTH = 1000
 """Maximum length of a salt in characters."""
 
@@ -48,7 +48,7 @@ def check_commitment(subject: str, salt: str, committed: str) -> None:
         raise InputError(
             f"{subject}: expected a salt of up to {MAX_SALT_LENGTH} characters, found {len(salt)}"
         )
-    if committed and not _HASH.match(committed):
+    if committed and not _HASH_PATTERN.match(committed):
         raise InputError(
             f"{subject}: salt_sha256: expected 64 hexadecimal digits, found {committed!r:.80}"
         )

@@ -23,7 +23,7 @@ from bench.benchmark.problem.salt import TargetStreams
 from bench.core.input_signals import evaluate_signal
 from sims.core.simulator import Array, Channel, InputError, Scenario, Simulator, UnitCube
 
-_CUBE = np.array([[0.0], [1.0]])
+_CUBE_CORNERS = np.array([[0.0], [1.0]])
 """Opposite corners of the unit cube, for any dimension."""
 DIVERGENCE_LIMIT = 1e12
 """Largest magnitude of a sample, in units of its channel's typical magnitude.
@@ -170,7 +170,7 @@ def _draw_target(problem: TargetProblem, kind: str, index: int, number: int) -> 
     experiment_name = problem.experiment.same_targets_as or problem.experiment.name
     redraw_names = ("redraw", number) if number else ()
     streams = TargetStreams(problem.salt, experiment_name, kind, index, *redraw_names)
-    box = _CUBE if kind == "wide" else problem.cube.training
+    box = _CUBE_CORNERS if kind == "wide" else problem.cube.training
     start, truth = (
         streams.get_stream(stream_name).uniform(box[0], box[1], size=problem.cube.dim)
         for stream_name in ("start", "truth")

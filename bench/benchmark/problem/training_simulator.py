@@ -10,7 +10,7 @@ import numpy as np
 from methods.tuner import BudgetExceededError, ScenarioInfo
 from sims.core.simulator import Array, Scenario, UnitCube
 
-_SLACK = 1e-9
+_RANGE_TOLERANCE = 1e-9
 """Tolerance for points outside the training range, in the unit cube, because of rounding."""
 
 
@@ -118,7 +118,7 @@ class CountedTrainingSimulator:
         """
         points = np.asarray(points, dtype=np.float64)
         low, high = self.training
-        if not ((points >= low - _SLACK) & (points <= high + _SLACK)).all():
+        if not ((points >= low - _RANGE_TOLERANCE) & (points <= high + _RANGE_TOLERANCE)).all():
             raise ValueError(
                 "a learned tuner may only simulate inside the training range while it trains"
             )

@@ -26,14 +26,14 @@ class RangeResult(NamedTuple):
     Attributes:
         where: The range in words, for the middle of a sentence.
         title: The range with its number of targets, for the beginning of a sentence.
-        standings: Verdicts after 1, 3, 10 and all simulations.
+        rankings: Verdicts after 1, 3, 10 and all simulations.
         has_failures: Whether a tuner failed in all of its runs.
         notes: Failed runs, and how the verdicts were decided.
     """
 
     where: str
     title: str
-    standings: list[headline.Standing]
+    rankings: list[headline.TunerRanking]
     has_failures: bool
     notes: list[str]
 
@@ -42,7 +42,7 @@ def list_range_results(view: ComparisonView) -> list[RangeResult]:
     """List the verdicts on the tuners by range of targets."""
     results = []
     for kind in view.ranges:
-        standings = headline.list_standings(view.statistics, kind)
+        rankings = headline.rank_at_checkpoints(view.statistics, kind)
         notes = (
             headline.list_failed_runs(view.statistics, kind),
             headline.explain_ranking(view.statistics, kind),
@@ -51,8 +51,8 @@ def list_range_results(view: ComparisonView) -> list[RangeResult]:
             RangeResult(
                 headline.WHERE[kind],
                 _format_title(view, kind),
-                standings,
-                any(standing.failed for standing in standings),
+                rankings,
+                any(ranking.failed for ranking in rankings),
                 [note for note in notes if note],
             )
         )
@@ -74,10 +74,10 @@ def _conclude_range(view: ComparisonView, kind: str) -> str:
 
     `kind` is the range of the targets. Tuners that share the smallest error are not listed here.
     """
-    standings, title = headline.list_standings(view.statistics, kind), _format_title(view, kind)
-    if not standings:
+    rankings, title = headline.rank_at_checkpoints(view.statistics, kind), _format_title(view, kind)
+    if not rankings:
         return f"{title}: the errors on the targets do not decide."
-    last = standings[-1]
+    last = rankings[-1]
     # The wording of the first one explains the format of the others.
     first = [
         re.sub(r" (\d\S*x) \((\d+)/(\d+)\)$", r" \1 the error (larger on \2 of \3 targets)", text)
@@ -189,7 +189,7 @@ def list_failures(view: ComparisonView) -> list[Failure]:
 
 def list_small_samples(view: ComparisonView) -> list[str]:
     """List warnings about ranges with too few targets for a significant difference."""
-    texts = (headline.warn_too_few_targets(view.statistics, kind) for kind in view.ranges)
+    texts = (headline.warn_about_target_count(view.statistics, kind) for kind in view.ranges)
     return list(dict.fromkeys(text for text in texts if text))
 
 

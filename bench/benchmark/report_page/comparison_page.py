@@ -35,7 +35,7 @@ def render_page(results: ComparisonReportData) -> str:
         for name, table in chart.tables.items() if chart else ():
             page.add_table(name, table, _DIGITS)
     range_results = conclusion.list_range_results(view)
-    standings = [result.standings for result in range_results]
+    rankings = [result.rankings for result in range_results]
     equal_errors = headline.format_error_floor(view.statistics)
     return page.render(
         _TEMPLATE,
@@ -47,7 +47,7 @@ def render_page(results: ComparisonReportData) -> str:
         equal_errors=equal_errors.capitalize(),
         floor_text=equal_errors,
         range_results=range_results,
-        together=list(zip(*standings, strict=True)) if all(standings) else [],
+        together=list(zip(*rankings, strict=True)) if all(rankings) else [],
         best_headings=[f"best (median error), {result.where}" for result in range_results],
         conclusion=conclusion.write_conclusion(view),
         small_samples=conclusion.list_small_samples(view),

@@ -29,7 +29,7 @@ WHERE = {
 """Wording for the ranges of targets."""
 
 
-class Standing(NamedTuple):
+class TunerRanking(NamedTuple):
     """Verdicts on the tuners of one range after some number of simulations.
 
     Attributes:
@@ -49,7 +49,7 @@ class Standing(NamedTuple):
     failed: list[str]
 
 
-def list_standings(statistics: ComparisonStatistics, kind: str) -> list[Standing]:
+def rank_at_checkpoints(statistics: ComparisonStatistics, kind: str) -> list[TunerRanking]:
     """List the verdicts after 1, 3, 10 and all simulations in one range.
 
     Args:
@@ -67,7 +67,7 @@ def _select_range(statistics: ComparisonStatistics, kind: str) -> pd.DataFrame:
     return statistics.ranking[statistics.ranking["range"] == kind]
 
 
-def _sort_by_verdict(statistics: ComparisonStatistics, k: int, part: pd.DataFrame) -> Standing:
+def _sort_by_verdict(statistics: ComparisonStatistics, k: int, part: pd.DataFrame) -> TunerRanking:
     """Sort the tuners of one range by their verdict after `k` simulations.
 
     `part` are the rows of the ranking for this range and this number of simulations.
@@ -79,7 +79,7 @@ def _sort_by_verdict(statistics: ComparisonStatistics, k: int, part: pd.DataFram
     # Equal tuners are in the order of legends, so that a page has one order.
     best = sorted(named(BEST, EQUAL)["tuner"], key=statistics.order.index)
     first = named(BEST)
-    return Standing(
+    return TunerRanking(
         k,
         [str(name) for name in best],
         _format_best_error(statistics, float(first["median"].iloc[0])) if len(first) else "",
@@ -159,7 +159,7 @@ def _count_tested_tuners(statistics: ComparisonStatistics, kind: str) -> int:
     return max(part.loc[part["verdict"] != FAILED, "tuner"].nunique() - 1, 0)
 
 
-def warn_too_few_targets(statistics: ComparisonStatistics, kind: str) -> str:
+def warn_about_target_count(statistics: ComparisonStatistics, kind: str) -> str:
     """Warn if there are too few targets for any significant difference; empty otherwise.
 
     Args:

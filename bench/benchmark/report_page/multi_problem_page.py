@@ -28,7 +28,7 @@ _LABELS = {
     "heldout_error": "RMSE on held-out runs, median",
     "obs_error": "RMSE on the runs tuned on, median",
 }
-TunerLooks = Sequence[tuple[str, MarkStyle]]
+TunerMarkStyles = Sequence[tuple[str, MarkStyle]]
 """Tuners in the order of the legend, each with its style."""
 
 
@@ -110,7 +110,7 @@ def render_multi_problem_page(several: MultiProblemPageData) -> str:
 
 
 def make_runtime_panel(
-    styles: TunerLooks, shares: Mapping[str, Array]
+    styles: TunerMarkStyles, shares: Mapping[str, Array]
 ) -> tuple[Panel, pd.DataFrame]:
     """Make the panel of runtime distributions over all problems, with its table.
 

@@ -68,9 +68,9 @@ NUMERICAL_PACKAGES = (
     "torch",
 )
 """Numerical packages; another version of one may give other results."""
-_PLUGIN = "simgap_plugin_"
+_PLUGIN_MODULE_PREFIX = "simgap_plugin_"
 """Prefix of the module names of plugin files (`bench.core.plugin_registries`)."""
-_GROUPS = ("simgap.tuners", "simgap.simulators", "simgap.effects", "simgap.diagnosers")
+_ENTRY_POINT_GROUPS = ("simgap.tuners", "simgap.simulators", "simgap.effects", "simgap.diagnosers")
 """Entry-point groups by which installed plugins register."""
 
 
@@ -200,7 +200,7 @@ def hash_class_source(kind: type) -> str:
 
 def _get_class_name(kind: type) -> str:
     """Return the full name of a class; the changing module name of a plugin file is replaced."""
-    plugin = kind.__module__.startswith(_PLUGIN)
+    plugin = kind.__module__.startswith(_PLUGIN_MODULE_PREFIX)
     return f"{'plugin' if plugin else kind.__module__}.{kind.__qualname__}"
 
 
@@ -307,7 +307,7 @@ def _make_source_error(kind: type) -> InputError:
 @cache
 def _list_plugin_packages() -> frozenset[str]:
     """Return the top-level packages of installed plugins, including this project's own."""
-    entries = [entry for group in _GROUPS for entry in entry_points(group=group)]
+    entries = [entry for group in _ENTRY_POINT_GROUPS for entry in entry_points(group=group)]
     return frozenset(entry.module.partition(".")[0] for entry in entries)
 
 

@@ -399,13 +399,13 @@ def _validate_part(part: Any, file: str) -> dict[str, Any]:
 
 
 def serve_inspection(
-    channel: MessageChannel, _reach: AccessPolicy, active_layers: list[str]
+    channel: MessageChannel, _policy: AccessPolicy, active_layers: list[str]
 ) -> None:
     """Answer one question about a plugin; runs in the isolated process.
 
     Args:
         channel: channel to the harness.
-        _reach: access policy; not used.
+        _policy: access policy; not used.
         active_layers: names of the active isolation layers.
     """
     channel.send_document(b"R", active_layers)

@@ -20,8 +20,7 @@ from bench.benchmark.isolation.process_exit import RunEndedError
 from bench.benchmark.isolation.rng_transfer import decode_rng_state, encode_rng_state
 from bench.benchmark.isolation.tuner_processes import IsolatedProcess
 from bench.benchmark.problem.training_simulator import CountedTrainingSimulator
-from methods.tuner import BudgetExceededError, TrainingCallback
-from methods.tuner import TrainingSimulator as Ground
+from methods.tuner import BudgetExceededError, TrainingCallback, TrainingSimulator
 from sims.core.simulator import Array
 
 _NO_DEADLINE = float("inf")
@@ -30,7 +29,7 @@ _NO_DEADLINE = float("inf")
 
 def train_remotely(
     child: IsolatedProcess,
-    practice: CountedTrainingSimulator,
+    simulator: CountedTrainingSimulator,
     stream: NDArray[np.uint32],
     watch: TrainingCallback | None,
 ) -> dict[str, Array]:
@@ -38,7 +37,7 @@ def train_remotely(
 
     Args:
         child: process of the tuner.
-        practice: training simulator, which counts the simulations.
+        simulator: training simulator, which counts the simulations.
         stream: seed of the tuner's random generator.
         watch: training callback; None for none.
 
@@ -49,15 +48,15 @@ def train_remotely(
         RunEndedError: the tuner failed.
         KilledExternallyError: its process was killed externally.
     """
-    request = {"stream": stream.astype(np.int64), "budget": np.array(practice.budget)}
+    request = {"stream": stream.astype(np.int64), "budget": np.array(simulator.budget)}
     child.send(b"F", *pack_arrays(request), flags=watch is not None, deadline=_NO_DEADLINE)
-    grounds: list[Ground] = [practice]
+    simulators: list[TrainingSimulator] = [simulator]
     while True:
         message = child.receive(MAX_STATE_BYTES, _NO_DEADLINE)
         try:
             if message.kind == b"L":
                 return unpack_arrays(message.body)
-            _handle_message(child, message, grounds, watch)
+            _handle_message(child, message, simulators, watch)
         except ProtocolError as error:
             raise RunEndedError(
                 "crashed", f"the tuner's process violated the message protocol: {error}"
@@ -67,7 +66,7 @@ def train_remotely(
 def _handle_message(
     child: IsolatedProcess,
     message: Message,
-    grounds: list[Ground],
+    simulators: list[TrainingSimulator],
     callback: TrainingCallback | None,
 ) -> None:
     """Handle one message of a tuner during its training.
@@ -84,9 +83,9 @@ def _handle_message(
         and (callback is not None or not message.flags & 1)
     ):
         # The second simulator is for evaluation only, and exists only if there is a callback.
-        if message.flags & 1 and callback is not None and len(grounds) == 1:
-            grounds.append(callback.ground)
-        _serve_simulation(child, message, grounds[message.flags & 1])
+        if message.flags & 1 and callback is not None and len(simulators) == 1:
+            simulators.append(callback.ground)
+        _serve_simulation(child, message, simulators[message.flags & 1])
     else:
         raise ProtocolError("it sent a message of an unexpected kind")
 
@@ -104,7 +103,9 @@ def _parse_progress(document: Any) -> tuple[str, int, int, float, float]:
         raise ProtocolError("its report of progress is not valid") from None
 
 
-def _serve_simulation(child: IsolatedProcess, message: Message, ground: Ground) -> None:
+def _serve_simulation(
+    child: IsolatedProcess, message: Message, simulator: TrainingSimulator
+) -> None:
     """Send the properties of a simulator, and simulate if the message requests it.
 
     It serves a learned tuner that trains in an isolated process. A request that is not valid, or
@@ -113,24 +114,24 @@ def _serve_simulation(child: IsolatedProcess, message: Message, ground: Ground) 
     result: dict[str, NDArray[Any]] = {}
     if message.flags & 2:
         try:
-            result = _simulate_points(message, ground)
+            result = _simulate_points(message, simulator)
         except (ValueError, BudgetExceededError) as error:
             kind = "budget" if isinstance(error, BudgetExceededError) else "value"
             refusal = json.dumps({"kind": kind, "says": str(error)}).encode()
             child.send(b"X", refusal, deadline=_NO_DEADLINE)
             return
     properties = {
-        "training": ground.training,
-        "scale": ground.scale,
-        "lengths": np.array(ground.lengths, dtype=np.int64),
-        "initial": ground.scene.initial,
-        "inputs": ground.scene.inputs,
-        "counts": np.array([ground.used, ground.budget], dtype=np.int64),
+        "training": simulator.training,
+        "scale": simulator.scale,
+        "lengths": np.array(simulator.lengths, dtype=np.int64),
+        "initial": simulator.scene.initial,
+        "inputs": simulator.scene.inputs,
+        "counts": np.array([simulator.used, simulator.budget], dtype=np.int64),
     }
     child.send(b"O", *pack_arrays({**properties, **result}), deadline=_NO_DEADLINE)
 
 
-def _simulate_points(message: Message, ground: Ground) -> dict[str, NDArray[Any]]:
+def _simulate_points(message: Message, simulator: TrainingSimulator) -> dict[str, NDArray[Any]]:
     """Simulate the requested points.
 
     Returns:
@@ -138,9 +139,9 @@ def _simulate_points(message: Message, ground: Ground) -> dict[str, NDArray[Any]
     """
     request = unpack_arrays(message.body)
     points = request.get("points", np.empty(0))
-    if points.dtype != np.float64 or points.ndim != 2 or points.shape[1] != ground.dim:
+    if points.dtype != np.float64 or points.ndim != 2 or points.shape[1] != simulator.dim:
         raise ProtocolError("it requested no points")
     generator = np.random.Generator(np.random.PCG64())
     generator.bit_generator.state = decode_rng_state(request.get("rng", np.empty(0)))
-    observations = ground.simulate(generator, points)
+    observations = simulator.simulate(generator, points)
     return {"observations": observations, "rng": encode_rng_state(generator.bit_generator.state)}

@@ -37,15 +37,15 @@ _RUN_MEMORY = 500
 """Memory of a planned run in bytes: its request, its id and its status."""
 _RUN_SECONDS = 5e-4
 """Time to score and store a run, in seconds."""
-_PER_PART = 1000
+_RUNS_PER_PART = 1000
 """Number of runs that share a file while a comparison is running."""
-_WORKER = 30e6
+_WORKER_BYTES = 30e6
 """Memory of a worker process in bytes that is not shared with other processes."""
-_CLUSTER = 10_000
+_MAX_CLUSTER_WORKERS = 10_000
 """Assumed maximum number of workers of a cluster."""
-_TRAINING = 0.1
+_MIN_TRAINING_SECONDS = 0.1
 """Minimum duration of a training in seconds."""
-_USUAL: Mapping[str, float] = {
+_TYPICAL_SIZES: Mapping[str, float] = {
     "targets": 100,
     "seeds": 5,
     "budget": 100,
@@ -153,12 +153,12 @@ def estimate_comparison_need(
     held_out = experiment.held_out.scenarios if experiment.held_out else 0
     longest = max((budget for _, budget in each), default=0)
     trained = experiment.training_budget if sizes.learned else 0
-    workers = _CLUSTER if cluster else max(jobs, 1)
+    workers = _MAX_CLUSTER_WORKERS if cluster else max(jobs, 1)
     memory = (
         runs * _RUN_MEMORY
         + targets * (1 + held_out) * sizes.observation
         + rows * _ROW_MEMORY
-        + (0 if cluster else jobs * _WORKER)
+        + (0 if cluster else jobs * _WORKER_BYTES)
         + longest * (sizes.dim + 1) * BYTES_PER_NUMBER
         + trained * sizes.observation
         + sizes.steps * BYTES_PER_STEP
@@ -185,7 +185,7 @@ def estimate_comparison_need(
         _suggest_reduction(counts),
         memory,
         rows * _ROW_DISK,
-        runs / _PER_PART,
+        runs / _RUNS_PER_PART,
         sizes.steps,
         seconds,
     )
@@ -193,7 +193,7 @@ def estimate_comparison_need(
 
 def _suggest_reduction(counts: Mapping[str, float]) -> str:
     """Suggest a change: reduce the number that is largest compared with its typical value."""
-    largest = max(counts, key=lambda name: counts[name] / _USUAL[name])
+    largest = max(counts, key=lambda name: counts[name] / _TYPICAL_SIZES[name])
     if largest == "steps":
         return "set a longer time_step, or sample a shorter time"
     return f"lower {largest}"
@@ -222,6 +222,6 @@ def check_training_size(
         memory=budget * sizes.observation + sizes.steps * BYTES_PER_STEP,
         files=seeds,
         steps=sizes.steps,
-        seconds=seeds * (_TRAINING + budget * sizes.simulation),
+        seconds=seeds * (_MIN_TRAINING_SECONDS + budget * sizes.simulation),
     )
     check_feasible(f"experiment {experiment.name}", need, get_machine_resources(), force)

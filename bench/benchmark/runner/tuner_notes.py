@@ -10,7 +10,7 @@ from bench.benchmark.runner.worker_tasks import RunOutcome
 
 SLOW_IMPORTS = 1.0
 """Minimum import time of a run, in seconds, for suggesting one process for several runs."""
-_NAMED = 3
+_MAX_NAMED_FILES = 3
 """Maximum number of file names in a note."""
 
 
@@ -56,8 +56,8 @@ class Notes:
         for label, tuner in self._tuners.items():
             if tuner.files:
                 files = "1 file" if tuner.files == 1 else f"{tuner.files} files"
-                names = ", ".join(list(tuner.names)[:_NAMED])
-                suffix = ", …" if tuner.unnamed or len(tuner.names) > _NAMED else ""
+                names = ", ".join(list(tuner.names)[:_MAX_NAMED_FILES])
+                suffix = ", …" if tuner.unnamed or len(tuner.names) > _MAX_NAMED_FILES else ""
                 were = "was" if tuner.files == 1 else "were"
                 lines.append(
                     f"{files} written by tuner {label} ({names}{suffix}) {were} discarded with its "

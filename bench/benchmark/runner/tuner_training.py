@@ -46,7 +46,7 @@ from sims.core.simulator import Array, InputError
 
 _COST_ARRAY = "__simulations_and_seconds__"
 """Name of the array with the cost of the training: simulations and seconds."""
-_KEY = "__key__"
+_KEY_ARRAY = "__key__"
 """Name of the array with the training key."""
 _REMEDY = "delete it to train again"
 """Advice for a file that cannot be used; it is never repaired silently."""
@@ -178,7 +178,7 @@ class TrainingRequest:
 
 def train_or_load(
     experiment: Experiment,
-    lesson: TrainingRequest,
+    request: TrainingRequest,
     watch: TrainingCallback | None = None,
     anew: bool = False,
 ) -> TrainingResult:
@@ -186,7 +186,7 @@ def train_or_load(
 
     Args:
         experiment: configuration with the simulator and the training budget.
-        lesson: request of the training.
+        request: request of the training.
         watch: training callback; None for none.
         anew: True to train even if there are weights, and to replace them.
 
@@ -199,7 +199,7 @@ def train_or_load(
     """
     earlier_requests: list[str] = []
     return retry_if_killed(
-        lambda: _train_or_read_weights(experiment, lesson, watch, anew, earlier_requests)
+        lambda: _train_or_read_weights(experiment, request, watch, anew, earlier_requests)
     )
 
 
@@ -244,7 +244,7 @@ def _train_or_read_weights(
     # Cost and key are stored with the weights, so that an exchanged file is detected.
     metadata = {
         _COST_ARRAY: np.array([practice.used, seconds]),
-        _KEY: np.frombuffer(name.encode(), dtype=np.uint8),
+        _KEY_ARRAY: np.frombuffer(name.encode(), dtype=np.uint8),
     }
     _write_atomically(path, {**state, **metadata})
     return TrainingResult(path, practice.used, seconds)
@@ -297,29 +297,29 @@ class _ReplayCheckedSimulator(CountedTrainingSimulator):
 
 def _train_in_process(
     request: TrainingRequest,
-    practice: CountedTrainingSimulator,
+    simulator: CountedTrainingSimulator,
     stream: NDArray[np.uint32],
     callback: TrainingCallback | None,
 ) -> Mapping[str, Array]:
     """Train a trusted tuner in this process, and return its weights."""
     tuner = build_tuner(request.entry)
     tuner.watch = callback
-    tuner.fit(practice, np.random.default_rng(stream), practice.budget)
+    tuner.fit(simulator, np.random.default_rng(stream), simulator.budget)
     return tuner.state()
 
 
 def _train_isolated(
     request: TrainingRequest,
-    practice: CountedTrainingSimulator,
+    simulator: CountedTrainingSimulator,
     stream: NDArray[np.uint32],
     callback: TrainingCallback | None,
 ) -> Mapping[str, Array]:
     """Train a tuner in its isolated process, and return its weights; this process simulates."""
     assert request.tuned is not None
     with start_isolated_tuner(request.tuned, request.seed, "run", request.hidden) as tuner:
-        state = train_remotely(tuner.child, practice, stream, callback)
+        state = train_remotely(tuner.child, simulator, stream, callback)
     # These names are arguments of `np.savez` or reserved in the file.
-    reserved = {"file", "allow_pickle", _COST_ARRAY, _KEY} & set(state)
+    reserved = {"file", "allow_pickle", _COST_ARRAY, _KEY_ARRAY} & set(state)
     if reserved:
         raise RunEndedError(
             "crashed", f"the tuner's state has arrays with the reserved names {reserved}"
@@ -382,7 +382,7 @@ def read_weights(path: Path) -> dict[str, Array]:
         WeightsError: the file is missing, damaged, or of another training.
     """
     state = _read_checked_arrays(path, path.stem)
-    del state[_COST_ARRAY], state[_KEY]
+    del state[_COST_ARRAY], state[_KEY_ARRAY]
     return state
 
 
@@ -411,7 +411,7 @@ def _read_checked_arrays(path: Path, name: str) -> dict[str, Array]:
         raise WeightsError(
             f"{path}: expected trained weights, found none or a damaged file; {_REMEDY}"
         ) from None
-    counts, stored_key = arrays.get(_COST_ARRAY, np.empty(0)), arrays.get(_KEY, np.empty(0))
+    counts, stored_key = arrays.get(_COST_ARRAY, np.empty(0)), arrays.get(_KEY_ARRAY, np.empty(0))
     if (
         counts.shape != (2,)
         or counts.dtype != np.float64

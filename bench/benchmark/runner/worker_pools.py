@@ -282,8 +282,8 @@ class _WorkerSlot:
     def _start_process(self) -> None:
         """Start a new process in its own pebble pool.
 
-        `_births` is the pipe through which processes of this pool report that they have started,
-        and `_born` counts these reports.
+        `_start_receiver` is the pipe through which processes of this pool report that they have
+        started, and `_start_count` counts these reports.
         """
         from pebble import ProcessPool
 
@@ -291,9 +291,9 @@ class _WorkerSlot:
         context = WorkerContext()
         # Each process that the pool starts reports here. A second report means that the first
         # process is dead, which pebble does not notice if the exit code is 0.
-        self._births, births_sender = context.Pipe(duplex=False)
-        self._born = 0
-        arguments = (self._plugins, births_sender)
+        self._start_receiver, start_sender = context.Pipe(duplex=False)
+        self._start_count = 0
+        arguments = (self._plugins, start_sender)
         self._pool = ProcessPool(
             1, initializer=initialise_worker, initargs=arguments, context=context
         )
@@ -359,10 +359,10 @@ class _WorkerSlot:
 
     def _was_replaced_without_result(self) -> bool:
         """Return whether the process was replaced although its running call has no result."""
-        while self._births.poll():
-            self._births.recv()
-            self._born += 1
-        return self._born > 1 and any(future.running() for future in self.given)
+        while self._start_receiver.poll():
+            self._start_receiver.recv()
+            self._start_count += 1
+        return self._start_count > 1 and any(future.running() for future in self.given)
 
     def _replace_process(self) -> None:
         """Replace a lost worker process.
@@ -378,7 +378,7 @@ class _WorkerSlot:
             )
         self.given.clear()
         self.stop()
-        self._births.close()
+        self._start_receiver.close()
         self._start_process()
 
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from bench.benchmark.runner.plugin_discovery import Plugin
 
 
-def initialise_worker(plugins: Sequence[Plugin], births: Any) -> None:
+def initialise_worker(plugins: Sequence[Plugin], start_sender: Any) -> None:
     """Initialise a worker process.
 
     It ignores interrupts, discards its output, ends with its parent, and protects its memory from
@@ -23,12 +23,12 @@ def initialise_worker(plugins: Sequence[Plugin], births: Any) -> None:
 
     Args:
         plugins: plugins to load or to register.
-        births: connection on which the worker reports that it has started.
+        start_sender: connection on which the worker reports that it has started.
     """
     # Ctrl-C in a terminal reaches every process of the group; only the parent handles it.
     ignore_interrupts()
     # This comes before everything that may fail: an unreported start would look like a busy worker.
-    births.send(os.getpid())
+    start_sender.send(os.getpid())
     threading.Thread(target=_end_with_parent, daemon=True, name="end-with-parent").start()
     set_not_dumpable()
     from bench.benchmark.runner.plugin_discovery import register_plugins

@@ -70,7 +70,7 @@ class ComparisonStatistics:
         if not in_widths:
             # For a recording no error is known to be zero; the smallest median error is used
             # instead.
-            self.floor = (1.0 + self.floor) * _find_least_median(self.curves)
+            self.floor = (1.0 + self.floor) * _find_lowest_median(self.curves)
         self.all_runs = runs
         self._curves: dict[str, RunCurves] = {}
         self._medians: dict[tuple[str, str], pd.DataFrame] = {}
@@ -266,7 +266,7 @@ class ComparisonStatistics:
         return max(self.tuning_costs)
 
 
-def _find_least_median(curves: RunCurves) -> float:
+def _find_lowest_median(curves: RunCurves) -> float:
     """Return the smallest median final error of any tuner; 0 if every run failed."""
     medians = [
         float(np.median(curves.select(tuner=t).compute_final_values()))

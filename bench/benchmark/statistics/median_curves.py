@@ -32,9 +32,9 @@ DISTANCE_COLUMNS = [
     "low",
     "high",
 ]
-_MOST_GROUPS = 4
+_MAX_GROUPS = 4
 """Maximum number of groups of targets outside the training range."""
-_GROUP = 4
+_MIN_GROUP_SIZE = 4
 """Minimum number of targets in a group outside the training range.
 
 A group can be smaller if there are fewer targets in total. The interval of a smaller group would
@@ -44,7 +44,7 @@ _BOOTSTRAP_RESAMPLES = 500
 """Number of bootstrap resamples; enough for an interval band a few pixels wide."""
 _CURVE_POINT_COUNT = 40
 """Number of points of a curve, on a logarithmic scale of simulations."""
-_SAME = 0.02
+_MAX_INVISIBLE_DIFFERENCE = 0.02
 """Relative difference of errors that is not visible on a logarithmic axis."""
 _DISTANCE_CHECKPOINTS = (3, 10)
 """Numbers of simulations for plots of error against distance, in addition to the whole budget."""
@@ -102,8 +102,9 @@ def find_coinciding_curves(
 ) -> dict[str, str]:
     """Find curves that cannot be seen because another one is drawn above them.
 
-    A curve coincides with a later one up to k if the two differ by less than `_SAME` in every panel
-    up to k, and if they have halved the initial error by then. Before that most tuners are equal.
+    A curve coincides with a later one up to k if the two differ by less than
+    `_MAX_INVISIBLE_DIFFERENCE` in every panel up to k, and if they have halved the initial error by
+    then. Before that most tuners are equal.
 
     Args:
         curves_by_tuner: curves of each tuner in drawing order, one per panel: medians by number of
@@ -139,7 +140,9 @@ def _count_equal_simulations(first: pd.Series[float], second: pd.Series[float]) 
     """Return the largest number of simulations up to which two curves look the same; 0 for none."""
     points = first.index.intersection(second.index)
     a, b = first[points].to_numpy(), second[points].to_numpy()
-    is_equal = np.logical_and.accumulate(np.abs(a - b) <= _SAME * np.maximum(a, b))
+    is_equal = np.logical_and.accumulate(
+        np.abs(a - b) <= _MAX_INVISIBLE_DIFFERENCE * np.maximum(a, b)
+    )
     return int(points[is_equal][-1]) if is_equal.any() else 0
 
 
@@ -149,7 +152,7 @@ def compute_medians_by_distance(
     """Compute median errors by distance from the training range, after few and all simulations.
 
     Targets inside the training range are one group (bin 0). Those outside are sorted by distance
-    and divided into at most `_MOST_GROUPS` groups of equal size.
+    and divided into at most `_MAX_GROUPS` groups of equal size.
 
     Args:
         curves: error of the runs in the range `wide`.
@@ -194,7 +197,7 @@ def _group_by_distance(distances: pd.Series[float]) -> dict[int, list[str]]:
     """Return the target names of each group: 0 inside the training range, then by distance."""
     names_inside = list(distances.index[distances <= 0])
     outside = list(distances[distances > 0].sort_values(kind="stable").index)
-    count = min(max(len(outside) // _GROUP, 1), _MOST_GROUPS)
+    count = min(max(len(outside) // _MIN_GROUP_SIZE, 1), _MAX_GROUPS)
     parts = [list(part) for part in np.array_split(np.array(outside, dtype=object), count)]
     return {b: names for b, names in enumerate([names_inside, *parts]) if names}
 

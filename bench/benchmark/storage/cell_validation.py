@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 Mask = NDArray[np.bool_]
 
-_TEXTS: Mapping[type, str] = {
+_VALUE_PATTERNS: Mapping[type, str] = {
     bool: "True|False",
     int: r"-?\d{1,18}",
     float: r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d{1,3})?|-?inf|nan|",
@@ -121,7 +121,7 @@ def parse_csv_column(column: ColumnSpec, values: pa.Array) -> pa.Array:
 
     if column.kind is str:
         return values
-    is_valid = compute.match_substring_regex(values, f"^({_TEXTS[column.kind]})$")
+    is_valid = compute.match_substring_regex(values, f"^({_VALUE_PATTERNS[column.kind]})$")
     _raise_for_bad_row(
         column,
         to_numpy_mask(compute.invert(is_valid)),
@@ -172,7 +172,7 @@ def check_cells(
     column: ColumnSpec,
     values: pa.Array,
     at_start: Mask | None = None,
-    no_truth: Mask | None = None,
+    is_recording: Mask | None = None,
 ) -> None:
     """Check that every cell fits the declaration of its column.
 
@@ -180,7 +180,7 @@ def check_cells(
         column: Its declaration.
         values: Result of `parse_parquet_column`, `parse_csv_column` or `parse_json_column`.
         at_start: Mask of rows with k = 0.
-        no_truth: Mask of rows of a recording.
+        is_recording: Mask of rows of a recording.
 
     Raises:
         CellError: The first cell that does not.
@@ -204,7 +204,7 @@ def check_cells(
         EmptyCellRule.NEVER: np.zeros(len(numbers), dtype=bool),
         EmptyCellRule.MAY: empty,
         EmptyCellRule.AT_START: at_start,
-        EmptyCellRule.NO_TRUTH: no_truth,
+        EmptyCellRule.RECORDING_ONLY: is_recording,
     }[column.empty]
     if is_empty_required is None:
         return

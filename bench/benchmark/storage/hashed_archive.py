@@ -28,24 +28,25 @@ MANIFEST_FILE = "manifest.json"
 MAX_UNPACKED_BYTES = 8 << 30
 """Maximum size of an unpacked archive in bytes."""
 MAX_COMPRESSION_RATIO = 200
-"""Maximum ratio of unpacked to packed size, if the unpacked size exceeds `_HARMLESS`."""
-_HARMLESS = 100 << 20
-_MOST = 100_000
+"""Maximum ratio of unpacked to packed size, if the unpacked size exceeds
+`_MIN_BYTES_FOR_RATIO_CHECK`."""
+_MIN_BYTES_FOR_RATIO_CHECK = 100 << 20
+_MAX_FILES = 100_000
 """Maximum number of files in an archive."""
-_MANIFEST_BYTES = 64 << 20
-_BLOCK = 1 << 20
+_MAX_MANIFEST_BYTES = 64 << 20
+_BLOCK_BYTES = 1 << 20
 """Number of bytes that are read at a time."""
-_EPOCH = (1980, 1, 1, 0, 0, 0)
+_ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)
 """The earliest time that a zip file can store, which is given to every file."""
-_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+_COMPRESSION_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 """Compression methods that an archive may have."""
-_ENCRYPTED = 0x1
+_ENCRYPTED_FLAG = 0x1
 """Flag of an encrypted file in a zip archive."""
-_LONGEST = 1000
+_MAX_PATH_LENGTH = 1000
 """Maximum length of a path in characters."""
 
 
-class ArchiveFault(NamedTuple):
+class ManifestMismatch(NamedTuple):
     """A difference between an archive and its manifest.
 
     Attributes:
@@ -89,7 +90,7 @@ def write_archive(
                     place.open("rb") as source,
                     packed.open(_make_zip_header(f"{name}/{path}"), "w") as target,
                 ):
-                    while block := source.read(_BLOCK):
+                    while block := source.read(_BLOCK_BYTES):
                         target.write(block)
     except OSError as error:
         raise InputError(f"{archive}: cannot be written ({error.strerror})") from None
@@ -100,7 +101,7 @@ def _make_zip_header(path: str) -> zipfile.ZipInfo:
 
     The bytes of the archive then depend on the content of the files only.
     """
-    entry = zipfile.ZipInfo(path, _EPOCH)
+    entry = zipfile.ZipInfo(path, _ZIP_EPOCH)
     entry.create_system = 3  # Always Unix, so that the bytes do not depend on this machine.
     entry.external_attr = (stat.S_IFREG | 0o644) << 16
     entry.compress_type = zipfile.ZIP_DEFLATED
@@ -113,12 +114,12 @@ class UnpackedArchive(NamedTuple):
     Attributes:
         folder: Temporary folder with its content.
         manifest: Its manifest.
-        faults: Differences from the manifest.
+        mismatches: Differences from the manifest.
     """
 
     folder: Path
     manifest: dict[str, Any]
-    faults: list[ArchiveFault]
+    mismatches: list[ManifestMismatch]
 
 
 @contextmanager
@@ -157,8 +158,8 @@ def _check_entries(archive: Path, packed: zipfile.ZipFile) -> list[zipfile.ZipIn
         InputError: One cannot.
     """
     entries = packed.infolist()
-    if len(entries) > _MOST:
-        raise _make_refusal(archive, f"{len(entries)} files, at most {_MOST} expected")
+    if len(entries) > _MAX_FILES:
+        raise _make_refusal(archive, f"{len(entries)} files, at most {_MAX_FILES} expected")
     for entry in entries:
         if problem := _find_entry_error(entry):
             raise _make_refusal(archive, f"{entry.filename[:80]!r} {problem}")
@@ -169,7 +170,9 @@ def _check_entries(archive: Path, packed: zipfile.ZipFile) -> list[zipfile.ZipIn
     if repeated_names:
         raise _make_refusal(archive, f"{repeated_names[0]!r} is in it twice")
     total, size = sum(entry.file_size for entry in entries), archive.stat().st_size
-    if total > MAX_UNPACKED_BYTES or (total > _HARMLESS and total > MAX_COMPRESSION_RATIO * size):
+    if total > MAX_UNPACKED_BYTES or (
+        total > _MIN_BYTES_FOR_RATIO_CHECK and total > MAX_COMPRESSION_RATIO * size
+    ):
         raise _make_refusal(archive, f"it would unpack from {size} bytes to {total}")
     if packed.comment or min((e.header_offset for e in entries), default=0) > 0:
         raise _make_refusal(archive, "it contains data that belong to no file")
@@ -187,13 +190,13 @@ def _find_entry_error(entry: zipfile.ZipInfo) -> str:
     # If the two stored names of an entry differ, programs would unpack it to different paths.
     if name != entry.orig_filename or "\\" in name or ":" in name or not name.isprintable():
         return "is not a plain path"
-    if len(name) > _LONGEST or any(part in ("", ".", "..") for part in parts):
+    if len(name) > _MAX_PATH_LENGTH or any(part in ("", ".", "..") for part in parts):
         return "is not a path inside its folder"
     if kind not in (0, stat.S_IFREG) or entry.is_dir():
         return "is a link, a folder or a device; expected a file"
-    if entry.flag_bits & _ENCRYPTED:
+    if entry.flag_bits & _ENCRYPTED_FLAG:
         return "is encrypted"
-    if entry.compress_type not in _METHODS:
+    if entry.compress_type not in _COMPRESSION_METHODS:
         return "is compressed in a way that simgap does not use"
     return ""
 
@@ -229,7 +232,7 @@ def _read_manifest(archive: Path, packed: zipfile.ZipFile, top: str) -> dict[str
         InputError: the manifest is too large, or does not follow its schema.
     """
     entry = packed.getinfo(f"{top}/{MANIFEST_FILE}")
-    if entry.file_size > _MANIFEST_BYTES:
+    if entry.file_size > _MAX_MANIFEST_BYTES:
         raise _make_refusal(archive, f"{MANIFEST_FILE} has {entry.file_size} bytes")
     try:
         manifest = json.loads(packed.read(entry))
@@ -263,27 +266,27 @@ def _unpack_file(
 
 
 def _read_blocks(source: IO[bytes]) -> Iterator[bytes]:
-    while block := source.read(_BLOCK):
+    while block := source.read(_BLOCK_BYTES):
         yield block
 
 
 def _compare_with_manifest(
     manifest: dict[str, Any], unpacked: Mapping[str, tuple[int, str]]
-) -> Iterator[ArchiveFault]:
+) -> Iterator[ManifestMismatch]:
     """Yield files that are missing, added, or different from the manifest."""
     listed_files = {each["path"]: (each["bytes"], each["sha256"]) for each in manifest["files"]}
     if len(listed_files) < len(manifest["files"]):
-        yield ArchiveFault(MANIFEST_FILE, "expected each file once, found one listed twice")
+        yield ManifestMismatch(MANIFEST_FILE, "expected each file once, found one listed twice")
     for path in sorted({*listed_files, *unpacked}):
         if path not in unpacked:
-            yield ArchiveFault(path, "expected it, as the manifest lists it; found none")
+            yield ManifestMismatch(path, "expected it, as the manifest lists it; found none")
         elif path not in listed_files:
-            yield ArchiveFault(
+            yield ManifestMismatch(
                 path, "expected no file that the manifest does not list; found this one"
             )
         elif listed_files[path] != unpacked[path]:
             (size, digest), (found_size, found_digest) = listed_files[path], unpacked[path]
             expected = f"{size} bytes with SHA-256 {digest[:12]}"
-            yield ArchiveFault(
+            yield ManifestMismatch(
                 path, f"expected {expected}, found {found_size} bytes with {found_digest[:12]}"
             )

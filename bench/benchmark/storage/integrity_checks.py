@@ -50,27 +50,27 @@ class CheckedFiles(NamedTuple):
 
 
 def check_files(
-    folder: Path, experiment: Experiment, *, under_way: bool, plan: list[str] | None = None
+    folder: Path, experiment: Experiment, *, is_unfinished: bool, plan: list[str] | None = None
 ) -> CheckedFiles:
     """Check runs.parquet, status.csv, training.csv, identifiability.csv and their consistency.
 
     Args:
         folder: Folder of the comparison.
         experiment: The experiment.
-        under_way: Whether runs may be missing.
+        is_unfinished: Whether runs may be missing.
         plan: The id of every run; None if unknown.
 
     Raises:
         InputError: A check fails; the message is one line.
     """
-    remedy = get_remedy(folder, under_way=under_way)
+    remedy = get_remedy(folder, is_unfinished=is_unfinished)
     file = RunsTable(folder / "runs.parquet", remedy)
     runs = file.read_runs(experiment)
     status = CsvTable(folder / "status.csv", STATUS_COLUMNS, remedy)
     statuses = status.table.to_pandas()
     check_statuses(statuses, experiment, status.make_error)
     executed = statuses[statuses["status"] != "skipped"]
-    if not under_way:
+    if not is_unfinished:
         check_complete(executed, experiment, status.make_error)
         labels = set(statuses["tuner"])
         missing_labels = [label for label in list_tuner_labels(experiment) if label not in labels]
@@ -100,14 +100,14 @@ def check_files(
     )
 
 
-def get_remedy(folder: Path, *, under_way: bool) -> str:
+def get_remedy(folder: Path, *, is_unfinished: bool) -> str:
     """Return advice for a damaged file of results.
 
     Args:
         folder: Folder of the comparison.
-        under_way: Whether its segments still exist.
+        is_unfinished: Whether its segments still exist.
     """
-    if under_way:  # The segments contain everything.
+    if is_unfinished:  # The segments contain everything.
         return f"write it again with simgap compare --resume {folder}"
     return "restore the file, or start a new comparison"
 
@@ -154,24 +154,26 @@ def _list_identifiability_columns(names: list[str]) -> list[ColumnSpec]:
     )
 
 
-def check_statuses(statuses: pd.DataFrame, experiment: Experiment, fault: RowErrorFactory) -> None:
+def check_statuses(
+    statuses: pd.DataFrame, experiment: Experiment, make_error: RowErrorFactory
+) -> None:
     """Check that statuses are unique, belong to the experiment, and are within its budget.
 
     Args:
         statuses: Rows with the columns of `table_schemas.STATUS_COLUMNS`, cells checked.
         experiment: The experiment.
-        fault: Makes the error for a row.
+        make_error: Makes the error for a row.
 
     Raises:
         InputError: A check fails.
     """
     raise_for_first_bad_row(
         statuses["run"].duplicated(),
-        fault,
+        make_error,
         lambda row: f"run: expected every run once, found {statuses['run'].iloc[row]} twice",
     )
-    check_known(statuses["tuner"], list_tuner_labels(experiment), "tuner", fault)
-    check_known(statuses["simulator"], [experiment.simulator], "simulator", fault)
+    check_known(statuses["tuner"], list_tuner_labels(experiment), "tuner", make_error)
+    check_known(statuses["simulator"], [experiment.simulator], "simulator", make_error)
     skipped = statuses["status"] == "skipped"
     id_prefixes = (
         statuses["tuner"] + "/" + statuses["target"] + "/" + statuses["seed"].astype(str) + "/"
@@ -184,7 +186,7 @@ def check_statuses(statuses: pd.DataFrame, experiment: Experiment, fault: RowErr
     ]
     raise_for_first_bad_row(
         ~np.array(has_valid_id, dtype=bool),
-        fault,
+        make_error,
         lambda row: (
             f"run: expected one that begins with {id_prefixes.iloc[row]}, "
             f"found {statuses['run'].iloc[row]}"
@@ -194,14 +196,14 @@ def check_statuses(statuses: pd.DataFrame, experiment: Experiment, fault: RowErr
         statuses["target"][~skipped],
         list_target_names(experiment),
         "target",
-        lambda row, reason: fault(int(np.flatnonzero(~skipped)[row]), reason),
+        lambda row, reason: make_error(int(np.flatnonzero(~skipped)[row]), reason),
     )
     budgets = {entry.label: entry.budget or experiment.budget for entry in experiment.tuners}
     budget = statuses["tuner"].map(budgets).astype(np.int64)  # Also for an empty column.
     simulations = statuses["simulations"]
     raise_for_first_bad_row(
         simulations > budget,
-        fault,
+        make_error,
         lambda row: (
             f"simulations: expected at most {budget.iloc[row]}, "
             f"the budget of {statuses['tuner'].iloc[row]}, found {simulations.iloc[row]}"
@@ -210,7 +212,7 @@ def check_statuses(statuses: pd.DataFrame, experiment: Experiment, fault: RowErr
     # "done" means that the budget was used; a run that ends earlier has converged or failed.
     raise_for_first_bad_row(
         (statuses["status"] == "done") & (simulations != budget),
-        fault,
+        make_error,
         lambda row: (
             f"simulations: expected {budget.iloc[row]} as the run is done, found "
             f"{simulations.iloc[row]}"
@@ -219,7 +221,11 @@ def check_statuses(statuses: pd.DataFrame, experiment: Experiment, fault: RowErr
 
 
 def check_rows_match_statuses(
-    runs: pd.DataFrame, file: RunsTable, statuses: pd.DataFrame, fault: RowErrorFactory, source: str
+    runs: pd.DataFrame,
+    file: RunsTable,
+    statuses: pd.DataFrame,
+    make_error: RowErrorFactory,
+    source: str,
 ) -> None:
     """Check that rows and statuses describe the same runs consistently.
 
@@ -227,7 +233,7 @@ def check_rows_match_statuses(
         runs: One line per run, as read from `file`.
         file: File of the rows.
         statuses: How they ended; cells checked.
-        fault: Makes the error for a row of the statuses.
+        make_error: Makes the error for a row of the statuses.
         source: Name of the file of statuses, for messages.
 
     Raises:
@@ -254,13 +260,13 @@ def check_rows_match_statuses(
     ids = statuses["run"]
     raise_for_first_bad_row(
         is_executed & ~has_rows,
-        fault,
+        make_error,
         lambda row: f"run: {ids[row]} has no rows in {file.path.name}",
     )
     run_statuses, used_counts = statuses.iloc[places].reset_index(drop=True), runs["used"]
     raise_for_first_bad_row(
         run_statuses["simulations"] != used_counts,
-        lambda i, reason: fault(int(places[i]), reason),
+        lambda i, reason: make_error(int(places[i]), reason),
         lambda i: (
             f"simulations: expected {used_counts[i]}, the last k of {names[i]} in "
             f"{file.path.name}, found {run_statuses['simulations'][i]}"

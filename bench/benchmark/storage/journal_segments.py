@@ -30,13 +30,13 @@ PLAN_FILE = "plan.txt"
 """Name of the file of the plan, which lists the id of every run."""
 PLAN_REMEDY = "restore it, or delete it and resume the comparison, which writes it again"
 """Advice for a damaged plan."""
-_HEAD = struct.Struct(">4sII")
+_RECORD_HEADER = struct.Struct(">4sII")
 """Head of a record: mark, length of the content, checksum of the content."""
-_MARK = b"run\n"
+_RECORD_MARK = b"run\n"
 """Mark at the beginning of a record."""
 SEGMENT_REMEDY = "restore it, or delete it and resume the comparison: the runs are repeated"
 """Advice for a damaged segment."""
-_PLACE = ColumnSpec("place in the plan", int, low=0, high=2.0**31)
+_PLAN_INDEX = ColumnSpec("place in the plan", int, low=0, high=2.0**31)
 
 
 def encode_record(place: int, status: RunStatus, rows: pa.Table) -> bytes:
@@ -55,7 +55,7 @@ def encode_record(place: int, status: RunStatus, rows: pa.Table) -> bytes:
     with pa.ipc.new_stream(sink, rows.schema) as stream:
         stream.write_table(rows)
     packed: bytes = sink.getvalue().to_pybytes()
-    return _HEAD.pack(_MARK, len(packed), zlib.crc32(packed)) + packed
+    return _RECORD_HEADER.pack(_RECORD_MARK, len(packed), zlib.crc32(packed)) + packed
 
 
 def read_records(path: Path) -> Iterator[tuple[int, RunStatus, pa.Table, int]]:
@@ -70,16 +70,16 @@ def read_records(path: Path) -> Iterator[tuple[int, RunStatus, pa.Table, int]]:
     import pyarrow as pa
 
     data, end = path.read_bytes(), 0
-    while end + _HEAD.size <= len(data):
-        mark, length, checksum = _HEAD.unpack_from(data, end)
-        payload = data[end + _HEAD.size : end + _HEAD.size + length]
-        if mark != _MARK or len(payload) < length or zlib.crc32(payload) != checksum:
+    while end + _RECORD_HEADER.size <= len(data):
+        mark, length, checksum = _RECORD_HEADER.unpack_from(data, end)
+        payload = data[end + _RECORD_HEADER.size : end + _RECORD_HEADER.size + length]
+        if mark != _RECORD_MARK or len(payload) < length or zlib.crc32(payload) != checksum:
             return
-        end += _HEAD.size + length
+        end += _RECORD_HEADER.size + length
         try:
             rows = pa.ipc.open_stream(payload).read_all()
             statuses = _convert_statuses([json.loads(rows.schema.metadata[b"status"])])
-        except _DAMAGE as error:
+        except _DAMAGE_ERRORS as error:
             raise _make_damage_error(path, f"a record of a run: {get_first_line(error)}") from None
         ((place, status),) = statuses.items()
         yield place, status, rows.replace_schema_metadata(), end
@@ -95,13 +95,21 @@ def read_part_statuses(path: Path) -> dict[int, RunStatus]:
 
     try:
         return _convert_statuses(json.loads(parquet.read_schema(path).metadata[b"statuses"]))
-    except _DAMAGE as error:
+    except _DAMAGE_ERRORS as error:
         raise _make_damage_error(
             path, f"a part of a comparison, found damage: {get_first_line(error)}"
         ) from None
 
 
-_DAMAGE = (OSError, ValueError, KeyError, TypeError, CellError, RecursionError, NotImplementedError)
+_DAMAGE_ERRORS = (
+    OSError,
+    ValueError,
+    KeyError,
+    TypeError,
+    CellError,
+    RecursionError,
+    NotImplementedError,
+)
 """Errors that reading a damaged segment may raise; they include Arrow's own errors."""
 
 
@@ -111,8 +119,8 @@ def _convert_statuses(entries: Any) -> dict[int, RunStatus]:
     Raises:
         CellError: A value violates its declaration.
     """
-    places = cell_validation.parse_json_column(_PLACE, [place for place, _ in entries])
-    cell_validation.check_cells(_PLACE, places)
+    places = cell_validation.parse_json_column(_PLAN_INDEX, [place for place, _ in entries])
+    cell_validation.check_cells(_PLAN_INDEX, places)
     columns = [c for c in STATUS_COLUMNS if c.name in STATUS_COLUMN_NAMES]
     for column in columns:
         values = [status[column.name] for _, status in entries]

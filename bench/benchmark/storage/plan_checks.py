@@ -21,7 +21,7 @@ from sims.core.toml_validation import format_value
 if TYPE_CHECKING:
     import pandas as pd
 
-_SEED = re.compile("[0-9]{1,9}")
+_SEED_PATTERN = re.compile("[0-9]{1,9}")
 
 
 def list_target_names(experiment: Experiment) -> list[str]:
@@ -55,7 +55,7 @@ def check_plan(plan: Sequence[str], experiment: Experiment, path: Path, remedy: 
     rows = []
     for row, name in enumerate(plan):
         parts = name.rsplit("/", 3)
-        if len(parts) != 4 or not _SEED.fullmatch(parts[2]):
+        if len(parts) != 4 or not _SEED_PATTERN.fullmatch(parts[2]):
             raise at(row, f"expected TUNER/TARGET/SEED/HASH, found {format_value(name)}")
         rows.append((name, parts[0], parts[1], int(parts[2])))
     plan_table = pd.DataFrame(rows, columns=["run", "tuner", "target", "seed"])
@@ -69,14 +69,14 @@ def check_plan(plan: Sequence[str], experiment: Experiment, path: Path, remedy: 
 
 
 def check_complete(
-    executed_runs: pd.DataFrame, experiment: Experiment, fault: TableErrorFactory
+    executed_runs: pd.DataFrame, experiment: Experiment, make_error: TableErrorFactory
 ) -> None:
     """Check that each tuner with runs has all of its runs, and no more.
 
     Args:
         executed_runs: Tuner, target and seed of each run; the index is the row in the file.
         experiment: The experiment.
-        fault: Makes the error for a row, or for the file.
+        make_error: Makes the error for a row, or for the file.
 
     Raises:
         InputError: A run is missing, or there is one too many.
@@ -92,13 +92,13 @@ def check_complete(
         if missing:
             target, seed = missing
             problem = f"expected a run of {entry.label} on {target} with seed {seed}, found none"
-            raise fault(None, problem)
+            raise make_error(None, problem)
         if len(tuner_rows) > len(targets) * len(seeds):
             is_surplus = tuner_rows.duplicated(["target", "seed"]) | (
                 tuner_rows["seed"] >= len(seeds)
             )
             row = int(tuner_rows.index[int(is_surplus.to_numpy().argmax())])
-            raise fault(
+            raise make_error(
                 row,
                 f"run: expected {len(targets)} targets with {len(seeds)} seeds, "
                 f"found one more: {tuner_rows['run'][row]}",

@@ -42,13 +42,13 @@ def _name_and_version(distribution: Distribution) -> tuple[str, str]:
     """
     text = distribution.read_text("METADATA") or distribution.read_text("PKG-INFO") or ""
     lines = text.partition("\n\n")[0].splitlines()
-    head = dict(line.split(": ", 1) for line in lines if _FIELD.match(line))
+    head = dict(line.split(": ", 1) for line in lines if _METADATA_FIELD.match(line))
     if {"Name", "Version"} <= head.keys():
         return head["Name"], head["Version"]
     return distribution.metadata["Name"], distribution.version
 
 
-_FIELD = re.compile("(Name|Version): ")
+_METADATA_FIELD = re.compile("(Name|Version): ")
 
 
 def get_utc_time() -> str:

@@ -25,16 +25,19 @@ if TYPE_CHECKING:
 
     from bench.benchmark.problem.experiment import Experiment
 
-_PACKAGE = Path(__file__).resolve().parents[2]
-REFERENCE_FOLDERS = (_PACKAGE.parent / "results" / "reference", _PACKAGE / "reference")
+_PACKAGE_FOLDER = Path(__file__).resolve().parents[2]
+REFERENCE_FOLDERS = (
+    _PACKAGE_FOLDER.parent / "results" / "reference",
+    _PACKAGE_FOLDER / "reference",
+)
 """Folders of references: in the root of a checkout, or in the package of a wheel."""
 _TABLE = "table.csv"
-_DRAWN = ("tuner", "range", "simulations", "metric", "median")
-_COLUMNS = [column for column in ERROR_TABLE_COLUMNS if column.name in _DRAWN]
+_USED_COLUMNS = ("tuner", "range", "simulations", "metric", "median")
+_COLUMNS = [column for column in ERROR_TABLE_COLUMNS if column.name in _USED_COLUMNS]
 """Columns of a table that are read; an older table may lack others."""
-_SAME_PROBLEM = ("simulator", "model", "recording", "observe", "error_channel")
+_PROBLEM_KEYS = ("simulator", "model", "recording", "observe", "error_channel")
 """Keys that must be equal for the errors of two comparisons to be comparable."""
-_ALIKE = (
+_COMPARED_KEYS = (
     "ranges",
     "targets",
     "seeds",
@@ -97,12 +100,12 @@ class ReferenceResult:
         # Keys that were added in a later version cannot be compared with an older file.
         differing = [
             key
-            for key in (*_SAME_PROBLEM, *_ALIKE)
+            for key in (*_PROBLEM_KEYS, *_COMPARED_KEYS)
             if key in self.document
             and _normalise_value(self.document[key]) != drawn_document.get(key)
         ]
         for key in differing:
-            if key in _SAME_PROBLEM:
+            if key in _PROBLEM_KEYS:
                 raise InputError(
                     f"{self.name}: of another problem than experiment {experiment.name}: {key} is "
                     f"{_format_setting(self.document[key])}, "

@@ -272,15 +272,15 @@ def read_comparison(folder: Path, columns: Sequence[str] | None = None) -> Store
 
     experiment = read_configuration(folder).experiment
     path = folder / "runs.parquet"
-    under_way = (folder / SEGMENTS_FOLDER).exists()
+    is_unfinished = (folder / SEGMENTS_FOLDER).exists()
     # The study was killed before its first results were written, so nothing is damaged.
-    if not path.exists() and under_way:
+    if not path.exists() and is_unfinished:
         raise InputError(
             f"{folder}: not finished, and no tables are written yet; resume it to run what is "
             "missing"
         )
-    plan = read_plan(folder) if under_way else None
-    files = check_files(folder, experiment, under_way=under_way, plan=plan)
+    plan = read_plan(folder) if is_unfinished else None
+    files = check_files(folder, experiment, is_unfinished=is_unfinished, plan=plan)
     stored_names = parquet.read_schema(path).names
     read_names = [name for name in stored_names if columns is None or name in columns]
     runs = parquet.read_table(path, columns=read_names).to_pandas()

@@ -21,13 +21,13 @@ TableErrorFactory = Callable[[int | None, str], InputError]
 
 
 def raise_for_first_bad_row(
-    bad: pd.Series | Mask, fault: RowErrorFactory, describe_row: Callable[[int], str]
+    bad: pd.Series | Mask, make_error: RowErrorFactory, describe_row: Callable[[int], str]
 ) -> None:
     """Raise an error for the first bad row.
 
     Args:
         bad: Mask of bad rows.
-        fault: Makes the error.
+        make_error: Makes the error.
         describe_row: Describes what is wrong in a row.
 
     Raises:
@@ -36,11 +36,11 @@ def raise_for_first_bad_row(
     mask = np.asarray(bad, dtype=bool)
     if mask.any():
         row = int(mask.argmax())
-        raise fault(row, describe_row(row))
+        raise make_error(row, describe_row(row))
 
 
 def check_known(
-    values: pd.Series, known_values: Iterable[str], column: str, fault: RowErrorFactory
+    values: pd.Series, known_values: Iterable[str], column: str, make_error: RowErrorFactory
 ) -> None:
     """Reject values that the experiment does not define.
 
@@ -48,14 +48,14 @@ def check_known(
         values: Values to check.
         known_values: Values that the experiment defines.
         column: Name of the quantity.
-        fault: Makes the error.
+        make_error: Makes the error.
 
     Raises:
         InputError: There is an unknown value.
     """
     raise_for_first_bad_row(
         ~values.isin(list(known_values)),
-        fault,
+        make_error,
         lambda row: (
             f"{column}: expected one of experiment.toml, found {format_value(values.iloc[row])}"
         ),
@@ -63,7 +63,7 @@ def check_known(
 
 
 def check_equal(
-    found: pd.Series, expected: pd.Series, name: str, why: str, fault: RowErrorFactory
+    found: pd.Series, expected: pd.Series, name: str, why: str, make_error: RowErrorFactory
 ) -> None:
     """Reject values that differ from the expected ones; two missing values are equal.
 
@@ -72,7 +72,7 @@ def check_equal(
         expected: Expected values.
         name: Name of the column.
         why: Reason for the expected values.
-        fault: Makes the error.
+        make_error: Makes the error.
 
     Raises:
         InputError: A value differs.
@@ -80,6 +80,6 @@ def check_equal(
     is_different = found.to_numpy() != expected.to_numpy()
     raise_for_first_bad_row(
         is_different & ~(found.isna() & expected.isna()).to_numpy(),
-        fault,
+        make_error,
         lambda i: f"{name}: expected {expected[i]} {why}, found {found[i]}",
     )

@@ -194,9 +194,9 @@ def _convert_batch(
     try:
         typed = {c.name: parse_parquet_column(c, batch[c.name].combine_chunks()) for c in columns}
         at_start = typed["k"].to_numpy() == 0
-        no_truth = to_numpy_mask(compute.equal(typed["range"], "real"))
+        is_recording = to_numpy_mask(compute.equal(typed["range"], "real"))
         for column in columns:
-            check_cells(column, typed[column.name], at_start, no_truth)
+            check_cells(column, typed[column.name], at_start, is_recording)
     except CellError as error:
         row = None if error.row is None else error.row + offset
         raise _shift_error_row(error, row) from None

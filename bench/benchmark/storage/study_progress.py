@@ -58,14 +58,14 @@ class StudyProgress(NamedTuple):
         what: What is counted, e.g. ``runs finished``.
         hashes: Hashes of what must not change until it is complete, by readable names.
         ends: How every planned run ended, in the order of the plan.
-        under_way: Whether results remain to be written, although everything may have ended.
+        is_unfinished: Whether results remain to be written, although everything may have ended.
     """
 
     name: str
     what: str
     hashes: Mapping[str, str]
     ends: tuple[RunEnd, ...]
-    under_way: bool = False
+    is_unfinished: bool = False
 
     @property
     def finished(self) -> int:
@@ -75,4 +75,4 @@ class StudyProgress(NamedTuple):
     @property
     def is_complete(self) -> bool:
         """True if nothing is missing."""
-        return not self.under_way and self.finished == len(self.ends)
+        return not self.is_unfinished and self.finished == len(self.ends)

@@ -35,7 +35,7 @@ class EmptyCellRule(Enum):
     NEVER = "never"
     MAY = "anywhere"
     AT_START = "where k = 0, and nowhere else"
-    NO_TRUTH = "on a recording, and nowhere else"
+    RECORDING_ONLY = "on a recording, and nowhere else"
 
 
 @dataclass(frozen=True)
@@ -75,13 +75,13 @@ class ColumnSpec:
             (False, False): "",
             (True, False): f" of at least {self.low:g}",
             (True, True): f" from {self.low:g} to {self.high:g}",
-        }[self.low > -math.inf, self.high < _LARGEST]
+        }[self.low > -math.inf, self.high < _MAX_EXACT_INTEGER]
         number = "a whole number" if self.kind is int else "a number"
         return f"{number}{limit_texts}"
 
 
 Columns = Sequence[ColumnSpec]
-_LARGEST = 2.0**53
+_MAX_EXACT_INTEGER = 2.0**53
 """Upper limit of whole numbers that a float represents exactly."""
 
 
@@ -94,7 +94,7 @@ def _declare_size_column(
 
 def _declare_count_column(name: str, low: int = 0, **options: Any) -> ColumnSpec:
     """Declare a column of whole numbers that are not negative."""
-    return ColumnSpec(name, int, low=low, high=_LARGEST, **options)
+    return ColumnSpec(name, int, low=low, high=_MAX_EXACT_INTEGER, **options)
 
 
 _TRUSTED = ColumnSpec("trusted", bool, required=False, default=False)
@@ -106,14 +106,14 @@ RUN_COLUMNS: Columns = (
     _RANGE,
     _declare_count_column("k"),
     _declare_size_column("loss", EmptyCellRule.AT_START, infinite=True),
-    _declare_size_column("param_error", EmptyCellRule.NO_TRUTH),
-    _declare_size_column("param_abs_error", EmptyCellRule.NO_TRUTH, required=False),
+    _declare_size_column("param_error", EmptyCellRule.RECORDING_ONLY),
+    _declare_size_column("param_abs_error", EmptyCellRule.RECORDING_ONLY, required=False),
     _declare_size_column("stiff_error", EmptyCellRule.MAY, required=False),
     _declare_size_column("sloppy_error", EmptyCellRule.MAY, required=False),
-    _declare_size_column("outside", EmptyCellRule.NO_TRUTH),
+    _declare_size_column("outside", EmptyCellRule.RECORDING_ONLY),
     ColumnSpec("proposal_PARAMETER", float, empty=EmptyCellRule.AT_START),
     ColumnSpec("recommendation_PARAMETER", float),
-    ColumnSpec("true_PARAMETER", float, empty=EmptyCellRule.NO_TRUTH),
+    ColumnSpec("true_PARAMETER", float, empty=EmptyCellRule.RECORDING_ONLY),
     _declare_size_column("obs_error", EmptyCellRule.MAY, infinite=True),
     _declare_size_column("heldout_error", EmptyCellRule.MAY, infinite=True),
     _declare_size_column("obs_error_CHANNEL_in_noise", EmptyCellRule.MAY, infinite=True),

@@ -12,7 +12,7 @@ from bench.cli.catalogue import is_path_argument
 from bench.cli.output import CommandResult, PrintLine
 
 SHELLS = ("bash", "zsh", "fish", "tcsh")
-_FUNCTIONS = """
+_BASH_FUNCTIONS = """
 _simgap_experiments() {{ compgen -W "{experiments}" -- "$1"; compgen -f -- "$1"; }}
 _simgap_parts() {{ compgen -W "{parts}" -- "$1"; }}
 _simgap_schemas() {{ compgen -W "{schemas}" -- "$1"; }}
@@ -58,12 +58,12 @@ def build_completion_script(parser: argparse.ArgumentParser, shell: str) -> str:
         "schemas": list_schema_names(),
     }
     words_by_key = {key: " ".join(values) for key, values in words.items()}
-    functions = _FUNCTIONS.format(**words_by_key) if shell == "bash" else ""
+    functions = _BASH_FUNCTIONS.format(**words_by_key) if shell == "bash" else ""
     script: str = shtab.complete(parser, shell=shell, preamble=functions)
     return script
 
 
-_WORDS = {
+_BASH_COMPLETERS = {
     ("compare", "experiment"): "_simgap_experiments",
     ("train", "experiment"): "_simgap_experiments",
     ("check", "name"): "_simgap_parts",
@@ -77,7 +77,7 @@ def _set_completion(command: str, action: argparse.Action, shtab: Any) -> None:
 
     `shtab` is the library that builds the completion script.
     """
-    known_words = _WORDS.get((command, action.dest))
+    known_words = _BASH_COMPLETERS.get((command, action.dest))
     if known_words:
         complete = {**shtab.FILE, "bash": known_words}
     elif is_path_argument(action):

@@ -41,7 +41,7 @@ def collect_info() -> JsonDocument:
         "processors": count_available_cores(),
         "memory": _read_memory_size(),
         "paths": {
-            "simgap": str(_HOME),
+            "simgap": str(_PACKAGES_FOLDER),
             "cache": str(_get_cache_folder()),
             "data sets": str(_get_data_set_folder()),
             "SIMGAP_DATA": os.environ.get("SIMGAP_DATA"),
@@ -52,7 +52,7 @@ def collect_info() -> JsonDocument:
     }
 
 
-_HOME = Path(__file__).resolve().parents[3]
+_PACKAGES_FOLDER = Path(__file__).resolve().parents[3]
 """Folder that contains simgap's packages."""
 
 
@@ -72,9 +72,17 @@ def _read_git_revision() -> str | None:
     """Return the commit of a checkout, with + if files were changed; None for a wheel."""
     import subprocess
 
-    if not (_HOME / ".git").exists():
+    if not (_PACKAGES_FOLDER / ".git").exists():
         return None
-    command = ("git", "-C", str(_HOME), "describe", "--always", "--dirty=+", "--abbrev=12")
+    command = (
+        "git",
+        "-C",
+        str(_PACKAGES_FOLDER),
+        "describe",
+        "--always",
+        "--dirty=+",
+        "--abbrev=12",
+    )
     try:
         process = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True)
     except (OSError, subprocess.SubprocessError):

@@ -88,47 +88,47 @@ def _describe_isolation(study: Study) -> JsonDocument:
     }
 
 
-def _format_isolation(seal: JsonDocument) -> str:
+def _format_isolation(isolation: JsonDocument) -> str:
     """Format the isolation of a study as text."""
-    if seal["trusted"]:
+    if isolation["trusted"]:
         return "trusted: its tuners run without isolation"
-    missing, salt = seal["missing"], seal["salt_sha256"]
+    missing, salt = isolation["missing"], isolation["salt_sha256"]
     processes = "isolated: a process for each "
-    processes += "run" if seal["isolation"] == "run" else "tuner and seed"
+    processes += "run" if isolation["isolation"] == "run" else "tuner and seed"
     layers = f", WITHOUT the layers {', '.join(missing)}" if missing else ", all layers active"
     salt_note = f"; salt with SHA-256 {salt[:12]}" if salt else "; its salt is public"
-    return processes + layers + salt_note + (", revealed" if seal["revealed"] else "")
+    return processes + layers + salt_note + (", revealed" if isolation["revealed"] else "")
 
 
 def _print_progress(study: Study, is_all: bool, print_line: PrintLine) -> JsonDocument:
     """Print the progress of a study, and return it as a document."""
-    standing = study.status()
-    planned, unit = len(standing.ends), standing.what
-    seal, groups = _describe_isolation(study), _count_endings(standing)
-    resume = None if standing.is_complete else f"simgap compare --resume {study.folder}"
-    listed_runs = standing.ends if is_all else _select_notable_runs(standing)
+    progress = study.status()
+    planned, unit = len(progress.ends), progress.what
+    isolation, groups = _describe_isolation(study), _count_endings(progress)
+    resume = None if progress.is_complete else f"simgap compare --resume {study.folder}"
+    listed_runs = progress.ends if is_all else _select_notable_runs(progress)
 
-    complete = ", complete" if standing.is_complete else ""
-    print_line(f"{standing.name}: {standing.finished} of {planned} {unit}{complete}")
-    print_line("  " + ", ".join(f"{name} {value}" for name, value in standing.hashes.items()))
-    print_line(f"  {_format_isolation(seal)}")
+    complete = ", complete" if progress.is_complete else ""
+    print_line(f"{progress.name}: {progress.finished} of {planned} {unit}{complete}")
+    print_line("  " + ", ".join(f"{name} {value}" for name, value in progress.hashes.items()))
+    print_line(f"  {_format_isolation(isolation)}")
     for line in _format_counts(groups):
         print_line(f"  {line}")
     for run_end in listed_runs:
         print_line(f"{run_end.status:10} {run_end.name}  {_get_last_line(run_end)}".rstrip())
-    if len(standing.ends) > len(listed_runs):
-        print_line(f"({len(listed_runs)} of {len(standing.ends)} listed; --runs lists all)")
+    if len(progress.ends) > len(listed_runs):
+        print_line(f"({len(listed_runs)} of {len(progress.ends)} listed; --runs lists all)")
     if resume:
         print_line(f"to finish it: {resume}")
     return {
-        "name": standing.name,
+        "name": progress.name,
         "folder": study.folder,
         "what": unit,
-        "finished": standing.finished,
+        "finished": progress.finished,
         "planned": planned,
-        "complete": standing.is_complete,
-        "hashes": dict(standing.hashes),
-        "seal": seal,
+        "complete": progress.is_complete,
+        "hashes": dict(progress.hashes),
+        "seal": isolation,
         "groups": groups,
         "runs": [run_end._asdict() for run_end in listed_runs],
         "resume": resume,

@@ -38,7 +38,7 @@ _DIGITS = 4
 """Significant digits of values in the page's tables."""
 _FILTERED_COLUMNS = ("training", "property", "value", "cell", "tuner", "simulations", "level")
 """Columns by which the page's tables are filtered."""
-_STYLE = """
+_STYLESHEET = """
 table.suite-ranks { font-size: 0.8rem; }
 table.suite-ranks thead th { writing-mode: vertical-rl; transform: rotate(180deg); }
 table.suite-ranks td a { color: inherit; text-decoration: none; display: block; }
@@ -59,7 +59,7 @@ def render_suite_page(tables: SuiteTables) -> str:
         tables: tables of the suite.
     """
     suite = tables.suite
-    page = HtmlPage(_STYLE)
+    page = HtmlPage(_STYLESHEET)
     frames = {
         "ranks": tables.ranks,
         "pairs": tables.pairs,

@@ -38,7 +38,7 @@ MEASURED_LEVELS = (2.0, 1.1, 1.01)
 """Error levels for measured data, as multiples of the smallest median error of any tuner."""
 TARGETS_SHARING_TRAINING = 10
 """Number of targets that share one training when its cost is counted."""
-_RESAMPLES = 2000
+_RESAMPLE_COUNT = 2000
 """Number of bootstrap resamples of cells."""
 ERROR_COLUMNS = ["cell", "tuner", "simulations", "median_error", "rank", "targets", "failures"]
 RANK_COLUMNS = ["training", "simulations", "tuner", "mean_rank", "low", "high", "cells"]
@@ -221,7 +221,7 @@ class SuiteTables:
                 if ranks.empty:
                     continue
                 rng = make_rng("suite ranks", k)
-                resamples = rng.integers(len(ranks), size=(_RESAMPLES, len(ranks)))
+                resamples = rng.integers(len(ranks), size=(_RESAMPLE_COUNT, len(ranks)))
                 for tuner, mean in ranks.mean().sort_values(kind="stable").items():
                     resampled = ranks[tuner].to_numpy()[resamples].mean(axis=1)
                     interval = compute_percentile_interval(resampled)

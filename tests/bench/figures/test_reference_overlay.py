@@ -61,7 +61,7 @@ def test_what_is_damaged_is_said_in_a_line(name, tmp_path):
 )
 def test_grey_lines_are_the_medians_of_the_table_up_to_the_budget(name, metric):
     reference = find_reference(REFERENCE)
-    drawn = draw_figure(stored(), LABELS, name, behind=[reference])
+    drawn = draw_figure(stored(), LABELS, name, references=[reference])
     found = grey_lines(drawn, reference)
     assert set(found) == set(reference.tuners)
     for tuner, lines in found.items():
@@ -86,7 +86,7 @@ def test_grey_lines_are_the_medians_of_the_table_up_to_the_budget(name, metric):
 
 def test_the_legend_and_the_caption_name_the_reference_with_its_version_and_how_it_differs():
     reference = find_reference(f"comparison/{REFERENCE}")
-    drawn = draw_figure(stored(), LABELS, "error", behind=[reference])
+    drawn = draw_figure(stored(), LABELS, "error", references=[reference])
     assert f"thin, grey: {reference.name},\nsimgap {reference.simgap}" in legend(drawn)
     assert legend(drawn).count("random") == 2
     caption = drawn.get_supxlabel().replace("\n", " ")
@@ -99,17 +99,17 @@ def test_the_legend_and_the_caption_name_the_reference_with_its_version_and_how_
 
 def test_two_references_have_two_greys_and_a_third_is_refused():
     two = [find_reference(REFERENCE), find_reference(f"comparison/{REFERENCE}")]
-    drawn = draw_figure(stored(), LABELS, "error", behind=two)
+    drawn = draw_figure(stored(), LABELS, "error", references=two)
     shades = {grey_lines(drawn, each)["random"][0].get_color() for each in two}
     assert shades == set(REFERENCE_GREYS)
     with pytest.raises(InputError, match="expected 2 references at most, found 3"):
-        draw_figure(stored(), LABELS, "error", behind=[*two, two[0]])
+        draw_figure(stored(), LABELS, "error", references=[*two, two[0]])
 
 
 def test_another_problem_and_another_figure_are_refused():
     with pytest.raises(InputError, match=r"of another problem than .*: simulator is pendulum"):
-        draw_figure(stored(), LABELS, "error", behind=[find_reference("pendulum-real")])
+        draw_figure(stored(), LABELS, "error", references=[find_reference("pendulum-real")])
     with pytest.raises(
         InputError, match=r"figure runtime: expected one of error, misfit, directions"
     ):
-        draw_figure(stored(), LABELS, "runtime", behind=[find_reference(REFERENCE)])
+        draw_figure(stored(), LABELS, "runtime", references=[find_reference(REFERENCE)])

@@ -5,7 +5,7 @@ import csv
 import pytest
 import tomli_w
 
-from bench.benchmark.isolation.process_exit import ISOLATED
+from bench.benchmark.isolation.process_exit import ISOLATION_NOTE
 from bench.benchmark.problem.experiment import TunerEntry
 from bench.benchmark.runner.tuner_notes import Notes
 from bench.cli.main import main
@@ -37,12 +37,12 @@ def test_errors_of_isolation_say_so_and_others_do_not(tmp_path, capsys):
         need(seal)
     tuners = [*REFUSED, "mistaken", "keeps_log"]
     said, reasons = compared(tmp_path, capsys, tuners, PLUGINS / "isolated.py")
-    assert ISOLATED.endswith("use --trust while developing")
+    assert ISOLATION_NOTE.endswith("use --trust while developing")
     for name in REFUSED:
-        assert reasons[name].endswith(f"; {ISOLATED}"), reasons[name]
+        assert reasons[name].endswith(f"; {ISOLATION_NOTE}"), reasons[name]
     assert reasons["mistaken"].endswith("ValueError: no PermissionError\n")
-    assert f"\n{', '.join(REFUSED)}: {ISOLATED}\n" in said
-    assert said.count(ISOLATED) == 1
+    assert f"\n{', '.join(REFUSED)}: {ISOLATION_NOTE}\n" in said
+    assert said.count(ISOLATION_NOTE) == 1
     assert said.endswith(
         "\n2 files written by tuner keeps_log (log.txt, out/points.csv) were discarded with its "
         "sandbox\n"
@@ -54,7 +54,7 @@ def test_a_trusted_tuner_gets_no_message_about_isolation(tmp_path, capsys, monke
     tuners, plugin = ["reads_here", "keeps_log"], PLUGINS / "isolated.py"
     said, reasons = compared(tmp_path, capsys, tuners, plugin, "--trust")
     assert "No such file or directory" in reasons["reads_here"]
-    assert ISOLATED not in said + reasons["reads_here"]
+    assert ISOLATION_NOTE not in said + reasons["reads_here"]
     assert "discarded" not in said
     assert (tmp_path / "log.txt").exists()
 
@@ -89,7 +89,7 @@ def test_a_plugin_that_reads_a_file_on_import_is_refused_with_the_reason(tmp_pat
     error = capsys.readouterr().err
     assert error.count("\n") == 1
     assert "PermissionError" in error
-    assert error.endswith(f"; {ISOLATED}\n")
+    assert error.endswith(f"; {ISOLATION_NOTE}\n")
 
 
 def test_files_count_once_where_a_process_serves_several_runs():

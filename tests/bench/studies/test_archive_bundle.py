@@ -247,13 +247,13 @@ def test_what_would_leave_the_folder_or_stand_for_something_else_is_refused(
 def test_a_bomb_is_refused_before_it_is_unpacked(
     compared, tmp_path, capsys, monkeypatch, limit, at
 ):
-    monkeypatch.setattr(archives, "_HARMLESS", 1 << 20)
+    monkeypatch.setattr(archives, "_MIN_BYTES_FOR_RATIO_CHECK", 1 << 20)
     monkeypatch.setattr(archives, limit, at)
     files = {**content(compared), "run/zeros": bytes(10 << 20)}
     code, found = verified(packed(tmp_path / "a.zip", files), capsys)
     assert code == 2
     assert "it would unpack from" in found["error"]["message"]
-    monkeypatch.setattr(archives, "_MOST", 3)
+    monkeypatch.setattr(archives, "_MAX_FILES", 3)
     assert "files, at most 3" in verified(compared, capsys)[1]["error"]["message"]
 
 
