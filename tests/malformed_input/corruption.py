@@ -33,8 +33,14 @@ def paths(document, way=()):
 
 
 @st.composite
-def documents(draw, sound, more=()):
-    """Draw a TOML document with one to three errors, as bytes."""
+def documents(draw, sound, more=(), junk=JUNK):
+    """Draw a TOML document with one to three errors, as bytes.
+
+    Args:
+        sound: valid document.
+        more: further keys that an error may add.
+        junk: strategy of wrong values.
+    """
     document = copy.deepcopy(sound)
     for _ in range(draw(st.integers(1, 3))):
         ways = [*paths(document), *((name,) for name in more)]
@@ -46,13 +52,13 @@ def documents(draw, sound, more=()):
         if act == 0:
             place.pop(way[-1], None)
         elif act == 1 and isinstance(place.get(way[-1]), dict):
-            place[way[-1]][draw(st.sampled_from(["x", "oops", "", "a b", "é"]))] = draw(JUNK)
+            place[way[-1]][draw(st.sampled_from(["x", "oops", "", "a b", "é"]))] = draw(junk)
         elif act == 2 and isinstance(place.get(way[-1]), list) and place[way[-1]]:
             held = list(place[way[-1]])
-            held[draw(st.integers(0, len(held) - 1))] = draw(JUNK)
+            held[draw(st.integers(0, len(held) - 1))] = draw(junk)
             place[way[-1]] = held
         else:
-            place[way[-1]] = draw(JUNK)
+            place[way[-1]] = draw(junk)
     try:
         data = tomli_w.dumps(document).encode("utf-8", "replace")
     except (TypeError, ValueError):
@@ -81,24 +87,29 @@ CELLS = st.sampled_from([
 
 
 @st.composite
-def tables(draw, sound):
-    """Draw a CSV file with one to three errors, as bytes."""
+def tables(draw, sound, cells=CELLS):
+    """Draw a CSV file with one to three errors, as bytes.
+
+    Args:
+        sound: valid file.
+        cells: strategy of wrong cells.
+    """
     rows = [line.split(",") for line in sound.decode().splitlines()]
     for _ in range(draw(st.integers(1, 3))):
         act = draw(st.integers(0, 7))
         row = draw(st.integers(0, len(rows) - 1)) if rows else 0
         if act <= 3 and rows:
             cell = draw(st.integers(0, max(len(rows[row]) - 1, 0)))
-            rows[row][cell : cell + 1] = [draw(CELLS)]
+            rows[row][cell : cell + 1] = [draw(cells)]
         elif act == 4 and rows:
             rows.insert(draw(st.integers(0, len(rows))), rows[row])
         elif act == 5 and rows:
             del rows[row : row + draw(st.integers(1, 30))]
         elif act == 6 and rows:
-            column, value = draw(st.integers(0, max(len(rows[0]) - 1, 0))), draw(CELLS)
+            column, value = draw(st.integers(0, max(len(rows[0]) - 1, 0))), draw(cells)
             rows = [[*r[:column], value, *r[column + 1 :]] if i else r for i, r in enumerate(rows)]
         elif rows:
-            rows[row].append(draw(CELLS))
+            rows[row].append(draw(cells))
     text = "".join(",".join(row) + "\n" for row in rows)
     return draw(spoilt(text.encode("utf-8", "replace")))
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+from importlib.util import find_spec
 from pathlib import Path
 
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from tests.bench.logs.log_writers import NEEDED, OPTIONS, WRITERS
 from tests.malformed_input import valid_input
 from tests.malformed_input.corruption import bytes_of, documents, spoilt, tables
 from tests.malformed_input.malformed_arguments import vectors
@@ -135,22 +137,30 @@ def recordings(draw):
 
 @st.composite
 def logs(draw):
-    """Draw a corrupted log of any format, or a corrupted description of one, to import
-    or inspect.
-    """
-    files = {"arm.xml": valid_input.ARM, "log.csv": valid_input.logs()["log.csv"]}
-    if draw(st.integers(0, 3)) == 0:
-        files["mapped.toml"] = draw(documents(valid_input.MAPPED, MAPPED))
-        if draw(st.booleans()):
-            files["log.csv"] = draw(tables(files["log.csv"]))
-        return Case(("inspect", "mapped.toml", "--out", "out"), files, owns=("out",))
-    name = draw(st.sampled_from([name for name, data in valid_input.logs().items() if data]))
-    whole = valid_input.logs()[name]
-    files[name] = draw(tables(whole) if name.endswith(".csv") else bytes_of(whole))
-    command = ("import", name, "--model", "arm.xml", "--out", "made.toml")
+    """Draw a corrupted log of any format, or a corrupted description of one."""
+    if draw(st.integers(0, 3)):
+        return draw(log_folders(draw(st.sampled_from(list(LOG_FORMATS)))))
+    files = {"arm.xml": valid_input.ARM, "log.csv": valid_input.MAPPED_LOG}
+    files["mapped.toml"] = draw(documents(valid_input.MAPPED, MAPPED))
+    if draw(st.booleans()):
+        files["log.csv"] = draw(tables(files["log.csv"]))
+    return Case(("inspect", "mapped.toml", "--out", "out"), files, owns=("out",))
+
+
+@st.composite
+def log_folders(draw, kind):
+    """Draw logs of a format, of which one file is damaged, and the command that imports them."""
+    files = dict(valid_input.log_folder(kind))
+    name = draw(st.sampled_from([name for name in files if name.startswith("logs/")]))
+    files[name] = draw(tables(files[name]) if name.endswith(".csv") else bytes_of(files[name]))
+    # A file that is named must be readable; of a folder, it may be left out.
+    given = name if name.count("/") == 1 else "logs"
+    command = ("import", given, "--model", "arm.xml", "--out", "made.toml", *OPTIONS.get(kind, ()))
     return Case(command, files, owns=("made.toml",))
 
 
+LOG_FORMATS = [kind for kind in WRITERS if find_spec(NEEDED.get(kind, "numpy"))]
+"""Log formats that can be written with the installed packages."""
 MAPPED = ("free", "time", "file", "column", "unit", "offset", "hold", "folder", "model", "engine",
           "actuators", "oops")  # fmt: skip
 RECORDED = ("constants", "noise", "inputs", "initial", "runs", "extra", "parameters", "effects",

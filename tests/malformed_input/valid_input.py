@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import io
+import math
 import os
 import tempfile
 from functools import cache
 from pathlib import Path
 from unittest.mock import patch
 
-import numpy as np
-import pandas as pd
 import tomli_w
 
 from bench.api.recordings import simulate
@@ -22,6 +20,7 @@ from bench.benchmark.runner.study_setup import prepare_study
 from bench.cli.main import main
 from bench.core.plugin_registries import REGISTRIES
 from bench.logs.film_recording import write_film as film
+from tests.bench.logs.log_writers import write_folder
 from tests.conftest import PLUGINS
 
 LEARNER = Path(__file__).with_name("learner.py")
@@ -170,55 +169,26 @@ MAPPED = {
                            "hold": "linear"}},
     "runs": {"1": {"held_out": False}},
 }  # fmt: skip
-"""Description of the CSV log."""
+"""Description of `MAPPED_LOG`."""
+
+
+MAPPED_LOG = "\n".join(
+    [
+        "stamp,position,command_hip,command_knee,note",
+        *(
+            f'{20 * k},"[{60 * math.sin(0.06 * k):.4f}, {30 * math.cos(0.04 * k):.4f}]",'
+            f"{60 * math.sin(0.06 * k + 0.1):.4f},{30 * math.cos(0.04 * k + 0.1):.4f},ok"
+            for k in range(60)
+        ),
+    ]
+).encode()
 
 
 @cache
-def logs():
-    """Return the same motion of two joints in every log format, by file name."""
-    times = np.arange(60) * 0.02
-    q = np.degrees(np.column_stack([np.sin(3 * times), 0.5 * np.cos(2 * times)]))
-    u = np.degrees(np.column_stack([np.sin(3 * times + 0.1), 0.5 * np.cos(2 * times + 0.1)]))
-    rows = ["stamp,position,command_hip,command_knee,note"]
-    for t, (a, b), (c, d) in zip(1e3 * times, q, u, strict=True):
-        rows.append(f'{t:.0f},"[{a:.4f}, {b:.4f}]",{c:.4f},{d:.4f},ok')
-    columns = {"stamp": 1e3 * times, "position": q, "command": u}
-    archive, parquet = io.BytesIO(), io.BytesIO()
-    np.savez(archive, **columns)
-    flat = {"stamp": 1e3 * times, "position_hip": q[:, 0], "position_knee": q[:, 1]}
-    pd.DataFrame({**flat, "command_hip": u[:, 0]}).to_parquet(parquet)
-    text = "\n".join(rows)
-    plain = [line.split('"') for line in rows[1:]]
-    table = ["stamp;position hip;position knee"]
-    table += [f"{a.rstrip(',')};" + b.strip("[]").replace(", ", ";") for a, b, _ in plain]
-    return {
-        "log.csv": text.encode(),
-        "comma.csv": "\n".join(table).replace(".", ",").encode(),
-        "log.npz": archive.getvalue(),
-        "log.parquet": parquet.getvalue(),
-        "log.mcap": _bag(times, np.radians(q)),
-    }
-
-
-def _bag(times, q):
-    """Return a ROS bag with one topic; empty if rosbags is not installed."""
-    try:
-        from rosbags.rosbag2 import StoragePlugin, Writer
-        from rosbags.typesys import Stores, get_typestore
-    except ImportError:
-        return b""
-    types = get_typestore(Stores.ROS2_JAZZY)
-    state = types.types["sensor_msgs/msg/JointState"]
-    header = types.types["std_msgs/msg/Header"]
-    stamp = types.types["builtin_interfaces/msg/Time"]
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "bag"
-        with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-            topic = writer.add_connection("/joint_states", state.__msgtype__, typestore=types)
-            for t, own in zip(times, q, strict=True):
-                head = header(stamp(1000, round(1e9 * t)), "")
-                one = state(head, ["hip", "knee"], own, 0 * own, 0 * own)
-                raw = types.serialize_cdr(one, state.__msgtype__)
-                writer.write(topic, round(1e9 * (1000 + t)), raw)
-        (file,) = path.glob("*.mcap")
-        return file.read_bytes()
+def log_folder(kind: str) -> dict[str, bytes]:
+    """Return the files of two short runs in a log format, and the model file of the arm."""
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place)
+        write_folder(folder, kind, runs=2, count=40)
+        files = [path for path in folder.rglob("*") if path.is_file()]
+        return {path.relative_to(folder).as_posix(): path.read_bytes() for path in sorted(files)}

@@ -9,15 +9,14 @@ import pytest
 
 from bench.cli.main import main
 from bench.logs.inspection import load_recording
-from tests.bench.logs.damaged_logs import answer_to_damage
 from tests.bench.logs.log_writers import JOINTS, NEEDED, OPTIONS, WRITERS, motion, write_folder
+from tests.malformed_input.input_strategies import log_folders, made
+from tests.malformed_input.malformed_case import tried
 
 QUICK = ("csv", "npz")
 """Formats of the fast tests of whole commands."""
 DAMAGES = 12
-"""Number of damaged folders of each format; ``python -m tests.bench.logs.damaged_logs`` makes
-thousands.
-"""
+"""Number of damaged folders of each format; `make malformed KINDS=logs` makes thousands."""
 
 
 def skip_without(kind):
@@ -61,5 +60,10 @@ def test_two_commands_give_a_verdict(kind, tmp_path, capsys):
 @pytest.mark.parametrize("kind", WRITERS)
 def test_a_damaged_folder_is_one_line_and_nothing_is_written(kind, tmp_path):
     skip_without(kind)
-    errors = [answer_to_damage(kind, seed, tmp_path / str(seed)) for seed in range(DAMAGES)]
-    assert [error for error in errors if error is not None] != [], "no folder was damaged"
+    codes = []
+
+    def act(case):
+        codes.append(tried(case, tmp_path / str(len(codes)), {}).code)
+
+    made(log_folders(kind), DAMAGES, act)
+    assert 2 in codes, "no folder was damaged"

@@ -2,9 +2,6 @@
 never a traceback or an endless loop.
 """
 
-import csv
-import datetime
-import io
 from collections import Counter
 
 import numpy as np
@@ -16,6 +13,7 @@ from hypothesis import strategies as st
 from sims.core.simulator import Channel, Constant, InputError, Simulator
 from sims.recording.recording import read_recording
 from sims.recording.unit_conversion import compute_unit_scale
+from tests.malformed_input import corruption
 
 EXAMPLES = 2000
 SETTINGS = settings(
@@ -67,134 +65,34 @@ class Swing(Simulator):
     states = {"q": 0.0, "qd": 0.0}  # noqa: RUF012
 
 
-def table(header, rows, mark=",", end="\n"):
-    text = io.StringIO()
-    csv.writer(text, delimiter=mark, lineterminator=end).writerows([header, *rows])
-    return text.getvalue()
-
-
-cells = st.one_of(st.sampled_from(JUNK), st.text(max_size=6), st.floats().map(repr))
-leaves = st.one_of(
-    st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=8),
-    st.sampled_from(UNITS + JUNK[:-12]),
-    st.just(10**400), st.just(datetime.date(2020, 2, 29)),
-)  # fmt: skip
-values = st.recursive(
-    leaves,
-    lambda v: st.lists(v, max_size=2) | st.dictionaries(st.text(max_size=4), v, max_size=2),
-    max_leaves=4,
-)
+GOOD_TABLE = "\n".join(",".join(row) for row in (HEADER, *ROWS)).encode() + b"\n"
+GOOD_TOML = tomli_w.dumps(TOML).encode()
+CELLS = st.one_of(st.sampled_from(JUNK), st.text(max_size=6), st.floats().map(repr))
+VALUES = st.one_of(corruption.JUNK, st.sampled_from(UNITS + JUNK[:-12]), st.just(10**400))
+DESCRIPTIONS = corruption.documents(TOML, ("oops", "a\nb", "Channels"), VALUES)
 
 
 @st.composite
 def spoilt_tables(draw):
-    """Return a table with one to three errors, as bytes."""
-    header, rows = list(HEADER), [list(row) for row in ROWS]
-    mark, end = ",", "\n"
-    for _ in range(draw(st.integers(1, 3))):
-        column, row = (
-            draw(st.integers(0, len(header) - 1)),
-            draw(st.integers(0, len(rows) - 1)) if rows else 0,
-        )
-        act = draw(st.integers(0, 15))
-        if act == 0 and len(header) > 1:
-            del header[column]
-            rows = [r[:column] + r[column + 1 :] for r in rows]
-        elif act == 1:
-            header.insert(column, header[-1])
-            rows = [[*r[:column], r[-1] if r else "", *r[column:]] for r in rows]
-        elif act == 2:
-            header[column] = draw(cells)
-        elif act in (3, 4, 5) and rows and column < len(rows[row]):
-            rows[row][column] = draw(cells)
-        elif act == 6 and rows:
-            rows.insert(draw(st.integers(0, len(rows))), rows.pop(row))
-        elif act == 7 and rows:
-            rows.insert(row, list(rows[row]))
-        elif act == 8:
-            rows = rows[: draw(st.integers(0, 3))]
-        elif act == 9 and rows:
-            rows[row] = rows[row][: draw(st.integers(0, 4))]
-        elif act == 10 and rows:
-            rows[row] = rows[row] + [draw(cells)] * draw(st.integers(1, 3))
-        elif act == 11:
-            same = draw(st.sampled_from(JUNK[:8]))
-            rows = [[*r[:column], same, *r[column + 1 :]] for r in rows]
-        elif act == 12:
-            mark = draw(st.sampled_from([",", ";", "\t", "|", " "]))
-        elif act == 13:
-            end = draw(st.sampled_from(["\n", "\r\n", "\r", "\n\n", " \n", ",\n", "\n\r"]))
-        elif act == 14:
-            rows = rows * draw(st.integers(0, 3))
-        elif act == 15:
-            rows.sort(key=lambda r: r[1] if len(r) > 1 else "")
-    return spoilt_bytes(draw, table(header, rows, mark, end))
-
-
-def spoilt_bytes(draw, text):
-    """Return the text in some encoding, possibly truncated or with wrong bytes."""
-    encoding = draw(
-        st.sampled_from(
-            ["utf-8"] * 8 + ["utf-8-sig", "utf-16", "utf-16-le", "latin-1", "cp1252", "utf-32"]
-        )
-    )
-    data = text.encode(encoding, errors="replace")
-    act = draw(st.integers(0, 12))
+    """Return a table with wrong cells and rows, or another layout or encoding, as bytes."""
+    data = draw(corruption.tables(GOOD_TABLE, CELLS))
+    act, column = draw(st.integers(0, 9)), draw(st.integers(0, len(HEADER) - 1))
     if act == 0:
-        data = data[: draw(st.integers(0, len(data)))]
-    elif act == 1:
-        place = draw(st.integers(0, len(data)))
-        data = data[:place] + draw(st.binary(max_size=6)) + data[place:]
-    elif act == 2:
-        place = draw(st.integers(0, len(data)))
-        data = (
-            data[:place]
-            + draw(st.sampled_from([b'"', b"\x00", b"\xff", b"\n", b",", b"\xef\xbb\xbf"]))
-            + data[place:]
-        )
-    return data
-
-
-@st.composite
-def spoilt_descriptions(draw):
-    """Return a description with one to three errors, as bytes."""
-    document = {k: v if isinstance(v, str) else {**v} for k, v in TOML.items()}
-    document["channels"] = {k: {**v} for k, v in TOML["channels"].items()}
-    document["runs"] = {"2": {**TOML["runs"]["2"]}}
-    for _ in range(draw(st.integers(1, 3))):
-        act = draw(st.integers(0, 7))
-        key = draw(st.sampled_from(sorted(document))) if document else "x"
-        inner = document.get(key)
-        if act == 0:
-            document.pop(key, None)
-        elif act == 1:
-            document[draw(st.sampled_from([key, "oops", "a\nb", "Channels"]))] = draw(values)
-        elif act in (2, 3) and isinstance(document.get("channels"), dict):
-            channel = draw(st.sampled_from(["q", "qd", "nope"]))
-            document["channels"][channel] = {
-                "unit": draw(st.sampled_from(UNITS) | st.text(max_size=12))
-            }
-        elif act == 4 and isinstance(inner, dict) and inner:
-            inner[draw(st.sampled_from([*map(str, inner), "mass", "held_out", "initial", "7"]))] = (
-                draw(values)
-            )
-        elif act == 5 and isinstance(inner, dict) and inner:
-            inner.pop(draw(st.sampled_from(sorted(map(str, inner)))), None)
-        elif act == 6 and isinstance(document.get("channels"), dict):
-            document["channels"]["q"] = {"unit": "rad", "noise": draw(values)}
-        elif act == 7:
-            document["runs"] = {draw(st.sampled_from(["1", "2", "3", "9", ""])): draw(values)}
-    try:
-        text = tomli_w.dumps(without_none(document))
-    except (TypeError, ValueError):  # values that TOML cannot represent
-        text = repr(document)
-    return spoilt_bytes(draw, text)
-
-
-def without_none(value):
-    if isinstance(value, dict):
-        return {k: without_none(v) for k, v in value.items() if v is not None}
-    return [without_none(v) for v in value if v is not None] if isinstance(value, list) else value
+        return data.replace(b",", draw(st.sampled_from([b";", b"\t", b"|", b" "])))
+    if act == 1:
+        ends = [b"\r\n", b"\r", b"\n\n", b" \n", b",\n", b"\n\r"]
+        return data.replace(b"\n", draw(st.sampled_from(ends)))
+    if act == 2:
+        codes = ["utf-8-sig", "utf-16", "utf-16-le", "latin-1", "cp1252", "utf-32"]
+        return data.decode("utf-8", "replace").encode(draw(st.sampled_from(codes)), "replace")
+    rows = [row.split(b",") for row in data.split(b"\n")]
+    if act == 3:
+        rows = [[*row[:column], *row[column + 1 :]] for row in rows]
+    elif act == 4:
+        rows = [[*row[:column], row[-1], *row[column:]] for row in rows]
+    elif act == 5:
+        rows.sort(key=lambda row: row[1:2])
+    return b"\n".join(b",".join(row) for row in rows)
 
 
 @pytest.fixture(scope="module")
@@ -239,7 +137,6 @@ def outcome(folder, table_bytes, description_bytes):
     return repr((recording.system, recording.constants, recording.noise, runs))
 
 
-GOOD_TABLE, GOOD_TOML = table(HEADER, ROWS).encode(), tomli_w.dumps(TOML).encode()
 seen: Counter[str] = Counter()
 
 
@@ -260,7 +157,7 @@ def test_damaged_tables(folder, monkeypatch, data):
 
 @pytest.mark.slow
 @settings(SETTINGS, max_examples=EXAMPLES // 2)
-@given(data=spoilt_descriptions())
+@given(data=DESCRIPTIONS)
 def test_damaged_descriptions(folder, data):
     outcome(folder, GOOD_TABLE, data)
 
