@@ -54,11 +54,11 @@ class AugmentedSystem(System):
         They are stored in the columns of `theta` after the system's own parameters.
         """
         coefficients = []
-        place = len(cls.base_system.parameters)
+        column = len(cls.base_system.parameters)
         for effect in cls.effects:
             count = len(effect.coefficients)
-            coefficients.append(theta[:, place : place + count].T[:, :, None])
-            place += count
+            coefficients.append(theta[:, column : column + count].T[:, :, None])
+            column += count
         return coefficients
 
     def mass(self, theta: Array, constants: Mapping[str, Array]) -> Array:
@@ -164,16 +164,17 @@ def integrate_with_hidden_states(engine: Engine, batch: IntegrationBatch) -> Tra
     if not active.any():
         return engine.integrate(replace(batch, effects=other_effects))
     motions = []
-    numbers = (1 << np.arange(len(hidden))) @ active
-    for number in sorted(set(numbers.tolist())):
-        members = np.flatnonzero(numbers == number)
-        active_effects = [pair for k, pair in enumerate(hidden) if number >> k & 1]
-        part = slice_batch(replace(batch, effects=other_effects), members)
-        effects = [(e, c[:, members]) for e, c in active_effects]
-        motion = engine.integrate(_augment_batch(part, effects) if active_effects else part)
+    # Bit k of a pattern says whether effect k is active; elements with equal patterns form a group.
+    patterns = (1 << np.arange(len(hidden))) @ active
+    for pattern in sorted(set(patterns.tolist())):
+        group_indices = np.flatnonzero(patterns == pattern)
+        active_effects = [pair for k, pair in enumerate(hidden) if pattern >> k & 1]
+        group = slice_batch(replace(batch, effects=other_effects), group_indices)
+        effects = [(e, c[:, group_indices]) for e, c in active_effects]
+        motion = engine.integrate(_augment_batch(group, effects) if active_effects else group)
         base_size = batch.x.shape[1]
         parts = (values[:, :, :base_size] for values in (motion.x, motion.v, motion.a))
-        motions.append((members, Trajectories(*parts)))
+        motions.append((group_indices, Trajectories(*parts)))
     return join_trajectories(motions, batch)
 
 

@@ -186,14 +186,16 @@ def _find_change_times(
     """Return the times (L, K) at which a changed command is applied; zero where there are fewer."""
     columns = []
     for index, name in enumerate(commands[0]):
-        rows = []
+        change_times = []
         for s, u in zip(runs.unique_scenarios, commands, strict=True):
             changed = np.diff(u[name]) != 0
-            later = np.maximum(_get_command_times(s)[1:], 0.0)
+            command_times = np.maximum(_get_command_times(s)[1:], 0.0)
             # Commands from before the run may be applied within it.
-            rows.append(np.concatenate([_get_history_times(s, name), later[changed]]))
-        size = max(row.size for row in rows)
-        padded = [np.concatenate([row, np.zeros(size - row.size)]) for row in rows]
+            change_times.append(
+                np.concatenate([_get_history_times(s, name), command_times[changed]])
+            )
+        size = max(row.size for row in change_times)
+        padded = [np.concatenate([row, np.zeros(size - row.size)]) for row in change_times]
         applied = np.stack(padded)[runs.scenario_index]
         # Effects act on the first input only.
         for effect, c in shifting if index == 0 else ():
@@ -230,30 +232,30 @@ def _divide_intervals(instants: Array, largest_step: float) -> tuple[Array, Arra
     parts = np.where(intervals > 0, np.maximum(parts, 1), 0)
     steps_per_block = int(np.bincount(parts[parts > 0]).argmax()) if parts.any() else 1
     blocks = -(-parts // steps_per_block)
-    rows = np.cumsum(blocks, axis=1)
-    size = max(int(rows[:, -1].max()), 1)
+    block_ends = np.cumsum(blocks, axis=1)
+    max_blocks = max(int(block_ends[:, -1].max()), 1)
     # Arrays with one entry per block: its interval, its number in the batch element, and the
     # numbers of its steps in the interval.
     interval = np.repeat(np.arange(elements * samples), blocks.ravel())
     element = interval // samples
-    element_blocks = rows[:, -1]
+    element_blocks = block_ends[:, -1]
     first_blocks = np.cumsum(element_blocks) - element_blocks
     block = np.arange(interval.size) - first_blocks[element]
-    blocks_before = (rows - blocks).ravel()[interval]
-    in_interval = (block - blocks_before)[:, None]
-    number = in_interval * steps_per_block + np.arange(steps_per_block)
-    count = parts.ravel()[interval, None]
-    length = intervals.ravel()[interval, None] / count
-    steps = np.zeros((elements, size, steps_per_block))
-    step_ends = np.repeat(instants[:, -1], size * steps_per_block).reshape(
-        elements, size, steps_per_block
+    blocks_before = (block_ends - blocks).ravel()[interval]
+    block_in_interval = (block - blocks_before)[:, None]
+    step_numbers = block_in_interval * steps_per_block + np.arange(steps_per_block)
+    step_counts = parts.ravel()[interval, None]
+    step_lengths = intervals.ravel()[interval, None] / step_counts
+    steps = np.zeros((elements, max_blocks, steps_per_block))
+    step_ends = np.repeat(instants[:, -1], max_blocks * steps_per_block).reshape(
+        elements, max_blocks, steps_per_block
     )
-    steps[element, block] = np.where(number < count, length, 0.0)
+    steps[element, block] = np.where(step_numbers < step_counts, step_lengths, 0.0)
     # The last step of an interval ends exactly at the given time.
-    inner_times = interval_starts.ravel()[interval, None] + (number + 1) * length
-    instant = instants.ravel()[interval, None]
-    step_ends[element, block] = np.where(number + 1 < count, inner_times, instant)
-    return steps.reshape(elements, -1), step_ends.reshape(elements, -1), steps_per_block, rows
+    inner_times = interval_starts.ravel()[interval, None] + (step_numbers + 1) * step_lengths
+    interval_ends = instants.ravel()[interval, None]
+    step_ends[element, block] = np.where(step_numbers + 1 < step_counts, inner_times, interval_ends)
+    return steps.reshape(elements, -1), step_ends.reshape(elements, -1), steps_per_block, block_ends
 
 
 def _sample_times(scenario: Scenario) -> Array:
@@ -314,22 +316,22 @@ def compute_applied_inputs(
         Applied inputs (L, S) by name.
     """
     effects = tuple((effect, c, is_active(c)) for effect, c in acting if c.any())
-    starts, end, steps = _step_begins(plan.ends), plan.ends, plan.steps
-    first, *other_names = commands[0]
+    starts, ends, steps = _step_begins(plan.ends), plan.ends, plan.steps
+    input_name, *other_names = commands[0]
     applied = {}
-    for name in other_names if effects else (first, *other_names):
-        applied[name] = _average_command(runs, name, commands, starts, end, plan.has_uniform_steps)
+    for name in other_names if effects else (input_name, *other_names):
+        applied[name] = _average_command(runs, name, commands, starts, ends, plan.has_uniform_steps)
     if not effects:
         return applied
-    lead = _build_lead_in_steps(
-        runs, first, max(float(steps.max(initial=0.0)), MAX_LEAD_IN_STEP_SECONDS)
+    lead_in = _build_lead_in_steps(
+        runs, input_name, max(float(steps.max(initial=0.0)), MAX_LEAD_IN_STEP_SECONDS)
     )
-    if lead[0].size:
-        parts = zip(lead, (starts, end, steps), strict=True)
-        starts, end, steps = (
+    if lead_in[0].size:
+        parts = zip(lead_in, (starts, ends, steps), strict=True)
+        starts, ends, steps = (
             np.hstack([lead_part[runs.scenario_index], run_part]) for lead_part, run_part in parts
         )
-    step_ends = end
+    step_ends = ends
     # Backwards from the plant to the command: map the times through the effects.
     for effect, c, is_acting in reversed(effects):
         assert isinstance(effect, Input)
@@ -337,22 +339,30 @@ def compute_applied_inputs(
         if not _shifts_time(effect):
             continue
         starts = np.where(is_acting, effect.times(c, starts), starts)
-        end = np.where(is_acting, effect.times(c, end), end)
+        ends = np.where(is_acting, effect.times(c, ends), ends)
     # Forwards with the values. Rows that share their memory are equal.
-    uniform = plan.has_uniform_steps or end.strides[0] == 0
-    means = _average_command(runs, first, commands, starts, end, uniform)
+    has_uniform_steps = plan.has_uniform_steps or ends.strides[0] == 0
+    means = _average_command(runs, input_name, commands, starts, ends, has_uniform_steps)
     for effect, c, is_acting in effects:
         if isinstance(effect, Input) and effect.between:
             other_means = _average_command(
-                runs, first, commands, starts, end, uniform, is_other_interpolation=True
+                runs,
+                input_name,
+                commands,
+                starts,
+                ends,
+                has_uniform_steps,
+                is_other_interpolation=True,
             )
             means = np.where(is_acting, means + c[0] * (other_means - means), means)
     pairs = zip(runs.unique_scenarios, commands, strict=True)
-    beginnings = np.array([_get_command_values(s, first, u[first])[0] for s, u in pairs])
-    result = _apply_input_effects(
-        effects, steps, step_ends, means, beginnings[runs.scenario_index, None]
+    initial_values = np.array(
+        [_get_command_values(s, input_name, u[input_name])[0] for s, u in pairs]
     )
-    return {first: result[:, lead[0].shape[1] :], **applied}
+    result = _apply_input_effects(
+        effects, steps, step_ends, means, initial_values[runs.scenario_index, None]
+    )
+    return {input_name: result[:, lead_in[0].shape[1] :], **applied}
 
 
 def _build_lead_in_steps(
@@ -446,7 +456,7 @@ def _average_command(
     name: str,
     commands: Commands,
     starts: Array,
-    end: Array,
+    ends: Array,
     has_uniform_steps: bool,
     is_other_interpolation: bool = False,
 ) -> Array:
@@ -457,7 +467,7 @@ def _average_command(
         name: Name of the input.
         commands: Inputs of each distinct scenario.
         starts: (L, S) beginnings of the steps, s.
-        end: (L, S) ends of the steps, s.
+        ends: (L, S) ends of the steps, s.
         has_uniform_steps: Whether batch elements with the same scenario have the same steps, so
             that only the first of them is evaluated.
         is_other_interpolation: Whether to interpolate held signals linearly, and to hold linear
@@ -469,9 +479,9 @@ def _average_command(
     count = len(commands) if has_uniform_steps else len(starts)
     result = np.empty((count, starts.shape[1]))
     # Process all batch elements with the same scenario in one call.
-    by_run = np.argsort(runs.scenario_index, kind="stable")
-    borders = np.flatnonzero(np.diff(runs.scenario_index[by_run])) + 1
-    for elements in np.split(by_run, borders):
+    order = np.argsort(runs.scenario_index, kind="stable")
+    borders = np.flatnonzero(np.diff(runs.scenario_index[order])) + 1
+    for elements in np.split(order, borders):
         run = runs.scenario_index[elements[0]]
         scenario = runs.unique_scenarios[run]
         average_signal = (
@@ -487,7 +497,7 @@ def _average_command(
         )
         signal = _get_command_values(scenario, name, commands[run][name])
         result[target_rows] = average_signal(
-            instants, signal, starts[source_rows], end[source_rows]
+            instants, signal, starts[source_rows], ends[source_rows]
         )
     return runs.expand_rows(result) if has_uniform_steps else result
 

@@ -12,7 +12,7 @@ from sims.core.simulator import InputError, Scenario
 from sims.engines import make_engine
 from sims.engines.batch import BatchEngine
 from sims.engines.compiled import compilability
-from sims.engines.compiled.expression_graph import LANE, OPERATION_CODES, ExpressionGraph
+from sims.engines.compiled.expression_graph import OPERATION_CODES, PER_ELEMENT, ExpressionGraph
 from sims.engines.compiled.kernel import get_kernel
 from sims.engines.compiled.node_arrays import NotTraceableError
 from sims.engines.compiled.traced_array import TracedArray
@@ -266,7 +266,7 @@ def test_sine_cosine_and_exponential_are_accurate_to_rounding():
 def test_equal_expressions_are_one_node_and_constants_are_computed():
     graph = ExpressionGraph()
     nodes = np.empty((1, 1), dtype=object)
-    nodes[0, 0] = graph.make_input(LANE)
+    nodes[0, 0] = graph.make_input(PER_ELEMENT)
     x = TracedArray(graph, nodes)
     assert (np.sin(x) + 1.0).nodes[0, 0] is (np.sin(x) + 1.0).nodes[0, 0]
     assert (np.full((1, 1), 2.0) * np.ones_like(x)).nodes[0, 0].value == 2.0

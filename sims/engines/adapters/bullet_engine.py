@@ -38,7 +38,7 @@ _NO_ROTATION = (0.0, 0.0, 0.0, 1.0)
 """Identity rotation as a quaternion x, y, z, w."""
 _ZERO_VECTOR = (0.0, 0.0, 0.0)
 """Zero vector: the origin, or zero velocity."""
-_IMPACT = 1e-4
+_IMPACT_STEP_SECONDS = 1e-4
 """Length of the time step of an impact, in seconds."""
 _REACH = 0.02 * math.sqrt(3)
 """Height above the ground, in radii of the ball, at which Bullet's contact begins."""
@@ -260,11 +260,11 @@ class BulletBall(_BulletMover):
             friction: friction coefficient.
         """
         self.set_contact_parameters(restitution, friction)
-        self.set_step(_IMPACT)
+        self.set_step(_IMPACT_STEP_SECONDS)
         # Bullet adds gravity's velocity change of the step before it solves the contact. This is
         # compensated, so that the solver sees v.
         contact_position = x[0], x[1], self._floor - ball_rollout.CONTACT_PENETRATION
-        self.set_state(contact_position, (v[0], v[1], v[2] + self._gravity * _IMPACT))
+        self.set_state(contact_position, (v[0], v[1], v[2] + self._gravity * _IMPACT_STEP_SECONDS))
         self._set_contact(True)
         _, velocity = self.advance_freely((1,))[0]
         self._set_contact(False)

@@ -35,7 +35,7 @@ from sims.engines.external.ball_rollout import BallState
 from sims.engines.external.element_forces import Vector
 from sims.engines.external.world_interface import MujocoJointWorldModule
 
-_IMPACT = 1e-4
+_IMPACT_STEP_SECONDS = 1e-4
 """Length of the time step of an impact in seconds.
 
 MuJoCo treats accelerations above 1e10 as a failure.
@@ -73,7 +73,7 @@ class CompiledWorld:
         # A copy of a simulator, in this or in another process, gets its own world.
         return CompiledWorld, (self._compile,)
 
-    def get_fresh(self, constants: Mapping[str, float]) -> tuple[Any, Any]:
+    def get_reset_world(self, constants: Mapping[str, float]) -> tuple[Any, Any]:
         """Return model and data in their initial state, for these constants."""
         if self._built_for != constants:
             mujoco = import_mujoco()
@@ -108,7 +108,7 @@ class MujocoJoint:
     def reset_world(self, constants: dict[str, float]) -> None:
         """Prepare a world for these constants, in its initial state."""
         self._constants, self.compute_gravity_force = constants, self._gravity(constants)
-        self._model, self._data = self._world.get_fresh(constants)
+        self._model, self._data = self._world.get_reset_world(constants)
         self._x = self._data.qpos
         self._w = self._data.qvel
         self._force = self._data.qfrc_applied
@@ -162,7 +162,7 @@ class MujocoMover:
         self._mass = constants["mass"]
         self._floor = constants["radius"]
         self._gravity = constants["gravity"]
-        self._model, self._data = self._world.get_fresh(constants)
+        self._model, self._data = self._world.get_reset_world(constants)
         self._x = self._data.qpos
         self._w = self._data.qvel
         self._force = self._data.qfrc_applied
@@ -245,18 +245,18 @@ class MujocoBall(MujocoMover):
             friction: friction coefficient.
         """
         self._is_supported = False
-        self.set_step(_IMPACT)
+        self.set_step(_IMPACT_STEP_SECONDS)
         self.set_state((x[0], x[1], self._floor - ball_rollout.CONTACT_PENETRATION), v)
         self._set_contact_parameters(0.0, (1.0 + restitution) * self._inverse_step)  # (3)
         # The impact removes tangential speed mu (1 + e) |vn| (`engines.ground_contact`), in
         # this one step.
         tangential_speed = math.hypot(v[0], v[1])
-        share = (
+        removed_share = (
             min(friction * (1.0 + restitution) * -v[2] / tangential_speed, 1.0)
             if tangential_speed
             else 0.0
         )
-        deceleration = share * self._inverse_step
+        deceleration = removed_share * self._inverse_step
         self._set_contact(True)
         _, velocity = self.advance((-deceleration * v[0], -deceleration * v[1], self._gravity))
         self._set_contact(False)

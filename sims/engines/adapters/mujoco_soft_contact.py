@@ -73,8 +73,8 @@ def compute_damping_ratio(
     low = 0.0
     high = max_damping_ratio
     for _ in range(60):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if _compute_restitution(middle) > restitution else (low, middle)
+        ratio = 0.5 * (low + high)
+        low, high = (ratio, high) if _compute_restitution(ratio) > restitution else (low, ratio)
     return low
 
 

@@ -18,11 +18,14 @@ from __future__ import annotations
 
 import numpy as np
 
+from sims.engines.compiled.accelerations import compute_frictionless_acceleration, evaluate_forces
 from sims.engines.compiled.data_layout import (
     BOUNCES,
+    CONSTANTS_BEGIN,
     DIMENSIONS,
     ELEMENT,
     FLOOR_LEVEL,
+    FORCES_BEGIN,
     K1,
     BatchArrays,
     BlockBuffers,
@@ -31,7 +34,6 @@ from sims.engines.compiled.data_layout import (
     V,
     X,
 )
-from sims.engines.compiled.dynamics import compute_frictionless_acceleration, evaluate_forces
 from sims.engines.compiled.element_clock import load_element
 from sims.engines.compiled.element_stepping import resolve_initial_ground_contact
 from sims.engines.compiled.events import compute_rebound_velocity
@@ -47,11 +49,14 @@ def fly_elements(program: ProgramArrays, arrays: BatchArrays, block: BlockBuffer
     Args:
         program: program of the system and its effects.
         arrays: batch of elements.
-        block: buffers of the slots.
+        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
+            one batch element.
     """
     for order_index in range(arrays.order.size):
         load_element(program, arrays, block, 0, order_index)
-        run_instructions(program.code, program.ends[0], program.ends[1], block.r, 1)
+        run_instructions(
+            program.code, program.ends[CONSTANTS_BEGIN], program.ends[FORCES_BEGIN], block.r, 1
+        )
         if program.flags[BOUNCES] != 0:
             resolve_initial_ground_contact(program, arrays, block, 1)
         evaluate_forces(program, block, 1)
@@ -68,7 +73,8 @@ def record_flight(program: ProgramArrays, arrays: BatchArrays, block: BlockBuffe
     Args:
         program: program of the system and its effects.
         arrays: batch of elements.
-        block: buffers of the slots.
+        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
+            one batch element.
     """
     element = block.n[ELEMENT, 0]
     row = element if arrays.steps.shape[0] > 1 else 0
@@ -94,7 +100,8 @@ def record_arc(
     Args:
         program: program of the system and its effects.
         arrays: batch of elements.
-        block: buffers of the slots.
+        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
+            one batch element.
         record: index of the record.
         time: seconds since the start of the run.
     """
@@ -115,7 +122,8 @@ def compute_impact_time(program: ProgramArrays, block: BlockBuffers) -> float:
 
     Args:
         program: program of the system and its effects.
-        block: buffers of the slots.
+        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
+            one batch element.
     """
     if program.flags[BOUNCES] == 0:
         return np.inf
@@ -140,7 +148,8 @@ def bounce(program: ProgramArrays, arrays: BatchArrays, block: BlockBuffers, imp
     Args:
         program: program of the system and its effects.
         arrays: batch of elements.
-        block: buffers of the slots.
+        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
+            one batch element.
         impact: time of the impact in seconds since the start of the run.
     """
     a = block.a

@@ -11,7 +11,7 @@ from sims.core.effect import Contact, Effect, Force, Friction
 from sims.core.engine import IntegrationBatch, Trajectories
 from sims.core.simulator import Array, Indices
 from sims.engines.compiled.compilability import get_force_program
-from sims.engines.compiled.data_layout import GUIDED_COUNT, HAS_FRICTION, BatchArrays
+from sims.engines.compiled.data_layout import FRICTION_COORDINATE_COUNT, HAS_FRICTION, BatchArrays
 from sims.engines.compiled.force_program import ForceProgram, NumpyForceProgram
 from sims.engines.compiled.kernel import get_kernel
 from sims.engines.compiled.kernel_entry import FLY_ELEMENTS, STEP_BLOCK, STEP_IN_LOCKSTEP
@@ -151,7 +151,7 @@ class _BatchRunner:
         # Elements with many steps begin first; the others fill the remaining slots meanwhile.
         order = np.argsort(-parts, kind="stable")
         separate_count = len(order)
-        has_events = program.arrays.flags[HAS_FRICTION:GUIDED_COUNT].any()
+        has_events = program.arrays.flags[HAS_FRICTION:FRICTION_COORDINATE_COUNT].any()
         if not has_events and len(self._steps) == 1 and self._patience >= 1.0:
             separate_count = int(np.count_nonzero(parts > 1))
         self._run_kernel_function(

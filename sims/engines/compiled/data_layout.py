@@ -94,14 +94,18 @@ class BlockBuffers(NamedTuple):
     n: IntTable
 
 
+# Entries of `ProgramArrays.ends`: where the instructions of constants, forces and impacts begin.
+CONSTANTS_BEGIN, FORCES_BEGIN, IMPACT_BEGIN, PROGRAM_END = range(4)
 # Entries of `ProgramArrays.rows`.
 IN_T, IN_X, IN_V, IN_U, IN_P, IN_E, IN_MU, IN_SPEED, OUT_LIMIT, OUT_E, OUT_MU = range(11)
 # Entries of `ProgramArrays.flags`.
-DIMENSIONS, HAS_FRICTION, HAS_FORCES, BOUNCES, GUIDED_COUNT = range(5)
+DIMENSIONS, HAS_FRICTION, HAS_FORCES, BOUNCES, FRICTION_COORDINATE_COUNT = range(5)
 # Rows of `BatchArrays.ground`.
 FLOOR, RESTITUTION, GROUND_FRICTION, MIN_REMAINING_SHARE = range(4)
 # Rows of `BlockBuffers.a`: first the rows with one number per slot, then the first row of each
-# vector. MAX_ACCELERATION is the square of the largest acceleration so far.
+# vector. MAX_ACCELERATION is the square of the largest acceleration so far. EXCESS_BEFORE and
+# EXCESS_AFTER are the force minus the limit of dry friction at the ends of a step, and H is the
+# step size.
 (
     T,
     REMAINING_TIME,
@@ -112,8 +116,8 @@ FLOOR, RESTITUTION, GROUND_FRICTION, MIN_REMAINING_SHARE = range(4)
     EVENT_DELAY,
     H,
     MASS,
-    BEFORE,
-    AFTER,
+    EXCESS_BEFORE,
+    EXCESS_AFTER,
     STEP_COUNT,
     STEP_START,
     NONLINEARITY,
@@ -166,13 +170,13 @@ def make_flags(system: System, names: InputNames, effects: Sequence[Effect]) -> 
     has_friction, has_forces = (
         any(isinstance(effect, kind) for effect in effects) for kind in (Friction, Force)
     )
-    guided_count = system.guided or names.coordinates
+    friction_coordinate_count = system.guided or names.coordinates
     flags = (
         names.coordinates,
         has_friction,
         has_forces or system.bends,
         system.bounces,
-        guided_count,
+        friction_coordinate_count,
     )
     return np.array(flags, dtype=np.int64)
 
@@ -199,7 +203,8 @@ def check_array_layout(
     Args:
         program: program of the system and its effects.
         arrays: batch of elements.
-        block: buffers of the slots.
+        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
+            one batch element.
         w: number of slots in use.
         spans: (L,) step sizes in seconds.
         divisions: (L,) numbers of parts.

@@ -45,8 +45,9 @@ def load_element(
     Args:
         program: program of the system and its effects.
         arrays: batch of elements.
-        block: buffers of the slots.
-        i: index of the slot.
+        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
+            one batch element.
+        i: index of the slot, the column of the batch element.
         order_index: index of the element in `arrays.order`.
     """
     a = block.a
@@ -81,8 +82,9 @@ def set_inputs(program: ProgramArrays, arrays: BatchArrays, block: BlockBuffers,
     Args:
         program: program of the system and its effects.
         arrays: batch of elements.
-        block: buffers of the slots.
-        i: index of the slot.
+        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
+            one batch element.
+        i: index of the slot, the column of the batch element.
     """
     first = program.rows[IN_U]
     step = min(block.n[STEP_INDEX, i], arrays.steps.shape[1] - 1)
@@ -99,8 +101,9 @@ def record_and_check_remaining(
     Args:
         program: program of the system and its effects.
         arrays: batch of elements.
-        block: buffers of the slots.
-        i: index of the slot.
+        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
+            one batch element.
+        i: index of the slot, the column of the batch element.
 
     Returns:
         Whether the element has further steps.
@@ -131,8 +134,9 @@ def record_state(
     Args:
         program: program of the system and its effects.
         arrays: batch of elements.
-        block: buffers of the slots.
-        i: index of the slot.
+        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
+            one batch element.
+        i: index of the slot, the column of the batch element.
         record: index of the record.
     """
     a = block.a
@@ -152,8 +156,9 @@ def next_step(program: ProgramArrays, arrays: BatchArrays, block: BlockBuffers, 
     Args:
         program: program of the system and its effects.
         arrays: batch of elements.
-        block: buffers of the slots.
-        i: index of the slot.
+        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
+            one batch element.
+        i: index of the slot, the column of the batch element.
     """
     a = block.a
     n = block.n

@@ -28,19 +28,22 @@ from __future__ import annotations
 
 import numpy as np
 
+from sims.engines.compiled.accelerations import begin_step, compute_acceleration, evaluate_forces
 from sims.engines.compiled.data_layout import (
-    AFTER,
     BOUNCES,
+    CONSTANTS_BEGIN,
     DIMENSIONS,
     DIRECTION,
     ELEMENT,
     EVENT_DELAY,
+    EXCESS_AFTER,
     F1,
     F2,
     F3,
     F4,
     FLOOR,
     FLOOR_LEVEL,
+    FORCES_BEGIN,
     HAS_FORCES,
     HAS_FRICTION,
     IN_T,
@@ -78,7 +81,6 @@ from sims.engines.compiled.data_layout import (
     V,
     X,
 )
-from sims.engines.compiled.dynamics import begin_step, compute_acceleration, evaluate_forces
 from sims.engines.compiled.element_clock import load_element, next_step, record_and_check_remaining
 from sims.engines.compiled.events import (
     FORCE_NONLINEARITY_TOLERANCE,
@@ -101,7 +103,8 @@ def step_block(program: ProgramArrays, arrays: BatchArrays, block: BlockBuffers,
     Args:
         program: program of the system and its effects.
         arrays: batch of elements.
-        block: buffers of the slots.
+        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
+            one batch element.
         w: number of slots in use.
     """
     loaded_count = 0
@@ -118,7 +121,9 @@ def step_block(program: ProgramArrays, arrays: BatchArrays, block: BlockBuffers,
     has_new_elements = True
     while active_count > 0:
         if has_new_elements:
-            run_instructions(program.code, program.ends[0], program.ends[1], block.r, w)
+            run_instructions(
+                program.code, program.ends[CONSTANTS_BEGIN], program.ends[FORCES_BEGIN], block.r, w
+            )
             if program.flags[BOUNCES] != 0:
                 resolve_initial_ground_contact(program, arrays, block, w)
             has_new_elements = False
@@ -159,7 +164,8 @@ def resolve_initial_ground_contact(
     Args:
         program: program of the system and its effects.
         arrays: batch of elements.
-        block: buffers of the slots.
+        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
+            one batch element.
         w: number of slots in use.
     """
     a = block.a
@@ -199,7 +205,8 @@ def try_step(program: ProgramArrays, block: BlockBuffers, w: int) -> None:
 
     Args:
         program: program of the system and its effects.
-        block: buffers of the slots.
+        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
+            one batch element.
         w: number of slots in use.
     """
     a = block.a
@@ -245,7 +252,8 @@ def detect_possible_events(program: ProgramArrays, block: BlockBuffers, w: int) 
 
     Args:
         program: program of the system and its effects.
-        block: buffers of the slots.
+        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
+            one batch element.
         w: number of slots in use.
     """
     a = block.a
@@ -284,7 +292,8 @@ def detect_friction_events(program: ProgramArrays, block: BlockBuffers, w: int) 
 
     Args:
         program: program of the system and its effects.
-        block: buffers of the slots.
+        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
+            one batch element.
         w: number of slots in use.
     """
     a = block.a
@@ -303,7 +312,7 @@ def detect_friction_events(program: ProgramArrays, block: BlockBuffers, w: int) 
         is_nonlinear = bend > FRICTION_NONLINEARITY_TOLERANCE * largest
         reverses = a[NEXT_V, i] * a[DIRECTION, i] < 0.0
         slips = 1 if is_nonlinear or reverses else 0
-        loosens = 1 if a[AFTER, i] > 0.0 else 0
+        loosens = 1 if a[EXCESS_AFTER, i] > 0.0 else 0
         n[MAY_HAVE_EVENT, i] |= loosens if n[IS_STICKING, i] != 0 else slips
 
 
@@ -313,7 +322,8 @@ def accept_steps(program: ProgramArrays, arrays: BatchArrays, block: BlockBuffer
     Args:
         program: program of the system and its effects.
         arrays: batch of elements.
-        block: buffers of the slots.
+        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
+            one batch element.
         w: number of slots in use.
     """
     a = block.a
@@ -350,8 +360,9 @@ def accept_or_retry(
     Args:
         program: program of the system and its effects.
         arrays: batch of elements.
-        block: buffers of the slots.
-        i: index of the slot.
+        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
+            one batch element.
+        i: index of the slot, the column of the batch element.
     """
     a = block.a
     n = block.n

@@ -28,8 +28,6 @@ from __future__ import annotations
 import numpy as np
 
 from sims.engines.compiled.data_layout import (
-    AFTER,
-    BEFORE,
     BOUNCES,
     BREAK_AWAY,
     DIMENSIONS,
@@ -37,16 +35,19 @@ from sims.engines.compiled.data_layout import (
     ELEMENT,
     EVENT_COUNT,
     EVENT_DELAY,
+    EXCESS_AFTER,
+    EXCESS_BEFORE,
     F1,
     F2,
     F3,
     F4,
     FLOOR,
+    FRICTION_COORDINATE_COUNT,
     GROUND_FRICTION,
-    GUIDED_COUNT,
     HAS_FORCES,
     HAS_FRICTION,
     IMPACT,
+    IMPACT_BEGIN,
     IN_E,
     IN_MU,
     IN_SPEED,
@@ -67,6 +68,7 @@ from sims.engines.compiled.data_layout import (
     OUT_E,
     OUT_MU,
     PENDING_EVENT,
+    PROGRAM_END,
     REMAINING_TIME,
     RESTITUTION,
     SHORT_FLIGHT_COUNT,
@@ -120,7 +122,7 @@ def dot(a: FloatArray, first_vector: int, second_vector: int, d: int, i: int) ->
         first_vector: first row of the first vector.
         second_vector: first row of the second vector.
         d: number of dimensions.
-        i: index of the slot.
+        i: index of the slot, the column of the batch element.
     """
     total = a[first_vector, i] * a[second_vector, i]
     for k in range(1, d):
@@ -135,7 +137,7 @@ def compute_norm(a: FloatArray, first_vector: int, d: int, i: int) -> float:
         a: numbers of the slots.
         first_vector: first row of the vector.
         d: number of dimensions.
-        i: index of the slot.
+        i: index of the slot, the column of the batch element.
     """
     if d == 1:
         return abs(a[first_vector, i])  # type: ignore[no-any-return]
@@ -166,8 +168,9 @@ def is_too_nonlinear(program: ProgramArrays, block: BlockBuffers, i: int) -> boo
 
     Args:
         program: program of the system and its effects.
-        block: buffers of the slots.
-        i: index of the slot.
+        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
+            one batch element.
+        i: index of the slot, the column of the batch element.
     """
     a = block.a
     d = program.flags[DIMENSIONS]
@@ -175,22 +178,24 @@ def is_too_nonlinear(program: ProgramArrays, block: BlockBuffers, i: int) -> boo
     a[MAX_ACCELERATION, i] = nan_maximum(a[MAX_ACCELERATION, i], dot(a, K1, K1, d, i))
     is_nonlinear = False
     if program.flags[HAS_FORCES] != 0:
-        square = 0.0
+        squared_change = 0.0
         for k in range(d):
             outer_sum = a[K1 + k, i] + a[K4 + k, i]
             middle_sum = a[K2 + k, i] + a[K3 + k, i]
-            square += (outer_sum - middle_sum) * (outer_sum - middle_sum)
-        is_nonlinear = square > FORCE_NONLINEARITY_TOLERANCE * a[MAX_ACCELERATION, i]
+            squared_change += (outer_sum - middle_sum) * (outer_sum - middle_sum)
+        is_nonlinear = squared_change > FORCE_NONLINEARITY_TOLERANCE * a[MAX_ACCELERATION, i]
     if program.flags[HAS_FRICTION] != 0:
         largest = nan_maximum(compute_norm(a, F1, d, i), compute_norm(a, F4, d, i))
         a[MAX_FRICTION, i] = nan_maximum(a[MAX_FRICTION, i], largest)
         negligible = NEGLIGIBLE_ACCELERATION_SHARE * np.sqrt(a[MAX_ACCELERATION, i]) * a[MASS, i]
-        square = 0.0
+        squared_change = 0.0
         for k in range(d):
             change = a[F1 + k, i] - a[F2 + k, i] - a[F3 + k, i] + a[F4 + k, i]
-            square += change * change
-        size = abs(change) if d == 1 else np.sqrt(square)
-        if block.n[IS_STICKING, i] == 0 and size > FRICTION_NONLINEARITY_TOLERANCE * nan_maximum(
+            squared_change += change * change
+        change_size = abs(change) if d == 1 else np.sqrt(squared_change)
+        if block.n[
+            IS_STICKING, i
+        ] == 0 and change_size > FRICTION_NONLINEARITY_TOLERANCE * nan_maximum(
             a[MAX_FRICTION, i], negligible
         ):
             is_nonlinear = True
@@ -217,15 +222,16 @@ def detect_event(program: ProgramArrays, arrays: BatchArrays, block: BlockBuffer
     Args:
         program: program of the system and its effects.
         arrays: batch of elements.
-        block: buffers of the slots.
-        i: index of the slot.
+        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
+            one batch element.
+        i: index of the slot, the column of the batch element.
     """
     a = block.a
     d = program.flags[DIMENSIONS]
     h = a[H, i]
-    is_open = has_no_pending_event(block, i)
+    has_no_event = has_no_pending_event(block, i)
     has_event = False
-    if is_open and program.flags[BOUNCES] != 0:
+    if has_no_event and program.flags[BOUNCES] != 0:
         floor = arrays.ground[FLOOR, block.n[ELEMENT, i]]
         end_value = a[NEXT_X + d - 1, i]
         if end_value < floor:
@@ -235,7 +241,7 @@ def detect_event(program: ProgramArrays, arrays: BatchArrays, block: BlockBuffer
             has_event = True
     if program.flags[HAS_FRICTION] != 0:
         is_sticking = block.n[IS_STICKING, i] != 0
-        if is_open and not is_sticking:
+        if has_no_event and not is_sticking:
             end_value = dot(a, NEXT_V, DIRECTION, d, i)
             if end_value < 0.0:
                 speed = dot(a, V, DIRECTION, d, i)
@@ -243,9 +249,9 @@ def detect_event(program: ProgramArrays, arrays: BatchArrays, block: BlockBuffer
                 schedule_event(block, i, find_event_time(speed, rate, end_value, h), STANDSTILL)
                 has_event = True
         awaits_break_away = block.n[PENDING_EVENT, i] == BREAK_AWAY
-        if is_sticking and (is_open or awaits_break_away):
-            value_before = a[BEFORE, i]
-            value_after = a[AFTER, i]
+        if is_sticking and (has_no_event or awaits_break_away):
+            value_before = a[EXCESS_BEFORE, i]
+            value_after = a[EXCESS_AFTER, i]
             # A scheduled break-away is checked again with a tolerance.
             if value_after > (
                 BREAK_AWAY_TIME_TOLERANCE * (value_after - value_before)
@@ -264,8 +270,9 @@ def schedule_event(block: BlockBuffers, i: int, seconds: float, event: int) -> N
     """Schedule an event at the end of the next step; of two events the first counts.
 
     Args:
-        block: buffers of the slots.
-        i: index of the slot.
+        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
+            one batch element.
+        i: index of the slot, the column of the batch element.
         seconds: seconds to the event.
         event: kind of event.
     """
@@ -284,8 +291,9 @@ def handle_event(program: ProgramArrays, arrays: BatchArrays, block: BlockBuffer
     Args:
         program: program of the system and its effects.
         arrays: batch of elements.
-        block: buffers of the slots.
-        i: index of the slot.
+        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
+            one batch element.
+        i: index of the slot, the column of the batch element.
     """
     event = block.n[PENDING_EVENT, i]
     if event == IMPACT:
@@ -304,8 +312,9 @@ def shift_time(block: BlockBuffers, i: int, seconds: float) -> float:
     rest.
 
     Args:
-        block: buffers of the slots.
-        i: index of the slot.
+        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
+            one batch element.
+        i: index of the slot, the column of the batch element.
         seconds: time correction in seconds; NaN counts as zero.
 
     Returns:
@@ -331,8 +340,9 @@ def handle_impact(
     Args:
         program: program of the system and its effects.
         arrays: batch of elements.
-        block: buffers of the slots.
-        i: index of the slot.
+        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
+            one batch element.
+        i: index of the slot, the column of the batch element.
         k: first row of the acceleration before the impact.
     """
     a = block.a
@@ -371,8 +381,9 @@ def compute_rebound_velocity(
     Args:
         program: program of the system and its effects.
         arrays: batch of elements.
-        block: buffers of the slots.
-        i: index of the slot.
+        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
+            one batch element.
+        i: index of the slot, the column of the batch element.
         pull: upward acceleration before the impact.
     """
     a = block.a
@@ -388,7 +399,7 @@ def compute_rebound_velocity(
         r[rows[IN_E], s] = arrays.ground[RESTITUTION, element]
         r[rows[IN_MU], s] = arrays.ground[GROUND_FRICTION, element]
         r[rows[IN_SPEED], s] = speed
-    run_instructions(program.code, program.ends[2], program.ends[3], r, width)
+    run_instructions(program.code, program.ends[IMPACT_BEGIN], program.ends[PROGRAM_END], r, width)
     e = r[rows[OUT_E], i]
     mu = r[rows[OUT_MU], i]
     rebound_speed = e * speed
@@ -417,8 +428,9 @@ def is_bouncing_over(block: BlockBuffers, i: int, rebound_speed: float, down: fl
     shorter than `MIN_FLIGHT_SECONDS`, or after `MAX_SHORT_FLIGHTS` short ones.
 
     Args:
-        block: buffers of the slots.
-        i: index of the slot.
+        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
+            one batch element.
+        i: index of the slot, the column of the batch element.
         rebound_speed: rebound speed.
         down: downward acceleration.
     """
@@ -436,8 +448,9 @@ def handle_standstill(program: ProgramArrays, block: BlockBuffers, i: int) -> No
 
     Args:
         program: program of the system and its effects.
-        block: buffers of the slots.
-        i: index of the slot.
+        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
+            one batch element.
+        i: index of the slot, the column of the batch element.
     """
     a = block.a
     d = program.flags[DIMENSIONS]
@@ -451,10 +464,10 @@ def handle_standstill(program: ProgramArrays, block: BlockBuffers, i: int) -> No
     for k in range(d):
         a[V + k, i] -= a[DIRECTION + k, i] * directed_velocity
     # The speed becomes exactly zero, because only an element with zero speed can stick.
-    guided_count = program.flags[GUIDED_COUNT]
+    friction_coordinate_count = program.flags[FRICTION_COORDINATE_COUNT]
     if (
-        compute_norm(a, V, guided_count, i)
-        <= REST_SPEED_SHARE * compute_norm(a, K4, guided_count, i) * a[MAX_STEP, i]
+        compute_norm(a, V, friction_coordinate_count, i)
+        <= REST_SPEED_SHARE * compute_norm(a, K4, friction_coordinate_count, i) * a[MAX_STEP, i]
     ):
-        for k in range(guided_count):
+        for k in range(friction_coordinate_count):
             a[V + k, i] = 0.0

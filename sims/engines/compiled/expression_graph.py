@@ -27,7 +27,7 @@ EXTERNAL = len(OPERATIONS)
 Its last two arguments are the part of the program and the address of the function.
 """
 
-CONSTANT, LANE, MOMENT, IMPACT = range(4)
+CONSTANT, PER_ELEMENT, PER_EVALUATION, PER_IMPACT = range(4)
 """Change frequency of a value: never, per batch element, per evaluation, or per impact."""
 
 
@@ -39,7 +39,7 @@ class ExpressionNode:
         operation: a name of `OPERATIONS`, ``input`` or ``constant``.
         args: argument nodes.
         value: value of a constant.
-        change_frequency: change frequency, from CONSTANT to IMPACT.
+        change_frequency: change frequency, from CONSTANT to PER_IMPACT.
     """
 
     operation: str

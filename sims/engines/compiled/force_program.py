@@ -27,10 +27,10 @@ from sims.engines.compiled.data_layout import (
     make_flags,
 )
 from sims.engines.compiled.expression_graph import (
-    IMPACT,
-    LANE,
-    MOMENT,
     OPERATION_CODES,
+    PER_ELEMENT,
+    PER_EVALUATION,
+    PER_IMPACT,
     ExpressionGraph,
     ExpressionNode,
 )
@@ -169,20 +169,20 @@ class SystemTracer:
         self.graph = graph
         self._system = system
         self._names = names
-        self.t = make_input_vector(graph, 1, MOMENT)
-        self.x = make_input_vector(graph, names.coordinates, MOMENT)
-        self.v = make_input_vector(graph, names.coordinates, MOMENT)
+        self.t = make_input_vector(graph, 1, PER_EVALUATION)
+        self.x = make_input_vector(graph, names.coordinates, PER_EVALUATION)
+        self.v = make_input_vector(graph, names.coordinates, PER_EVALUATION)
         self.u: dict[str, Any] = {
-            name: make_input_vector(graph, 1, MOMENT) for name in names.inputs
+            name: make_input_vector(graph, 1, PER_EVALUATION) for name in names.inputs
         }
-        theta = make_input_vector(graph, names.parameters, LANE)
+        theta = make_input_vector(graph, names.parameters, PER_ELEMENT)
         constants: dict[str, Any] = {
-            name: make_input_vector(graph, 1, LANE) for name in names.constants
+            name: make_input_vector(graph, 1, PER_ELEMENT) for name in names.constants
         }
         self.e: Any
         self.mu: Any
         self.speed: Any
-        self.e, self.mu, self.speed = (make_input_vector(graph, 1, IMPACT) for _ in range(3))
+        self.e, self.mu, self.speed = (make_input_vector(graph, 1, PER_IMPACT) for _ in range(3))
         self.parameters = collect_nodes(theta, *constants.values())
         self._moment = StateSnapshot(system, theta, constants, self.t, self.x, self.v, self.u)
         self._shape = 1, names.coordinates
@@ -215,7 +215,7 @@ class SystemTracer:
         kind = type(effect)
         if kind not in self._effects:
             count = len(effect.coefficients)
-            c = make_input_vector(self.graph, count, LANE).T[:, :, None]
+            c = make_input_vector(self.graph, count, PER_ELEMENT).T[:, :, None]
             force = limit = None
             if isinstance(effect, Force):
                 force = self._broadcast_result(effect.force(c, self._moment), self._shape)
@@ -278,17 +278,17 @@ class _ProgramNodes(NamedTuple):
 def _write_program(nodes: _ProgramNodes) -> ForceProgram:
     """Write traced expressions as instructions, with the registers of their inputs and outputs."""
     outputs = [*nodes.force, *nodes.limit, *nodes.impact]
-    written = emit_instructions(nodes.inputs, outputs)
-    limit = written.place[nodes.limit[0]] if nodes.limit else -1
-    rows = [*written.rows, limit, *(written.place[node] for node in nodes.impact)]
+    instructions = emit_instructions(nodes.inputs, outputs)
+    limit = instructions.place[nodes.limit[0]] if nodes.limit else -1
+    rows = [*instructions.rows, limit, *(instructions.place[node] for node in nodes.impact)]
     arrays = ProgramArrays(
-        code=written.code,
-        ends=written.ends,
+        code=instructions.code,
+        ends=instructions.ends,
         rows=np.array(rows, dtype=np.int64),
-        out=np.array([written.place[node] for node in nodes.force], dtype=np.int64),
+        out=np.array([instructions.place[node] for node in nodes.force], dtype=np.int64),
         flags=nodes.flags,
     )
-    return ForceProgram(arrays, written.values, written.first, len(written.place))
+    return ForceProgram(arrays, instructions.values, instructions.first, len(instructions.place))
 
 
 class InstructionList(NamedTuple):
@@ -323,35 +323,37 @@ def emit_instructions(
     Raises:
         NotTraceableError: too many registers are needed.
     """
-    place: dict[ExpressionNode, int] = {}
+    registers: dict[ExpressionNode, int] = {}
     rows = []
     for group in groups:
-        rows.append(len(place))
+        rows.append(len(registers))
         for node in group:
-            place[node] = len(place)
-    first = len(place)
-    order = _sort_nodes(outputs)
+            registers[node] = len(registers)
+    first_constant = len(registers)
+    sorted_nodes = _sort_nodes(outputs)
     # Constants have consecutive registers, so that they are set by one assignment.
     values = []
-    for node in order:
+    for node in sorted_nodes:
         if node.operation == "constant":
-            place[node] = len(place)
+            registers[node] = len(registers)
             values.append(node.value)
-    parts: dict[int, list[list[int]]] = {LANE: [], MOMENT: [], IMPACT: []}
-    for node in order:
+    by_frequency: dict[int, list[list[int]]] = {PER_ELEMENT: [], PER_EVALUATION: [], PER_IMPACT: []}
+    for node in sorted_nodes:
         if node.args:
-            place[node] = len(place)
-            args = [place[arg] for arg in node.args]
+            registers[node] = len(registers)
+            args = [registers[arg] for arg in node.args]
             args += [args[0]] * (3 - len(args))
-            parts[node.change_frequency].append(
-                [OPERATION_CODES[node.operation], place[node], *args]
+            by_frequency[node.change_frequency].append(
+                [OPERATION_CODES[node.operation], registers[node], *args]
             )
-    if len(place) > MAX_REGISTERS:
+    if len(registers) > MAX_REGISTERS:
         raise NotTraceableError(f"it needs more than {MAX_REGISTERS} registers")
-    lines = [line for part in parts.values() for line in part]
-    part_ends = np.cumsum([0, *(len(part) for part in parts.values())])
+    lines = [line for part in by_frequency.values() for line in part]
+    part_ends = np.cumsum([0, *(len(part) for part in by_frequency.values())])
     code = np.array(lines, dtype=np.int64).reshape(-1, 5)
-    return InstructionList(code, part_ends.astype(np.int64), rows, place, first, np.array(values))
+    return InstructionList(
+        code, part_ends.astype(np.int64), rows, registers, first_constant, np.array(values)
+    )
 
 
 def _sort_nodes(outputs: Sequence[ExpressionNode]) -> list[ExpressionNode]:

@@ -32,7 +32,8 @@ from sims.engines.compiled.data_layout import (
 )
 
 KERNEL_SOURCE_MODULES = (
-    *("ballistic_motion", "data_layout", "dynamics", "element_clock", "element_stepping", "events"),
+    *("accelerations", "ballistic_motion", "data_layout", "element_clock", "element_stepping"),
+    "events",
     *("expression_graph", "interpreter", "kernel_build", "kernel_entry", "llvm_code"),
     *("lockstep_stepping", "mujoco_callback", "step_size"),
 )

@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 
 from sims.engines.compiled import (
+    accelerations,
     ballistic_motion,
     data_layout,
-    dynamics,
     element_clock,
     element_stepping,
     events,
@@ -36,7 +36,7 @@ KERNEL_MODULES: tuple[ModuleType, ...] = (
     interpreter,
     events,
     element_clock,
-    dynamics,
+    accelerations,
     element_stepping,
     lockstep_stepping,
     ballistic_motion,
@@ -45,7 +45,12 @@ KERNEL_MODULES: tuple[ModuleType, ...] = (
 """Modules that contain the compiled functions."""
 _INLINED = frozenset(
     {
-        *("evaluate_forces", "begin_step", "compute_acceleration", "compute_pulling_force"),
+        *(
+            "evaluate_forces",
+            "begin_step",
+            "compute_acceleration",
+            "compute_force_without_friction",
+        ),
         *("compute_frictionless_acceleration", "try_step", "accept_steps", "next_step"),
         *("set_inputs", "record_and_check_remaining", "detect_possible_events"),
         *("detect_friction_events", "is_too_nonlinear", "has_no_pending_event", "nan_maximum"),

@@ -6,8 +6,11 @@ those of `sims.engines.compiled.element_stepping`, which checks every element in
 
 from __future__ import annotations
 
+from sims.engines.compiled.accelerations import compute_frictionless_acceleration, evaluate_forces
 from sims.engines.compiled.data_layout import (
+    CONSTANTS_BEGIN,
     DIMENSIONS,
+    FORCES_BEGIN,
     IN_U,
     K1,
     NEXT_V,
@@ -22,7 +25,6 @@ from sims.engines.compiled.data_layout import (
     V,
     X,
 )
-from sims.engines.compiled.dynamics import compute_frictionless_acceleration, evaluate_forces
 from sims.engines.compiled.element_clock import load_element, record_state, set_inputs
 from sims.engines.compiled.element_stepping import try_step
 from sims.engines.compiled.interpreter import run_instructions
@@ -39,7 +41,8 @@ def step_in_lockstep(
     Args:
         program: program of the system and its effects.
         arrays: batch of elements.
-        block: buffers of the slots.
+        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
+            one batch element.
         w: number of slots in use.
     """
     a = block.a
@@ -48,7 +51,9 @@ def step_in_lockstep(
         count = min(w, arrays.order.size - first)
         for i in range(w):
             load_element(program, arrays, block, i, first + min(i, count - 1))
-        run_instructions(program.code, program.ends[0], program.ends[1], block.r, w)
+        run_instructions(
+            program.code, program.ends[CONSTANTS_BEGIN], program.ends[FORCES_BEGIN], block.r, w
+        )
         for step in range(step_count + 1):
             evaluate_forces(program, block, w)
             compute_frictionless_acceleration(program, block, w, K1)
@@ -72,7 +77,8 @@ def accept_step(program: ProgramArrays, block: BlockBuffers, w: int, h: float) -
 
     Args:
         program: program of the system and its effects.
-        block: buffers of the slots.
+        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
+            one batch element.
         w: number of slots in use.
         h: step size in seconds.
     """
@@ -94,7 +100,8 @@ def set_shared_inputs(
     Args:
         program: program of the system and its effects.
         arrays: batch of elements.
-        block: buffers of the slots.
+        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
+            one batch element.
         w: number of slots in use.
         step: index of the step.
     """

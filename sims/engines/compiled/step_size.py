@@ -16,9 +16,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from sims.engines.compiled.accelerations import evaluate_forces
 from sims.engines.compiled.data_layout import (
+    CONSTANTS_BEGIN,
     DIMENSIONS,
     ELEMENT,
+    FORCES_BEGIN,
+    IMPACT_BEGIN,
     IN_U,
     IN_V,
     IN_X,
@@ -34,7 +38,6 @@ from sims.engines.compiled.data_layout import (
     V,
     X,
 )
-from sims.engines.compiled.dynamics import evaluate_forces
 from sims.engines.compiled.element_clock import load_element
 from sims.engines.compiled.interpreter import nan_maximum, run_instructions
 
@@ -65,7 +68,8 @@ def choose_step_divisions(
     Args:
         program: program of the system and its effects.
         arrays: batch of elements.
-        block: buffers of the slots.
+        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
+            one batch element.
         w: number of slots in use.
         spans: (L,) step sizes in seconds.
         max_phase: maximum phase of an oscillation per step in radians.
@@ -77,7 +81,9 @@ def choose_step_divisions(
             load_element(program, arrays, block, i, min(first + i, arrays.order.size - 1))
             if instants > 1:
                 select_sampled_steps(arrays, block, i)
-        run_instructions(program.code, program.ends[0], program.ends[1], block.r, w)
+        run_instructions(
+            program.code, program.ends[CONSTANTS_BEGIN], program.ends[FORCES_BEGIN], block.r, w
+        )
         for instant in range(instants):
             if instants > 1:
                 set_inputs_at(program, arrays, block, w, instant)
@@ -100,8 +106,9 @@ def select_sampled_steps(arrays: BatchArrays, block: BlockBuffers, i: int) -> No
 
     Args:
         arrays: batch of elements.
-        block: buffers of the slots.
-        i: index of the slot.
+        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
+            one batch element.
+        i: index of the slot, the column of the batch element.
     """
     n = block.n
     shared = arrays.steps.shape[0] == 1
@@ -133,7 +140,8 @@ def set_inputs_at(
     Args:
         program: program of the system and its effects.
         arrays: batch of elements.
-        block: buffers of the slots.
+        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
+            one batch element.
         w: number of slots in use.
         instant: index of the selected step.
     """
@@ -155,7 +163,8 @@ def compute_stiffness_and_damping(
     Args:
         program: program of the system and its effects.
         arrays: batch of elements.
-        block: buffers of the slots.
+        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
+            one batch element.
         w: number of slots in use.
         at_rest: whether to evaluate at rest at zero instead of the initial state.
     """
@@ -185,7 +194,8 @@ def update_max_slope(
 
     Args:
         program: program of the system and its effects.
-        block: buffers of the slots.
+        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
+            one batch element.
         w: number of slots in use.
         k: index of the coordinate.
         register: first register of the positions or velocities.
@@ -196,12 +206,16 @@ def update_max_slope(
         # Both velocities are on one side of rest: a discontinuity at rest is not a faster decay.
         for i in range(w):
             block.r[register + k, i] += FINITE_DIFFERENCE_STEP
-        run_instructions(program.code, program.ends[1], program.ends[2], block.r, w)
+        run_instructions(
+            program.code, program.ends[FORCES_BEGIN], program.ends[IMPACT_BEGIN], block.r, w
+        )
         for i in range(w):
             a[K1 + k, i] = block.r[program.out[k], i]
     for i in range(w):
         block.r[register + k, i] += FINITE_DIFFERENCE_STEP
-    run_instructions(program.code, program.ends[1], program.ends[2], block.r, w)
+    run_instructions(
+        program.code, program.ends[FORCES_BEGIN], program.ends[IMPACT_BEGIN], block.r, w
+    )
     for i in range(w):
         change = block.r[program.out[k], i] - a[K1 + k, i]
         slope = abs(change / (FINITE_DIFFERENCE_STEP * a[MASS, i]))

@@ -289,7 +289,8 @@ class BallRollout:
         """Advance under gravity alone, or at rest, by each number of steps in `counts`.
 
         No force has to be evaluated, so that the engine runs on its own. Returns the state
-        after each count.
+        after each count: position, velocity and acceleration, three numbers each. The engine's
+        velocity w is half a step earlier than v.
         """
         self._prepare_step(step)
         ax, ay, az = self.a

@@ -244,14 +244,14 @@ def _list_numbers(element: ElementWork) -> list[Array]:
     ]
 
 
-def equalise_steps(steps: Array, every: int) -> Array:
+def equalise_steps(steps: Array, steps_per_sample: int) -> Array:
     """Return equal steps if the given ones differ only by rounding.
 
     A change of the step size costs an engine more than a step.
 
     Args:
         steps: (S,) step sizes in seconds, > 0.
-        every: number of steps from one sample to the next.
+        steps_per_sample: number of steps from one sample to the next.
 
     Returns:
         The steps (S,), equal or unchanged.
@@ -263,7 +263,7 @@ def equalise_steps(steps: Array, every: int) -> Array:
     mean_step = math.fsum(steps) / steps.size
     equal_times = mean_step * np.arange(1, steps.size + 1)
     largest_deviation = np.abs(np.cumsum(steps) - equal_times).max()
-    are_equal = largest_deviation <= TIME_TOLERANCE * mean_step * every
+    are_equal = largest_deviation <= TIME_TOLERANCE * mean_step * steps_per_sample
     return np.full(steps.size, mean_step) if are_equal else steps
 
 

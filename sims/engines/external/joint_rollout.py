@@ -161,13 +161,13 @@ class LinearisedForces:
         evaluating it again.
         """
         # The second velocity is farther from zero, where forces may be discontinuous.
-        change = math.copysign(VELOCITY_STEP, v)
-        force, changed = self._forces.evaluate_at_velocities(t, x, (v, v + change))
+        velocity_step = math.copysign(VELOCITY_STEP, v)
+        force, perturbed_force = self._forces.evaluate_at_velocities(t, x, (v, v + velocity_step))
         self.weight = self._joint.compute_gravity_force(x)
         self.limit = self._forces.limit
         self._velocity = v
         self._force = force
-        self._slope = (changed - force) / change
+        self._slope = (perturbed_force - force) / velocity_step
 
     def compute_force(self, v: float) -> float:
         """Return all forces except dry friction, near the evaluated velocity."""

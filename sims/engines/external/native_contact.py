@@ -25,7 +25,7 @@ from sims.engines.external.ball_rollout import BallBody, get_gravity, make_traje
 from sims.engines.external.element_forces import ElementForces, Vector
 from sims.engines.external.external_engine import ElementWork, Trajectory, split_into_legs
 
-_SLOW = 0.2
+_MAX_RESTING_SPEED = 0.2
 """Speed in m/s below which Bullet treats a ball on the ground as resting."""
 
 
@@ -108,7 +108,7 @@ def integrate_native_ball(ball: NativeContactBall, element: ElementWork) -> Traj
     positions, v, effect_forces = make_trajectory(element, rows)
     speed = np.sqrt((v * v).sum(axis=1, keepdims=True))
     a: Array = np.array([gx, gy, gz]) + effect_forces - ball.damping * v * (1.0 + speed)  # (1)
-    for i in np.flatnonzero(np.abs(v[:, 2]) < _SLOW):
+    for i in np.flatnonzero(np.abs(v[:, 2]) < _MAX_RESTING_SPEED):
         if ball.is_near_contact(positions[i, 2] - floor):
             a[i, 2] = 0.0
     return positions, v, a

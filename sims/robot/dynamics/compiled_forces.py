@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from sims.core.effect import Effect, HiddenState, HiddenStateEffect
 from sims.core.simulator import Array
-from sims.engines.compiled.expression_graph import LANE, MOMENT, ExpressionGraph
+from sims.engines.compiled.expression_graph import PER_ELEMENT, PER_EVALUATION, ExpressionGraph
 from sims.engines.compiled.force_program import (
     InstructionList,
     collect_nodes,
@@ -134,12 +134,12 @@ class _Tracing:
         joints = len(system.coordinates)
         self._graph = graph
         self._t, self._midpoint_time, self._step, self._state_interval = (
-            make_input_vector(graph, 1, MOMENT) for _ in range(4)
+            make_input_vector(graph, 1, PER_EVALUATION) for _ in range(4)
         )
-        motion = [make_input_vector(graph, joints, MOMENT) for _ in JointStates._fields]
+        motion = [make_input_vector(graph, joints, PER_EVALUATION) for _ in JointStates._fields]
         self._motion = motion
-        self._inputs = {name: make_input_vector(graph, 1, MOMENT) for name in inputs}
-        self._stiffness = make_input_vector(graph, joints, LANE)
+        self._inputs = {name: make_input_vector(graph, 1, PER_EVALUATION) for name in inputs}
+        self._stiffness = make_input_vector(graph, joints, PER_ELEMENT)
         joint_states = JointStates(*motion)
         instants = [(self._t, joint_states.x, joint_states.v, joint_states.transmission_loads)]
         instants.append(
@@ -237,10 +237,12 @@ class _Tracing:
         if kind not in self._traced_effects:
             if getattr(effect, "__dict__", None):
                 raise NotTraceableError("it has instance attributes, which a trace cannot follow")
-            c = make_input_vector(self._graph, len(effect.coefficients), LANE).T[:, :, None]
+            c = make_input_vector(self._graph, len(effect.coefficients), PER_ELEMENT).T[:, :, None]
             state = None
             if isinstance(effect, HiddenStateEffect):
-                state = HiddenState(*(make_input_vector(self._graph, 1, MOMENT) for _ in range(2)))
+                state = HiddenState(
+                    *(make_input_vector(self._graph, 1, PER_EVALUATION) for _ in range(2))
+                )
             self._traced_effects[kind] = _TracedEffect(effect, c, state)
         return self._traced_effects[kind]
 

@@ -18,14 +18,16 @@ from __future__ import annotations
 import numpy as np
 
 from sims.engines.compiled.data_layout import (
-    AFTER,
-    BEFORE,
     BOUNCES,
     DIMENSIONS,
     DIRECTION,
+    EXCESS_AFTER,
+    EXCESS_BEFORE,
     F1,
-    GUIDED_COUNT,
+    FORCES_BEGIN,
+    FRICTION_COORDINATE_COUNT,
     HAS_FRICTION,
+    IMPACT_BEGIN,
     IN_T,
     IN_V,
     IN_X,
@@ -49,7 +51,8 @@ def evaluate_forces(program: ProgramArrays, block: BlockBuffers, w: int) -> None
 
     Args:
         program: program of the system and its effects.
-        block: buffers of the slots.
+        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
+            one batch element.
         w: number of slots in use.
     """
     d = program.flags[DIMENSIONS]
@@ -62,7 +65,7 @@ def evaluate_forces(program: ProgramArrays, block: BlockBuffers, w: int) -> None
         for i in range(w):
             r[rows[IN_X] + k, i] = a[X + k, i]
             r[rows[IN_V] + k, i] = a[V + k, i]
-    run_instructions(program.code, program.ends[1], program.ends[2], r, w)
+    run_instructions(program.code, program.ends[FORCES_BEGIN], program.ends[IMPACT_BEGIN], r, w)
 
 
 def begin_step(program: ProgramArrays, block: BlockBuffers, w: int) -> None:
@@ -72,7 +75,8 @@ def begin_step(program: ProgramArrays, block: BlockBuffers, w: int) -> None:
 
     Args:
         program: program of the system and its effects.
-        block: buffers of the slots.
+        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
+            one batch element.
         w: number of slots in use.
     """
     d = program.flags[DIMENSIONS]
@@ -85,29 +89,29 @@ def begin_step(program: ProgramArrays, block: BlockBuffers, w: int) -> None:
     a = block.a
     r = block.r
     limits = program.rows[OUT_LIMIT]
-    guided_count = program.flags[GUIDED_COUNT]
+    friction_coordinate_count = program.flags[FRICTION_COORDINATE_COUNT]
     for i in range(w):
         limit = r[limits, i]
-        compute_pulling_force(program, block, i, K1)
-        size = compute_norm(a, K1, guided_count, i)
-        speed = compute_norm(a, V, guided_count, i)
-        a[BEFORE, i] = size - limit
-        a[AFTER, i] = size - limit
+        compute_force_without_friction(program, block, i, K1)
+        force_size = compute_norm(a, K1, friction_coordinate_count, i)
+        speed = compute_norm(a, V, friction_coordinate_count, i)
+        a[EXCESS_BEFORE, i] = force_size - limit
+        a[EXCESS_AFTER, i] = force_size - limit
         is_still = speed == 0.0
-        is_sticking = is_still and size <= limit  # (2)
+        is_sticking = is_still and force_size <= limit  # (2)
         block.n[IS_STICKING, i] = is_sticking
         # (1) and (3): along the motion, or at rest along the pulling force.
         divisor = speed
         if is_still:
-            divisor = size if size > 0.0 else 1.0
-        for k in range(guided_count):
-            pull = a[K1 + k, i]
-            direction = (pull if is_still else a[V + k, i]) / divisor
+            divisor = force_size if force_size > 0.0 else 1.0
+        for k in range(friction_coordinate_count):
+            force = a[K1 + k, i]
+            direction = (force if is_still else a[V + k, i]) / divisor
             friction = limit * direction
             a[DIRECTION + k, i] = direction
             a[F1 + k, i] = friction
-            a[K1 + k, i] = 0.0 if is_sticking else (pull - friction) / a[MASS, i]
-        compute_unguided_acceleration(program, block, i, K1, F1)
+            a[K1 + k, i] = 0.0 if is_sticking else (force - friction) / a[MASS, i]
+        compute_acceleration_without_friction(program, block, i, K1, F1)
 
 
 def begin_step_1d(program: ProgramArrays, block: BlockBuffers, w: int) -> None:
@@ -115,31 +119,32 @@ def begin_step_1d(program: ProgramArrays, block: BlockBuffers, w: int) -> None:
 
     Args:
         program: program of the system and its effects.
-        block: buffers of the slots.
+        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
+            one batch element.
         w: number of slots in use.
     """
     a = block.a
     r = block.r
     limits = program.rows[OUT_LIMIT]
-    force = program.out[0]
+    force_row = program.out[0]
     for i in range(w):
-        pull = r[force, i]
+        force = r[force_row, i]
         limit = r[limits, i]
         v = a[V, i]
-        size = abs(pull)
-        excess = size - limit
+        force_size = abs(force)
+        excess = force_size - limit
         is_still = v == 0.0
-        towards = pull if is_still else v
-        divisor = (size if size > 0.0 else 1.0) if is_still else abs(v)
-        direction = towards / divisor
+        direction_source = force if is_still else v
+        divisor = (force_size if force_size > 0.0 else 1.0) if is_still else abs(v)
+        direction = direction_source / divisor
         friction = limit * direction
-        slipping = (pull - friction) / a[MASS, i]
-        is_held = is_still and size <= limit
-        a[BEFORE, i] = excess
-        a[AFTER, i] = excess
+        slip_acceleration = (force - friction) / a[MASS, i]
+        is_held = is_still and force_size <= limit
+        a[EXCESS_BEFORE, i] = excess
+        a[EXCESS_AFTER, i] = excess
         a[DIRECTION, i] = direction
         a[F1, i] = friction
-        a[K1, i] = 0.0 if is_held else slipping
+        a[K1, i] = 0.0 if is_held else slip_acceleration
         block.n[IS_STICKING, i] = 1 if is_held else 0
 
 
@@ -153,12 +158,15 @@ def compute_acceleration(
 
     Args:
         program: program of the system and its effects.
-        block: buffers of the slots.
+        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
+            one batch element.
         w: number of slots in use.
         row_of_result: first row of the accelerations.
         friction_row: first row of dry friction.
     """
-    run_instructions(program.code, program.ends[1], program.ends[2], block.r, w)
+    run_instructions(
+        program.code, program.ends[FORCES_BEGIN], program.ends[IMPACT_BEGIN], block.r, w
+    )
     if program.flags[HAS_FRICTION] == 0:
         compute_frictionless_acceleration(program, block, w, row_of_result)
         return
@@ -176,7 +184,8 @@ def compute_acceleration_1d(
 
     Args:
         program: program of the system and its effects.
-        block: buffers of the slots.
+        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
+            one batch element.
         w: number of slots in use.
         row_of_result: row of the acceleration.
         friction_row: row of dry friction.
@@ -184,15 +193,15 @@ def compute_acceleration_1d(
     a = block.a
     r = block.r
     limits = program.rows[OUT_LIMIT]
-    force = program.out[0]
+    force_row = program.out[0]
     for i in range(w):
-        pull = r[force, i]
+        force = r[force_row, i]
         limit = r[limits, i]
         friction = limit * a[DIRECTION, i]
-        slipping = (pull - friction) / a[MASS, i]
-        a[AFTER, i] = abs(pull) - limit
+        slip_acceleration = (force - friction) / a[MASS, i]
+        a[EXCESS_AFTER, i] = abs(force) - limit
         a[friction_row, i] = friction
-        a[row_of_result, i] = 0.0 if block.n[IS_STICKING, i] != 0 else slipping
+        a[row_of_result, i] = 0.0 if block.n[IS_STICKING, i] != 0 else slip_acceleration
 
 
 def compute_acceleration_nd(
@@ -202,66 +211,69 @@ def compute_acceleration_nd(
 
     Args:
         program: program of the system and its effects.
-        block: buffers of the slots.
-        i: index of the slot.
+        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
+            one batch element.
+        i: index of the slot, the column of the batch element.
         row_of_result: first row of the accelerations.
         friction_row: first row of dry friction.
     """
     a = block.a
-    guided_count = program.flags[GUIDED_COUNT]
+    friction_coordinate_count = program.flags[FRICTION_COORDINATE_COUNT]
     velocity = program.rows[IN_V]
     limit = block.r[program.rows[OUT_LIMIT], i]
-    compute_pulling_force(program, block, i, row_of_result)
-    a[AFTER, i] = compute_norm(a, row_of_result, guided_count, i) - limit
+    compute_force_without_friction(program, block, i, row_of_result)
+    a[EXCESS_AFTER, i] = compute_norm(a, row_of_result, friction_coordinate_count, i) - limit
     # The direction may turn within the step, but must not reverse: a reversal is an event at which
     # the step is cut.
     square = 0.0
-    for k in range(guided_count):
+    for k in range(friction_coordinate_count):
         square += block.r[velocity + k, i] * block.r[velocity + k, i]
     speed = np.sqrt(square)
     projection = 0.0
-    for k in range(guided_count):
+    for k in range(friction_coordinate_count):
         direction = a[DIRECTION + k, i]
         unit = block.r[velocity + k, i] / speed if speed > 0.0 else direction
         a[friction_row + k, i] = unit
         projection += unit * direction
     sign = -1.0 if projection < 0.0 else 1.0
-    for k in range(guided_count):
+    for k in range(friction_coordinate_count):
         friction = limit * (a[friction_row + k, i] * sign)
         a[friction_row + k, i] = friction
-        slipping = (a[row_of_result + k, i] - friction) / a[MASS, i]
-        a[row_of_result + k, i] = 0.0 if block.n[IS_STICKING, i] != 0 else slipping
-    compute_unguided_acceleration(program, block, i, row_of_result, friction_row)
+        slip_acceleration = (a[row_of_result + k, i] - friction) / a[MASS, i]
+        a[row_of_result + k, i] = 0.0 if block.n[IS_STICKING, i] != 0 else slip_acceleration
+    compute_acceleration_without_friction(program, block, i, row_of_result, friction_row)
 
 
-def compute_unguided_acceleration(
+def compute_acceleration_without_friction(
     program: ProgramArrays, block: BlockBuffers, i: int, row_of_result: int, friction_row: int
 ) -> None:
     """Convert forces to accelerations for the coordinates without dry friction.
 
     Args:
         program: program of the system and its effects.
-        block: buffers of the slots.
-        i: index of the slot.
+        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
+            one batch element.
+        i: index of the slot, the column of the batch element.
         row_of_result: first row of the accelerations, which contains the forces before.
         friction_row: first row of dry friction.
     """
     a = block.a
-    for k in range(program.flags[GUIDED_COUNT], program.flags[DIMENSIONS]):
+    for k in range(program.flags[FRICTION_COORDINATE_COUNT], program.flags[DIMENSIONS]):
         a[DIRECTION + k, i] = 0.0
         a[friction_row + k, i] = 0.0
         a[row_of_result + k, i] = a[row_of_result + k, i] / a[MASS, i]
 
 
-def compute_pulling_force(
+def compute_force_without_friction(
     program: ProgramArrays, block: BlockBuffers, i: int, row_of_result: int
 ) -> None:
     """Compute all forces except dry friction, without the part that the ground supports.
 
     Args:
         program: program of the system and its effects.
-        block: buffers of the slots.
-        i: index of the slot.
+        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
+            one batch element.
+        i: index of the slot, the column of the batch element.
         row_of_result: first row of the forces.
     """
     d = program.flags[DIMENSIONS]
@@ -280,17 +292,18 @@ def compute_frictionless_acceleration(
 
     Args:
         program: program of the system and its effects.
-        block: buffers of the slots.
+        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
+            one batch element.
         w: number of slots in use.
         row_of_result: first row of the accelerations.
     """
     a = block.a
     d = program.flags[DIMENSIONS]
     for k in range(d):
-        force = program.out[k]
+        force_row = program.out[k]
         row = row_of_result + k
         for i in range(w):
-            a[row, i] = block.r[force, i] / a[MASS, i]
+            a[row, i] = block.r[force_row, i] / a[MASS, i]
     if program.flags[BOUNCES] != 0:
         last_row = row_of_result + d - 1
         for i in range(w):
