@@ -17,6 +17,10 @@ _GRID_COUNT = 4
 """Number of successive grids, each around the best height of the previous one."""
 _LATER_GRID_SIZE = 9
 """Number of heights of each later grid, which covers two intervals of the previous one."""
+_SECONDS = 3.0
+"""Length of a simulated flight in seconds."""
+_RATE = 240.0
+"""Sampling rate in Hz; the crossing of the hoop's plane is interpolated linearly."""
 
 
 @dataclass(frozen=True)
@@ -47,8 +51,6 @@ def plan_shot(
     scene: ShotGeometry,
     constants: Mapping[str, float],
     heights: tuple[float, float],
-    seconds: float = 3.0,
-    rate: float = 240.0,
 ) -> ShotPlan:
     """Find the drop height with the largest distance to the rim, by successively finer grids.
 
@@ -61,8 +63,6 @@ def plan_shot(
         scene: Geometry of incline and hoop.
         constants: Known constants of the ball, such as radius and friction.
         heights: Minimum and maximum height, m.
-        seconds: Length of the simulated flight, s.
-        rate: Sampling rate in Hz; the crossing of the hoop's plane is interpolated linearly.
 
     Raises:
         InputError: The heights are not positive and increasing.
@@ -70,7 +70,7 @@ def plan_shot(
     low, high = heights
     if not 0 < low < high:
         raise InputError(f"expected drop heights above 0, the first the lower, found {heights}")
-    times = np.arange(round(seconds * rate) + 1) / rate
+    times = np.arange(round(_SECONDS * _RATE) + 1) / _RATE
     grid = np.linspace(low, high, _FIRST_GRID_SIZE)
     best = float("nan")
     for _ in range(_GRID_COUNT):

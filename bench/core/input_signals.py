@@ -119,9 +119,6 @@ _FORMS: dict[str, tuple[Callable[..., Array], str]] = {
 }
 """Function and argument names of each form of signal, by name."""
 
-SIGNAL_FORMS_HELP = ", ".join(f"{name}:{form}" for name, (_, form) in _FORMS.items())
-"""List of the forms of signals for a help text."""
-
 
 def evaluate_signal(text: str, times: Array, rng: np.random.Generator) -> Array:
     """Compute the values of the signal that a text describes.

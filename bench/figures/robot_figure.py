@@ -90,7 +90,6 @@ def draw_robot_figure(
     robot: RobotModel,
     positions: Mapping[str, float],
     marks: Sequence[PlaceMark] = (),
-    least: float = 0.0,
 ) -> Figure:
     """Draw the robot at a pose, with places marked.
 
@@ -98,7 +97,6 @@ def draw_robot_figure(
         robot: Robot to draw.
         positions: Positions by joint, rad or m; other joints keep the position of the model file.
         marks: Places to mark; places that the robot does not have are ignored.
-        least: Minimum width of the figure in inches.
     """
     data = make_posed_data(robot, dict(positions))
     projection = choose_projection(robot, data)
@@ -109,8 +107,6 @@ def draw_robot_figure(
     label_height = max(_compute_column_height(side) for side in label_columns)
     width, height = scale * projection.width, scale * projection.height
     tall = max(height, label_height)
-    spare = max(0.0, least - sum(columns) - width) / 2
-    columns = [column + spare for column in columns]
     size = (columns[0] + width + columns[1], tall + SCALE_BAR_HEIGHT_INCHES + 0.15)
     figure, axes = make_panel_grid(1, 1, size, layout=None)
     axis = axes[0, 0]

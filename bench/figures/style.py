@@ -300,14 +300,6 @@ def make_panel_grid(
     return figure, figure.subplots(rows, columns, squeeze=False, **options)
 
 
-def make_panel_row(panels: int) -> tuple[Figure, list[Axes]]:
-    """Make a figure with panels side by side that share their vertical axis."""
-    figure, axes = make_panel_grid(1, panels, (1.2 + 4.3 * panels, 4.6), sharey=True)
-    for axis in axes[0]:
-        style_axis(axis)
-    return figure, list(axes[0])
-
-
 def set_title(axis: Axes, title: str) -> None:
     """Set a title above a panel that has no ticks there."""
     # Without a fixed position, every drawing measures all ticks for the title.

@@ -7,6 +7,8 @@ from typing import Any
 
 FAMILYWISE_ERROR_RATE = 0.05
 """Familywise error rate: probability of any false alarm among all comparisons."""
+_MAX_CHANGES = 12
+"""Maximum number of changes that are printed."""
 RESULT_RELEVANT_KEYS = ("simgap", "python", "platform", "machine", "stepping", "seals", "packages")
 """Keys of an environment that may influence the results."""
 
@@ -67,20 +69,19 @@ def describe_side(folder: Any, name: str, environment: Mapping[str, Any]) -> dic
     }
 
 
-def format_changes(changes: Iterable[Mapping[str, Any]], max_count: int = 12) -> list[str]:
-    """Format changes as text lines, at most `max_count` of them.
+def format_changes(changes: Iterable[Mapping[str, Any]]) -> list[str]:
+    """Format changes as text lines, at most `_MAX_CHANGES` of them.
 
     Args:
         changes: the changes.
-        max_count: maximum number of changes.
     """
     lines = [
         f"  {each['what']}: {_shorten_text(each['a'])} -> {_shorten_text(each['b'])}"
         for each in changes
     ]
-    remaining_count = len(lines) - max_count
+    remaining_count = len(lines) - _MAX_CHANGES
     return [
-        *lines[:max_count],
+        *lines[:_MAX_CHANGES],
         *([f"  and {remaining_count} more (--json has all)"] if remaining_count > 0 else []),
     ]
 

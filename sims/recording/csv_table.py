@@ -24,6 +24,8 @@ from sims.recording.fast_csv import MIN_FAST_PARSE_BYTES, read_csv_fast
 
 _ROWS_PER_CHUNK = 1 << 13
 """Number of rows that are converted to numbers at once, which limits the memory for their text."""
+_MAX_NAMES = 12
+"""Maximum number of names in a message."""
 _SECONDS_PER_YEAR = 365.25 * 86400
 """Seconds per year."""
 _NUMBER = re.compile(r"\s*[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?\s*")
@@ -346,9 +348,9 @@ class RecordingTable:
             return reader.line_num
 
 
-def _join_names(names: Sequence[str], max_count: int = 12) -> str:
-    """Join names for a message; only the first `max_count` of many."""
-    text = ", ".join(names[:max_count])
-    if len(names) > max_count:
-        text += f" and {len(names) - max_count} more"
+def _join_names(names: Sequence[str]) -> str:
+    """Join names for a message; only the first `_MAX_NAMES` of many."""
+    text = ", ".join(names[:_MAX_NAMES])
+    if len(names) > _MAX_NAMES:
+        text += f" and {len(names) - _MAX_NAMES} more"
     return text

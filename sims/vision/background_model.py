@@ -93,7 +93,7 @@ def survey_frames(frames: Iterable[tuple[float, RgbImage]]) -> FrameSurvey:
     return FrameSurvey(np.array(times), np.array(motions), tuple(cuts), size)
 
 
-def select_frames(moved: Array, max_frames: int = MAX_BACKGROUND_FRAMES) -> list[int]:
+def select_frames(moved: Array) -> list[int]:
     """Select frames at even intervals of accumulated motion.
 
     Frames at even intervals of time would mostly show a ball that comes to rest, which would then
@@ -101,7 +101,6 @@ def select_frames(moved: Array, max_frames: int = MAX_BACKGROUND_FRAMES) -> list
 
     Args:
         moved: (n,) mean change from the previous frame, grey levels.
-        max_frames: Maximum number of frames.
 
     Returns:
         Sorted numbers of the frames.
@@ -110,7 +109,7 @@ def select_frames(moved: Array, max_frames: int = MAX_BACKGROUND_FRAMES) -> list
     # A small value for each frame, so that a film without motion has marks, too.
     min_motion = 1e-3 * moved.sum() / max(1, count)
     path_length = np.cumsum(moved + min_motion + 1e-12)
-    marks = np.linspace(path_length[0], path_length[-1], min(max_frames, count))
+    marks = np.linspace(path_length[0], path_length[-1], min(MAX_BACKGROUND_FRAMES, count))
     places = np.searchsorted(path_length, marks - 1e-12).clip(0, count - 1)
     return sorted(set(places.tolist()))
 

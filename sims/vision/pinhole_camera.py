@@ -147,14 +147,6 @@ class PinholeCamera:
         result: Array = offsets @ self.axes.T  # (1)
         return result
 
-    def compute_depth(self, points: ArrayLike) -> Array:
-        """Return the depths (...) of world points (..., 3) along the optical axis, m.
-
-        Depths are negative behind the camera.
-        """
-        result: Array = self.to_camera_frame(points)[..., 2]
-        return result
-
     def project(self, points: ArrayLike) -> Array:
         """Project world points (..., 3) to pixels (..., 2).
 

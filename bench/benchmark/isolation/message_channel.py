@@ -157,15 +157,14 @@ class MessageChannel:
         body = b"".join([part if isinstance(part, bytes) else bytes(part) for part in parts])
         self._write_message(_HEADER.pack(kind, flags, size, len(body)) + body, deadline)
 
-    def send_document(self, kind: bytes, document: Any, flags: int = 0) -> None:
+    def send_document(self, kind: bytes, document: Any) -> None:
         """Send a message whose body is JSON.
 
         Args:
             kind: one byte.
             document: JSON content.
-            flags: 0 to 255.
         """
-        self.send(kind, json.dumps(document).encode(), flags=flags)
+        self.send(kind, json.dumps(document).encode())
 
     def _write_message(self, message: bytes, deadline: float) -> None:
         """Write the whole message, in several parts if the pipe is full.

@@ -51,7 +51,6 @@ def build_error_table(
     statuses: pd.DataFrame,
     budget: int,
     trainings: Mapping[str, tuple[float, float]] | None = None,
-    resamples: int = 2000,
 ) -> pd.DataFrame:
     """Build the table of a comparison in long form.
 
@@ -60,7 +59,6 @@ def build_error_table(
         statuses: rows of status.csv.
         budget: largest number of simulations in the table.
         trainings: simulations and seconds of one training, by tuner.
-        resamples: number of bootstrap resamples.
 
     Returns:
         Table with the columns `ERROR_TABLE_COLUMNS`.
@@ -85,7 +83,7 @@ def build_error_table(
         counts = len(tuner_rows), int(rows.failed[tuner_rows].sum())
         for metric, curve in curves.items():
             values = _summarise_over_targets(
-                curve, tuner_rows, points, (str(tuner), str(kind), metric), resamples
+                curve, tuner_rows, points, (str(tuner), str(kind), metric)
             )
             for i, k in enumerate(points):
                 errors, times = values[:, i], (seconds[0][i], seconds[1][i])
@@ -104,7 +102,6 @@ def _summarise_over_targets(
     rows: NDArray[np.int64],
     points: list[int],
     names: tuple[str, str, str],
-    resamples: int,
 ) -> Array:
     """Compute median, mean, low and high over targets of the runs in `rows`.
 
@@ -113,9 +110,7 @@ def _summarise_over_targets(
     """
     _, groups = curves.select_mask(np.isin(np.arange(len(curves.used)), rows)).group_by_target()
     values = average_over_seeds(curves.values[rows][:, points], groups)
-    low, high = compute_bootstrap_interval(
-        values, compute_resampled_means, *names, resamples=resamples
-    )
+    low, high = compute_bootstrap_interval(values, compute_resampled_means, *names)
     with warnings.catch_warnings():
         # NumPy warns about columns of NaN alone; the result NaN is shown in the table.
         warnings.simplefilter("ignore", RuntimeWarning)

@@ -25,6 +25,8 @@ from sims.core.simulator import Array
 
 RUNTIME_THRESHOLDS: Array = np.logspace(0, -8, 51)
 """Thresholds of the runtime distribution in widths of the training range; 51 as in COCO."""
+RESAMPLES = 1000
+"""Number of resamples of a 95 % interval."""
 ERT_TARGET_LEVELS = (0.1, 0.01, 1e-3, 1e-4, 1e-6)
 """Thresholds of the ERT table in widths of the training range."""
 
@@ -151,7 +153,7 @@ def compute_effort(
     )
 
 
-def draw_target_resamples(targets: int, *names: str, resamples: int = 1000) -> NDArray[np.int64]:
+def draw_target_resamples(targets: int, *names: str) -> NDArray[np.int64]:
     """Draw target indices with replacement, from a random stream that depends on names only.
 
     Tuners that share the targets get the same draws.
@@ -159,12 +161,11 @@ def draw_target_resamples(targets: int, *names: str, resamples: int = 1000) -> N
     Args:
         targets: number of targets.
         names: names that determine the random stream.
-        resamples: number of resamples.
 
     Returns:
-        (resamples, targets) indices.
+        (RESAMPLES, targets) indices.
     """
-    return make_rng("resample", *names).integers(targets, size=(resamples, targets))
+    return make_rng("resample", *names).integers(targets, size=(RESAMPLES, targets))
 
 
 def compute_percentile_interval(values: Array) -> tuple[float, float]:

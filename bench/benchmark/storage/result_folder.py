@@ -48,20 +48,17 @@ DEFAULT_RESULTS_FOLDER = Path("results")
 """Default parent folder of new results."""
 
 
-def choose_free_folder(
-    experiment: Experiment, out: Path | None, results: Path = DEFAULT_RESULTS_FOLDER
-) -> Path:
+def choose_free_folder(experiment: Experiment, out: Path | None) -> Path:
     """Choose the folder of a new study.
 
     Args:
         experiment: The experiment.
-        out: Wanted folder; None for a folder in `results` named after the experiment and the time.
-        results: Parent of such a folder.
+        out: Wanted folder; None for a folder in results/ named after the experiment and the time.
 
     Raises:
         InputError: `out` exists and is not empty.
     """
-    folder = out or make_timestamped_path(results, experiment.name)
+    folder = out or make_timestamped_path(DEFAULT_RESULTS_FOLDER, experiment.name)
     try:
         check_folder_empty(folder)
     except InputError as error:

@@ -22,6 +22,7 @@ from sims.core.simulator import Array
 SIZE_TOLERANCE = 0.03  # relative tolerance of the size
 MAX_STRENGTH_FACTOR = 8.0  # maximum factor of the strength per step, so that the fit can follow
 FINITE_DIFFERENCE_STEP = 1e-5  # finite-difference step, as a fraction of a parameter's scale
+FIRST_STRENGTH = 1e-3  # first strength to try
 DIVERGED_VALUE = 1e30  # in units of the noise: larger values count as diverged
 
 
@@ -238,7 +239,6 @@ def find_strength_for_size(
     compute_residual: Callable[[float], float],
     target_size: float,
     largest: float,
-    first: float = 1e-3,
 ) -> float | None:
     """Find the strength at which the size has the requested value.
 
@@ -248,13 +248,12 @@ def find_strength_for_size(
         compute_residual: size as a function of the strength, increasing from zero.
         target_size: requested size.
         largest: maximum strength.
-        first: first strength to try.
 
     Returns:
         The strength, or None if it is not below `largest`.
     """
     # Bracket: (strength, size) below and above the requested size.
-    low, high, strength = (0.0, 0.0), (np.inf, np.inf), first
+    low, high, strength = (0.0, 0.0), (np.inf, np.inf), FIRST_STRENGTH
     for _ in range(12):
         size = compute_residual(strength)
         if abs(size / target_size - 1) < SIZE_TOLERANCE:

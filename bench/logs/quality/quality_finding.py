@@ -25,15 +25,18 @@ class QualityFinding(NamedTuple):
         return f"{self.about}: {self.text}; {self.remedy}"
 
 
-def format_names(names: Iterable[str], most: int = 4) -> str:
+_MAX_NAMES = 4
+"""Maximum number of names that are written out."""
+
+
+def format_names(names: Iterable[str]) -> str:
     """Format a list of names, each once, and the number of names beyond the first few.
 
     Args:
         names: Names, possibly repeated.
-        most: Maximum number of names that are written out.
     """
     distinct_names = list(dict.fromkeys(names))
-    unnamed_count = len(distinct_names) - most
-    return ", ".join(distinct_names[:most]) + (
+    unnamed_count = len(distinct_names) - _MAX_NAMES
+    return ", ".join(distinct_names[:_MAX_NAMES]) + (
         f" and {unnamed_count} more" if unnamed_count > 0 else ""
     )

@@ -181,10 +181,10 @@ class SuiteTables:
         """Return median log errors after k simulations: a row per cell, a column per tuner."""
         return self._median_log_errors[training, k]
 
-    def get_ranks(self, k: int, training: str = FREE) -> pd.DataFrame:
+    def get_ranks(self, k: int) -> pd.DataFrame:
         """Rank the tuners in each cell; 1 is best, NaN where a tuner has no such run."""
         # Rounding gives errors that differ by the last bit the same rank.
-        return self.get_medians(k, training).round(9).rank(axis=1)
+        return self.get_medians(k).round(9).rank(axis=1)
 
     @cached_property
     def errors(self) -> pd.DataFrame:
@@ -228,18 +228,15 @@ class SuiteTables:
                     lines.append((training, k, tuner, mean, *interval, len(ranks)))
         return pd.DataFrame(lines, columns=RANK_COLUMNS)
 
-    def find_best(self, k: int, training: str = FREE, trained: bool = True) -> str:
+    def find_best(self, k: int, training: str = FREE) -> str:
         """Return the tuner with the lowest mean rank after k simulations.
 
         Args:
             k: number of simulations.
             training: `FREE` or `COUNTED`.
-            trained: whether tuners that need training are included.
         """
         rows = self.ranks
         rows = rows[(rows["training"] == training) & (rows["simulations"] == k)]
-        if not trained:
-            rows = rows[~rows["tuner"].isin(self.get_trained_tuners())]
         return str(rows["tuner"].iloc[0])
 
     @cached_property

@@ -51,8 +51,8 @@ def notes():
 
 
 def still():
-    figure, axes = style.make_panel_row(1)
-    axes[0].plot(STEPS, np.sqrt(STEPS), color=style.BLUE)
+    figure, axes = style.make_panel_grid(1, 1, (5.5, 4.6))
+    axes[0, 0].plot(STEPS, np.sqrt(STEPS), color=style.BLUE)
     return PrintedFigure(
         style.render_svg(figure), style.render_pdf(figure), 'curves with "quotes" & <b>', "error"
     )

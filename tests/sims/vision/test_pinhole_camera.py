@@ -28,7 +28,7 @@ def test_projection_by_hand():
         [100 - focal / 2, 50 + focal / 2],
     ]
     np.testing.assert_allclose(camera.project(points), pixels, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(camera.compute_depth(points), [5, 5, 5, 2], atol=1e-14)
+    np.testing.assert_allclose(camera.to_camera_frame(points)[:, 2], [5, 5, 5, 2], atol=1e-14)
     assert np.isnan(camera.project([6, 0, 2])).all()
 
 
