@@ -171,7 +171,7 @@ def explain_and_design(
     """
     with _explain_run(recording, options) as run:
         explanation = run.run()
-        run.watch.stage("designing the next recording")
+        run.watch.begin_stage("designing the next recording")
         return ExplanationAndDesign(explanation, run.design(seconds, longest))
 
 
@@ -324,7 +324,7 @@ class _ExplainRun:
         """Return the filtered runs of a robot, if there are any."""
         if not hasattr(self, "fitting"):
             return []
-        return [w.followed for w in self._list_run_evaluators() if w.followed is not None]
+        return [w.filtered_runs for w in self._list_run_evaluators() if w.filtered_runs is not None]
 
     def _prepare_validation(self, kind: type[SystemSimulator]) -> Validation | None:
         """Prepare the validation: on held-out runs, or by cross-validation of few runs."""
@@ -350,11 +350,11 @@ class _ExplainRun:
         evaluator = RunEvaluator(
             kind, self.recording, runs, self.engine, list_hat_effects(kind), self.free
         )
-        evaluator.watch = self.watch
+        evaluator.search_control = self.watch
         evaluator.worker_pool = self.worker_pool
         self.worker_pool.register(evaluator)
         use_bounds(evaluator, {name: bounds for name, (_, bounds) in self.wider.items()})
-        evaluator.identified = self.identified
+        evaluator.identified_base = self.identified
         return evaluator
 
     def _make_no_effects_error(self) -> InputError:
@@ -374,7 +374,7 @@ class _ExplainRun:
         evaluator = self.fitting
         # With fewer samples than unknowns every model fits exactly, and no gap would be visible.
         samples = int(np.isfinite(evaluator.observed).sum())
-        unknowns = evaluator.base.size + int((~evaluator.known).sum())
+        unknowns = evaluator.base_indices.size + int((~evaluator.known_state_mask).sum())
         if samples < MIN_SAMPLES_PER_UNKNOWN * unknowns + MIN_EXTRA_SAMPLES:
             least = int(MIN_SAMPLES_PER_UNKNOWN * unknowns) + MIN_EXTRA_SAMPLES
             raise InputError(
@@ -403,14 +403,14 @@ class _ExplainRun:
                 base model can simulate the recording.
         """
         self._refuse_broken_conventions()
-        self.watch.stage(STAGES["base_fit"])
+        self.watch.begin_stage(STAGES["base_fit"])
         base = self._fit_base()
         if not np.isfinite(base.fit.simulated[np.isfinite(self.fitting.observed)]).all():
             raise self._make_simulation_error()
         found = self._search_with_friction_forms(base)
         found = self._search_with_better_step(found.search, found.finding) or found
         base, search, finding, rng = found
-        self.watch.stage("measuring the gain")
+        self.watch.begin_stage("measuring the gain")
         verdict = self.assessor.build_verdict(search, finding, rng, self.started)
         verdict = replace(
             verdict, recording_faults=self.faults, recording_notes=self.recording.notes
@@ -484,7 +484,7 @@ class _ExplainRun:
         from bench.diagnosis.conventions.convention_comparison import ConventionComparison
         from bench.diagnosis.conventions.corrected_description import list_changed_tables
 
-        self.watch.stage("comparing conventions of log and model")
+        self.watch.begin_stage("comparing conventions of log and model")
         if self._has_contacts and self._is_linear_model_wrong_at_contacts(self._get_filter()):
             return
         differences = ConventionComparison(self._unit_check_subject).differences()
@@ -528,7 +528,7 @@ class _ExplainRun:
         self._set_up(make_soft_kind(self.kind))
         self.assessor = replace(self.assessor, before=held_out)
         fitter = TrajectoryFitter(self.fitting, self.noise, base.fixed_parameters)
-        start = replace(base.fit.make_start(), states=self.fitting.guess)
+        start = replace(base.fit.make_start(), initial_states=self.fitting.initial_state_guesses)
         (fit,) = fitter.fit_models([start], FINAL_ITERATIONS)
         base = self._correct_step_errors(replace(base, fit=fit))
         rng = self._make_rng()
@@ -564,7 +564,7 @@ class _ExplainRun:
 
         For a robot whose runs could be filtered, the search uses prediction errors.
         """
-        if self.fitting.followed is None:
+        if self.fitting.filtered_runs is None:
             if self.fitting.is_in_contact:
                 # This import is needed for robots only.
                 from bench.diagnosis.kalman.contact_proposals import propose_contact_effects
@@ -587,12 +587,12 @@ class _ExplainRun:
         if not self._checks_units_late or explained or self.watch.has_abandoned_fits():
             return ()
         left, before = (
-            search.compute_excess(model) for model in (finding.model, search.base_model)
+            search.compute_excess_residual(model) for model in (finding.model, search.base_model)
         )
         # With a wrong unit or sign, effects would leave more of the discrepancy.
         if left < MAX_EXCESS_SHARE_WITH_RIGHT_UNITS * before:
             return ()
-        base = BaseFit(search.base_model.fit, frozenset(search.frozen))
+        base = BaseFit(search.base_model.fit, frozenset(search.fixed_parameters))
         fault = find_wrong_units(self._unit_check_subject, self.fitting, self.noise, base)
         return () if fault is None else (fault,)
 
@@ -648,7 +648,7 @@ class _ExplainRun:
         search.
         """
         kind = EffectSearch
-        if self.fitting.followed is not None:
+        if self.fitting.filtered_runs is not None:
             # This import is needed for robots only.
             from bench.diagnosis.prediction_error.prediction_error_search import (
                 PredictionErrorSearch,
@@ -690,14 +690,14 @@ class _ExplainRun:
         lost = (
             self.has_base_parameters
             and self.identified is None
-            and self.fitting.followed is not None
+            and self.fitting.filtered_runs is not None
         )
         return self.kind.has_model and not lost
 
     @property
     def has_base_parameters(self) -> bool:
         """Return whether the base model has parameters."""
-        return bool(self.fitting.base.size)
+        return bool(self.fitting.base_indices.size)
 
     def _filter_runs(self) -> None:
         """Filter the runs of a robot with the present model (Kalman filter and smoother).
@@ -708,7 +708,7 @@ class _ExplainRun:
         # This import is needed for robots only.
         from bench.diagnosis.kalman.candidate_responses import FollowedRuns
 
-        self.watch.stage("computing prediction errors")
+        self.watch.begin_stage("computing prediction errors")
         evaluator, *held_out = self._list_run_evaluators()
         followed = self._get_filter()
         # Where the linear model diverges, causes are searched by simulation.
@@ -770,7 +770,7 @@ class _ExplainRun:
         # The joints of a real robot have friction, and long recordings are those of real robots.
         found, wider = identify_base(evaluator, self.noise, followed, is_long(evaluator))
         if found is not followed:
-            self.identified = evaluator.identified = found.theta[evaluator.base]
+            self.identified = evaluator.identified_base = found.theta[evaluator.base_indices]
         self._widen_ranges(wider, declared)
         return found
 
@@ -793,7 +793,7 @@ class _ExplainRun:
 
     def _shows_step_errors(self, base: BaseFit) -> bool:
         """Return whether the recording shows the discretisation error of the engine's steps."""
-        lost = self.fitting.followed is None or not np.isfinite(base.fit.cost)
+        lost = self.fitting.filtered_runs is None or not np.isfinite(base.fit.cost)
         if self.watch.has_abandoned_fits() or lost:
             return True
         # These imports are needed for robots only.
@@ -812,7 +812,7 @@ class _ExplainRun:
         # This import is needed for robots only.
         from bench.diagnosis.prediction_error.effect_selection import shows_step_errors
 
-        followed = self.fitting.followed
+        followed = self.fitting.filtered_runs
         if followed is not None and not shows_step_errors(followed):
             return base
         return correct_discretisation(self.fitting, self.noise, base)
@@ -870,7 +870,7 @@ class _ExplainRun:
             if not fine.is_accurate_enough(left):
                 continue
             self._set_up(fine.kind)
-            if self.fitting.followed is None:
+            if self.fitting.filtered_runs is None:
                 # A model that diverges with the file's step may be filtered with a finer one.
                 self._filter_runs()
             other = fit_base_model(self.fitting, self.noise, self._get_nearby_starts(base))
@@ -920,7 +920,10 @@ class _ExplainRun:
             return None
         if not finding.causes and (self.coarse is not None or finding.verdict == "adequate"):
             return None
-        found = finding.model.penalised_log_likelihood, search.compute_excess(finding.model)
+        found = (
+            finding.model.penalised_log_likelihood,
+            search.compute_excess_residual(finding.model),
+        )
         here = _RunEvaluators(self.kind, self.fitting, self.validation)
         if self.coarse is not None:
             before = self.assessor.before
@@ -930,7 +933,7 @@ class _ExplainRun:
                     "the time step of the model file explains the data equally well: it is used"
                 )
                 self.coarse = None
-                base = BaseFit(search.base_model.fit, search.frozen)
+                base = BaseFit(search.base_model.fit, search.fixed_parameters)
                 return self._finish_base_and_search(
                     fit_base_model(self.fitting, self.noise, self._get_nearby_starts(base))
                 )
@@ -944,7 +947,7 @@ class _ExplainRun:
         if not is_finer_model_better(found, best):
             self._restore_evaluators(here)
             return None
-        base = BaseFit(search.base_model.fit, search.frozen)
+        base = BaseFit(search.base_model.fit, search.fixed_parameters)
         other = fit_base_model(self.fitting, self.noise, self._get_nearby_starts(base))
         self._use_finer(fine, best[0] - found[0], base, here)
         return self._finish_base_and_search(other)
@@ -965,17 +968,17 @@ class _ExplainRun:
                 theta = fit.theta.copy()
                 for left_out in set(names) - set(some):
                     theta[slots[left_out]] = self.fitting.get_nominal_theta()[slots[left_out]]
-                starts.append(FitStart(some, theta, fit.states))
-        fits = TrajectoryFitter(self.fitting, self.noise, search.frozen).fit_models(
+                starts.append(FitStart(some, theta, fit.initial_states))
+        fits = TrajectoryFitter(self.fitting, self.noise, search.fixed_parameters).fit_models(
             starts, MAX_ITERATIONS
         )
         models = self._create_search(
-            BaseFit(search.base_model.fit, search.frozen), self._make_rng()
+            BaseFit(search.base_model.fit, search.fixed_parameters), self._make_rng()
         )
         best = max(
             (models.add_fit(one) for one in fits), key=lambda model: model.penalised_log_likelihood
         )
-        return best.penalised_log_likelihood, models.compute_excess(best)
+        return best.penalised_log_likelihood, models.compute_excess_residual(best)
 
     def _get_nearby_starts(self, base: BaseFit) -> Array | None:
         """Return starting values for a fit with another step; None for the default starts.
@@ -985,7 +988,7 @@ class _ExplainRun:
         """
         if not np.isfinite(base.fit.cost) or self.identified is not None:
             return self._get_given_starts()
-        nearby: Array = base.fit.theta[self.fitting.base]
+        nearby: Array = base.fit.theta[self.fitting.base_indices]
         return nearby
 
     def _predict_with_file_step(self, base: BaseFit, validation: Validation | None) -> Array | None:
@@ -1002,7 +1005,7 @@ class _ExplainRun:
     def _rate_base(self, base: BaseFit) -> tuple[float, float]:
         """Return twice the log-likelihood and the RMS residual, in noise units, of a base model."""
         found = self._create_search(base, self._make_rng())
-        return float(found.base_model.likelihood.value), 1.0 + found.compute_excess(
+        return float(found.base_model.likelihood.value), 1.0 + found.compute_excess_residual(
             found.base_model
         )
 
@@ -1054,7 +1057,7 @@ class _ExplainRun:
         # A freed constant becomes a constant of the extended simulator, with its fitted value.
         freed = {
             p.name: numbers[evaluator.system_parameter_count + i].value
-            for i, p in enumerate(evaluator.freed)
+            for i, p in enumerate(evaluator.freed_constants)
         }
         added = {}
         # The simulator's order keeps the file independent of the order of the search.

@@ -141,16 +141,20 @@ def _refit_in(evaluator: RunEvaluator, models: ModelSet, model: FittedModel) -> 
     names, theta = replace_by_stateless_friction(models.evaluator, model.effects, model.fit.theta)
     # The random numbers of these models do not affect the result.
     other_models = ModelSet(
-        evaluator, models.noise, models.frozen, make_rng("friction form"), models.is_noise_stated
+        evaluator,
+        models.noise,
+        models.fixed_parameters,
+        make_rng("friction form"),
+        models.is_noise_stated,
     )
-    refitted_model = other_models.fit_one(FitStart(names, theta, model.fit.states))
-    if models.evaluator.correction is None:
+    refitted_model = other_models.fit_one(FitStart(names, theta, model.fit.initial_states))
+    if models.evaluator.discretisation_correction is None:
         return refitted_model
     # Both forms are compared without the discretisation error of the integrator.
     from bench.diagnosis.fitting.linearised_runs import correct_discretisation
 
     correct_discretisation(
-        evaluator, models.noise, refitted_model.fit.theta, refitted_model.fit.states
+        evaluator, models.noise, refitted_model.fit.theta, refitted_model.fit.initial_states
     )
     other_models.models.clear()
     return other_models.fit_one(refitted_model.fit.make_start())

@@ -121,13 +121,13 @@ class _Identified:
         """
         self.evaluator, self.noise, self.fit, self.found = evaluator, noise, fit, direction_set
         self.seen = np.isfinite(evaluator.observed)
-        q = fit.free.size
+        q = fit.free_indices.size
         jacobian = np.where(self.seen[..., None], fit.jacobian, 0.0)
         jacobian /= noise.sigma[:, None]
         runs = len(jacobian)
         flat = jacobian.reshape(runs, -1, jacobian.shape[3])
         # A known initial state is not fitted, so nothing is projected out for it.
-        self.states = flat[..., q:] * ~evaluator.known[:, None, :]
+        self.states = flat[..., q:] * ~evaluator.known_state_mask[:, None, :]
         self.parameters = self._project_out_states(flat[..., :q])
 
     def numbers(self) -> tuple[ParameterIdentifiability, ...]:
@@ -160,11 +160,11 @@ class _Identified:
         places = np.ix_(is_sensitive, is_sensitive)
         covariance[places] = inverse / np.outer(scale[is_sensitive], scale[is_sensitive])
         numbers = []
-        for i, place in enumerate(self.fit.free.tolist()):
+        for i, place in enumerate(self.fit.free_indices.tolist()):
             parameter = self.evaluator.parameters[place]
             sd = np.sqrt(max(float(covariance[i, i]), 0.0))
             confounders = []
-            for j, other_place in enumerate(self.fit.free.tolist()):
+            for j, other_place in enumerate(self.fit.free_indices.tolist()):
                 if i != j and np.isfinite(covariance[i, j]) and is_sensitive[i] and is_sensitive[j]:
                     corr = covariance[i, j] / np.sqrt(covariance[i, i] * covariance[j, j])
                     confounders.append(
@@ -177,7 +177,9 @@ class _Identified:
                 )
             )
         # The fit has frozen parameters to which the runs are insensitive.
-        for place in sorted(set(self.evaluator.base.tolist()) - set(self.fit.free.tolist())):
+        for place in sorted(
+            set(self.evaluator.base_indices.tolist()) - set(self.fit.free_indices.tolist())
+        ):
             parameter = self.evaluator.parameters[place]
             numbers.append(
                 _classify_parameter(
@@ -213,11 +215,11 @@ class _Identified:
         powers = np.sqrt(np.einsum("nk,nk->k", columns, columns))
         # A coefficient with several shapes is represented by the most sensitive one.
         best: dict[tuple[str, int], int] = {}
-        limits = {probe.effect for probe in probes if probe.fixed}
+        limits = {probe.effect for probe in probes if probe.is_single_size}
         for k, probe in enumerate(probes):
-            if probe.effect in limits and not probe.fixed:
+            if probe.effect in limits and not probe.is_single_size:
                 continue
-            key = probe.effect, probe.place
+            key = probe.effect, probe.coefficient_index
             if key not in best or powers[k] > powers[best[key]]:
                 best[key] = k
         selected_columns = list(best.values())
@@ -237,7 +239,7 @@ class _Identified:
             ]
             is_single_coefficient = sum(1 for effect, _ in best if effect == name) == 1
             label = name if is_single_coefficient else f"{name} {parameter.name.rpartition('.')[2]}"
-            if probe.fixed:
+            if probe.is_single_size:
                 # The effect of a limit or backlash is not proportional to it; it shows if it is
                 # reached.
                 limit = _classify_parameter(

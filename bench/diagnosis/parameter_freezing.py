@@ -42,7 +42,9 @@ def freeze_unidentified_parameters(
         search = searching(base)
         unidentified = find_unidentified_parameters(search, search.base_model)
         places = [
-            i for i in evaluator.base.tolist() if evaluator.parameters[i].name in unidentified
+            i
+            for i in evaluator.base_indices.tolist()
+            if evaluator.parameters[i].name in unidentified
         ]
         if not places:
             break

@@ -164,7 +164,7 @@ class DiagnosisReportDataBuilder:
         if scan is None:
             return ()
         return assess_identifiability(
-            self.search.evaluator, self.search.noise, scan.at, scan.directions
+            self.search.evaluator, self.search.noise, scan.fit, scan.directions
         )
 
     @property
@@ -221,7 +221,7 @@ class DiagnosisReportDataBuilder:
         evaluator = self.assessor.fitting_evaluator
         before = self.assessor.collect_parameter_estimates(self.search, self.finding.base)
         after = self.assessor.collect_parameter_estimates(self.search, self.finding.model)
-        for i in evaluator.base.tolist():
+        for i in evaluator.base_indices.tolist():
             parameter = evaluator.parameters[i]
             is_free = i not in self.base.fixed_parameters
             yield ParameterChange(

@@ -95,9 +95,11 @@ class VerdictBuilder:
         evaluator = self.fitting_evaluator
         numbers = self.collect_parameter_estimates(search, finding.model)
         causes = self.causes(search, finding)
-        parameters = {evaluator.parameters[i].name: numbers[i] for i in evaluator.base.tolist()}
+        parameters = {
+            evaluator.parameters[i].name: numbers[i] for i in evaluator.base_indices.tolist()
+        }
         # Simulations for the proposal of an experiment are not part of the answer.
-        simulations = evaluator.simulations
+        simulations = evaluator.simulation_count
         if self.validation is not None:
             simulations += self.validation.simulations
         heldout = self._measure_held_out_gain(finding, rng)
@@ -174,7 +176,9 @@ class VerdictBuilder:
     def _get_plausible_range(self, place: int) -> tuple[float, float]:
         """Return the plausible range, narrower than the bounds for a robot's free numbers."""
         parameter = self.fitting_evaluator.parameters[place]
-        free = self.fitting_evaluator.kind.has_model and place in self.fitting_evaluator.base
+        free = (
+            self.fitting_evaluator.kind.has_model and place in self.fitting_evaluator.base_indices
+        )
         return parameter.training or parameter.bounds if free else parameter.bounds
 
     def _add_totals(
@@ -237,7 +241,7 @@ class VerdictBuilder:
     def _get_bounds(self, model: FittedModel) -> dict[int, tuple[float, float]]:
         """Return the bounds of each fitted number, by index in the parameter vector."""
         evaluator = self.fitting_evaluator
-        ranges = {i: evaluator.parameters[i].bounds for i in evaluator.base.tolist()}
+        ranges = {i: evaluator.parameters[i].bounds for i in evaluator.base_indices.tolist()}
         return ranges | get_bounds_by_index(evaluator, model.effects)
 
     def restrict_verdict(self, search: EffectSearch, finding: DiagnosisResult) -> DiagnosisResult:
@@ -301,7 +305,7 @@ class VerdictBuilder:
 
         A cause may then compensate for a value beyond the bound.
         """
-        base_estimates = [numbers[i] for i in self.fitting_evaluator.base.tolist()]
+        base_estimates = [numbers[i] for i in self.fitting_evaluator.base_indices.tolist()]
         return any(n.at_bound is not None and not n.is_result for n in base_estimates)
 
     def estimate_noise_sigma(self, finding: DiagnosisResult) -> Array:

@@ -131,7 +131,7 @@ def answered(problem, rng):
     """Return (level, whether its interval holds the truth or it is fixed) of each free number."""
     world, noise = problem.world(problem.truth)
     fit = compute_central_jacobian(world, fit_base_model(world, noise).fit, noise)
-    places = {world.parameters[i].name: i for i in world.base}
+    places = {world.parameters[i].name: i for i in world.base_indices}
     rows = []
     for number in assess_identifiability(world, noise, fit):
         if not number.free:
@@ -153,7 +153,7 @@ def is_fixed(problem, number, rng):
         # Draw from the whole range: an insensitive number stays near its nominal value.
         truth = {**problem.truth, name: float(rng.uniform(number.low, number.high))}
         world, noise = problem.world(truth)
-        (place,) = (k for k, i in enumerate(world.base) if world.parameters[i].name == name)
+        (place,) = (k for k, i in enumerate(world.base_indices) if world.parameters[i].name == name)
         for tuner in TUNERS:
             found = find_start_with_tuner(tuner, world, noise, value)[place]
             if abs(found - truth[name]) > near:

@@ -102,8 +102,8 @@ def tuned(explained):
 
 def by_run(world, theta):
     """Return the RMSE (R, C) of a model that begins in the initial state of each run."""
-    runs = np.arange(len(world.tracks))
-    simulated = world.simulate(np.tile(theta, (runs.size, 1)), runs, world.guess)
+    runs = np.arange(len(world.prepared_runs))
+    simulated = world.simulate(np.tile(theta, (runs.size, 1)), runs, world.initial_state_guesses)
     return np.sqrt(np.nanmean((world.observed - simulated) ** 2, axis=1))
 
 

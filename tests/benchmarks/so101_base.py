@@ -66,7 +66,12 @@ def main():
     def errors(thetas, run):
         """Return errors for rows of parameters in one run, mrad."""
         of = np.full(len(thetas), run)
-        return 1e3 * (world.simulate(thetas, of, world.guess[of]) - world.observed[of])[:, :, 0]
+        return (
+            1e3
+            * (world.simulate(thetas, of, world.initial_state_guesses[of]) - world.observed[of])[
+                :, :, 0
+            ]
+        )
 
     def rms(theta):
         gaps = [errors(theta[None], run)[0][shown[run]] for run in range(len(names))]

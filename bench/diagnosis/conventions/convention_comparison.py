@@ -497,7 +497,13 @@ def _make_unfitted_start(evaluator: RunEvaluator) -> TrajectoryFit:
     """Return the model file's numbers as a fit, the starting point of candidate directions."""
     empty = np.zeros(0)
     return TrajectoryFit(
-        (), evaluator.get_nominal_theta(), evaluator.guess, np.zeros(0, np.intp), empty, empty, 0.0
+        (),
+        evaluator.get_nominal_theta(),
+        evaluator.initial_state_guesses,
+        np.zeros(0, np.intp),
+        empty,
+        empty,
+        0.0,
     )
 
 

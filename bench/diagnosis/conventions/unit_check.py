@@ -426,7 +426,7 @@ def _rescale_run(run: Run, factors: Mapping[str, float]) -> Run:
 def _list_parameters_at_bounds(evaluator: RunEvaluator, fit: TrajectoryFit) -> list[str]:
     """List the names of parameters whose value in the base fit is at a bound of their range."""
     names = []
-    for index in fit.free.tolist():
+    for index in fit.free_indices.tolist():
         parameter = evaluator.parameters[index]
         if bound_of(float(fit.theta[index]), *parameter.bounds) is not None:
             names.append(parameter.name)

@@ -176,7 +176,7 @@ def _add_small_gaps(
     smallest_probes: dict[str, CandidateDirection] = {}
     for probe in directions.candidates:
         is_backlash = (
-            probe.fixed
+            probe.is_single_size
             and evaluator.available_effects[probe.effect].coefficients[0].of
             not in NONLINEAR_COEFFICIENT_KINDS
         )
@@ -245,9 +245,9 @@ class _DetectionLimitCalculator:
         Gauss-Newton step from zero, eq. (2).
         """
         self.evaluator, self.direction_set = evaluator, direction_set
-        self.q = fit.free.size
-        self.places = fit.free.tolist()
-        self.free = tuple(evaluator.parameters[i].name for i in fit.free.tolist())
+        self.q = fit.free_indices.size
+        self.places = fit.free_indices.tolist()
+        self.free = tuple(evaluator.parameters[i].name for i in fit.free_indices.tolist())
         parameter_columns, state_columns = fit.jacobian[..., : self.q], fit.jacobian[..., self.q :]
         columns = np.concatenate(
             [parameter_columns, direction_set.responses, residual[..., None], state_columns], axis=3
@@ -279,7 +279,7 @@ class _DetectionLimitCalculator:
                 shapes.setdefault((probe.effect, probe.place), []).append(k)
         best = {key: probe_indices[0] for key, probe_indices in shapes.items()}
         limits = dict.fromkeys(
-            probe.effect for probe in self.direction_set.candidates if probe.fixed
+            probe.effect for probe in self.direction_set.candidates if probe.is_single_size
         )
         detection_limits = {}
         for (name, place), probe_indices in shapes.items():
@@ -326,7 +326,7 @@ class _DetectionLimitCalculator:
         )
 
     def _get_coefficient_index(self, probe: CandidateDirection) -> int:
-        return self.evaluator.get_coefficient_indices(probe.effect)[probe.place]
+        return self.evaluator.get_coefficient_indices(probe.effect)[probe.coefficient_index]
 
     def _list_confounded_parameters(self, k: int) -> tuple[str, ...]:
         """Return the parameters of the model that together have nearly the same influence."""
@@ -368,7 +368,7 @@ class _DetectionLimitCalculator:
         probes = [
             (k, p)
             for k, p in enumerate(self.direction_set.candidates)
-            if p.effect == name and p.fixed
+            if p.effect == name and p.is_single_size
         ]
         sizes_with_index = sorted((float(p.coefficients[0]), k) for k, p in probes)
         detectable_sizes = [

@@ -152,9 +152,9 @@ def _compute_fit_bounds(
     of the runs, because the data cannot show slower changes.
     """
     low, high = parameter.bounds
-    longest_run = evaluator.longest
+    longest_run = evaluator.longest_duration
     if is_instant(parameter):
-        return evaluator.clock
+        return evaluator.time_span
     if parameter.unit == "Hz":
         # The lower bound is at most half of the upper bound, so that the range is not empty.
         low = min(max(low, MIN_CYCLES_PER_RUN / longest_run), high / 2.0)

@@ -133,7 +133,7 @@ class _ReferenceMotions:
         self, evaluator: RunEvaluator, noise: NoiseModel, kind: type[RobotSimulator]
     ) -> None:
         self._evaluator, self._kind, self._noise = evaluator, kind, noise
-        self._tracks = evaluator.tracks[:CHECKED_RUN_COUNT]
+        self._tracks = evaluator.prepared_runs[:CHECKED_RUN_COUNT]
         self._seen: dict[IntegratorSettings, Array] = {}
 
     def of(self, numerics: IntegratorSettings) -> Array:
@@ -154,9 +154,11 @@ class _ReferenceMotions:
         theta = np.tile(
             evaluator.get_nominal_theta()[: evaluator.system_parameter_count], (count, 1)
         )
-        states = dict(zip(evaluator.states, evaluator.guess[:count].T, strict=True))
+        states = dict(
+            zip(evaluator.state_names, evaluator.initial_state_guesses[:count].T, strict=True)
+        )
         scenarios = [track.scenario for track in self._tracks]
-        evaluator.simulations += count
+        evaluator.simulation_count += count
         return simulator.simulate_batch(theta, scenarios, states)
 
     def reference(self, model_settings: IntegratorSettings) -> Array | None:

@@ -70,40 +70,40 @@ class RunEvaluator:
         recording: the recording, as given.
         runs: its runs that are used, as given.
         engine: name of the engine, as given.
-        extra: effects in addition to the library, as given.
+        extra_effects: effects in addition to the library, as given.
         library: names of the available effects, without the extra ones.
         simulator: simulator with all available effects; its channels are the recorded ones.
         system_parameter_count: number of base parameters of the system.
-        freed: constants that are treated as parameters.
+        freed_constants: constants that are treated as parameters.
         parameters: (P,) description of each element of theta.
-        base: (b,) indices in theta of the base parameters and the estimated constants.
+        base_indices: (b,) indices in theta of the base parameters and the estimated constants.
         coefficient_slices: slice of theta with the coefficients of each effect.
-        states: names of the initial states.
-        tracks: the runs, prepared for fitting.
+        state_names: names of the initial states.
+        prepared_runs: the runs, prepared for fitting.
         lengths: (R,) number of samples of each run.
         observed: (R, T, C) observations in SI units; NaN where missing, or after the end of a run.
-        known: (R, s) whether an initial state is known, and so is not estimated.
-        guess: (R, s) initial states, specified or guessed.
-        longest: duration of the longest run, in seconds.
-        clock: first and last time stamp of all runs, in seconds.
-        simulations: number of batch elements simulated so far.
-        watch: search control that stops fits early; by default it never does.
-        correction: (R, T, C) correction added to all simulations, or None
+        known_state_mask: (R, s) whether an initial state is known, and so is not estimated.
+        initial_state_guesses: (R, s) initial states, specified or guessed.
+        longest_duration: duration of the longest run, in seconds.
+        time_span: first and last time stamp of all runs, in seconds.
+        simulation_count: number of batch elements simulated so far.
+        search_control: search control that stops fits early; by default it never does.
+        discretisation_correction: (R, T, C) correction added to all simulations, or None
             (`bench.diagnosis.fitting.linearised_runs`).
-        derivatives: (R, T, C, s) derivatives by the initial states if they come from a
+        state_derivatives: (R, T, C, s) derivatives by the initial states if they come from a
             linearisation, else None.
-        neighbourhoods: linearised robot runs that were used most recently
+        cached_linearisations: linearised robot runs that were used most recently
             (`bench.diagnosis.fitting.linearised_runs`).
-        simulated: responses to effects that have no linearisation, by name and coefficients.
-        followed: the runs of a robot as followed by a state filter, or None
+        cached_responses: responses to effects that have no linearisation, by name and coefficients.
+        filtered_runs: the runs of a robot as followed by a state filter, or None
             (`bench.diagnosis.kalman.candidate_responses`).
-        identified: (b,) base parameters of a robot identified by prediction errors; None if there
-            are none.
+        identified_base: (b,) base parameters of a robot identified by prediction errors; None if
+            there are none.
         state_prior: (s,) standard deviations of the initial states about their guesses, if a filter
             follows the runs of a robot; else None.
         is_in_contact: whether geoms of a robot touch, so that initial states were estimated by a
             nonlinear filter.
-        measured: for runs of a robot, states estimated from readings alone
+        measured_states: for runs of a robot, states estimated from readings alone
             (`bench.diagnosis.kalman.measured_states`).
         worker_pool: worker pool for simulations and fits; by default only this process.
 
@@ -141,7 +141,7 @@ class RunEvaluator:
         self.recording = recording
         self.engine = engine
         self.runs = tuple(runs)
-        self.extra = tuple(extra)
+        self.extra_effects = tuple(extra)
         applicable_effects = library.list_effects_for(kind.system)
         recorded_signals = {*self.runs[0].channels, *(c.name for c in kind.inputs)}
         # An effect on a channel that is not recorded is not observable.
@@ -152,45 +152,57 @@ class RunEvaluator:
             and (effect.hook != "hidden" or kind.has_model or engine in HIDDEN_STATE_ENGINES)
         ]
         self.library = observable_effects if candidates is None else list(candidates)
-        self.simulator, self._fine = self._create_simulators()
+        self.simulator, self._fine_step_simulator = self._create_simulators()
 
         # Theta has three parts: base parameters, freed constants, coefficients.
         system = self.simulator.system
         self.system_parameter_count = len(system.parameters)
-        self.freed = [_make_freed_parameter(name, self.simulator, recording) for name in free]
+        self.freed_constants = [
+            _make_freed_parameter(name, self.simulator, recording) for name in free
+        ]
         coefficients = self.simulator.parameters[self.system_parameter_count :]
-        self.parameters: tuple[Parameter, ...] = (*system.parameters, *self.freed, *coefficients)
-        self.base: Indices = np.arange(self.system_parameter_count + len(self.freed))
-        self.coefficient_slices = _allocate_coefficients(self.simulator, self.base.size)
-        self._shifting, self._filtering = self._find_delaying_coefficients()
+        self.parameters: tuple[Parameter, ...] = (
+            *system.parameters,
+            *self.freed_constants,
+            *coefficients,
+        )
+        self.base_indices: Indices = np.arange(
+            self.system_parameter_count + len(self.freed_constants)
+        )
+        self.coefficient_slices = _allocate_coefficients(self.simulator, self.base_indices.size)
+        self._shifting_coefficients, self._fine_step_coefficients = (
+            self._find_delaying_coefficients()
+        )
 
         # A system without coordinates provides the names of its states itself.
-        self.states = [*system.coordinates, *system.rates] or list(kind.states)
-        self.tracks: tuple[RunData, ...] = tuple(
-            prepare_run(run, recording, self.simulator, self.states) for run in runs
+        self.state_names = [*system.coordinates, *system.rates] or list(kind.states)
+        self.prepared_runs: tuple[RunData, ...] = tuple(
+            prepare_run(run, recording, self.simulator, self.state_names) for run in runs
         )
-        self.lengths: Indices = np.array([len(t.observed) for t in self.tracks])
+        self.lengths: Indices = np.array([len(t.observed) for t in self.prepared_runs])
         self.observed = self._pad_observations()
-        self.known: Mask = np.array([t.known_state_mask for t in self.tracks])
-        self.guess: Array = np.array([t.initial_state_guess for t in self.tracks])
-        self.longest = self._get_longest_duration()
+        self.known_state_mask: Mask = np.array([t.known_state_mask for t in self.prepared_runs])
+        self.initial_state_guesses: Array = np.array(
+            [t.initial_state_guess for t in self.prepared_runs]
+        )
+        self.longest_duration = self._get_longest_duration()
         self.parameters = self._scale_coefficient_ranges()
-        self.clock = self._get_time_span()
-        self._travels: dict[str, float] = {}
-        self.derivatives: Array | None = None
-        self.correction: Array | None = None
-        self.neighbourhoods: dict[tuple[int, bytes, bytes], Any] = {}
-        self.simulated: dict[tuple[str, bytes], Array] = {}
-        self.followed: Any = None
-        self.identified: Array | None = None
+        self.time_span = self._get_time_span()
+        self._channel_ranges: dict[str, float] = {}
+        self.state_derivatives: Array | None = None
+        self.discretisation_correction: Array | None = None
+        self.cached_linearisations: dict[tuple[int, bytes, bytes], Any] = {}
+        self.cached_responses: dict[tuple[str, bytes], Array] = {}
+        self.filtered_runs: Any = None
+        self.identified_base: Array | None = None
         self.is_in_contact = False
         self.state_prior: Array | None = None
-        self.measured: dict[int, Mapping[int, Array]] = {}
-        self.simulations = 0
+        self.measured_states: dict[int, Mapping[int, Array]] = {}
+        self.simulation_count = 0
         self._cache = LaneCache()
-        self.watch = SearchControl()
+        self.search_control = SearchControl()
         self.worker_pool = ForkedWorkerPool()
-        self._parts: dict[float, list[Scenario]] = {}
+        self._shortened_scenarios: dict[float, list[Scenario]] = {}
 
     def _create_simulators(self) -> tuple[SystemSimulator, SystemSimulator]:
         """Create the simulator with all available effects, and a copy with a finer time step.
@@ -199,7 +211,7 @@ class RunEvaluator:
         """
         kind = self.kind
         effects: list[str | type[Effect]] = list(self.library)
-        effects += [effect for effect in self.extra if effect.fits(kind.system)]
+        effects += [effect for effect in self.extra_effects if effect.fits(kind.system)]
         # Channels follow the order of the simulator, not that of the columns of the log.
         recorded_channels = self.runs[0].channels
         observe = [c.name for c in kind.channels if c.name in recorded_channels]
@@ -223,26 +235,26 @@ class RunEvaluator:
 
     def _pad_observations(self) -> Array:
         """Return the observations (R, T, C) of all runs, NaN after the end of a shorter run."""
-        shape = len(self.tracks), self.lengths.max(), len(self.channels)
+        shape = len(self.prepared_runs), self.lengths.max(), len(self.channels)
         observed = np.full(shape, np.nan)
-        for row, track in zip(observed, self.tracks, strict=True):
+        for row, track in zip(observed, self.prepared_runs, strict=True):
             row[: len(track.observed)] = track.observed
         return observed
 
     def _get_longest_duration(self) -> float:
         """Return the duration of the longest run, in seconds."""
         # A duration of zero is replaced, because times are divided by it.
-        return max(track.duration for track in self.tracks) or 1.0
+        return max(track.duration for track in self.prepared_runs) or 1.0
 
     def _get_time_span(self) -> tuple[float, float]:
         """Return the first and the last time stamp of all runs."""
-        stamps = [track.scenario.times for track in self.tracks]
+        stamps = [track.scenario.times for track in self.prepared_runs]
         return min(float(t[0]) for t in stamps), max(float(t[-1]) for t in stamps)
 
     @property
     def sample_interval(self) -> float:
         """Median sample interval of the run sampled most often, in seconds; 0 if unknown."""
-        gaps = [np.diff(track.scenario.times) for track in self.tracks]
+        gaps = [np.diff(track.scenario.times) for track in self.prepared_runs]
         return min((float(np.median(gap)) for gap in gaps if gap.size), default=0.0)
 
     def get_effect_travel(self, effect: str) -> float:
@@ -272,9 +284,9 @@ class RunEvaluator:
 
     def _get_channel_range(self, name: str) -> float:
         """Return the largest range of a channel within one run, cached; 0 if not recorded."""
-        if name not in self._travels:
-            self._travels[name] = self._compute_channel_range(name)
-        return self._travels[name]
+        if name not in self._channel_ranges:
+            self._channel_ranges[name] = self._compute_channel_range(name)
+        return self._channel_ranges[name]
 
     def _compute_channel_range(self, name: str) -> float:
         """Compute the largest range (maximum less minimum) of a channel within one run.
@@ -311,9 +323,9 @@ class RunEvaluator:
 
     def _scale_coefficient_ranges(self) -> tuple[Parameter, ...]:
         """Return the parameters with coefficient ranges for the time scale of the runs."""
-        first, spacing = self.base.size, self.sample_interval
+        first, spacing = self.base_indices.size, self.sample_interval
         coefficients = self.parameters[first:]
-        scaled = [adapt_to_time_scale(p, self.longest, spacing) for p in coefficients]
+        scaled = [adapt_to_time_scale(p, self.longest_duration, spacing) for p in coefficients]
         return (*self.parameters[:first], *scaled)
 
     @property
@@ -343,7 +355,7 @@ class RunEvaluator:
         """Return the parameters (P,) at their nominal values, with all effects off."""
         values = np.array([p.nominal for p in self.parameters])
         # An effect is off if its coefficients are zero, whatever their nominal values.
-        values[self.base.size :] = 0.0
+        values[self.base_indices.size :] = 0.0
         return values
 
     def get_sample_mask(self, share: float) -> Mask:
@@ -389,8 +401,8 @@ class RunEvaluator:
             # Results are not cached here: the slowest element of a call sets the steps of all
             # elements, so an element differs in its last digits from call to call.
             result = self._simulate_batch(theta, runs, states, share)
-        if self.correction is not None:
-            result += self.correction[runs]
+        if self.discretisation_correction is not None:
+            result += self.discretisation_correction[runs]
         return result
 
     def _simulate_batch(self, theta: Array, runs: Indices, states: Array, share: float) -> Array:
@@ -399,7 +411,7 @@ class RunEvaluator:
         Elements of different kinds are simulated separately, and large batches are split. Arguments
         and result are those of `simulate`.
         """
-        self.simulations += len(theta)
+        self.simulation_count += len(theta)
         _, length, channels = self.observed.shape
         result = np.empty((len(theta), length, channels))
         if not len(theta):
@@ -436,20 +448,20 @@ class RunEvaluator:
             self.recording,
             runs,
             engine=self.engine,
-            extra=self.extra,
-            free=[p.name for p in self.freed],
+            extra=self.extra_effects,
+            free=[p.name for p in self.freed_constants],
             candidates=self.library,
         )
         # Periodic effects continue from segment to segment, and a value found in one segment holds
         # in all of them.
-        evaluator.longest = self.longest
+        evaluator.longest_duration = self.longest_duration
         evaluator.parameters = self.parameters
-        evaluator.clock = self.clock
+        evaluator.time_span = self.time_span
         # Ranges are computed now, because those of segments would differ.
         for name in self.channels:
             self._get_channel_range(name)
-        evaluator._travels = self._travels
-        evaluator.watch = self.watch
+        evaluator._channel_ranges = self._channel_ranges
+        evaluator.search_control = self.search_control
         evaluator.worker_pool = self.worker_pool
         return evaluator
 
@@ -463,14 +475,20 @@ class RunEvaluator:
             self.recording,
             self.runs,
             engine=self.engine,
-            extra=self.extra,
-            free=[p.name for p in self.freed],
+            extra=self.extra_effects,
+            free=[p.name for p in self.freed_constants],
             candidates=self.library,
         )
         evaluator.parameters = self.parameters
-        evaluator.watch, evaluator.worker_pool = self.watch, self.worker_pool
-        evaluator.followed, evaluator.guess = self.followed, self.guess
-        evaluator.derivatives, evaluator.identified = self.derivatives, self.identified
+        evaluator.search_control, evaluator.worker_pool = self.search_control, self.worker_pool
+        evaluator.filtered_runs, evaluator.initial_state_guesses = (
+            self.filtered_runs,
+            self.initial_state_guesses,
+        )
+        evaluator.state_derivatives, evaluator.identified_base = (
+            self.state_derivatives,
+            self.identified_base,
+        )
         evaluator.state_prior = self.state_prior
         evaluator.is_in_contact = self.is_in_contact
         self.worker_pool.register(evaluator)
@@ -478,7 +496,7 @@ class RunEvaluator:
 
     def make_simulator(self, kind: type[SystemSimulator]) -> SystemSimulator:
         """Return another simulator of the same system with the same effects and channels."""
-        effects: list[str | type[Effect]] = [*self.library, *self.extra]
+        effects: list[str | type[Effect]] = [*self.library, *self.extra_effects]
         return kind(self.recording.constants, self.channels, effects=effects)
 
     def group_compatible(self, theta: Array) -> Indices:
@@ -488,8 +506,8 @@ class RunEvaluator:
             theta: (L, P) parameters.
         """
         active = theta != 0
-        is_shifting = active[:, self._shifting].any(axis=1)
-        filtering = active[:, self._filtering].any(axis=1)
+        is_shifting = active[:, self._shifting_coefficients].any(axis=1)
+        filtering = active[:, self._fine_step_coefficients].any(axis=1)
         kinds: Indices = is_shifting + 2 * filtering
         return kinds
 
@@ -506,13 +524,13 @@ class RunEvaluator:
             runs: (L,) index of the run of each batch element.
             share: initial share of each run to which its scenario is cut.
         """
-        if share not in self._parts:
-            self._parts[share] = [
+        if share not in self._shortened_scenarios:
+            self._shortened_scenarios[share] = [
                 take_first_samples(t.scenario, int(np.ceil(share * len(t.observed))))
-                for t in self.tracks
+                for t in self.prepared_runs
             ]
         # Elements of one run share its scenario object, so the simulator prepares it only once.
-        scenarios = [self._parts[share][run] for run in runs]
+        scenarios = [self._shortened_scenarios[share][run] for run in runs]
         return [
             self._set_freed_constants(scenario, element_theta)
             for scenario, element_theta in zip(scenarios, theta, strict=True)
@@ -533,12 +551,12 @@ class RunEvaluator:
         Returns:
             Observations (L, T', C).
         """
-        simulator = self._fine if is_fine else self.simulator
+        simulator = self._fine_step_simulator if is_fine else self.simulator
         scenarios = self._make_scenarios(theta, runs, share)
         # The simulator does not treat freed constants as parameters.
-        freed_indices = np.arange(self.system_parameter_count, self.base.size)
+        freed_indices = np.arange(self.system_parameter_count, self.base_indices.size)
         lanes = np.delete(theta, freed_indices, axis=1)
-        initial = dict(zip(self.states, states.T, strict=True))
+        initial = dict(zip(self.state_names, states.T, strict=True))
         return simulator.simulate_batch(lanes, scenarios, initial)
 
     def simulate_scenarios(
@@ -554,18 +572,18 @@ class RunEvaluator:
         Returns:
             Observations (L, T, C), NaN after the end of a shorter scenario.
         """
-        self.simulations += len(theta)
+        self.simulation_count += len(theta)
         length = max(scenario.times.size for scenario in scenarios)
         result = np.full((len(theta), length, len(self.channels)), np.nan)
         max_batch_size = max(MIN_CHUNK_SIZE, MAX_BATCH_SAMPLES // length)
-        freed_indices = np.arange(self.system_parameter_count, self.base.size)
+        freed_indices = np.arange(self.system_parameter_count, self.base_indices.size)
         kinds = self.group_compatible(theta)
         for kind in np.unique(kinds):
-            simulator = self._fine if kind >= 2 else self.simulator
+            simulator = self._fine_step_simulator if kind >= 2 else self.simulator
             lanes = np.flatnonzero(kinds == kind)
             for part in np.array_split(lanes, -(-lanes.size // max_batch_size)):
                 part_scenarios = [self._set_freed_constants(scenarios[i], theta[i]) for i in part]
-                initial = dict(zip(self.states, states[part].T, strict=True))
+                initial = dict(zip(self.state_names, states[part].T, strict=True))
                 observations = simulator.simulate_batch(
                     np.delete(theta[part], freed_indices, 1), part_scenarios, initial
                 )
@@ -574,10 +592,12 @@ class RunEvaluator:
 
     def _set_freed_constants(self, scenario: Scenario, theta: Array) -> Scenario:
         """Return a scenario with the freed constants set from parameters (P,)."""
-        if not self.freed:
+        if not self.freed_constants:
             return scenario
-        values = theta[self.system_parameter_count : self.base.size].tolist()
-        freed_constants = {p.name: value for p, value in zip(self.freed, values, strict=True)}
+        values = theta[self.system_parameter_count : self.base_indices.size].tolist()
+        freed_constants = {
+            p.name: value for p, value in zip(self.freed_constants, values, strict=True)
+        }
         return replace(scenario, constants={**scenario.constants, **freed_constants})
 
     def make_observing_simulator(
@@ -592,7 +612,7 @@ class RunEvaluator:
             effects: names of the effects.
         """
         effect_types: list[str | type[Effect]] = [
-            next((e for e in self.extra if e.name == name), name) for name in effects
+            next((e for e in self.extra_effects if e.name == name), name) for name in effects
         ]
         settings: dict[str, Any] = {}
         if self.engine == "batch":
@@ -616,11 +636,13 @@ class RunEvaluator:
             filtered_runs: filtered runs, a
                 `bench.diagnosis.kalman.candidate_responses.FollowedRuns`.
         """
-        self.followed = filtered_runs
+        self.filtered_runs = filtered_runs
         initial_states = filtered_runs.get_first_states()
         is_finite = np.isfinite(initial_states).all()
-        self.guess = np.where(self.known | ~is_finite, self.guess, initial_states)
-        self.derivatives = filtered_runs.compute_state_sensitivities()
+        self.initial_state_guesses = np.where(
+            self.known_state_mask | ~is_finite, self.initial_state_guesses, initial_states
+        )
+        self.state_derivatives = filtered_runs.compute_state_sensitivities()
         self.state_prior = filtered_runs.get_state_prior()
 
     def begin_at(self, states: Array, deviations: Array) -> None:
@@ -630,14 +652,16 @@ class RunEvaluator:
             states: (R, s) initial states.
             deviations: (s,) standard deviations of their errors.
         """
-        self.guess = np.where(self.known, self.guess, states)
+        self.initial_state_guesses = np.where(
+            self.known_state_mask, self.initial_state_guesses, states
+        )
         self.state_prior = deviations
         self.is_in_contact = True
 
     def close(self) -> None:
         """Release the resources of the engine."""
         self.simulator.close()
-        self._fine.close()
+        self._fine_step_simulator.close()
 
 
 def _is_effect_observable(effect: type[Effect], recorded_signals: set[str]) -> bool:

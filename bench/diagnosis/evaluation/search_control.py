@@ -117,16 +117,16 @@ class SearchControl:
         self._stop = stop
         self._progress = progress
         self._listener = listener or SilentListener()
-        self._by: StopReason | None = None
-        self._left = False
-        self._what = ""
+        self._stop_reason: StopReason | None = None
+        self._has_abandoned_fits = False
+        self._step_text = ""
         self._question = "base_fit"
         # Weights of finished questions, of the present question, and of the later ones.
-        self._done, self._now = 0.0, QUESTION_SECONDS["base_fit"]
-        self._ahead = _list_later_weights("base_fit")
-        self._looks = -1
+        self._finished_weight, self._current_weight = 0.0, QUESTION_SECONDS["base_fit"]
+        self._later_weight = _list_later_weights("base_fit")
+        self._finished_steps = -1
 
-    def stage(self, name: str, total: int | None = None) -> None:
+    def begin_stage(self, name: str, total: int | None = None) -> None:
         """Report the start of a stage.
 
         Args:
@@ -139,7 +139,7 @@ class SearchControl:
         """Report further finished steps of the stage."""
         self._listener.advance(count)
 
-    def found(self, effects: Sequence[str], share: float) -> None:
+    def report_best_model(self, effects: Sequence[str], share: float) -> None:
         """Report the best model so far.
 
         Args:
@@ -150,11 +150,15 @@ class SearchControl:
 
     def should_stop(self) -> bool:
         """Return whether the search has to end; once true, it stays true."""
-        if self._by is None and self._stop():
-            self._by = "interrupt"
-        if self._by is None and self.deadline is not None and time.monotonic() >= self.deadline:
-            self._by = "budget"
-        return self._by is not None
+        if self._stop_reason is None and self._stop():
+            self._stop_reason = "interrupt"
+        if (
+            self._stop_reason is None
+            and self.deadline is not None
+            and time.monotonic() >= self.deadline
+        ):
+            self._stop_reason = "budget"
+        return self._stop_reason is not None
 
     def begin_question(self, question: str) -> None:
         """Begin a question of `QUESTION_TEXTS`.
@@ -164,8 +168,8 @@ class SearchControl:
         """
         self._enter_part(QUESTION_SECONDS[question])
         self._question = question
-        self._ahead = _list_later_weights(question)
-        self.stage(STAGES[question])
+        self._later_weight = _list_later_weights(question)
+        self.begin_stage(STAGES[question])
         self.report_and_check(QUESTION_TEXTS[question])
 
     def begin_larger_models(self) -> None:
@@ -174,9 +178,9 @@ class SearchControl:
 
     def _enter_part(self, weight: float) -> None:
         """Move the progress to a part of the search with the given weight."""
-        self._done += self._now
-        self._now = weight
-        self._looks = -1
+        self._finished_weight += self._current_weight
+        self._current_weight = weight
+        self._finished_steps = -1
 
     def report_and_check(self, step_text: str) -> None:
         """Report the next step, and check that the search may continue.
@@ -189,8 +193,8 @@ class SearchControl:
 
     def report(self, step_text: str) -> None:
         """Report the next step without a check, where fits stop by themselves."""
-        self._what = step_text
-        self._looks += 1
+        self._step_text = step_text
+        self._finished_steps += 1
         self._report_progress(0.0)
 
     def check_not_stopped(self) -> None:
@@ -209,16 +213,16 @@ class SearchControl:
             share: share of the fit that is finished, 0 to 1.
         """
         self._report_progress(share)
-        self._left |= self.should_stop()
-        return self._left
+        self._has_abandoned_fits |= self.should_stop()
+        return self._has_abandoned_fits
 
     def record_abandoned_fit(self, is_abandoned: bool) -> None:
         """Record whether a fit was stopped in another process."""
-        self._left |= is_abandoned
+        self._has_abandoned_fits |= is_abandoned
 
     def has_abandoned_fits(self) -> bool:
         """Return whether any fit was stopped early."""
-        return self._left
+        return self._has_abandoned_fits
 
     def make_early_stop(self, held_out: bool) -> EarlyStop:
         """Return the reason of the early end and the questions that were skipped.
@@ -230,7 +234,9 @@ class SearchControl:
         skipped_questions = names[names.index(self._question) :]
         if not held_out:
             skipped_questions = [name for name in skipped_questions if name != "held_out"]
-        return EarlyStop(self._by or "interrupt", self._what, tuple(skipped_questions))
+        return EarlyStop(
+            self._stop_reason or "interrupt", self._step_text, tuple(skipped_questions)
+        )
 
     def _report_progress(self, share: float) -> None:
         """Report the finished share of the search.
@@ -238,14 +244,14 @@ class SearchControl:
         Args:
             share: finished share of the present fit, 0 to 1.
         """
-        remaining = (1.0 - PROGRESS_STEP_SHARE) ** self._looks
+        remaining = (1.0 - PROGRESS_STEP_SHARE) ** self._finished_steps
         # Earlier steps have taken their shares; the fit is a part of the present step.
         finished_share = 1.0 - remaining * (1.0 - PROGRESS_STEP_SHARE * share)
-        total = self._done + self._now + self._ahead
-        total_share = (self._done + self._now * finished_share) / total
+        total = self._finished_weight + self._current_weight + self._later_weight
+        total_share = (self._finished_weight + self._current_weight * finished_share) / total
         self._listener.completed(total_share)
         if self._progress is not None:
-            self._progress(total_share, self._what)
+            self._progress(total_share, self._step_text)
 
 
 def _list_later_weights(question: str) -> float:

@@ -49,8 +49,8 @@ Task = Callable[..., Result]
 class SharedState(Protocol):
     """Shared state that tasks work on, such as a `World`."""
 
-    simulations: int
-    watch: SearchControl
+    simulation_count: int
+    search_control: SearchControl
     worker_pool: ForkedWorkerPool
 
 
@@ -241,8 +241,8 @@ class ForkedWorkerPool:
                     unprocessed.append(number)
                     continue
                 free.append(pipe)
-                evaluator.simulations += reply.simulations
-                evaluator.watch.record_abandoned_fit(reply.left)
+                evaluator.simulation_count += reply.simulations
+                evaluator.search_control.record_abandoned_fit(reply.left)
                 if reply.error is not None:
                     errors[number] = reply.error, reply.trace
                 else:
@@ -256,7 +256,7 @@ class ForkedWorkerPool:
         """Wait for replies and return their pipes; tell workers to stop if the search must end."""
         while True:
             ready_pipes = connection.wait(pipes, POLL_INTERVAL_SECONDS)
-            if self._ending is not None and evaluator.watch.should_stop():
+            if self._ending is not None and evaluator.search_control.should_stop():
                 self._ending[0] = 1
             if ready_pipes:
                 return ready_pipes
@@ -367,9 +367,9 @@ def _run_worker(
             place, task, item = pickle.loads(pipe.recv_bytes())
         except (EOFError, OSError):
             return
-        evaluator, deadline = evaluators[place], evaluators[place].watch.deadline
-        evaluator.watch = SearchControl(stop=lambda: ending[0] != 0)
-        evaluator.watch.deadline = deadline
+        evaluator, deadline = evaluators[place], evaluators[place].search_control.deadline
+        evaluator.search_control = SearchControl(stop=lambda: ending[0] != 0)
+        evaluator.search_control.deadline = deadline
         before = evaluator.simulations
         result, error, trace = None, None, ""
         try:
@@ -378,6 +378,7 @@ def _run_worker(
             error, trace = raised, traceback.format_exc()
         count = evaluator.simulations - before
         if not _send(
-            pipe, _Answer(result, error, trace, count, evaluator.watch.has_abandoned_fits())
+            pipe,
+            _Answer(result, error, trace, count, evaluator.search_control.has_abandoned_fits()),
         ):
             return

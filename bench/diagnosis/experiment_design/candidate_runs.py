@@ -88,11 +88,11 @@ class RigModel:
         candidate run.
         """
         self.evaluator, self.seconds = evaluator, seconds
-        self.old = evaluator.tracks[0].scenario
+        self.old = evaluator.prepared_runs[0].scenario
         self.step = float(np.median(np.diff(self.old.times)))
         self.largest, self.rest = {}, {}
         for name in self.old.inputs:
-            signals = [track.scenario.inputs[name] for track in evaluator.tracks]
+            signals = [track.scenario.inputs[name] for track in evaluator.prepared_runs]
             middle = float(np.median(np.concatenate(signals)))
             self.largest[name] = max(float(np.abs(values - middle).max()) for values in signals)
             self.rest[name] = middle
@@ -105,9 +105,9 @@ class RigModel:
 
         A robot cannot be started in motion.
         """
-        states = self.evaluator.tracks[0].initial_state_guess.copy()
+        states = self.evaluator.prepared_runs[0].initial_state_guess.copy()
         rates = set(self.evaluator.simulator.system.rates)
-        for i, name in enumerate(self.evaluator.states):
+        for i, name in enumerate(self.evaluator.state_names):
             states[i] = 0.0 if name in rates else self._clip_to_joint_range(name, float(states[i]))
         return states
 
@@ -155,10 +155,10 @@ class RigModel:
         """
         system, evaluator = self.evaluator.simulator.system, self.evaluator
         unobserved_states = {
-            evaluator.states[i] for i in np.flatnonzero(evaluator.known.all(axis=0))
+            evaluator.state_names[i] for i in np.flatnonzero(evaluator.known_state_mask.all(axis=0))
         }
         for name in system.coordinates:
-            usual_value = float(self.begin[evaluator.states.index(name)])
+            usual_value = float(self.begin[evaluator.state_names.index(name)])
             values = [
                 share * usual_value if abs(usual_value) > REST_STATE else share
                 for share in INITIAL_STATE_FACTORS
@@ -170,7 +170,9 @@ class RigModel:
         if evaluator.kind.has_model:
             return
         for name in system.rates:
-            fastest = float(np.abs(evaluator.guess[:, evaluator.states.index(name)]).max())
+            fastest = float(
+                np.abs(evaluator.initial_state_guesses[:, evaluator.state_names.index(name)]).max()
+            )
             for value in (
                 (fastest, -fastest) if fastest > REST_RATE and name not in unobserved_states else ()
             ):
@@ -207,7 +209,7 @@ class RigModel:
             inputs[name] = self._limit_command(name, command)
             limited_inputs += [name] if (inputs[name] != command).any() else []
         for name, value in plan.states:
-            states[self.evaluator.states.index(name)] = value
+            states[self.evaluator.state_names.index(name)] = value
         constants = {**self.old.constants, **dict(plan.constants)}
         scenario = replace(self.old, times=times, inputs=inputs, constants=constants)
         return CandidateRun(

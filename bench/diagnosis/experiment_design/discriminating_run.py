@@ -203,13 +203,13 @@ def _get_first_run(evaluator: RunEvaluator, limits: StatedLimits) -> _Run:
     A robot starts at rest, because it cannot be started in motion, and with commands and positions
     within their limits.
     """
-    track = evaluator.tracks[0]
+    track = evaluator.prepared_runs[0]
     if not evaluator.kind.has_model:
         return _Run("", {}, track.scenario, track.initial_state_guess)
     rates = set(evaluator.simulator.system.rates)
     states = [
         0.0 if name in rates else _clip(value, limits.states.get(name))
-        for name, value in zip(evaluator.states, track.initial_state_guess, strict=True)
+        for name, value in zip(evaluator.state_names, track.initial_state_guess, strict=True)
     ]
     recorded_inputs = track.scenario.inputs
     inputs = {
@@ -249,7 +249,7 @@ def _change_initial_states(
     """
     system = evaluator.simulator.system
     height = len(system.coordinates) - 1
-    states_with_units = zip(evaluator.states, _list_state_units(evaluator), strict=True)
+    states_with_units = zip(evaluator.state_names, _list_state_units(evaluator), strict=True)
     for place, (name, unit) in enumerate(states_with_units):
         above_ground = system.bounces and place == height
         if evaluator.kind.has_model and name not in system.coordinates:
@@ -333,9 +333,9 @@ def _compute_discrimination(
     """
     model_thetas = [model.fit.theta, competing_model.fit.theta]
     # Freed constants are fitted with the parameters, but passed to the simulator as constants.
-    places = evaluator.base[evaluator.system_parameter_count :]
+    places = evaluator.base_indices[evaluator.system_parameter_count :]
     theta = np.delete(np.stack(model_thetas), places, axis=1)
-    names = [parameter.name for parameter in evaluator.freed]
+    names = [parameter.name for parameter in evaluator.freed_constants]
     scenarios = []
     for model_theta in model_thetas:
         values = model_theta[places].tolist()
@@ -345,11 +345,11 @@ def _compute_discrimination(
 
     # Each model is one batch element of the call, both with the same initial states.
     initial = {}
-    for name, value in zip(evaluator.states, run.states.tolist(), strict=True):
+    for name, value in zip(evaluator.state_names, run.states.tolist(), strict=True):
         initial[name] = np.full(2, value)
     model_prediction, competing_prediction = evaluator.simulator.simulate_batch(
         theta, scenarios, initial
     )
-    evaluator.simulations += 2
+    evaluator.simulation_count += 2
     whitened_difference = (model_prediction - competing_prediction) / sigma
     return float(np.sqrt(np.square(whitened_difference).mean()))  # (1)

@@ -126,7 +126,7 @@ class RunRanker:
         self.pairs = list(permutations(range(count), 2))
         self.most = MAX_USEFUL_DISCRIMINATION * len(self.pairs) / 2 if self.pairs else np.inf
         self.patience = FEWER if self.evaluator.kind.has_model else MANY
-        self.free = ~self.evaluator.known.all(axis=0)
+        self.free = ~self.evaluator.known_state_mask.all(axis=0)
 
     # -- runs
 
@@ -233,7 +233,7 @@ class RunRanker:
             the initial state so much that its result could not be interpreted.
         """
         begin = run.states if states is None else states
-        free = known_model.model.fit.free.tolist()
+        free = known_model.model.fit.free_indices.tolist()
         thetas = [theta] * (1 + len(free) + int(self.free.sum()))
         for row, place in enumerate(free):
             displaced_theta = theta.copy()
@@ -267,7 +267,11 @@ class RunRanker:
         fit = competing_model.model.fit
         simulated = self._simulate_run(run, [true_model.model.fit.theta], [run.states])
         target = self._whiten(simulated)[0]
-        theta, states, deviation = fit.theta.copy(), run.states.copy(), np.zeros(fit.free.size)
+        theta, states, deviation = (
+            fit.theta.copy(),
+            run.states.copy(),
+            np.zeros(fit.free_indices.size),
+        )
         linearisation, damping = self._linearise_run(run, competing_model, theta), 1e-6
         if linearisation is None or not np.isfinite(target).all():
             return 0.0
@@ -279,7 +283,7 @@ class RunRanker:
                 target - linearisation.centre, linearisation, competing_model, deviation, damping
             )
             trial_theta, trial_states = theta.copy(), states.copy()
-            trial_theta[fit.free] += step * competing_model.spread
+            trial_theta[fit.free_indices] += step * competing_model.spread
             trial_states[self.free] += state_step
             trial_linearisation = self._linearise_run(
                 run, competing_model, trial_theta, trial_states
@@ -318,9 +322,9 @@ def _compute_prior_covariance(models: ModelSet, model: FittedModel) -> _Known:
     for a derivative.
     """
     covariance = compute_covariance(models, model)
-    bounds = np.array([models.evaluator.parameters[i].bounds for i in model.fit.free]).reshape(
-        -1, 2
-    )
+    bounds = np.array(
+        [models.evaluator.parameters[i].bounds for i in model.fit.free_indices]
+    ).reshape(-1, 2)
     # At most a tenth of the range, because derivatives are finite differences with this step.
     max_spread = 0.1 * (bounds[:, 1] - bounds[:, 0])
     spread = np.minimum(np.sqrt(np.maximum(np.diagonal(covariance), 1e-300)), max_spread)

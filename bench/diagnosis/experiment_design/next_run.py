@@ -118,7 +118,7 @@ def design_next_run(
         if (
             not ranked_runs
             or ranked_runs[0].value >= ranker.most
-            or models.evaluator.watch.has_abandoned_fits()
+            or models.evaluator.search_control.has_abandoned_fits()
         ):
             break
         plans = [
@@ -215,7 +215,7 @@ def _describe_best_run(
         discrimination=discrimination,
         times=run.scenario.times,
         inputs=dict(run.scenario.inputs),
-        initial=dict(zip(models.evaluator.states, run.states.tolist(), strict=True)),
+        initial=dict(zip(models.evaluator.state_names, run.states.tolist(), strict=True)),
         constants={k: v for k, v in constants.items() if rig.old.constants.get(k) != v},
         groups=groups,
     )

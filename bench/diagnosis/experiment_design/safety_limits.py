@@ -54,8 +54,12 @@ class RigLimits:
         self.evaluator = evaluator
         self.past = self._simulate_monitored_channels(
             model,
-            [track.scenario for track in evaluator.tracks],
-            np.where(np.isfinite(model.fit.states), model.fit.states, evaluator.guess),
+            [track.scenario for track in evaluator.prepared_runs],
+            np.where(
+                np.isfinite(model.fit.initial_states),
+                model.fit.initial_states,
+                evaluator.initial_state_guesses,
+            ),
         )
         self.bounds = self._determine_bounds()
 
@@ -111,17 +115,17 @@ class RigLimits:
         simulator = evaluator.make_observing_simulator(self.monitored_channels, model.effects)
         try:
             theta = np.array([[values.get(p.name, 0.0) for p in simulator.parameters]])
-            freed_constants = {p.name: values[p.name] for p in evaluator.freed}
+            freed_constants = {p.name: values[p.name] for p in evaluator.freed_constants}
             model_scenarios = [
                 replace(s, constants={**s.constants, **freed_constants}) for s in scenarios
             ]
-            initial = dict(zip(evaluator.states, states.T, strict=True))
+            initial = dict(zip(evaluator.state_names, states.T, strict=True))
             result = simulator.simulate_batch(
                 np.repeat(theta, len(model_scenarios), 0), model_scenarios, initial
             )
         finally:
             simulator.close()
-        evaluator.simulations += len(model_scenarios)
+        evaluator.simulation_count += len(model_scenarios)
         names = [channel.name for channel in simulator.channels]
         return [
             dict(zip(names, lane[: scenario.times.size].T, strict=True))

@@ -91,34 +91,34 @@ def fit_base_model(
         The best fit, with insensitive parameters at their nominal values.
     """
     thetas = _list_starts(evaluator, initial_base)
-    starts = [FitStart((), theta, evaluator.guess) for theta in thetas]
+    starts = [FitStart((), theta, evaluator.initial_state_guesses) for theta in thetas]
     # Simulating a start costs far less than fitting it, so the starts are reduced first.
-    evaluator.watch.report(f"base fit from {len(starts)} starts")
+    evaluator.search_control.report(f"base fit from {len(starts)} starts")
     if len(starts) > FITTED_STARTS:
         order = np.argsort(compute_start_costs(evaluator, noise, starts), kind="stable")
         starts = [starts[i] for i in order[:FITTED_STARTS]]
 
     fits: list[TrajectoryFit] = []
-    for horizon in FIT_HORIZONS if evaluator.followed is None else FILTERED_FIT_HORIZONS:
-        evaluator.watch.report(f"base fit, first {horizon.share:.0%} of the runs")
+    for horizon in FIT_HORIZONS if evaluator.filtered_runs is None else FILTERED_FIT_HORIZONS:
+        evaluator.search_control.report(f"base fit, first {horizon.share:.0%} of the runs")
         fits = TrajectoryFitter(evaluator, noise, share=horizon.share).fit_models(
             starts, horizon.iterations
         )
         starts = [fit.make_start() for fit in fits]
     best = min(fits, key=lambda fit: fit.cost)
-    if evaluator.has_linearisation and evaluator.followed is None:
+    if evaluator.has_linearisation and evaluator.filtered_runs is None:
         # Derivatives about the first start are replaced by those about the fitted model for all
         # later fits. The import is local, because only robots need it.
         from bench.diagnosis.fitting.linearised_runs import compute_state_jacobian
 
-        compute_state_jacobian(evaluator, best.theta, best.states, is_recomputed=True)
+        compute_state_jacobian(evaluator, best.theta, best.initial_states, is_recomputed=True)
         best = TrajectoryFitter(evaluator, noise).fit_models([best.make_start()], FINAL_ITERATIONS)[
             0
         ]
 
     # An insensitive parameter is set to nominal, because the value that the search reached means
     # nothing.
-    places = evaluator.base.tolist()
+    places = evaluator.base_indices.tolist()
     insensitive = frozenset(i for i in places if not _is_sensitive(evaluator, best, i, noise))
     if insensitive:
         insensitive_places = list(insensitive)
@@ -142,8 +142,8 @@ def correct_discretisation(evaluator: RunEvaluator, noise: NoiseModel, base: Bas
     # Imported here, because only robots need it.
     from bench.diagnosis.fitting.linearised_runs import correct_discretisation
 
-    correct_discretisation(evaluator, noise, base.fit.theta, base.fit.states)
-    if evaluator.correction is None:
+    correct_discretisation(evaluator, noise, base.fit.theta, base.fit.initial_states)
+    if evaluator.discretisation_correction is None:
         return base
     fit = TrajectoryFitter(evaluator, noise, base.fixed_parameters).fit_models(
         [base.fit.make_start()], FINAL_ITERATIONS
@@ -159,16 +159,16 @@ def _list_starts(evaluator: RunEvaluator, initial_base: Array | None) -> list[Ar
     """
     nominal = evaluator.get_nominal_theta()
     if initial_base is not None:
-        nominal[evaluator.base] = initial_base
+        nominal[evaluator.base_indices] = initial_base
         return [nominal]
-    parameters = [evaluator.parameters[i] for i in evaluator.base]
+    parameters = [evaluator.parameters[i] for i in evaluator.base_indices]
     starts = [nominal]
     # A simulator may have no parameters; its base fit only fits initial states.
     if not parameters:
         return starts
     for shares in spread_start_points(GRID_STARTS, len(parameters)):
         theta = nominal.copy()
-        for place, parameter, share in zip(evaluator.base, parameters, shares, strict=True):
+        for place, parameter, share in zip(evaluator.base_indices, parameters, shares, strict=True):
             theta[place] = _interpolate_bounds(parameter, share)
         starts.append(theta)
     return starts
@@ -196,7 +196,10 @@ def compute_lowest_start_cost(evaluator: RunEvaluator, noise: NoiseModel, share:
     Returns:
         The sum of squares; infinite if no start can be simulated.
     """
-    starts = [FitStart((), theta, evaluator.guess) for theta in _list_starts(evaluator, None)]
+    starts = [
+        FitStart((), theta, evaluator.initial_state_guesses)
+        for theta in _list_starts(evaluator, None)
+    ]
     return float(compute_start_costs(evaluator, noise, starts, share, np.inf).min())
 
 
@@ -216,10 +219,10 @@ def compute_start_costs(
         share: initial share of each run that counts.
         failed_residual: residual of a sample that could not be simulated.
     """
-    count, runs = len(starts), len(evaluator.tracks)
+    count, runs = len(starts), len(evaluator.prepared_runs)
     thetas = [s.theta for s in starts]
     theta = np.repeat(thetas, runs, axis=0)
-    states = np.concatenate([s.states for s in starts])
+    states = np.concatenate([s.initial_states for s in starts])
     lanes = np.tile(np.arange(runs), count)
     simulated = evaluator.simulate(theta, lanes, states, share)
     simulated = simulated.reshape(count, runs, *simulated.shape[1:])
@@ -240,7 +243,7 @@ def _is_sensitive(
     over its whole range. `place` is the index of the parameter in theta.
     """
     # A fixed parameter has no column.
-    columns = np.flatnonzero(fit.free == place)
+    columns = np.flatnonzero(fit.free_indices == place)
     if not columns.size:
         return False
     low, high = evaluator.parameters[place].bounds

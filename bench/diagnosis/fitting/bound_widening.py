@@ -34,7 +34,7 @@ def list_parameters_at_bounds(evaluator: RunEvaluator, base: BaseFit) -> list[in
     They are at a bound of their range, and physics allows values beyond this bound.
     """
     places = []
-    for i in evaluator.base.tolist():
+    for i in evaluator.base_indices.tolist():
         if i in base.fixed_parameters:
             continue
         low, high = evaluator.parameters[i].bounds
@@ -61,7 +61,7 @@ def fit_wider(
     new_bounds: dict[str, Bounds] = {}
     for _ in range(MAX_WIDENING_ROUNDS):
         places = list_parameters_at_bounds(evaluator, base)
-        if not places or evaluator.watch.has_abandoned_fits():
+        if not places or evaluator.search_control.has_abandoned_fits():
             break
         for i in places:
             parameter = evaluator.parameters[i]
@@ -182,7 +182,7 @@ def describe_unusual_values(
         wider: by parameter name, the declared range and the wider range that was used.
     """
     sentences = []
-    for i in evaluator.base.tolist():
+    for i in evaluator.base_indices.tolist():
         parameter, value = evaluator.parameters[i], float(theta[i])
         if parameter.name not in wider:
             continue

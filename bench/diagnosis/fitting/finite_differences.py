@@ -52,7 +52,7 @@ def build_displaced_inputs(
     """
     q, count = free.size, state_indices.size
     theta = np.tile(start.theta, (1 + q + count, 1))
-    states = np.tile(start.states, (1 + q + count, 1, 1))
+    states = np.tile(start.initial_states, (1 + q + count, 1, 1))
     for j, place in enumerate(free):
         theta[1 + j, place] += steps[j]
     # An initial state influences only its own run, so one batch element per run gives all

@@ -91,11 +91,11 @@ class KnownJacobian(NamedTuple):
     """Known derivatives of the runs by some of the parameters, about a nearby point.
 
     Attributes:
-        free: (q,) indices of these parameters in theta.
+        free_indices: (q,) indices of these parameters in theta.
         jacobian: (R, T, C, q) derivatives.
     """
 
-    free: Indices
+    free_indices: Indices
     jacobian: Array
 
     def drop_parameters(self, places: Collection[int]) -> KnownJacobian:
@@ -103,8 +103,10 @@ class KnownJacobian(NamedTuple):
 
         It is used for a model with fewer effects than the one whose derivatives are known.
         """
-        kept_columns = [j for j, place in enumerate(self.free.tolist()) if place not in places]
-        return KnownJacobian(self.free[kept_columns], self.jacobian[..., kept_columns])
+        kept_columns = [
+            j for j, place in enumerate(self.free_indices.tolist()) if place not in places
+        ]
+        return KnownJacobian(self.free_indices[kept_columns], self.jacobian[..., kept_columns])
 
     def add_parameters(self, places: Sequence[int], jacobian: Array) -> KnownJacobian:
         """Return the derivatives together with those by further parameters.
@@ -113,7 +115,7 @@ class KnownJacobian(NamedTuple):
             places: (k,) indices of the further parameters in theta.
             jacobian: (R, T, C, k) derivatives by them.
         """
-        free = np.concatenate([self.free, np.array(places, dtype=np.intp)])
+        free = np.concatenate([self.free_indices, np.array(places, dtype=np.intp)])
         return KnownJacobian(free, np.concatenate([self.jacobian, jacobian], axis=3))
 
 
@@ -124,17 +126,17 @@ class FitStart:
     Attributes:
         effects: names of the active effects.
         theta: (P,) parameters.
-        states: (R, s) initial states.
-        known: derivatives that are known near the start, if any.
-        by_states: (R, T, C, s) derivatives by initial states about a model near the start; None to
-            use those that all models share.
+        initial_states: (R, s) initial states.
+        known_jacobian: derivatives that are known near the start, if any.
+        state_jacobian: (R, T, C, s) derivatives by initial states about a model near the start;
+            None to use those that all models share.
     """
 
     effects: tuple[str, ...]
     theta: Array
-    states: Array
-    known: KnownJacobian | None = None
-    by_states: Array | None = None
+    initial_states: Array
+    known_jacobian: KnownJacobian | None = None
+    state_jacobian: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -144,8 +146,8 @@ class TrajectoryFit:
     Attributes:
         effects: names of the active effects.
         theta: (P,) parameters and coefficients.
-        states: (R, s) initial states.
-        free: (q,) indices of the fitted elements of theta.
+        initial_states: (R, s) initial states.
+        free_indices: (q,) indices of the fitted elements of theta.
         simulated: (R, T, C) simulated observations.
         jacobian: (R, T, C, q + s) derivatives of `simulated`, initial states last.
         cost: sum of squares of the whitened residual.
@@ -154,8 +156,8 @@ class TrajectoryFit:
 
     effects: tuple[str, ...]
     theta: Array
-    states: Array
-    free: Indices
+    initial_states: Array
+    free_indices: Indices
     simulated: Array
     jacobian: Array
     cost: float
@@ -163,11 +165,11 @@ class TrajectoryFit:
 
     def get_known_jacobian(self) -> KnownJacobian:
         """Return the derivatives by the parameters, for reuse in fits that start nearby."""
-        return KnownJacobian(self.free, self.jacobian[..., : self.free.size])
+        return KnownJacobian(self.free_indices, self.jacobian[..., : self.free_indices.size])
 
     def make_start(self) -> FitStart:
         """Return a start with which another fit continues from this one."""
-        return FitStart(self.effects, self.theta, self.states)
+        return FitStart(self.effects, self.theta, self.initial_states)
 
 
 @dataclass(frozen=True)
@@ -186,7 +188,7 @@ class FitState:
 
     Attributes:
         point: best point so far.
-        free: (q,) indices of the fitted elements of theta.
+        free_indices: (q,) indices of the fitted elements of theta.
         low: (q,) lower bounds of the fitted parameters.
         high: (q,) upper bounds of the fitted parameters.
         widths: (q,) widths of the plausible ranges of the parameters.
@@ -200,15 +202,15 @@ class FitState:
         is_jacobian_stale: whether the derivatives must be recomputed before the next step.
         is_waiting: whether recomputing can wait until the fit is known not to be far behind others.
         is_final_fit: whether the fit continues to the threshold `FINAL_CONVERGENCE_TOLERANCE`.
-        rough: whether the cost is not smooth at the scale of the noise.
-        samples: number of samples that count.
-        renewals: number of times the derivatives were recomputed.
-        by_states: (R, T, C, s) derivatives by initial states about this model; None to use those
-            that all models share.
+        has_rough_cost: whether the cost is not smooth at the scale of the noise.
+        sample_count: number of samples that count.
+        jacobian_renewals: number of times the derivatives were recomputed.
+        own_state_jacobian: (R, T, C, s) derivatives by initial states about this model; None to use
+            those that all models share.
     """
 
     point: FitPoint
-    free: Indices
+    free_indices: Indices
     low: Array
     high: Array
     widths: Array
@@ -221,19 +223,23 @@ class FitState:
     is_jacobian_stale: bool = False
     is_waiting: bool = False
     is_final_fit: bool = False
-    rough: bool = False
-    samples: int = 0
-    renewals: int = 0
-    by_states: Array | None = None
+    has_rough_cost: bool = False
+    sample_count: int = 0
+    jacobian_renewals: int = 0
+    own_state_jacobian: Array | None = None
 
     @property
-    def needs_own_states(self) -> bool:
+    def needs_own_state_jacobian(self) -> bool:
         """True if the derivatives by initial states that all models share are not good enough.
 
         This is the case if the model is near the data, but its derivatives by parameters had to be
         recomputed several times.
         """
-        is_slow = self.rough and self.by_states is None and self.renewals >= SHARED_RENEWALS
+        is_slow = (
+            self.has_rough_cost
+            and self.own_state_jacobian is None
+            and self.jacobian_renewals >= SHARED_RENEWALS
+        )
         return is_slow and not self._is_far(self.point.cost)
 
     def get_tolerance(self, cost: float) -> float:
@@ -244,7 +250,7 @@ class FitState:
         A fit whose parameters are reported has only a smaller absolute part.
         """
         if self.is_final_fit:
-            return ROUGH_FINAL_TOLERANCE if self.rough else FINAL_CONVERGENCE_TOLERANCE
+            return ROUGH_FINAL_TOLERANCE if self.has_rough_cost else FINAL_CONVERGENCE_TOLERANCE
         return (
             CONVERGENCE_TOLERANCE
             + (COARSE_SHARE if self._is_far(cost) else RELATIVE_CONVERGENCE_TOLERANCE) * cost
@@ -255,11 +261,13 @@ class FitState:
 
         The cost of such a fit changes by jumps that are larger than the remaining gain.
         """
-        return self.rough and cost > FAR_MEAN_SQUARE * self.samples
+        return self.has_rough_cost and cost > FAR_MEAN_SQUARE * self.sample_count
 
     def _is_rough_at(self, decrease: float) -> bool:
         """Return whether the cost is not smooth at the scale of a decrease."""
-        return self.rough and decrease < (EXACT_ROUGHNESS if self.is_final_fit else ROUGHNESS)
+        return self.has_rough_cost and decrease < (
+            EXACT_ROUGHNESS if self.is_final_fit else ROUGHNESS
+        )
 
     def make_fit(self) -> TrajectoryFit:
         """Return the best point so far as a fitted model."""
@@ -267,8 +275,8 @@ class FitState:
         return TrajectoryFit(
             point.start.effects,
             point.start.theta,
-            point.start.states,
-            self.free,
+            point.start.initial_states,
+            self.free_indices,
             point.simulated,
             point.jacobian,
             point.cost,
@@ -281,8 +289,8 @@ class FitState:
         The step of a parameter at its upper bound points inward.
         """
         steps = self.steps.copy()
-        parameter_steps = steps[: self.free.size]
-        parameter_steps[theta[self.free] + parameter_steps > self.high] *= -1.0
+        parameter_steps = steps[: self.free_indices.size]
+        parameter_steps[theta[self.free_indices] + parameter_steps > self.high] *= -1.0
         return steps
 
     def update_jacobian(self, new_point: FitPoint) -> Array:
@@ -296,8 +304,8 @@ class FitState:
         point = self.point
         # Samples after the end of a shorter run are NaN, and count as unchanged.
         observed_change = np.nan_to_num(new_point.simulated - point.simulated)
-        parameter_change = (new_point.start.theta - point.start.theta)[self.free]
-        state_changes = new_point.start.states - point.start.states
+        parameter_change = (new_point.start.theta - point.start.theta)[self.free_indices]
+        state_changes = new_point.start.initial_states - point.start.initial_states
         displacement = np.concatenate(
             [
                 np.broadcast_to(parameter_change, (len(state_changes), parameter_change.size)),
@@ -375,8 +383,8 @@ class FitState:
             jacobian: (R, T, C, q + s) whitened derivatives.
         """
         # Direction of steepest descent of the cost.
-        descent = np.einsum("rtc,rtcq->q", residual, jacobian[..., : self.free.size])
-        values = self.point.start.theta[self.free]
+        descent = np.einsum("rtc,rtcq->q", residual, jacobian[..., : self.free_indices.size])
+        values = self.point.start.theta[self.free_indices]
         is_blocked_below = (values <= self.low) & (descent < 0)
         is_blocked_above = (values >= self.high) & (descent > 0)
         is_blocked: Mask = is_blocked_below | is_blocked_above

@@ -37,7 +37,7 @@ def compute_effect_responses(
     """
     runs, length, channels = evaluator.observed.shape
     result: Array = np.full((len(added), runs, length, channels), np.nan, dtype=np.float32)
-    cached_responses = evaluator.simulated
+    cached_responses = evaluator.cached_responses
     keys = [(name, c.tobytes()) for name, c in added]
     missing_indices = [i for i, key in enumerate(keys) if key not in cached_responses]
     calls = [(run, theta, states[run], [added[i] for i in missing_indices]) for run in range(runs)]
@@ -47,7 +47,7 @@ def compute_effect_responses(
         # Values that overflow single precision become infinite here.
         with np.errstate(over="ignore"):
             result[missing_indices, run, : values.shape[1]] = values
-        evaluator.simulations += simulation_count
+        evaluator.simulation_count += simulation_count
     result[~is_finite_response(result)] = np.nan
     for i, key in enumerate(keys):
         if key in cached_responses:
@@ -92,9 +92,9 @@ def compute_state_jacobian(
         states: (R, s) initial states.
         is_recomputed: whether to recompute the derivatives about this model and store them.
     """
-    if evaluator.derivatives is None or is_recomputed:
-        evaluator.derivatives = compute_initial_state_derivatives(evaluator, theta, states)
-    return evaluator.derivatives
+    if evaluator.state_derivatives is None or is_recomputed:
+        evaluator.state_derivatives = compute_initial_state_derivatives(evaluator, theta, states)
+    return evaluator.state_derivatives
 
 
 def compute_initial_state_derivatives(
@@ -108,7 +108,7 @@ def compute_initial_state_derivatives(
         states: (R, s) initial states of the model.
     """
     runs, length, channels = evaluator.observed.shape
-    result = np.zeros((runs, length, channels, len(evaluator.states)))
+    result = np.zeros((runs, length, channels, len(evaluator.state_names)))
     calls = [(run, theta, states[run]) for run in range(runs)]
     for run, values in evaluator.worker_pool.map_unordered(
         evaluator, _compute_initial_state_derivatives, calls
@@ -134,11 +134,11 @@ def _get_linearisation(
     `theta` is (P,), `states` (s,): positions first, then velocities.
     """
     key = run, theta.tobytes(), states.tobytes()
-    cache = evaluator.neighbourhoods
+    cache = evaluator.cached_linearisations
     linearisation: RunLinearisation | None = cache.pop(key, None)
     if linearisation is None:
-        coordinate_count = len(evaluator.states) // 2
-        scenario = evaluator.tracks[run].scenario
+        coordinate_count = len(evaluator.state_names) // 2
+        scenario = evaluator.prepared_runs[run].scenario
         linearisation = RunLinearisation(
             evaluator.simulator,
             theta,
@@ -148,7 +148,7 @@ def _get_linearisation(
         )
     cache[key] = linearisation
     # Drop the linearisations that were not used for the longest time.
-    for oldest_key in list(cache)[: -len(evaluator.tracks)]:
+    for oldest_key in list(cache)[: -len(evaluator.prepared_runs)]:
         del cache[oldest_key]
     return linearisation
 
@@ -176,20 +176,20 @@ def correct_discretisation(
     if not evaluator.has_linearisation:
         return
     assert issubclass(evaluator.kind, RobotSimulator)
-    effects = [*evaluator.library, *evaluator.extra]
-    runs = len(evaluator.tracks)
-    scenarios = [track.scenario for track in evaluator.tracks]
+    effects = [*evaluator.library, *evaluator.extra_effects]
+    runs = len(evaluator.prepared_runs)
+    scenarios = [track.scenario for track in evaluator.prepared_runs]
     lanes = np.tile(theta, (runs, 1))
-    initial_states = dict(zip(evaluator.states, states.T, strict=True))
+    initial_states = dict(zip(evaluator.state_names, states.T, strict=True))
     half_step_kind = evaluator.kind.with_half_step()
     simulated = [evaluator.simulator.simulate_batch(lanes, scenarios, initial_states)]
     for kind in (half_step_kind, half_step_kind.with_half_step()):
         finer = kind(evaluator.recording.constants, evaluator.channels, effects=effects)
         simulated.append(finer.simulate_batch(lanes, scenarios, initial_states))
     # In units of a run with the usual step: 1 + 2 with half of the step + 4 with a quarter.
-    evaluator.simulations += 7 * runs
+    evaluator.simulation_count += 7 * runs
     correction = 2.0 * simulated[2] - simulated[1] - simulated[0]  # (1)
     sizes = np.square(correction / noise.sigma)[np.isfinite(evaluator.observed)]
     # A large error cannot be removed by this correction.
     if float(np.sqrt(sizes.mean())) < MAX_CORRECTABLE_ERROR:
-        evaluator.correction = np.nan_to_num(correction)
+        evaluator.discretisation_correction = np.nan_to_num(correction)

@@ -84,23 +84,23 @@ class ModelSet:
     Attributes:
         evaluator: the runs for fitting.
         noise: sensor noise.
-        frozen: indices of parameters that do not influence the data.
+        fixed_parameters: indices of parameters that do not influence the data.
         rng: source of all random numbers.
         is_noise_stated: (C,) whether the recording specifies the noise of each channel.
         models: the best fit for each set of effects.
         null_gains: gain of each effect under the null hypothesis, about the base model.
-        derived: fits whose derivatives were recomputed with central differences, each with its
-            original fit.
+        refined_jacobians: fits whose derivatives were recomputed with central differences, each
+            with its original fit.
     """
 
     evaluator: RunEvaluator
     noise: NoiseModel
-    frozen: frozenset[int]
+    fixed_parameters: frozenset[int]
     rng: np.random.Generator
     is_noise_stated: Mask
     models: dict[frozenset[str], FittedModel] = field(default_factory=dict)
     null_gains: dict[str, float] = field(default_factory=dict)
-    derived: dict[int, tuple[TrajectoryFit, TrajectoryFit]] = field(default_factory=dict)
+    refined_jacobians: dict[int, tuple[TrajectoryFit, TrajectoryFit]] = field(default_factory=dict)
     _drawn: int = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -152,7 +152,7 @@ class ModelSet:
 
     def _rate_fit(self, fit: TrajectoryFit) -> FittedModel:
         """Return a fit with its likelihood and its penalised log-likelihood, eq. (1)."""
-        freedom = fit.free.size + count_identified_states(self.evaluator, fit, self.noise)
+        freedom = fit.free_indices.size + count_identified_states(self.evaluator, fit, self.noise)
         # A model that could not be simulated is stored, too, so that it is not tried again.
         likelihood = _LOST
         if np.isfinite(fit.cost):
@@ -222,7 +222,7 @@ class ModelSet:
             race: whether to stop fits that fall far behind.
             iterations: maximum number of steps of each fit.
         """
-        watch = self.evaluator.watch
+        watch = self.evaluator.search_control
         watch.report_and_check(f"refit of {_format_starts(starts)}")
         noise = noise or self.noise
         starts = [self.with_sensitivities(start) for start in starts]
@@ -231,8 +231,8 @@ class ModelSet:
         # Sums of squares with different weights are not comparable.
         is_race = race and noise is self.noise
         lowest_cost = self._find_lowest_cost(starts) if is_race else np.inf
-        fitter = TrajectoryFitter(self.evaluator, noise, self.frozen)
-        watch.stage(_name_stage(starts), len(starts))
+        fitter = TrajectoryFitter(self.evaluator, noise, self.fixed_parameters)
+        watch.begin_stage(_name_stage(starts), len(starts))
         for fit in fitter.fit_models(
             starts, iterations, race=race, lowest_cost=lowest_cost, finished=watch.advance
         ):
@@ -270,10 +270,10 @@ class ModelSet:
         )
         if base is None or best is None or not best.effects:
             return
-        gap = self.compute_excess(base)
+        gap = self.compute_excess_residual(base)
         if gap > 0 and np.isfinite(gap):
-            share = 1.0 - max(self.compute_excess(best), 0.0) / gap
-            self.evaluator.watch.found(best.effects, max(share, 0.0))
+            share = 1.0 - max(self.compute_excess_residual(best), 0.0) / gap
+            self.evaluator.search_control.report_best_model(best.effects, max(share, 0.0))
 
     def refine_jacobian(self, model: FittedModel) -> FittedModel:
         """Return the model with derivatives at its own parameters, computed at most once.
@@ -289,7 +289,7 @@ class ModelSet:
             and stored_model.fit.theta is model.fit.theta
         ):
             return stored_model
-        fitter = TrajectoryFitter(self.evaluator, self.noise, self.frozen)
+        fitter = TrajectoryFitter(self.evaluator, self.noise, self.fixed_parameters)
         (fit,) = fitter.fit_models([model.fit.make_start()], iterations=0)
         result = replace(model, fit=replace(model.fit, jacobian=fit.jacobian, is_own_jacobian=True))
         if stored_model is model:
@@ -304,7 +304,7 @@ class ModelSet:
         nothing. A fit that leaves clearly larger residuals is rejected: with structured residuals,
         this method prefers smooth residuals to small ones.
         """
-        self.evaluator.watch.stage("refining the model")
+        self.evaluator.search_control.begin_stage("refining the model")
         squares = TrajectoryFitter(self.evaluator, self.noise).compute_cost
         for _ in range(MAX_REWEIGHTED_FITS):
             likelihood = model.likelihood
@@ -316,9 +316,11 @@ class ModelSet:
             noise = NoiseModel(
                 np.maximum(sigma, MIN_SIGMA_SHARE * self.noise.sigma), likelihood.phi
             )
-            fitter = TrajectoryFitter(self.evaluator, noise, self.frozen, exact=True)
+            fitter = TrajectoryFitter(
+                self.evaluator, noise, self.fixed_parameters, is_final_fit=True
+            )
             (fit,) = fitter.fit_models([self.make_final_start(model)], MAX_ITERATIONS)
-            if self.evaluator.watch.has_abandoned_fits():
+            if self.evaluator.search_control.has_abandoned_fits():
                 break
             refitted = self._rate_fit(replace(fit, cost=squares(fit)))
             if refitted.fit.cost > MAX_REWEIGHTED_SQUARES_RATIO * squares(model.fit):
@@ -343,7 +345,7 @@ class ModelSet:
         remaining_starts = list(starts)
         # Patient fits keep all candidates at first, but only a few may be fitted to whole runs.
         for horizon, count in zip(FIT_HORIZONS[:-1], MODELS_KEPT_PER_HORIZON, strict=True):
-            fitter = TrajectoryFitter(self.evaluator, noise, self.frozen, horizon.share)
+            fitter = TrajectoryFitter(self.evaluator, noise, self.fixed_parameters, horizon.share)
             fits = fitter.fit_models(remaining_starts, horizon.iterations)
             fits.sort(key=lambda fit: fit.cost)
             remaining_starts = [fit.make_start() for fit in fits[:count]]
@@ -365,7 +367,7 @@ class ModelSet:
         models = [m for m in fitted_models if len(m.effects) == size]
         return max(models, key=lambda m: m.penalised_log_likelihood) if models else None
 
-    def compute_excess(self, model: FittedModel) -> float:
+    def compute_excess_residual(self, model: FittedModel) -> float:
         """Return the RMS residual of a model, in units of the noise floor, minus one.
 
         A model whose residual is only noise has the excess 0.
@@ -418,14 +420,14 @@ def count_identified_states(
         noise: noise of each channel.
     """
     observed_mask = np.isfinite(evaluator.observed)
-    states = fit.jacobian[..., fit.free.size :]
+    states = fit.jacobian[..., fit.free_indices.size :]
     observed_states = np.where(observed_mask[..., None], states, 0.0)
     scaled = observed_states / noise.sigma[:, None]
     # The shape is written out, because -1 is ambiguous if there are no states.
     runs, length, channels, size = scaled.shape
     columns = scaled.reshape(runs, length * channels, size) * compute_state_prior(evaluator)
     # A known state is not a degree of freedom.
-    columns = np.where(evaluator.known[:, None, :], 0.0, columns)
+    columns = np.where(evaluator.known_state_mask[:, None, :], 0.0, columns)
     normal = np.matmul(columns.transpose(0, 2, 1), columns)
     eigenvalues = np.linalg.eigvalsh(normal)
     # Rounding may make an eigenvalue slightly negative.

@@ -92,7 +92,7 @@ def join_segment_fits(evaluator: RunEvaluator, segment_fit: TrajectoryFit) -> Fi
     counts = [len(_split_run(run)) for run in evaluator.runs]
     # The initial state of a run is that of its first segment.
     first = np.cumsum([0, *counts])[:-1]
-    return FitStart(segment_fit.effects, segment_fit.theta, segment_fit.states[first])
+    return FitStart(segment_fit.effects, segment_fit.theta, segment_fit.initial_states[first])
 
 
 def forgets_initial_state(evaluator: RunEvaluator, noise: NoiseModel, derivatives: Array) -> bool:

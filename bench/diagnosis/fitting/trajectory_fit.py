@@ -117,18 +117,20 @@ class TrajectoryFitter:
     Attributes:
         evaluator: the runs.
         noise: noise of each channel.
-        frozen: indices of parameters that are not fitted, because the data do not show them.
+        fixed_parameters: indices of parameters that are not fitted, because the data do not show
+            them.
         share: only this initial share of each run counts.
-        parameters: False to fit only initial states.
-        exact: whether fits are refined to final convergence, as needed for reported parameters.
+        fits_parameters: False to fit only initial states.
+        is_final_fit: whether fits are refined to final convergence, as needed for reported
+            parameters.
     """
 
     evaluator: RunEvaluator
     noise: NoiseModel
-    frozen: frozenset[int] = frozenset()
+    fixed_parameters: frozenset[int] = frozenset()
     share: float = 1.0
-    parameters: bool = True
-    exact: bool = False
+    fits_parameters: bool = True
+    is_final_fit: bool = False
 
     def fit_models(
         self,
@@ -156,7 +158,9 @@ class TrajectoryFitter:
             unfinished = [i for i, problem in enumerate(problems) if not problem.is_finished]
             if not unfinished or (
                 racing_round.first
-                and self.evaluator.watch.should_abandon_fit(racing_round.first / iterations)
+                and self.evaluator.search_control.should_abandon_fit(
+                    racing_round.first / iterations
+                )
             ):
                 break
             best = min(lowest_cost, *(problem.point.cost for problem in problems))
@@ -179,7 +183,13 @@ class TrajectoryFitter:
 
         A worker creates its own fitter from them; see `_advance_group`.
         """
-        return self.noise, self.frozen, self.share, self.parameters, self.exact
+        return (
+            self.noise,
+            self.fixed_parameters,
+            self.share,
+            self.fits_parameters,
+            self.is_final_fit,
+        )
 
     def _group_fits(
         self, problems: Sequence[FitState], unfinished: Sequence[int]
@@ -194,7 +204,7 @@ class TrajectoryFitter:
             return [list(unfinished)]
         runs, length, _ = evaluator.observed.shape
         state_count = self._list_displaced_states().size
-        lanes = sum(1 + problems[i].free.size + state_count for i in unfinished) * runs
+        lanes = sum(1 + problems[i].free_indices.size + state_count for i in unfinished) * runs
         cost = lanes * length * self.share + ALGEBRA_COST_SAMPLES * len(unfinished)
         # Compiled batch elements are stepped in parallel, however long they are.
         count = int(np.ceil(min(cost / GROUP_COST_SAMPLES, lanes / MIN_CHUNK_SIZE)))
@@ -240,7 +250,9 @@ class TrajectoryFitter:
             if not trials and any(p.is_waiting and not p.is_finished for p in problems):
                 continue
             # The caller checks whether the fit was stopped early here.
-            if not trials or self.evaluator.watch.should_abandon_fit(iteration / racing_round.all):
+            if not trials or self.evaluator.search_control.should_abandon_fit(
+                iteration / racing_round.all
+            ):
                 break
             make_points = (
                 self._simulate_without_derivatives
@@ -266,11 +278,13 @@ class TrajectoryFitter:
                 [(p, p.point.start) for p in known_problems], sample_mask
             )
             for problem, point in zip(known_problems, points, strict=True):
-                assert point.start.known is not None
+                assert point.start.known_jacobian is not None
                 state_jacobian = self._compute_initial_state_derivatives(
                     problem, point.start, point.simulated.shape[1]
                 )
-                parameter_jacobian = point.start.known.jacobian[:, : point.simulated.shape[1]]
+                parameter_jacobian = point.start.known_jacobian.jacobian[
+                    :, : point.simulated.shape[1]
+                ]
                 self._move_to_point(
                     problem,
                     replace(
@@ -284,11 +298,11 @@ class TrajectoryFitter:
 
         This saves one simulation per parameter. Only robots reuse derivatives.
         """
-        known_jacobian = problem.point.start.known
+        known_jacobian = problem.point.start.known_jacobian
         return (
             self.evaluator.has_linearisation
             and known_jacobian is not None
-            and np.array_equal(known_jacobian.free, problem.free)
+            and np.array_equal(known_jacobian.free_indices, problem.free_indices)
         )
 
     def _renew_derivatives(
@@ -306,16 +320,16 @@ class TrajectoryFitter:
         if not stale_problems:
             return
         for problem in stale_problems:
-            problem.renewals += 1
-            if problem.needs_own_states:
+            problem.jacobian_renewals += 1
+            if problem.needs_own_state_jacobian:
                 # Imported here, because only robots need it.
                 from bench.diagnosis.fitting.linearised_runs import (
                     compute_initial_state_derivatives,
                 )
 
                 start = problem.point.start
-                problem.by_states = compute_initial_state_derivatives(
-                    self.evaluator, start.theta, start.states
+                problem.own_state_jacobian = compute_initial_state_derivatives(
+                    self.evaluator, start.theta, start.initial_states
                 )
         points = self._simulate_points([(p, p.point.start) for p in stale_problems], sample_mask)
         for problem, point in zip(stale_problems, points, strict=True):
@@ -325,8 +339,8 @@ class TrajectoryFitter:
         """Create the state of a new fit: fitted parameters, their bounds and difference steps."""
         evaluator = self.evaluator
         bounds: dict[int, tuple[float, float]] = {}
-        if self.parameters:
-            base = [i for i in evaluator.base.tolist() if i not in self.frozen]
+        if self.fits_parameters:
+            base = [i for i in evaluator.base_indices.tolist() if i not in self.fixed_parameters]
             bounds = {i: evaluator.parameters[i].bounds for i in base}
             bounds |= get_bounds_by_index(evaluator, start.effects)
         free = list(bounds)
@@ -337,23 +351,23 @@ class TrajectoryFitter:
         # Plausible ranges scale the finite differences; a fit may go far beyond them.
         plausible_ranges = [evaluator.parameters[i].bounds for i in free]
         widths = np.array([b - a for a, b in plausible_ranges], dtype=np.float64)
-        state_steps = np.full(len(evaluator.states), INITIAL_STATE_STEP)
+        state_steps = np.full(len(evaluator.state_names), INITIAL_STATE_STEP)
 
         # A start may have a size from a score test, or come from wider bounds.
         theta = start.theta.copy()
         theta[free] = np.clip(theta[free], low, high)
-        clipped_start = replace(start, theta=theta, states=start.states.copy())
+        clipped_start = replace(start, theta=theta, initial_states=start.initial_states.copy())
         return FitState(
             point=FitPoint(clipped_start, np.empty(0), np.empty(0), np.inf),
-            free=np.array(free, dtype=np.intp),
+            free_indices=np.array(free, dtype=np.intp),
             low=low,
             high=high,
             widths=widths,
             steps=np.concatenate([INITIAL_PARAMETER_STEP * widths, state_steps]),
-            is_final_fit=self.exact,
-            rough=evaluator.has_linearisation,
-            samples=int(evaluator.get_sample_mask(self.share).sum()),
-            by_states=start.by_states,
+            is_final_fit=self.is_final_fit,
+            has_rough_cost=evaluator.has_linearisation,
+            sample_count=int(evaluator.get_sample_mask(self.share).sum()),
+            own_state_jacobian=start.state_jacobian,
         )
 
     def _simulate_points(self, trials: Sequence[_TrialStep], sample_mask: Mask) -> list[FitPoint]:
@@ -363,11 +377,11 @@ class TrajectoryFitter:
         integrates over time only once. An initial state that is known in every run is not an
         unknown.
         """
-        runs, size = self.evaluator.guess.shape
+        runs, size = self.evaluator.initial_state_guesses.shape
         state_indices = self._list_displaced_states()
         steps = [problem.compute_inward_steps(start.theta) for problem, start in trials]
         displaced_inputs = [
-            build_displaced_inputs(start, problem.free, step, state_indices)
+            build_displaced_inputs(start, problem.free_indices, step, state_indices)
             for (problem, start), step in zip(trials, steps, strict=True)
         ]
         # Batch elements are ordered by model, then by unknown, then by run.
@@ -381,15 +395,15 @@ class TrajectoryFitter:
         first = 0
         for (problem, start), step in zip(trials, steps, strict=True):
             # The first element is not displaced; each other one has one unknown displaced.
-            end = first + 1 + problem.free.size + state_indices.size
+            end = first + 1 + problem.free_indices.size + state_indices.size
             part = simulated[first:end]
             first = end
             jacobian = self._compute_derivatives(part, step, state_indices)
             if self.evaluator.has_linearisation:
-                jacobian[..., problem.free.size :] = self._compute_initial_state_derivatives(
-                    problem, start, part.shape[2]
+                jacobian[..., problem.free_indices.size :] = (
+                    self._compute_initial_state_derivatives(problem, start, part.shape[2])
                 )
-            cost = self._compute_cost(part[0], start.states, sample_mask)
+            cost = self._compute_cost(part[0], start.initial_states, sample_mask)
             points.append(FitPoint(start, part[0], jacobian, cost))
         return points
 
@@ -400,11 +414,11 @@ class TrajectoryFitter:
 
         `_judge_trial` updates these derivatives if the point is accepted.
         """
-        runs = len(self.evaluator.guess)
+        runs = len(self.evaluator.initial_state_guesses)
         simulated = self.evaluator.simulate(
             np.concatenate([np.tile(start.theta, (runs, 1)) for _, start in trials]),
             np.tile(np.arange(runs), len(trials)),
-            np.concatenate([start.states for _, start in trials]),
+            np.concatenate([start.initial_states for _, start in trials]),
             self.share,
         ).reshape(len(trials), runs, *self.evaluator.observed.shape[1:])
         return [
@@ -412,7 +426,7 @@ class TrajectoryFitter:
                 start,
                 part,
                 problem.point.jacobian,
-                self._compute_cost(part, start.states, sample_mask),
+                self._compute_cost(part, start.initial_states, sample_mask),
             )
             for (problem, start), part in zip(trials, simulated, strict=True)
         ]
@@ -424,7 +438,7 @@ class TrajectoryFitter:
         """
         if self.evaluator.has_linearisation:
             return np.array([], dtype=np.intp)
-        return np.flatnonzero(~self.evaluator.known.all(axis=0))
+        return np.flatnonzero(~self.evaluator.known_state_mask.all(axis=0))
 
     def _compute_initial_state_derivatives(
         self, problem: FitState, start: FitStart, samples: int
@@ -437,11 +451,11 @@ class TrajectoryFitter:
         # Imported here, because only robots need it.
         from bench.diagnosis.fitting.linearised_runs import compute_state_jacobian
 
-        shared = problem.by_states
+        shared = problem.own_state_jacobian
         if shared is None:
-            shared = compute_state_jacobian(evaluator, start.theta, start.states)
+            shared = compute_state_jacobian(evaluator, start.theta, start.initial_states)
         derivatives = shared[:, :samples]
-        masked_derivatives: Array = derivatives * ~evaluator.known[:, None, None, :]
+        masked_derivatives: Array = derivatives * ~evaluator.known_state_mask[:, None, None, :]
         return masked_derivatives
 
     def _compute_derivatives(self, part: Array, steps: Array, state_indices: Indices) -> Array:
@@ -454,7 +468,7 @@ class TrajectoryFitter:
             steps: (q + s,) displacements.
             state_indices: (n,) indices of the initial states that are displaced.
         """
-        known_mask = self.evaluator.known
+        known_mask = self.evaluator.known_state_mask
         q = steps.size - known_mask.shape[1]
         columns = np.concatenate([np.arange(q), q + state_indices])
         # An abandoned batch element is NaN, so the effect of its unknown is not known.
@@ -484,7 +498,9 @@ class TrajectoryFitter:
 
         They are in units of the prior standard deviation.
         """
-        drift: Array = (states - self.evaluator.guess) / compute_state_prior(self.evaluator)
+        drift: Array = (states - self.evaluator.initial_state_guesses) / compute_state_prior(
+            self.evaluator
+        )
         return drift
 
     def compute_cost(self, fit: TrajectoryFit) -> float:
@@ -493,7 +509,7 @@ class TrajectoryFitter:
         Costs with different weights cannot be compared directly.
         """
         return self._compute_cost(
-            fit.simulated, fit.states, self.evaluator.get_sample_mask(self.share)
+            fit.simulated, fit.initial_states, self.evaluator.get_sample_mask(self.share)
         )
 
     def _compute_cost(self, simulated: Array, states: Array, sample_mask: Mask) -> float:
@@ -541,10 +557,10 @@ class TrajectoryFitter:
         step = compute_gauss_newton_step(
             residual,
             jacobian,
-            problem.free.size,
-            self._compute_state_deviation(point.start.states),
+            problem.free_indices.size,
+            self._compute_state_deviation(point.start.initial_states),
             compute_state_prior(self.evaluator),
-            self.evaluator.known,
+            self.evaluator.known_state_mask,
             problem.damping,
             problem.find_blocked_parameters(
                 residual, jacobian
@@ -562,9 +578,11 @@ class TrajectoryFitter:
 
         # Copy the parameters, because the old point is still needed if the trial is rejected.
         theta = point.start.theta.copy()
-        trial_values = theta[problem.free] + step.parameter_step
-        theta[problem.free] = np.clip(trial_values, problem.low, problem.high)
-        return replace(point.start, theta=theta, states=point.start.states + step.state_steps)
+        trial_values = theta[problem.free_indices] + step.parameter_step
+        theta[problem.free_indices] = np.clip(trial_values, problem.low, problem.high)
+        return replace(
+            point.start, theta=theta, initial_states=point.start.initial_states + step.state_steps
+        )
 
     def _judge_trial(self, problem: FitState, point: FitPoint) -> None:
         """Accept a trial point if its cost is lower, else reject it, and update the damping.
@@ -576,7 +594,7 @@ class TrajectoryFitter:
         if point.cost < problem.point.cost:
             if self.evaluator.has_linearisation:
                 problem.point = replace(point, jacobian=problem.update_jacobian(point))
-                problem.has_own_jacobian = not problem.free.size
+                problem.has_own_jacobian = not problem.free_indices.size
             else:
                 self._move_to_point(problem, point)
             problem.accept_step(decrease, point.cost, is_own_jacobian)
@@ -601,6 +619,6 @@ def compute_state_prior(evaluator: RunEvaluator) -> Array:
     pairs = dict(zip(system.rates, system.coordinates, strict=False))
     is_measured = [
         name in recorded_channels or pairs.get(name) in recorded_channels
-        for name in evaluator.states
+        for name in evaluator.state_names
     ]
     return np.where(is_measured, OBSERVED_STATE_PRIOR_SIGMA, UNOBSERVED_STATE_PRIOR_SIGMA)

@@ -35,13 +35,13 @@ def find_start_with_tuner(
     channels = evaluator.observed.shape[2]
     # A tuner accepts one table, so the runs are concatenated, all padded to the same length.
     observed = evaluator.observed.reshape(-1, channels)
-    parameters = [evaluator.parameters[i] for i in evaluator.base]
+    parameters = [evaluator.parameters[i] for i in evaluator.base_indices]
     problem = StandaloneProblem(
         parameters=parameters,
-        start=evaluator.get_nominal_theta()[evaluator.base],
+        start=evaluator.get_nominal_theta()[evaluator.base_indices],
         observed=observed,
         scale=noise.sigma,
-        lengths=(evaluator.observed.shape[1],) * len(evaluator.tracks),
+        lengths=(evaluator.observed.shape[1],) * len(evaluator.prepared_runs),
         evaluate=lambda base: _evaluate_base(evaluator, noise, observed, base),
     )
     return run_tuner(
@@ -70,14 +70,14 @@ def _evaluate_base(
         Observations (n, T, C) and losses (n,).
     """
     count = len(base)
-    runs = len(evaluator.tracks)
+    runs = len(evaluator.prepared_runs)
     # No effect is active, because the coefficients after the base parameters are zero.
     theta = np.tile(evaluator.get_nominal_theta(), (count, 1))
-    theta[:, evaluator.base] = base
+    theta[:, evaluator.base_indices] = base
     simulated = evaluator.simulate(
         np.repeat(theta, runs, axis=0),
         np.tile(np.arange(runs), count),
-        np.tile(evaluator.guess, (count, 1)),
+        np.tile(evaluator.initial_state_guesses, (count, 1)),
     ).reshape(count, -1, observed.shape[1])
 
     residuals = np.where(np.isfinite(observed), simulated - observed, 0.0)

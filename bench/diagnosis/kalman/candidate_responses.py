@@ -173,8 +173,12 @@ class FollowedRuns:
         linear: list[MeasuredLinear] = []
         for number in range(max_linearisations if trajectories is None else 1):
             # Near the data, Jacobians change little from one motion to another.
-            neighbours: Sequence[MeasuredLinear | None] = linear or [None] * len(evaluator.tracks)
-            motion: Sequence[Trajectory | None] = trajectories or [None] * len(evaluator.tracks)
+            neighbours: Sequence[MeasuredLinear | None] = linear or [None] * len(
+                evaluator.prepared_runs
+            )
+            motion: Sequence[Trajectory | None] = trajectories or [None] * len(
+                evaluator.prepared_runs
+            )
             linear = [
                 _linearise_run(evaluator, theta, noise, run, motion[run], neighbour)
                 for run, neighbour in enumerate(neighbours)
@@ -255,19 +259,19 @@ class FollowedRuns:
             theta: (P,) parameters of the model.
             noise: sensor noise.
         """
-        known: FollowedRuns | None = evaluator.followed
+        known: FollowedRuns | None = evaluator.filtered_runs
         if (
             known is not None
             and known.evaluator is evaluator
             and np.array_equal(known.theta, theta)
         ):
             return known
-        evaluator.watch.stage("computing prediction errors", 1)
+        evaluator.search_control.begin_stage("computing prediction errors", 1)
         assert isinstance(evaluator.simulator, RobotSimulator)
         # With another step size, the motion at the ends of the steps is not known.
         has_same_step = known is not None and known.step == evaluator.simulator.time_step
         motion = known.trajectories if known is not None and has_same_step else None
-        followed = evaluator.followed = cls.follow(evaluator, theta, noise, motion)
+        followed = evaluator.filtered_runs = cls.follow(evaluator, theta, noise, motion)
         return followed
 
     def refit_noise(self, runs: LinearRuns) -> FollowedRuns:
@@ -385,7 +389,9 @@ class FollowedRuns:
             axis=(0, 1, 2)
         )
         pushed[..., ~is_finite], readings[..., ~is_finite] = 0.0, 0.0
-        sizes = np.array([1.0 if p.fixed else p.coefficients[p.place] for p in probes])
+        sizes = np.array(
+            [1.0 if p.is_single_size else p.coefficients[p.coefficient_index] for p in probes]
+        )
         return Columns(tuple(probes), np.array(places, dtype=np.intp), sizes, pushed, readings)
 
     def step_error_response(self) -> Array:
@@ -426,7 +432,7 @@ class FollowedRuns:
         )
         initial_changes = np.zeros((len(self.linear), self.runs.prior.size, joint_states.size))
         initial_changes[:, joint_states, np.arange(joint_states.size)] = 1.0
-        result = np.zeros((*self.runs.residuals.shape, len(self.evaluator.states)))
+        result = np.zeros((*self.runs.residuals.shape, len(self.evaluator.state_names)))
         result[..., : joint_states.size] = self._propagate_without_gain(initial_changes)
         return result
 
@@ -482,7 +488,7 @@ class FollowedRuns:
         the valid range of the linear model.
         """
         joints = len(self.linear[0].trajectory.x[0])
-        if len(self.evaluator.states) != 2 * joints:
+        if len(self.evaluator.state_names) != 2 * joints:
             return None
         prior = self.runs.prior
         velocities = prior[self.linear[0].positions + np.arange(joints)] / VELOCITY_PRIOR
@@ -609,9 +615,9 @@ def _linearise_run(
 
     The motion `trajectory` is estimated from the readings alone if it is None.
     """
-    half = len(evaluator.states) // 2
-    scenario = evaluator.tracks[run].scenario
-    start = evaluator.guess[run, :half], evaluator.guess[run, half:]
+    half = len(evaluator.state_names) // 2
+    scenario = evaluator.prepared_runs[run].scenario
+    start = evaluator.initial_state_guesses[run, :half], evaluator.initial_state_guesses[run, half:]
     robot = simulator or evaluator.simulator
     if trajectory is None:
         states = estimate_measured_states(evaluator, noise.sigma, run)

@@ -59,7 +59,7 @@ def propose_contact_effects(search: EffectSearch, evaluators: Sequence[RunEvalua
         for c in (START_SHARES[0] * low, START_SHARES[1] * high):
             theta = base.theta.copy()
             theta[evaluator.coefficient_slices[name]] = c
-            starts.append(FitStart((name,), theta, base.states))
+            starts.append(FitStart((name,), theta, base.initial_states))
     search.refit_models(starts, race=False)
     fits = [search.models[frozenset((name,))] for name in names]
     best = max([search.base_model, *fits], key=lambda model: model.penalised_log_likelihood)
@@ -70,6 +70,10 @@ def propose_contact_effects(search: EffectSearch, evaluators: Sequence[RunEvalua
     known = [search.base_model, *fits]
     search.models.clear()
     search.refit_models(
-        [FitStart(model.effects, model.fit.theta, evaluator.guess) for model in known], race=False
+        [
+            FitStart(model.effects, model.fit.theta, evaluator.initial_state_guesses)
+            for model in known
+        ],
+        race=False,
     )
     search.fit_to_convergence(search.models[frozenset(best.effects)])

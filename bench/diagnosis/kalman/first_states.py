@@ -78,7 +78,7 @@ def estimate_first_states(
         return None
     typical = compute_joint_scales(robot).force
     states, variances = [], []
-    for number in range(len(evaluator.tracks)):
+    for number in range(len(evaluator.prepared_runs)):
         run = _CubatureFilter(evaluator, simulator, theta, sigma, number)
         tried = [run.smooth(share * typical) for share in FORCE_SHARES]
         best = max(tried, key=lambda one: one.log_likelihood)
@@ -108,8 +108,8 @@ class _CubatureFilter:
         run: int,
     ) -> None:
         """Compute the inputs over all steps, and find the recorded components of the state."""
-        track = evaluator.tracks[run]
-        self._start = evaluator.guess[run]
+        track = evaluator.prepared_runs[run]
+        self._start = evaluator.initial_state_guesses[run]
         acting = simulator.get_active_effects(theta[None])
         joints = len(simulator.addresses.positions)
         work = RobotRunBatch(

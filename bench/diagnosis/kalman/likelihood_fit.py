@@ -63,10 +63,10 @@ def identify_base(
     """
 
     def follow(theta: Array, best: FollowedRuns) -> FollowedRuns:
-        evaluator.watch.stage("identifying the base parameters")
+        evaluator.search_control.begin_stage("identifying the base parameters")
         return FollowedRuns.follow(evaluator, theta, noise, force=best.force)
 
-    places = evaluator.base.tolist()
+    places = evaluator.base_indices.tolist()
     limits = {i: compute_range_around(evaluator, i) for i in places}
     resisting = get_bounds_by_index(evaluator, _list_resisting_effects(followed))
     found = []
@@ -125,7 +125,7 @@ def maximise_innovation_likelihood(
     """
     best = followed
     for _ in range(iterations):
-        if best.evaluator.watch.has_abandoned_fits():
+        if best.evaluator.search_control.has_abandoned_fits():
             break
         step, expected = compute_likelihood_step(best, bounds)
         if expected < min_gain:

@@ -36,9 +36,9 @@ def estimate_measured_states(
     Returns:
         States (T, 3) at the samples, by index of the joint.
     """
-    if run not in evaluator.measured:
-        evaluator.measured[run] = _compute_measured_states(evaluator, sigma, run)
-    return evaluator.measured[run]
+    if run not in evaluator.measured_states:
+        evaluator.measured_states[run] = _compute_measured_states(evaluator, sigma, run)
+    return evaluator.measured_states[run]
 
 
 def _compute_measured_states(
@@ -49,7 +49,7 @@ def _compute_measured_states(
     Joints with fewer than three recorded positions are left out.
     """
     coordinates, rates = evaluator.simulator.system.coordinates, evaluator.simulator.system.rates
-    track = evaluator.tracks[run]
+    track = evaluator.prepared_runs[run]
     times, observed = track.scenario.times, track.observed
     joints, readings = [], []
     for joint, names in enumerate(zip(coordinates, rates, strict=True)):

@@ -71,7 +71,7 @@ def fit_single_in_place(context: SearchContext, best: FittedModel) -> FittedMode
     if (
         not explained
         or has_series(context.evaluator, best.effects)
-        or context.evaluator.watch.has_abandoned_fits()
+        or context.evaluator.search_control.has_abandoned_fits()
     ):
         return best
     filters = context.filters
@@ -183,7 +183,7 @@ def _confirm_by_filter(
     return (
         None
         if 2.0 * loss > COMPETING_MODEL_MARGIN
-        else FitStart(names, followed.theta, start.states)
+        else FitStart(names, followed.theta, start.initial_states)
     )
 
 
@@ -209,9 +209,11 @@ def _refine_near(context: SearchContext, size: int) -> None:
     Otherwise, incomplete fits would decide between them.
     """
     search, near_models = context.search, _list_models_near_the_best(context, size)
-    if context.evaluator.watch.has_abandoned_fits() or len(near_models) < 2:
+    if context.evaluator.search_control.has_abandoned_fits() or len(near_models) < 2:
         return
-    fitter = TrajectoryFitter(context.evaluator, search.noise, search.frozen, exact=True)
+    fitter = TrajectoryFitter(
+        context.evaluator, search.noise, search.fixed_parameters, is_final_fit=True
+    )
     starts = [model.fit.make_start() for model in near_models]
     for model, fit in zip(near_models, fitter.fit_models(starts, MAX_ITERATIONS), strict=True):
         if fit.cost < model.fit.cost:

@@ -76,7 +76,9 @@ class EffectProposals:
         if proposed is None:
             proposed = self._for_base[count] = self._propose_effects(current)
         by_regression, joint_model = proposed
-        present_model = FitStart(current.names, current.followed.theta, evaluator.guess)
+        present_model = FitStart(
+            current.names, current.followed.theta, evaluator.initial_state_guesses
+        )
         return [
             with_effect(evaluator, present_model, name, c)
             for name, c in by_regression + joint_model[:max_joint_proposals]

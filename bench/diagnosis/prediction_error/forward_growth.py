@@ -96,7 +96,11 @@ def select_in_model(context: SearchContext, friction: FitStart | None = None) ->
     Raises:
         SoftFrictionError: dry friction is likelier in MuJoCo's soft form.
     """
-    watch, filters, base = context.evaluator.watch, context.filters, context.search.base_model
+    watch, filters, base = (
+        context.evaluator.search_control,
+        context.filters,
+        context.search.base_model,
+    )
     current = filters.empty_set
     if friction is not None:
         current = filters.follow_with_effects(friction.theta, friction.effects)
@@ -161,8 +165,8 @@ def try_one_more_effect(context: SearchContext, current: FilteredSet) -> list[Fi
     Returns:
         The larger sets, the likeliest first; empty if no effect gains.
     """
-    watch, filters = context.evaluator.watch, context.filters
-    watch.stage("testing the effects of the model one by one", MAX_REGRESSION_PROPOSALS)
+    watch, filters = context.evaluator.search_control, context.filters
+    watch.begin_stage("testing the effects of the model one by one", MAX_REGRESSION_PROPOSALS)
     larger_sets = []
     for start in context.proposals.of(current):
         larger_sets.append(filters.follow_with_effects(start.theta, start.effects, 0))

@@ -112,10 +112,14 @@ def identify_incomplete(context: SearchContext) -> IdentifiedSet | None:
         if the set lacks no force, so that a simulation can be fitted.
     """
     evaluator, filters = context.evaluator, context.filters
-    excess = context.search.compute_excess(context.search.base_model)
-    if not is_long(evaluator) or not excess > MIN_EXCESS or evaluator.watch.has_abandoned_fits():
+    excess = context.search.compute_excess_residual(context.search.base_model)
+    if (
+        not is_long(evaluator)
+        or not excess > MIN_EXCESS
+        or evaluator.search_control.has_abandoned_fits()
+    ):
         return None
-    evaluator.watch.stage("identifying the joints and bodies")
+    evaluator.search_control.begin_stage("identifying the joints and bodies")
     textbook = [
         name
         for name in evaluator.library
@@ -153,7 +157,7 @@ def _is_negligible(context: SearchContext, current: FilteredSet) -> bool:
 def _get_bounds(context: SearchContext, names: Sequence[str]) -> dict[int, Bounds]:
     """Return the bounds of the base parameters and of some effects, by index in theta."""
     evaluator = context.evaluator
-    free = [i for i in evaluator.base.tolist() if i not in context.search.frozen]
+    free = [i for i in evaluator.base_indices.tolist() if i not in context.search.fixed_parameters]
     bounds = {i: compute_range_around(evaluator, i) for i in free}
     return bounds | get_bounds_by_index(evaluator, names)
 
@@ -162,7 +166,7 @@ def _fit_set(context: SearchContext, followed: FollowedRuns, names: Sequence[str
     """Maximise the likelihood of the innovations with effects in the filter's model."""
 
     def follow(theta: Array, best: FollowedRuns) -> FollowedRuns:
-        context.evaluator.watch.check_not_stopped()
+        context.evaluator.search_control.check_not_stopped()
         return best.with_parameters(theta)
 
     base_log_likelihood = context.filters.base.log_likelihood
@@ -264,7 +268,7 @@ def _add_next_effect(
         return None
     name, (solution,) = best.effect, regression.solve([best])[1]
     c = group_coefficients(evaluator, columns.probes, best, solution)
-    present = FitStart(current.names, current.followed.theta, evaluator.guess)
+    present = FitStart(current.names, current.followed.theta, evaluator.initial_state_guesses)
     start = with_effect(evaluator, present, name, c)
     larger = _fit_set(context, current.followed.with_parameters(start.theta), start.effects)
     gain = 2.0 * (larger.followed.log_likelihood - current.followed.log_likelihood)
@@ -290,9 +294,9 @@ def _simulate_set(context: SearchContext, current: FilteredSet) -> FittedModel:
     theta, states = current.followed.theta, context.filters.estimate_first_states(current.followed)
     start = FitStart(current.names, theta, states)
     (fitted_states,) = TrajectoryFitter(
-        evaluator, search.noise, search.frozen, parameters=False
+        evaluator, search.noise, search.fixed_parameters, fits_parameters=False
     ).fit_models([start], MAX_STATE_ITERATIONS)
-    (fit,) = TrajectoryFitter(evaluator, search.noise, search.frozen).fit_models(
-        [replace(start, states=fitted_states.states)], 0
+    (fit,) = TrajectoryFitter(evaluator, search.noise, search.fixed_parameters).fit_models(
+        [replace(start, initial_states=fitted_states.initial_states)], 0
     )
     return search.add_fit(fit)

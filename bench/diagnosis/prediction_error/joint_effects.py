@@ -139,7 +139,7 @@ def offset_from_command(evaluator: RunEvaluator, noise: NoiseModel, joint: int) 
     column = evaluator.channels.index(channel)
     differences = [
         track.observed[:, column] - system.gear(joint) * track.scenario.inputs[servo]
-        for track in evaluator.tracks
+        for track in evaluator.prepared_runs
         if servo in track.scenario.inputs
     ]
     offset = float(np.nanmean(np.concatenate(differences))) if differences else 0.0

@@ -67,7 +67,7 @@ class LibraryColumns:
         if self._library is None:
             evaluator = self.filters.evaluator
             names = [name for name in evaluator.library if not has_many_shapes(name)]
-            evaluator.watch.stage(f"testing {len(names)} effects", 1)
+            evaluator.search_control.begin_stage(f"testing {len(names)} effects", 1)
             self._library = self.filters.base.columns(self.probes(names))
         return self._library
 
@@ -108,14 +108,16 @@ class LibraryColumns:
             bounds = compute_coefficient_bounds(evaluator, name)
             for probe in iterate_first_probes(evaluator, base.fit, name):
                 # The value in the model file may be too large, so the correction may be negative.
-                signed = probe.signed or (bounds[probe.place][0] < 0 and not probe.fixed)
-                probes.append(replace(probe, signed=signed))
+                signed = probe.can_be_negative or (
+                    bounds[probe.coefficient_index][0] < 0 and not probe.is_single_size
+                )
+                probes.append(replace(probe, can_be_negative=signed))
         return probes
 
     def select(self) -> Selected:
         """Select effects of the library by regression."""
         library = self.library
-        self.filters.evaluator.watch.stage("selecting effects", 1)
+        self.filters.evaluator.search_control.begin_stage("selecting effects", 1)
         selected = identify(self.filters.base, library, self.base_regression)
         self.filters.numerics = selected.numerics
         return selected
@@ -132,7 +134,7 @@ class LibraryColumns:
             theta[self.filters.evaluator.coefficient_slices[group.effect]] = self.coefficients(
                 group, solution
             )
-        return FitStart(tuple(group.effect for group in groups), theta, base.fit.states)
+        return FitStart(tuple(group.effect for group in groups), theta, base.fit.initial_states)
 
     def coefficients(self, group: DirectionGroup, solution: Array) -> Array:
         """Return the coefficients (k,) of an effect from the regression.
@@ -201,14 +203,14 @@ def group_coefficients(
         evaluator.available_effects[group.effect],
     )
     if effect.probe_points():
-        sizes = np.array([probe.coefficients[probe.place] for probe in own])
+        sizes = np.array([probe.coefficients[probe.coefficient_index] for probe in own])
         points = np.array([probe.coefficients for probe in own])
         return clip_coefficients(evaluator, group.effect, effect.combine(points, solution / sizes))
     c = own[0].coefficients.copy()
     for column, value in zip(group.column_indices, solution, strict=True):
         # A fixed change is valid only at its own size.
-        if not probes[column].fixed:
-            c[probes[column].place] = value
+        if not probes[column].is_single_size:
+            c[probes[column].coefficient_index] = value
     return clip_coefficients(evaluator, group.effect, c)
 
 
@@ -244,13 +246,15 @@ def _make_tangent_probes(
     the derivatives by the coefficients.
     """
     c = theta[evaluator.coefficient_slices[name]]
-    probes = [CandidateDirection(name, 0, 0, c, signed=True, fixed=True)]
+    probes = [CandidateDirection(name, 0, 0, c, can_be_negative=True, is_single_size=True)]
     for place, (low, high) in enumerate(compute_coefficient_bounds(evaluator, name)):
         displaced = c.copy()
         size = max(abs(float(c[place])), RELATIVE_DIFFERENCE * (high - low))
         step = RELATIVE_DIFFERENCE * size
         displaced[place] += step if displaced[place] + step <= high else -step
         probes.append(
-            CandidateDirection(name, 1 + place, place, displaced, signed=True, fixed=True)
+            CandidateDirection(
+                name, 1 + place, place, displaced, can_be_negative=True, is_single_size=True
+            )
         )
     return probes

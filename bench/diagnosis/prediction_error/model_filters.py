@@ -83,10 +83,12 @@ class ModelFilters:
         Without effects, the base model may need absurd values.
         """
         theta: Array = self.models.base_model.fit.theta.copy()
-        identified = self.evaluator.identified
+        identified = self.evaluator.identified_base
         if identified is not None:
-            is_free = [i not in self.models.frozen for i in self.evaluator.base.tolist()]
-            theta[self.evaluator.base[is_free]] = identified[is_free]
+            is_free = [
+                i not in self.models.fixed_parameters for i in self.evaluator.base_indices.tolist()
+            ]
+            theta[self.evaluator.base_indices[is_free]] = identified[is_free]
         return theta
 
     def make_theta_with(self, name: str, c: Array) -> Array:
@@ -183,12 +185,17 @@ class ModelFilters:
         With an encoder offset, positions are smoothed ones. The states of the base fit are not
         used, because they are biased by what is missing.
         """
-        states, positions = self.evaluator.guess.copy(), followed.get_first_positions()
+        states, positions = (
+            self.evaluator.initial_state_guesses.copy(),
+            followed.get_first_positions(),
+        )
         measured_positions = states[:, : positions.shape[1]]
         noise = float(np.nanmax(self.noise.sigma))
         has_moved = np.abs(positions - measured_positions) > OFFSET_THRESHOLD * noise
         is_offset = (
-            np.isfinite(positions) & has_moved & ~self.evaluator.known[:, : positions.shape[1]]
+            np.isfinite(positions)
+            & has_moved
+            & ~self.evaluator.known_state_mask[:, : positions.shape[1]]
         )
         states[:, : positions.shape[1]] = np.where(is_offset, positions, measured_positions)
         return states

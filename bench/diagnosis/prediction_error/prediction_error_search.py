@@ -136,7 +136,10 @@ class PredictionErrorSearch(EffectSearch):
         if not is_explained(context, best):
             selected = select_with_shapes(context, selected)
             best = select_higher_merit(best, fit_quick_selection(context, selected))
-        if not is_explained(context, best) and not self.evaluator.watch.has_abandoned_fits():
+        if (
+            not is_explained(context, best)
+            and not self.evaluator.search_control.has_abandoned_fits()
+        ):
             best = select_higher_merit(best, fit_series_effects(context, selected))
         if not best.effects:
             best = fit_selection(context, selected)
@@ -152,7 +155,7 @@ class PredictionErrorSearch(EffectSearch):
         return (
             lacks
             and not is_explained(self._search_context, best)
-            and not self.evaluator.watch.has_abandoned_fits()
+            and not self.evaluator.search_control.has_abandoned_fits()
         )
 
     def _add_missing_effects(
@@ -188,7 +191,7 @@ class PredictionErrorSearch(EffectSearch):
         Both searches have the same runs. If the form of the dry friction that effects add differs,
         the base model has none of it.
         """
-        self.evaluator.followed = replace(
+        self.evaluator.filtered_runs = replace(
             other._search_context.filters.base, evaluator=self.evaluator
         )
         self._search_context.columns.take_over(other._search_context.columns)
@@ -275,18 +278,18 @@ class PredictionErrorSearch(EffectSearch):
             return start
         followed = self._search_context.filters.get_similar_filter(model)
         return (
-            replace(start, by_states=followed.compute_state_sensitivities())
+            replace(start, state_jacobian=followed.compute_state_sensitivities())
             if followed.is_sound
             else start
         )
 
     def with_sensitivities(self, start: FitStart) -> FitStart:
         """Return a start with derivatives by its coefficients about the measured motion."""
-        free = set(self.evaluator.base.tolist()) - self.frozen
-        has_jacobian = start.known is not None or not start.effects
+        free = set(self.evaluator.base_indices.tolist()) - self.fixed_parameters
+        has_jacobian = start.known_jacobian is not None or not start.effects
         if has_jacobian or free or has_series(self.evaluator, start.effects):
             return start
-        return replace(start, known=self._search_context.columns.sensitivities(start))
+        return replace(start, known_jacobian=self._search_context.columns.sensitivities(start))
 
     def get_known_directions(self) -> tuple[TrajectoryFit, DirectionSet] | None:
         """Return the first-order changes of the base model's runs by every candidate.

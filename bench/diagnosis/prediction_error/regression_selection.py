@@ -310,9 +310,11 @@ def group_probes(probes: Sequence[CandidateDirection]) -> list[DirectionGroup]:
     """Group the columns of the probes of one effect at one grid point, which act together."""
     places: dict[tuple[str, int], list[int]] = {}
     for i, probe in enumerate(probes):
-        places.setdefault((probe.effect, probe.group), []).append(i)
+        places.setdefault((probe.effect, probe.grid_point), []).append(i)
     return [
-        DirectionGroup(effect, tuple(columns), tuple(not probes[i].signed for i in columns))
+        DirectionGroup(
+            effect, tuple(columns), tuple(not probes[i].can_be_negative for i in columns)
+        )
         for (effect, _), columns in places.items()
     ]
 

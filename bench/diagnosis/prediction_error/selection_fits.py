@@ -93,7 +93,7 @@ def fit_selection(context: SearchContext, selected: Selected) -> FittedModel:
         return base
     start = context.columns.start(selected.groups, selected.coefficients)
     states = context.filters.estimate_first_states(selected.followed)
-    fitted = fit(context, replace(start, states=states))
+    fitted = fit(context, replace(start, initial_states=states))
     if not np.isfinite(fitted.fit.cost):
         return base
     fitted = remove_idle_effects(context, fitted)
@@ -162,7 +162,9 @@ def select_with_shapes(context: SearchContext, selected: Selected) -> Selected:
     ]
     if not many_shaped:
         return selected
-    evaluator.watch.stage(f"testing {len(many_shaped)} effects with several coefficients", 1)
+    evaluator.search_control.begin_stage(
+        f"testing {len(many_shaped)} effects with several coefficients", 1
+    )
     context.columns.add(many_shaped)
     return context.columns.select()
 
@@ -394,7 +396,7 @@ def fit_single_effects(context: SearchContext) -> FittedModel:
         # Slow effects are fitted only if no other effect explains the runs.
         group = [one for one in starts if _is_slow(context, one.effects) == is_slow]
         if group and not is_explained(context, best):
-            fitted += search.fit_all([replace(start, states=states) for start in group])
+            fitted += search.fit_all([replace(start, initial_states=states) for start in group])
             best = max(fitted, key=lambda model: model.penalised_log_likelihood)
     if not is_explained(context, best):
         best = select_higher_merit(best, refine_single_effects(context, fitted))
@@ -427,7 +429,7 @@ def refine_single_effects(context: SearchContext, fitted: Sequence[FittedModel])
         if not is_at_noise(context, refined) and is_nearly_explained(context, refined):
             refined = fit_nearby(context, refined, refined.effects[0])
         best = select_higher_merit(best, refined)
-        if is_explained(context, best) or context.evaluator.watch.has_abandoned_fits():
+        if is_explained(context, best) or context.evaluator.search_control.has_abandoned_fits():
             break
     return best
 
@@ -451,11 +453,13 @@ def fit_series_effects(context: SearchContext, selected: Selected) -> FittedMode
     )
     if not probes:
         return search.base_model
-    evaluator.watch.stage("testing elasticity and backlash between drives and links", len(probes))
+    evaluator.search_control.begin_stage(
+        "testing elasticity and backlash between drives and links", len(probes)
+    )
     starts = []
     for probe in probes:
         theta = context.filters.make_theta_with(probe.effect, probe.coefficients)
-        starts.append(FitStart((probe.effect,), theta, evaluator.guess))
+        starts.append(FitStart((probe.effect,), theta, evaluator.initial_state_guesses))
     fitted = search.fit_all([start for _, start in select_lowest_of_each(context, starts)])
     return fit(
         context, max(fitted, key=lambda model: model.penalised_log_likelihood).fit.make_start()

@@ -46,12 +46,14 @@ def fit(context: SearchContext, start: FitStart) -> FittedModel:
     fitted = search.fit_one(start)
     if is_explained(context, fitted) or not np.isfinite(fitted.fit.cost):
         return fitted
-    derivatives_before = evaluator.derivatives
-    compute_state_jacobian(evaluator, fitted.fit.theta, fitted.fit.states, is_recomputed=True)
+    derivatives_before = evaluator.state_derivatives
+    compute_state_jacobian(
+        evaluator, fitted.fit.theta, fitted.fit.initial_states, is_recomputed=True
+    )
     fitted = search.fit_one(fitted.fit.make_start())
     if not is_explained(context, fitted):
         # Derivatives about a wrong motion are not valid for other models.
-        evaluator.derivatives = derivatives_before
+        evaluator.state_derivatives = derivatives_before
     for name in fitted.effects:
         if has_dry_friction(evaluator, [name]) and not is_explained(context, fitted):
             fitted = fit_nearby(context, fitted, name)
@@ -98,7 +100,8 @@ def list_nearby_starts(context: SearchContext, model: FittedModel, name: str) ->
             theta = model.fit.theta.copy()
             theta[place] *= factor
             starts += [
-                FitStart(model.effects, theta, states) for states in (model.fit.states, measured)
+                FitStart(model.effects, theta, states)
+                for states in (model.fit.initial_states, measured)
             ]
     return starts
 
@@ -138,7 +141,7 @@ def is_explained(context: SearchContext, model: FittedModel) -> bool:
     # Friction of the wrong form may leave a small residual.
     if has_dry_friction(context.evaluator, model.effects) and not context.filters.is_soft:
         return False
-    excess = context.search.compute_excess
+    excess = context.search.compute_excess_residual
     return excess(model) < min(NEGLIGIBLE, NEGLIGIBLE_SHARE * excess(context.search.base_model))
 
 
@@ -151,7 +154,7 @@ def is_at_noise(context: SearchContext, model: FittedModel) -> bool:
     """
     return (
         context.search.is_noise_like(model)
-        and context.search.compute_excess(model) < EXPLAINED_EXCESS
+        and context.search.compute_excess_residual(model) < EXPLAINED_EXCESS
     )
 
 
@@ -162,7 +165,7 @@ def is_nearly_explained(context: SearchContext, model: FittedModel) -> bool:
         context: context of the search.
         model: the fitted model.
     """
-    excess = context.search.compute_excess
+    excess = context.search.compute_excess_residual
     return excess(model) < NEARLY_EXPLAINED_SHARE * excess(context.search.base_model)
 
 
@@ -227,4 +230,4 @@ def make_replacing_start(
         theta[evaluator.coefficient_slices[name]] = 0.0
     theta[evaluator.coefficient_slices[other]] = c
     remaining = (name for name in model.effects if name not in names)
-    return FitStart((*remaining, other), theta, model.fit.states)
+    return FitStart((*remaining, other), theta, model.fit.initial_states)

@@ -190,12 +190,16 @@ class AlternativeFinder:
         ):
             validation = None
         if self.structure:
-            other_excess = self.search.compute_excess(other_model)
-            ratios = [compute_excess_ratio(other_excess, self.search.compute_excess(model))]
+            other_excess = self.search.compute_excess_residual(other_model)
+            ratios = [
+                compute_excess_ratio(other_excess, self.search.compute_excess_residual(model))
+            ]
             if validation is not None:
-                other_excess = validation.compute_excess(other_model.effects)
+                other_excess = validation.compute_excess_residual(other_model.effects)
                 ratios.append(
-                    compute_excess_ratio(other_excess, validation.compute_excess(model.effects))
+                    compute_excess_ratio(
+                        other_excess, validation.compute_excess_residual(model.effects)
+                    )
                 )
             return convert_excess_ratio(ratios)
         distance = self._compute_comparable_merit(model) - self._compute_comparable_merit(

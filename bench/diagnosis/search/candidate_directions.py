@@ -89,19 +89,19 @@ class CandidateDirection:
 
     Attributes:
         effect: name of the effect.
-        group: number of the grid point; directions of one group act together.
-        place: index of the coefficient that scales it.
+        grid_point: number of the grid point; directions of one group act together.
+        coefficient_index: index of the coefficient that scales it.
         coefficients: (k,) coefficients that are simulated.
-        signed: whether the scaling coefficient may be negative.
-        fixed: whether the direction is valid only at this size.
+        can_be_negative: whether the scaling coefficient may be negative.
+        is_single_size: whether the direction is valid only at this size.
     """
 
     effect: str
-    group: int
-    place: int
+    grid_point: int
+    coefficient_index: int
     coefficients: Array
-    signed: bool
-    fixed: bool = False
+    can_be_negative: bool
+    is_single_size: bool = False
 
 
 @dataclass(frozen=True)
@@ -161,7 +161,7 @@ def iterate_first_probes(
     coefficients = effect.coefficients
     for c in effect.probe_points():
         # Changes at several points add up to that at a point between them (`Effect.combine`).
-        yield CandidateDirection(name, 0, 0, c, signed=True)
+        yield CandidateDirection(name, 0, 0, c, can_be_negative=True)
     shaping = [i for i, p in enumerate(parameters) if p.bounds[0] > 0]
     count = len(parameters)
     scaling = [i for i in range(count) if i not in shaping]
@@ -187,10 +187,10 @@ def iterate_first_probes(
             c[place] = INITIAL_PROBE_SHARE * high
             yield CandidateDirection(
                 effect=name,
-                group=group,
-                place=place,
+                grid_point=group,
+                coefficient_index=place,
                 coefficients=c,
-                signed=low < 0,
+                can_be_negative=low < 0,
             )
         group += 1
     if leading.of == "stop":
@@ -232,7 +232,12 @@ def _make_end_stop_probes(
     ]
     for number, c in enumerate(end_stops, start=first):
         yield CandidateDirection(
-            effect=name, group=number, place=0, coefficients=c, signed=True, fixed=True
+            effect=name,
+            grid_point=number,
+            coefficient_index=0,
+            coefficients=c,
+            can_be_negative=True,
+            is_single_size=True,
         )
 
 
@@ -269,11 +274,11 @@ def _make_limit_probes(
     for number, c in enumerate(sizes, start=group):
         yield CandidateDirection(
             effect=name,
-            group=number,
-            place=0,
+            grid_point=number,
+            coefficient_index=0,
             coefficients=c,
-            signed=False,
-            fixed=True,
+            can_be_negative=False,
+            is_single_size=True,
         )
 
 
@@ -297,20 +302,20 @@ def _make_shape_grid(
     if parameter.unit == "Hz":
         # A periodic effect must complete a cycle within a run, otherwise any slow change would be
         # periodic.
-        min_frequency = max(low, MIN_CYCLES_PER_RUN / evaluator.longest)
+        min_frequency = max(low, MIN_CYCLES_PER_RUN / evaluator.longest_duration)
         lowest_frequency = min(min_frequency, high / 2.0)
-        return _make_frequency_grid(lowest_frequency, high, evaluator.longest)
+        return _make_frequency_grid(lowest_frequency, high, evaluator.longest_duration)
     if _is_period(parameter, travel):
         frequencies = _make_frequency_grid(1.0 / high, 1.0 / low, travel)
         return 1.0 / frequencies
     if is_instant(parameter):
-        clock_start, clock_end = evaluator.clock
+        clock_start, clock_end = evaluator.time_span
         # An event at the ends of the recording would have nothing before or after it.
         return np.linspace(clock_start, clock_end, EVENT_TIME_COUNT + 2)[1:-1]
     if parameter.unit == "s":
         # A decay much longer than the runs is constant within them; successive times differ by at
         # most a factor of two.
-        high = max(min(high, MAX_DECAY_FACTOR * evaluator.longest), 2.0 * low)
+        high = max(min(high, MAX_DECAY_FACTOR * evaluator.longest_duration), 2.0 * low)
         return np.geomspace(low, high, int(np.ceil(np.log2(high / low))) + 1)
     return np.geomspace(low, high, SHAPE_GRID_SIZE)
 
@@ -340,7 +345,7 @@ def generate_frequency_neighbours(
         ):
             theta = fit.theta.copy()
             theta[evaluator.coefficient_slices[name]] = c
-            yield FitStart(fit.effects, theta, fit.states)
+            yield FitStart(fit.effects, theta, fit.initial_states)
         bounds = compute_coefficient_bounds(evaluator, name)
         for number, place in enumerate(evaluator.get_coefficient_indices(name)):
             parameter = evaluator.parameters[place]
@@ -350,7 +355,7 @@ def generate_frequency_neighbours(
             ):
                 theta = fit.theta.copy()
                 theta[place] = np.clip(shifted_value, *bounds[number])
-                yield FitStart(fit.effects, theta, fit.states)
+                yield FitStart(fit.effects, theta, fit.initial_states)
 
 
 def _shift_frequency_or_time(
@@ -365,7 +370,7 @@ def _shift_frequency_or_time(
             yield value + samples * evaluator.sample_interval
     for cycles in FREQUENCY_SHIFTS_CYCLES:
         if parameter.unit == "Hz":
-            yield value + cycles / evaluator.longest
+            yield value + cycles / evaluator.longest_duration
         elif _is_period(parameter, travel) and value > 0:
             frequency = 1.0 / value + cycles / travel
             # Beyond the longest period, the frequency might become negative.
@@ -412,7 +417,7 @@ def _compute_probe_sizes(probes: Sequence[CandidateDirection]) -> Array:
     """
     sizes = []
     for probe in probes:
-        size = 1.0 if probe.fixed else probe.coefficients[probe.place]
+        size = 1.0 if probe.is_single_size else probe.coefficients[probe.coefficient_index]
         sizes.append(size)
     return np.array(sizes)
 
@@ -434,8 +439,8 @@ def _make_modifier_probes(
         # The first shape already shows whether a coefficient acts by itself; members of a family do
         # not modify each other.
         elif (
-            probe.group == 0
-            and not probe.fixed
+            probe.grid_point == 0
+            and not probe.is_single_size
             and evaluator.available_effects[probe.effect].place != ALL_PLACES
         ):
             idle_probes.append(probe)
@@ -460,14 +465,14 @@ def _iterate_grid_points(
             continue
         c = first.coefficients.copy()
         for modifier, share in zip(modifiers, point, strict=True):
-            _, high = parameters[modifier.place].bounds
-            c[modifier.place] = share * high
+            _, high = parameters[modifier.coefficient_index].bounds
+            c[modifier.coefficient_index] = share * high
         yield CandidateDirection(
             effect=first.effect,
-            group=group,
-            place=first.place,
+            grid_point=group,
+            coefficient_index=first.coefficient_index,
             coefficients=c,
-            signed=first.signed,
+            can_be_negative=first.can_be_negative,
         )
 
 
@@ -508,7 +513,7 @@ def compute_responses(
         # Imported here, because only robots need it.
         from bench.diagnosis.fitting.linearised_runs import compute_effect_responses
 
-        return compute_effect_responses(evaluator, fit.theta, fit.states, added)
+        return compute_effect_responses(evaluator, fit.theta, fit.initial_states, added)
     values = simulate_with_effect(evaluator, fit, added)
     values -= fit.simulated
     return values
@@ -527,7 +532,7 @@ def simulate_with_effect(
     Returns:
         Observations (K, R, T, C).
     """
-    runs = len(evaluator.tracks)
+    runs = len(evaluator.prepared_runs)
     theta = np.tile(fit.theta, (len(added), 1))
     for row, (name, c) in zip(theta, added, strict=True):
         row[evaluator.coefficient_slices[name]] = c
@@ -536,6 +541,6 @@ def simulate_with_effect(
     simulated = evaluator.simulate(
         theta=np.repeat(theta, runs, axis=0),
         runs=np.tile(np.arange(runs), count),
-        states=np.tile(fit.states, (count, 1)),
+        states=np.tile(fit.initial_states, (count, 1)),
     )
     return simulated.reshape(count, runs, *simulated.shape[1:])

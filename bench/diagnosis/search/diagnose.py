@@ -101,7 +101,7 @@ class Inquiry:
         """
         self._search = search
         self._held_out = held_out
-        self._watch = search.evaluator.watch
+        self._watch = search.evaluator.search_control
         self._trial: HeldOutValidation | None = None
         self._model: FittedModel | None = None
 
@@ -256,7 +256,7 @@ def is_motionless(search: EffectSearch) -> bool:
     smallest = np.nanmin(observed, axis=(0, 1))
     ranges = largest - smallest
     # Parameters that do not influence the simulated runs were fixed by the base fit.
-    is_model_sensitive = len(search.frozen) != search.evaluator.base.size
+    is_model_sensitive = len(search.fixed_parameters) != search.evaluator.base_indices.size
     residual_sigma = search.base_model.likelihood.sigma
     return verdict_rules.is_motionless(
         ranges, residual_sigma, search.noise.sigma, is_model_sensitive
@@ -267,7 +267,7 @@ def _build_motionless_result(search: EffectSearch) -> DiagnosisResult:
     """Return the verdict "unidentifiable" for a recording without motion."""
     base, evaluator = search.base_model, search.evaluator
     # No parameter can be determined, and no test of the residual is meaningful.
-    unidentified = tuple(evaluator.parameters[i].name for i in evaluator.base)
+    unidentified = tuple(evaluator.parameters[i].name for i in evaluator.base_indices)
     excess = base.likelihood.sigma / search.noise.sigma
     no_lack_of_fit = LackOfFitResult(1.0, "", excess, ())
     return DiagnosisResult(
@@ -284,7 +284,7 @@ def find_unidentified_parameters(search: EffectSearch, base: FittedModel) -> tup
     """
     variances = np.diagonal(compute_covariance(search, base))
     spread = np.sqrt(np.maximum(variances, 0.0))
-    parameters = [search.evaluator.parameters[place] for place in base.fit.free]
+    parameters = [search.evaluator.parameters[place] for place in base.fit.free_indices]
     unidentified = []
     for parameter, sd in zip(parameters, spread.tolist(), strict=True):
         low, high = parameter.bounds

@@ -101,7 +101,7 @@ class EffectSearch(ModelMoves):
                 best = self.correct_step_errors(larger)
             # Near the noise, or if the residual may be noise, adding two effects at once would fit
             # noise.
-            elif self.compute_excess(best) < FAR_EXCESS or self.is_noise_like(best):
+            elif self.compute_excess_residual(best) < FAR_EXCESS or self.is_noise_like(best):
                 break
             # The missing effect is then not in the library, and three effects would only mimic it.
             if size > 1 and is_hopeless(self, larger):
@@ -122,7 +122,9 @@ class EffectSearch(ModelMoves):
         # Imported here, because only robots need it.
         from bench.diagnosis.fitting.linearised_runs import correct_discretisation
 
-        correct_discretisation(self.evaluator, self.noise, model.fit.theta, model.fit.states)
+        correct_discretisation(
+            self.evaluator, self.noise, model.fit.theta, model.fit.initial_states
+        )
         size = len(model.effects)
         # A richer effect may have fitted only the discretisation error.
         close_models = [
@@ -163,7 +165,7 @@ class EffectSearch(ModelMoves):
         None if no model of this size could be fitted.
         """
         if size > 1:
-            self.evaluator.watch.begin_larger_models()
+            self.evaluator.search_control.begin_larger_models()
         larger = self._grow_models(size)
         if larger is None:
             return None
@@ -210,7 +212,7 @@ class EffectSearch(ModelMoves):
         if model is None:
             return False
         # The discretisation error, of friction for example, could be mistaken for a missing effect.
-        if self.evaluator.has_linearisation and self.compute_excess(model) < FAR_EXCESS:
+        if self.evaluator.has_linearisation and self.compute_excess_residual(model) < FAR_EXCESS:
             model = self.correct_step_errors(model)
         return self.is_noise_like(model) and self.is_complete(model, EFFECT_P_VALUE_THRESHOLD)
 
@@ -244,12 +246,12 @@ class EffectSearch(ModelMoves):
             self._sketch = EffectSearch(
                 segment_evaluator,
                 self.noise,
-                self.frozen,
+                self.fixed_parameters,
                 self.make_rng("pieces"),
                 self.is_noise_stated,
             )
             self._sketch.refit_models(
-                [FitStart((), self.base_model.fit.theta, segment_evaluator.guess)]
+                [FitStart((), self.base_model.fit.theta, segment_evaluator.initial_state_guesses)]
             )
         segment_models = self._sketch
         segment_models.refit_extensions(
@@ -267,9 +269,9 @@ class EffectSearch(ModelMoves):
         """
         fit, evaluator = self.base_model.fit, self.evaluator
         by_states = (
-            evaluator.derivatives
+            evaluator.state_derivatives
             if evaluator.has_linearisation
-            else fit.jacobian[..., fit.free.size :]
+            else fit.jacobian[..., fit.free_indices.size :]
         )
         return by_states is not None and forgets_initial_state(evaluator, self.noise, by_states)
 
@@ -284,9 +286,9 @@ class EffectSearch(ModelMoves):
             part = self.models.get(frozenset([name]))
             # The richer effect must reduce the excess clearly, otherwise it mimics a missing
             # effect.
-            if part is not None and self.compute_excess(
+            if part is not None and self.compute_excess_residual(
                 single
-            ) > MAX_REPLACEMENT_EXCESS_SHARE * self.compute_excess(part):
+            ) > MAX_REPLACEMENT_EXCESS_SHARE * self.compute_excess_residual(part):
                 return part
         return single
 
@@ -326,9 +328,9 @@ def is_hopeless(search: EffectSearch, larger: FittedModel) -> bool:
         larger: the model of several effects.
     """
     # If two effects leave as much as the best single one, a third effect will not help.
-    of_base = MAX_PAIR_EXCESS_SHARE * search.compute_excess(search.base_model)
+    of_base = MAX_PAIR_EXCESS_SHARE * search.compute_excess_residual(search.base_model)
     of_single = MAX_PAIR_EXCESS_SHARE_OF_SINGLE * min(_list_excesses(search, 1), default=np.inf)
-    excess = search.compute_excess(larger)
+    excess = search.compute_excess_residual(larger)
     if search.thorough:
         # The model to extend need not have the lowest excess, because merit is misleading there.
         excess = min(excess, *_list_excesses(search, len(larger.effects)))
@@ -337,7 +339,9 @@ def is_hopeless(search: EffectSearch, larger: FittedModel) -> bool:
 
 def _list_excesses(search: EffectSearch, size: int) -> list[float]:
     """Return the RMS residual minus one, in units of the noise, of models of `size` effects."""
-    return [search.compute_excess(m) for m in search.models.values() if len(m.effects) == size]
+    return [
+        search.compute_excess_residual(m) for m in search.models.values() if len(m.effects) == size
+    ]
 
 
 def select_conservative_model(
@@ -356,9 +360,9 @@ def select_conservative_model(
     """
     # A model that contains the effects of the best one replaces none of them.
     is_extension = set(best.effects) <= set(larger.effects)
-    if is_extension or search.compute_excess(
+    if is_extension or search.compute_excess_residual(
         larger
-    ) < MAX_REPLACEMENT_EXCESS_SHARE * search.compute_excess(best):
+    ) < MAX_REPLACEMENT_EXCESS_SHARE * search.compute_excess_residual(best):
         return larger
     extensions = [
         model

@@ -56,12 +56,12 @@ def group_directions(directions: DirectionSet) -> list[DirectionGroup]:
     """Group the directions of each effect at each grid point of its shape; they act together."""
     places: dict[tuple[str, int], list[int]] = {}
     for i, probe in enumerate(directions.candidates):
-        key = probe.effect, probe.group
+        key = probe.effect, probe.grid_point
         places.setdefault(key, []).append(i)
     members = []
     for (effect, _), columns in places.items():
         probes = [directions.candidates[i] for i in columns]
-        positive = tuple(not probe.signed for probe in probes)
+        positive = tuple(not probe.can_be_negative for probe in probes)
         members.append(DirectionGroup(effect, tuple(columns), positive))
     return members
 

@@ -61,7 +61,7 @@ class HeldOutValidation:
         results = self.runs.validate([model.fit for model in models_by_effects.values()])
         self.held_out_fits.update(zip(models_by_effects, results, strict=True))
 
-    def compute_excess(self, names: EffectNames, sigma: Array | None = None) -> float:
+    def compute_excess_residual(self, names: EffectNames, sigma: Array | None = None) -> float:
         """Return the RMS residual of a model on the held-out runs in units of the noise, minus one.
 
         Args:
@@ -143,10 +143,11 @@ class HeldOutValidation:
             len(larger.effects) - len(model.effects)
         )
         fitted_ratio = compute_excess_ratio(
-            search.compute_excess(larger), search.compute_excess(model)
+            search.compute_excess_residual(larger), search.compute_excess_residual(model)
         )
         held_out_ratio = compute_excess_ratio(
-            self.compute_excess(larger.effects), self.compute_excess(model.effects)
+            self.compute_excess_residual(larger.effects),
+            self.compute_excess_residual(model.effects),
         )
         return max(fitted_ratio, held_out_ratio) / required_ratio
 
@@ -174,14 +175,14 @@ class HeldOutValidation:
         after = self.held_out_fits[full_model.effects].penalised_log_likelihood
         # Both merit and excess are tested, because far from the noise merit alone may be mimicry.
         excesses = (
-            self.compute_excess(reduced_model.effects),
-            self.compute_excess(full_model.effects),
+            self.compute_excess_residual(reduced_model.effects),
+            self.compute_excess_residual(full_model.effects),
         )
         if improves_held_out((before, after), excesses):
             return True
         excess_without, excess_with = (
-            search.compute_excess(reduced_model),
-            search.compute_excess(full_model),
+            search.compute_excess_residual(reduced_model),
+            search.compute_excess_residual(full_model),
         )
         # Errors of a motion without feedback accumulate, whatever their cause.
         is_better = (
@@ -212,6 +213,6 @@ class HeldOutValidation:
         # floor is.
         known_noise = np.where(lack_of_fit.has_structure, 0.0, residual_sigma)
         noise = np.maximum(self.runs.noise.sigma, known_noise)
-        before = self.compute_excess((), noise)
-        after = self.compute_excess(model.effects, noise)
+        before = self.compute_excess_residual((), noise)
+        after = self.compute_excess_residual(model.effects, noise)
         return misses_held_out_gap(before, after)

@@ -66,7 +66,10 @@ def compute_reachable_levels(evaluator: RunEvaluator, name: str) -> Array:
     }
     level_function = level_functions.get(kind, _get_largest_input)
     return np.array(
-        [max(level_function(evaluator, t, member) for t in evaluator.tracks) for member in members]
+        [
+            max(level_function(evaluator, t, member) for t in evaluator.prepared_runs)
+            for member in members
+        ]
     )
 
 
@@ -228,8 +231,10 @@ def generate_event_times(evaluator: RunEvaluator, name: str, c: Array) -> Iterat
     for i, parameter in enumerate(list_coefficients(evaluator, name)):
         if not is_instant(parameter):
             continue
-        clock_start, clock_end = evaluator.clock
-        stamps = np.unique(np.concatenate([track.scenario.times for track in evaluator.tracks]))
+        clock_start, clock_end = evaluator.time_span
+        stamps = np.unique(
+            np.concatenate([track.scenario.times for track in evaluator.prepared_runs])
+        )
         midpoints = (stamps[1:] + stamps[:-1]) / 2.0
         near_midpoints = midpoints[
             np.abs(midpoints - c[i]) <= (clock_end - clock_start) / (EVENT_TIME_COUNT + 1)

@@ -80,7 +80,7 @@ def list_joint_families(evaluator: RunEvaluator, speed_share: float) -> Iterator
         speed_share: speed over which dry friction reverses its sign, as a share of the high speed
             of a joint.
     """
-    longest_run = evaluator.longest
+    longest_run = evaluator.longest_duration
     for joint, name in enumerate(evaluator.simulator.system.coordinates):
         if name not in evaluator.channels:
             continue
@@ -112,7 +112,7 @@ def _compute_high_speed(evaluator: RunEvaluator, channel: int) -> float:
     The quantile is used instead of the maximum, because single differences may be noise.
     """
     rates = [np.zeros(1)]
-    for track in evaluator.tracks:
+    for track in evaluator.prepared_runs:
         if len(track.observed) > 3:
             # Use every third sample, because differences of neighbours are mostly noise.
             step = np.diff(track.scenario.times[::3])

@@ -162,7 +162,7 @@ def assess_lack_of_fit(models: ModelSet, model: FittedModel) -> LackOfFitResult:
     size_result = assess_residual_size(models, model)
     if not any(probe.name in evaluator.coefficient_slices for probe in (HatForce, JointHatForce)):
         return size_result
-    evaluator.watch.report_and_check("an unmodelled force")
+    evaluator.search_control.report_and_check("an unmodelled force")
     force_test = models.score_unmodelled_force(model)
     level = get_structure_threshold(bool(is_noise_stated.all()))
     # The linear innovations test decides if it finds no force; otherwise the force is simulated.
@@ -261,7 +261,11 @@ def list_hat_probes(evaluator: RunEvaluator) -> tuple[list[CandidateDirection], 
         width = (high - low) / (HAT_COUNT - 1)
         for centre in np.linspace(low, high, HAT_COUNT):
             _, c = coefficients(centre, width)
-            probes.append(CandidateDirection(label, group=0, place=0, coefficients=c, signed=True))
+            probes.append(
+                CandidateDirection(
+                    label, grid_point=0, coefficient_index=0, coefficients=c, can_be_negative=True
+                )
+            )
     return probes, size
 
 
@@ -331,7 +335,7 @@ def _iterate_families(evaluator: RunEvaluator) -> Iterator[_Family]:
 def _iterate_hats_over_time(evaluator: RunEvaluator) -> Iterator[_Family]:
     """Yield families of hat forces over time, along each coordinate and against the motion."""
     durations = []
-    for track in evaluator.tracks:
+    for track in evaluator.prepared_runs:
         times = track.scenario.times
         durations.append(float(times[-1] - times[0]))
     longest_run = max(durations)
@@ -390,7 +394,7 @@ def _compute_high_speed_quantile(evaluator: RunEvaluator) -> float:
             continue
         c = evaluator.channels.index(name)
         rates = [np.zeros(1)]
-        for track in evaluator.tracks:
+        for track in evaluator.prepared_runs:
             if len(track.observed) > 3:
                 # Use every third sample, because differences of neighbours are mostly noise.
                 step = np.diff(track.scenario.times[::3])

@@ -68,7 +68,9 @@ class ModelMoves(ScoredModelSet):
             known_jacobian = model.fit.get_known_jacobian().drop_parameters(
                 self.evaluator.get_coefficient_indices(name)
             )
-            starts.append(FitStart(remaining_effects, theta, model.fit.states, known_jacobian))
+            starts.append(
+                FitStart(remaining_effects, theta, model.fit.initial_states, known_jacobian)
+            )
         self.refit_models(starts)
 
     def drop_unneeded_effects(self, model: FittedModel) -> FittedModel:
@@ -98,8 +100,8 @@ class ModelMoves(ScoredModelSet):
             for parts in self._iterate_contained_effects(model, name):
                 simpler_model = self._fit_with_parts(model, name, parts)
                 is_excess_close = (
-                    self.compute_excess(model)
-                    > MAX_RICHER_LAW_EXCESS_RATIO * self.compute_excess(simpler_model)
+                    self.compute_excess_residual(model)
+                    > MAX_RICHER_LAW_EXCESS_RATIO * self.compute_excess_residual(simpler_model)
                     > 0.0
                 )
                 if (
@@ -134,7 +136,7 @@ class ModelMoves(ScoredModelSet):
         coefficient_count = len(members[0].coefficients) if members else 0
         # A coefficient shared by all places says nothing about a single place.
         if len(members) > 1 and coefficients.size == coefficient_count * len(members):
-            free = model.fit.free.tolist()
+            free = model.fit.free_indices.tolist()
             columns = [free.index(place) for place in self.evaluator.get_coefficient_indices(name)]
             responses = np.sqrt(np.square(model.fit.jacobian[..., columns]).sum(axis=(0, 1, 2)))
             sizes = (
@@ -169,7 +171,7 @@ class ModelMoves(ScoredModelSet):
             theta[self.evaluator.coefficient_slices[name]] = 0.0
             for part, c in parts.items():
                 theta[self.evaluator.coefficient_slices[part]] += c
-            return self.fit_one(FitStart(names, theta, model.fit.states))
+            return self.fit_one(FitStart(names, theta, model.fit.initial_states))
         return self.models[key]
 
     def swap_effect(self, model: FittedModel) -> FittedModel:

@@ -104,7 +104,7 @@ def _make_swapped_start(
     theta = model.fit.theta.copy()
     theta[slots[removed_effect]] = 0.0
     theta[slots[added_effect]] = other_model.fit.theta[slots[added_effect]]
-    return FitStart(other_model.effects, theta, model.fit.states)
+    return FitStart(other_model.effects, theta, model.fit.initial_states)
 
 
 def list_competing_models(search: EffectSearch, model: FittedModel) -> list[FittedModel]:
@@ -132,9 +132,9 @@ def _is_competitive(search: EffectSearch, other_model: FittedModel, model: Fitte
         < MAX_COMPETITOR_DISTANCE
     ):
         return True
-    return search.compute_excess(other_model) < MAX_COMPETITOR_EXCESS_RATIO * search.compute_excess(
-        model
-    )
+    return search.compute_excess_residual(
+        other_model
+    ) < MAX_COMPETITOR_EXCESS_RATIO * search.compute_excess_residual(model)
 
 
 def list_submodels(search: EffectSearch, model: FittedModel) -> list[FittedModel]:

@@ -87,7 +87,8 @@ def select_refit_starts(
             known_jacobian = _predict_jacobian(evaluator, model, direction_set, group, name)
             for c in _list_start_sizes(evaluator, direction_set, group, scored, name):
                 start = replace(
-                    with_effect(evaluator, model.fit.make_start(), name, c), known=known_jacobian
+                    with_effect(evaluator, model.fit.make_start(), name, c),
+                    known_jacobian=known_jacobian,
                 )
                 numbered.append((peak, start))
     # Patient fits begin with the first part of the runs, so starts are compared there.
@@ -167,7 +168,7 @@ def with_effect(evaluator: RunEvaluator, start: FitStart, name: str, c: Array) -
         theta[place] = 0.0
     theta[evaluator.coefficient_slices[name]] = c
     remaining_effects = [n for n in start.effects if n not in contained]
-    return FitStart((*remaining_effects, name), theta, start.states)
+    return FitStart((*remaining_effects, name), theta, start.initial_states)
 
 
 def _predict_jacobian(
@@ -185,9 +186,9 @@ def _predict_jacobian(
     if not evaluator.has_linearisation:
         return None
     columns = {
-        direction_set.candidates[i].place: i
+        direction_set.candidates[i].coefficient_index: i
         for i in group.column_indices
-        if not direction_set.candidates[i].fixed
+        if not direction_set.candidates[i].is_single_size
     }
     places = evaluator.get_coefficient_indices(name)
     shaping = [i for i in range(len(places)) if evaluator.parameters[places[i]].bounds[0] > 0]
@@ -224,28 +225,28 @@ def _list_start_sizes(
     bounds = compute_coefficient_bounds(evaluator, name)
     first = direction_set.candidates[group.column_indices[0]]
     # A direction for one full size says nothing about other sizes.
-    if first.fixed:
+    if first.is_single_size:
         yield first.coefficients
         yield from generate_neighbouring_end_stops(evaluator, name, first.coefficients)
         return
     for share in SIZE_SHARES:
         c = first.coefficients.copy()
         for column, size in zip(group.column_indices, estimate, strict=True):
-            place = direction_set.candidates[column].place
+            place = direction_set.candidates[column].coefficient_index
             c[place] = share * float(np.clip(size, *bounds[place]))
         yield c
         yield from generate_event_times(evaluator, name, c)
     # With several coefficients, the ranges do not show how the coefficients are related.
     if len(group.column_indices) > 1:
         return
-    place = evaluator.coefficient_slices[name].start + first.place
+    place = evaluator.coefficient_slices[name].start + first.coefficient_index
     _, upper_bound = evaluator.parameters[place].bounds
     shares = list(RANGE_SHARES)
-    if first.signed:
+    if first.can_be_negative:
         shares += [-share for share in RANGE_SHARES]
     for share in shares:
         c = first.coefficients.copy()
-        c[first.place] = share * upper_bound
+        c[first.coefficient_index] = share * upper_bound
         yield c
 
 
@@ -266,10 +267,10 @@ def _select_nearest_start(
     if not numbered:
         return []
     starts = [start for _, start in numbered]
-    runs = len(evaluator.tracks)
+    runs = len(evaluator.prepared_runs)
     count = len(starts)
     theta = np.repeat([s.theta for s in starts], runs, axis=0)
-    states = np.concatenate([s.states for s in starts])
+    states = np.concatenate([s.initial_states for s in starts])
     lanes = np.tile(np.arange(runs), count)
     # All starts are simulated in one engine call, as one batch.
     predictions = evaluator.simulate(theta, lanes, states, share)

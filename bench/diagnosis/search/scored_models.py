@@ -63,13 +63,13 @@ class ModelScan(NamedTuple):
     """Directions, score test and scores about one model.
 
     Attributes:
-        at: the fit that the directions refer to.
+        fit: the fit that the directions refer to.
         directions: directions of the effects that the model lacks.
         test: score test with these directions.
         scores: scores of these effects.
     """
 
-    at: TrajectoryFit
+    fit: TrajectoryFit
     directions: DirectionSet
     test: ScoreTest
     scores: CandidateScores
@@ -171,7 +171,7 @@ class ScoredModelSet(ModelSet):
             # A model that has hardly moved keeps its directions.
             if (
                 previous_scan is not None
-                and self._compute_fit_distance(previous_scan.at, model.fit) < UNCHANGED_FIT_SIGMAS
+                and self._compute_fit_distance(previous_scan.fit, model.fit) < UNCHANGED_FIT_SIGMAS
             ):
                 scores = _score_residual(
                     previous_scan.test, residual, residual, self.observed_mask, stream
@@ -192,13 +192,15 @@ class ScoredModelSet(ModelSet):
         if calls:
             max_effects = max(len(missing_effects) for _, missing_effects, *_ in calls)
             further_text = f" added to each of {len(calls)} models" if len(calls) > 1 else ""
-            self.evaluator.watch.stage(f"testing {max_effects} effects{further_text}", len(calls))
+            self.evaluator.search_control.begin_stage(
+                f"testing {max_effects} effects{further_text}", len(calls)
+            )
         scans = {}
         for number, scan in self.evaluator.worker_pool.map_unordered(
             self.evaluator, _scan_model, calls
         ):
             scans[number] = scan
-            self.evaluator.watch.advance()
+            self.evaluator.search_control.advance()
         for number, key in enumerate(keys):
             scores = self.scores_by_effects.get(key, scans[number].scores)
             # Scores that were kept when the directions were removed remain valid.
@@ -208,7 +210,9 @@ class ScoredModelSet(ModelSet):
     def _report_scoring(self, model: FittedModel) -> None:
         """Report to the user that a model is scored now, and stop if the search has to end."""
         model_text = " + ".join(model.effects) or "the base model"
-        self.evaluator.watch.report_and_check(f"scores of the effect library at {model_text}")
+        self.evaluator.search_control.report_and_check(
+            f"scores of the effect library at {model_text}"
+        )
 
     def _make_room(self, kept_keys: Sequence[frozenset[str]]) -> None:
         """Remove the oldest stored directions until `DIRECTION_CACHE_BYTES` is not exceeded.
@@ -341,7 +345,8 @@ class ScoredModelSet(ModelSet):
         """Return whether one of the fitted models `keys` (sets of effects) leaves only noise."""
         models = [self.models[key] for key in keys if key in self.models]
         return any(
-            self.is_noise_like(m) and self.compute_excess(m) < MAX_EXCESS_TO_STOP for m in models
+            self.is_noise_like(m) and self.compute_excess_residual(m) < MAX_EXCESS_TO_STOP
+            for m in models
         )
 
     def compute_missing_effect_p_value(self, model: FittedModel, larger: FittedModel) -> float:

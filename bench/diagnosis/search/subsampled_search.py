@@ -58,7 +58,13 @@ def _search_subsampled(search: EffectSearch, thinned_runs: RunEvaluator) -> Fitt
     if search.is_complete(search.base_model, MAX_P_VALUE_FIRST_EFFECT):
         return search.run()
     rng = search.make_rng("fewer samples")
-    search_arguments = thinned_runs, search.noise, search.frozen, rng, search.is_noise_stated
+    search_arguments = (
+        thinned_runs,
+        search.noise,
+        search.fixed_parameters,
+        rng,
+        search.is_noise_stated,
+    )
     subsampled_search = EffectSearch(*search_arguments, thorough=search.thorough)
     subsampled_search.refit_models([search.base_model.fit.make_start()])
     try:
@@ -82,7 +88,7 @@ def _adopt_subsampled_models(search: EffectSearch, model: FittedModel) -> None:
 
     It is used if the time limit ends the search on the thinned runs.
     """
-    fitter = TrajectoryFitter(search.evaluator, search.noise, search.frozen)
+    fitter = TrajectoryFitter(search.evaluator, search.noise, search.fixed_parameters)
     (fit,) = fitter.fit_models([model.fit.make_start()], iterations=0)
     search.best_supported_model = search.add_fit(fit)
 
@@ -116,7 +122,7 @@ def _select_full_model(search: EffectSearch, subsampled_model: FittedModel) -> F
     """
     model = search.models[frozenset(subsampled_model.effects)]
     best = search.get_best(len(subsampled_model.effects))
-    if best is None or search.compute_excess(model) >= FAR_EXCESS:
+    if best is None or search.compute_excess_residual(model) >= FAR_EXCESS:
         return model
     return best
 
@@ -124,7 +130,7 @@ def _select_full_model(search: EffectSearch, subsampled_model: FittedModel) -> F
 def _is_confirmed_by_all_samples(search: EffectSearch, model: FittedModel) -> bool:
     """Return whether all samples support the model without any further effect."""
     # Far from the noise, more samples of the same runs show nothing new.
-    if search.compute_excess(model) >= FAR_EXCESS:
+    if search.compute_excess_residual(model) >= FAR_EXCESS:
         return True
     return search.is_complete(
         model, MAX_P_VALUE_FURTHER_EFFECT if model.effects else MAX_P_VALUE_FIRST_EFFECT

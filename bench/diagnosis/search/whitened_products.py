@@ -202,7 +202,7 @@ class WhiteningDesign:
         missing neighbours of each sample, and `_known` caches the projected design of each phi.
         """
         self.blocks = list(blocks)
-        self._own = fit.free.size
+        self._own = fit.free_indices.size
         self._jacobian = np.moveaxis(fit.jacobian, 3, 0)
         self._directions = np.moveaxis(directions, 3, 0)
         self._weights = observed_mask / sigma

@@ -54,7 +54,10 @@ class CrossValidation:
         """Number of simulations made for the folds alone."""
         if "_folds" not in self.__dict__:
             return 0
-        return sum(fold.fitting.simulations + fold.left_out.simulations for fold in self._run_folds)
+        return sum(
+            fold.fitting.simulation_count + fold.left_out.simulation_count
+            for fold in self._run_folds
+        )
 
     def close(self) -> None:
         """Close the simulators of the folds; the run evaluator of all runs stays open."""
@@ -77,10 +80,10 @@ class CrossValidation:
         """
         shape = self.evaluator.observed.shape
         simulated = np.full((len(fits), *shape), np.nan)
-        states = np.stack([fit.states for fit in fits])
+        states = np.stack([fit.initial_states for fit in fits])
         free = np.zeros(len(fits))
         for number, fold in enumerate(self._run_folds):
-            self.evaluator.watch.stage(
+            self.evaluator.search_control.begin_stage(
                 f"cross-validation, fold {number + 1} of {len(self._run_folds)}"
             )
             thetas = self._refit_fold(fold, fits)
@@ -128,10 +131,12 @@ class CrossValidation:
         """Make a run evaluator of the runs `rows`, which are the fitted or the left-out ones."""
         evaluator = self.evaluator.with_runs([self.evaluator.runs[row] for row in rows])
         length = evaluator.observed.shape[1]
-        if self.evaluator.correction is not None:
-            evaluator.correction = self.evaluator.correction[rows, :length]
-        if self.evaluator.derivatives is not None:
-            evaluator.derivatives = self.evaluator.derivatives[rows, :length]
+        if self.evaluator.discretisation_correction is not None:
+            evaluator.discretisation_correction = self.evaluator.discretisation_correction[
+                rows, :length
+            ]
+        if self.evaluator.state_derivatives is not None:
+            evaluator.state_derivatives = self.evaluator.state_derivatives[rows, :length]
         # Workers that are started for one fold also know the other folds.
         evaluator.worker_pool.register(evaluator)
         return evaluator
@@ -146,16 +151,18 @@ class CrossValidation:
         Returns:
             Parameters (P,) of each model; an effect that these runs do not show is switched off.
         """
-        base = set(self.evaluator.base.tolist())
+        base = set(self.evaluator.base_indices.tolist())
         # All models of a search keep the same parameters fixed at their nominal values.
-        frozen = frozenset(base - set(fits[0].free.tolist()))
+        frozen = frozenset(base - set(fits[0].free_indices.tolist()))
         length = fold.fitting.observed.shape[1]
         starts = []
         for fit in fits:
-            jacobian = fit.jacobian[fold.fitted_rows, :length, :, : fit.free.size]
-            known_jacobian = KnownJacobian(fit.free, jacobian)
+            jacobian = fit.jacobian[fold.fitted_rows, :length, :, : fit.free_indices.size]
+            known_jacobian = KnownJacobian(fit.free_indices, jacobian)
             starts.append(
-                FitStart(fit.effects, fit.theta, fit.states[fold.fitted_rows], known_jacobian)
+                FitStart(
+                    fit.effects, fit.theta, fit.initial_states[fold.fitted_rows], known_jacobian
+                )
             )
         refits = TrajectoryFitter(fold.fitting, self.noise, frozen).fit_models(starts, MAX_STEPS)
         return self._remove_unsupported(fold.fitting, refits)
@@ -173,14 +180,14 @@ class CrossValidation:
         removals = [(i, name) for i, fit in enumerate(fits) for name in fit.effects]
         if not removals:
             return thetas
-        runs = len(evaluator.tracks)
+        runs = len(evaluator.prepared_runs)
         lanes = np.stack([fits[i].theta for i, _ in removals])
         for lane, (_, name) in zip(lanes, removals, strict=True):
             lane[evaluator.get_coefficient_indices(name)] = 0.0
         simulated_without = evaluator.simulate(
             np.repeat(lanes, runs, axis=0),
             np.tile(np.arange(runs), len(removals)),
-            np.concatenate([fits[i].states for i, _ in removals]),
+            np.concatenate([fits[i].initial_states for i, _ in removals]),
         ).reshape(len(removals), *evaluator.observed.shape)
         observed_mask = np.isfinite(evaluator.observed)
         for (i, name), simulated in zip(removals, simulated_without, strict=True):

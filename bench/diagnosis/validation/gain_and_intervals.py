@@ -70,8 +70,8 @@ def compute_central_jacobian(
     Returns:
         The fit with the new Jacobian.
     """
-    q = fit.free.size
-    runs, size = fit.states.shape
+    q = fit.free_indices.size
+    runs, size = fit.initial_states.shape
     bounds = _widen_bounds(evaluator, fit)
     ranges = bounds[:, 1] - bounds[:, 0]
     steps = compute_difference_steps(fit.jacobian, noise, ranges)
@@ -88,7 +88,7 @@ def compute_central_jacobian(
     lower_side, upper_side = simulated.reshape(2, steps.size, *fit.simulated.shape)
 
     # Row j has changed parameter j, so the widths are on the diagonal.
-    lower, upper = theta[:, :q, fit.free]
+    lower, upper = theta[:, :q, fit.free_indices]
     parameter_widths = np.diagonal(upper - lower)
     widths = np.concatenate([parameter_widths, 2.0 * steps[q:]])
     jacobian = np.moveaxis(upper_side - lower_side, 0, -1) / widths
@@ -105,10 +105,10 @@ def get_central_jacobian(models: ModelSet, fit: TrajectoryFit) -> TrajectoryFit:
         models: Models with the run evaluator, the noise and the cache.
         fit: Fit with a one-sided Jacobian.
     """
-    cached_entry = models.derived.get(id(fit))
+    cached_entry = models.refined_jacobians.get(id(fit))
     # An id can be reused after an object is deleted, so the object itself is compared.
     if cached_entry is None or cached_entry[0] is not fit:
-        cached_entry = models.derived[id(fit)] = (
+        cached_entry = models.refined_jacobians[id(fit)] = (
             fit,
             compute_central_jacobian(models.evaluator, fit, models.noise),
         )
@@ -121,12 +121,12 @@ def _displace_both_sides(fit: TrajectoryFit, steps: Array, bounds: Array) -> tup
     The first axis is the lower and the upper side. Row j of the first n parameters and states has
     number j moved by its step.
     """
-    q = fit.free.size
+    q = fit.free_indices.size
     theta = np.tile(fit.theta, (2, len(steps), 1))
-    states = np.tile(fit.states, (2, len(steps), 1, 1))
+    states = np.tile(fit.initial_states, (2, len(steps), 1, 1))
     for side, sign in enumerate((-1.0, 1.0)):
         shifts = sign * steps
-        for j, place in enumerate(fit.free):
+        for j, place in enumerate(fit.free_indices):
             displaced_value = fit.theta[place] + shifts[j]
             # At a bound the step is one-sided, so the actual difference is used as the divisor.
             theta[side, j, place] = np.clip(displaced_value, *bounds[j])
@@ -140,8 +140,8 @@ def _widen_bounds(evaluator: RunEvaluator, fit: TrajectoryFit) -> Array:
 
     Coefficients may be outside their plausible range.
     """
-    values = fit.theta[fit.free]
-    bounds = [evaluator.parameters[i].bounds for i in fit.free]
+    values = fit.theta[fit.free_indices]
+    bounds = [evaluator.parameters[i].bounds for i in fit.free_indices]
     # The shape is set explicitly because there may be no parameters.
     table = np.array(bounds).reshape(-1, 2)
     low, high = table.T
@@ -217,7 +217,7 @@ def compute_fisher_blocks(models: ModelSet, model: FittedModel) -> FisherBlocks:
     sigma = np.maximum(model.likelihood.sigma, 1e-300)
     noise = NoiseModel(sigma, model.likelihood.phi)
     return compute_fisher_blocks_from_jacobian(
-        models.evaluator, fit.jacobian, model.fit.free.size, noise
+        models.evaluator, fit.jacobian, model.fit.free_indices.size, noise
     )
 
 
@@ -245,7 +245,7 @@ def compute_fisher_blocks_from_jacobian(
     inner, cross = hold_known_states(
         normal[:, q:, q:] + np.diag(precision) + ridge,
         normal[:, :q, q:],
-        evaluator.known,
+        evaluator.known_state_mask,
     )
     return FisherBlocks(noise, j, normal[:, :q, :q], cross, inner)
 
@@ -266,7 +266,7 @@ def compute_intervals(
     variances = np.diagonal(compute_covariance(models, model))
     # Rounding may make a variance negative.
     spread = np.sqrt(np.maximum(variances, 0.0))
-    places = model.fit.free.tolist()
+    places = model.fit.free_indices.tolist()
     result = {}
     for place, sd in zip(places, spread.tolist(), strict=True):
         value = float(model.fit.theta[place])
@@ -378,7 +378,7 @@ def _list_resampled_parts(evaluator: RunEvaluator, by_stretches: bool) -> list[t
 
     Each is the index of the run and the slice of its samples.
     """
-    count = len(evaluator.tracks)
+    count = len(evaluator.prepared_runs)
     if count > 1 and not by_stretches:
         return [(run, slice(None)) for run in range(count)]
     parts = []

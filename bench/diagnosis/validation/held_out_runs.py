@@ -113,7 +113,7 @@ class HeldOutRuns:
     @property
     def simulations(self) -> int:
         """Number of simulations of the held-out runs."""
-        return self.evaluator.simulations
+        return self.evaluator.simulation_count
 
     def close(self) -> None:
         """Release the resources of the simulator."""
@@ -130,9 +130,9 @@ class HeldOutRuns:
         decide between them. Models far from the nearest one are therefore fitted again from its
         initial states, and the better fit counts.
         """
-        guess = self.evaluator.guess
+        guess = self.evaluator.initial_state_guesses
         initial_starts = [FitStart((), theta, guess) for theta in thetas]
-        is_filtered = self.evaluator.followed is not None
+        is_filtered = self.evaluator.filtered_runs is not None
         fits = self._fit_initial_states(
             initial_starts, FILTERED_HORIZON_STAGES if is_filtered else HORIZON_STAGES
         )
@@ -149,7 +149,10 @@ class HeldOutRuns:
         # The comparison is negated because the cost of a failed fit may be NaN.
         limit = REFIT_SQUARES_RATIO * nearest_fit.cost
         far_indices = [i for i, fit in enumerate(fits) if not fit.cost < limit]
-        starts = [replace(fits[i].make_start(), states=nearest_fit.states) for i in far_indices]
+        starts = [
+            replace(fits[i].make_start(), initial_states=nearest_fit.initial_states)
+            for i in far_indices
+        ]
         # These initial states are good over the first fraction of the runs already.
         refits = self._fit_initial_states(
             starts, FILTERED_HORIZON_STAGES if is_filtered else HORIZON_STAGES[1:]
@@ -168,11 +171,13 @@ class HeldOutRuns:
         fits: list[TrajectoryFit] = []
         if not starts:
             return fits
-        watch = self.evaluator.watch
+        watch = self.evaluator.search_control
         models = "one model" if len(starts) == 1 else f"{len(starts)} models"
-        watch.stage(f"simulating held-out runs with {models}", len(stages))
+        watch.begin_stage(f"simulating held-out runs with {models}", len(stages))
         for share, iterations in stages:
-            fitter = TrajectoryFitter(self.evaluator, self.noise, share=share, parameters=False)
+            fitter = TrajectoryFitter(
+                self.evaluator, self.noise, share=share, fits_parameters=False
+            )
             fits = fitter.fit_models(starts, iterations)
             starts = [fit.make_start() for fit in fits]
             watch.advance()
@@ -187,10 +192,12 @@ class HeldOutRuns:
         evaluator = self.evaluator
         if not evaluator.has_linearisation or not np.isfinite(fit.cost):
             return False
-        runs = len(evaluator.guess)
+        runs = len(evaluator.initial_state_guesses)
         lanes = np.tile(fit.theta, (runs, 1))
-        simulated_from_guess = evaluator.simulate(lanes, np.arange(runs), evaluator.guess)
-        state_changes = fit.states - evaluator.guess
+        simulated_from_guess = evaluator.simulate(
+            lanes, np.arange(runs), evaluator.initial_state_guesses
+        )
+        state_changes = fit.initial_states - evaluator.initial_state_guesses
         # A diverging simulation from the guess is infinite or NaN.
         with np.errstate(over="ignore", invalid="ignore"):
             linearisation_error = (
@@ -233,7 +240,7 @@ class HeldOutRuns:
 
         nearest_fit = _find_lowest_cost_fit(fits)
         compute_state_jacobian(
-            self.evaluator, nearest_fit.theta, nearest_fit.states, is_recomputed=True
+            self.evaluator, nearest_fit.theta, nearest_fit.initial_states, is_recomputed=True
         )
         return self._fit_initial_states([fit.make_start() for fit in fits], stages)
 
@@ -244,11 +251,11 @@ class HeldOutRuns:
         """
         if not np.isfinite(fit.cost):
             no_prediction = np.full_like(self.evaluator.observed, np.nan)
-            return HeldOutFit(no_prediction, -np.inf, fit.states)
+            return HeldOutFit(no_prediction, -np.inf, fit.initial_states)
         # Only initial states were fitted here, so only they count as free.
         free = count_identified_states(self.evaluator, fit, self.noise)
         penalised_likelihood = compute_merit(self.evaluator.observed, fit.simulated, free)
-        return HeldOutFit(fit.simulated, penalised_likelihood, fit.states, free)
+        return HeldOutFit(fit.simulated, penalised_likelihood, fit.initial_states, free)
 
 
 def compute_merit(observed: Array, simulated: Array, free: float) -> float:

@@ -180,7 +180,7 @@ def assess_consistency(models: ModelSet, model: FittedModel) -> tuple[ParameterC
     """
     evaluator = models.evaluator
     groupings = list(_list_groupings(evaluator.runs))
-    if not groupings or not model.fit.free.size:
+    if not groupings or not model.fit.free_indices.size:
         return ()
     curvatures, gradients = _compute_run_normal_equations(models, model)
     consistencies = [
@@ -297,12 +297,14 @@ def _list_groupings(runs: Sequence[Run]) -> Iterator[_RunGrouping]:
 def _compute_run_normal_equations(models: ModelSet, model: FittedModel) -> tuple[Array, Array]:
     """Compute the normal equations of each run: H (R, q, q) and g (R, q) of eq. (1)."""
     evaluator, fit = models.evaluator, model.fit
-    q = fit.free.size
+    q = fit.free_indices.size
     fisher_blocks = compute_fisher_blocks(models, model)
     residual = whiten(models.compute_residual(fit), models.observed_mask, fisher_blocks.noise)
     pull = np.einsum("rnk,rn->rk", fisher_blocks.jacobian, residual.reshape(len(residual), -1))
-    pull[:, q:] += compute_state_prior(evaluator) ** -2.0 * (evaluator.guess - fit.states)
-    pull[:, q:] *= ~evaluator.known
+    pull[:, q:] += compute_state_prior(evaluator) ** -2.0 * (
+        evaluator.initial_state_guesses - fit.initial_states
+    )
+    pull[:, q:] *= ~evaluator.known_state_mask
     right_hand_sides = np.concatenate(
         [fisher_blocks.cross.transpose(0, 2, 1), pull[:, q:, None]], 2
     )
@@ -337,7 +339,7 @@ def _test_parameters(
         group_covariance = _invert_regularised(curvatures[list(runs)].sum(axis=0))
         steps.append(group_covariance @ gradients[list(runs)].sum(axis=0))  # (2)
         errors.append(np.sqrt(np.maximum(np.diagonal(group_covariance), 0.0)))
-    for column, place in enumerate(model.fit.free.tolist()):
+    for column, place in enumerate(model.fit.free_indices.tolist()):
         parameter, value = evaluator.parameters[place], float(model.fit.theta[place])
         low, high = parameter.bounds
         size = max(high - low, abs(value))

@@ -108,7 +108,7 @@ def _compute_motion_covariates(
         return
     column = evaluator.channels.index(name)
     rows = []
-    for track, simulated in zip(evaluator.tracks, model.fit.simulated, strict=True):
+    for track, simulated in zip(evaluator.prepared_runs, model.fit.simulated, strict=True):
         times = track.scenario.times
         place = simulated[: times.size, column]
         rate = np.gradient(place, times)

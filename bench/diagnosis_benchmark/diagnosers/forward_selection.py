@@ -283,7 +283,7 @@ def _add_refit(evidence: RegressionEvidence, fit: TrajectoryFit) -> RefittedMode
     """
     residual = (evidence.world.observed - fit.simulated) / evidence.noise.sigma
     squares = float(np.square(residual[evidence.observed_mask]).sum())
-    numbers = fit.free.size + int((~evidence.world.known).sum())
+    numbers = fit.free_indices.size + int((~evidence.world.known_state_mask).sum())
     return RefittedModel(fit, squares if np.isfinite(squares) else np.inf, numbers)
 
 
@@ -372,14 +372,14 @@ def _choose_starts(
     bounds = compute_coefficient_bounds(world, name)
     sizes = np.linalg.lstsq(effects[:, list(column.places)], residual, rcond=1e-9)[0]
     starts = []
-    for share in (1.0,) if probes[0].fixed else (1.0, 0.3):
+    for share in (1.0,) if probes[0].is_single_size else (1.0, 0.3):
         c = probes[0].coefficients.copy()
         for probe, size in zip(probes, sizes.tolist(), strict=True):
-            if not probe.fixed:
-                c[probe.place] = np.clip(share * size, *bounds[probe.place])
+            if not probe.is_single_size:
+                c[probe.coefficient_index] = np.clip(share * size, *bounds[probe.coefficient_index])
         theta = current_fit.theta.copy()
         theta[world.coefficient_slices[name]] = c
-        starts.append(FitStart((*current_fit.effects, name), theta, current_fit.states))
+        starts.append(FitStart((*current_fit.effects, name), theta, current_fit.initial_states))
     return starts
 
 
@@ -406,7 +406,7 @@ def _compute_intervals(
     residual_variance = model.squares / max(len(rows) - model.numbers, 1)
     spread = spread * np.sqrt(max(residual_variance, 1e-12))
     intervals: dict[str, tuple[float | None, float | None]] = {}
-    for i, place in enumerate(fit.free.tolist()):
+    for i, place in enumerate(fit.free_indices.tolist()):
         value, half_width = float(fit.theta[place]), Z95 * float(spread[i])
         intervals[world.parameters[place].name] = value - half_width, value + half_width
     return intervals

@@ -233,9 +233,11 @@ def _compute_network_input(
         rms = float(np.sqrt(np.nanmean(np.square(residual))))
         names = [c.name for c in kind.channels]
         inputs = [c.name for c in kind.inputs]
-        image = np.zeros((len(world.tracks), 3 * len(names) + len(inputs) + 1, GRID_POINT_COUNT))
+        image = np.zeros(
+            (len(world.prepared_runs), 3 * len(names) + len(inputs) + 1, GRID_POINT_COUNT)
+        )
         grid = np.linspace(0.0, 1.0, GRID_POINT_COUNT)
-        for r, track in enumerate(world.tracks):
+        for r, track in enumerate(world.prepared_runs):
             size = int(world.lengths[r])
             clock = np.linspace(0.0, 1.0, size)
             for c, name in enumerate(world.channels):

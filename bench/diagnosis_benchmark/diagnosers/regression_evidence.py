@@ -167,8 +167,8 @@ class RegressionEvidence:
         for i, probe in enumerate(self.sensitivity_directions.candidates):
             # Each direction of a fixed size is a column of its own, because such directions do not
             # add up.
-            separate_index = i if probe.fixed else -1
-            places.setdefault((probe.effect, probe.group, separate_index), []).append(i)
+            separate_index = i if probe.is_single_size else -1
+            places.setdefault((probe.effect, probe.grid_point, separate_index), []).append(i)
         return [EffectColumn(effect, tuple(members)) for (effect, *_), members in places.items()]
 
     def build_trajectory_regression(self) -> RegressionData:
@@ -246,7 +246,7 @@ class RegressionEvidence:
         runs, length, channels = world.observed.shape
         names = [channel.name for channel in world.simulator.inputs]
         states = np.zeros((runs, length, 1 + channels + len(names)))
-        for r, track in enumerate(world.tracks):
+        for r, track in enumerate(world.prepared_runs):
             size = int(world.lengths[r])
             times, inputs = track.scenario.times, track.scenario.inputs
             states[r, :size, 0] = times - times[0]
@@ -277,7 +277,7 @@ class RegressionEvidence:
         sigma = np.ones((runs, length, channels))
         is_used = np.zeros((runs, length, channels), dtype=bool)
         pairs = dict(zip(system.rates, system.coordinates, strict=False))
-        for r, track in enumerate(world.tracks):
+        for r, track in enumerate(world.prepared_runs):
             size = int(world.lengths[r])
             step = float(np.median(np.diff(track.scenario.times)))
             window = _round_down_to_odd(
@@ -358,7 +358,7 @@ class RegressionEvidence:
             run: index of the run.
         """
         world, system = self.world, self.world.simulator.system
-        track = world.tracks[run]
+        track = world.prepared_runs[run]
         size, dimensions = int(world.lengths[run]), len(system.coordinates)
         zeros = np.zeros((size, dimensions))
         if system.uniform or dimensions != 1:
@@ -417,9 +417,9 @@ def compute_base_jacobian(world: RunEvaluator, fit: TrajectoryFit) -> Array:
     Returns:
         Columns, (R, T, C, q + n), for q free parameters and n unknown initial states of all runs.
     """
-    shared = fit.free.size
+    shared = fit.free_indices.size
     runs, length, channels, _ = fit.jacobian.shape
-    unknown_states = [np.flatnonzero(~world.known[r]) for r in range(runs)]
+    unknown_states = [np.flatnonzero(~world.known_state_mask[r]) for r in range(runs)]
     width = shared + sum(places.size for places in unknown_states)
     columns = np.zeros((runs, length, channels, width))
     columns[..., :shared] = fit.jacobian[..., :shared]

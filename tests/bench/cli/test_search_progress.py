@@ -267,9 +267,9 @@ def test_a_search_reports_its_stages_their_steps_and_the_best_model():
 
 def test_a_watch_without_a_listener_is_silent():
     watch = SearchControl()
-    watch.stage("testing 38 effects", 1)
+    watch.begin_stage("testing 38 effects", 1)
     watch.advance()
-    watch.found(["drag.linear"], 1.0)
+    watch.report_best_model(["drag.linear"], 1.0)
 
 
 def terminal_output(command, columns=120, interrupt_at=None):

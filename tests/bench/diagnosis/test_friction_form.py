@@ -86,7 +86,7 @@ def fitted(path, name):
     base = fit_base_model(stiff, noise)
     rng = np.random.default_rng(0)
     models = ModelSet(stiff, noise, base.fixed_parameters, rng, np.ones(2, dtype=bool))
-    models.refit_models([FitStart((name,), base.fit.theta, base.fit.states)], race=False)
+    models.refit_models([FitStart((name,), base.fit.theta, base.fit.initial_states)], race=False)
     return models, models.models[frozenset([name])], evaluator(make_soft_kind(kind))
 
 
@@ -104,7 +104,7 @@ def test_the_form_that_was_planted_fits_better(tmp_path, form):
     assert best.fit.theta[evaluator.get_coefficient_indices(name)[0]] == pytest.approx(
         PLANTED, rel=0.03
     )
-    assert abs(models.compute_excess(best)) < 0.1
+    assert abs(models.compute_excess_residual(best)) < 0.1
     assert get_friction_form(evaluator, name) == ("soft" if form == "soft" else None)
     assert get_friction_form(other, "drag.linear@elbow") is None
 

@@ -109,7 +109,7 @@ def test_a_fit_may_move_a_delay_up_to_the_longest_run(seconds):
         recording(runs=2, seconds=seconds, rate=20),
         candidates=["sensor.lag", "input.delay", "input.lag"],
     )
-    longest = there.longest
+    longest = there.longest_duration
     for name in there.library:
         ((low, high),) = compute_coefficient_bounds(there, name)
         assert high == pytest.approx(longest)

@@ -38,26 +38,28 @@ def test_guesses_are_near_stated_states_are_kept_and_hidden_axes_stay():
     second = replace(second, initial={"z": 2.5, "vx": 7.0})
     made = replace(made, runs=(first, second))
     there = evaluator(made, candidates=[])
-    assert there.states == ["x", "y", "z", "vx", "vy", "vz"]
-    np.testing.assert_allclose(there.guess[0], [0, 0, 3, 2, 0, 1], atol=0.15)
+    assert there.state_names == ["x", "y", "z", "vx", "vy", "vz"]
+    np.testing.assert_allclose(there.initial_state_guesses[0], [0, 0, 3, 2, 0, 1], atol=0.15)
     # No recorded channel depends on y.
     known = [
         [0, 1, 0, 0, 1, 0],
         [0, 1, 1, 1, 1, 0],
     ]
-    np.testing.assert_array_equal(there.known, known)
-    assert (there.guess[1, 2], there.guess[1, 3]) == (2.5, 7.0)
+    np.testing.assert_array_equal(there.known_state_mask, known)
+    assert (there.initial_state_guesses[1, 2], there.initial_state_guesses[1, 3]) == (2.5, 7.0)
 
 
 def test_a_ball_whose_height_is_not_recorded_begins_too_high_for_an_impact():
     start, times = {"z": 3.0, "vx": 2.0}, np.arange(100) / 50
     made = recorded(Ball(observe=["x"]), [0.7], [start], times, 0.001)
     there = evaluator(made, candidates=[])
-    z = there.states.index("z")
-    assert there.guess[0, z] > 0.5 * 9.81 * 2.0**2 + 10
+    z = there.state_names.index("z")
+    assert there.initial_state_guesses[0, z] > 0.5 * 9.81 * 2.0**2 + 10
     assert (
-        there.known[0, z]
-        or there.simulate(there.get_nominal_theta()[None], np.array([0]), there.guess)[0, -1, 0]
+        there.known_state_mask[0, z]
+        or there.simulate(
+            there.get_nominal_theta()[None], np.array([0]), there.initial_state_guesses
+        )[0, -1, 0]
         > 3.5
     )
 
@@ -67,7 +69,7 @@ def test_missing_samples_at_the_beginning_and_first_samples():
     # The first four angles are missing, but their rates are present.
     run = changed(made.runs[0], q=lambda v: np.where(np.arange(v.size) < 4, np.nan, v))
     there = evaluator(replace(made, runs=(run,)), candidates=[])
-    assert there.guess[0, 0] == pytest.approx(1.0, abs=0.02)
+    assert there.initial_state_guesses[0, 0] == pytest.approx(1.0, abs=0.02)
     scenario = Scenario(np.arange(5.0), inputs={"u": np.arange(5.0)})
     cut = take_first_samples(scenario, 3)
     np.testing.assert_array_equal(cut.times, [0, 1, 2])

@@ -22,7 +22,7 @@ def test_a_vector_holds_parameters_constants_set_free_and_coefficients():
     )
     assert [p.name for p in there.parameters[:3]] == ["inertia", "length", "mass"]
     assert there.coefficient_slices["drag.linear"] == slice(3, 4)
-    assert list(there.base) == [0, 1, 2]
+    assert list(there.base_indices) == [0, 1, 2]
     np.testing.assert_allclose(there.get_nominal_theta()[:3], [3.3e-3, 0.15, 0.15])
     assert not there.get_nominal_theta()[3:].any()
     assert there.parameters[1].bounds == pytest.approx(
@@ -50,12 +50,12 @@ def test_cached_elements_equal_the_simulation():
     theta = np.array(rows)
     runs = np.array([0, 1, 1])
     states = np.array([[1.0, 0.0], [0.4, 0.5], [-2.0, 0.0]])
-    before = there.simulations
+    before = there.simulation_count
     seen = there.simulate(theta, runs, states)
-    assert there.simulations - before == 3
+    assert there.simulation_count - before == 3
     assert seen.shape == (3, 90, 2)
     for lane in range(3):
-        times = there.tracks[runs[lane]].scenario.times
+        times = there.prepared_runs[runs[lane]].scenario.times
         initial = dict(zip(("q", "qd"), states[lane], strict=True))
         scenario = Scenario(times, initial, constants={"gravity": theta[lane, 1]})
         # Simulate each element separately with a step ten times shorter.
@@ -76,8 +76,8 @@ def test_a_later_clock_changes_nothing():
     run = made.runs[0]
     later = replace(made, runs=(replace(run, times=run.times + 1e4),))
     one, two = (evaluator(part, candidates=["drag.linear"]) for part in (made, later))
-    np.testing.assert_allclose(one.guess, two.guess, atol=1e-6)
-    lane = one.get_nominal_theta()[None], np.array([0]), one.guess
+    np.testing.assert_allclose(one.initial_state_guesses, two.initial_state_guesses, atol=1e-6)
+    lane = one.get_nominal_theta()[None], np.array([0]), one.initial_state_guesses
     seen = [there.simulate(*lane) for there in (one, two)]
     np.testing.assert_allclose(*seen, atol=1e-4)
 

@@ -32,13 +32,16 @@ def test_of_samples_closer_than_steps_every_so_manyth_is_kept(log):
     few = thin_runs(there)
     assert few.lengths.tolist() == [200, 200]
     np.testing.assert_array_equal(few.observed, there.observed[:, ::10])
-    np.testing.assert_array_equal(few.tracks[0].scenario.times, TIMES[::10])
+    np.testing.assert_array_equal(few.prepared_runs[0].scenario.times, TIMES[::10])
     assert [p.name for p in few.parameters] == [p.name for p in there.parameters]
-    assert (few.longest, few.watch) == (there.longest, there.watch)
+    assert (few.longest_duration, few.search_control) == (
+        there.longest_duration,
+        there.search_control,
+    )
 
 
 def test_an_input_gives_the_same_momentum(log):
-    few = thin_runs(evaluator(log)).tracks[0].scenario
+    few = thin_runs(evaluator(log)).prepared_runs[0].scenario
     before = np.concatenate([[0.0], np.cumsum(PUSHED[:-1] * np.diff(TIMES))])[::10]
     after = np.concatenate([[0.0], np.cumsum(few.inputs["u"][:-1] * np.diff(few.times))])
     np.testing.assert_allclose(after, before, atol=1e-12)
@@ -48,8 +51,8 @@ def test_the_same_parameters_give_nearly_the_same_motion(log):
     there = evaluator(log)
     few = thin_runs(there)
     theta, runs = np.array([there.get_nominal_theta()]), np.zeros(1, dtype=int)
-    whole = there.simulate(theta, runs, there.guess[:1])
-    seldom = few.simulate(theta, runs, there.guess[:1])
+    whole = there.simulate(theta, runs, there.initial_state_guesses[:1])
+    seldom = few.simulate(theta, runs, there.initial_state_guesses[:1])
     assert np.abs(seldom - whole[:, ::10]).max() < 1e-4 * np.ptp(whole)
 
 

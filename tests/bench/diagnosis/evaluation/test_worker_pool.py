@@ -38,7 +38,7 @@ def eager(monkeypatch):
 
 
 def times(there, number):
-    there.simulations += number
+    there.simulation_count += number
     return there.factor * number, os.getpid()
 
 
@@ -54,7 +54,7 @@ def fails(there, number):
 
 
 def waits(there, number):
-    while not there.watch.should_abandon_fit(0.0):
+    while not there.search_control.should_abandon_fit(0.0):
         time.sleep(0.01)
     return number
 
@@ -79,7 +79,7 @@ def test_results_come_in_order_from_other_processes_and_are_accounted_for(jobs):
     workers = {process for _, process in results}
     assert os.getpid() not in workers
     assert 1 <= len(workers) <= jobs
-    assert there.simulations == sum(range(20))
+    assert there.simulation_count == sum(range(20))
     assert not alive(workers)
 
 
@@ -132,7 +132,7 @@ def test_workers_leave_off_when_the_search_has_to_end():
     there = evaluator(stop=lambda: bool(wanted) or wanted.append(1))
     with closing(ForkedWorkerPool(2)) as crew:
         assert crew.map(there, waits, [(1,), (2,)]) == [1, 2]
-    assert there.watch.has_abandoned_fits()
+    assert there.search_control.has_abandoned_fits()
     there = evaluator(budget=0.2)
     with closing(ForkedWorkerPool(2)) as crew:
         assert crew.map(there, waits, [(1,), (2,)]) == [1, 2]

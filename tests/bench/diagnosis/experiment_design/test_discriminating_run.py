@@ -26,7 +26,7 @@ def rivals(made, sigma, effects, **options):
     )
     models = []
     for name in effects:
-        start = FitStart((name,), base.fit.theta, base.fit.states)
+        start = FitStart((name,), base.fit.theta, base.fit.initial_states)
         models.append(search.add_fit(TrajectoryFitter(there, noise).fit_models([start], 20)[0]))
     return search, *models
 
@@ -52,7 +52,7 @@ def test_the_run_that_differs_most_is_proposed_and_does_tell_them_apart(free):
     assert float(said[2]) == pytest.approx(found.apart, rel=0.01)
     if free:
         return
-    track = search.evaluator.tracks[0]
+    track = search.evaluator.prepared_runs[0]
     initial = dict(zip(("q", "qd"), track.initial_state_guess.tolist(), strict=True)) | {
         k: v for k, v in found.change.items() if k in ("q", "qd")
     }
@@ -92,9 +92,9 @@ def test_an_input_is_made_smaller_or_larger():
     made = recording("slider", runs=1, seconds=1, rate=50, inputs=["u=square:1:1"], noise=["0.003"],
                      effects=["input.gain=0.2"])  # fmt: skip
     search, model, rival = rivals(made, 0.003, ("input.deadband", "friction.coulomb"))
-    before = search.evaluator.simulations
+    before = search.evaluator.simulation_count
     found = propose_discriminating_run(search, model, rival)
     assert np.isfinite(found.apart)
-    assert search.evaluator.simulations - before == 2 * (1 + 6 + 2), (
+    assert search.evaluator.simulation_count - before == 2 * (1 + 6 + 2), (
         "twice as long, each state three ways, the input two"
     )

@@ -67,7 +67,9 @@ def world_of(kind, command, begin=0.0):
     recording = RunEvaluator(
         kind, Recording("x.csv", kind.name, "", {}, {}, (run,)), (run,), None, candidates=()
     )
-    fit = SimpleNamespace(theta=recording.get_nominal_theta(), states=recording.guess)
+    fit = SimpleNamespace(
+        theta=recording.get_nominal_theta(), initial_states=recording.initial_state_guesses
+    )
     return recording, SimpleNamespace(fit=fit, effects=())
 
 
@@ -180,7 +182,7 @@ def test_every_simple_run_of_a_robot_is_within_the_limits(tmp_path):
     assert len(runs) > 4
     for run in runs:
         assert np.abs(run.scenario.inputs["u.m"]).max() <= 1.0
-        states = dict(zip(evaluator.states, run.states, strict=True))
+        states = dict(zip(evaluator.state_names, run.states, strict=True))
         assert abs(states["q.hip"]) <= 0.9
         assert states["qd.hip"] == 0.0
         assert "commands limited" in run.says

@@ -48,7 +48,9 @@ def arm(tmp_path_factory):
         run = Run("1", TIMES, channels, inputs, {}, {}, held_out=False)
         recording = Recording(Path("x.csv"), kind.name, "", {}, {}, (run,))
         evaluator = RunEvaluator(kind, recording, (run,), None, candidates=())
-        fit = SimpleNamespace(theta=evaluator.get_nominal_theta(), states=evaluator.guess)
+        fit = SimpleNamespace(
+            theta=evaluator.get_nominal_theta(), initial_states=evaluator.initial_state_guesses
+        )
         return evaluator, SimpleNamespace(fit=fit, effects=())
 
     return made

@@ -49,7 +49,7 @@ def test_restitution_that_a_fall_does_not_touch_is_reported_and_stays_nominal():
     base = fit_base_model(there, white(there, 0.005))
     assert base.insensitive_parameters == frozenset({0})
     assert base.fit.theta[0] == there.get_nominal_theta()[0] == 0.5
-    assert base.fit.free.size == 0
+    assert base.fit.free_indices.size == 0
     assert base.fit.cost / np.isfinite(there.observed).sum() == pytest.approx(1.0, abs=0.2)
 
     # One run with an impact is enough.
@@ -66,10 +66,10 @@ def test_a_given_start_is_where_it_begins():
     noise = white(there, [0.003, 0.02])
     many = fit_base_model(there, noise)
     # Number of simulations of the fit with many starts.
-    before = there.simulations
+    before = there.simulation_count
     one = fit_base_model(there, noise, np.array([5.9e-3]))
     assert one.fit.theta[0] == pytest.approx(many.fit.theta[0], rel=1e-4)
-    assert there.simulations - before < 0.6 * before, "a single start costs less"
+    assert there.simulation_count - before < 0.6 * before, "a single start costs less"
 
 
 @pytest.mark.parametrize("dim", [1, 2, 3])

@@ -39,8 +39,8 @@ def search_of(there, phi, seed=0):
 
 
 def entered(search, theta, iterations, noise=None, exact=False):
-    start = FitStart((NAME,), np.array(theta), search.evaluator.guess)
-    fitter = TrajectoryFitter(search.evaluator, noise or search.noise, exact=exact)
+    start = FitStart((NAME,), np.array(theta), search.evaluator.initial_state_guesses)
+    fitter = TrajectoryFitter(search.evaluator, noise or search.noise, is_final_fit=exact)
     return search.add_fit(fitter.fit_models([start], iterations)[0])
 
 
@@ -58,8 +58,10 @@ def test_it_is_where_generalised_least_squares_ends(there, phi):
     told = search.fit_to_convergence(begun)
     assert told.likelihood.phi[0] == pytest.approx(phi, abs=0.12)
     noise = autoregressive(there, told.likelihood.sigma[0], told.likelihood.phi)
-    start = FitStart((NAME,), np.array([1.1, 0.1]), there.guess)
-    best = search._rate_fit(TrajectoryFitter(there, noise, exact=True).fit_models([start], 60)[0])
+    start = FitStart((NAME,), np.array([1.1, 0.1]), there.initial_state_guesses)
+    best = search._rate_fit(
+        TrajectoryFitter(there, noise, is_final_fit=True).fit_models([start], 60)[0]
+    )
     assert off(search, told, best) < 0.05
     assert off(search, begun, best) > 0.3
     assert search.models[frozenset({NAME})] is told
@@ -98,7 +100,9 @@ def test_a_residual_that_is_no_noise_does_not_bias_it(there):
     there.observed[...] += 0.5 * (times / times[-1])[None, :, None] ** 3
     begun = entered(search, [MASS, DRAG], 60, exact=True)
     noise = autoregressive(there, begun.likelihood.sigma[0], begun.likelihood.phi)
-    (fit,) = TrajectoryFitter(there, noise, exact=True).fit_models([begun.fit.make_start()], 60)
+    (fit,) = TrajectoryFitter(there, noise, is_final_fit=True).fit_models(
+        [begun.fit.make_start()], 60
+    )
     pulled = search._rate_fit(
         replace(fit, cost=TrajectoryFitter(there, search.noise).compute_cost(fit))
     )

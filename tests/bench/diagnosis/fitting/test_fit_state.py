@@ -20,7 +20,7 @@ def linear(theta, states):
 
 def at(theta, states, jacobian):
     start = FitStart((), np.array(theta), np.array(states))
-    return FitPoint(start, linear(start.theta, start.states), jacobian, 1.0)
+    return FitPoint(start, linear(start.theta, start.initial_states), jacobian, 1.0)
 
 
 def problem(jacobian, steps=None):
@@ -79,10 +79,10 @@ def test_what_has_converged_with_derivatives_of_another_point_is_not_believed():
 def test_known_derivatives_follow_the_parameters_that_they_are_by():
     known = KnownJacobian(np.array([0, 4, 5]), TRUE[..., :3])
     fewer = known.drop_parameters([4])
-    assert fewer.free.tolist() == [0, 5]
+    assert fewer.free_indices.tolist() == [0, 5]
     assert np.array_equal(fewer.jacobian, TRUE[..., [0, 2]])
     more = fewer.add_parameters(range(7, 9), TRUE[..., 3:])
-    assert more.free.tolist() == [0, 5, 7, 8]
+    assert more.free_indices.tolist() == [0, 5, 7, 8]
     assert np.array_equal(more.jacobian, TRUE[..., [0, 2, 3, 4]])
 
 
@@ -105,6 +105,6 @@ def test_a_rough_fit_ends_at_gains_that_its_own_derivatives_do_not_predict(
     rough, decrease, is_finished
 ):
     state = problem(TRUE)
-    state.rough, state.is_final_fit, state.predicted_decrease = rough, True, 0.3
+    state.has_rough_cost, state.is_final_fit, state.predicted_decrease = rough, True, 0.3
     state.accept_step(decrease, 1000.0, is_own_jacobian=True)
     assert state.is_finished == is_finished

@@ -59,7 +59,9 @@ def test_what_is_held_or_damped_forgets_and_what_swings_or_creeps_does_not(
 ):
     there = evaluator(tmp_path, text)
     noise = NoiseModel(np.array([1e-3]), np.zeros(1))
-    by_states = compute_state_jacobian(there, there.get_nominal_theta(), there.guess)
+    by_states = compute_state_jacobian(
+        there, there.get_nominal_theta(), there.initial_state_guesses
+    )
     assert forgets_initial_state(there, noise, by_states) is expected
     known = np.zeros_like(by_states)
     assert not forgets_initial_state(there, noise, known), (
@@ -71,17 +73,17 @@ def test_a_simulated_element_is_not_simulated_again(tmp_path):
     there = evaluator(tmp_path, ARM.format(damping=0.4, drive=SERVO))
     theta = np.tile(there.get_nominal_theta(), (3, 1))
     runs = np.array([0, 1, 0])
-    states = there.guess[runs] + np.array([[0.0], [0.0], [0.1]])
+    states = there.initial_state_guesses[runs] + np.array([[0.0], [0.0], [0.1]])
     first = there.simulate(theta, runs, states)
-    assert there.simulations == 3
+    assert there.simulation_count == 3
     again = there.simulate(theta[::-1], runs[::-1], states[::-1])
-    assert there.simulations == 3
+    assert there.simulation_count == 3
     np.testing.assert_array_equal(again[::-1], first)
     # A part of a run is a separate batch element with its own simulation.
     half = there.simulate(theta[:1], runs[:1], states[:1], 0.5)
-    assert there.simulations == 4
+    assert there.simulation_count == 4
     assert np.isnan(half).any()
     # A correction of all simulations is not part of the cached results.
-    there.correction = np.full(there.observed.shape, 1.0)
+    there.discretisation_correction = np.full(there.observed.shape, 1.0)
     np.testing.assert_array_equal(there.simulate(theta, runs, states), first + 1.0)
-    assert there.simulations == 4
+    assert there.simulation_count == 4

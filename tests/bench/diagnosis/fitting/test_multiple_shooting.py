@@ -29,20 +29,20 @@ LONG = recorded(Pendulum(), [0.0035], STARTS, TIMES, noise=SIGMA)
 def test_pieces_are_the_runs_cut_up_and_nothing_else():
     there = evaluator(LONG)
     cut = make_segment_evaluator(there)
-    assert len(cut.tracks) == 2 * SEGMENTS_PER_RUN
-    again = np.concatenate([t.scenario.times for t in cut.tracks[:SEGMENTS_PER_RUN]])
+    assert len(cut.prepared_runs) == 2 * SEGMENTS_PER_RUN
+    again = np.concatenate([t.scenario.times for t in cut.prepared_runs[:SEGMENTS_PER_RUN]])
     assert again.tolist() == TIMES.tolist(), "time goes on, as what is periodic must"
     assert (
-        np.concatenate([t.observed for t in cut.tracks[SEGMENTS_PER_RUN:]]).tolist()
-        == there.tracks[1].observed.tolist()
+        np.concatenate([t.observed for t in cut.prepared_runs[SEGMENTS_PER_RUN:]]).tolist()
+        == there.prepared_runs[1].observed.tolist()
     )
     assert [p.name for p in cut.parameters] == [p.name for p in there.parameters]
-    assert cut.longest == there.longest
+    assert cut.longest_duration == there.longest_duration
 
 
 def test_what_is_known_of_the_beginning_is_known_of_the_first_piece_alone():
     told = with_runs(LONG, [replace(run, initial={"q": 1.2}) for run in LONG.runs])
-    known = make_segment_evaluator(evaluator(told)).known[:, 0]
+    known = make_segment_evaluator(evaluator(told)).known_state_mask[:, 0]
     assert known.tolist() == ([True] + [False] * (SEGMENTS_PER_RUN - 1)) * 2
 
 
@@ -52,7 +52,7 @@ def test_runs_too_short_for_two_pieces_are_left_alone():
     short = recorded(Pendulum(), [0.0035], STARTS[:1], times, noise=SIGMA)
     assert make_segment_evaluator(evaluator(short)) is None
     both = with_runs(short, [*short.runs, LONG.runs[0]])
-    assert len(make_segment_evaluator(evaluator(both)).tracks) == 1 + SEGMENTS_PER_RUN
+    assert len(make_segment_evaluator(evaluator(both)).prepared_runs) == 1 + SEGMENTS_PER_RUN
 
 
 def test_over_pieces_the_sum_of_squares_has_one_minimum_where_whole_runs_have_many():
@@ -65,9 +65,11 @@ def test_over_pieces_the_sum_of_squares_has_one_minimum_where_whole_runs_have_ma
         for inertia in inertias:
             theta = some.get_nominal_theta()
             theta[0] = inertia
-            starts.append(FitStart((), theta, some.guess))
+            starts.append(FitStart((), theta, some.initial_state_guesses))
         # Fit the initial states at each inertia.
-        fits = TrajectoryFitter(some, white(some, SIGMA), parameters=False).fit_models(starts, 8)
+        fits = TrajectoryFitter(some, white(some, SIGMA), fits_parameters=False).fit_models(
+            starts, 8
+        )
         cost = np.array([f.cost for f in fits])
         left, here, right = cost[:-2], cost[1:-1], cost[2:]
         lower = (here < left) & (here < right)
@@ -86,11 +88,11 @@ def test_a_fit_of_pieces_begins_that_of_whole_runs_with_their_first_pieces():
     # On whole runs, a fit from this start does not reach the true parameters.
     theta = cut.get_nominal_theta()
     theta[0] = 0.0045
-    begun = FitStart((), theta, cut.guess)
+    begun = FitStart((), theta, cut.initial_state_guesses)
     found = TrajectoryFitter(cut, white(cut, SIGMA)).fit_models([begun], 12)[0]
     start = join_segment_fits(there, found)
-    assert start.states.tolist() == found.states[[0, SEGMENTS_PER_RUN]].tolist()
-    without = FitStart((), theta, there.guess)
+    assert start.initial_states.tolist() == found.initial_states[[0, SEGMENTS_PER_RUN]].tolist()
+    without = FitStart((), theta, there.initial_state_guesses)
     fits = TrajectoryFitter(there, white(there, SIGMA)).fit_models([start, without], 20)
     assert fits[0].theta[0] == pytest.approx(0.0035, rel=1e-3)
     assert fits[1].cost > 100.0 * fits[0].cost

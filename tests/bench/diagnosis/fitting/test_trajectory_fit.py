@@ -36,7 +36,7 @@ def swings():
 
 def fitted(there, theta=None, sigma=1e-3, iterations=30, states=None, effects=(), **options):
     theta = there.get_nominal_theta() if theta is None else theta
-    start = FitStart(effects, theta, there.guess if states is None else states)
+    start = FitStart(effects, theta, there.initial_state_guesses if states is None else states)
     return TrajectoryFitter(there, white(there, sigma), **options).fit_models([start], iterations)[
         0
     ]
@@ -48,7 +48,7 @@ def test_parameters_and_initial_states_of_noiseless_runs_come_back():
     assert there.observed.shape == (3, 130, 2)
     assert fit.theta[0] == pytest.approx(TRUTH, rel=2e-5)
     released = [[0.7, 0], [-1.2, 0], [2.2, 0]]
-    np.testing.assert_allclose(fit.states, released, atol=1e-3)
+    np.testing.assert_allclose(fit.initial_states, released, atol=1e-3)
     seen = np.isfinite(there.observed)
     # The deviation is below the assumed noise, in rad and rad/s.
     assert np.abs(fit.simulated - there.observed)[seen].max() < 1e-3
@@ -70,14 +70,14 @@ def test_restitution_and_six_initial_states_of_noiseless_bounces():
         [0, 0, 2, 1, 0, 0.5],
         [0, 0.3, 3, 0, -0.7, 0],
     ]
-    np.testing.assert_allclose(fit.states, expected, atol=1e-4)
+    np.testing.assert_allclose(fit.initial_states, expected, atol=1e-4)
 
 
 def test_an_effect_is_fitted_with_the_parameters():
     made = recording(effects=["drag.linear=8e-4"], theta=["2.7e-3"], runs=2, seconds=1.5, rate=60)
     there = evaluator(made, candidates=["drag.linear", "friction.coulomb"])
     fit = fitted(there, effects=("drag.linear",))
-    assert list(fit.free) == [0, 1]
+    assert list(fit.free_indices) == [0, 1]
     assert fit.theta[0] == pytest.approx(TRUTH, rel=1e-4)
     assert fit.theta[1] == pytest.approx(8e-4, rel=1e-3)
     assert fit.theta[2] == 0
@@ -91,7 +91,7 @@ def test_the_jacobian_is_the_derivative():
         moved = np.tile(fit.theta, (2, 1))
         moved[:, column] += [step, 2 * step]  # drag cannot be negative
         thetas = [np.tile(theta, (3, 1)) for theta in moved]
-        one, two = (there.simulate(theta, runs, fit.states) for theta in thetas)
+        one, two = (there.simulate(theta, runs, fit.initial_states) for theta in thetas)
         # This is a second-order one-sided difference with three points.
         forward = (4 * one - two - 3 * fit.simulated) / (2 * step)
         near = np.isfinite(forward)
@@ -112,14 +112,14 @@ def test_several_models_in_one_call_equal_one_by_one():
     ):
         theta = there.get_nominal_theta()
         theta[0] = inertia
-        starts.append(FitStart(effects, theta, there.guess))
+        starts.append(FitStart(effects, theta, there.initial_state_guesses))
     fitter = TrajectoryFitter(there, white(there, 1e-3))
     together = fitter.fit_models(starts, 6)
     alone = [fitter.fit_models([start], 6)[0] for start in starts]
     for a, b in zip(together, alone, strict=True):
         assert a.effects == b.effects
         np.testing.assert_allclose(a.theta, b.theta, rtol=1e-9, atol=1e-15)
-        np.testing.assert_allclose(a.states, b.states, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(a.initial_states, b.initial_states, rtol=1e-9, atol=1e-12)
         assert a.cost == pytest.approx(b.cost, rel=1e-6, abs=1e-9)
 
 
@@ -134,7 +134,7 @@ def test_missing_samples_change_nothing_but_what_is_known():
     fit = fitted(there)
     assert np.isnan(there.observed).sum() > 200
     assert fit.theta[0] == pytest.approx(TRUTH, rel=2e-5)
-    np.testing.assert_allclose(fit.states[:, 0], [0.7, -1.2, 2.2], atol=1.5e-4)
+    np.testing.assert_allclose(fit.initial_states[:, 0], [0.7, -1.2, 2.2], atol=1.5e-4)
 
 
 def test_only_the_first_share_counts():
@@ -177,9 +177,9 @@ def test_frozen_parameters_and_known_initial_states_stay():
     runs = [replace(run, initial={"q": q}) for run, q in zip(made.runs, stated, strict=True)]
     there = evaluator(replace(made, runs=tuple(runs)))
     fit = fitted(there)
-    assert tuple(fit.states[:, 0]) == stated
-    assert (there.known == [[True, False]] * 3).all()
-    assert np.abs(fit.states[1:, 1]).max() > 0
+    assert tuple(fit.initial_states[:, 0]) == stated
+    assert (there.known_state_mask == [[True, False]] * 3).all()
+    assert np.abs(fit.initial_states[1:, 1]).max() > 0
     frozen = fitted(evaluator(made), frozen=frozenset({0}))
     assert frozen.theta[0] == 3.3e-3
     assert frozen.free.size == 0
@@ -194,8 +194,8 @@ def test_no_derivative_is_simulated_by_what_is_known():
     runs = [replace(run, initial=known) for run, known in zip(made.runs, told, strict=True)]
     there = evaluator(replace(made, runs=tuple(runs)))
     fit = fitted(there, iterations=0)
-    assert there.simulations == 3 * (1 + 1 + 1), "as it is, the inertia moved, the rate moved"
-    usual = fitted(evaluator(made), iterations=0, states=there.guess)
+    assert there.simulation_count == 3 * (1 + 1 + 1), "as it is, the inertia moved, the rate moved"
+    usual = fitted(evaluator(made), iterations=0, states=there.initial_state_guesses)
     np.testing.assert_array_equal(fit.jacobian[..., 0], usual.jacobian[..., 0])
     assert not fit.jacobian[..., 1].any()
     assert not fit.jacobian[0, ..., 2].any(), "a state that only one run states"
@@ -226,7 +226,7 @@ def test_least_squares_with_coloured_noise_is_generalised():
             noise[t] = 0.95 * noise[t - 1] + np.sqrt(1 - 0.95**2) * noise[t]
         run = changed(clean.runs[0], q=lambda v, noise=noise: v + 0.02 * noise)
         there = evaluator(replace(clean, runs=(run,)))
-        start = FitStart((), there.get_nominal_theta(), there.guess)
+        start = FitStart((), there.get_nominal_theta(), there.initial_state_guesses)
         # The noise is treated once as white and once as AR(1).
         fitters = [
             TrajectoryFitter(there, noise)

@@ -42,16 +42,18 @@ def theta_of(evaluator, name, c):
 
 def motion_with(evaluator, theta):
     """Return the linear model about the motion simulated with these parameters."""
-    half = len(evaluator.states) // 2
-    start = evaluator.guess[0, :half], evaluator.guess[0, half:]
-    simulated = MeasuredLinear(evaluator.simulator, theta, evaluator.tracks[0].scenario, start)
+    half = len(evaluator.state_names) // 2
+    start = evaluator.initial_state_guesses[0, :half], evaluator.initial_state_guesses[0, half:]
+    simulated = MeasuredLinear(
+        evaluator.simulator, theta, evaluator.prepared_runs[0].scenario, start
+    )
     x, v, _ = simulated.trajectory
     nothing = FloatingState(np.zeros((len(x), 0)), np.zeros((len(x), 0)))
     motion = Trajectory(x, v, nothing)
     return MeasuredLinear(
         evaluator.simulator,
         evaluator.get_nominal_theta(),
-        evaluator.tracks[0].scenario,
+        evaluator.prepared_runs[0].scenario,
         start,
         motion,
     )
@@ -59,7 +61,7 @@ def motion_with(evaluator, theta):
 
 def added(linear, evaluator, name, c):
     """Return the force and readings that an effect adds about the motion, at zero deviation."""
-    size = 2 * (len(evaluator.states) // 2)
+    size = 2 * (len(evaluator.state_names) // 2)
     return linear.added(
         [(evaluator.available_effects[name], c)], np.zeros((linear.knots.size, size))
     )
@@ -73,7 +75,7 @@ def test_the_model_misses_a_motion_by_what_the_missing_effect_adds(evaluator, na
     maps = linear.interval_maps()
     pushed, _ = added(linear, evaluator, name, c)
     expected = (maps.inputs @ pushed)[:, :, 0]
-    joints = len(evaluator.states) // 2
+    joints = len(evaluator.state_names) // 2
     # Only velocities are compared: the model uses the mean force, which moves positions
     # differently.
     found, wanted = maps.defects[:, joints:], expected[:, joints:]
@@ -97,7 +99,7 @@ def test_a_sensor_effect_changes_readings_alone(evaluator):
 def test_a_gain_of_a_sensor_acts_on_what_is_predicted(evaluator):
     """If the gain scaled the reading itself, it would explain the noise."""
     linear = motion_with(evaluator, evaluator.get_nominal_theta())
-    predicted = np.zeros((linear.knots.size, 2 * (len(evaluator.states) // 2)))
+    predicted = np.zeros((linear.knots.size, 2 * (len(evaluator.state_names) // 2)))
     elbow = evaluator.channels.index("q.elbow")
     predicted[:, evaluator.simulator.system.coordinates.index("q.elbow")] = 0.2
     _, readings = linear.added(
@@ -109,13 +111,13 @@ def test_a_gain_of_a_sensor_acts_on_what_is_predicted(evaluator):
 
 def test_jacobians_of_other_commands_are_not_used_again(evaluator):
     """Delayed steps change between samples, so the model is evaluated at more times."""
-    scenario, half = evaluator.tracks[0].scenario, len(evaluator.states) // 2
+    scenario, half = evaluator.prepared_runs[0].scenario, len(evaluator.state_names) // 2
     steps = {name: np.full_like(values, values[0]) for name, values in scenario.inputs.items()}
     for values in steps.values():
         for sample in (3, 8, 14, 21, 29):
             values[sample:] += 0.06
     scenario = replace(scenario, inputs=steps)
-    start = evaluator.guess[0, :half], evaluator.guess[0, half:]
+    start = evaluator.initial_state_guesses[0, :half], evaluator.initial_state_guesses[0, half:]
     nominal = MeasuredLinear(evaluator.simulator, evaluator.get_nominal_theta(), scenario, start)
     delayed = theta_of(evaluator, "input.delay@m_shoulder", (0.013,))
     given = delayed, scenario, start, nominal.trajectory
@@ -130,10 +132,13 @@ def test_maps_carry_a_deviation_as_the_simulator_does(evaluator):
     """Compare a state deviation mapped to the next sample with that of two simulations."""
     linear = motion_with(evaluator, evaluator.get_nominal_theta())
     maps = linear.interval_maps()
-    half = len(evaluator.states) // 2
+    half = len(evaluator.state_names) // 2
     moved = 1e-5
-    scenario = evaluator.tracks[0].scenario
-    start = evaluator.guess[0, :half].copy(), evaluator.guess[0, half:].copy()
+    scenario = evaluator.prepared_runs[0].scenario
+    start = (
+        evaluator.initial_state_guesses[0, :half].copy(),
+        evaluator.initial_state_guesses[0, half:].copy(),
+    )
     base = MeasuredLinear(evaluator.simulator, evaluator.get_nominal_theta(), scenario, start)
     for column in range(half):
         other = start[0].copy()
@@ -169,12 +174,16 @@ def test_a_quintic_goes_through_values_and_derivatives():
 
 
 def test_control_changes_of_several_runs_are_those_of_each_run(evaluator):
-    half = len(evaluator.states) // 2
+    half = len(evaluator.state_names) // 2
     linear = [
         MeasuredLinear(evaluator.simulator, evaluator.get_nominal_theta(), track.scenario, start)
         for track, start in zip(
-            evaluator.tracks,
-            zip(evaluator.guess[:, :half], evaluator.guess[:, half:], strict=True),
+            evaluator.prepared_runs,
+            zip(
+                evaluator.initial_state_guesses[:, :half],
+                evaluator.initial_state_guesses[:, half:],
+                strict=True,
+            ),
             strict=True,
         )
     ]

@@ -24,7 +24,7 @@ def search_of(*models, excess=None):
     return SimpleNamespace(
         models=table,
         settled_effects=None,
-        compute_excess=lambda m: excesses.get(m.effects, 0.0),
+        compute_excess_residual=lambda m: excesses.get(m.effects, 0.0),
         remove_effect=lambda m, name: table[frozenset(m.effects) - {name}],
     )
 

@@ -33,7 +33,7 @@ from tests.bench.diagnosis.explained_samples import evaluator, recording, search
 
 def fitted(there):
     return TrajectoryFitter(there, white(there, 0.003)).fit_models(
-        [FitStart((), there.get_nominal_theta(), there.guess)], 20
+        [FitStart((), there.get_nominal_theta(), there.initial_state_guesses)], 20
     )[0]
 
 
@@ -60,8 +60,8 @@ def test_a_direction_is_the_derivative_of_the_trajectory(swing, effect, size):
     there, fit = swing
     found = compute_directions(there, fit, [effect])
     (column,) = of(found, effect)
-    for r, track in enumerate(there.tracks):
-        initial = dict(zip(there.states, fit.states[r].tolist(), strict=True))
+    for r, track in enumerate(there.prepared_runs):
+        initial = dict(zip(there.state_names, fit.initial_states[r].tolist(), strict=True))
         scenario = Scenario(track.scenario.times, initial)
         with_it, without = (
             Pendulum(fixed={effect: c}, time_step=1e-3).simulate(fit.theta[None, :1], scenario)[0]
@@ -104,13 +104,13 @@ def test_driven_runs_try_limits_of_the_input():
     limits = sorted(
         found.candidates[i].coefficients[0]
         for i in of(found, "input.saturation")
-        if found.candidates[i].fixed
+        if found.candidates[i].is_single_size
     )
     np.testing.assert_allclose(limits, [0.3, 0.7, 1.2, 1.7, 1.9, 1.98], rtol=2e-3)
     (gain,) = of(found, "input.gain")
-    assert found.candidates[gain].signed
+    assert found.candidates[gain].can_be_negative
     x = found.responses[0, :, there.channels.index("x"), gain]
-    expected = there.tracks[0].observed[:, there.channels.index("x")]
+    expected = there.prepared_runs[0].observed[:, there.channels.index("x")]
     np.testing.assert_allclose(
         x, expected, atol=0.02
     )  # equals the response of a slider at rest to the input
@@ -121,15 +121,17 @@ def test_shapes_are_laid_on_a_grid_and_those_of_one_shape_act_together(swing):
     found = compute_directions(there, fit, ["friction.stribeck", "force.periodic"])
     groups = {}
     for i in of(found, "friction.stribeck"):
-        groups.setdefault(found.candidates[i].group, []).append(found.candidates[i])
+        groups.setdefault(found.candidates[i].grid_point, []).append(found.candidates[i])
     assert len(groups) == SHAPE_GRID_SIZE
     for members in groups.values():
-        assert {p.place for p in members} == {0, 1}, "coulomb and extra, at one Stribeck speed"
+        assert {p.coefficient_index for p in members} == {0, 1}, (
+            "coulomb and extra, at one Stribeck speed"
+        )
         assert len({p.coefficients[2] for p in members}) == 1
-        assert not any(p.signed for p in members)
+        assert not any(p.can_be_negative for p in members)
     speeds = sorted({members[0].coefficients[2] for members in groups.values()})
     np.testing.assert_allclose([speeds[0], speeds[-1]], [0.02, 2.0], rtol=1e-12)
-    frequencies = {found.candidates[i].group for i in of(found, "force.periodic")}
+    frequencies = {found.candidates[i].grid_point for i in of(found, "force.periodic")}
     assert 4 <= len(frequencies) <= MAX_FREQUENCIES
 
 
@@ -140,7 +142,7 @@ def test_what_dies_away_is_tried_at_times_that_the_runs_can_show(swing):
         {float(found.candidates[i].coefficients[2]) for i in of(found, "friction.warming")}
     )
     longest = 3.0 * max(
-        track.scenario.times[-1] - track.scenario.times[0] for track in there.tracks
+        track.scenario.times[-1] - track.scenario.times[0] for track in there.prepared_runs
     )
     np.testing.assert_allclose([times[0], times[-1]], [0.5, longest], rtol=1e-12)
     assert (np.diff(np.log2(times)) <= 1.0).all()
@@ -159,7 +161,7 @@ def test_what_modifies_an_effect_is_tried_with_it():
     winds = {tuple(found.candidates[i].coefficients[1:]) for i in columns}
     assert (0.0, 0.0) in winds, "drag in still air"
     assert len(winds) == 25
-    assert {found.candidates[i].place for i in columns} == {0}
+    assert {found.candidates[i].coefficient_index for i in columns} == {0}
     along = [
         i
         for i in columns
@@ -219,7 +221,7 @@ def test_what_happens_once_is_looked_for_on_the_clock_of_the_stamps():
     q = there.channels.index("q")
     for i in columns:
         instant = found.candidates[i].coefficients[1]
-        for r, track in enumerate(there.tracks):
+        for r, track in enumerate(there.prepared_runs):
             stamps = track.scenario.times
             whole = np.abs(stamps - instant) > 0.6 / 60
             slipped = found.responses[r, whole, q, i]

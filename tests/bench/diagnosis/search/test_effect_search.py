@@ -32,7 +32,8 @@ def test_an_effect_is_taken_that_has_merit_and_is_no_chance(monkeypatch, merit, 
     made = search(
         monkeypatch, is_complete=lambda self, best, doubt: best is not BASE,
         compute_missing_effect_p_value=chance,
-        _search_size=lambda self, best, size: larger, compute_excess=0.1, is_noise_like=False,
+        _search_size=lambda self, best, size: larger, compute_excess_residual=0.1,
+        is_noise_like=False,
         correct_step_errors=lambda self, model: model,
     )  # fmt: skip
     assert made.run() is (larger if taken else BASE)
@@ -51,7 +52,7 @@ def test_where_nothing_suggests_an_effect_none_is_tried(monkeypatch):
 
     asked = {
         "is_complete": plain, "_search_size": grown, "compute_missing_effect_p_value": 0.0,
-        "compute_excess": 0.1, "is_noise_like": False,
+        "compute_excess_residual": 0.1, "is_noise_like": False,
     }  # fmt: skip
     asked["correct_step_errors"] = lambda self, model: model
     assert search(monkeypatch, **asked).run() is LARGER

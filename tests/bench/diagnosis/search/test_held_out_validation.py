@@ -11,8 +11,8 @@ BASE, A, B, BOTH = model(), model("a"), model("b"), model("a", "b")
 
 def test_excess_is_the_residual_above_the_noise():
     trial = HeldOutValidation(*held_out({(): 3.0}))
-    assert trial.compute_excess(()) == pytest.approx(2.0)
-    assert trial.compute_excess((), np.array([1.5])) == pytest.approx(1.0)
+    assert trial.compute_excess_residual(()) == pytest.approx(2.0)
+    assert trial.compute_excess_residual((), np.array([1.5])) == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize(

@@ -29,7 +29,7 @@ def fitted(made, names, values):
     theta = made.evaluator.get_nominal_theta()
     for name in names:
         theta[made.evaluator.coefficient_slices[name]] = values[name]
-    made.refit_models([FitStart(names, theta, made.evaluator.guess)])
+    made.refit_models([FitStart(names, theta, made.evaluator.initial_state_guesses)])
     return made.models[frozenset(names)]
 
 
@@ -79,7 +79,9 @@ def test_data_far_from_the_model_are_explained_by_the_smaller_model(monkeypatch)
     part = fitted(made, ("friction.coulomb",), {"friction.coulomb": 0.5})
     for share, names in ((0.94, model.effects), (0.96, part.effects)):
         excess = {model.effects: share, part.effects: 1.0}
-        monkeypatch.setattr(made, "compute_excess", lambda m, excess=excess: excess[m.effects])
+        monkeypatch.setattr(
+            made, "compute_excess_residual", lambda m, excess=excess: excess[m.effects]
+        )
         better = type(model)(model.fit, model.likelihood, part.penalised_log_likelihood + 5.0)
         assert made.simplify_laws(better).effects == names
 

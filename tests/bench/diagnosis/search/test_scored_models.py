@@ -17,14 +17,14 @@ def test_directions_are_simulated_anew_where_a_model_has_moved(moved, anew):
     recorded = recording("slider", noise=["0.01"], observe=["x"], runs=2, seconds=2.0, rate=50.0)
     search, base = searched(recorded, 0.01, candidates=["friction.coulomb", "spring.linear"])
     search.score_missing_effects(base)
-    once = search.evaluator.simulations
+    once = search.evaluator.simulation_count
     assert search.score_missing_effects(base) is search.cached_scans[frozenset()].scores
 
     shifted = replace(base.fit, simulated=base.fit.simulated + moved * 0.01, cost=0.0)
     search.models[frozenset()] = replace(base, penalised_log_likelihood=-np.inf)
     again = search.add_fit(shifted)
     scores = search.score_missing_effects(again)
-    assert (search.evaluator.simulations > once) is anew
+    assert (search.evaluator.simulation_count > once) is anew
     # The residual is that of the new fit, even if the directions are those of the old one.
     assert scores is not search.superseded_scans.get(frozenset())
     assert set(scores.effects) == {"friction.coulomb", "spring.linear"}
@@ -89,9 +89,9 @@ def test_what_was_scored_longest_ago_makes_room_and_is_scored_again_alike(monkey
     monkeypatch.setattr("bench.diagnosis.search.scored_models.DIRECTION_CACHE_BYTES", 1.5 * size)
     search.score_missing_effects(second)
     assert set(search.cached_scans) == {frozenset(), frozenset(second.effects)}
-    once = search.evaluator.simulations
+    once = search.evaluator.simulation_count
     assert search.score_missing_effects(first) is before
-    assert search.evaluator.simulations == once
+    assert search.evaluator.simulation_count == once
 
     # Extensions of both models are fitted, including those of the dropped model.
     search.refit_extensions([first, second], 3)
@@ -118,6 +118,6 @@ def test_a_survey_of_several_models_reports_each_of_them():
     names = [("friction.coulomb",), ("spring.linear",)]
     search.refit_models([replace(search.base_model.fit.make_start(), effects=one) for one in names])
     heard = Events()
-    search.evaluator.watch = SearchControl(listener=heard)
+    search.evaluator.search_control = SearchControl(listener=heard)
     search.refit_extensions([search.models[frozenset(one)] for one in names], 0)
     assert heard.finished["testing 2 effects added to each of 2 models", 2] == 2

@@ -85,7 +85,7 @@ def test_a_search_that_has_to_end_tells_what_few_samples_support(search, monkeyp
         return model
 
     monkeypatch.setattr(EffectSearch, "add_fit", watched)
-    search.evaluator.watch = ended
+    search.evaluator.search_control = ended
     with pytest.raises(SearchStoppedError):
         search_with_subsampling(search)
     assert search.best_supported_model is not None

@@ -104,7 +104,7 @@ def test_an_effect_that_the_other_runs_do_not_show_predicts_nothing():
     noise = white(there, SIGMA)
     fits = TrajectoryFitter(there, noise).fit_models(
         [
-            FitStart(names, there.get_nominal_theta(), there.guess)
+            FitStart(names, there.get_nominal_theta(), there.initial_state_guesses)
             for names in ((), ("input.gain",))
         ],
         20,

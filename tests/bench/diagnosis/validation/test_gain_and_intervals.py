@@ -146,7 +146,7 @@ def test_intervals_cover_the_true_parameters(phi):
     for _ in range(60):
         there.observed[...] = clean + correlated(rng, phi, 0.004, clean.shape)
         fit = TrajectoryFitter(there, noise).fit_models(
-            [FitStart(("drag.linear",), theta, there.guess)], 12
+            [FitStart(("drag.linear",), theta, there.initial_state_guesses)], 12
         )[0]
         search = EffectSearch(there, noise, frozenset(), rng, marked(there, True))
         found = compute_intervals(search, search.add_fit(fit))
@@ -178,7 +178,7 @@ def test_the_covariance_is_that_of_all_unknowns_at_once(told):
         rows[r, :, 0], rows[r, :, 1 + 2 * r : 3 + 2 * r] = flattened[:, 0], flattened[:, 1:]
     normal = np.einsum("rnk,rnl->kl", rows, rows) + np.diag([0, *[1e-4] * 4])
     # A known initial state is not an unknown.
-    unknown = [0, *(1 + np.flatnonzero(~search.evaluator.known))]
+    unknown = [0, *(1 + np.flatnonzero(~search.evaluator.known_state_mask))]
     inverse = np.linalg.inv(normal[np.ix_(unknown, unknown)])
     # Values in kg^2 m^4 are far below absolute tolerances, so they are scaled.
     known = compute_covariance(search, model)[0, 0]
@@ -208,7 +208,7 @@ def test_a_coordinate_that_is_not_recorded_hides_no_coefficient_of_the_others():
     noise = white(there, 0.003)
     theta = np.array([0.5, 0.2, -0.02])
     fit = TrajectoryFitter(there, noise).fit_models(
-        [FitStart(("lift.magnus",), theta, there.guess)], 8
+        [FitStart(("lift.magnus",), theta, there.initial_state_guesses)], 8
     )[0]
     search = EffectSearch(there, noise, frozenset(), np.random.default_rng(0), marked(there, True))
     _, low, high = compute_intervals(search, search.add_fit(fit))[1]
@@ -237,7 +237,7 @@ def test_what_the_data_do_not_bound_has_no_interval():
     made = recorded(Pendulum(), [3.3e-3], [{"q": 1e-4}], np.arange(60) / 60, [0.01, 0.05])
     there = evaluator(made, candidates=["drag.quadratic"])
     noise = white(there, [0.01, 0.05])
-    start = FitStart(("drag.quadratic",), np.array([3.3e-3, 1e-3]), there.guess)
+    start = FitStart(("drag.quadratic",), np.array([3.3e-3, 1e-3]), there.initial_state_guesses)
     search = EffectSearch(there, noise, frozenset(), np.random.default_rng(0), marked(there, True))
     model = search.add_fit(TrajectoryFitter(there, noise).fit_models([start], 3)[0])
     assert np.isnan(compute_intervals(search, model)[1][1:]).all()
