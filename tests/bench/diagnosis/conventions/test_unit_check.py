@@ -234,7 +234,7 @@ def recognised_of(effect, value):
     subject = Subject(simulators.get("pendulum"), recording, "batch")
     evaluator = RunEvaluator(subject.kind, recording, recording.training(), candidates=[effect])
     number = FittedValue(value, "1", value - 1e-3, value + 1e-3)
-    nowhere = SimpleNamespace(free=np.array([], dtype=int), theta=np.array([]))
+    nowhere = SimpleNamespace(free_indices=np.array([], dtype=int), theta=np.array([]))
     cause = Cause(effect, (), "says so", {"coefficient": number}, 0.0)
     return find_imitated_unit(subject, evaluator, cause, nowhere)
 

@@ -27,7 +27,9 @@ pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="workers are for
 
 def evaluator(**watch):
     """Return the attributes of a run evaluator that a worker pool needs."""
-    return SimpleNamespace(simulations=0, watch=SearchControl(**watch), worker_pool=None, factor=3)
+    return SimpleNamespace(
+        simulation_count=0, search_control=SearchControl(**watch), worker_pool=None, factor=3
+    )
 
 
 @pytest.fixture(autouse=True)
@@ -160,7 +162,7 @@ def test_workers_end_with_a_parent_that_is_killed():
             os.write(1, f"{os.getpid()}\n".encode())
             time.sleep(60)
         worker_pool.PARALLEL_THRESHOLD_SECONDS = 0.0
-        world = SimpleNamespace(simulations=0, watch=SearchControl(), worker_pool=None)
+        world = SimpleNamespace(simulation_count=0, search_control=SearchControl(), worker_pool=None)
         worker_pool.ForkedWorkerPool(2).map(world, task, [(1,), (2,)])
     """)
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as parent:

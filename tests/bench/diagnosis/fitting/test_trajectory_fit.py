@@ -180,7 +180,7 @@ def test_frozen_parameters_and_known_initial_states_stay():
     assert tuple(fit.initial_states[:, 0]) == stated
     assert (there.known_state_mask == [[True, False]] * 3).all()
     assert np.abs(fit.initial_states[1:, 1]).max() > 0
-    frozen = fitted(evaluator(made), frozen=frozenset({0}))
+    frozen = fitted(evaluator(made), fixed_parameters=frozenset({0}))
     assert frozen.theta[0] == 3.3e-3
     assert frozen.free.size == 0
     alone = fitted(evaluator(made), parameters=False)

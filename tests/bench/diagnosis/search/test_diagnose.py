@@ -67,7 +67,7 @@ def test_a_fuller_account_is_asked_for_where_causes_stand_and_something_is_left(
 ):
     """The larger model is fitted to convergence and its laws are simplified."""
     measured = []
-    watch = SimpleNamespace(watch=None)
+    watch = SimpleNamespace(search_control=None)
     search = SimpleNamespace(
         evaluator=watch,
         fit_to_convergence=lambda m: m,

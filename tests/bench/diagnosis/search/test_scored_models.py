@@ -29,7 +29,7 @@ def test_directions_are_simulated_anew_where_a_model_has_moved(moved, anew):
     assert scores is not search.superseded_scans.get(frozenset())
     assert set(scores.effects) == {"friction.coulomb", "spring.linear"}
     np.testing.assert_array_equal(
-        search.cached_scans[frozenset()].at.simulated, (shifted if anew else base.fit).simulated
+        search.cached_scans[frozenset()].fit.simulated, (shifted if anew else base.fit).simulated
     )
 
 

@@ -42,7 +42,7 @@ def errors(rmse, runs=6, samples=200, seed=0):
 def runs_of(observed):
     return SimpleNamespace(
         observed=observed,
-        tracks=[None] * len(observed),
+        prepared_runs=[None] * len(observed),
         lengths=np.full(len(observed), observed.shape[1]),
     )
 
