@@ -162,7 +162,8 @@ def test_workers_end_with_a_parent_that_is_killed():
             os.write(1, f"{os.getpid()}\n".encode())
             time.sleep(60)
         worker_pool.PARALLEL_THRESHOLD_SECONDS = 0.0
-        world = SimpleNamespace(simulation_count=0, search_control=SearchControl(), worker_pool=None)
+        control = SearchControl()
+        world = SimpleNamespace(simulation_count=0, search_control=control, worker_pool=None)
         worker_pool.ForkedWorkerPool(2).map(world, task, [(1,), (2,)])
     """)
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as parent:
