@@ -370,13 +370,13 @@ def _run_worker(
         evaluator, deadline = evaluators[place], evaluators[place].search_control.deadline
         evaluator.search_control = SearchControl(stop=lambda: ending[0] != 0)
         evaluator.search_control.deadline = deadline
-        before = evaluator.simulations
+        before = evaluator.simulation_count
         result, error, trace = None, None, ""
         try:
             result = task(evaluator, *item)
         except Exception as raised:
             error, trace = raised, traceback.format_exc()
-        count = evaluator.simulations - before
+        count = evaluator.simulation_count - before
         if not _send(
             pipe,
             _Answer(result, error, trace, count, evaluator.search_control.has_abandoned_fits()),

@@ -182,8 +182,8 @@ def test_frozen_parameters_and_known_initial_states_stay():
     assert np.abs(fit.initial_states[1:, 1]).max() > 0
     frozen = fitted(evaluator(made), fixed_parameters=frozenset({0}))
     assert frozen.theta[0] == 3.3e-3
-    assert frozen.free.size == 0
-    alone = fitted(evaluator(made), parameters=False)
+    assert frozen.free_indices.size == 0
+    alone = fitted(evaluator(made), fits_parameters=False)
     assert alone.theta[0] == 3.3e-3
     assert alone.cost > 1e3 * fitted(evaluator(made)).cost
 
