@@ -1,10 +1,8 @@
-"""Measure a comparison page against cocopp's: seconds, bytes and response time.
+"""Measure a comparison page: seconds, bytes and response time.
 
 Run: `python -m tests.benchmarks.page_sizes`. Prints one JSON line per measurement; seconds are
 processor time, except those of the browser and where the clock is named. The response to a click is
 complete when the next frame is painted: the `duration` of the browser's Event Timing (8 ms steps).
-cocopp comes from the Python in $PEERS, or is installed into a temporary environment; it gets the
-same number of runs of the same length (`tests.benchmarks.coco_bbob`).
 """
 
 from __future__ import annotations
@@ -25,7 +23,6 @@ from bench.benchmark.report_page.comparison_page import render_page
 from bench.benchmark.report_page.comparison_page_data import ComparisonReportData
 from bench.benchmark.results_report import _render_figures, build_tables
 from bench.benchmark.storage.result_folder import StoredComparison
-from tests.benchmarks import coco_bbob
 from tests.browser import Opened, launched
 
 TUNERS = ("random", "cma_es", "nelder_mead", "bayes", "least_squares", "tunenet")
@@ -121,12 +118,10 @@ def ours(browser, place, targets, budget):
 
 
 def main():
-    with tempfile.TemporaryDirectory() as folder:
-        with launched() as browser:
-            # The first comparison is small, because its time includes imports.
-            for targets, budget in ((5, 20), (60, 100), (825, 100)):
-                ours(browser, Path(folder), targets, budget)
-        coco_bbob.measured(Path(folder), 100)
+    with tempfile.TemporaryDirectory() as folder, launched() as browser:
+        # The first comparison is small, because its time includes imports.
+        for targets, budget in ((5, 20), (60, 100), (825, 100)):
+            ours(browser, Path(folder), targets, budget)
 
 
 if __name__ == "__main__":

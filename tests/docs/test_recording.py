@@ -14,7 +14,24 @@ from tests.docs.documentation_pages import blocks, quoted, section, tables, text
 
 PAGE = text_of("recording.md")
 BLOCKS = dict(blocks(PAGE))
-FAULTS = tables(section(PAGE, "## Error messages"))[0][1:]
+MORE_ERRORS = """
+| `swing.csv` | `run,t,` | `run,time,` | `swing.csv: expected column 't', found columns run, time, u, q, temperature` |
+| `swing.csv` | `light,0.02,0,19.6,` | `light,0.02,,19.6,` | `swing.csv, row 3, column u: expected a finite number, found ''; an input has no missing samples` |
+| `swing.csv` | `light,0.02,` | `light,0.00,` | `swing.csv, row 3, column t: expected more than 0 s, found 0 s` |
+| `swing.csv` | `heavy,0.02,` | `other,0.02,` | `swing.csv, row 6, column run: run 'heavy' has one row; expected at least two` |
+| `swing.toml` | `system = ` | `title2 = ` | `unknown entry of swing.toml 'title2'; did you mean title?` |
+| `swing.toml` | `noise = 0.2` | `noise = 0` | `swing.toml: channels.q.noise: expected more than 0 (leave it out if unknown), found 0` |
+| `swing.toml` | `[channels.q]` | `[channels.angle]` | `unknown channel in swing.toml 'angle'; there are: q, qd` |
+| `swing.toml` | `[extra.temperature]` | `[extra.pressure]` | `swing.csv: expected column 'pressure', found columns run, t, u, q, temperature` |
+| `swing.toml` | `length = ` | `lenght = ` | `unknown entry in [constants] of swing.toml 'lenght'; there are: gravity, length, mass; did you mean length?` |
+| `swing.toml` | `mass = 0.15` | `mass = -0.15` | `swing.toml: constants.mass: expected more than 0 kg, found -0.15` |
+| `swing.toml` | `held_out = true` | `held_out = "yes"` | `swing.toml: runs.last.held_out: expected true or false, found 'yes'` |
+| `swing.toml` | `qd = 0.0` | `speed = 0.0` | `unknown entry in [runs.last.initial] of swing.toml 'speed'; there are: q, qd` |
+| `swing.toml` | `noise = 0.2` | `noise = 1e300` | `swing.toml: channels.q.noise: expected a number within ±1e+15, found 1e+300` |
+| `swing.toml` | `mass = 0.15` | `mass = 1e12` | `swing.toml: constants.mass: expected 1e-09 to 1e+09 kg, found 1e+12` |
+"""  # noqa: E501 - a row is one line
+"""Further errors, in rows as on the page."""
+ERRORS = tables(section(PAGE, "## Error messages"))[0][1:] + tables(MORE_ERRORS)[0]
 
 
 @pytest.fixture
@@ -49,7 +66,7 @@ def test_the_smallest_description_is_enough(files):
     assert (fitting.times.size, measuring.times.size) == (2, 2)
 
 
-@pytest.mark.parametrize("row", FAULTS, ids=[quoted(row[2])[0] for row in FAULTS])
+@pytest.mark.parametrize("row", ERRORS, ids=[quoted(row[2])[0] for row in ERRORS])
 def test_a_fault_has_the_message_of_the_page(files, row):
     # Columns of the table: file, original text, changed text, message.
     (name,), (before,), (after,), (message,) = map(quoted, row)

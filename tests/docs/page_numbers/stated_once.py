@@ -40,7 +40,7 @@ is yours.
 WIDTH = 120
 REFERENCE_PAGES = (
     "", "ball-drop-video", "bounce-shot", "exam", "multi", "next-recording", "real",
-    "real/datasheets", "robots",
+    "real/datasheets", "robots", "tunenet-study",
 )  # fmt: skip
 """Folders below results/reference whose README.md is registered."""
 
