@@ -43,7 +43,7 @@ TRAINING_RANGE_HALF_WIDTHS = 3.0
 MAX_SYSTEM_NAME_LENGTH = 40
 """Maximum number of characters of the system's name in the name of its extension."""
 
-_SMALLEST = 1e-12
+_MIN_HALF_WIDTH = 1e-12
 """Minimum half width of the training range in the number's unit; otherwise it is empty about 0."""
 
 _KEYS = (
@@ -418,7 +418,7 @@ def _coefficients(extended: ExtendedSimulator, kind: type[SystemSimulator]) -> l
 
 def _at(parameter: Parameter, number: FittedValue) -> Parameter:
     """Set the nominal value of a parameter to a fitted number, with a training range around it."""
-    reach = max(MIN_TRAINING_RANGE_SHARE * abs(number.value), _SMALLEST)
+    reach = max(MIN_TRAINING_RANGE_SHARE * abs(number.value), _MIN_HALF_WIDTH)
     if number.low is not None and number.high is not None:
         reach = max(reach, TRAINING_RANGE_HALF_WIDTHS * (number.high - number.low) / 2.0)
     low, high = parameter.bounds
@@ -470,3 +470,26 @@ def open_extended(
         return replace(extended, kind=kind), kind, make_simulator_class(extended, kind)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
+
+
+def list_effect_coefficients(
+    extended: ExtendedSimulator, kind: type[Simulator]
+) -> dict[str, list[float]]:
+    """List the coefficients of an extended simulator by effect, in the order of the effect.
+
+    Args:
+        extended: the extended simulator.
+        kind: class of the simulator.
+
+    Raises:
+        InputError: the simulator does not support effects.
+    """
+    if not issubclass(kind, SystemSimulator):
+        raise InputError(f"simulator {kind.name} takes no effects, and cannot be extended")
+    coefficients = {}
+    for name, numbers in extended.effects.items():
+        declared_effect = library.find_effect(name, kind.system).on(kind.system)
+        coefficients[name] = [
+            numbers[c.name].value if c.name in numbers else 0.0 for c in declared_effect
+        ]
+    return coefficients

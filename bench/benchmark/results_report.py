@@ -234,7 +234,9 @@ def _describe_best_tuners(view: ComparisonView) -> list[str]:
     statistics, texts = view.statistics, []
     label = view.format_metric_label(view.shown_metric)
     for kind in view.ranges:
-        range_text = f"{headline.WHERE[kind]}, {headline.format_target_count(statistics, kind)}"
+        range_text = (
+            f"{headline.RANGE_PHRASES[kind]}, {headline.format_target_count(statistics, kind)}"
+        )
         lines = [
             f"\nbest tuners, {range_text} ({label}; {headline.format_error_floor(statistics)})"
         ]

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_GROUPS = {"untuned": (GREY, "s"), "tuned": (BLUE, "o"), "extended": (VERMILION, "D")}
+_GROUP_STYLES = {"untuned": (GREY, "s"), "tuned": (BLUE, "o"), "extended": (VERMILION, "D")}
 """Colour and marker of each group of methods."""
 _GROUP_LABELS = {
     "untuned": "untuned simulator",
@@ -135,7 +135,7 @@ def _draw_legend(figure: Figure, methods: Sequence[str]) -> None:
 
     present_groups = {get_method_group(method) for method in methods}
     handles = []
-    for group, (colour, marker) in _GROUPS.items():
+    for group, (colour, marker) in _GROUP_STYLES.items():
         if group in present_groups:
             handles.append(Line2D([], [], color=colour, marker=marker, label=_GROUP_LABELS[group]))
     columns = len(handles)
@@ -156,7 +156,7 @@ def draw_miss_figure(settings: ShotConfig, rows: pd.DataFrame) -> Figure:
     miss_axis, error_axis = axes[0]
     for place, method in enumerate(methods):
         part = rows[rows["method"] == method]
-        colour, _ = _GROUPS[get_method_group(method)]
+        colour, _ = _GROUP_STYLES[get_method_group(method)]
         _draw_box_plot(miss_axis, 100 * part["off"].dropna().to_numpy(), place, colour)
         _draw_box_plot(
             error_axis, 100 * part["prediction_error"].dropna().to_numpy(), place, colour

@@ -29,7 +29,7 @@ from sims.core.simulator import InputError
 
 SHOTS_FOLDER = "shots"
 """Name of the folder of finished shots, in the folder of a study."""
-_REMEDY = "damaged; delete it, and resume to repeat it"
+_DAMAGE_ADVICE = "damaged; delete it, and resume to repeat it"
 _NULLABLE_NUMBERS = ("height", "margin", "restitution", "seconds")
 """Numbers of a model that may be missing."""
 
@@ -95,14 +95,14 @@ def read_shot(folder: Path, setup: ShotSetup) -> dict[str, Any] | None:
         _validate_document(document, "models", SHOT_MODEL_COLUMNS)
         _validate_document(document, "rows", tuple(c for c in SHOT_COLUMNS if c.required))
     except CellError as error:
-        raise InputError(f"{path}, {error.says}; {_REMEDY}") from None
+        raise InputError(f"{path}, {error.says}; {_DAMAGE_ADVICE}") from None
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        raise InputError(f"{path}: {_REMEDY}") from None
+        raise InputError(f"{path}: {_DAMAGE_ADVICE}") from None
     expected = (setup.name, [model["method"] for model in document["models"]])
     names = {row["shot"] for row in document["rows"]}, [row["method"] for row in document["rows"]]
     if names != ({expected[0]}, expected[1]):
         message = f"expected a row of {expected[0]} for each model, found others"
-        raise InputError(f"{path}: {message}; {_REMEDY}")
+        raise InputError(f"{path}: {message}; {_DAMAGE_ADVICE}")
     for model in document["models"]:
         # JSON has no NaN, so missing numbers are stored as null.
         model.update({name: math.nan for name in _NULLABLE_NUMBERS if model[name] is None})

@@ -45,7 +45,7 @@ _FLIGHT_STEP = 1e-3
 """Length of a step in flight, s."""
 _CONTACT_STEP = 3e-5
 """Length of a step in contact in seconds, a hundredth of an impact."""
-_IMPEDANCE = 0.9999
+_CONTACT_IMPEDANCE = 0.9999
 """Constraint impedance of the contact, the largest that MuJoCo allows."""
 _MAX_DAMPING_RATIO = 60.0
 """Damping ratio at which the restitution is practically zero."""
@@ -245,7 +245,7 @@ def _render_mjcf(ball: BallKind, ground: InclinedGround) -> str:
           <freejoint/>
           <inertial pos="0 0 0" mass="{ball.mass!r}" diaginertia="{moments}"/>
           <geom type="sphere" size="{ball.radius!r}" condim="1" priority="1"
-            solimp="{_IMPEDANCE} {_IMPEDANCE} 0.001 0.5 2"/>
+            solimp="{_CONTACT_IMPEDANCE} {_CONTACT_IMPEDANCE} 0.001 0.5 2"/>
         </body>
       </worldbody>
     </mujoco>"""

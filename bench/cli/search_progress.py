@@ -19,8 +19,8 @@ LOG_INTERVAL = 10.0
 UPDATE_INTERVAL = 0.5
 """Interval of the timer that updates the display between two events, in seconds."""
 HINT_AFTER = 20.0
-"""Elapsed time after which `HINT` is printed, in seconds."""
-HINT = "add --budget 60 to stop after a minute with the best result so far"
+"""Elapsed time after which `BUDGET_HINT` is printed, in seconds."""
+BUDGET_HINT = "add --budget 60 to stop after a minute with the best result so far"
 MIN_SHARE_FOR_ESTIMATE = 0.02
 """Minimum share of the search that must be done before the remaining time is estimated."""
 MIN_REMAINING_RATIO = 0.5
@@ -186,7 +186,7 @@ class ProgressDisplay(SearchProgress):
     Args:
         budget: Seconds after which the search ends; None without such a limit.
         silent: Whether to show nothing.
-        hint: Whether to print `HINT` in a long search without a budget.
+        hint: Whether to print `BUDGET_HINT` in a long search without a budget.
         stream: Output stream; stderr if None.
         clock: Returns the time in seconds.
     """
@@ -300,7 +300,7 @@ class ProgressDisplay(SearchProgress):
         with self._block_timer_writes():
             if self._hints and self.elapsed() >= HINT_AFTER and self._is_searching:
                 self._hints = False
-                self._waiting.append(HINT)
+                self._waiting.append(BUDGET_HINT)
             self._shown_at = current_time
             if self._live:
                 self._draw_lines()

@@ -38,9 +38,9 @@ from sims.own_simulator import OwnSimulator
 from sims.system_simulator import SystemSimulator
 
 _NAME = re.compile(r"[a-z]+(\.[a-z_]+)?$")
-_SAMPLES = 60
+_SAMPLES_PER_RUN = 60
 """Number of samples of a run."""
-_RATE = 30.0
+_SAMPLING_RATE = 30.0
 """Sampling rate of a run, Hz."""
 
 
@@ -88,7 +88,7 @@ def _choose_engine(host: type[SystemSimulator]) -> str | None:
 
 def _make_scenario(system: type[System]) -> Scenario:
     """Make a run with nonzero velocities in all directions and inputs that change."""
-    times = np.arange(_SAMPLES) / _RATE
+    times = np.arange(_SAMPLES_PER_RUN) / _SAMPLING_RATE
     # Initial values of states that are neither coordinates nor rates, such as levels, are among the
     # rates.
     initial = dict.fromkeys(system.rates, 0.7) | dict.fromkeys(system.coordinates, 0.4)

@@ -16,7 +16,7 @@ from bench.conformance.check_base import NotApplicable, check
 from bench.conformance.toy_problem import make_evaluate, make_task, make_trained_tuner, run_tuner
 from methods.tuner import Tuner
 
-_BUDGET = 5
+_RUN_SIMULATIONS = 5
 """Number of simulations of a run, enough for a tuner to use all of its features."""
 _SEED = 0
 """Seed of the runs that are compared."""
@@ -30,9 +30,9 @@ def check_same_run_when_sealed(kind: type[Tuner]) -> NotApplicable | None:
     tuned = _make_tuner_spec(kind)
     if tuned is None:
         return NotApplicable("its class is in no plugin file and no installed package")
-    local_trace = run_tuner(make_trained_tuner(kind, 2), 2, _BUDGET, _SEED)
+    local_trace = run_tuner(make_trained_tuner(kind, 2), 2, _RUN_SIMULATIONS, _SEED)
     state = make_trained_tuner(kind, 2).state() if kind.learned else None
-    task, _ = make_task(2, _BUDGET)
+    task, _ = make_task(2, _RUN_SIMULATIONS)
     location = f"{kind.__name__}: what needs files, the network or processes; docs/isolation.md"
     try:
         with start_isolated_tuner(tuned, _SEED, "run", state=state) as tuner:

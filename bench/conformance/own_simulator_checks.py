@@ -9,13 +9,13 @@ from sims.core.simulator import Array, InputError, Simulator
 from sims.own_simulator import OwnSimulator
 from sims.own_simulator_engine import inertia_of, observed
 
-_STEPS = 20
+_FORCED_STEPS = 20
 """Number of steps of a run in which a force is applied."""
-_LARGEST = 1e6
+_MAX_TRIED_FORCE = 1e6
 """Maximum force that is tried, in N, N m or m/s^2; a small force may not overcome friction."""
-_LATER = 5
+_CHECKED_STEP = 5
 """Number of steps after which the effect of a force in the first step must not have grown."""
-_GROWN = 2.5
+_GROWTH_RATIO = 2.5
 """Ratio of velocity changes above which the effect of a force has grown."""
 
 
@@ -101,27 +101,31 @@ def check_step_goes_on_by_its_seconds(kind: type[Simulator]) -> NotApplicable | 
         return _NOT_OWN
     simulator = user_class()
     full_change, half_change = (
-        _compute_scaled_change(simulator, user_class.time_step / n, _FEW * n) for n in (1, 2)
+        _compute_scaled_change(simulator, user_class.time_step / n, _COMPARED_STEPS * n)
+        for n in (1, 2)
     )
     simulator.close()
-    has_moved = np.abs(full_change) > _ROUNDING
+    has_moved = np.abs(full_change) > _MIN_MOTION
     if not has_moved.any():
         return NotApplicable("nothing moves")
     ratio = float(np.min(np.abs(half_change[has_moved] / full_change[has_moved])))
-    expected = f"{2 * _FEW} steps of time_step / 2 to reach the same state as {_FEW} of time_step"
+    expected = (
+        f"{2 * _COMPARED_STEPS} steps of time_step / 2 to reach the same state as "
+        f"{_COMPARED_STEPS} of time_step"
+    )
     location = f"{user_class.__name__}.step: the engine must step by `seconds`"
-    check(ratio < _FARTHER, expected, f"{ratio:.2g} times as far", location)
+    check(ratio < _MAX_DISTANCE_RATIO, expected, f"{ratio:.2g} times as far", location)
     return None
 
 
-_FEW = 8
+_COMPARED_STEPS = 8
 """Number of steps that are compared with twice as many of half their length."""
-_FARTHER = 1.6
+_MAX_DISTANCE_RATIO = 1.6
 """Ratio of distances above which the simulator ignores the length of a step.
 
 The ratio is then 2 or more; it is near 1 for any integrator that resolves the motion.
 """
-_ROUNDING = 1e-9
+_MIN_MOTION = 1e-9
 """Minimum change of a channel, in units of its scale, that counts as motion."""
 
 
@@ -160,12 +164,12 @@ def check_forces_act(kind: type[Simulator]) -> NotApplicable | None:
     for place, name in enumerate(user_class.coordinates):
         forced = unforced
         size = 1.0
-        while is_bitwise_equal(unforced, forced) and size <= _LARGEST:
+        while is_bitwise_equal(unforced, forced) and size <= _MAX_TRIED_FORCE:
             force = np.zeros(len(user_class.coordinates))
             force[place] = size
             forced = _simulate_motion(simulator, force)
             size *= 10.0
-        found_text = f"the same motion with forces up to {_LARGEST:g}"
+        found_text = f"the same motion with forces up to {_MAX_TRIED_FORCE:g}"
         check(
             not is_bitwise_equal(unforced, forced),
             f"a force along {name} to change the motion",
@@ -176,7 +180,7 @@ def check_forces_act(kind: type[Simulator]) -> NotApplicable | None:
         reset = f"{user_class.__name__}.reset: it must remove a force that was applied"
         check(is_restored, "the same run after one with forces", "another", reset)
         velocity = np.abs(forced - unforced)[:, len(user_class.coordinates) + place]
-        has_grown = 0.0 < velocity[1] * _GROWN < velocity[_LATER]
+        has_grown = 0.0 < velocity[1] * _GROWTH_RATIO < velocity[_CHECKED_STEP]
         expected = f"a force along {name} to act in the next step alone"
         check(not has_grown, expected, "that it acts in later steps too", location)
     simulator.close()
@@ -188,7 +192,7 @@ def _simulate_motion(simulator: OwnSimulator, force: Array | None) -> Array:
     names = (*simulator.coordinates, *simulator.rates)
     _start_run(simulator)
     rows = []
-    for i in range(_STEPS + 1):
+    for i in range(_FORCED_STEPS + 1):
         observation = simulator.observe()
         rows.append([observed(simulator, observation, name) for name in names])
         if force is not None:

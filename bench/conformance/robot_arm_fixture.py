@@ -52,13 +52,13 @@ ARM_MJCF = """
 The ball at its tip slides on the table where contacts are enabled.
 """
 
-_CONTACT = "table/ball"
+_TESTED_CONTACT = "table/ball"
 """Contact at which effects at contacts act."""
 
 OBSERVED_CHANNELS = ("q.shoulder", "q.elbow", "qd.shoulder", "tau.elbow", "s.wrist.y")
 """Observed channels, one of each kind."""
 
-_SECONDS = 0.8
+_RUN_SECONDS = 0.8
 """Duration of a run in seconds."""
 
 
@@ -74,7 +74,7 @@ def make_arm_simulator(effect: type[Effect]) -> type[RobotSimulator]:
     from sims.robot.robot_simulator import make_robot_simulator
 
     spec = mujoco.MjSpec.from_string(ARM_MJCF)
-    contacts = (_CONTACT,) if effect.at == "contact" else ()
+    contacts = (_TESTED_CONTACT,) if effect.at == "contact" else ()
     if contacts:
         spec.option.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
     robot = RobotModel(Path("checks.xml"), "mjcf", spec, digest="checks", contacts=contacts)
@@ -98,7 +98,7 @@ def list_effect_places(effect: type[Effect]) -> tuple[type[Effect], ...]:
 def make_scenario() -> Scenario:
     """Make a run in which both joints reverse and every command changes."""
     # The first samples are at the ends of simulation steps, the others between them.
-    times = np.concatenate([np.arange(0.0, 0.3, 0.02), np.arange(0.301, _SECONDS, 0.021)])
+    times = np.concatenate([np.arange(0.0, 0.3, 0.02), np.arange(0.301, _RUN_SECONDS, 0.021)])
     initial = {"q.shoulder": 0.4, "q.elbow": -0.7, "qd.shoulder": -1.0, "qd.elbow": 2.0}
     first = np.where(times % 0.4 < 0.2, 0.6, -0.3)
     return Scenario(times, initial, {"u.m_shoulder": first, "u.m_elbow": 0.4 - 2.0 * first})

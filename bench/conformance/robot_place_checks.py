@@ -25,7 +25,7 @@ from sims.core.effect import (
 from sims.core.simulator import Array, InputError
 
 NO_PLACE = NotApplicable("a robot has no place for it")
-_SHARES = (0.3, 0.9)
+_TESTED_RANGE_SHARES = (0.3, 0.9)
 """Fractions of the plausible range at which coefficients of the batch elements are set."""
 
 
@@ -114,7 +114,7 @@ def check_it_acts_at_its_place_alone(effect: type[Effect]) -> NotApplicable | No
     for effect_class in classes:
         location = f"{effect.__name__} at {effect_class.place or 'the world'}"
         thetas = np.concatenate(
-            [_make_coefficients(effect_class, share) for share in (0.05, *_SHARES)]
+            [_make_coefficients(effect_class, share) for share in (0.05, *_TESTED_RANGE_SHARES)]
         )
         observations = kind(observe=OBSERVED_CHANNELS, effects=[effect_class]).simulate(
             thetas, make_scenario()
@@ -197,7 +197,7 @@ def check_lanes_of_a_robot_are_independent(effect: type[Effect]) -> NotApplicabl
     start = 0
     for effect_class in classes:
         end = start + len(effect_class.coefficients)
-        for share in _SHARES:
+        for share in _TESTED_RANGE_SHARES:
             row = rows[0].copy()
             row[:, start:end] = _make_coefficients(effect_class, share)
             rows.append(row)

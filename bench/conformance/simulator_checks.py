@@ -232,7 +232,7 @@ def check_initial_states_show(kind: type[Simulator]) -> NotApplicable | None:
     run = _make_scenario(kind, 600, size=1.0)
     observations = simulator.simulate(theta, run)
     for name, value in kind.states.items():
-        changed_value = value + _MOVED * max(abs(value), scales.get(name, 1.0))
+        changed_value = value + _STATE_CHANGE_SHARE * max(abs(value), scales.get(name, 1.0))
         changed_scenario = Scenario(run.times, {name: changed_value}, run.inputs)
         check(
             not np.array_equal(observations, simulator.simulate(theta, changed_scenario)),
@@ -245,7 +245,7 @@ def check_initial_states_show(kind: type[Simulator]) -> NotApplicable | None:
     return None
 
 
-_MOVED = 0.01
+_STATE_CHANGE_SHARE = 0.01
 """Change of an initial state, as a fraction of its value or of the scale of its channel."""
 
 

@@ -30,7 +30,7 @@ BYTES_PER_STEP = 32
 """Memory of a step of a running simulation in bytes: its length, its end, and applied inputs."""
 BYTES_PER_NUMBER = 8
 """Size of a number in bytes."""
-_CONTROL = Path("/sys/fs/cgroup/memory.max")
+_CONTAINER_LIMIT_FILE = Path("/sys/fs/cgroup/memory.max")
 """File in which Linux states the memory limit of a container."""
 
 
@@ -148,7 +148,7 @@ def _read_memory_limit() -> float:
     with suppress(AttributeError, OSError, ValueError):  # a system that does not state it
         limits.append(float(os.sysconf("SC_PHYS_PAGES")) * os.sysconf("SC_PAGE_SIZE"))
     with suppress(OSError, ValueError):  # no container, or the limit "max"
-        limits.append(float(_CONTROL.read_text()))
+        limits.append(float(_CONTAINER_LIMIT_FILE.read_text()))
     return min(limit for limit in limits if limit > 0)
 
 

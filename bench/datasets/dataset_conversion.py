@@ -15,9 +15,9 @@ Conversion = Callable[[Mapping[str, bytes]], dict[str, Content]]
 
 _PERIOD_MS = 1
 """Sample period of the published file, ms."""
-_EVERY = 5
+_DECIMATION = 5
 """Decimation factor: every fifth sample is kept, which gives 200 Hz."""
-_SAMPLES = 1000
+_SAMPLES_PER_RUN = 1000
 """Number of samples of a run: 5 s at 200 Hz."""
 _HELD_OUT_FROM = 7
 """Number of the first held-out run."""
@@ -51,17 +51,19 @@ def free_swing(files: Mapping[str, bytes]) -> dict[str, Content]:
         InputError: the file does not have this form.
     """
     (name,) = [name for name in files if name.endswith(".mat")]
-    swing = _join_pieces(name, files[name])[:, ::_EVERY]
+    swing = _join_pieces(name, files[name])[:, ::_DECIMATION]
     q = np.round(swing[0], _DECIMALS) - np.pi
     qd = np.round(swing[1], _DECIMALS)
-    runs = swing.shape[1] // _SAMPLES
+    runs = swing.shape[1] // _SAMPLES_PER_RUN
     if runs == 0:
-        raise InputError(f"{name}: expected at least {_SAMPLES * _EVERY} samples of 1 ms")
+        raise InputError(
+            f"{name}: expected at least {_SAMPLES_PER_RUN * _DECIMATION} samples of 1 ms"
+        )
     lines = ["run,t,q,qd"]
     for run in range(runs):
-        for i in range(_SAMPLES):
-            k = run * _SAMPLES + i
-            t = i * _EVERY * _PERIOD_MS / 1000
+        for i in range(_SAMPLES_PER_RUN):
+            k = run * _SAMPLES_PER_RUN + i
+            t = i * _DECIMATION * _PERIOD_MS / 1000
             lines.append(f"{run + 1},{t:.7g},{q[k]:.7g},{qd[k]:.7g}")
     held_out = range(_HELD_OUT_FROM, runs + 1)
     description = _FREE_SWING + "".join(f"\n[runs.{run}]\nheld_out = true\n" for run in held_out)

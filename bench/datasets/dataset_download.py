@@ -20,7 +20,7 @@ from sims.core.simulator import InputError
 
 _TIMEOUT = 30.0
 """Timeout for a server that sends no data, seconds."""
-_BLOCK = 1 << 16
+_READ_BLOCK_BYTES = 1 << 16
 """Number of bytes that are read at a time."""
 
 Advance = Callable[[int], None]
@@ -149,7 +149,7 @@ def _download_content(url: str, data_set: DataSet, file: SourceFile, advance: Ad
     try:
         with urllib.request.urlopen(request, timeout=_TIMEOUT) as answer:
             while len(content) <= file.bytes:
-                block = answer.read(min(_BLOCK, file.bytes + 1 - len(content)))
+                block = answer.read(min(_READ_BLOCK_BYTES, file.bytes + 1 - len(content)))
                 if not block:
                     break
                 content += block

@@ -62,7 +62,7 @@ from bench.diagnosis.validation.held_out_runs import HeldOutRuns, Validation
 from bench.diagnosis.verdict import RecordingFault
 from bench.diagnosis.verdict_builder import VerdictBuilder
 from bench.logs.importing.filter_start import leave_out_settling
-from bench.logs.importing.sample_thinning import thin
+from bench.logs.importing.sample_thinning import thin_recording
 from bench.logs.joined_recordings import load_joined
 from bench.logs.quality.timestamp_check import check_recording_plausible
 from bench.logs.segmentation import segment_recording
@@ -252,7 +252,7 @@ class _ExplainRun:
         # This check precedes the run evaluators, which plan every step of every run.
         for odd in check_recording_plausible(self.recording, kind, force):
             say(f"{self.path}: {odd}")
-        self.recording, thinned = thin(self.recording, kind)
+        self.recording, thinned = thin_recording(self.recording, kind)
         self.recording, settled = leave_out_settling(self.recording, kind)
         self.recording, note = segment_recording(
             self.recording, kind, options.pieces, options.whole

@@ -39,7 +39,7 @@ PRELOAD_MODULE = "bench.diagnosis_benchmark.preload"
 """Module that is preloaded in the fork server."""
 _MAX_ANSWER_BYTES = 1 << 20
 """Maximum size of an answer, bytes."""
-_REASON = 200
+_MAX_REASON_LENGTH = 200
 """Maximum length of the reason why a diagnoser does not support a case, characters."""
 BUDGET_EXCEEDED_REASON = "it asked for more simulations than are allowed"
 """Reason of a missing answer when the diagnoser exceeded its simulation budget."""
@@ -267,7 +267,7 @@ def _validate_answer(message: Any, limits: AnswerLimits) -> dict[str, Any]:
     simulations, seconds = int(message["simulations"]), float(message["processor_seconds"])
     if not 0 <= simulations <= limits.simulations or not 0 <= seconds < 1e9:
         raise ProtocolError("it reported an impossible number of simulations")
-    if skipped := str(message.get("skipped", ""))[:_REASON]:
+    if skipped := str(message.get("skipped", ""))[:_MAX_REASON_LENGTH]:
         empty_answer = {"answer": None, "simulations": 0, "processor_seconds": 0.0}
         return {**empty_answer, "skipped": skipped}
     answer = Answer.of(message["answer"]).document()

@@ -35,8 +35,8 @@ def draw_confusion_matrices(rows: pd.DataFrame, order: Sequence[str], title: str
     graded_rows = graded_rows.assign(
         family=_list_hidden_families(graded_rows), answer=_list_answer_families(graded_rows)
     )
-    hidden = sorted(set(graded_rows["family"]), key=lambda name: (name in _LAST, name))
-    answer_labels = [name for name in hidden if name not in _LAST]
+    hidden = sorted(set(graded_rows["family"]), key=lambda name: (name in _LAST_ROW_LABELS, name))
+    answer_labels = [name for name in hidden if name not in _LAST_ROW_LABELS]
     answer_labels += sorted(set(graded_rows["answer"]) - {*answer_labels, *_FAMILY_LABELS})
     answer_labels += [name for name in _FAMILY_LABELS if (graded_rows["answer"] == name).any()]
     column_count = min(_PANELS_PER_ROW, len(order))
@@ -68,9 +68,9 @@ def draw_confusion_matrices(rows: pd.DataFrame, order: Sequence[str], title: str
     return figure
 
 
-_LAST = ("(foreign)", "(clean)")
+_LAST_ROW_LABELS = ("(foreign)", "(clean)")
 """Row labels that follow below those of the effect families."""
-_RIGHT = {"(clean)": ("nothing",), "(foreign)": ("unknown",)}
+_CORRECT_ANSWERS = {"(clean)": ("nothing",), "(foreign)": ("unknown",)}
 """Correct answers for the rows of clean recordings and unmodelled causes."""
 
 
@@ -140,7 +140,7 @@ def _draw_confusion_matrix(axis: Axes, counts: pd.DataFrame, name: str) -> None:
     axis.imshow(shares, cmap="Greys", vmin=0, vmax=100, aspect="auto")
     answer_labels = list(counts.columns)
     for i, family in enumerate(counts.index):
-        for right_answer in _RIGHT.get(family, (family,)):
+        for right_answer in _CORRECT_ANSWERS.get(family, (family,)):
             if right_answer in answer_labels:
                 corner = answer_labels.index(right_answer) - 0.5, i - 0.5
                 axis.add_patch(

@@ -41,9 +41,9 @@ from sims.core.simulator import Array
 from sims.recording.recording import read_recording
 from sims.system_simulator import SystemSimulator
 
-_LIMIT = 1 << 40
+_MAX_MESSAGE_BYTES = 1 << 40
 """Maximum size in bytes of a message from the harness; large, because the harness is trusted."""
-_DOCUMENT = 1 << 30
+_MAX_DOCUMENT_BYTES = 1 << 30
 """Maximum size in bytes of a case document."""
 
 
@@ -63,21 +63,26 @@ def serve_requests(channel: MessageChannel, reach: AccessPolicy, first_document:
     trained_arrays: Mapping[str, Array] = {}
     with suppress(PeerClosedError):
         while True:
-            message = channel.receive(_LIMIT)
+            message = channel.receive(_MAX_MESSAGE_BYTES)
             try:
                 match message.kind:
                     case b"L":
                         trained_arrays = unpack_arrays(message.body)
                         channel.send(b"K")
                     case b"Q":
-                        question = message.to_document(_DOCUMENT)
+                        question = message.to_document(_MAX_DOCUMENT_BYTES)
                         channel.send_document(
                             b"A", diagnose_case(question, Path(reach.folder), trained_arrays)
                         )
                     case b"F":
-                        arrays, used_simulations = train_diagnoser(message.to_document(_DOCUMENT))
+                        arrays, used_simulations = train_diagnoser(
+                            message.to_document(_MAX_DOCUMENT_BYTES)
+                        )
                         channel.send(
-                            b"L", *pack_arrays({**arrays, _USED: np.array([used_simulations])})
+                            b"L",
+                            *pack_arrays(
+                                {**arrays, _USED_SIMULATIONS_KEY: np.array([used_simulations])}
+                            ),
                         )
             except PeerClosedError:
                 return
@@ -88,7 +93,7 @@ def serve_requests(channel: MessageChannel, reach: AccessPolicy, first_document:
                 channel.send(b"D", error_text[-MAX_TEXT_BYTES // 2 :])
 
 
-_USED = "simulations"
+_USED_SIMULATIONS_KEY = "simulations"
 """Name of the array with the number of simulations that a training used."""
 
 

@@ -34,15 +34,15 @@ def _declare_fraction_column(name: str) -> ColumnSpec:
     return ColumnSpec(name, float, low=0.0, high=1.0, empty=EmptyCellRule.MAY)
 
 
-_COUNTED = (
+_COUNT_COLUMNS = (
     _declare_count_column("count"),
     _declare_count_column("of"),
     *(_declare_fraction_column(name) for name in ("share", "low", "high")),
 )
-_KIND = ColumnSpec("kind", str, words=CASE_KINDS)
-_ITEM: Columns = (
+_KIND_COLUMN = ColumnSpec("kind", str, words=CASE_KINDS)
+_ITEM_COLUMNS: Columns = (
     *(ColumnSpec(name, str) for name in ("question", "diagnoser")),
-    _KIND,
+    _KIND_COLUMN,
     ColumnSpec("system", str),
     _declare_text_column("hidden"),
     ColumnSpec("noise", str),
@@ -61,36 +61,42 @@ _ITEM: Columns = (
     *(_declare_size_column(name) for name in ("seconds", "processor_seconds")),
     ColumnSpec("trusted", bool),
 )
-_BY_NAME = {column.name: column for column in _ITEM} | {"right_by": ColumnSpec("right_by", str)}
-_QUANTILES = [
+_BY_NAME = {column.name: column for column in _ITEM_COLUMNS} | {
+    "right_by": ColumnSpec("right_by", str)
+}
+_QUANTILE_COLUMNS = [
     f"{what}_{part}"
     for what in ("simulations", "processor_seconds", "seconds")
     for part in ("median", "p95")
 ]
 
 TABLE_COLUMNS: Mapping[str, Columns] = {
-    "table": (ColumnSpec("diagnoser", str), ColumnSpec("metric", str), *_COUNTED),
+    "table": (ColumnSpec("diagnoser", str), ColumnSpec("metric", str), *_COUNT_COLUMNS),
     "failures": tuple(_BY_NAME[name] for name in FAILED),
     "groups": (
         *(ColumnSpec(name, str) for name in ("diagnoser", "metric", "by", "value")),
-        *_COUNTED,
+        *_COUNT_COLUMNS,
     ),
     "power": (
         ColumnSpec("diagnoser", str),
         _declare_size_column("size"),
         ColumnSpec("metric", str),
-        *_COUNTED,
+        *_COUNT_COLUMNS,
     ),
     "confusion": (
         *(ColumnSpec(name, str) for name in ("diagnoser", "hidden", "said")),
         _declare_count_column("count"),
     ),
-    "calibration": (ColumnSpec("diagnoser", str), _declare_fraction_column("level"), *_COUNTED),
-    "sets": (ColumnSpec("diagnoser", str), ColumnSpec("largest_set", str), *_COUNTED),
+    "calibration": (
+        ColumnSpec("diagnoser", str),
+        _declare_fraction_column("level"),
+        *_COUNT_COLUMNS,
+    ),
+    "sets": (ColumnSpec("diagnoser", str), ColumnSpec("largest_set", str), *_COUNT_COLUMNS),
     "costs": (
         ColumnSpec("diagnoser", str),
         _declare_count_column("answers"),
-        *(_declare_size_column(name) for name in _QUANTILES),
+        *(_declare_size_column(name) for name in _QUANTILE_COLUMNS),
         _declare_count_column("training_simulations"),
         _declare_size_column("training_seconds"),
     ),
@@ -100,7 +106,7 @@ TABLE_COLUMNS: Mapping[str, Columns] = {
         *(_declare_count_column(name) for name in ("questions", "only_simgap", "only_other")),
         *(_declare_fraction_column(name) for name in ("p_value", "p_holm")),
     ),
-    "items": _ITEM,
+    "items": _ITEM_COLUMNS,
 }
 """Columns of each table, by the name of its file."""
 STATUS_COLUMNS = ("question", "diagnoser", "status", "reason", "simulations", "seconds")

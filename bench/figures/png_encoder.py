@@ -14,9 +14,9 @@ import numpy as np
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _EIGHT_BITS_RGB = (8, 2, 0, 0, 0)
 """Bit depth, colour type, compression, filter method and interlacing of the header."""
-_LEVEL = 3
+_COMPRESSION_LEVEL = 3
 """Compression level: the default 6 takes twice the time for files of the same size."""
-_METRE = 39.3701
+_INCHES_PER_METRE = 39.3701
 """Number of inches in a metre."""
 
 
@@ -36,13 +36,13 @@ def encode_png(rgba: bytes | memoryview, height: int, width: int, dpi: float) ->
     # Each row begins with the number of its filter: 0 for none.
     rows = np.zeros((height, 1 + 3 * width), dtype=np.uint8)
     rows[:, 1:].reshape(height, width, 3)[:] = pixels
-    density = round(dpi * _METRE)
+    density = round(dpi * _INCHES_PER_METRE)
     return b"".join(
         (
             _SIGNATURE,
             _make_chunk(b"IHDR", struct.pack(">II5B", width, height, *_EIGHT_BITS_RGB)),
             _make_chunk(b"pHYs", struct.pack(">IIB", density, density, 1)),
-            _make_chunk(b"IDAT", zlib.compress(rows.tobytes(), _LEVEL)),
+            _make_chunk(b"IDAT", zlib.compress(rows.tobytes(), _COMPRESSION_LEVEL)),
             _make_chunk(b"IEND", b""),
         )
     )

@@ -40,11 +40,11 @@ MAX_LABEL_LINE_LENGTH = 34
 """Maximum length of a line of a label, in characters."""
 MOST_LETTERS = 120
 """Maximum length of a text in a label, which may have several lines, in characters."""
-_LINE = 0.155
+_LINE_SPACING = 0.155
 """Distance between lines of a label, in inches."""
-_BETWEEN = 0.09
+_LABEL_SPACING = 0.09
 """Distance between labels, in inches."""
-_SIZES: Mapping[str, tuple[str, float]] = {
+_MARKER_BY_PLACE_KIND: Mapping[str, tuple[str, float]] = {
     "joint": ("o", 17.0),
     "actuator": ("s", 22.0),
     "body": ("D", 17.0),
@@ -83,7 +83,7 @@ class _Label(NamedTuple):
     @property
     def height(self) -> float:
         """Height in inches."""
-        return _LINE * len(self.lines) + _BETWEEN
+        return _LINE_SPACING * len(self.lines) + _LABEL_SPACING
 
 
 def draw_robot_figure(
@@ -322,7 +322,7 @@ def _draw_place_rings(
         place = locate_place(robot, data, kind, name)
         if place is None:
             continue
-        shape, size = _SIZES.get(kind, _SIZES["joint"])
+        shape, size = _MARKER_BY_PLACE_KIND.get(kind, _MARKER_BY_PLACE_KIND["joint"])
         x, y = projection.project(place[None])[0].tolist()
         # Markers cannot be dashed, so a ring is a scatter plot of one point.
         axis.scatter(

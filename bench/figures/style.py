@@ -105,7 +105,7 @@ _LINES = (
     (0, (8, 2)),
 )
 
-_LONG = re.compile(rb"\b[1-9]\d*\.\d{3,}\b")
+_LONG_NUMBER_PATTERN = re.compile(rb"\b[1-9]\d*\.\d{3,}\b")
 """Pattern of a number in an SVG file with needless digits; numbers below 1 are scales."""
 
 _DASHES: dict[Any, tuple[float, ...]] = {"-": (), "--": (3.7, 1.6), "-.": (6.4, 1.6, 1.0, 1.6)}
@@ -342,7 +342,7 @@ def finish_figure(
     for reference in style.references:
         legend_entries += _make_reference_entries(axes, style, reference)
         caption += _format_reference_caption(reference, style.experiment)
-    size = 9.0 if len(legend_entries) <= _ROWS else 7.0
+    size = 9.0 if len(legend_entries) <= _MAX_LEGEND_ROWS else 7.0
     figure.legend(
         [handle for handle, _ in legend_entries],
         [label for _, label in legend_entries],
@@ -360,7 +360,7 @@ def finish_figure(
     add_caption(figure, caption, letters=17)
 
 
-_ROWS = 18
+_MAX_LEGEND_ROWS = 18
 """Maximum number of legend entries in letters of the normal size."""
 
 
@@ -456,7 +456,9 @@ def render_svg(figure: Figure) -> bytes:
         figure.savefig(file, format="svg", metadata={"Date": None})
     # A hundredth of a point is finer than any printer's resolution; longer numbers would double the
     # size.
-    return _LONG.sub(lambda match: f"{float(match[0]):.2f}".encode(), file.getvalue())
+    return _LONG_NUMBER_PATTERN.sub(
+        lambda match: f"{float(match[0]):.2f}".encode(), file.getvalue()
+    )
 
 
 def render_png_and_pdf(figure: Figure, dpi: int = DPI) -> tuple[bytes, bytes | None]:

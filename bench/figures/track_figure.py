@@ -16,11 +16,11 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_SHOWN = 6
+_MAX_OUTLINES = 6
 """Number of ball outlines that are drawn, evenly spaced along its path."""
 _DPI = 140
-_SEEN = BLUE
-_MISSING = RUST
+_DETECTED_COLOUR = BLUE
+_MISSING_COLOUR = RUST
 
 
 def render_track_figure(
@@ -67,7 +67,7 @@ def _draw_scene(axis: Axes, track: BallTrack) -> None:
 
     axis.imshow(_overlay_balls(track), interpolation="nearest")
     axis.plot(track.u, track.v, "-", color="white", linewidth=2.4)
-    axis.plot(track.u, track.v, ".-", color=_SEEN, linewidth=0.8, markersize=2.5)
+    axis.plot(track.u, track.v, ".-", color=_DETECTED_COLOUR, linewidth=0.8, markersize=2.5)
     for k in _choose_frames(track):
         middle = (track.u[k], track.v[k])
         for colour, width in (("black", 1.6), ("white", 0.8)):
@@ -84,10 +84,12 @@ def _draw_over_time(axis: Axes, track: BallTrack, part: slice, values: Array, la
     """
     times, is_missing = track.times, ~np.isfinite(track.u)
     axis.axvspan(times[part][0], times[part][-1], color=RECORDED_PART_GREY, linewidth=0)
-    axis.plot(times, values, ".-", color=_SEEN, markersize=3, linewidth=0.7)
+    axis.plot(times, values, ".-", color=_DETECTED_COLOUR, markersize=3, linewidth=0.7)
     foot = np.full(is_missing.sum(), 0.02)
     transform = axis.get_xaxis_transform()
-    axis.plot(times[is_missing], foot, "|", color=_MISSING, markersize=7, transform=transform)
+    axis.plot(
+        times[is_missing], foot, "|", color=_MISSING_COLOUR, markersize=7, transform=transform
+    )
     axis.set(xlabel="time [s]", ylabel=label)
     axis.spines[["top", "right"]].set_visible(False)
 
@@ -98,7 +100,7 @@ def _choose_frames(track: BallTrack) -> list[int]:
     steps = np.hypot(np.diff(track.u[visible]), np.diff(track.v[visible]))
     path_length = np.concatenate([[0.0], np.cumsum(steps)])
     # Evenly along the path, not in time: outlines of a slow ball would cover each other.
-    indices = np.searchsorted(path_length, np.linspace(0, path_length[-1], _SHOWN)).clip(
+    indices = np.searchsorted(path_length, np.linspace(0, path_length[-1], _MAX_OUTLINES)).clip(
         0, len(visible) - 1
     )
     return [visible[i] for i in np.unique(indices)]

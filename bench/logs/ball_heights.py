@@ -37,11 +37,11 @@ _MIN_FLIGHT_EXTENT = 0.3
 """Minimum extent of a flight, in ball radii, or in metres for heights."""
 _MIN_HOLD_SECONDS = 0.25
 """Minimum duration in seconds for which a ball is held before its release."""
-_DIFFER = 0.05
+_REPORTED_SCALE_DIFFERENCE = 0.05
 """Relative difference between the scales from the fall and the diameter that is reported."""
-_MEETING = 0.1
+_BOUNCE_SEARCH_SECONDS = 0.1
 """Time in seconds around the end of a flight and the start of the next in which they may meet."""
-_FITS = 3
+_REWEIGHTED_FITS = 3
 """Number of reweighted line fits to the radius after the first, unweighted fit."""
 
 
@@ -131,7 +131,7 @@ def compute_heights_by_scale(
     else:
         factor = ball = diameter / 2
         method = "scaled by the ball's diameter, for a horizontal camera"
-        if fallen is not None and abs(fallen / factor - 1) > _DIFFER:
+        if fallen is not None and abs(fallen / factor - 1) > _REPORTED_SCALE_DIFFERENCE:
             notes.append(
                 f"the fall gives {fallen / factor - 1:+.0%} for all heights: the camera is tilted, "
                 "or gravity is not 9.81 m/s²; the scale 'fall' uses the fall"
@@ -163,16 +163,16 @@ def _smooth_radius(track: BallTrack) -> Array:
 
     The outline in a single frame is too noisy. Frames far from the line get a small weight.
     """
-    s, visible_frames = _compute_fall_position(track), track.visible_frames
-    places, radii = s[visible_frames], track.radius[visible_frames]
-    line = np.polyfit(places, radii, 1)
-    for _ in range(_FITS):
-        deviations = np.abs(radii - np.polyval(line, places))
+    fall_position, visible_frames = _compute_fall_position(track), track.visible_frames
+    positions, radii = fall_position[visible_frames], track.radius[visible_frames]
+    line = np.polyfit(positions, radii, 1)
+    for _ in range(_REWEIGHTED_FITS):
+        deviations = np.abs(radii - np.polyval(line, positions))
         # A frame whose outline is far off, as at an impact, gets a small weight.
         typical_deviation = max(float(np.median(deviations)), 1e-9)
-        line = np.polyfit(places, radii, 1, w=1 / (1 + (deviations / typical_deviation) ** 2))
+        line = np.polyfit(positions, radii, 1, w=1 / (1 + (deviations / typical_deviation) ** 2))
     # The line may cross zero outside the frames that show the ball; a radius may not.
-    result: Array = np.maximum(np.polyval(line, s), 0.3 * float(np.median(radii)))
+    result: Array = np.maximum(np.polyval(line, fall_position), 0.3 * float(np.median(radii)))
     return result
 
 
@@ -224,7 +224,10 @@ def _estimate_ground_position(track: BallTrack, q: Array, arcs: list[_Flight]) -
     for earlier_arc, later_arc in pairwise(arcs):
         roots = np.roots(earlier_arc.curve - later_arc.curve)
         # Two parabolas have up to two intersections: the bounce, and one outside both flights.
-        begin, end = earlier_arc.end - _MEETING, later_arc.begin + _MEETING
+        begin, end = (
+            earlier_arc.end - _BOUNCE_SEARCH_SECONDS,
+            later_arc.begin + _BOUNCE_SEARCH_SECONDS,
+        )
         real_roots = [r.real for r in roots if abs(r.imag) < 1e-9 and begin < r.real < end]
         crossings += [float(np.polyval(earlier_arc.curve, r)) for r in real_roots[:1]]
     if crossings:

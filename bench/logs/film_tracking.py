@@ -18,7 +18,7 @@ from sims.vision.ball_tracker import BallTrack, estimate_roughness, track_ball
 from sims.vision.camera_file import get_camera_file_path, read_camera_file
 from sims.vision.video_files import VideoFile
 
-_DIGITS = 9
+_TABLE_DIGITS = 9
 """Number of significant digits in the table, finer than a pixel's noise."""
 
 
@@ -118,7 +118,7 @@ def track_film(
         if content is not None
     }
     recording = _build_recording(track, heights, noise, part, video)
-    write_recording(out, recording, BallSystem, digits=_DIGITS, beside=figure_contents)
+    write_recording(out, recording, BallSystem, digits=_TABLE_DIGITS, beside=figure_contents)
 
     count, frames = int(np.isfinite(heights.z[part]).sum()), part.stop - part.start
     lines = (

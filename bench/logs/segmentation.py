@@ -83,11 +83,11 @@ def segment_recording(
     segments: list[Run] = []
     notes = []
     for word, runs in (("fitting", recording.training()), ("measuring", recording.held_out())):
-        all_of_it = sum(map(_compute_duration, runs))
-        if all_of_it <= budget and seconds is None:
+        total_seconds = sum(map(_compute_duration, runs))
+        if total_seconds <= budget and seconds is None:
             segments += runs
             continue
-        share = min(budget / all_of_it, 1.0) if all_of_it > 0 else 1.0
+        share = min(budget / total_seconds, 1.0) if total_seconds > 0 else 1.0
         cut_run = _take_beginning if floats else _cut_run
         new_segments = [
             p
@@ -97,7 +97,8 @@ def segment_recording(
         segments += new_segments
         used_seconds = sum(map(_compute_duration, new_segments))
         notes.append(
-            f"{used_seconds:.3g} s of {all_of_it:.4g} s for {word}, in {len(new_segments)} pieces"
+            f"{used_seconds:.3g} s of {total_seconds:.4g} s for {word}, "
+            f"in {len(new_segments)} pieces"
         )
     if not notes:
         return SegmentedRecording(recording, "")
@@ -124,26 +125,28 @@ def _compute_duration(run: Run) -> float:
     return float(run.times[-1] - run.times[0])
 
 
-def _cut_run(run: Run, seconds: float, longest: float) -> list[Run]:
-    """Cut a run into segments of at most `longest` seconds that last `seconds` in total.
+def _cut_run(run: Run, seconds: float, max_length: float) -> list[Run]:
+    """Cut a run into segments of at most `max_length` seconds that last `seconds` in total.
 
     The segments are spread over the run. Each begins at the sample before which the commands have
     changed least.
     """
-    length = min(longest, seconds)
+    length = min(max_length, seconds)
     # A segment needs a few samples, even if only little of a run may be kept.
     length = max(length, MIN_SEGMENT_INTERVALS * float(np.median(np.diff(run.times))))
     count = max(int(seconds / length + 0.5), 1)
-    span = _compute_duration(run) / count
-    length = min(length, span)
+    spacing = _compute_duration(run) / count
+    length = min(length, spacing)
     change = _compute_command_changes(run)
     segments = []
     for number in range(count):
         # A segment may begin anywhere in its part of the run that leaves enough room for it.
-        first = run.times[0] + number * span
-        low, high = np.searchsorted(run.times, (first, first + max(span - length, 0.0)))
-        high = max(high, low + 1)
-        begin = int(low + np.argmin(change[low:high]))
+        first = run.times[0] + number * spacing
+        first_allowed, end_allowed = np.searchsorted(
+            run.times, (first, first + max(spacing - length, 0.0))
+        )
+        end_allowed = max(end_allowed, first_allowed + 1)
+        begin = int(first_allowed + np.argmin(change[first_allowed:end_allowed]))
         # The sample at its very end is the first sample of the next segment.
         end = int(np.searchsorted(run.times, run.times[begin] + length - ROUNDING_SECONDS))
         name = f"{run.name} from {run.times[begin]:.4g} s"

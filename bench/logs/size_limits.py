@@ -17,17 +17,17 @@ from bench.core.resource_estimates import (
 from sims.core.simulator import Simulator
 from sims.recording.recording import Recording
 
-_CELL = 8
+_BYTES_PER_NUMBER = 8
 """Size of a number in a table, in bytes."""
 _CELL_SECONDS = 1e-7
 """Time to write a number, in seconds."""
 _RUN_MEMORY = 3000
 """Memory of a run in addition to its samples, in bytes."""
-_LANES = 10
+_MIN_SIMULTANEOUS_SIMULATIONS = 10
 """Minimum number of simultaneous simulations for fitting a run."""
-_FITTING = 100
+_MIN_FIT_SIMULATIONS = 100
 """Minimum number of simulations of a run for fitting it."""
-_PIXEL = 100
+_BYTES_PER_PIXEL = 100
 """Memory per pixel of a rendered image, in bytes."""
 _PIXEL_SECONDS = 1e-8
 """Time to render a pixel, in seconds."""
@@ -55,8 +55,10 @@ def check_simulation_size(
         f"{runs:.4g} runs of {samples:.4g} samples and {steps:.3g} steps",
         "lower runs, seconds or rate",
         # The samples exist as numbers, and as the text of the table before it is written.
-        memory=cells * (BYTES_PER_NUMBER + _CELL) + runs * _RUN_MEMORY + steps * BYTES_PER_STEP,
-        disk=cells * _CELL,
+        memory=cells * (BYTES_PER_NUMBER + _BYTES_PER_NUMBER)
+        + runs * _RUN_MEMORY
+        + steps * BYTES_PER_STEP,
+        disk=cells * _BYTES_PER_NUMBER,
         steps=steps,
         seconds=runs * (MIN_SIMULATION_SECONDS + MIN_STEP_SECONDS * steps) + cells * _CELL_SECONDS,
     )
@@ -80,9 +82,9 @@ def check_recording_size(recording: Recording, simulator: Simulator, force: bool
     need = ResourceNeed(
         f"{count} runs of up to {longest:.4g} s, {steps:.3g} steps,",
         "explain shorter runs",
-        memory=count * _LANES * steps * BYTES_PER_STEP,
+        memory=count * _MIN_SIMULTANEOUS_SIMULATIONS * steps * BYTES_PER_STEP,
         steps=steps,
-        seconds=count * _FITTING * steps * MIN_STEP_SECONDS,
+        seconds=count * _MIN_FIT_SIMULATIONS * steps * MIN_STEP_SECONDS,
     )
     check_feasible(str(recording.path), need, get_machine_resources(), force)
 
@@ -103,7 +105,7 @@ def check_film_size(recording: Path, frames: int, pixels: int, force: bool = Fal
     need = ResourceNeed(
         f"{frames} pictures of {pixels:.4g} x {pixels:.4g} pixels",
         "lower the size",
-        memory=area * _PIXEL,
+        memory=area * _BYTES_PER_PIXEL,
         seconds=frames * area * _PIXEL_SECONDS,
     )
     check_feasible(str(recording), need, get_machine_resources(), force)

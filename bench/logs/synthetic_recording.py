@@ -36,7 +36,7 @@ from sims.recording.recording_description import ModelFileReference, get_floatin
 from sims.recording.recording_writer import check_absent, write_recording
 from sims.system_simulator import SystemSimulator
 
-_DIGITS = 9
+_TABLE_DIGITS = 9
 """Number of significant digits in the table: finer than any sensor, but files stay small."""
 _MOST_SAMPLES = 1e8
 """Number of samples per run above which a length or rate is considered a typing error."""
@@ -143,7 +143,11 @@ class SimulatedRecording:
         truth = _make_true_parameters_path(table_path)
         truth_file = {truth: tomli_w.dumps(dict(self.truth))}
         write_recording(
-            table_path, self.recording, type(self.simulator), digits=_DIGITS, beside=truth_file
+            table_path,
+            self.recording,
+            type(self.simulator),
+            digits=_TABLE_DIGITS,
+            beside=truth_file,
         )
         return [table_path, table_path.with_suffix(".toml"), truth]
 
@@ -375,7 +379,7 @@ def _count_samples(options: SimulationSpec) -> int:
 def _make_sample_times(samples: int, rate: float) -> Array:
     """Return the sample times (T,) of a run in seconds, from zero."""
     # Round as in the table, so that the times read back are the times simulated.
-    return np.array([float(f"{t:.{_DIGITS}g}") for t in (np.arange(samples) / rate).tolist()])
+    return np.array([float(f"{t:.{_TABLE_DIGITS}g}") for t in (np.arange(samples) / rate).tolist()])
 
 
 def _make_parameters(

@@ -1,4 +1,4 @@
-"""Calibration recording for explain, and the experiments before and after the extension.
+"""Calibration recording of a misspecification study, and its extension of the simulator by explain.
 
 The recording contains nothing of the targets: its parameters, initial states, inputs and noise are
 drawn from separate random streams.
@@ -6,10 +6,7 @@ drawn from separate random streams.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -19,18 +16,12 @@ from bench.benchmark.problem.model_file_simulator import find_model
 from bench.benchmark.problem.salt import TargetStreams
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.core.plugin_registries import simulators
-from sims import effects as library
 from sims import extended_simulator as extending
-from sims.core.simulator import Array, InputError, Scenario, Simulator
+from sims.core.simulator import Array, Scenario
 from sims.extended_simulator import ExtendedSimulator
 from sims.recording.recording import Recording, Run
 from sims.recording.recording_description import ModelFileReference
 from sims.recording.recording_writer import write_recording
-from sims.system_simulator import SystemSimulator
-
-PLAIN, EXTENDED = "plain", "extended"
-"""Names of the simulators in which tuners are compared: the original and the extended one."""
-MODEL_LABELS = (PLAIN, EXTENDED)
 
 
 def write_calibration_recording(experiment: Experiment, salt: str, path: Path) -> Array:
@@ -132,67 +123,3 @@ def load_extended(file: Path) -> ExtendedSimulator:
         InputError: the file cannot be used.
     """
     return extending.open_extended(file, simulators.get)[0]
-
-
-def list_coefficients(extended: ExtendedSimulator, kind: type[Simulator]) -> dict[str, list[float]]:
-    """List the coefficients of an extended simulator by effect, in the order of the effect.
-
-    Args:
-        extended: the extended simulator.
-        kind: class of the simulator.
-
-    Raises:
-        InputError: the simulator does not support effects.
-    """
-    if not issubclass(kind, SystemSimulator):
-        raise InputError(f"simulator {kind.name} takes no effects, and cannot be extended")
-    coefficients = {}
-    for name, numbers in extended.effects.items():
-        declared_effect = library.find_effect(name, kind.system).on(kind.system)
-        coefficients[name] = [
-            numbers[c.name].value if c.name in numbers else 0.0 for c in declared_effect
-        ]
-    return coefficients
-
-
-def make_base_experiment(experiment: Experiment) -> Experiment:
-    """Make the experiment in the original simulator, which lacks the hidden effects."""
-    return _make_comparison_experiment(experiment, PLAIN, experiment.settings)
-
-
-def make_extended_experiment(experiment: Experiment, effects: dict[str, list[float]]) -> Experiment:
-    """Make the experiment in the extended simulator.
-
-    The tuned parameters remain the same. The missing effects act with the coefficients that explain
-    fitted.
-
-    Args:
-        experiment: the experiment.
-        effects: coefficients by name of the effect.
-    """
-    settings = dict(experiment.settings)
-    # An effect that is tuned stays tuned, although explain fitted its coefficients too.
-    tuned = {*settings.get("effects", ()), *(p for p in experiment.parameters)}
-    fixed_effects = {name: values for name, values in effects.items() if name not in tuned}
-    settings["fixed"] = {**settings.get("fixed", {}), **fixed_effects}
-    return _make_comparison_experiment(experiment, EXTENDED, settings)
-
-
-def _make_comparison_experiment(
-    experiment: Experiment, model: str, settings: Mapping[str, Any]
-) -> Experiment:
-    """Make the experiment of one of the two comparisons: the same targets in another simulator.
-
-    Args:
-        experiment: the experiment of the study.
-        model: `PLAIN` or `EXTENDED`, which is added to name and title.
-        settings: settings of the simulator, such as its fixed effects.
-    """
-    return replace(
-        experiment,
-        name=f"{experiment.name}-{model}",
-        title=f"{experiment.title or experiment.name} ({model})",
-        same_targets_as=experiment.name,
-        settings=settings,
-        calibration=None,
-    )

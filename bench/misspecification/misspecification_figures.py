@@ -33,10 +33,10 @@ _MARKER_STYLES: dict[str, dict[str, Any]] = {
     "extended": {"color": BLUE, "marker": "o"},
 }
 """Marker styles by simulator: hollow before, filled after, distinguishable in greyscale."""
-_NAMES = {"plain": "simulator as it is", "extended": "extended by explain"}
-_REFERENCE = "least_squares"
+_MODEL_NAMES = {"plain": "simulator as it is", "extended": "extended by explain"}
+_REFERENCE_TUNER = "least_squares"
 """Tuner whose bias is taken as the model's own, since it finds the best fit if there is one."""
-_COLUMNS = 3
+_PANEL_COLUMNS = 3
 
 
 class StudyResult(Protocol):
@@ -158,7 +158,7 @@ def _make_panels(count: int) -> tuple[Figure, list[Axes]]:
     Returns:
         The figure and its panels; surplus panels of the last row are empty.
     """
-    columns = min(count, _COLUMNS)
+    columns = min(count, _PANEL_COLUMNS)
     rows = -(-count // columns)
     figure, axes = make_panel_grid(rows, columns, (1.6 + 3.4 * columns, 1.3 + 2.9 * rows))
     panels = list(np.ravel(axes))
@@ -192,7 +192,7 @@ def _draw_means(panel: Axes, study: StudyResult, lines: pd.DataFrame) -> None:
             markersize=4.5,
             linewidth=1.1,
             capsize=2,
-            label=_NAMES[model],
+            label=_MODEL_NAMES[model],
             **_MARKER_STYLES[model],
         )
     panel.set_yticks(range(len(tuners)), tuners, fontsize=8)
@@ -210,7 +210,7 @@ def _find_most_biased(lines: pd.DataFrame) -> str:
         lines: rows of the score table of one study, with the metric "bias".
     """
     plain_lines = lines[lines["model"] == "plain"]
-    reference = plain_lines[plain_lines["tuner"] == _REFERENCE]
+    reference = plain_lines[plain_lines["tuner"] == _REFERENCE_TUNER]
     sizes = (reference if len(reference) else plain_lines).groupby("parameter", sort=False)["mean"]
     largest = sizes.mean().abs().fillna(0.0)
     return [str(name) for name in largest.index][int(largest.to_numpy().argmax())]

@@ -24,15 +24,17 @@ from bench.benchmark.storage.study_progress import (
     StudyProgress,
 )
 from bench.misspecification.calibration import (
-    MODEL_LABELS,
-    PLAIN,
-    list_coefficients,
     load_extended,
-    make_base_experiment,
-    make_extended_experiment,
     run_explain,
     write_calibration_recording,
 )
+from bench.misspecification.comparison_experiments import (
+    MODEL_LABELS,
+    PLAIN,
+    make_base_experiment,
+    make_extended_experiment,
+)
+from sims.extended_simulator import list_effect_coefficients
 
 if TYPE_CHECKING:
     from bench.benchmark.problem.experiment import Experiment
@@ -221,7 +223,7 @@ class MisspecificationStudy:
             return make_base_experiment(experiment)
         kind = get_simulator_class(experiment)
         extended = load_extended(self.folder / EXTENDED_MODEL_FILE)
-        return make_extended_experiment(experiment, list_coefficients(extended, kind))
+        return make_extended_experiment(experiment, list_effect_coefficients(extended, kind))
 
     def close(self) -> None:
         """Close the study; its comparisons are opened when they run."""

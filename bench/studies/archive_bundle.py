@@ -30,7 +30,7 @@ from bench.benchmark.storage.result_folder import CONFIGURATION_FILE, read_confi
 from bench.core.plugin_registries import simulators
 from bench.diagnosis.score_extended import score_model
 from bench.diagnosis.verdict import Verdict
-from bench.misspecification.calibration import MODEL_LABELS
+from bench.misspecification.comparison_experiments import MODEL_LABELS
 from bench.schemas import find_violations
 from bench.studies.study import list_study_folders
 from bench.studies.verification import VerificationFailure, VerificationResult, verify_comparison
@@ -43,11 +43,11 @@ VERDICT_FILE = "verdict.json"
 """File of the verdict in the folder of an explanation."""
 EXTENDED_MODEL_FILE = "extended.toml"
 """File of the extended simulator in the folder of an explanation."""
-_FORMAT = 1
+_FORMAT_VERSION = 1
 """Version of the manifest's format."""
 _RECORDINGS_FOLDER = "recordings"
 """Folder of recordings in the archive of an explanation."""
-_PLUGINS = "plugins"
+_PLUGIN_FOLDER = "plugins"
 """Folder of plugin files in the archive of a comparison."""
 _ERROR_TOLERANCE = 1e-3
 """Relative tolerance of a held-out error.
@@ -105,7 +105,7 @@ def write_bundle(
         files |= _list_recording_files(recordings)
         command = _format_explain_command(folder)
     metadata = {
-        "format": _FORMAT,
+        "format": _FORMAT_VERSION,
         "kind": kind,
         "name": name,
         "simgap": str(read_environment(list_study_folders(folder)[0]).get("simgap") or __version__),
@@ -154,7 +154,7 @@ def _list_plugin_files(folder: Path) -> dict[str, Path]:
         for file in read_configuration(part).plugins
     ]
     existing_files = [file for file in dict.fromkeys(plugins) if file.is_file()]
-    return {f"{_PLUGINS}/{file.name}": file for file in existing_files}
+    return {f"{_PLUGIN_FOLDER}/{file.name}": file for file in existing_files}
 
 
 def _list_comparison_folders(folder: Path) -> Iterator[Path]:
@@ -170,7 +170,9 @@ def _format_compare_command(folder: Path, name: str) -> str:
     experiment = configurations[0].experiment
     if not experiment.suite or experiment.diagnosis:
         return f"simgap compare {name}/{CONFIGURATION_FILE}"
-    plugins = [f"--plugin {name}/{_PLUGINS}/{Path(f).name}" for f in configurations[0].plugins]
+    plugins = [
+        f"--plugin {name}/{_PLUGIN_FOLDER}/{Path(f).name}" for f in configurations[0].plugins
+    ]
     tuners = ",".join(entry.label for entry in experiment.tuners)
     return " ".join(["simgap compare suite", *plugins, f"--tuners {tuners}"])
 

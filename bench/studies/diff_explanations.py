@@ -41,7 +41,7 @@ VERDICT, EXTENDED = "verdict.json", "extended.toml"
 _MAX_COMPARED_CANDIDATES = 5
 """Number of the best candidates of each explanation that are compared."""
 _HELD_OUT = ("rmse_base", "rmse_extended", "noise_floor", "gap_closed", "low", "high")
-_Z95 = 1.96
+_NORMAL_95 = 1.96
 """Half width of a 95 % interval, in standard errors."""
 
 
@@ -316,7 +316,7 @@ def _compute_p_value(row: Mapping[str, Any]) -> float:
     limits = [row[key] for key in ("low_a", "high_a", "low_b", "high_b", "a", "b")]
     if any(end is None for end in limits):
         return math.nan
-    errors = [(row[f"high_{m}"] - row[f"low_{m}"]) / (2 * _Z95) for m in ("a", "b")]
+    errors = [(row[f"high_{m}"] - row[f"low_{m}"]) / (2 * _NORMAL_95) for m in ("a", "b")]
     spread = math.hypot(*errors)
     difference = abs(row["a"] - row["b"])
     if spread == 0:

@@ -57,8 +57,8 @@ def fill_gaps(channel: Array, simulated: Array) -> Array:
     # weight.
     x = _scale_like(simulated, simulated[is_present])
     y = _scale_like(channel, channel[is_present])
-    table = np.stack([np.ones_like(x), x, -x * y], axis=1)[is_present]
-    a, b, c = _fit_camera_line(table, y[is_present])
+    design_matrix = np.stack([np.ones_like(x), x, -x * y], axis=1)[is_present]
+    a, b, c = _fit_camera_line(design_matrix, y[is_present])
     denominator = 1 + c * x
     # A change of sign would put a part of the run behind the camera.
     if not (denominator > _MIN_DENOMINATOR).all():
@@ -69,23 +69,25 @@ def fill_gaps(channel: Array, simulated: Array) -> Array:
     return result
 
 
-def _fit_camera_line(table: Array, values: Array) -> Array:
+def _fit_camera_line(design_matrix: Array, values: Array) -> Array:
     """Fit the numbers a, b, c (3,) of (2), the linear form of the camera's line, robustly.
 
     The method is iteratively reweighted least squares with Cauchy's weights, so that a few wrong
-    samples do not spoil the fit. `table` (n, 3) has the regressors 1, x and -x y of n samples,
-    `values` (n,) the y.
+    samples do not spoil the fit. `design_matrix` (n, 3) has the regressors 1, x and -x y of n
+    samples, `values` (n,) the y.
     """
-    weights: Array = np.ones(len(table))
-    numbers: Array = np.zeros(3)
+    weights: Array = np.ones(len(design_matrix))
+    coefficients: Array = np.zeros(3)
     for _ in range(_ITERATIONS):
-        solution = np.linalg.lstsq(table * weights[:, None], values * weights, rcond=None)[0]
-        numbers = solution.astype(np.float64)
-        residual: Array = values - table @ numbers
+        solution = np.linalg.lstsq(design_matrix * weights[:, None], values * weights, rcond=None)[
+            0
+        ]
+        coefficients = solution.astype(np.float64)
+        residual: Array = values - design_matrix @ coefficients
         width = max(_CAUCHY_WIDTH * float(np.median(np.abs(residual))), _MIN_CAUCHY_WIDTH)
         # This is the root of Cauchy's weight, because it multiplies both sides of (2).
         weights = 1 / np.sqrt(1 + (residual / width) ** 2)
-    return numbers
+    return coefficients
 
 
 def _scale_like(values: Array, reference: Array) -> Array:

@@ -169,17 +169,19 @@ def _compute_causal_attention(xp: Any, w: dict[str, Any], block: int, h: Any) ->
     `xp` is numpy or torch, `w` the weights, `block` the number of the block, and `h` are the
     tokens.
     """
-    count, width = h.shape[-2:]
+    count, token_size = h.shape[-2:]
     projections = _apply_linear_layer(w, f"heard{block}", h)
-    query, key = projections[..., :width], projections[..., width : 2 * width]
+    query, key = projections[..., :token_size], projections[..., token_size : 2 * token_size]
     lag = np.arange(count)[:, None] - np.arange(count)
-    later = xp.asarray(np.where(lag < 0, _CAUSAL_MASK_OFFSET, 0.0).astype(np.float32))
-    score = query @ key.swapaxes(-1, -2) / width**0.5 + w[f"lag{block}.bias"][np.maximum(lag, 0)]
-    score = score - later
+    future_penalty = xp.asarray(np.where(lag < 0, _CAUSAL_MASK_OFFSET, 0.0).astype(np.float32))
+    score = (
+        query @ key.swapaxes(-1, -2) / token_size**0.5 + w[f"lag{block}.bias"][np.maximum(lag, 0)]
+    )
+    score = score - future_penalty
     # The largest score is subtracted, so that the exponentials do not overflow.
-    share = xp.exp(score - xp.amax(score, -1)[..., None])
-    share = share / share.sum(axis=-1, keepdims=True)
-    return _apply_linear_layer(w, f"mixed{block}", share @ projections[..., 2 * width :])
+    attention = xp.exp(score - xp.amax(score, -1)[..., None])
+    attention = attention / attention.sum(axis=-1, keepdims=True)
+    return _apply_linear_layer(w, f"mixed{block}", attention @ projections[..., 2 * token_size :])
 
 
 def _apply_linear_layer(w: dict[str, Any], layer: str, x: Any) -> Any:

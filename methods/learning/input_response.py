@@ -28,11 +28,11 @@ They overlap: successive bumps are shifted by an eighth of their width.
 """
 _MIN_SAMPLES = 7
 """Minimum number of samples of a run, for a bump of half width 3."""
-_STEEPNESS = 10.0
+_SIGN_STEEPNESS = 10.0
 """Factor in the smoothed sign: it saturates at a fraction of the mean rate of change."""
 _MIN_DIVISOR = 1e-300
 """Minimum divisor, so that a zero signal stays zero."""
-_RIDGE = 1e-6
+_RIDGE_PARAMETER = 1e-6
 """Ridge parameter, per mean square of a regressor.
 
 With it, two collinear regressors, such as a constant input and 1, share a coefficient.
@@ -107,7 +107,7 @@ def _compute_smoothed_velocity_signs(series: Array) -> Array:
     rates = sliding_window_view(padded, len(offsets), axis=1) @ line
     mean_rate = np.abs(rates).mean(axis=1, keepdims=True) + _MIN_DIVISOR
     # tanh replaces the sign function, which would jump where noise crosses zero.
-    return np.asarray(np.tanh(_STEEPNESS * rates / mean_rate), dtype=np.float64)
+    return np.asarray(np.tanh(_SIGN_STEEPNESS * rates / mean_rate), dtype=np.float64)
 
 
 def _fit_ridge_regression(regressors: Array, values: Array) -> Array:
@@ -120,7 +120,7 @@ def _fit_ridge_regression(regressors: Array, values: Array) -> Array:
     scaled = regressors / size
     transposed = scaled.transpose(0, 2, 1)
     count = scaled.shape[1]
-    ridge = _RIDGE * np.eye(scaled.shape[2])
+    ridge = _RIDGE_PARAMETER * np.eye(scaled.shape[2])
     normal = transposed @ scaled / count + ridge
     coefficients = np.linalg.solve(normal, transposed @ values / count)
     return np.asarray(coefficients / size.transpose(0, 2, 1), dtype=np.float64)

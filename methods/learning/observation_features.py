@@ -137,9 +137,9 @@ def estimate_noise_sigma(observations: Array, lengths: tuple[int, ...]) -> Array
     sigmas = np.zeros((observations.shape[0], observations.shape[2]))
     for run in np.split(observations, np.cumsum(lengths)[:-1], axis=1):
         # Third differences of a parabola are zero, so those of smooth motion are small.
-        thirds = np.abs(np.diff(run, n=3, axis=1))
-        count = min(_MAX_PARTS, max(1, thirds.shape[1] // _MIN_PART_DIFFERENCES))
-        parts = np.array_split(thirds, count, axis=1)
+        third_differences = np.abs(np.diff(run, n=3, axis=1))
+        count = min(_MAX_PARTS, max(1, third_differences.shape[1] // _MIN_PART_DIFFERENCES))
+        parts = np.array_split(third_differences, count, axis=1)
         for i, c in np.ndindex(sigmas.shape):
             min_median = _compute_min_part_median([part[i, :, c] for part in parts])
             noise = min_median / (_NORMAL_MAD * _THIRD_DIFFERENCE_STD)
@@ -253,25 +253,29 @@ def make_weighted_features(
     floor = _ROUNDING_SHARE * max(float(deviation.max()), _MIN_DIVISOR)
     reliability = explained / (explained + strictness * unexplained + floor)  # (2)
     best = reliability.max(axis=1, keepdims=True)
-    share = reliability / np.where(best > 0, best, 1.0)
-    parameter_weight = np.max(share**2, axis=0)  # (3)
-    context = (scenario_spread / (scenario_spread + strictness * spread + floor)) ** 2  # (4)
+    relative_reliability = reliability / np.where(best > 0, best, 1.0)
+    parameter_weight = np.max(relative_reliability**2, axis=0)  # (3)
+    scenario_weight = (
+        scenario_spread / (scenario_spread + strictness * spread + floor)
+    ) ** 2  # (4)
     # A stable sort chooses the same numbers on every machine if weights are equal.
-    order = np.argsort(-np.maximum(parameter_weight, context), kind="stable")
+    order = np.argsort(-np.maximum(parameter_weight, scenario_weight), kind="stable")
     chosen_numbers = np.sort(order[:max_inputs])
     by_parameters = _compute_weight_per_deviation(
         parameter_weight[chosen_numbers], spread[chosen_numbers]
     )
-    by_context = _compute_weight_per_deviation(context[chosen_numbers], deviation[chosen_numbers])
+    by_context = _compute_weight_per_deviation(
+        scenario_weight[chosen_numbers], deviation[chosen_numbers]
+    )
     gain = np.maximum(by_parameters, by_context)
     # The network's initial weights and learning rate assume inputs of mean square 1.
-    size = np.sqrt(np.mean((gain * deviation[chosen_numbers]) ** 2)) if max_inputs else 1.0
+    rms_input = np.sqrt(np.mean((gain * deviation[chosen_numbers]) ** 2)) if max_inputs else 1.0
     return ObservationFeatures(
         points,
         False,
         chosen_numbers.astype(np.float64),
         rows[:, chosen_numbers].mean(axis=0),
-        gain / size if size > 0 else gain,
+        gain / rms_input if rms_input > 0 else gain,
     )
 
 
@@ -289,20 +293,20 @@ def _compute_sensitivities(parameters: Array, rows: Array) -> tuple[Array, Array
         Root mean squares of each number (D,), of the part that each parameter explains (dim, D),
         and of the residual (D,).
     """
-    scenarios, each, dim = parameters.shape
+    scenarios, simulations_per_scenario, dim = parameters.shape
     count = rows.shape[2]
     offsets = parameters - parameters.mean(axis=1, keepdims=True)
     # A fit with 1 + dim free numbers leaves this share of the variance of pure noise.
-    free_share = max(each - 1 - dim, 1) / each
+    residual_share = max(simulations_per_scenario - 1 - dim, 1) / simulations_per_scenario
     total = np.zeros(count)
     residual_variance = np.zeros(count)
     explained = np.zeros((dim, count))
     for delta, values in zip(offsets, rows, strict=True):
         centred = values - values.mean(axis=0)
         slopes = np.linalg.lstsq(delta, centred, rcond=None)[0]  # (1)
-        left_over = centred - delta @ slopes
+        residuals = centred - delta @ slopes
         total += np.mean(centred**2, axis=0)
-        residual_variance += np.mean(left_over**2, axis=0) / free_share
+        residual_variance += np.mean(residuals**2, axis=0) / residual_share
         explained += np.mean(delta**2, axis=0)[:, None] * slopes**2
     return (
         np.sqrt(total / scenarios),

@@ -293,14 +293,14 @@ def _make_loss(
     import torch
     from torch.nn.functional import softplus
 
-    def unit(x: Any) -> Any:
+    def activate(x: Any) -> Any:
         return softplus(x) - _SOFTPLUS_AT_ZERO if design.smooth else torch.relu(x)
 
-    def branch(x: Any, layer: str) -> Any:
-        return unit(x @ w[f"{layer}.weight"] + w[f"{layer}.bias"])
+    def compute_branch(x: Any, layer: str) -> Any:
+        return activate(x @ w[f"{layer}.weight"] + w[f"{layer}.bias"])
 
-    def joined(a: Any, b: Any) -> Any:
-        hidden = branch(torch.cat([a, b], dim=-1), "joined")
+    def compute_output(a: Any, b: Any) -> Any:
+        hidden = compute_branch(torch.cat([a, b], dim=-1), "joined")
         output = hidden @ w["output.weight"] + w["output.bias"]  # (1)
         return torch.tanh(output) if design.bounded else output
 
@@ -315,18 +315,18 @@ def _make_loss(
             target_rows: (n, m, E) input rows of the target's side.
             y: (n, m, dim) parameters.
         """
-        b = branch(target_rows, "target")
+        b = compute_branch(target_rows, "target")
         if is_target_only:
             # A proposed input of zero leaves the branch's bias.
-            zero_branch = unit(w["proposed.bias"]).expand_as(b)
-            error = joined(zero_branch, b) - y
+            zero_branch = activate(w["proposed.bias"]).expand_as(b)
+            error = compute_output(zero_branch, b) - y
             return (error**2).sum(dim=-1).mean()
         # Half of the ordered pairs is enough, because the network is antisymmetric.
         first, second = torch.triu_indices(x.shape[1], x.shape[1], offset=1)
-        a = branch(x, "proposed")
-        h = joined(a[:, first], b[:, second])
+        a = compute_branch(x, "proposed")
+        h = compute_output(a[:, first], b[:, second])
         if design.antisymmetric:
-            h = (h - joined(a[:, second], b[:, first])) / 2.0  # (2)
+            h = (h - compute_output(a[:, second], b[:, first])) / 2.0  # (2)
         difference = y[:, second] - y[:, first]
         squares = ((h - difference) ** 2).sum(dim=-1)
         if design.relative:

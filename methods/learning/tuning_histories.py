@@ -31,9 +31,9 @@ def draw_binary_search(simulator: TrainingSimulator, rng: np.random.Generator, c
     Returns:
         (count, dim) points; the first one is the target.
     """
-    target, source = simulator.sample(rng, 2)
+    target, start = simulator.sample(rng, 2)
     lower, upper = (corner.copy() for corner in simulator.training)
-    points = [target, source]
+    points = [target, start]
     while len(points) < count:
         last = points[-1]
         is_below = last < target

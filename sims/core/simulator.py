@@ -44,7 +44,7 @@ class InputError(ValueError):
         super().__init__(truncate_text("".join(escaped), MAX_MESSAGE_LENGTH))
 
 
-_ALIKE = 0.7
+_MIN_NAME_SIMILARITY = 0.7
 """Minimum similarity (0 to 1, `difflib`) of a name that a message proposes instead of another."""
 
 
@@ -85,7 +85,7 @@ def similar(name: str, known_names: Iterable[str]) -> str:
     names = {known_name.lower(): known_name for known_name in known_names}
     lower_name = name.lower()[:MAX_QUOTED_NAME_LENGTH]
     similar = [key for key in names if len(lower_name) >= 3 and key.startswith(lower_name)]
-    similar = similar or get_close_matches(lower_name, names, cutoff=_ALIKE)
+    similar = similar or get_close_matches(lower_name, names, cutoff=_MIN_NAME_SIMILARITY)
     similar_names = [names[key] for key in similar[:3]]
     return f"; did you mean {' or '.join(similar_names)}?" if similar_names else ""
 

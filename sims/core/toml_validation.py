@@ -30,10 +30,10 @@ Source = Path | str
 Range = tuple[float, float]
 """Lower and upper end of a range."""
 
-_LONGEST = 40
+_MAX_QUOTED_CHARACTERS = 40
 """Maximum number of characters of a user's value that a message quotes."""
 
-_WORDS: Mapping[type, str] = {
+_TYPE_DESCRIPTIONS: Mapping[type, str] = {
     str: "text",
     int: "a whole number",
     float: "a number",
@@ -43,7 +43,7 @@ _WORDS: Mapping[type, str] = {
 }
 """Description of each type in messages."""
 
-_WIDER: Mapping[type, tuple[type, ...]] = {float: (int, float), list: (list, tuple)}
+_ACCEPTED_TYPES: Mapping[type, tuple[type, ...]] = {float: (int, float), list: (list, tuple)}
 """Types accepted instead of another: TOML integers as floats, tuples from Python as lists."""
 
 
@@ -86,7 +86,7 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 def format_value(value: object) -> str:
     """Format a value of a user's file for a message, truncated."""
-    return truncate_text(repr(value), _LONGEST)
+    return truncate_text(repr(value), _MAX_QUOTED_CHARACTERS)
 
 
 def make_error(source: Source, where: str, wanted: str, value: object) -> InputError:
@@ -134,14 +134,16 @@ def check_type(source: Source, where: str, value: Any, wanted: type, words: str 
     Raises:
         InputError: The value has another type.
     """
-    kinds = _WIDER.get(wanted, (wanted,))
+    kinds = _ACCEPTED_TYPES.get(wanted, (wanted,))
     # In Python, booleans are integers.
     is_wrong_bool = isinstance(value, bool) and wanted is not bool
     if is_wrong_bool or not isinstance(value, kinds):
-        raise make_error(source, where, words or _WORDS[wanted], value)
+        raise make_error(source, where, words or _TYPE_DESCRIPTIONS[wanted], value)
     size: Any = value
     if wanted is int and not -MAX_INTEGER <= size <= MAX_INTEGER:  # TOML integers are unbounded
-        raise make_error(source, where, f"{words or _WORDS[int]} within ±{MAX_INTEGER:.0e}", value)
+        raise make_error(
+            source, where, f"{words or _TYPE_DESCRIPTIONS[int]} within ±{MAX_INTEGER:.0e}", value
+        )
     return value
 
 
@@ -203,7 +205,7 @@ def check_number(source: Source, where: str, value: Any, words: str = "") -> flo
     try:
         return float(check_type(source, where, value, float, words))
     except OverflowError:  # TOML integers are unbounded
-        raise make_error(source, where, words or _WORDS[float], value) from None
+        raise make_error(source, where, words or _TYPE_DESCRIPTIONS[float], value) from None
 
 
 def check_finite(source: Source, where: str, value: Any, words: str = "") -> float:
@@ -217,9 +219,11 @@ def check_finite(source: Source, where: str, value: Any, words: str = "") -> flo
     """
     result = check_number(source, where, value, words)
     if not math.isfinite(result):
-        raise make_error(source, where, words or _WORDS[float], value)
+        raise make_error(source, where, words or _TYPE_DESCRIPTIONS[float], value)
     if abs(result) > MAX_NUMBER:
-        raise make_error(source, where, f"{words or _WORDS[float]} within ±{MAX_NUMBER:g}", value)
+        raise make_error(
+            source, where, f"{words or _TYPE_DESCRIPTIONS[float]} within ±{MAX_NUMBER:g}", value
+        )
     return result
 
 

@@ -21,7 +21,7 @@ import numpy as np
 from sims.core.effect import Coefficient, Contact, ModelValueEffect
 from sims.core.simulator import Array
 
-_SMALLEST = 1e-9
+_MIN_IMPACT_SPEED = 1e-9
 """Minimum impact speed in m/s for the power law, so that a negative power is finite."""
 _POWER = ((-0.4, 0.2), (-0.4, 0.2), (0, 0))
 """Plausible powers of the impact speed: yielding bodies have about -1/4, viscoelastic ones less."""
@@ -48,7 +48,7 @@ class SpeedDependentRestitution(Contact):
             restitution: (L, 1) restitution without the effect.
             speed: (L, 1) impact speed in m/s.
         """
-        scaled = restitution * np.maximum(speed, _SMALLEST) ** c[0]  # (1)
+        scaled = restitution * np.maximum(speed, _MIN_IMPACT_SPEED) ** c[0]  # (1)
         # a restitution above 1 without the effect stays: c = 0 is off
         return np.minimum(scaled, np.maximum(restitution, 1.0))
 

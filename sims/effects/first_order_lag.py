@@ -15,7 +15,7 @@ import numpy as np
 
 from sims.core.simulator import Array
 
-_SMALLEST = 1e-12
+_MIN_TIME_CONSTANT = 1e-12
 """Smallest time constant in seconds; such a lag has no effect on any step."""
 
 
@@ -31,7 +31,7 @@ def compute_lag_response(steps: Array, lag: Array) -> tuple[Array, Array]:
     Returns:
         Both weights (L, S).
     """
-    ratio = steps / np.maximum(lag, _SMALLEST)
+    ratio = steps / np.maximum(lag, _MIN_TIME_CONSTANT)
     # a step of zero length, where an element waits, keeps the old value: the limit of m is 1
     divisor = np.where(ratio > 0, ratio, 1.0)
     # expm1, since 1 - exp has cancellation if steps are much shorter than the lag
@@ -39,24 +39,24 @@ def compute_lag_response(steps: Array, lag: Array) -> tuple[Array, Array]:
     return np.exp(-ratio), mean
 
 
-def apply_recursion(decay: Array, gained: Array, start: Array) -> Array:
+def apply_recursion(decay: Array, additions: Array, start: Array) -> Array:
     """Return the recursion y[k] = decay[k] y[k - 1] + gained[k].
 
     Args:
         decay: (L, S) factors.
-        gained: (L, S) additions.
+        additions: (L, S) additions.
         start: (L, 1) value y[-1].
 
     Returns:
         Values y (L, S).
     """
     # rows are contiguous in memory, and the additions become the result
-    result = np.ascontiguousarray(gained.T)
+    result = np.ascontiguousarray(additions.T)
     decay_rows = np.ascontiguousarray(decay.T)
     state: Array = start[:, 0]
     # step by step: a closed form would divide by products of decays, which underflow
-    for row, share in zip(result, decay_rows, strict=True):
-        row += share * state
+    for row, factor in zip(result, decay_rows, strict=True):
+        row += factor * state
         state = row
     return result.T
 

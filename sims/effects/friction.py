@@ -43,7 +43,7 @@ _PLACE = (
     "M. R. Popovic, A. A. Goldenberg, IEEE Trans. Robot. Autom. 14(1), 114 (1998); B. Armstrong,"
     " Proc. IEEE ICRA, 1422 (1988)"
 )
-_SMALLEST = 1e-9
+_MIN_DIVISOR = 1e-9
 """Smallest speed, period or time, which replaces zero to avoid 0 / 0."""
 _USUAL = ("m/s^2", "N", "N*m")
 """Units of a force on the three kinds of system."""
@@ -197,7 +197,7 @@ class PositionFriction(Friction):
             c: (K, L, 1) coefficients.
             moment: state snapshot of L batch elements.
         """
-        angle = 2 * np.pi * moment.primary / np.maximum(c[3], _SMALLEST)
+        angle = 2 * np.pi * moment.primary / np.maximum(c[3], _MIN_DIVISOR)
         mean = c[0] + np.sqrt(c[1] ** 2 + c[2] ** 2)
         return np.maximum(mean + c[1] * np.sin(angle) + c[2] * np.cos(angle), 0.0)  # (6)
 
@@ -221,7 +221,7 @@ class WarmingFriction(Friction):
             c: (K, L, 1) coefficients.
             moment: state snapshot of L batch elements.
         """
-        remaining_share = np.exp(-moment.t / np.maximum(c[2], _SMALLEST))
+        remaining_share = np.exp(-moment.t / np.maximum(c[2], _MIN_DIVISOR))
         return (
             np.maximum(c[0], 0.0) + np.maximum(c[1], 0.0) * moment.speed
         ) * remaining_share  # (7)
@@ -256,6 +256,6 @@ def _limit_to_opposing(drive: Array, external_load: Array) -> Array:
 
 def _compute_stribeck_factor(speed: Array, scale: Array) -> Array:
     """Return exp(-(v / scale)^2) (L, 1), the share of Stribeck's extra friction (2) at a speed."""
-    ratio = speed / np.maximum(scale, _SMALLEST)
+    ratio = speed / np.maximum(scale, _MIN_DIVISOR)
     factor: Array = np.exp(-np.square(ratio))
     return factor

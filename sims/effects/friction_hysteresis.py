@@ -22,7 +22,7 @@ MAX_STATE_RATE = 400.0
 
 It is far above the rates visible in a log, and low enough to be integrated.
 """
-_SMALLEST = 1e-9
+_MIN_DEFLECTION = 1e-9
 """Smallest deflection in m or rad, which replaces zero to avoid division by zero."""
 _WAY = ((2e-4, 0.05), (2e-4, 0.05), (1e-3, 0.3))
 """Plausible deflections in m or rad before surfaces slide."""
@@ -50,6 +50,6 @@ class FrictionHysteresis(HiddenStateEffect):
             moment: state snapshot of L batch elements.
             state: hidden state w, as the velocity of the hidden coordinate.
         """
-        ratio = moment.v[:, :1] / np.maximum(c[1], _SMALLEST)
+        ratio = moment.v[:, :1] / np.maximum(c[1], _MIN_DEFLECTION)
         rate = np.clip(ratio, -MAX_STATE_RATE, MAX_STATE_RATE)
         return moment.along_primary(-c[0] * state.v), rate - np.abs(rate) * state.v  # (1)

@@ -92,9 +92,11 @@ class PayloadMass(ModelValueEffect):
     )
 
     def probe_points(self) -> Sequence[Array]:
-        """Return a small mass at the middle of the link, and moved along each observable axis.
+        """Return coefficients at which a search compares the effect with the data, (4,) each.
 
-        At a place, the plausible positions are those within the link.
+        The first point is a small mass at the middle of the link; each of the others moves it along
+        one observable axis. The coefficients are the mass, then the position along x, y and z. An
+        axis whose limits are equal is not observable.
         """
         limits = np.array([c.plausible[0] for c in self.coefficients])
         middle = limits.mean(axis=1)

@@ -37,7 +37,7 @@ _SCALE = ((-0.9, 9), (-0.9, 9), (-0.9, 9))
 """Plausible gains combined with a power, which changes the scale far from one unit."""
 _EXPONENT = ((-0.5, 2), (-0.5, 2), (-0.5, 2))
 """Plausible additions to the exponent one."""
-_LEAST = 0.01
+_MIN_EXPONENT = 0.01
 """Smallest exponent; with zero, only the sign of the input would act."""
 _OFFSET = ((-2, 2), (-2, 2), (-0.2, 0.2))
 """Plausible biases, in the units of `_FORCE_UNITS`."""
@@ -234,7 +234,7 @@ class InputPower(Input):
             signal: signal (L, S) over the steps.
         """
         size = np.abs(signal.values)
-        power = np.sign(signal.values) * size ** np.maximum(1.0 + c[1], _LEAST)
+        power = np.sign(signal.values) * size ** np.maximum(1.0 + c[1], _MIN_EXPONENT)
         return (1.0 + c[0]) * np.where(c[1] != 0, power, signal.values)  # (8)
 
 

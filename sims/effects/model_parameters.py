@@ -26,7 +26,7 @@ _LENGTH = ("m", "m", "m")
 _TENTH = ((-0.1, 0.1), (-0.1, 0.1), (-0.1, 0.1))
 """Plausible offsets of a centre of mass in metres."""
 _IDENTIFICATION = "W. Khalil, E. Dombre, Modeling, Identification and Control of Robots (2002)"
-_LEAST = -0.99
+_MIN_RELATIVE_ERROR = -0.99
 """Smallest relative error of a number that must stay positive."""
 
 
@@ -38,7 +38,7 @@ class MassScale(ModelValueEffect):
     says = "the body is heavier or lighter than the model file states"
     source = _IDENTIFICATION + ", chapter 12"
     at = "body"
-    coefficients = (Coefficient("coefficient", _PURE, _HALF, least=_LEAST),)
+    coefficients = (Coefficient("coefficient", _PURE, _HALF, least=_MIN_RELATIVE_ERROR),)
 
 
 class CentreOfMassOffset(ModelValueEffect):
@@ -60,7 +60,7 @@ class InertiaScale(ModelValueEffect):
     says = "the body's moment of inertia differs from the model file"
     source = _IDENTIFICATION + ", chapter 12"
     at = "body"
-    coefficients = (Coefficient("coefficient", _PURE, _HALF, least=_LEAST),)
+    coefficients = (Coefficient("coefficient", _PURE, _HALF, least=_MIN_RELATIVE_ERROR),)
 
 
 class ArmatureOffset(ModelValueEffect):
@@ -84,7 +84,7 @@ class ActuatorStiffnessScale(ModelValueEffect):
     says = "the servo's proportional gain differs from the model file"
     source = "K. J. Astrom, R. M. Murray, Feedback Systems (2008), chapter 10"
     at = "actuator"
-    coefficients = (Coefficient("coefficient", _PURE, _HALF, least=_LEAST),)
+    coefficients = (Coefficient("coefficient", _PURE, _HALF, least=_MIN_RELATIVE_ERROR),)
 
 
 class ActuatorDampingScale(ModelValueEffect):
@@ -95,7 +95,7 @@ class ActuatorDampingScale(ModelValueEffect):
     says = "the servo's damping gain differs from the model file"
     source = "K. J. Astrom, R. M. Murray, Feedback Systems (2008), chapter 10"
     at = "actuator"
-    coefficients = (Coefficient("coefficient", _PURE, _HALF, least=_LEAST),)
+    coefficients = (Coefficient("coefficient", _PURE, _HALF, least=_MIN_RELATIVE_ERROR),)
 
 
 class ActuatorForceLimit(ModelValueEffect):

@@ -39,16 +39,17 @@ def _format_effect_rows(effect: type[Effect]) -> list[str]:
     return rows
 
 
-def _format_range(c: Coefficient, place: int) -> str:
+def _format_range(c: Coefficient, kind_index: int) -> str:
     """Format the plausible range of a coefficient for one kind of system.
 
-    `place` is the index of the kind in `SYSTEM_KINDS`. A dash means that the effect does not exist
-    on this kind of system, and (*) that the unit is that of another quantity, such as an input.
+    `kind_index` is the index of the kind in `SYSTEM_KINDS`. A dash means that the effect does not
+    exist on this kind of system, and (*) that the unit is that of another quantity, such as an
+    input.
     """
-    unit = c.units[place]
+    unit = c.units[kind_index]
     if unit is None:
         return "–"
-    low, high = c.plausible[place]
+    low, high = c.plausible[kind_index]
     text = f"{low:g} … {high:g}"
     if unit != "1":
         text += f" {unit}"

@@ -58,7 +58,7 @@ _OFF_AXIS = ((0, 0), (0, 0), (-0.1, 0.1))
 """Plausible errors of an eccentric encoder, in the units of `_ANGLE`."""
 _INSTANT = ((0.01, 10), (0.01, 10), (0.01, 10))
 """Plausible times in seconds on a recording's clock; a fit searches the duration of the runs."""
-_SHORTEST = 1e-12
+_MIN_SAMPLE_INTERVAL = 1e-12
 """Smallest time in seconds between two different samples."""
 _VOCABULARY = "International Vocabulary of Metrology, JCGM 200:2012"
 
@@ -224,7 +224,7 @@ class ClockSkew(Sensor):
 
 def _smooth_step(instant: Array, times: Array) -> Array:
     """Return the progress (L, S) of the slip at stamps `times`: 0 before, 1 after, (8) between."""
-    intervals = np.maximum(np.diff(times, axis=1, prepend=times[:, :1]), _SHORTEST)
+    intervals = np.maximum(np.diff(times, axis=1, prepend=times[:, :1]), _MIN_SAMPLE_INTERVAL)
     share: Array = np.clip((times - instant) / intervals + 0.5, 0.0, 1.0)
     return share
 

@@ -113,21 +113,23 @@ def _apply_acceleration_limit(signal: Signal, max_acceleration: Array) -> Array:
     gains = max_acceleration * steps
     inverses = np.divide(1.0, steps, out=np.zeros_like(steps), where=steps > 0)
     rows = zip(commands, steps, gains, 0.5 * gains, 0.25 * gains**2, inverses, means, strict=True)
-    place, speed = signal.start[:, 0].copy(), np.zeros(commands.shape[1])
+    position, speed = signal.start[:, 0].copy(), np.zeros(commands.shape[1])
     # The loop has thousands of steps of a few elements: everything possible is computed before it.
-    for row, h, gain, half_gain, square, inverse, mean in rows:
-        deviation = row - place
+    for row, h, gain, half_gain, squared_gain, inverse, mean in rows:
+        deviation = row - position
         direction = np.copysign(1.0, deviation)
         remaining, directed_speed = np.abs(deviation), direction * speed
         braking_distance = h * directed_speed
-        short = inverse * (remaining - 0.5 * braking_distance)
-        root = np.maximum(square + max_acceleration * (2.0 * remaining - braking_distance), 0.0)
-        long = np.maximum(np.sqrt(root) - half_gain, gain)
-        limited_speed = np.maximum(np.minimum(short, long), directed_speed - gain)
+        one_step_speed = inverse * (remaining - 0.5 * braking_distance)
+        root = np.maximum(
+            squared_gain + max_acceleration * (2.0 * remaining - braking_distance), 0.0
+        )
+        braking_speed = np.maximum(np.sqrt(root) - half_gain, gain)
+        limited_speed = np.maximum(np.minimum(one_step_speed, braking_speed), directed_speed - gain)
         next_speed = direction * np.minimum(limited_speed, directed_speed + gain)
         travel = 0.5 * h * (speed + next_speed)
-        np.add(place, (travel + 0.5 * h * speed) / 3.0, out=mean)
-        place = place + travel
+        np.add(position, (travel + 0.5 * h * speed) / 3.0, out=mean)
+        position = position + travel
         speed = next_speed
     return means.T
 
@@ -141,19 +143,24 @@ def _average_earlier_signal(signal: Signal, delay: Array) -> Array:
     step_starts = step_ends - signal.steps
     cumulative_integral = np.cumsum(signal.values * signal.steps, axis=1)
     result = signal.values.copy()
-    for lane in np.flatnonzero(delay[:, 0] > 0):
+    for batch_index in np.flatnonzero(delay[:, 0] > 0):
         # integral of the signal, beginning long before the run
         knots = np.concatenate(
-            [[step_starts[lane, 0] - 1.0, step_starts[lane, 0]], step_ends[lane]]
+            [
+                [step_starts[batch_index, 0] - 1.0, step_starts[batch_index, 0]],
+                step_ends[batch_index],
+            ]
         )
-        integral = np.concatenate([[-signal.start[lane, 0], 0.0], cumulative_integral[lane]])
+        integral = np.concatenate(
+            [[-signal.start[batch_index, 0], 0.0], cumulative_integral[batch_index]]
+        )
         first, last = (
-            _integrate_signal(knots, integral, t[lane] - delay[lane])
+            _integrate_signal(knots, integral, t[batch_index] - delay[batch_index])
             for t in (step_starts, step_ends)
         )
-        steps = signal.steps[lane]
-        long = steps > 0
-        result[lane, long] = (last - first)[long] / steps[long]
+        steps = signal.steps[batch_index]
+        has_length = steps > 0
+        result[batch_index, has_length] = (last - first)[has_length] / steps[has_length]
     return result
 
 

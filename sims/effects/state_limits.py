@@ -24,7 +24,7 @@ _LEVEL = ("m", "m", "m")
 """Units of a level; a level may have another unit."""
 _TYPICAL = ((0, 4), (0, 4), (0, 4))
 """Plausible rims, relative to the typical size of the level."""
-_DEEP = 0.01
+_REFERENCE_PENETRATION = 0.01
 """Penetration in m or rad at which the stiffness of a stop is specified."""
 _STIFF = (None, "N/m", "N*m/rad")
 """Units of a stop's stiffness; a body in free flight meets the ground instead."""
@@ -80,5 +80,7 @@ class EndStop(Force):
         """
         side = np.sign(c[0])
         depth = np.maximum(side * (moment.primary - c[1]), 0.0)
-        losing = np.maximum(1.0 + c[2] * side * moment.v, 0.0)
-        return moment.along_primary(-c[0] * depth * np.sqrt(depth / _DEEP) * losing)  # (2)
+        damping_factor = np.maximum(1.0 + c[2] * side * moment.v, 0.0)
+        return moment.along_primary(
+            -c[0] * depth * np.sqrt(depth / _REFERENCE_PENETRATION) * damping_factor
+        )  # (2)

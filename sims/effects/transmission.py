@@ -50,9 +50,9 @@ It is far above the frequencies visible in a log, and low enough to be integrate
 """
 CONTACT_DAMPING_DEPTH = 0.01
 """Penetration of a flank at which half of its damping acts, as a fraction of the gap."""
-_MOST = 0.98
+_MAX_LOAD_SHARE = 0.98
 """Maximum share of the inertia on the load side of a transmission."""
-_LEAST = 1e-12
+_MIN_COMPLIANCE = 1e-12
 """Smallest compliance in rad/(N m) or m/N, which counts as zero."""
 _ELASTIC = "M. W. Spong, J. Dyn. Syst. Meas. Control 109(4), 310 (1987), doi:10.1115/1.3143860"
 _PLAY = "M. Nordin, P.-O. Gutman, Automatica 38(10), 1633 (2002), doi:10.1016/S0005-1098(02)00047-X"
@@ -73,7 +73,7 @@ _RATIO = ((0.005, 1), (0.005, 1), (0.005, 1))
 _GAP = ((0, 0.02), (0, 0.02), (0, 0.1))
 """Plausible gaps in m or rad."""
 _SPRUNG = (
-    Coefficient("share", _PURE, _ANY_SHARE, most=_MOST),
+    Coefficient("share", _PURE, _ANY_SHARE, most=_MAX_LOAD_SHARE),
     Coefficient("frequency", ("rad/s", "rad/s", "rad/s"), _SWING),
     Coefficient("damping", _PURE, _RATIO, tried=(0.03, 0.3)),
 )
@@ -106,7 +106,7 @@ class DrivenLoad(HiddenStateEffect):
 
     def behind(self, c: Array) -> Array:
         """Return the load's share of the inertia (L, 1), limited to its maximum."""
-        return np.clip(c[self.share], 0.0, _MOST)
+        return np.clip(c[self.share], 0.0, _MAX_LOAD_SHARE)
 
     def element(self, c: Array) -> SeriesElement:
         """Return the series element: a spring with damper for a compliance, else backlash."""
@@ -116,7 +116,7 @@ class DrivenLoad(HiddenStateEffect):
         none = np.zeros_like(c[0])
         compliance = numbers.get("compliance", none)
         # A compliance of zero is off; it adds no spring to a batch in which others are on.
-        stiffness = np.where(compliance > 0, 1.0 / np.maximum(compliance, _LEAST), 0.0)
+        stiffness = np.where(compliance > 0, 1.0 / np.maximum(compliance, _MIN_COMPLIANCE), 0.0)
         gap = np.maximum(numbers.get("gap", none), 0.0)
         return SeriesElement(stiffness, numbers.get("damping", none), gap, numbers["rotor"])
 

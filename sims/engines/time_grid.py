@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 from sims.core.effect import ActiveEffects, Effect, Input, Sensor, Signal
 from sims.core.simulator import Array, Indices, Scenario
 
-_ROUNDING = 1e-6
+_ROUNDING_SHARE = 1e-6
 """Fraction of a step by which an interval may exceed an integer number of steps."""
 
 MAX_LEAD_IN_STEP_SECONDS = 2e-3
@@ -228,7 +228,7 @@ def _divide_intervals(instants: Array, largest_step: float) -> tuple[Array, Arra
     interval_starts = np.concatenate([start, instants[:, :-1]], axis=1)
     intervals = instants - interval_starts
     # Tolerate rounding where an interval is an integer number of steps.
-    parts = np.ceil(intervals / largest_step - _ROUNDING).astype(np.intp)
+    parts = np.ceil(intervals / largest_step - _ROUNDING_SHARE).astype(np.intp)
     parts = np.where(intervals > 0, np.maximum(parts, 1), 0)
     steps_per_block = int(np.bincount(parts[parts > 0]).argmax()) if parts.any() else 1
     blocks = -(-parts // steps_per_block)

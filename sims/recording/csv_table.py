@@ -28,7 +28,7 @@ _MAX_NAMES = 12
 """Maximum number of names in a message."""
 _SECONDS_PER_YEAR = 365.25 * 86400
 """Seconds per year."""
-_NUMBER = re.compile(r"\s*[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?\s*")
+_NUMBER_PATTERN = re.compile(r"\s*[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?\s*")
 """Pattern of a number as instruments write it, without `inf` or `1_000`, which float() accepts."""
 
 
@@ -167,16 +167,20 @@ class RecordingTable:
         # A single column is most likely due to another separator.
         if len(header) < 2:
             text = "".join(header)
-            marks = [name for mark, name in ((";", "semicolons"), ("\t", "tabs")) if mark in text]
-            found_text = f"{marks[0]} (save it with commas)" if marks else format_value(text)
+            separators = [
+                name for mark, name in ((";", "semicolons"), ("\t", "tabs")) if mark in text
+            ]
+            found_text = (
+                f"{separators[0]} (save it with commas)" if separators else format_value(text)
+            )
             raise InputError(
                 f"{self.path}, row 1: expected columns {', '.join(self.wanted)} between commas, "
                 f"found {found_text}"
             )
-        for place, name in enumerate(header):
+        for index, name in enumerate(header):
             if not name:
-                raise InputError(f"{self.path}, row 1: column {place + 1} has no name")
-            if name in header[:place]:
+                raise InputError(f"{self.path}, row 1: column {index + 1} has no name")
+            if name in header[:index]:
                 raise InputError(f"{self.path}, row 1: column {format_value(name)} is given twice")
         for name in self.wanted:
             if name not in header:
@@ -193,34 +197,38 @@ class RecordingTable:
                 )
         return header
 
-    def _check_row_widths(self, rows: list[list[str]], width: int, first: int) -> list[list[str]]:
+    def _check_row_widths(
+        self, rows: list[list[str]], width: int, first_row: int
+    ) -> list[list[str]]:
         """Check that all rows have as many cells as the header, and return them.
 
         Args:
             rows: Cells of each row.
             width: Number of cells of the header.
-            first: Number of the first of these rows, counted from 0.
+            first_row: Number of the first of these rows, counted from 0.
         """
         if set(map(len, rows)) != {width}:
             record, row = next((i, row) for i, row in enumerate(rows) if len(row) != width)
             raise InputError(
-                f"{self.path}, row {self._find_line_number(first + record)}: "
+                f"{self.path}, row {self._find_line_number(first_row + record)}: "
                 f"expected {width} cells as in the header, found {len(row)}"
             )
         return rows
 
-    def _convert_to_numbers(self, name: str, cells: Sequence[str], first: int) -> Array:
+    def _convert_to_numbers(self, name: str, cells: Sequence[str], first_row: int) -> Array:
         """Convert the cells of a column to numbers (T,); empty ones to NaN where gaps are allowed.
 
         Args:
             name: Name of the column.
             cells: Text of each cell.
-            first: Number of the first of these rows, counted from 0.
+            first_row: Number of the first of these rows, counted from 0.
         """
         try:
             values = np.array(list(map(float, cells)))
         except ValueError:
-            values = np.array([float(c) if _NUMBER.fullmatch(c) else math.nan for c in cells])
+            values = np.array(
+                [float(c) if _NUMBER_PATTERN.fullmatch(c) else math.nan for c in cells]
+            )
         suspects: Iterable[int] = np.flatnonzero(~np.isfinite(values)).tolist()
         joined_cells = "".join(cells)
         # float() also accepts 1_000 and digits of other scripts.
@@ -228,7 +236,7 @@ class RecordingTable:
             suspects = range(len(cells))
         for i in suspects:
             if cells[i].strip() or name not in self.gaps:
-                self._check_cell(name, cells[i], first + i)
+                self._check_cell(name, cells[i], first_row + i)
         return values
 
     def _check_cell(self, name: str, cell: str, record: int) -> None:
@@ -237,7 +245,7 @@ class RecordingTable:
         Raises:
             InputError: the cell does not; the message states its row and column.
         """
-        if not (_NUMBER.fullmatch(cell) and math.isfinite(float(cell))):
+        if not (_NUMBER_PATTERN.fullmatch(cell) and math.isfinite(float(cell))):
             missing = name in self.inputs and not cell.strip()
             note = "; an input has no missing samples" if missing else ""
             self.raise_error(

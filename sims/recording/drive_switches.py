@@ -22,9 +22,9 @@ Mask = NDArray[np.bool_]
 Run: TypeAlias = Any
 """Alias for `sims.recording.recording.Run`, whose module imports this one."""
 
-KEYS = ("enable", "disable")
+SWITCH_KEYS = ("enable", "disable")
 """Keys of ``[actuators.NAME]`` that name a switch column."""
-FEWEST = 10
+MIN_PART_SAMPLES = 10
 """Minimum number of samples of a part of a run; fewer determine no more than an initial state."""
 MOST_RUNS = 6
 """Maximum number of runs named in a message."""
@@ -85,7 +85,7 @@ def read_switches(path: Path, meta: Mapping[str, Any]) -> tuple[DriveSwitch, ...
     """
     switches = []
     for name, table in check_table(path, "actuators", meta.get("actuators", {})).items():
-        keys = [key for key in KEYS if isinstance(table, dict) and key in table]
+        keys = [key for key in SWITCH_KEYS if isinstance(table, dict) and key in table]
         if len(keys) > 1:
             raise InputError(f"{path}: actuators.{name}: expected enable or disable, found both")
         for key in keys:
@@ -101,7 +101,7 @@ def without_switches(actuators: Mapping[str, Any]) -> dict[str, Any]:
         if not isinstance(table, dict):
             result[name] = table
             continue
-        other_entries = {key: value for key, value in table.items() if key not in KEYS}
+        other_entries = {key: value for key, value in table.items() if key not in SWITCH_KEYS}
         # A table with a switch column only belongs to an actuator of the model file.
         if other_entries or not table:
             result[name] = other_entries
@@ -146,7 +146,9 @@ class Switched(NamedTuple):
     notes: tuple[str, ...]
 
 
-def switched_runs(path: Path, runs: Sequence[Run], switches: Sequence[DriveSwitch]) -> Switched:
+def apply_drive_switches(
+    path: Path, runs: Sequence[Run], switches: Sequence[DriveSwitch]
+) -> Switched:
     """Add to each run at which samples its drives are off.
 
     Args:
@@ -214,17 +216,17 @@ def spans(mask: Mask) -> list[tuple[int, int]]:
     return list(zip(first.tolist(), end.tolist(), strict=True))
 
 
-def parts_without(run: Run, off: Mask) -> list[Run]:
+def split_without_masked(run: Run, off: Mask) -> list[Run]:
     """Return the parts of a run in which a mask (T,) is not set.
 
-    Parts of fewer than `FEWEST` samples are left out. If the mask is set nowhere, the run itself is
-    returned.
+    Parts of fewer than `MIN_PART_SAMPLES` samples are left out. If the mask is set nowhere, the run
+    itself is returned.
     """
     if not off.any():
         return [run]
     parts = []
     for first, end in spans(~off):
-        if end - first < FEWEST:
+        if end - first < MIN_PART_SAMPLES:
             continue
         name = f"{run.name} from {run.times[first]:.4g} s" if first else run.name
         part = run.part(slice(first, end), name)

@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 
 from sims.core.simulator import Array, InputError, make_read_only
 from sims.recording.angle_unwrapping import unwrapped
-from sims.recording.column_mapping import RecordingSources, read_logs
+from sims.recording.column_mapping import RecordingSources
 from sims.recording.csv_table import CsvRun, has_run_column, read_table
-from sims.recording.drive_switches import switched_runs
+from sims.recording.drive_switches import apply_drive_switches
+from sims.recording.log_joining import read_logs
 from sims.recording.recording_description import (
     DeclaredSignals,
     ModelFileReference,
@@ -32,7 +33,12 @@ from sims.recording.recording_description import (
     read_meta,
     read_system_name,
 )
-from sims.recording.recording_frame import Frame, described, read_frame, with_index
+from sims.recording.recording_frame import (
+    Frame,
+    build_frame_description,
+    move_index_to_columns,
+    read_frame,
+)
 from sims.recording.unit_conversion import IDENTITY_SCALE, UnitScale
 
 __all__ = ["DeclaredSignals", "Recording", "Run", "read_recording", "read_system_name"]
@@ -226,7 +232,7 @@ def read_recording(
         table = csv_path
         parts = read_table(csv_path, *columns, list(description.extra))
     check_run_names(description_path, description.runs, [part.name for part in parts])
-    switched = switched_runs(
+    switched = apply_drive_switches(
         table, [_make_run(table, part, description) for part in parts], description.switches
     )
     runs = switched.runs if whole else _split_runs(description_path, switched.runs, folds)
@@ -304,12 +310,12 @@ def recording_of_frame(
         InputError: The frame is malformed; the message is one line.
     """
     path = Path(name)
-    indexed_frame = with_index(path, frame)
-    document = described(path, indexed_frame, declared, meta, units)
+    indexed_frame = move_index_to_columns(path, frame)
+    document = build_frame_description(path, indexed_frame, declared, meta, units)
     description = check_description(path, document, declared)
     parts = read_frame(path, indexed_frame, description)
     check_run_names(path, description.runs, [part.name for part in parts])
-    switched = switched_runs(
+    switched = apply_drive_switches(
         path, [_make_run(path, part, description) for part in parts], description.switches
     )
     return Recording(
@@ -353,27 +359,29 @@ _HELD_OUT_STRIDE = 3
 
 def _make_run(table: Path, part: CsvRun, description: RecordingDescription) -> Run:
     """Make a run in SI units from its table and the metadata of the description."""
-    marks = description.runs.get(part.name, _UNMARKED)
+    metadata = description.runs.get(part.name, _UNMARKED)
     channels = {n: _convert_column(table, part, n, s) for n, s in description.channels.items()}
     inputs = {n: _convert_column(table, part, n, s) for n, s in description.inputs.items()}
     for name, command in description.wrapped.items():
         channels[name] = make_read_only(unwrapped(channels[name], inputs.get(command)))
     # Extra columns keep their unit, because no system reads them.
     extra = {name: part.columns[name] for name in description.extra if name in part.columns}
-    first = {
+    initial_values = {
         n: s.gain * extra[n][0] + s.offset
         for n, s in description.initial_pose_scales.items()
         if n in extra
     }
-    initial_pose = {name: float(value) for name, value in first.items() if np.isfinite(value)}
+    initial_pose = {
+        name: float(value) for name, value in initial_values.items() if np.isfinite(value)
+    }
     return Run(
         part.name,
         part.times,
         channels,
         inputs,
-        marks.constants,
-        {**initial_pose, **marks.initial},
-        bool(marks.held_out),
+        metadata.constants,
+        {**initial_pose, **metadata.initial},
+        bool(metadata.held_out),
         extra,
         description.linear,
         description.sources.offset,

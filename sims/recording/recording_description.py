@@ -53,7 +53,7 @@ _KEYS = (
 HOLD_MODES = ("zero", "linear")
 """How an input continues between two samples: it is held (zero order) or interpolated linearly."""
 
-_NEVER = 1e12
+_MAX_NOISE_FACTOR = 1e12
 """Limit of plausible sensor noise, as a factor above and below the typical size of its channel."""
 
 
@@ -284,10 +284,12 @@ def check_description(
     constants = _read_constants(path, "constants", meta.get("constants", {}), declared)
     _check_constants_possible(path, "constants", constants, declared)
     # The names of the runs are checked after the table was read (`check_run_names`).
-    marks = check_table(path, "runs", meta.get("runs", {}))
-    runs = {name: _read_run(path, name, run_table, declared) for name, run_table in marks.items()}
+    run_tables = check_table(path, "runs", meta.get("runs", {}))
+    runs = {
+        name: _read_run(path, name, run_table, declared) for name, run_table in run_tables.items()
+    }
     # A robot has no system name: its model file is stated instead.
-    robotic = declared.has_model
+    is_robot = declared.has_model
     extra = _read_extra_columns(path, meta, declared)
     switches = _read_drive_switches(path, meta, declared)
     extra = {**{switch.column: {"unit": "1"} for switch in switches}, **extra}
@@ -299,7 +301,7 @@ def check_description(
     )
     extra_units = {name: str(table["unit"]) for name, table in extra.items()}
     return RecordingDescription(
-        system=declared.name if robotic else _read_system_name(path, meta),
+        system=declared.name if is_robot else _read_system_name(path, meta),
         title=title,
         channels={name: column.scale for name, column in channels.items()},
         inputs={name: column.scale for name, column in inputs.items()},
@@ -524,7 +526,7 @@ def _read_noises(
             continue
         # A standard deviation has no offset and no sign.
         noises[name] = abs(column.scale.gain) * _read_noise(path, name, column.table["noise"])
-        if not 1 / _NEVER < noises[name] / sizes[name] < _NEVER:
+        if not 1 / _MAX_NOISE_FACTOR < noises[name] / sizes[name] < _MAX_NOISE_FACTOR:
             expected = f"that of values of about {sizes[name]:g} in SI units"
             raise make_error(path, f"channels.{name}.noise", expected, column.table["noise"])
     return noises

@@ -48,7 +48,7 @@ class Frame(Protocol):
         """Access to rows by number."""
 
 
-def with_index(path: Path, frame: Frame) -> Any:
+def move_index_to_columns(path: Path, frame: Frame) -> Any:
     """Return the frame with ``run`` and ``t`` as columns if they are levels of its index.
 
     Args:
@@ -72,7 +72,7 @@ def with_index(path: Path, frame: Frame) -> Any:
     return indexed_frame
 
 
-def described(
+def build_frame_description(
     path: Path,
     frame: Frame,
     declared: DeclaredSignals,
@@ -86,7 +86,7 @@ def described(
 
     Args:
         path: Name of the frame, for messages.
-        frame: Data frame with columns as returned by `with_index`.
+        frame: Data frame with columns as returned by `move_index_to_columns`.
         declared: System, or simulator of it.
         meta: Statements of the user, with the keys of `NAME.toml`.
         units: Units of columns, by name.
@@ -185,8 +185,8 @@ def read_frame(path: Path, frame: Frame, description: RecordingDescription) -> l
 
     Args:
         path: Name of the frame, for messages.
-        frame: Data frame with columns as returned by `with_index`; it is one run if it has no
-            column ``run``.
+        frame: Data frame with columns as returned by `move_index_to_columns`; it is one run if it
+            has no column ``run``.
         description: Checked description of the frame.
 
     Raises:

@@ -18,7 +18,7 @@ from sims.core.simulator import Array, InputError, make_unknown_name_error
 from sims.recording.recording import DeclaredSignals, Recording, Run
 from sims.recording.recording_description import get_description_path
 
-_EXACT = 17
+_LOSSLESS_DIGITS = 17
 """Number of significant digits with which a number is written without loss."""
 
 
@@ -27,7 +27,7 @@ def write_recording(
     recording: Recording,
     declared: DeclaredSignals,
     *,
-    digits: int = _EXACT,
+    digits: int = _LOSSLESS_DIGITS,
     beside: Mapping[Path, Content] | None = None,
 ) -> None:
     """Write a recording such that `read_recording` gives it back unchanged, in SI units.
@@ -146,7 +146,7 @@ def _format_cells(values: Array, digits: int) -> list[str]:
     """Format a column of the table; a missing sample (NaN) becomes an empty cell."""
     # repr gives the shortest text that is read back as the same number; a missing sample is an
     # empty cell.
-    shortest = repr if digits >= _EXACT else f"{{:.{digits}g}}".format
+    shortest = repr if digits >= _LOSSLESS_DIGITS else f"{{:.{digits}g}}".format
     return [shortest(v) if math.isfinite(v) else "" for v in values.tolist()]
 
 

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 from sims.core.simulator import InputError
 
-_LONGEST = 60
+_MAX_UNIT_LENGTH = 60
 """Maximum number of characters of a unit."""
 _ROUNDING = 1e-9
 """Relative deviation from a linear conversion that is accepted as rounding error."""
@@ -52,8 +52,10 @@ def compute_unit_scale(unit: str, target: str) -> UnitScale:
     """
     if unit == target:
         return IDENTITY_SCALE
-    if len(unit) > _LONGEST or not _is_simple_unit(unit):
-        raise InputError(f"expected a unit that converts to {target}, found {unit[:_LONGEST]!r}")
+    if len(unit) > _MAX_UNIT_LENGTH or not _is_simple_unit(unit):
+        raise InputError(
+            f"expected a unit that converts to {target}, found {unit[:_MAX_UNIT_LENGTH]!r}"
+        )
     registry = _get_unit_registry()
     try:
         parsed = registry.parse_units(unit or "1")
@@ -84,7 +86,7 @@ def compute_unit_scale(unit: str, target: str) -> UnitScale:
 
 def is_unit(unit: str) -> bool:
     """Return whether `unit` can be converted, which means that pint knows every name in it."""
-    if len(unit) > _LONGEST or not _is_simple_unit(unit):
+    if len(unit) > _MAX_UNIT_LENGTH or not _is_simple_unit(unit):
         return False
     try:
         _get_unit_registry().parse_units(unit)
@@ -100,14 +102,14 @@ def _is_simple_unit(unit: str) -> bool:
     A simple unit consists of names and 1, joined by * / or spaces, each with at most one small
     power.
     """
-    place, previous_token = 0, "operator"
-    while place < len(unit):
-        token = _TOKEN.match(unit, place)
+    position, previous_token = 0, "operator"
+    while position < len(unit):
+        token = _TOKEN.match(unit, position)
         if token is None or (
             token.lastgroup == "power" and previous_token in ("power", "operator")
         ):
             return False
-        place, previous_token = token.end(), str(token.lastgroup)
+        position, previous_token = token.end(), str(token.lastgroup)
     return previous_token != "operator"
 
 

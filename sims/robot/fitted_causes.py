@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 ALL_PLACES = "*"
 """Place of an effect family, which acts at all places of its kind."""
 
-_AXES: Mapping[str, tuple[str, ...]] = {
+_COEFFICIENT_NAMES: Mapping[str, tuple[str, ...]] = {
     "joint.axis": ("x", "y", "z"),
     "mass.offset": ("x", "y", "z"),
     "payload": ("mass", "x", "y", "z"),
@@ -70,7 +70,7 @@ class FittedCause:
     @property
     def coefficients(self) -> Array:
         """Coefficients (K,) in the order of the effect; unspecified ones are zero."""
-        axes = _AXES.get(self.effect)
+        axes = _COEFFICIENT_NAMES.get(self.effect)
         if axes is None:
             return np.array([number.value for number in self.numbers.values()])
         zero = FittedValue(0.0, "1", None, None)

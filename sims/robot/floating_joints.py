@@ -26,7 +26,11 @@ from sims.core.simulator import Array, InputError
 from sims.robot.robot_model import Joint, RobotModel
 
 IndexArray = NDArray[np.intp]
-AXES, TURN, SPIN = ("x", "y", "z"), ("qw", "qx", "qy", "qz"), ("wx", "wy", "wz")
+POSITION_AXES, QUATERNION_ENTRIES, ANGULAR_VELOCITY_AXES = (
+    ("x", "y", "z"),
+    ("qw", "qx", "qy", "qz"),
+    ("wx", "wy", "wz"),
+)
 MIN_QUATERNION_NORM = 1e-6
 """Minimum length of a valid quaternion, and of a rotation vector that is not treated as zero."""
 
@@ -71,10 +75,14 @@ class FloatingJoints:
         """Return the floating joints of a robot."""
         joints = tuple(joint for joint in robot.joints if not joint.has_one_coordinate)
         positions = [
-            j.position + k for j in joints for k in range(len(_list_translation_axes(j) + TURN))
+            j.position + k
+            for j in joints
+            for k in range(len(_list_translation_axes(j) + QUATERNION_ENTRIES))
         ]
         velocities = [
-            j.velocity + k for j in joints for k in range(len(_list_translation_axes(j) + SPIN))
+            j.velocity + k
+            for j in joints
+            for k in range(len(_list_translation_axes(j) + ANGULAR_VELOCITY_AXES))
         ]
         return cls(joints, np.array(positions, np.intp), np.array(velocities, np.intp))
 
@@ -84,9 +92,15 @@ class FloatingJoints:
     def names(self) -> tuple[list[str], list[str]]:
         """Return the names of positions and velocities, such as ``q.base.qw``, ``qd.base.wx``."""
         axes = [(joint.name, _list_translation_axes(joint)) for joint in self.joints]
-        positions = [f"q.{name}.{axis}" for name, joint_axes in axes for axis in joint_axes + TURN]
+        positions = [
+            f"q.{name}.{axis}"
+            for name, joint_axes in axes
+            for axis in joint_axes + QUATERNION_ENTRIES
+        ]
         velocities = [
-            f"qd.{name}.{axis}" for name, joint_axes in axes for axis in joint_axes + SPIN
+            f"qd.{name}.{axis}"
+            for name, joint_axes in axes
+            for axis in joint_axes + ANGULAR_VELOCITY_AXES
         ]
         return positions, velocities
 
@@ -99,9 +113,9 @@ class FloatingJoints:
         units: dict[str, str] = {}
         for joint in self.joints:
             units |= {f"q.{joint.name}.{axis}": "m" for axis in _list_translation_axes(joint)}
-            units |= {f"q.{joint.name}.{axis}": "1" for axis in TURN}
+            units |= {f"q.{joint.name}.{axis}": "1" for axis in QUATERNION_ENTRIES}
             units |= {f"qd.{joint.name}.{axis}": "m/s" for axis in _list_translation_axes(joint)}
-            units |= {f"qd.{joint.name}.{axis}": "rad/s" for axis in SPIN}
+            units |= {f"qd.{joint.name}.{axis}": "rad/s" for axis in ANGULAR_VELOCITY_AXES}
         return units
 
     def states(self, model: Any) -> dict[str, float]:
@@ -124,7 +138,7 @@ class FloatingJoints:
         ):
             length = float(np.linalg.norm(pose[quaternion_columns]))
             if length < MIN_QUATERNION_NORM:
-                state_names = ", ".join(f"q.{joint.name}.{axis}" for axis in TURN)
+                state_names = ", ".join(f"q.{joint.name}.{axis}" for axis in QUATERNION_ENTRIES)
                 raise InputError(
                     f"initial states {state_names}: expected a quaternion, found zeros"
                 )
@@ -148,8 +162,8 @@ class FloatingJoints:
             rotation_index = number - first - len(axes)
             if -len(axes) <= rotation_index < 0:
                 result[:, quaternion_columns.start + rotation_index] += displacement
-            elif 0 <= rotation_index < len(SPIN):
-                quaternion = np.zeros(len(TURN))
+            elif 0 <= rotation_index < len(ANGULAR_VELOCITY_AXES):
+                quaternion = np.zeros(len(QUATERNION_ENTRIES))
                 quaternion[0], quaternion[1 + rotation_index] = (
                     np.cos(0.5 * displacement),
                     np.sin(0.5 * displacement),
@@ -168,7 +182,9 @@ class FloatingJoints:
         for axes, quaternion_columns, first in self._joint_addresses:
             place = slice(quaternion_columns.start - len(axes), quaternion_columns.start)
             result[:, place] += displacements[:, first : first + len(axes)]
-            rotation = displacements[:, first + len(axes) : first + len(axes) + len(SPIN)]
+            rotation = displacements[
+                :, first + len(axes) : first + len(axes) + len(ANGULAR_VELOCITY_AXES)
+            ]
             angle = np.linalg.norm(rotation, axis=1, keepdims=True)
             # sin(a / 2) / a, whose limit is 1 / 2 at a = 0.
             half_sinc = 0.5 * np.sinc(angle / (2.0 * np.pi))
@@ -197,15 +213,17 @@ class FloatingJoints:
         """Where the pose numbers and the velocities of each joint are, in order."""
         floating_joints, end, first = [], 0, 0
         for axes in map(_list_translation_axes, self.joints):
-            end += len(axes + TURN)
-            floating_joints.append(FloatingJoint(axes, slice(end - len(TURN), end), first))
-            first += len(axes + SPIN)
+            end += len(axes + QUATERNION_ENTRIES)
+            floating_joints.append(
+                FloatingJoint(axes, slice(end - len(QUATERNION_ENTRIES), end), first)
+            )
+            first += len(axes + ANGULAR_VELOCITY_AXES)
         return tuple(floating_joints)
 
 
 def _list_translation_axes(joint: Joint) -> tuple[str, ...]:
     """Return the axes of translation of a floating joint."""
-    return AXES if joint.kind == "free" else ()
+    return POSITION_AXES if joint.kind == "free" else ()
 
 
 def _multiply_quaternions(first: Array, second: Array) -> Array:

@@ -14,21 +14,21 @@ from sims.vision.ball_renderer import RgbImage
 
 MAX_BACKGROUND_FRAMES = 25
 """Maximum number of frames whose median is the background."""
-_PIXELS = 5_000
+_SURVEY_PIXELS = 5_000
 """Approximate number of pixels per picture used in the first pass."""
-_CUT = 0.5
+_MIN_CUT_SHARE = 0.5
 """Fraction of pixels that change where the film is cut or the camera moves."""
-_STEP = 12
+_MIN_PIXEL_CHANGE = 12
 """Change in grey levels above which a pixel counts as changed; smaller ones are noise or shadow."""
-_GRAIN = 4
+_COMPRESSION_NOISE = 4
 """Grey levels of compression noise in addition to the camera noise, which the median estimates."""
-_NEAR = 1.3
+_HIDDEN_RADII = 1.3
 """Distance around a ball's centre at which it hides the background with its soft edge, in radii."""
-_EDGE = 3
+_HIDDEN_MARGIN_PIXELS = 3
 """Additional margin around a ball that compression affects, pixels."""
-_NORMAL = 1.4826
+_SIGMA_PER_MEDIAN = 1.4826
 """Standard deviation of normal noise divided by its median magnitude."""
-_WORST = 1.5
+_LARGEST_OF_THREE_RATIO = 1.5
 """Assumed ratio of the largest of three noise magnitudes to a single one."""
 
 
@@ -75,21 +75,21 @@ def survey_frames(frames: Iterable[tuple[float, RgbImage]]) -> FrameSurvey:
             raise InputError(f"frame {number}: expected {expected}, found another size")
         height, width = picture.shape[:2]
         size = width, height
-        share = height * width / _PIXELS
-        skip = max(1, int(share**0.5))
-        coarse = picture[::skip, ::skip].astype(np.int16)
-        reference_frame = coarse if previous_frame is None else previous_frame
-        change = np.abs(coarse - reference_frame).max(axis=2)
-        if np.mean(change > _STEP) > _CUT:
+        downsampling = height * width / _SURVEY_PIXELS
+        pixel_stride = max(1, int(downsampling**0.5))
+        thinned = picture[::pixel_stride, ::pixel_stride].astype(np.int16)
+        reference_frame = thinned if previous_frame is None else previous_frame
+        change = np.abs(thinned - reference_frame).max(axis=2)
+        if np.mean(change > _MIN_PIXEL_CHANGE) > _MIN_CUT_SHARE:
             cuts.append(number)
             # The whole picture has changed, and no ball has moved.
             change[:] = 0
         times.append(time)
         # Ignore small changes: noise would make a static picture look busy.
         median_change = np.median(change)
-        excess = change - 2 * median_change - _GRAIN
+        excess = change - 2 * median_change - _COMPRESSION_NOISE
         motions.append(float(np.maximum(excess, 0).mean()))
-        previous_frame = coarse
+        previous_frame = thinned
     return FrameSurvey(np.array(times), np.array(motions), tuple(cuts), size)
 
 
@@ -109,9 +109,9 @@ def select_frames(moved: Array) -> list[int]:
     # A small value for each frame, so that a film without motion has marks, too.
     min_motion = 1e-3 * moved.sum() / max(1, count)
     path_length = np.cumsum(moved + min_motion + 1e-12)
-    marks = np.linspace(path_length[0], path_length[-1], min(MAX_BACKGROUND_FRAMES, count))
-    places = np.searchsorted(path_length, marks - 1e-12).clip(0, count - 1)
-    return sorted(set(places.tolist()))
+    targets = np.linspace(path_length[0], path_length[-1], min(MAX_BACKGROUND_FRAMES, count))
+    frame_numbers = np.searchsorted(path_length, targets - 1e-12).clip(0, count - 1)
+    return sorted(set(frame_numbers.tolist()))
 
 
 def compute_median_background(pictures: list[RgbImage]) -> RgbImage:
@@ -127,7 +127,7 @@ def compute_median_background(pictures: list[RgbImage]) -> RgbImage:
 def compute_masked_background(
     pictures: list[RgbImage],
     balls: list[list[tuple[float, float, float]]],
-    before: RgbImage,
+    previous: RgbImage,
     shaded: NDArray[np.bool_] | None = None,
 ) -> RgbImage:
     """Return the median of pictures without the objects that hide the background.
@@ -135,26 +135,26 @@ def compute_masked_background(
     Args:
         pictures: Pictures (height, width, 3), n of them.
         balls: Circles (u, v, radius) of the objects in each picture, pixels.
-        before: Previous estimate of the background, used where no picture shows it.
+        previous: Previous estimate of the background, used where no picture shows it.
         shaded: Mask (n, height, width) of shadows that also hide it; None for none.
     """
-    height, width = before.shape[:2]
+    height, width = previous.shape[:2]
     rows, columns = np.mgrid[:height, :width]
     empty_masks = np.zeros((len(pictures), height, width), bool)
     hidden = empty_masks if shaded is None else shaded.copy()
     for mask, circles in zip(hidden, balls, strict=True):
         for u, v, radius in circles:
             distances = np.hypot(columns - u, rows - v)
-            mask |= distances < _NEAR * radius + _EDGE
+            mask |= distances < _HIDDEN_RADII * radius + _HIDDEN_MARGIN_PIXELS
     # Elsewhere the median is kept: pixels that are never hidden, or hidden in all pictures.
     is_partly_hidden = hidden.any(axis=0) & ~hidden.all(axis=0)
     colours = np.stack(pictures)[:, is_partly_hidden].astype(np.float32)
     values = np.where(hidden[:, is_partly_hidden, None], np.nan, colours)
-    result = before.copy()
+    result = previous.copy()
     if is_partly_hidden.any():
-        middle = _compute_nan_median(values)
+        median = _compute_nan_median(values)
         # Add half a grey level, because the conversion to integers truncates.
-        result[is_partly_hidden] = (middle + 0.5).astype(np.uint8)
+        result[is_partly_hidden] = (median + 0.5).astype(np.uint8)
     return result
 
 
@@ -181,8 +181,12 @@ def estimate_camera_noise(pictures: list[RgbImage], background: RgbImage) -> flo
     """
     # A few pictures suffice, because each has many pixels.
     stride = max(1, len(pictures) // 8)
-    worst = [_compute_largest_difference(picture, background) for picture in pictures[::stride]]
-    return float(_NORMAL * np.median(np.stack(worst)) / _WORST)
+    largest_differences = [
+        _compute_largest_difference(picture, background) for picture in pictures[::stride]
+    ]
+    return float(
+        _SIGMA_PER_MEDIAN * np.median(np.stack(largest_differences)) / _LARGEST_OF_THREE_RATIO
+    )
 
 
 def _compute_largest_difference(picture: RgbImage, background: RgbImage) -> NDArray[np.int16]:

@@ -20,9 +20,9 @@ from sims.vision import circle_fit
 from sims.vision.ball_renderer import RgbImage
 from sims.vision.video_packages import import_package
 
-_RAYS = 36
+_RAY_COUNT = 36
 """Number of rays, evenly spaced over the full circle, along which an edge is located."""
-_LEAST_AREA = 6
+_MIN_REGION_AREA = 6
 """Minimum area of a region in pixels; smaller ones are noise."""
 _LEAST_LEVEL = 12.0
 """Minimum threshold of the difference in grey levels, because compression adds noise."""
@@ -30,31 +30,31 @@ _MIN_RAY_AGREEMENT = 0.6
 """Minimum fraction of the rays that must agree on a circle."""
 _GOOD_RAY_AGREEMENT = 0.85
 """Fraction of agreeing rays below which a fit from arcs is also tried, as shadows bias circles."""
-_MOST_SPOTS = 4
+_MAX_REGIONS = 4
 """Maximum number of regions per picture that are measured, the largest first."""
-_TINY = 2.5
+_MIN_RAY_RADIUS = 2.5
 """Radius in pixels below which a region is too small for rays."""
-_ROUNDS = 3
+_MAX_EDGE_ITERATIONS = 3
 """Maximum number of iterations of edge location and circle fit."""
-_STILL = 0.02
+_CONVERGED_PIXELS = 0.02
 """Change of a circle in pixels below which the iteration ends."""
-_FINE = 0.25
+_RAY_SAMPLE_SPACING = 0.25
 """Spacing of samples along a ray, pixels."""
 _TUKEY_WIDTH_KNOWN_RADIUS = 0.5
 """Width of the robust weights in pixels when the radius is known."""
-_RIM = 5
+_UNSHADED_RIM_PIXELS = 5
 """Width in pixels of the line around a region in which nothing is treated as shadow."""
-_AROUND = 1.6
+_SURROUNDINGS_RADII = 1.6
 """Distance from the centre at which a region's surroundings are sampled, in radii."""
 _SHADOW_FACTOR_RANGE = (0.25, 0.97)
 """Range of brightness factors of shadow; darker is an object, lighter is noise."""
-_UNEVEN = 6.0
+_MAX_SHADOW_DEVIATION = 6.0
 """Maximum deviation of the colours from a common factor for shadow, grey levels."""
-_OUTSIDE = -1000.0
+_OUTSIDE_PICTURE_VALUE = -1000.0
 """Value for pixels outside the picture, far below every difference."""
-_SINGULAR = 1e-6
+_MIN_DETERMINANT = 1e-6
 """Determinant below which an edge does not determine a centre."""
-_TURNS = 12
+_MAX_GAUSS_NEWTON_STEPS = 12
 """Maximum number of Gauss-Newton steps."""
 
 GreyLevels: TypeAlias = NDArray[np.float32]
@@ -92,10 +92,10 @@ class BallDetection(NamedTuple):
 
         If shade hides a part of the edge, a fit with free radius shifts both centre and radius.
         """
-        if len(self.edges) < 0.4 * _RAYS:
+        if len(self.edges) < 0.4 * _RAY_COUNT:
             return self
         u, v = self.u, self.v
-        for _ in range(_TURNS):
+        for _ in range(_MAX_GAUSS_NEWTON_STEPS):
             away_u = self.edges[:, 0] - u
             away_v = self.edges[:, 1] - v
             distances = np.maximum(np.hypot(away_u, away_v), 1e-9)
@@ -107,7 +107,7 @@ class BallDetection(NamedTuple):
             normal = (rows * weights) @ rows.T
             (a, b, p), (_, c, q), _ = normal.tolist()
             area = a * c - b * b
-            if area < _SINGULAR:
+            if area < _MIN_DETERMINANT:
                 return self
             # Cramer's rule
             du = (c * p - b * q) / area
@@ -163,19 +163,19 @@ class BallDetector:
         if not mask.any():
             return []
         if self.shadows:
-            shade = self._compute_brightness_ratio(picture, mask) > 0
-            mask[shade] = 0
+            shadow_mask = self._compute_brightness_ratio(picture, mask) > 0
+            mask[shadow_mask] = 0
             # Remove single pixels that remain from shadow and noise.
-            pair = np.ones((2, 2), np.uint8)
-            mask = cv2.morphologyEx(mask, cv2.MORPH_OPEN, pair)
+            kernel = np.ones((2, 2), np.uint8)
+            mask = cv2.morphologyEx(mask, cv2.MORPH_OPEN, kernel)
         else:
-            shade = np.zeros(mask.shape, bool)
+            shadow_mask = np.zeros(mask.shape, bool)
         contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
         lengths = [(len(c), i) for i, c in enumerate(contours) if len(c) > 3]
-        large = sorted(lengths, reverse=True)[:_MOST_SPOTS]
+        largest_regions = sorted(lengths, reverse=True)[:_MAX_REGIONS]
         detections = []
-        for _, i in large:
-            detection = self._measure_object(contours[i], (brightness, difference), shade)
+        for _, i in largest_regions:
+            detection = self._measure_object(contours[i], (brightness, difference), shadow_mask)
             if detection is not None:
                 detections.append(self._add_colour(detection, picture))
         return (
@@ -211,7 +211,7 @@ class BallDetector:
         missing_shadow = np.zeros(mask.shape, bool)
         # Component 0 is the area between the others.
         for part in range(1, count):
-            if sizes[part, cv2.CC_STAT_AREA] < _LEAST_AREA:
+            if sizes[part, cv2.CC_STAT_AREA] < _MIN_REGION_AREA:
                 continue
             part_mask = (parts == part).astype(np.uint8)
             # Leave out one pixel between inside and ring, which is half one and half the other.
@@ -267,7 +267,7 @@ class BallDetector:
         symmetric_factor = np.minimum(factor, 1 / np.maximum(factor, 1e-3))
         darkest, lightest = _SHADOW_FACTOR_RANGE
         shade = (symmetric_factor > darkest) & (symmetric_factor < lightest)
-        shade &= relative_deviations < max(_UNEVEN, 3 * self.sigma)
+        shade &= relative_deviations < max(_MAX_SHADOW_DEVIATION, 3 * self.sigma)
         result[rows, columns] = np.where(shade, factor, 0)
         return result
 
@@ -287,12 +287,12 @@ class BallDetector:
         cv2 = import_package("cv2")
         left, top, width, height = cv2.boundingRect(contour)
         # An object that nearly fills the picture is not a ball in front of a background.
-        if width * height < _LEAST_AREA or max(width, height) > 0.9 * min(shade.shape):
+        if width * height < _MIN_REGION_AREA or max(width, height) > 0.9 * min(shade.shape):
             return None
         filled = np.zeros((height + 2, width + 2), np.uint8)
         offset = 1 - left, 1 - top
         cv2.drawContours(filled, [contour], -1, 1, -1, offset=offset)
-        if int(filled.sum()) < _LEAST_AREA:
+        if int(filled.sum()) < _MIN_REGION_AREA:
             return None
         # The largest inscribed disc is the ball, even if a shadow is connected to it.
         distance_map = cv2.distanceTransform(filled, cv2.DIST_L2, 5)
@@ -304,15 +304,15 @@ class BallDetector:
         half_size = int(2 * max(radius, 0.5 * max(width, height))) + 4
         u0 = max(0, int(u) - half_size)
         v0 = max(0, int(v) - half_size)
-        place = np.s_[v0 : int(v) + half_size + 1, u0 : int(u) + half_size + 1]
-        windows = np.stack([each[place] for each in differences]).astype(np.float32)
+        window = np.s_[v0 : int(v) + half_size + 1, u0 : int(u) + half_size + 1]
+        windows = np.stack([each[window] for each in differences]).astype(np.float32)
         # The edge itself, half ball and half background, must not be treated as shadow.
-        hidden = shade[place].astype(np.uint8)
+        shadow_mask = shade[window].astype(np.uint8)
         offset = -u0, -v0
-        cv2.drawContours(hidden, [contour], -1, 0, -1, offset=offset)
-        cv2.drawContours(hidden, [contour], -1, 0, _RIM, offset=offset)
-        windows[:, hidden > 0] = 0
-        if radius < _TINY:
+        cv2.drawContours(shadow_mask, [contour], -1, 0, -1, offset=offset)
+        cv2.drawContours(shadow_mask, [contour], -1, 0, _UNSHADED_RIM_PIXELS, offset=offset)
+        windows[:, shadow_mask > 0] = 0
+        if radius < _MIN_RAY_RADIUS:
             return self._measure_small_ball(windows[1], u - u0, v - v0, radius, u0, v0)
         return self._fit_circle(windows, (u - u0, v - v0, radius), u0, v0)
 
@@ -336,17 +336,17 @@ class BallDetector:
             The detection in the picture; None if too few rays agree on a circle.
         """
         u, v, radius = start
-        on_it = np.empty(0, bool)
+        is_on_circle = np.empty(0, bool)
         residuals = np.empty(0)
         edges = None
-        for _ in range(_ROUNDS):
+        for _ in range(_MAX_EDGE_ITERATIONS):
             edges = self._locate_edges(windows, u, v, radius)
             if edges is None:
                 return None
             fitted = circle_fit.fit_circle(edges, (u, v, None))
             has_enough_points = (
                 fitted is not None
-                and circle_fit.find_inliers(fitted).sum() >= _GOOD_RAY_AGREEMENT * _RAYS
+                and circle_fit.find_inliers(fitted).sum() >= _GOOD_RAY_AGREEMENT * _RAY_COUNT
             )
             if not has_enough_points:
                 from_an_arc = circle_fit.fit_circle(edges, circle_fit.fit_arc(edges))
@@ -357,17 +357,17 @@ class BallDetector:
             circle, residuals = fitted
             change = max(abs(new - old) for new, old in zip(circle, previous_circle, strict=True))
             u, v, radius = circle
-            on_it = circle_fit.find_inliers(fitted)
-            if change < _STILL:
+            is_on_circle = circle_fit.find_inliers(fitted)
+            if change < _CONVERGED_PIXELS:
                 break
-        agreement = float(on_it.sum()) / _RAYS
+        agreement = float(is_on_circle.sum()) / _RAY_COUNT
         height, width = windows.shape[1:]
         # A centre outside the window belongs to an arc of a large object.
         is_within = -0.5 <= u <= width - 0.5
         is_within &= -0.5 <= v <= height - 0.5
         if edges is None or agreement < _MIN_RAY_AGREEMENT or not is_within:
             return None
-        scatter = float(np.sqrt(np.mean(residuals[on_it] ** 2)))
+        scatter = float(np.sqrt(np.mean(residuals[is_on_circle] ** 2)))
         picture_edges = edges + np.array([u0, v0])
         return BallDetection(u + u0, v + v0, radius, agreement, scatter, picture_edges)
 
@@ -388,14 +388,14 @@ class BallDetector:
             Edge points in the window; None if there are too few.
         """
         start = max(0.0, 0.7 * radius - 2)
-        steps = np.arange(start, 1.5 * radius + 2, _FINE, dtype=np.float32)
+        distances = np.arange(start, 1.5 * radius + 2, _RAY_SAMPLE_SPACING, dtype=np.float32)
         cos, sin = _compute_ray_directions()
-        along_u = (u + cos * steps).astype(np.float32)
-        along_v = (v + sin * steps).astype(np.float32)
+        along_u = (u + cos * distances).astype(np.float32)
+        along_v = (v + sin * distances).astype(np.float32)
         profiles = [_interpolate_window(window, along_u, along_v) for window in windows]
         # Last pixels inside the edge, except those affected by blur.
-        is_inner = steps > min(0.5 * radius, radius - 3.5)
-        is_inner &= steps < max(0.7 * radius, radius - 1.3)
+        is_inner = distances > min(0.5 * radius, radius - 3.5)
+        is_inner &= distances < max(0.7 * radius, radius - 1.3)
         median_index = int(is_inner.sum()) // 2
         levels = []
         for profile in profiles:
@@ -412,19 +412,19 @@ class BallDetector:
         # A dark patch further inside is not an edge.
         is_crossing[:, : int(np.flatnonzero(is_inner)[0])] = False
         # Take the first of several crossings.
-        k = is_crossing.argmax(axis=1)
-        lines = np.arange(_RAYS)
-        a = values[lines, k]
-        b = values[lines, k + 1]
+        crossing_index = is_crossing.argmax(axis=1)
+        rays = np.arange(_RAY_COUNT)
+        value_before = values[rays, crossing_index]
+        value_after = values[rays, crossing_index + 1]
         has_edge = is_crossing.any(axis=1) & (half_level > 0.4 * self.level)
         # A fall to the value for outside is the end of the picture, not of the ball.
-        has_edge &= b > 0.5 * _OUTSIDE
-        if has_edge.sum() < 0.5 * _RAYS:
+        has_edge &= value_after > 0.5 * _OUTSIDE_PICTURE_VALUE
+        if has_edge.sum() < 0.5 * _RAY_COUNT:
             return None
         # Interpolate linearly between the two samples.
-        drop = np.maximum(a - b, 1e-6)
-        share = (a - half_level)[has_edge] / drop[has_edge]
-        edge_distances = steps[k[has_edge]] + _FINE * share
+        fall = np.maximum(value_before - value_after, 1e-6)
+        fraction = (value_before - half_level)[has_edge] / fall[has_edge]
+        edge_distances = distances[crossing_index[has_edge]] + _RAY_SAMPLE_SPACING * fraction
         edge_u = u + cos[has_edge, 0] * edge_distances
         edge_v = v + sin[has_edge, 0] * edge_distances
         return np.stack([edge_u, edge_v], axis=1).astype(np.float64)
@@ -449,7 +449,7 @@ class BallDetector:
             return None
         # A partly covered pixel differs in proportion: sums measure areas.
         area = total / max(peak, 1.0)
-        if area < _LEAST_AREA / 2:
+        if area < _MIN_REGION_AREA / 2:
             return None
         u = u0 + float((weights * columns).sum() / total)
         v = v0 + float((weights * rows).sum() / total)
@@ -479,8 +479,8 @@ def _compute_surrounding_colour(picture: RgbImage, detection: BallDetection) -> 
     """Return the median colour (3,) on a circle around a detection, in grey levels."""
     cos, sin = _compute_ray_directions()
     height, width = picture.shape[:2]
-    circle_radius = _AROUND * detection.radius
-    median_index = _RAYS // 2
+    circle_radius = _SURROUNDINGS_RADII * detection.radius
+    median_index = _RAY_COUNT // 2
     rows = (detection.v + circle_radius * sin[:, 0] + 0.5).astype(np.intp)
     columns = (detection.u + circle_radius * cos[:, 0] + 0.5).astype(np.intp)
     # Beyond the border, the outermost pixels are repeated.
@@ -492,7 +492,7 @@ def _compute_surrounding_colour(picture: RgbImage, detection: BallDetection) -> 
 
 
 def _interpolate_window(window: GreyLevels, u: GreyLevels, v: GreyLevels) -> GreyLevels:
-    """Interpolate a window at subpixel positions; `_OUTSIDE` outside it."""
+    """Interpolate a window at subpixel positions; `_OUTSIDE_PICTURE_VALUE` outside it."""
     cv2 = import_package("cv2")
     result: GreyLevels = cv2.remap(
         window,
@@ -500,7 +500,7 @@ def _interpolate_window(window: GreyLevels, u: GreyLevels, v: GreyLevels) -> Gre
         v,
         cv2.INTER_LINEAR,
         borderMode=cv2.BORDER_CONSTANT,
-        borderValue=_OUTSIDE,
+        borderValue=_OUTSIDE_PICTURE_VALUE,
     )
     return result
 
@@ -508,5 +508,5 @@ def _interpolate_window(window: GreyLevels, u: GreyLevels, v: GreyLevels) -> Gre
 @lru_cache(maxsize=1)
 def _compute_ray_directions() -> tuple[Array, Array]:
     """Return the cosines and sines (rays, 1) of the ray directions."""
-    angles = np.linspace(0, 2 * np.pi, _RAYS, endpoint=False)[:, None]
+    angles = np.linspace(0, 2 * np.pi, _RAY_COUNT, endpoint=False)[:, None]
     return np.cos(angles), np.sin(angles)

@@ -29,21 +29,21 @@ ColourArray: TypeAlias = NDArray[np.float32]
 PixelWindow: TypeAlias = tuple[int, int, int, int]
 """Part of a picture in pixels: left, top, right (exclusive), bottom (exclusive)."""
 
-_NEAR = 0.2
+_NEAR_PLANE = 0.2
 """Distance from the camera below which nothing is drawn, m."""
-_FAR = 200.0
+_FAR_PLANE = 200.0
 """Distance from the camera beyond which nothing is drawn, m."""
-_GROUND = 60.0
+_HALF_GROUND_SIDE = 60.0
 """Half the side length of the ground, m."""
-_THICKNESS = 0.05
+_HALF_GROUND_THICKNESS = 0.05
 """Half the thickness of the ground, whose upper side is at height 0, m."""
-_MARGIN = 2
+_OUTLINE_MARGIN_PIXELS = 2
 """Number of pixels around the ball's outline that are rendered with it."""
-_SMALL = 20
+_FINE_RENDER_RADIUS = 20
 """Radius in pixels below which a ball is rendered three times finer; larger ones twice."""
-_SHARPEST = 0.02
+_MIN_SHADOW_EDGE = 0.02
 """Half the width of a shadow's edge where the ball is on the ground, in ball radii."""
-_SUN = 0.01
+_SUN_ANGLE = 0.01
 """Growth of the shadow's edge per distance from ball to ground, as from the sun's disc, rad."""
 
 
@@ -68,9 +68,9 @@ class BallScene:
         p = bullet_world.import_pybullet()
         self._client: int = p.connect(p.DIRECT)
         self.close = weakref.finalize(self, p.disconnect, self._client)
-        extents = [_GROUND, _GROUND, _THICKNESS]
+        extents = [_HALF_GROUND_SIDE, _HALF_GROUND_SIDE, _HALF_GROUND_THICKNESS]
         ground = self._create_body(p.GEOM_BOX, look.ground, halfExtents=extents)
-        self._move_body(ground, (0, 0, -_THICKNESS))
+        self._move_body(ground, (0, 0, -_HALF_GROUND_THICKNESS))
         width, height = camera.size
         full_window = 0, 0, width, height
         self._rays = self._compute_view_directions()
@@ -159,10 +159,10 @@ class BallScene:
     def _cast_shadow(self, picture: ColourArray, position: Array) -> None:
         """Darken the ground in the ball's shadow; the sun's disc softens its edge."""
         light = self.look.light
-        stretch = 1 / light[2]
+        slant = 1 / light[2]
         travel = position[2] / light[2]
         # Intersection of the ground with the line through the ball's centre along the light.
-        foot = position - travel * light
+        shadow_centre = position - travel * light
         signs = np.array(
             [
                 (-1, -1, 0.0),
@@ -172,40 +172,40 @@ class BallScene:
             ]
         )
         # Slanting light stretches the disc to an ellipse.
-        corners = foot + self.radius * stretch * 1.1 * signs
+        corners = shadow_centre + self.radius * slant * 1.1 * signs
         window = _find_window(self.camera.project(corners), self.camera.size)
         if window is None:
             return
         left, top, right, bottom = window
-        place = np.s_[top:bottom, left:right]
-        offsets = self._points[place] - foot.astype(np.float32)
+        window_slice = np.s_[top:bottom, left:right]
+        offsets = self._points[window_slice] - shadow_centre.astype(np.float32)
         # Distance from that line by Pythagoras; rounding may make the square negative.
         light_components = offsets @ light.astype(np.float32)
         squared_distances = (offsets * offsets).sum(axis=-1)
         squares = squared_distances - light_components * light_components
         distance = np.sqrt(np.maximum(squares, 0))
-        soft = _SHARPEST * self.radius + _SUN * travel
-        depth = (self.radius + soft - distance) / (2 * soft)
-        hidden = np.clip(depth, 0, 1) * self._open[place]
-        left_over = 1 - self.look.shadow * hidden
-        picture[place] *= left_over[..., None].astype(np.float32)
+        edge_half_width = _MIN_SHADOW_EDGE * self.radius + _SUN_ANGLE * travel
+        depth = (self.radius + edge_half_width - distance) / (2 * edge_half_width)
+        shadow = np.clip(depth, 0, 1) * self._open[window_slice]
+        brightness = 1 - self.look.shadow * shadow
+        picture[window_slice] *= brightness[..., None].astype(np.float32)
 
     def _draw_ball(self, picture: ColourArray, position: Array) -> None:
         """Blend the ball into the picture, weighted by its coverage of each pixel."""
         centre, (semi_major_axis, _) = self.camera.project_sphere(position, self.radius)
-        reach = semi_major_axis + _MARGIN
-        if not np.isfinite(reach):
+        half_size = semi_major_axis + _OUTLINE_MARGIN_PIXELS
+        if not np.isfinite(half_size):
             return
-        corners = np.array([centre - reach, centre + reach])
+        corners = np.array([centre - half_size, centre + half_size])
         window = _find_window(corners, self.camera.size)
         if window is None:
             return
         self._move_body(self._ball, position)
-        oversampling = 3 if semi_major_axis < _SMALL else 2
+        oversampling = 3 if semi_major_axis < _FINE_RENDER_RADIUS else 2
         ball, covered = self._render_body(window, oversampling, self._ball)
         left, top, right, bottom = window
-        place = np.s_[top:bottom, left:right]
-        picture[place] = covered * ball + (1 - covered) * picture[place]
+        window_slice = np.s_[top:bottom, left:right]
+        picture[window_slice] = covered * ball + (1 - covered) * picture[window_slice]
 
     def _render_body(
         self, window: PixelWindow, oversampling: int, body: int
@@ -226,7 +226,7 @@ class BallScene:
         width = right - left
         height = bottom - top
         # size of a pixel on the near plane in metres
-        pixel_size = _NEAR / camera.focal
+        pixel_size = _NEAR_PLANE / camera.focal
         # The renderer counts pixels from their corner: shift by half a fine pixel, measured on
         # spheres.
         shift = 0.5 / oversampling
@@ -241,8 +241,8 @@ class BallScene:
             pixel_size * right_edge,
             -pixel_size * lower_edge,
             -pixel_size * upper_edge,
-            _NEAR,
-            _FAR,
+            _NEAR_PLANE,
+            _FAR_PLANE,
         )
         view = p.computeViewMatrix(camera.position, camera.target, (0, 0, 1))
         _, _, colours, _, bodies = p.getCameraImage(
@@ -258,11 +258,11 @@ class BallScene:
         # Average the fine pixels of each pixel; only colours of the body itself count.
         grouped = height, oversampling, width, oversampling
         is_body = np.reshape(bodies, (*grouped, 1)) == body
-        share = is_body.mean(axis=(1, 3), dtype=np.float32)
+        coverage = is_body.mean(axis=(1, 3), dtype=np.float32)
         colour = np.reshape(colours, (*grouped, 4))[..., :3]
         sums = np.where(is_body, colour, 0).sum(axis=(1, 3), dtype=np.float32)
-        count = np.maximum(share * oversampling**2, 1)
-        return sums / count, share
+        count = np.maximum(coverage * oversampling**2, 1)
+        return sums / count, coverage
 
 
 def _find_window(pixels: Array, size: tuple[int, int]) -> PixelWindow | None:

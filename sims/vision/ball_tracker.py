@@ -16,23 +16,23 @@ from sims.vision.ball_renderer import RgbImage
 from sims.vision.circle_fit import Circle
 from sims.vision.trajectory_linking import TrackedPath, link_detections, merge_continuations
 
-_LEAST_FRAMES = 5
+_MIN_FRAMES = 5
 """Minimum number of frames that must show the ball."""
-_WINDOW = 9
+_NOISE_WINDOW_SAMPLES = 9
 """Length in samples of the windows for noise estimation; shorter paths are not smoothed."""
-_FEW = 8
+_COMPARED_FRAMES = 8
 """Approximate number of frames on which both treatments of shadows are compared."""
-_HELD = 200_000_000
+_MAX_CACHED_BYTES = 200_000_000
 """Maximum number of bytes of frames that are cached in memory."""
-_FEWEST = 3
+_MIN_EMPTY_FRAMES = 3
 """Minimum number of frames without an object that prove that it is in the background estimate."""
-_MISFIT = 0.2
+_MAX_RADIUS_DEVIATION = 0.2
 """Maximum relative deviation of a radius from the linear trend along its path."""
-_SHADOWS = 0.8
+_MIN_SHADOW_REMOVAL_RATIO = 0.8
 """Minimum ratio of the ray agreement with and without shadow removal at which it is used."""
-_ROUNDS = 10
+_REWEIGHTING_ITERATIONS = 10
 """Number of iterations of reweighted least squares."""
-_SURE = 0.02
+_MIN_RADIUS_UNCERTAINTY = 0.02
 """Lower limit of the uncertainty of a radius, in pixels."""
 
 
@@ -88,21 +88,21 @@ def track_ball(frames: Iterable[tuple[float, RgbImage]]) -> BallTrack:
     numbers = [first + k for k in background_model.select_frames(survey.moved[first:end])]
     wanted_frames = set(numbers)
     pictures = [picture for number, (_, picture) in enumerate(frames) if number in wanted_frames]
-    finder = _make_detector(pictures)
+    detector = _make_detector(pictures)
     detections = []
     for number, (_, picture) in enumerate(frames):
         if first <= number < end:
-            detections.append(finder.detect(picture))
+            detections.append(detector.detect(picture))
     paths = link_detections(detections)
     if not paths:
         raise InputError(_format_no_ball_message(end - first, sum(map(bool, detections))))
     path, other_paths = merge_continuations(paths)
     # An object that hardly moves may be a ball, but its fall cannot be measured.
-    if len(path.frames) < _LEAST_FRAMES or path.travel < path.radius:
+    if len(path.frames) < _MIN_FRAMES or path.travel < path.radius:
         raise InputError(_format_no_ball_message(end - first, len(path.frames)))
     _note_other_objects(path, other_paths, notes)
     sample_pictures = {n - first: p for n, p in zip(numbers, pictures, strict=True)}
-    return _make_track(survey.times[first:end], path, survey.size, notes, finder, sample_pictures)
+    return _make_track(survey.times[first:end], path, survey.size, notes, detector, sample_pictures)
 
 
 class _FrameCache:
@@ -115,8 +115,8 @@ class _FrameCache:
     def __iter__(self) -> Iterator[tuple[float, RgbImage]]:
         """Yield time and picture of each frame, and store the frames in the first full pass.
 
-        More than `_HELD` bytes of pictures are not stored, and the film is read again in
-        each pass.
+        More than `_MAX_CACHED_BYTES` bytes of pictures are not stored, and the film is read again
+        in each pass.
         """
         if self._kept is not None:
             yield from self._kept
@@ -125,13 +125,13 @@ class _FrameCache:
         stored_bytes = 0
         for time, picture in self._source:
             stored_bytes += picture.nbytes
-            if stored_bytes <= _HELD:
+            if stored_bytes <= _MAX_CACHED_BYTES:
                 frames.append((time, picture))
             else:
                 # Too many frames: release those cached so far at once.
                 frames.clear()
             yield time, picture
-        if stored_bytes <= _HELD:
+        if stored_bytes <= _MAX_CACHED_BYTES:
             self._kept = frames
 
 
@@ -164,9 +164,9 @@ def _find_longest_shot(survey: background_model.FrameSurvey, notes: list[str]) -
             f"the film is cut or the camera moves (at {cuts}); "
             f"only the longest part is tracked, {span}"
         )
-    if end - first < _LEAST_FRAMES:
+    if end - first < _MIN_FRAMES:
         raise InputError(
-            f"expected at least {_LEAST_FRAMES} frames without a cut, found {end - first}"
+            f"expected at least {_MIN_FRAMES} frames without a cut, found {end - first}"
         )
     return first, end
 
@@ -178,7 +178,7 @@ def _make_detector(pictures: list[RgbImage]) -> BallDetector:
     of the ball.
     """
     background = background_model.compute_median_background(pictures)
-    stride = max(1, len(pictures) // _FEW)
+    stride = max(1, len(pictures) // _COMPARED_FRAMES)
     # Two passes: objects hidden by the first background are detected with the second.
     for _ in range(2):
         sigma = background_model.estimate_camera_noise(pictures, background)
@@ -187,26 +187,28 @@ def _make_detector(pictures: list[RgbImage]) -> BallDetector:
         shadow_detections = [shadow_detector.detect(p, ghosts=True) for p in pictures[::stride]]
         plain_detections = [plain_detector.detect(p, ghosts=True) for p in pictures[::stride]]
         # A ball of the ground's hue would be removed as shadow; then shadows must be tolerated.
-        if _compute_roundness(shadow_detections) >= _SHADOWS * _compute_roundness(plain_detections):
-            best, known_detections = shadow_detector, shadow_detections
+        if _compute_roundness(shadow_detections) >= _MIN_SHADOW_REMOVAL_RATIO * _compute_roundness(
+            plain_detections
+        ):
+            detector, known_detections = shadow_detector, shadow_detections
         else:
-            best, known_detections = plain_detector, plain_detections
+            detector, known_detections = plain_detector, plain_detections
         detections = []
         for i, picture in enumerate(pictures):
             if i % stride == 0:
                 detections.append(known_detections[i // stride])
             else:
-                detections.append(best.detect(picture, ghosts=True))
+                detections.append(detector.detect(picture, ghosts=True))
         hiding = _list_hiding_circles(detections)
         shadow_masks = None
-        if best.shadows:
+        if detector.shadows:
             shadow_masks = _find_shadows(
-                [best.find_missing_shadow(picture) for picture in pictures]
+                [detector.find_missing_shadow(picture) for picture in pictures]
             )
         background = background_model.compute_masked_background(
             pictures, hiding, background, shadow_masks
         )
-    return BallDetector(background, sigma, best.shadows)
+    return BallDetector(background, sigma, detector.shadows)
 
 
 def _compute_roundness(pictures: list[list[BallDetection]]) -> float:
@@ -236,7 +238,7 @@ def _list_hiding_circles(detections: list[list[BallDetection]]) -> list[list[Cir
             any(_is_same_object(ghost_circle, circle) for circle in circles) for circles in ghosts
         ]
         # One or two frames may miss it by mistake.
-        if sum(missing_flags) < _FEWEST:
+        if sum(missing_flags) < _MIN_EMPTY_FRAMES:
             continue
         for circles, is_missing in zip(balls, missing_flags, strict=True):
             if not is_missing:
@@ -251,7 +253,7 @@ def _find_shadows(lit: list[NDArray[np.bool_]]) -> NDArray[np.bool_]:
         lit: Masks (height, width) where the shadow in the background is missing, one per picture.
     """
     stack = np.stack(lit)
-    result: NDArray[np.bool_] = ~stack & (stack.sum(axis=0) >= _FEWEST)
+    result: NDArray[np.bool_] = ~stack & (stack.sum(axis=0) >= _MIN_EMPTY_FRAMES)
     return result
 
 
@@ -305,7 +307,7 @@ def _make_track(
         pictures: Some of the frames, by number.
     """
     columns = np.full((3, len(times)), np.nan)
-    steady, misfits = _refine_with_smooth_radius(path.spots)
+    steady, misfits = _refine_with_smooth_radius(path.detections)
     for frame, detection, misfit in zip(path.frames, steady, misfits, strict=True):
         # An empty cell is better than the position of another object.
         if not misfit:
@@ -317,11 +319,11 @@ def _make_track(
             f"{missing_count} of {len(times)} frames show no measurable ball; their cells are empty"
         )
     noise = np.nan
-    if len(times) > _WINDOW:
+    if len(times) > _NOISE_WINDOW_SAMPLES:
         noise = max(estimate_roughness(u), estimate_roughness(v))
     # If the path is too short or at rest, use the distance of the edges from their circles.
     if not (np.isfinite(noise) and noise > 0):
-        noise = float(np.median([detection.scatter for detection in path.spots]))
+        noise = float(np.median([detection.scatter for detection in path.detections]))
     return BallTrack(
         times,
         u,
@@ -347,30 +349,30 @@ def _refine_with_smooth_radius(
         The refitted detections, and whether the radius of each deviates too much from the linear
         trend, which means that another object was measured.
     """
-    if len(detections) < _WINDOW:
+    if len(detections) < _NOISE_WINDOW_SAMPLES:
         return detections, [False] * len(detections)
-    places = np.array([(detection.u, detection.v) for detection in detections])
-    offsets = places - places.mean(axis=0)
-    spread = np.maximum(np.ptp(places, axis=0), 1.0)
+    centres = np.array([(detection.u, detection.v) for detection in detections])
+    offsets = centres - centres.mean(axis=0)
+    spread = np.maximum(np.ptp(centres, axis=0), 1.0)
     # position along the path's main direction, about -1 to 1
     axes = np.linalg.svd(offsets, full_matrices=False)[2]
     path_position = offsets @ axes[0] / spread.max()
     basis = np.stack([np.ones_like(path_position), path_position], axis=1)
     radius = np.array([s.radius for s in detections])
     weights = np.ones_like(radius)
-    line = np.zeros(2)
-    for _ in range(_ROUNDS):
+    trend = np.zeros(2)
+    for _ in range(_REWEIGHTING_ITERATIONS):
         weighted_basis = basis * weights[:, None]
-        line = np.linalg.lstsq(weighted_basis, radius * weights, rcond=None)[0]
-        deviations = np.abs(radius - basis @ line)
+        trend = np.linalg.lstsq(weighted_basis, radius * weights, rcond=None)[0]
+        deviations = np.abs(radius - basis @ trend)
         # Weights with heavy tails: measurements of other objects must not affect the trend.
-        width = max(float(np.median(deviations)), _SURE)
+        width = max(float(np.median(deviations)), _MIN_RADIUS_UNCERTAINTY)
         weights = 1 / (1 + (deviations / width) ** 2)
-    fitted = np.maximum(basis @ line, 0.5)
-    tolerance = np.maximum(_MISFIT * fitted, 1.0)
+    fitted = np.maximum(basis @ trend, 0.5)
+    tolerance = np.maximum(_MAX_RADIUS_DEVIATION * fitted, 1.0)
     is_wrong = np.abs(radius - fitted) > tolerance
-    steady = [s.refit_with_radius(float(r)) for s, r in zip(detections, fitted, strict=True)]
-    return steady, is_wrong.tolist()
+    refitted = [s.refit_with_radius(float(r)) for s, r in zip(detections, fitted, strict=True)]
+    return refitted, is_wrong.tolist()
 
 
 def estimate_roughness(values: Array) -> float:
@@ -385,19 +387,19 @@ def estimate_roughness(values: Array) -> float:
     Returns:
         Standard deviation of the noise; NaN if the signal never moves.
     """
-    if len(values) < _WINDOW:
+    if len(values) < _NOISE_WINDOW_SAMPLES:
         return float("nan")
-    windows = sliding_window_view(values, _WINDOW)
+    windows = sliding_window_view(values, _NOISE_WINDOW_SAMPLES)
     windows = windows[np.isfinite(windows).all(axis=1)]
     # At rest the same pixels give the same error again and again, which is no scatter.
     finite_values = values[np.isfinite(values)]
     travel = max(float(np.ptp(finite_values)), 1e-12)
-    windows = windows[np.ptp(windows, axis=1) > 1e-3 * travel * _WINDOW]
+    windows = windows[np.ptp(windows, axis=1) > 1e-3 * travel * _NOISE_WINDOW_SAMPLES]
     if not len(windows):
         return float("nan")
     # A cubic has four coefficients, which reduces the degrees of freedom by four.
-    cubic = np.vander(np.linspace(-1, 1, _WINDOW), 4)
+    cubic = np.vander(np.linspace(-1, 1, _NOISE_WINDOW_SAMPLES), 4)
     basis = np.linalg.qr(cubic)[0]
     residuals = windows - windows @ basis @ basis.T
     squares = (residuals**2).sum(axis=1)
-    return float(np.sqrt(np.median(squares) / (_WINDOW - 4)))
+    return float(np.sqrt(np.median(squares) / (_NOISE_WINDOW_SAMPLES - 4)))

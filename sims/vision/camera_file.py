@@ -18,10 +18,17 @@ from sims.core.toml_validation import (
 )
 from sims.vision.pinhole_camera import PinholeCamera
 
-_CAMERA = {"azimuth": 1, "distance": 1, "height": 1, "field_of_view": 1, "target": 3, "size": 2}
+_CAMERA_ENTRY_SIZES = {
+    "azimuth": 1,
+    "distance": 1,
+    "height": 1,
+    "field_of_view": 1,
+    "target": 3,
+    "size": 2,
+}
 """Entries of [camera] and how many numbers each has."""
 
-_BALL = {"radius": 1, "x": 1, "y": 1}
+_BALL_ENTRY_SIZES = {"radius": 1, "x": 1, "y": 1}
 """Entries of [ball] and how many numbers each has."""
 
 
@@ -58,8 +65,8 @@ def read_camera_file(path: Path) -> FilmDescription:
     """
     meta = read_toml(path)
     # All entries are required: a partly default camera would give wrong lengths silently.
-    camera = _read_section(path, "camera", meta, _CAMERA)
-    ball = _read_section(path, "ball", meta, _BALL)
+    camera = _read_section(path, "camera", meta, _CAMERA_ENTRY_SIZES)
+    ball = _read_section(path, "ball", meta, _BALL_ENTRY_SIZES)
     if ball["radius"] <= 0:
         raise make_error(path, "ball.radius", "more than 0 m", ball["radius"])
     # Sizes are integers, but may be written as floats in TOML.

@@ -25,21 +25,21 @@ CircleFit = tuple[Circle, Array]
 
 _MAX_ITERATIONS = 8
 """Maximum number of Gauss-Newton steps."""
-_EXACT = 1e-3
+_CONVERGED_STEP_PIXELS = 1e-3
 """Length of a step, in pixels, below which the iteration ends."""
 _ARC_STRIDE = 3
 """Number of points between the beginnings of consecutive arcs."""
-_TUKEY = 4.7
+_TUKEY_WIDTH = 4.7
 """Width of Tukey's weights in standard deviations, for 95 % efficiency with normal errors."""
-_NORMAL = 1.4826
+_SIGMA_PER_MEDIAN = 1.4826
 """Standard deviation of a normal distribution divided by its median absolute deviation."""
-_FINEST = 0.15
+_MIN_EDGE_NOISE = 0.15
 """Lower limit of the estimated edge noise in pixels, so that good points are not rejected."""
-_SINGULAR = 1e-6
+_MIN_DETERMINANT = 1e-6
 """Determinant below which the points do not determine a circle."""
-_LEAST_RADIUS = 0.5
+_MIN_RADIUS = 0.5
 """Minimum radius, pixels."""
-_MOST_RADIUS = 1e4
+_MAX_RADIUS = 1e4
 """Maximum radius in pixels; with a larger one, the points are on a straight line."""
 
 
@@ -72,7 +72,9 @@ def fit_circle(points: Array, start: tuple[float, float, float | None] | None) -
         if radius is None:
             radius = _compute_median(distances)
         residuals = distances - radius  # (1)
-        width = _TUKEY * max(_NORMAL * _compute_median(np.abs(residuals)), _FINEST)
+        width = _TUKEY_WIDTH * max(
+            _SIGMA_PER_MEDIAN * _compute_median(np.abs(residuals)), _MIN_EDGE_NOISE
+        )
         weights = np.maximum(1 - (residuals / width) ** 2, 0.0) ** 2  # (3)
         np.maximum(distances, 1e-9, out=distances)
         rows[0] = away_u / distances
@@ -85,9 +87,9 @@ def fit_circle(points: Array, start: tuple[float, float, float | None] | None) -
         u += du
         v += dv
         radius += dr
-        if abs(du) + abs(dv) + abs(dr) < _EXACT:
+        if abs(du) + abs(dv) + abs(dr) < _CONVERGED_STEP_PIXELS:
             break
-    if radius is None or not _LEAST_RADIUS < radius < _MOST_RADIUS:
+    if radius is None or not _MIN_RADIUS < radius < _MAX_RADIUS:
         return None
     return (u, v, radius), np.hypot(x - u, y - v) - radius
 
@@ -104,13 +106,13 @@ def _solve_gauss_newton_step(normal: Array) -> tuple[float, float, float] | None
     a = xx - mx * mx / total
     b = xy - mx * my / total
     c = yy - my * my / total
-    area = a * c - b * b
-    if total * area < _SINGULAR:
+    determinant = a * c - b * b
+    if total * determinant < _MIN_DETERMINANT:
         return None
     p = p - mx * r / total
     q = q - my * r / total
-    du = (c * p - b * q) / area
-    dv = (a * q - b * p) / area
+    du = (c * p - b * q) / determinant
+    dv = (a * q - b * p) / determinant
     dr = (r - mx * du - my * dv) / total
     return du, dv, dr
 
@@ -154,14 +156,14 @@ def fit_arc(points: Array) -> Circle | None:
     count = len(points)
     arc_starts = np.arange(0, count, _ARC_STRIDE)
     arc_offsets = np.arange(count // 2 + 1)
-    numbers = (arc_starts[:, None] + arc_offsets) % count
+    point_indices = (arc_starts[:, None] + arc_offsets) % count
     # Relative to the mean, because the squares in (4) lose digits far from the origin.
-    middle = points.mean(axis=0)
-    arcs = points[numbers] - middle
-    table = np.concatenate([arcs, np.ones((*numbers.shape, 1))], axis=2)
-    transposed = table.transpose(0, 2, 1)
-    normal = transposed @ table
-    if (np.abs(np.linalg.det(normal)) < _SINGULAR).any():
+    mean = points.mean(axis=0)
+    arcs = points[point_indices] - mean
+    design_matrix = np.concatenate([arcs, np.ones((*point_indices.shape, 1))], axis=2)
+    transposed = design_matrix.transpose(0, 2, 1)
+    normal = transposed @ design_matrix
+    if (np.abs(np.linalg.det(normal)) < _MIN_DETERMINANT).any():
         return None
     squares = (arcs**2).sum(axis=2)[..., None]
     solution = np.linalg.solve(normal, transposed @ squares)  # (4)
@@ -169,7 +171,7 @@ def fit_arc(points: Array) -> Circle | None:
     u = doubled_u / 2
     v = doubled_v / 2
     radius = np.sqrt(np.maximum(constant + u**2 + v**2, 0.0))
-    x, y = (points - middle).T
+    x, y = (points - mean).T
     distances = np.hypot(x - u[:, None], y - v[:, None])
     deviations = distances - radius[:, None]
     # Half the tolerance of `find_inliers`: points graze the circle of a wrong arc.
@@ -177,8 +179,8 @@ def fit_arc(points: Array) -> Circle | None:
     is_on_circle = np.abs(deviations) < tolerance[:, None]
     best = int(is_on_circle.sum(axis=1).argmax())
     return (
-        float(u[best] + middle[0]),
-        float(v[best] + middle[1]),
+        float(u[best] + mean[0]),
+        float(v[best] + mean[1]),
         float(radius[best]),
     )
 

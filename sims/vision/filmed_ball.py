@@ -114,9 +114,9 @@ class FilmedBall(Simulator):
             rows = np.array(tracks).reshape(places.shape[:2])  # also for an empty batch
             heights = np.full_like(rows, np.nan)
         else:
-            middles, _ = camera.project_sphere(places, radius)
+            outline_centres, _ = camera.project_sphere(places, radius)
             heights = places[..., 2]
-            rows = middles[..., 1]
+            rows = outline_centres[..., 1]
         observations = np.stack([heights, rows], axis=2)
         result: Array = observations[:, :, self.columns]
         return result

@@ -9,13 +9,13 @@ import numpy as np
 
 from sims.core.simulator import Array, make_read_only
 
-_CONTRAST = 0.3
+_MIN_CONTRAST = 0.3
 """Minimum difference between ball and ground in some colour, on a scale from 0 to 1."""
-_WAVES = 6
+_WAVE_COUNT = 6
 """Number of waves whose sum is the ground's pattern."""
-_LOWEST = np.pi / 6
+_MIN_LIGHT_ELEVATION = np.pi / 6
 """Minimum elevation of the light, rad (30 degrees)."""
-_HIGHEST = np.pi / 2.25
+_MAX_LIGHT_ELEVATION = np.pi / 2.25
 """Maximum elevation of the light, rad (80 degrees)."""
 _BALL_VALUE = (0.15, 1.0)
 """Range of the brightness of balls, on a scale from 0 to 1; black is excluded."""
@@ -55,25 +55,25 @@ class SceneAppearance:
         """
         # The order of the draws must not change, because it determines the result of a seed.
         azimuth = rng.uniform(0, 2 * np.pi)
-        elevation = rng.uniform(_LOWEST, _HIGHEST)
-        flat = np.cos(elevation)
+        elevation = rng.uniform(_MIN_LIGHT_ELEVATION, _MAX_LIGHT_ELEVATION)
+        horizontal = np.cos(elevation)
         light = [
-            flat * np.cos(azimuth),
-            flat * np.sin(azimuth),
+            horizontal * np.cos(azimuth),
+            horizontal * np.sin(azimuth),
             np.sin(elevation),
         ]
         ground = _draw_colour(rng, saturation=(0.0, 0.4), value=(0.3, 0.85))
         ball = _draw_colour(rng, saturation=(0.0, 1.0), value=_BALL_VALUE)
-        while np.max(np.abs(np.subtract(ball, ground))) < _CONTRAST:
+        while np.max(np.abs(np.subtract(ball, ground))) < _MIN_CONTRAST:
             ball = _draw_colour(rng, saturation=(0.0, 1.0), value=_BALL_VALUE)
         sky = _draw_colour(rng, saturation=(0.0, 0.3), value=(0.7, 1.0))
-        turn = 2 * np.pi
-        bearing = rng.uniform(0, turn, _WAVES)
-        length = rng.uniform(0.5, 6.0, _WAVES)
-        phase = rng.uniform(0, turn, _WAVES)
-        amplitude = rng.uniform(0.0, 0.04, _WAVES)
-        wave_x = length * np.cos(bearing)
-        wave_y = length * np.sin(bearing)
+        full_turn = 2 * np.pi
+        bearing = rng.uniform(0, full_turn, _WAVE_COUNT)
+        wave_number = rng.uniform(0.5, 6.0, _WAVE_COUNT)
+        phase = rng.uniform(0, full_turn, _WAVE_COUNT)
+        amplitude = rng.uniform(0.0, 0.04, _WAVE_COUNT)
+        wave_x = wave_number * np.cos(bearing)
+        wave_y = wave_number * np.sin(bearing)
         waves = np.stack([wave_x, wave_y, phase, amplitude], axis=1)
         return cls(
             make_read_only(light),

@@ -14,11 +14,11 @@ _MAX_MISSED_FRAMES = 15
 """Maximum number of consecutive frames in which an object may be missed."""
 _RADIUS_RATIO_RANGE = (0.65, 1.55)
 """Range of the ratio of two radii of one object, which approaches the camera or is blurred."""
-_LEAST = 3
+_MIN_PATH_FRAMES = 3
 """Minimum number of frames of a path; shorter ones are noise."""
-_CHANCE = 0.5
+_CHANCE_RAY_AGREEMENT = 0.5
 """Fraction of the rays that agree on a circle at random."""
-_MEMORY = 20
+_COLOUR_MEMORY_FRAMES = 20
 """Number of frames over which the colour of a path is averaged."""
 _COLOUR_TOLERANCE = 25.0
 """Tolerance of the colour of an object, in grey levels."""
@@ -38,23 +38,23 @@ class TrackedPath:
     """Path of one object: frame numbers, detections and mean colour."""
 
     frames: list[int] = field(default_factory=list)
-    spots: list[BallDetection] = field(default_factory=list)
+    detections: list[BallDetection] = field(default_factory=list)
     mean_colour: Array = field(default_factory=lambda: np.zeros(3))
 
-    def append(self, frame: int, spot: BallDetection) -> None:
+    def append(self, frame: int, detection: BallDetection) -> None:
         """Append a detection, and update the mean colour.
 
         Args:
             frame: Number of the frame.
-            spot: Detection in that frame.
+            detection: Detection in that frame.
         """
         # A plain mean at first, later an exponential one, because the light changes along the path.
-        count = len(self.spots) + 1
-        weight = 1.0 / min(count, _MEMORY)
-        colour = np.array(spot.colour)
+        count = len(self.detections) + 1
+        weight = 1.0 / min(count, _COLOUR_MEMORY_FRAMES)
+        colour = np.array(detection.colour)
         self.mean_colour = (1.0 - weight) * self.mean_colour + weight * colour
         self.frames.append(frame)
-        self.spots.append(spot)
+        self.detections.append(detection)
 
     def predict(self, frame: int) -> tuple[float, float, float]:
         """Predict the position in a frame by linear extrapolation.
@@ -69,12 +69,12 @@ class TrackedPath:
             Position (u, v), and the maximum distance of a detection from it, which allows for a
             bounce; pixels.
         """
-        last = self.spots[-1]
+        last = self.detections[-1]
         u, v = last.u, last.v
         # A single detection has no direction.
-        if len(self.spots) < 2:
+        if len(self.detections) < 2:
             return u, v, 4 * last.radius + 10
-        previous = self.spots[-2]
+        previous = self.detections[-2]
         gap = self.frames[-1] - self.frames[-2]
         du = (u - previous.u) / gap
         dv = (v - previous.v) / gap
@@ -84,7 +84,7 @@ class TrackedPath:
         reach = 2 * speed * frame_gap + last.radius + 2
         return u + du * frame_gap, v + dv * frame_gap, reach
 
-    def compute_distance(self, frame: int, spot: BallDetection) -> float:
+    def compute_distance(self, frame: int, detection: BallDetection) -> float:
         """Return the distance of a detection from this path as a fraction of the allowed one.
 
         Position, radius and colour count; the result is infinite for another object. Colour
@@ -93,16 +93,16 @@ class TrackedPath:
 
         Args:
             frame: Number of the frame.
-            spot: Detection in that frame.
+            detection: Detection in that frame.
         """
         u, v, reach = self.predict(frame)
-        position_distance = float(np.hypot(spot.u - u, spot.v - v)) / reach
+        position_distance = float(np.hypot(detection.u - u, detection.v - v)) / reach
         if position_distance > 1:
             return np.inf
         low, high = _RADIUS_RATIO_RANGE
-        if not low < spot.radius / self.spots[-1].radius < high:
+        if not low < detection.radius / self.detections[-1].radius < high:
             return np.inf
-        colour_distance = self.compute_colour_distance(spot.colour, spot.contrast)
+        colour_distance = self.compute_colour_distance(detection.colour, detection.contrast)
         return position_distance + colour_distance if colour_distance <= 1 else np.inf
 
     def compute_colour_distance(self, colour: Sequence[float], contrast: float) -> float:
@@ -115,7 +115,7 @@ class TrackedPath:
             contrast: Contrast with the background of the object of that colour, grey levels.
         """
         # The smaller the ball, the more of it is mixed with the background.
-        tinge = _COLOUR_TOLERANCE * (1.0 + _CHROMA_BLUR_PIXELS / self.spots[-1].radius)
+        tinge = _COLOUR_TOLERANCE * (1.0 + _CHROMA_BLUR_PIXELS / self.detections[-1].radius)
         tolerance = max(
             tinge,
             _CONTRAST_TOLERANCE_SHARE * contrast,
@@ -127,17 +127,17 @@ class TrackedPath:
     @property
     def contrast(self) -> float:
         """Contrast of the last detection with the background, grey levels."""
-        return self.spots[-1].contrast
+        return self.detections[-1].contrast
 
     @property
     def radius(self) -> float:
         """Median radius of the detections, pixels."""
-        return float(np.median([s.radius for s in self.spots]))
+        return float(np.median([s.radius for s in self.detections]))
 
     @property
     def places(self) -> Array:
         """Centres of the detections (n, 2), pixels."""
-        return np.array([(s.u, s.v) for s in self.spots])
+        return np.array([(s.u, s.v) for s in self.detections])
 
     @property
     def travel(self) -> float:
@@ -151,7 +151,10 @@ class TrackedPath:
 
         A count of frames alone would prefer a permanent remnant of shadow to a ball.
         """
-        return sum((spot.ray_agreement - _CHANCE) * spot.radius for spot in self.spots)
+        return sum(
+            (detection.ray_agreement - _CHANCE_RAY_AGREEMENT) * detection.radius
+            for detection in self.detections
+        )
 
 
 def link_detections(pictures: Sequence[Sequence[BallDetection]]) -> list[TrackedPath]:
@@ -162,42 +165,42 @@ def link_detections(pictures: Sequence[Sequence[BallDetection]]) -> list[Tracked
     """
     finished_paths: list[TrackedPath] = []
     active_paths: list[TrackedPath] = []
-    for frame, spots in enumerate(pictures):
+    for frame, detections in enumerate(pictures):
         finished_paths += [
             path for path in active_paths if frame - path.frames[-1] > _MAX_MISSED_FRAMES
         ]
         active_paths = [
             path for path in active_paths if frame - path.frames[-1] <= _MAX_MISSED_FRAMES
         ]
-        used_detections = _extend_paths(active_paths, frame, spots)
+        used_detections = _extend_paths(active_paths, frame, detections)
         # Each remaining detection begins a new path.
-        for k, spot in enumerate(spots):
+        for k, detection in enumerate(detections):
             if k not in used_detections:
                 path = TrackedPath()
-                path.append(frame, spot)
+                path.append(frame, detection)
                 active_paths.append(path)
-    paths = [path for path in finished_paths + active_paths if len(path.frames) >= _LEAST]
+    paths = [path for path in finished_paths + active_paths if len(path.frames) >= _MIN_PATH_FRAMES]
     # Objects that do not move come last, regardless of their evidence.
     return sorted(paths, key=lambda path: -path.evidence * (path.travel > path.radius))
 
 
 def _extend_paths(
-    active_paths: Sequence[TrackedPath], frame: int, spots: Sequence[BallDetection]
+    active_paths: Sequence[TrackedPath], frame: int, detections: Sequence[BallDetection]
 ) -> set[int]:
     """Append each detection in a frame to the path that it fits best, nearest pairs first.
 
     Args:
         active_paths: Paths that may continue.
         frame: Number of the frame.
-        spots: Detections in that frame.
+        detections: Detections in that frame.
 
     Returns:
         Numbers of the detections that were appended.
     """
     pairs = []
     for i, path in enumerate(active_paths):
-        for k, spot in enumerate(spots):
-            distance = path.compute_distance(frame, spot)
+        for k, detection in enumerate(detections):
+            distance = path.compute_distance(frame, detection)
             if np.isfinite(distance):
                 pairs.append((distance, i, k))
     paths: set[int] = set()
@@ -208,7 +211,7 @@ def _extend_paths(
             continue
         paths.add(i)
         used_detections.add(k)
-        active_paths[i].append(frame, spots[k])
+        active_paths[i].append(frame, detections[k])
     return used_detections
 
 
@@ -224,7 +227,7 @@ def merge_continuations(paths: Sequence[TrackedPath]) -> tuple[TrackedPath, list
     main = paths[0]
     other_paths = []
     frames = list(main.frames)
-    spots = list(main.spots)
+    detections = list(main.detections)
     low, high = _RADIUS_RATIO_RANGE
     for path in paths[1:]:
         # A ball is in one place: a detection in the same frame is another object.
@@ -234,13 +237,13 @@ def merge_continuations(paths: Sequence[TrackedPath]) -> tuple[TrackedPath, list
         line_distance = _compute_median_distance(main.places, path.places)
         if is_disjoint and is_similar and line_distance < _MAX_CONTINUATION_DISTANCE * main.radius:
             frames += path.frames
-            spots += path.spots
+            detections += path.detections
         else:
             other_paths.append(path)
     order = np.argsort(frames).tolist()
     merged_path = TrackedPath(
         [frames[i] for i in order],
-        [spots[i] for i in order],
+        [detections[i] for i in order],
         main.mean_colour,
     )
     return merged_path, other_paths

@@ -19,13 +19,13 @@ from sims.recording.recording_writer import check_absent, write_files
 from sims.vision.ball_renderer import RgbImage
 from sims.vision.video_packages import import_package
 
-_FRAMES = (1e-3, 1e7)
+_FRAME_RATE_RANGE = (1e-3, 1e7)
 """Range of plausible frame rates, frames per second."""
-_TICKS = 90_000
+_TICKS_PER_SECOND = 90_000
 """Time stamps per second in the files written here, a multiple of the usual frame rates."""
 _DEFAULT_RATE = 30.0
 """Frame rate in frames per second of a file that states neither times nor a rate."""
-_HEAD = 64
+_HEAD_BYTES = 64
 """Number of bytes from which the kind of an unreadable file is determined."""
 
 
@@ -71,10 +71,10 @@ def _encode_frames(path: Path, frames: Iterable[RgbImage], times: Array, crf: in
     quality.
     """
     av = import_package("av")
-    ticks = np.rint((times - times[0]) * _TICKS).astype(int)
+    ticks = np.rint((times - times[0]) * _TICKS_PER_SECOND).astype(int)
     rate = Fraction(30)
     if len(times) > 1:
-        seconds = Fraction(max(1, int(ticks[-1])), _TICKS)
+        seconds = Fraction(max(1, int(ticks[-1])), _TICKS_PER_SECOND)
         rate = Fraction(len(times) - 1, 1) / seconds
     # Write the index first, so that a truncated file can be read up to the end.
     with av.open(str(path), "w", options={"movflags": "faststart"}) as file:
@@ -91,7 +91,7 @@ def _encode_frames(path: Path, frames: Iterable[RgbImage], times: Array, crf: in
             "bf": "0",
             **exact_options,
         }
-        stream.codec_context.time_base = Fraction(1, _TICKS)
+        stream.codec_context.time_base = Fraction(1, _TICKS_PER_SECOND)
         converter = av.video.reformatter.VideoReformatter()
         for tick, picture in zip(ticks.tolist(), frames, strict=True):
             if not stream.codec_context.is_open:
@@ -105,7 +105,7 @@ def _encode_frames(path: Path, frames: Iterable[RgbImage], times: Array, crf: in
             coloured = av.VideoFrame.from_ndarray(picture, format="rgb24")
             frame = converter.reformat(coloured, format="yuv420p", threads=1)
             frame.pts = tick
-            frame.time_base = Fraction(1, _TICKS)
+            frame.time_base = Fraction(1, _TICKS_PER_SECOND)
             file.mux(stream.encode(frame))
         file.mux(stream.encode(None))
 
@@ -128,8 +128,8 @@ class VideoFile:
     def __init__(self, path: Path, fps: float | None = None) -> None:
         """Check the frame rate, and that the file can be opened as a video."""
         require_file(path)
-        if fps is not None and not _FRAMES[0] <= fps <= _FRAMES[1]:
-            expected = f"more than 0, from {_FRAMES[0]:g} to {_FRAMES[1]:g}"
+        if fps is not None and not _FRAME_RATE_RANGE[0] <= fps <= _FRAME_RATE_RANGE[1]:
+            expected = f"more than 0, from {_FRAME_RATE_RANGE[0]:g} to {_FRAME_RATE_RANGE[1]:g}"
             raise InputError(f"frames a second, {fps:g}: expected {expected}")
         self.path, self.fps = path, fps
         self.notes: list[str] = []
@@ -233,7 +233,7 @@ def _apply_rotation(frame: Any, degrees: float) -> RgbImage:
 def _describe_unreadable_file(path: Path) -> str:
     """Describe why a file is not a readable video, from its first bytes."""
     with path.open("rb") as file:
-        start = file.read(_HEAD)
+        start = file.read(_HEAD_BYTES)
     if not start:
         return "expected a video, found an empty file"
     # These bytes begin an MP4 file, whose index may be at its end.

@@ -34,7 +34,7 @@ _RANGE_LABELS = {
     "wide": "true parameters in bounds",
     "real": "recording, at nominal values",
 }
-_MARKS = (("o", BLUE), ("^", VERMILION))
+_RANGE_MARKERS = (("o", BLUE), ("^", VERMILION))
 """Markers and colours of the ranges, in their order."""
 
 
@@ -72,7 +72,7 @@ def _draw_spectra(axis: Axes, table: pd.DataFrame, directions: int) -> None:
     are not. The ranges of targets are drawn side by side.
     """
     ranges = list(dict.fromkeys(table["range"]))
-    for place, (kind, (marker, colour)) in enumerate(zip(ranges, _MARKS, strict=False)):
+    for place, (kind, (marker, colour)) in enumerate(zip(ranges, _RANGE_MARKERS, strict=False)):
         part = table[table["range"] == kind]
         targets = part["target"].nunique()
         # Markers of one direction lie side by side within 0.3, the ranges 0.4 apart.

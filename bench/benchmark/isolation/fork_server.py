@@ -28,7 +28,7 @@ from bench.benchmark.isolation.message_channel import MessageChannel
 
 EXIT_CODE = struct.Struct("<i")
 """Report of a supervisor: exit code, or minus the number of the signal that killed the process."""
-_LENGTH = struct.Struct("<I")
+_LENGTH_FORMAT = struct.Struct("<I")
 _POLL_MILLISECONDS = 20
 """Interval in which a supervisor looks after its process, if the system has no pidfd."""
 
@@ -45,7 +45,7 @@ def send_request(link: socket.socket, request: Any, descriptors: tuple[int, ...]
         OSError: the fork server is gone.
     """
     body = json.dumps(request).encode()
-    socket.send_fds(link, [_LENGTH.pack(len(body))], descriptors)
+    socket.send_fds(link, [_LENGTH_FORMAT.pack(len(body))], descriptors)
     link.sendall(body)
     if not link.recv(1):
         raise BrokenPipeError
@@ -53,10 +53,10 @@ def send_request(link: socket.socket, request: Any, descriptors: tuple[int, ...]
 
 def _receive_request(link: socket.socket) -> tuple[dict[str, Any], list[int]] | None:
     """Return a request with its open files; None if the client has closed its socket."""
-    head, descriptors, _, _ = socket.recv_fds(link, _LENGTH.size, 3)
-    if len(head) < _LENGTH.size:
+    head, descriptors, _, _ = socket.recv_fds(link, _LENGTH_FORMAT.size, 3)
+    if len(head) < _LENGTH_FORMAT.size:
         return None
-    (size,) = _LENGTH.unpack(head)
+    (size,) = _LENGTH_FORMAT.unpack(head)
     body = link.recv(size, socket.MSG_WAITALL)
     return json.loads(body), list(descriptors)
 

@@ -149,7 +149,7 @@ _LOAD, _AND, _EQUAL, _AT_LEAST, _RETURN = 0x20, 0x54, 0x15, 0x35, 0x06
 """BPF instructions: load a word, AND, jump if equal, jump if at least, return."""
 _ARCHITECTURES = {"x86_64": 0xC000003E, "aarch64": 0xC00000B7}
 """AUDIT_ARCH of each machine; calls with the numbers of another architecture are blocked."""
-_X32 = 0x40000000
+_FIRST_X32_CALL = 0x40000000
 """First call number of the x32 interface, which is not used."""
 _NUMBER_OFFSET, _ARCHITECTURE_OFFSET, _ARGUMENTS_OFFSET = 0, 4, 16
 """Positions of call number, architecture and arguments in the data of a filter, in bytes."""
@@ -202,7 +202,7 @@ def build_filter(machine: str, rules: Mapping[str, int | ArgumentRule]) -> list[
     program += [BpfInstruction(_EQUAL, _ARCHITECTURES[machine], skip_if_true=1), *_emit_rule(_KILL)]
     program += [
         BpfInstruction(_LOAD, _NUMBER_OFFSET),
-        *_emit_conditional(_AT_LEAST, _X32, _emit_rule(_ENOSYS)),
+        *_emit_conditional(_AT_LEAST, _FIRST_X32_CALL, _emit_rule(_ENOSYS)),
     ]
     for name, number in _SYSCALL_NUMBERS[machine].items():
         program += _emit_conditional(_EQUAL, number, _emit_rule(rules[name]))

@@ -39,7 +39,7 @@ _BOOTSTRAP_CODE = (
     "from bench.benchmark.isolation.fork_server import serve_fork_requests; "
     "serve_fork_requests({descriptor})"
 )
-_PRELOADED = ("numpy.random", "bench.benchmark.isolation.tuner_server")
+_PRELOADED_MODULES = ("numpy.random", "bench.benchmark.isolation.tuner_server")
 _NUMERICAL_VARIABLE_PREFIXES = ("OPENBLAS_", "MKL_", "OMP_", "NPY_")
 """Prefixes of environment variables that determine how numerical libraries compute."""
 START_TIMEOUT_SECONDS = 60.0
@@ -108,7 +108,7 @@ class ForkServerClient:
         )
         server_link.close()
         atexit.register(self.close)
-        self._send_request({}, _PRELOADED)
+        self._send_request({}, _PRELOADED_MODULES)
 
     def _send_request(
         self, request: Mapping[str, Any], modules: Iterable[str], descriptors: tuple[int, ...] = ()

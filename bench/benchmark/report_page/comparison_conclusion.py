@@ -49,7 +49,7 @@ def list_range_results(view: ComparisonView) -> list[RangeResult]:
         )
         results.append(
             RangeResult(
-                headline.WHERE[kind],
+                headline.RANGE_PHRASES[kind],
                 _format_title(view, kind),
                 rankings,
                 any(ranking.failed for ranking in rankings),
@@ -60,7 +60,7 @@ def list_range_results(view: ComparisonView) -> list[RangeResult]:
 
 
 def _format_title(view: ComparisonView, kind: str) -> str:
-    text = headline.WHERE[kind]
+    text = headline.RANGE_PHRASES[kind]
     return f"{text[0].upper()}{text[1:]} ({headline.format_target_count(view.statistics, kind)})"
 
 

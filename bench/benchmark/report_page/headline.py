@@ -21,7 +21,7 @@ from bench.pages.text_format import format_number
 
 _DIGITS = 2
 """Number of significant digits of factors."""
-WHERE = {
+RANGE_PHRASES = {
     "in": "targets in the training range",
     "wide": "targets anywhere in the bounds",
     "real": "the recording",

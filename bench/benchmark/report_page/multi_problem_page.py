@@ -22,7 +22,7 @@ from sims.core.simulator import Array
 _TEMPLATE = Path(__file__).with_name("multi_problem.html")
 _DIGITS = 7
 """Number of significant digits of values that are in no file next to the page."""
-_LABELS = {
+_METRIC_LABELS = {
     "param_error": "mean parameter error [training widths], median",
     "stiff_error": "error along stiff directions [training widths], median",
     "heldout_error": "RMSE on held-out runs, median",
@@ -163,6 +163,6 @@ def _make_error_panels(page_data: MultiProblemPageData) -> tuple[list[Panel], pd
             )
             targets = statistics.target_counts[str(kind)]
             title = f"{experiment.title or experiment.name}. {PANEL_TITLES[str(kind)]} ({targets})"
-            y_axis, facets = Axis(_LABELS[metric], "log"), {"problem": problem}
+            y_axis, facets = Axis(_METRIC_LABELS[metric], "log"), {"problem": problem}
             panels.append(Panel(title, "errors", "simulations", series, x_axis, y_axis, facets))
     return panels, pd.concat(frames, ignore_index=True)

@@ -48,7 +48,7 @@ _COST_ARRAY = "__simulations_and_seconds__"
 """Name of the array with the cost of the training: simulations and seconds."""
 _KEY_ARRAY = "__key__"
 """Name of the array with the training key."""
-_REMEDY = "delete it to train again"
+_RETRAIN_ADVICE = "delete it to train again"
 """Advice for a file that cannot be used; it is never repaired silently."""
 
 
@@ -347,7 +347,7 @@ def _check_weights(request: TrainingRequest, path: Path) -> None:
 
 
 def _make_weights_error(path: Path, entry: TunerEntry, reason: object) -> WeightsError:
-    return WeightsError(f"{path}: not the weights of {entry.label}: {reason}; {_REMEDY}")
+    return WeightsError(f"{path}: not the weights of {entry.label}: {reason}; {_RETRAIN_ADVICE}")
 
 
 def _write_atomically(path: Path, arrays: Mapping[str, Array | NDArray[np.uint8]]) -> None:
@@ -409,7 +409,7 @@ def _read_checked_arrays(path: Path, name: str) -> dict[str, Array]:
         AttributeError,
     ):
         raise WeightsError(
-            f"{path}: expected trained weights, found none or a damaged file; {_REMEDY}"
+            f"{path}: expected trained weights, found none or a damaged file; {_RETRAIN_ADVICE}"
         ) from None
     counts, stored_key = arrays.get(_COST_ARRAY, np.empty(0)), arrays.get(_KEY_ARRAY, np.empty(0))
     if (
@@ -419,11 +419,13 @@ def _read_checked_arrays(path: Path, name: str) -> dict[str, Array]:
         or stored_key.ndim != 1
     ):
         raise WeightsError(
-            f"{path}: expected trained weights, found arrays {sorted(arrays)[:4]}; {_REMEDY}"
+            f"{path}: expected trained weights, found arrays {sorted(arrays)[:4]}; "
+            f"{_RETRAIN_ADVICE}"
         )
     stored_name = stored_key.tobytes().decode("utf-8", "replace")
     if stored_name != name:
         raise WeightsError(
-            f"{path}: expected the weights of {name}, found those of {stored_name:.80}; {_REMEDY}"
+            f"{path}: expected the weights of {name}, found those of {stored_name:.80}; "
+            f"{_RETRAIN_ADVICE}"
         )
     return arrays

@@ -33,7 +33,7 @@ REFERENCE_FOLDERS = (
 """Folders of references: in the root of a checkout, or in the package of a wheel."""
 _TABLE = "table.csv"
 _USED_COLUMNS = ("tuner", "range", "simulations", "metric", "median")
-_COLUMNS = [column for column in ERROR_TABLE_COLUMNS if column.name in _USED_COLUMNS]
+_READ_COLUMNS = [column for column in ERROR_TABLE_COLUMNS if column.name in _USED_COLUMNS]
 """Columns of a table that are read; an older table may lack others."""
 _PROBLEM_KEYS = ("simulator", "model", "recording", "observe", "error_channel")
 """Keys that must be equal for the errors of two comparisons to be comparable."""
@@ -215,7 +215,9 @@ def _read_reference(name: str, folder: Path) -> ReferenceResult:
     except (OSError, ValueError, KeyError, AttributeError, TypeError) as error:
         expected = "expected the results of a comparison"
         raise InputError(f"{path}: {expected}, found {get_first_line(error)}") from None
-    table = CsvTable(folder / _TABLE, _COLUMNS, f"write it again with simgap plot {folder}").table
+    table = CsvTable(
+        folder / _TABLE, _READ_COLUMNS, f"write it again with simgap plot {folder}"
+    ).table
     document = read_toml(folder / CONFIGURATION_FILE)
     return ReferenceResult(name, folder, table.to_pandas(), document, **origin, revision=revision)
 

@@ -44,10 +44,10 @@ from bench.diagnosis.kalman.joint_forces import (
 from sims.core.simulator import Array, Simulator
 from sims.recording.drive_switches import (
     DriveSwitch,
-    parts_without,
+    apply_drive_switches,
     spans,
     spans_of_runs,
-    switched_runs,
+    split_without_masked,
 )
 from sims.recording.recording import Recording, Run
 
@@ -149,7 +149,7 @@ def remove_inactive_drives(recording: Recording, kind: type[Simulator]) -> Recor
             unexplained.append(drive)
             left_out = [a | _widen_mask(b) for a, b in zip(left_out, drive.masks, strict=True)]
             continue
-        runs, said = switched_runs(recording.path, runs, switches)
+        runs, said = apply_drive_switches(recording.path, runs, switches)
         lines = " and ".join(switch.line for switch in switches)
         description = recording.path.with_suffix(".toml").name
         notes += [
@@ -158,7 +158,7 @@ def remove_inactive_drives(recording: Recording, kind: type[Simulator]) -> Recor
             for text in said
         ]
     pairs = zip(runs, left_out, strict=True)
-    kept = [part for run, mask in pairs for part in parts_without(run, mask)]
+    kept = [part for run, mask in pairs for part in split_without_masked(run, mask)]
     if unexplained and any(not run.held_out for run in kept):
         notes += [_format_message(recording, unexplained, left_out)]
         runs = tuple(kept)

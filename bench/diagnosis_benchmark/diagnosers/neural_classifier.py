@@ -32,7 +32,7 @@ GRID_POINT_COUNT = 64
 """Number of grid points over a run."""
 LAYER_WIDTH = 48
 """Number of channels of the network's layers."""
-EPOCHS = 60
+TRAINING_EPOCHS = 60
 """Number of training epochs."""
 BATCH_SIZE = 64
 """Number of recordings per training step."""
@@ -52,7 +52,7 @@ VALIDATION_SHARE = 0.15
 """Fraction of the examples used for validation, by which the epoch is selected."""
 _RESIDUAL_CLIP = 30.0
 """Absolute value at which residuals are clipped, in units of the noise."""
-_NOISES = {"point": (2e-3, 2e-2), "linear": (1e-3, 1e-2), "rotary": (1e-3, 1e-2)}
+_NOISE_RANGES = {"point": (2e-3, 2e-2), "linear": (1e-3, 1e-2), "rotary": (1e-3, 1e-2)}
 """Noise range of the first channel by kind of system, SI units."""
 
 
@@ -151,7 +151,7 @@ def _simulate_example(training_task: DiagnoserTrainingTask, name: str, number: i
     """
     rng, kind = training_task.rng, training_task.kind
     system = kind.system
-    low, high = _NOISES[system.kind]
+    low, high = _NOISE_RANGES[system.kind]
     sigma = float(np.exp(rng.uniform(np.log(low), np.log(high))))
     # In SI units a rate is 5 times as noisy as a position, as in many cases of the benchmark.
     noise = {c.name: sigma * (5.0 if c.name in system.rates else 1.0) for c in kind.channels}
@@ -364,9 +364,9 @@ def _train_network(
         split = max(1, round(VALIDATION_SHARE * len(labels)))
         validation, training = slice(0, split), np.arange(split, len(labels))
         optimiser = torch.optim.Adam(network.parameters(), lr=2e-3, weight_decay=1e-4)
-        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, EPOCHS)
+        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, TRAINING_EPOCHS)
         best, state = np.inf, network.state_dict()
-        for _ in range(EPOCHS):
+        for _ in range(TRAINING_EPOCHS):
             network.train()
             order = training[torch.randperm(len(training)).numpy()]
             for part in np.array_split(order, max(1, len(order) // BATCH_SIZE)):

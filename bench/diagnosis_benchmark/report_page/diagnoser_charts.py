@@ -16,7 +16,7 @@ from bench.diagnosis_benchmark.result_tables import (
 from bench.figures.style import GREY, make_mark_style
 from bench.pages.chart import Axis, Panel, ReferenceLine, Series
 
-_SHARES = {
+_SHARE_METRICS = {
     "false alarms": "alarms",
     "named, alone": "alone",
     PRIMARY_METRIC: "set of 2",
@@ -66,7 +66,7 @@ def build_chart_tables(data: DiagnoserReportData) -> dict[str, pd.DataFrame]:
 def _list_shares(data: DiagnoserReportData) -> list[str]:
     """List the metrics of the chart of shares that have answers."""
     table = data.tables["table"]
-    return [name for name in _SHARES if table.loc[table["metric"] == name, "of"].any()]
+    return [name for name in _SHARE_METRICS if table.loc[table["metric"] == name, "of"].any()]
 
 
 def make_charts(data: DiagnoserReportData) -> dict[str, list[Panel]]:
@@ -109,7 +109,7 @@ def _make_shares(data: DiagnoserReportData, table: pd.DataFrame) -> list[Panel]:
         table: rows of table.csv of these metrics.
     """
     counts = table.groupby("metric")["of"].max()
-    names = tuple(f"{_SHARES[name]}\nn={int(counts[name])}" for name in _list_shares(data))
+    names = tuple(f"{_SHARE_METRICS[name]}\nn={int(counts[name])}" for name in _list_shares(data))
     x_axis = Axis("what is counted; at most n answers or intervals", names=names)
     series = data.make_interval_series("share", is_shifted=True)
     return [Panel("", "shares", "place", series, x_axis, _SHARE_AXIS)]

@@ -20,7 +20,7 @@ from bench.pages.text_format import format_p_value, format_percent, sanitise
 
 _SIGNIFICANCE_LEVEL = 0.05
 """Maximum Holm-corrected p-value for a significant difference between two diagnosers."""
-_KINDS = {
+_SENTENCES_BY_KIND = {
     "clean": "false alarms in {of} clean recordings",
     "single": "of {of} single effects of at least one noise",
     "double": "of {of} pairs",
@@ -48,9 +48,9 @@ def count_own_failures(data: DiagnoserReportData) -> OwnFailures | None:
     if graded_rows.empty:
         return None
     wrong_rows = graded_rows[~is_correct(graded_rows)]
-    counts = {kind: int((graded_rows["kind"] == kind).sum()) for kind in _KINDS}
+    counts = {kind: int((graded_rows["kind"] == kind).sum()) for kind in _SENTENCES_BY_KIND}
     kinds = [
-        f"{int((wrong_rows['kind'] == kind).sum())} {_KINDS[kind].format(of=count)}"
+        f"{int((wrong_rows['kind'] == kind).sum())} {_SENTENCES_BY_KIND[kind].format(of=count)}"
         for kind, count in counts.items()
         if count
     ]

@@ -211,21 +211,23 @@ class ColumnAssigner:
 
         A motor takes a torque or force, a servo a position or velocity.
         """
-        quantity = column_guessing.get_commanded_role(column)
+        given_quantity = column_guessing.get_commanded_role(column)
         expected = COMMAND_QUANTITIES.get(actuator.kind)
         if (
             actuator.kind == "motor"
-            and quantity is None
+            and given_quantity is None
             and self._resembles_position(column, joint)
         ):
-            quantity = "position"
+            given_quantity = "position"
         name = f"u.{actuator.name}"
-        if expected is not None and quantity is not None and quantity != expected:
+        if expected is not None and given_quantity is not None and given_quantity != expected:
             words = {"force": "torque" if joint.kind == "hinge" else "force"}
-            desired, expected_quantity = (words.get(word, word) for word in (quantity, expected))
+            given_words, expected_quantity = (
+                words.get(word, word) for word in (given_quantity, expected)
+            )
             self._result.leave_out(
                 column,
-                f"is a desired {desired} of {joint.name}, and {actuator.name} takes a "
+                f"is a desired {given_words} of {joint.name}, and {actuator.name} takes a "
                 f"{expected_quantity}",
             )
         elif actuator.kind == "motor":
@@ -234,8 +236,8 @@ class ColumnAssigner:
             signal = self._make_position_signal(column, joint, placement)
             self._add_signal(self._signals.inputs, name, column, signal)
         else:
-            si = f"{joint.unit}/s"
-            unit = column.unit if is_convertible(column.unit, si) else si
+            si_unit = f"{joint.unit}/s"
+            unit = column.unit if is_convertible(column.unit, si_unit) else si_unit
             signal = Signal(column, unit, placement, f"; in {unit}")
             self._add_signal(self._signals.inputs, name, column, signal)
 

@@ -14,8 +14,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from sims.core.simulator import Array
-from sims.recording.column_mapping import MAX_REPEATED
 from sims.recording.log_formats.unit_names import read_unit, split_unit
+from sims.recording.log_joining import MAX_REPEATED
 from sims.robot.robot_model import Joint
 
 Role = Literal["command", "position", "velocity", "force", "other"]
@@ -38,11 +38,17 @@ ROLE_KEYWORDS: Mapping[Role, frozenset[str]] = {
     role: frozenset(words.split()) for role, words in _WORD_LISTS.items()
 }
 """Words in the name of a column or of its file, by the role that they indicate."""
-_VAGUE = frozenset({"joint", "joints", "state", "states", "current", "currents", "load", "loads"})
+_WEAK_ROLE_WORDS = frozenset(
+    {"joint", "joints", "state", "states", "current", "currents", "load", "loads"}
+)
 """Words that indicate a role only if no other word does."""
-_MEASURED = frozenset(["meas", "measured", "actual", "act", "present", "sensed", "ist", "istwert"])
+_MEASURED_WORDS = frozenset(
+    ["meas", "measured", "actual", "act", "present", "sensed", "ist", "istwert"]
+)
 """Words for a measured signal, if a log has several signals of one kind."""
-_GLUED = re.compile(r"(?P<what>q|dq|qd|tau|pos|vel)(?P<command>des|cmd|ref|goal|target|desired)")
+_JOINED_WORDS_PATTERN = re.compile(
+    r"(?P<what>q|dq|qd|tau|pos|vel)(?P<command>des|cmd|ref|goal|target|desired)"
+)
 """Pattern of two words written as one, for example ``qdes`` and ``taucmd``."""
 _ROLE_OF_QUANTITY: Mapping[str, Role] = {
     "angular velocity": "velocity",
@@ -105,7 +111,7 @@ def split_name(text: str) -> list[str]:
     spaced = re.sub(r"([a-z0-9])([A-Z])", r"\1 \2", text)
     words = []
     for part in re.split(r"[\W_]+|(?<=[^\W\d_])(?=\d)", spaced):
-        joined_words = _GLUED.fullmatch(part.lower())
+        joined_words = _JOINED_WORDS_PATTERN.fullmatch(part.lower())
         words += [joined_words["what"], joined_words["command"]] if joined_words else [part.lower()]
     return [word for word in words if word]
 
@@ -133,12 +139,14 @@ def get_commanded_role(column: LogColumn) -> Role | None:
         return "position"
     column_words, file_words = _split_into_words(column)
     # `joint_command` gives no more information than `command`; `joint_position_command` does.
-    return _guess_measured_role(column_words - _VAGUE) or _guess_measured_role(file_words - _VAGUE)
+    return _guess_measured_role(column_words - _WEAK_ROLE_WORDS) or _guess_measured_role(
+        file_words - _WEAK_ROLE_WORDS
+    )
 
 
 def is_measured(column: LogColumn) -> bool:
     """Return whether a column's name says that it was measured."""
-    return bool(set(split_name(column.bare)) & _MEASURED)
+    return bool(set(split_name(column.bare)) & _MEASURED_WORDS)
 
 
 def _split_into_words(column: LogColumn) -> tuple[set[str], set[str]]:
@@ -153,7 +161,11 @@ def _guess_measured_role(words: set[str]) -> Role | None:
     roles: tuple[Role, ...] = ("other", "velocity", "force", "position")
     # `current` in "current position" is not an electric current, and a joint state may be a
     # velocity.
-    for word_subset in (words - _VAGUE, words & {"current", "currents", "load", "loads"}, words):
+    for word_subset in (
+        words - _WEAK_ROLE_WORDS,
+        words & {"current", "currents", "load", "loads"},
+        words,
+    ):
         for role in roles:
             if word_subset & ROLE_KEYWORDS[role]:
                 return role
@@ -208,19 +220,19 @@ def match_numbered_joints(
         Joints by column name; empty if a column has no number, numbers repeat, or there are more
             columns than joints.
     """
-    places: dict[str, int] = {}
+    numbers: dict[str, int] = {}
     for column in columns:
         digits = re.findall(r"\d+", column.bare)
         if not digits:
             return {}
-        places[column.name] = int(digits[-1])
-    first = min(places.values(), default=0)
-    if len(columns) > len(joints) or len(set(places.values())) < len(columns):
+        numbers[column.name] = int(digits[-1])
+    first = min(numbers.values(), default=0)
+    if len(columns) > len(joints) or len(set(numbers.values())) < len(columns):
         return {}
-    order = {name: place - first for name, place in places.items()}
+    order = {name: index - first for name, index in numbers.items()}
     if max(order.values(), default=0) >= len(joints):
         return {}
-    return {name: joints[place] for name, place in order.items()}
+    return {name: joints[index] for name, index in order.items()}
 
 
 def list_clock_columns(columns: Iterable[LogColumn]) -> list[LogColumn]:
@@ -230,12 +242,12 @@ def list_clock_columns(columns: Iterable[LogColumn]) -> list[LogColumn]:
     increasing columns with other names.
     """
     ranked_columns = []
-    for place, column in enumerate(columns):
+    for position, column in enumerate(columns):
         words = set(split_name(column.bare))
         is_named = bool(words & TIME_COLUMN_NAMES) or column.quantity == "time"
         if _is_increasing(column.values, MAX_REPEATED if is_named else 0.0):
             rank = 0 if is_named and "header" in words else 1 if is_named else 2
-            ranked_columns.append((rank, place, column))
+            ranked_columns.append((rank, position, column))
     return [
         column
         for _, _, column in sorted(ranked_columns, key=lambda ranked_column: ranked_column[:2])

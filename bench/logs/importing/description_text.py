@@ -5,43 +5,18 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
-
-import numpy as np
 
 from bench.logs.importing.import_result import ImportOptions, ImportResult
 from bench.logs.importing.run_logs import RunLogs, hold_signal
-from bench.logs.importing.servo_estimation import ServoResponse, estimate_servo_response
+from bench.logs.importing.servo_estimation import AddedServo, estimate_added_servo
 from bench.logs.importing.signal_assignment import Signal, SignalAssignment
 from sims.core.simulator import Array
 from sims.core.toml_validation import toml_key, toml_text
 from sims.robot.places.typical_forces import compute_joint_scales
 from sims.robot.robot_model import Joint
 
-DEFAULT_RESPONSE = ServoResponse(20.0, 0.7)
-"""Natural frequency in rad/s and damping ratio of a servo whose gains are unknown."""
-MIN_MOTION = {"rad": 0.02, "m": 0.002}
-"""Smallest motion of a joint, by its unit, that shows something about the gains of its servo."""
 FREE_GAINS = "actuator.stiffness", "actuator.damping"
 """Free numbers of a servo that is missing in the model file."""
-
-
-class _AddedServo(NamedTuple):
-    """Position servo that is missing in the model file.
-
-    Attributes:
-        name: Name that it gets.
-        joint: Joint that it drives.
-        kp: Stiffness, N·m/rad.
-        kv: Damping, N·m·s/rad.
-        is_free: Whether its gains are fitted, because the log moves the joint.
-    """
-
-    name: str
-    joint: Joint
-    kp: float
-    kv: float
-    is_free: bool
 
 
 class DescriptionWriter:
@@ -153,39 +128,28 @@ class DescriptionWriter:
         )
         return [*lines, ""]
 
-    def _estimate_added_servo(self, name: str, joint: Joint) -> _AddedServo:
-        """Estimate the gains kp and kv of a servo that is missing in the model file.
-
-        They follow from frequency and damping of its response and from the inertia of the joint.
-        Without motion, the gains of a usual servo are taken.
-        """
+    def _estimate_added_servo(self, name: str, joint: Joint) -> AddedServo:
+        """Estimate the gains of a servo that the model file lacks, and note their origin."""
         signals = self._signals
         inertia = float(compute_joint_scales(signals.robot).inertia[signals.joints.index(joint)])
-        samples = self._collect_servo_samples(name, joint)
-        response = estimate_servo_response(samples)
-        frequency, damping = response or DEFAULT_RESPONSE
-        kp, kv = inertia * frequency**2, 2.0 * damping * frequency * inertia
-        is_moved = response is not None or any(
-            np.ptp(u) > 0 and np.ptp(q[np.isfinite(q)]) > MIN_MOTION[joint.unit]
-            for _, u, q in samples
-            if np.isfinite(q).any()
-        )
+        servo = estimate_added_servo(name, joint, inertia, self._collect_servo_samples(name, joint))
+        frequency, damping = servo.response
         gains = f"for {frequency:.3g} rad/s and a damping ratio of {damping:.2g}"
-        if is_moved:
-            origin = "as it follows its command" if response else "typical of a hobby servo"
+        if servo.is_free:
+            origin = (
+                "as it follows its command" if servo.is_measured else "typical of a hobby servo"
+            )
             self._result.guessed.append(
                 f"gains of the servo of {joint.name}: {gains}, {origin}; free"
             )
         else:
             self._result.checks.append(
                 f"gains of the servo of {joint.name}: the log does not move this joint and cannot "
-                f"show them; kp = {kp:.4g} and kv = {kv:.4g} ({gains}) only hold its position "
-                "and are "
-                f"not fitted; state those of the drive in [actuators.{toml_key(name)}], or "
-                "import a "
-                "log that moves the joint"
+                f"show them; kp = {servo.kp:.4g} and kv = {servo.kv:.4g} ({gains}) only hold its "
+                f"position and are not fitted; state those of the drive in "
+                f"[actuators.{toml_key(name)}], or import a log that moves the joint"
             )
-        return _AddedServo(name, joint, kp, kv, is_moved)
+        return servo
 
     def _collect_servo_samples(self, name: str, joint: Joint) -> list[tuple[Array, Array, Array]]:
         """Return times (s), commands and positions (T,) of a servo in each run, in rad or m.

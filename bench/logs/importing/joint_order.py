@@ -70,8 +70,8 @@ def find_best_order(distances: Array) -> list[int]:
     # SciPy's optimisers are slow to import.
     from scipy.optimize import linear_sum_assignment
 
-    _, places = linear_sum_assignment(distances)
-    order: list[int] = places.tolist()
+    _, assigned = linear_sum_assignment(distances)
+    order: list[int] = assigned.tolist()
     return order
 
 

@@ -25,15 +25,15 @@ from sims.robot.robot_model import Actuator, Joint, RobotModel
 
 ALL_ORDERS = 4
 """Maximum number of joints for which every order is tested."""
-WINDOW = 11
+SMOOTHING_WINDOW = 11
 """Length of the smoothing window in samples."""
-DEGREE = 3
+SMOOTHING_DEGREE = 3
 """Degree of the smoothing polynomial."""
-INSTANTS = 150
+MAX_INSTANTS = 150
 """Maximum number of times at which forces are compared."""
-PREFERRED = 0.5
+MAX_PREFERRED_RATIO = 0.5
 """Maximum ratio of R in (1) for the preferred order to R for the model's order."""
-EXPLAINED = 0.7
+MAX_UNEXPLAINED = 0.7
 """Maximum R in (1) for the preferred order; a model that explains little prefers no order."""
 
 
@@ -52,7 +52,7 @@ class PreferredOrder(NamedTuple):
 
     def is_certain(self) -> bool:
         """Return whether the order explains much, and far more than the model's own order."""
-        return self.residual < min(EXPLAINED, PREFERRED * self.usual)
+        return self.residual < min(MAX_UNEXPLAINED, MAX_PREFERRED_RATIO * self.usual)
 
 
 def find_order_by_model(
@@ -76,16 +76,23 @@ def find_order_by_model(
     """
     is_usable = np.isfinite(commands).all(axis=0) & np.isfinite(positions).all(axis=0)
     is_usable &= np.diff(times, prepend=-np.inf) > 0
-    if is_usable.sum() < 4 * WINDOW or len(driven) < 2:
+    if is_usable.sum() < 4 * SMOOTHING_WINDOW or len(driven) < 2:
         return None
     # SciPy's signal module is slow to import.
     from scipy.signal import savgol_filter
 
     t, u, q = times[is_usable], np.array(commands)[:, is_usable], np.array(positions)[:, is_usable]
     step = float(np.median(np.diff(t)))
-    derivatives = [savgol_filter(q, WINDOW, DEGREE, deriv=k, delta=step, axis=1) for k in range(3)]
+    derivatives = [
+        savgol_filter(q, SMOOTHING_WINDOW, SMOOTHING_DEGREE, deriv=k, delta=step, axis=1)
+        for k in range(3)
+    ]
     motion = np.stack(derivatives)
-    window_centres = np.linspace(WINDOW, t.size - WINDOW - 1, min(INSTANTS, t.size - 2 * WINDOW))
+    window_centres = np.linspace(
+        SMOOTHING_WINDOW,
+        t.size - SMOOTHING_WINDOW - 1,
+        min(MAX_INSTANTS, t.size - 2 * SMOOTHING_WINDOW),
+    )
     rows = np.unique(window_centres.astype(np.intp))
     residuals = {
         order: _compute_order_residual(

@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 from sims.core.simulator import InputError
-from sims.recording.log_formats.hdf5_files import is_hdf5, runs_in
+from sims.recording.log_formats.hdf5_files import is_hdf5, list_run_paths
 from sims.recording.log_formats.lerobot_dataset import is_dataset
 from sims.recording.log_formats.log_files import LOG_SUFFIXES, list_logs, read_log
 from sims.recording.log_formats.ros_bags import BAG_SUFFIXES, is_bag
 
-TABLES = tuple(ending for ending in LOG_SUFFIXES if ending not in (".txt", ".dat"))
+TABLE_ENDINGS = tuple(ending for ending in LOG_SUFFIXES if ending not in (".txt", ".dat"))
 """File extensions of logs that are read from a folder; other text files may contain anything."""
 
 
@@ -62,7 +62,7 @@ def group_logs_by_run(logs: Sequence[Path]) -> dict[str, RunFiles]:
             if is_bag(part):
                 paths = list(list_logs(part))
             elif part.is_dir():
-                paths = [path for path in list_logs(part) if path.suffix.lower() in TABLES]
+                paths = [path for path in list_logs(part) if path.suffix.lower() in TABLE_ENDINGS]
             else:
                 continue
             if paths:
@@ -76,7 +76,7 @@ def group_logs_by_run(logs: Sequence[Path]) -> dict[str, RunFiles]:
         runs = {"": RunFiles(folders.pop(), files, chosen=True)}
     if not runs:
         log_names = ", ".join(map(str, logs))
-        kinds = ", ".join((*TABLES, *BAG_SUFFIXES))
+        kinds = ", ".join((*TABLE_ENDINGS, *BAG_SUFFIXES))
         raise InputError(f"{log_names}: expected logs ({kinds}), found none")
     if len(runs) == 1:
         ((name, run),) = runs.items()
@@ -88,7 +88,7 @@ def _make_run_per_group(run: RunFiles) -> dict[str, RunFiles]:
     """Return a run for each group of an HDF5 file with several runs; otherwise an empty dict."""
     if len(run.paths) != 1 or not is_hdf5(run.paths[0]):
         return {}
-    groups = runs_in(run.paths[0])
+    groups = list_run_paths(run.paths[0])
     if groups == run.paths:
         return {}
     return {group.name: RunFiles(run.folder, [group], True, run.chosen) for group in groups}
@@ -96,7 +96,7 @@ def _make_run_per_group(run: RunFiles) -> dict[str, RunFiles]:
 
 def _make_run_per_file(run: RunFiles) -> dict[str, RunFiles]:
     """Return a run for each file if all files have the same columns; otherwise an empty dict."""
-    tables = [path for path in run.paths if path.suffix.lower() in TABLES and path.is_file()]
+    tables = [path for path in run.paths if path.suffix.lower() in TABLE_ENDINGS and path.is_file()]
     stems = [path.stem for path in tables]
     if len(tables) < 2 or len(tables) < len(run.paths) or len(set(stems)) < len(stems):
         return {}

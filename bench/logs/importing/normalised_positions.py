@@ -18,7 +18,7 @@ from sims.core.toml_validation import read_toml
 from sims.recording.log_formats.lerobot_calibration import (
     AngleScale,
     MotorRange,
-    angle_scale,
+    compute_angle_scale,
     find_calibration,
     motor_of,
     range_scale,
@@ -68,7 +68,7 @@ class NormalisedPositions:
         motor = motor_of(column, self.motors)
         # Encoder counts of a slide joint's motor are not metres, so the model's range is used.
         if motor is not None and joint.kind == "hinge":
-            return "deg", angle_scale(self.motors[motor], from_zero)
+            return "deg", compute_angle_scale(self.motors[motor], from_zero)
         if joint.range is None:
             return None
         return joint.unit, range_scale(*joint.range, from_zero)

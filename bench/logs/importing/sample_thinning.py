@@ -16,21 +16,21 @@ import numpy as np
 from sims.core.simulator import Array, Simulator
 from sims.recording.recording import Recording, Run
 
-FASTEST = 400.0
+MAX_UNCHANGED_RATE = 400.0
 """Sampling rate in Hz up to which a recording is kept unchanged."""
-SLOWEST = 100.0
+MIN_THINNED_RATE = 100.0
 """Minimum sampling rate in Hz after thinning."""
-LARGER = 1.25
+MAX_ERROR_RATIO = 1.25
 """Maximum ratio of the interpolation error to that of keeping every second sample."""
-PRECISION = 1e-4
+NEGLIGIBLE_ERROR_SHARE = 1e-4
 """Negligible interpolation error as a fraction of a channel's range: a simulation's accuracy."""
-COMPLETE = 0.9
+MIN_AVAILABLE_SHARE = 0.9
 """Minimum share of available samples of each channel."""
-FEWEST = 40
+MIN_RUN_SAMPLES = 40
 """Minimum number of samples that each run must keep."""
 
 
-def thin(recording: Recording, kind: type[Simulator]) -> tuple[Recording, str]:
+def thin_recording(recording: Recording, kind: type[Simulator]) -> tuple[Recording, str]:
     """Keep each k-th sample of a robot's recording if these samples contain all motion.
 
     Inputs with zero-order hold are averaged between the samples that are kept.
@@ -43,10 +43,15 @@ def thin(recording: Recording, kind: type[Simulator]) -> tuple[Recording, str]:
         The recording, and a message for the user, which is empty if it is unchanged.
     """
     rate = min((_compute_sampling_rate(run) for run in recording.runs), default=0.0)
-    if not kind.has_model or rate <= FASTEST:
+    if not kind.has_model or rate <= MAX_UNCHANGED_RATE:
         return recording, ""
     stride = next(
-        (k for k in range(round(rate / SLOWEST), 1, -1) if _keeps_motion(recording, k)), 1
+        (
+            k
+            for k in range(round(rate / MIN_THINNED_RATE), 1, -1)
+            if _preserves_motion(recording, k)
+        ),
+        1,
     )
     if stride == 1:
         return recording, ""
@@ -63,21 +68,21 @@ def _compute_sampling_rate(run: Run) -> float:
     return float(1.0 / np.median(np.diff(run.times))) if run.times.size > 1 else 0.0
 
 
-def _keeps_motion(recording: Recording, stride: int) -> bool:
+def _preserves_motion(recording: Recording, stride: int) -> bool:
     """Return whether every k-th sample still shows the whole motion; k is `stride`.
 
     The motion between the kept samples is interpolated by a spline. Its error may hardly be larger
     than if every second sample is kept, which is noise.
     """
     for run in recording.runs:
-        if run.times.size < FEWEST * stride:
+        if run.times.size < MIN_RUN_SAMPLES * stride:
             return False
         for values in run.channels.values():
-            if np.isfinite(values).mean() < COMPLETE:
+            if np.isfinite(values).mean() < MIN_AVAILABLE_SHARE:
                 return False
-            min_error = PRECISION * float(np.ptp(values[np.isfinite(values)]))
+            min_error = NEGLIGIBLE_ERROR_SHARE * float(np.ptp(values[np.isfinite(values)]))
             allowed_error = max(
-                LARGER * _compute_interpolation_error(run.times, values, 2), min_error
+                MAX_ERROR_RATIO * _compute_interpolation_error(run.times, values, 2), min_error
             )
             if _compute_interpolation_error(run.times, values, stride) > allowed_error:
                 return False

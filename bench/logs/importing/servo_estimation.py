@@ -19,6 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sims.core.simulator import Array
+from sims.robot.robot_model import Joint
 
 FREQUENCY_GRID = np.geomspace(2.0, 200.0, 33)
 """Grid of natural frequencies in rad/s."""
@@ -36,6 +37,60 @@ class ServoResponse(NamedTuple):
 
     frequency: float
     damping: float
+
+
+DEFAULT_RESPONSE = ServoResponse(20.0, 0.7)
+"""Natural frequency in rad/s and damping ratio of a servo whose gains are unknown."""
+MIN_MOTION = {"rad": 0.02, "m": 0.002}
+"""Smallest motion of a joint, by its unit, that shows something about the gains of its servo."""
+
+
+class AddedServo(NamedTuple):
+    """Position servo that is missing in the model file.
+
+    Attributes:
+        name: Name that it gets.
+        joint: Joint that it drives.
+        response: Natural frequency and damping ratio from which the gains follow.
+        kp: Stiffness, N·m/rad.
+        kv: Damping, N·m·s/rad.
+        is_measured: Whether the response was estimated from the log, and is not the default.
+        is_free: Whether its gains are fitted, because the log moves the joint.
+    """
+
+    name: str
+    joint: Joint
+    response: ServoResponse
+    kp: float
+    kv: float
+    is_measured: bool
+    is_free: bool
+
+
+def estimate_added_servo(
+    name: str, joint: Joint, inertia: float, runs: Sequence[tuple[Array, Array, Array]]
+) -> AddedServo:
+    """Estimate the gains kp and kv of a servo that is missing in the model file.
+
+    They follow from frequency and damping of its response and from the inertia of the joint.
+    Without motion, the gains of a usual servo are taken.
+
+    Args:
+        name: Name that the servo gets.
+        joint: Joint that it drives.
+        inertia: Inertia about the joint, kg m^2 or kg.
+        runs: Times, commands and positions of each run, as in `estimate_servo_response`.
+    """
+    estimate = estimate_servo_response(runs)
+    response = estimate or DEFAULT_RESPONSE
+    frequency, damping = response
+    kp, kv = inertia * frequency**2, 2.0 * damping * frequency * inertia
+    is_moved = estimate is not None or any(
+        np.ptp(u) > 0 and np.ptp(q[np.isfinite(q)]) > MIN_MOTION[joint.unit]
+        for _, u, q in runs
+        if np.isfinite(q).any()
+    )
+    return AddedServo(name, joint, response, kp, kv, estimate is not None, is_moved)
 
 
 def estimate_servo_response(runs: Sequence[tuple[Array, Array, Array]]) -> ServoResponse | None:
@@ -64,10 +119,12 @@ def estimate_servo_response(runs: Sequence[tuple[Array, Array, Array]]) -> Servo
     best, smallest_residual = None, (1.0 - MIN_EXPLAINED_VARIANCE) * total_variation
     for frequency, damping in product(FREQUENCY_GRID.tolist(), DAMPING_GRID.tolist()):
         system = [frequency**2], [1.0, 2.0 * damping * frequency, frequency**2]
-        over, under, _ = cont2discrete(system, step)
+        numerator, denominator, _ = cont2discrete(system, step)
         residual = 0.0
         for _, u, q in moving:
-            residual += float(np.var(q - lfilter(np.ravel(over), under, u - u[0]))) * q.size
+            residual += (
+                float(np.var(q - lfilter(np.ravel(numerator), denominator, u - u[0]))) * q.size
+            )
         if residual < smallest_residual:
             best, smallest_residual = ServoResponse(frequency, damping), residual
     return best

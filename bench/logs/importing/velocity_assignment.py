@@ -28,7 +28,7 @@ from sims.robot.robot_model import Joint
 
 SLOPE_RANGE = (0.7, 1.4)
 """Interval of slopes, divided by a unit's factor, that confirm the unit."""
-UNITS = {"hinge": ("rad/s", "deg/s", "rpm", "turn/s"), "slide": ("m/s", "mm/s")}
+VELOCITY_UNITS = {"hinge": ("rad/s", "deg/s", "rpm", "turn/s"), "slide": ("m/s", "mm/s")}
 """Units of velocities, by kind of joint, the most usual first."""
 
 
@@ -121,7 +121,7 @@ def _confirm_unit(comparison: VelocityComparison | None, column: LogColumn, join
         return ""
     si = f"{joint.unit}/s"
     stated_units = [column.unit] if is_convertible(column.unit, si) else []
-    for unit in (*stated_units, *UNITS["hinge" if joint.kind == "hinge" else "slide"]):
+    for unit in (*stated_units, *VELOCITY_UNITS["hinge" if joint.kind == "hinge" else "slide"]):
         gain = compute_unit_scale(unit, si).gain
         if SLOPE_RANGE[0] < gain / comparison.slope < SLOPE_RANGE[1]:
             return unit

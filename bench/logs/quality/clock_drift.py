@@ -130,31 +130,33 @@ def _estimate_run_drifts(run: Run, command: str, position: str) -> Iterator[_Est
     step = max(float(np.median(np.diff(t))), float(t[-1] - t[0]) / MAX_COMPARED_INSTANTS)
     grid = np.arange(t[0], t[-1], step)
     positions = np.interp(grid, t[is_recorded], y[is_recorded])
-    memory = _average_over_intervals(np.interp(grid, t, u))
-    inner = slice(LAG_BIN_EDGES[-1], len(grid) + LAG_BIN_EDGES[0])
-    time = (grid - grid.mean())[inner]
-    positions, memory = positions[inner], memory[inner]
+    past_command_means = _average_over_intervals(np.interp(grid, t, u))
+    fitted_part = slice(LAG_BIN_EDGES[-1], len(grid) + LAG_BIN_EDGES[0])
+    time = (grid - grid.mean())[fitted_part]
+    positions, past_command_means = positions[fitted_part], past_command_means[fitted_part]
     if time.size < BLOCK_COUNT * LAG_BIN_EDGES[-1] or not np.std(positions) > 0:
         return
-    smooth = np.column_stack([np.ones_like(time), time, memory])
-    coefficients, *_ = np.linalg.lstsq(smooth, positions, rcond=1e-10)
-    predicted = smooth @ coefficients  # Equation (1).
+    regressors = np.column_stack([np.ones_like(time), time, past_command_means])
+    coefficients, *_ = np.linalg.lstsq(regressors, positions, rcond=1e-10)
+    predicted = regressors @ coefficients  # Equation (1).
     if np.var(positions - predicted) > (1.0 - MIN_EXPLAINED_VARIANCE) * np.var(positions):
         return
     rate = np.gradient(predicted, step)
-    basis, _ = np.linalg.qr(np.column_stack([smooth, rate]))
+    basis, _ = np.linalg.qr(np.column_stack([regressors, rate]))
     delay_response = -time * rate
     delay_response = delay_response - basis @ (basis.T @ delay_response)
-    power = float(delay_response @ delay_response)
-    if not power > 0:
+    response_power = float(delay_response @ delay_response)
+    if not response_power > 0:
         return
-    drift = float(delay_response @ positions) / power
+    drift = float(delay_response @ positions) / response_power
     residual = positions - basis @ (basis.T @ positions) - drift * delay_response
-    sums = np.add.reduceat(delay_response * residual, np.arange(0, time.size, LAG_BIN_EDGES[-1]))
+    block_sums = np.add.reduceat(
+        delay_response * residual, np.arange(0, time.size, LAG_BIN_EDGES[-1])
+    )
     error = (
-        STUDENT_T_FACTORS[min(len(sums), len(STUDENT_T_FACTORS) - 1)]
-        * float(np.sqrt(sums @ sums))
-        / power
+        STUDENT_T_FACTORS[min(len(block_sums), len(STUDENT_T_FACTORS) - 1)]
+        * float(np.sqrt(block_sums @ block_sums))
+        / response_power
     )
     yield _Estimate(drift, float(np.hypot(error, MODEL_ERROR_SHARE * drift)))
 

@@ -10,11 +10,11 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from sims.core.simulator import Array
 
-_MAD = 1.4826
+_SIGMA_PER_MEDIAN = 1.4826
 """Ratio of the standard deviation of a normal variable to its median magnitude."""
-_SAME = 0.05
+_QUANTISED_SHARE = 0.05
 """Share of unchanged samples above which a signal counts as quantised."""
-_GAP = 1.75
+_GAP_RATIO = 1.75
 """Ratio of an interval to the median interval above which it is a gap.
 
 A lost sample makes an interval twice as long.
@@ -87,7 +87,7 @@ def _estimate_sigma(runs: list[tuple[Array, Array]], order: int) -> float:
     """Return 1 sigma from differences of one order, over all runs; NaN if all are too short."""
     differences = [_compute_divided_differences(t, y, order) for t, y in runs if t.size > order + 1]
     pooled = np.concatenate(differences) if differences else np.empty(0)
-    return _MAD * float(np.median(np.abs(pooled))) if pooled.size else np.nan
+    return _SIGMA_PER_MEDIAN * float(np.median(np.abs(pooled))) if pooled.size else np.nan
 
 
 def _compute_divided_differences(times: Array, values: Array, order: int) -> Array:
@@ -97,7 +97,7 @@ def _compute_divided_differences(times: Array, values: Array, order: int) -> Arr
     """
     t, y = sliding_window_view(times, order + 1), sliding_window_view(values, order + 1)
     # Motion across a gap is no longer close to a polynomial.
-    is_gapless = t[:, -1] - t[:, 0] <= _GAP * order * np.median(np.diff(times))
+    is_gapless = t[:, -1] - t[:, 0] <= _GAP_RATIO * order * np.median(np.diff(times))
     t, y = t[is_gapless], y[is_gapless]
     # The ones on the diagonal leave out the factor t_i - t_i.
     time_differences = t[:, :, None] - t[:, None, :] + np.eye(order + 1)
@@ -113,11 +113,11 @@ def _find_quantisation_step(runs: list[tuple[Array, Array]]) -> float:
     changes = np.abs(np.concatenate([np.empty(0), *(np.diff(y) for _, y in runs)]))
     # Computed values that should be equal may differ by rounding, so tiny changes count as none.
     moving = changes[changes > 1e-12 * np.max(changes, initial=0.0)]
-    quantised = moving.size and np.mean(changes == 0) > _SAME
+    quantised = moving.size and np.mean(changes == 0) > _QUANTISED_SHARE
     return float(moving.min()) if quantised else 0.0
 
 
 def count_gaps(times: Array) -> int:
     """Count intervals that are much longer than the median interval."""
     intervals = np.diff(times)
-    return int((intervals > _GAP * np.median(intervals)).sum()) if intervals.size else 0
+    return int((intervals > _GAP_RATIO * np.median(intervals)).sum()) if intervals.size else 0

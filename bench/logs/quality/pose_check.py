@@ -45,7 +45,7 @@ MIN_OVERLAP_METRES = 1e-3
 """Smallest depth, in m, at which two bodies overlap; feet on the ground sink in by less."""
 MIN_OVERLAP_SHARE = 0.9
 """Smallest share of the recorded poses in which bodies overlap that do so by their shape."""
-_SMALLER = {"rad": (np.pi / 180.0, "degrees"), "m": (1e-3, "millimetres")}
+_SMALLER_UNITS = {"rad": (np.pi / 180.0, "degrees"), "m": (1e-3, "millimetres")}
 """Smaller unit in which positions are often recorded, by SI unit: its value and name."""
 
 
@@ -74,7 +74,7 @@ def _check_range(recording: Recording, joint: Any) -> Iterator[Anomaly]:
     Only the first run with such positions is reported.
     """
     column = f"q.{joint.name}"
-    unit, (smaller, name) = joint.unit, _SMALLER[joint.unit]
+    unit, (smaller_unit, name) = joint.unit, _SMALLER_UNITS[joint.unit]
     for run in recording.runs:
         values = run.channels.get(column)
         if values is None or not np.isfinite(values).any():
@@ -89,18 +89,20 @@ def _check_range(recording: Recording, joint: Any) -> Iterator[Anomaly]:
                 return
             continue
         low, high = joint.range
-        slack = MAX_RANGE_EXCESS * (high - low)
-        if low - slack <= extremes[0] and extremes[1] <= high + slack:
+        tolerance = MAX_RANGE_EXCESS * (high - low)
+        if low - tolerance <= extremes[0] and extremes[1] <= high + tolerance:
             excess = np.array([low - extremes[0], extremes[1] - high])
             if excess.max() > RANGE_TOLERANCE * (high - low):
-                side = int(excess.argmax())
-                stop = f"joint {joint.name} of the model stops at {(low, high)[side]:.4g}"
-                message = f"goes to {extremes[side]:.4g} {unit}, and {stop}; is its range right?"
+                exceeded_end = int(excess.argmax())
+                stop = f"joint {joint.name} of the model stops at {(low, high)[exceeded_end]:.4g}"
+                message = (
+                    f"goes to {extremes[exceeded_end]:.4g} {unit}, and {stop}; is its range right?"
+                )
                 yield Anomaly(f"run {run.name}, column {column}: {message}", False)
                 return
             continue
-        scaled = smaller * extremes
-        is_within_limits = low - slack <= scaled[0] and scaled[1] <= high + slack
+        scaled = smaller_unit * extremes
+        is_within_limits = low - tolerance <= scaled[0] and scaled[1] <= high + tolerance
         doubt = f"is the unit {name}?" if is_within_limits else "is the unit right?"
         message = f"expected within {low:.4g} to {high:.4g} {unit}, the joint's range"
         yield Anomaly(

@@ -85,18 +85,20 @@ def check_saturation(recording: Recording, kind: type[Simulator]) -> Iterator[Qu
             ]
             if not values:
                 continue
-            end = max(float(np.nanmax(run_values)) for run_values in values)
-            jump = CLIPPING_STEP_THRESHOLD * estimate_noise(signals).step
-            flat = sum(_count_saturated_samples(run_values, end, jump) for run_values in values)
+            extreme = max(float(np.nanmax(run_values)) for run_values in values)
+            min_jump = CLIPPING_STEP_THRESHOLD * estimate_noise(signals).step
+            saturated_count = sum(
+                _count_saturated_samples(run_values, extreme, min_jump) for run_values in values
+            )
             total = sum(run_values.size for run_values in values)
-            if flat > MIN_SATURATED_SHARE * total and not all(
-                _is_resting_value(run_values, end) for run_values in values
+            if saturated_count > MIN_SATURATED_SHARE * total and not all(
+                _is_resting_value(run_values, extreme) for run_values in values
             ):
-                value_text = append_unit(f"{sign * end:.4g}", channel.unit)
+                value_text = append_unit(f"{sign * extreme:.4g}", channel.unit)
                 yield QualityFinding(
                     "saturation",
                     f"{channel.name} stays at its {word} value, {value_text}, "
-                    f"in {flat / total:.1%} of the samples",
+                    f"in {saturated_count / total:.1%} of the samples",
                     "a sensor or joint at its limit carries no information: leave these samples "
                     "empty, or stay away from the limit",
                 )
@@ -184,19 +186,21 @@ def _select_runs(recording: Recording, channel: Channel) -> list[Run]:
     return [run for run in recording.runs if channel.name in run.channels]
 
 
-def _count_saturated_samples(values: Array, end: float, jump: float) -> int:
+def _count_saturated_samples(values: Array, extreme: float, min_jump: float) -> int:
     """Count samples in saturated stretches of at least `MIN_SATURATED_SAMPLES` samples.
 
     The signal must jump into or out of a stretch: a quantised signal that reverses at its end
     changes by one step only.
     """
-    is_at_end = np.concatenate([[False], values == end, [False]]).astype(np.int8)
+    is_at_end = np.concatenate([[False], values == extreme, [False]]).astype(np.int8)
     edges = np.flatnonzero(np.diff(is_at_end))
     first, last = edges[::2], edges[1::2]
-    padded_values = np.concatenate([[end], values, [end]])
-    jumps = np.fmax(np.abs(padded_values[first] - end), np.abs(padded_values[last + 1] - end))
+    padded_values = np.concatenate([[extreme], values, [extreme]])
+    jumps = np.fmax(
+        np.abs(padded_values[first] - extreme), np.abs(padded_values[last + 1] - extreme)
+    )
     lengths = last - first
-    return int(lengths[(lengths >= MIN_SATURATED_SAMPLES) & (jumps > jump)].sum())
+    return int(lengths[(lengths >= MIN_SATURATED_SAMPLES) & (jumps > min_jump)].sum())
 
 
 def _is_resting_value(values: Array, end: float) -> bool:

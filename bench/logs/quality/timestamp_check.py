@@ -45,9 +45,9 @@ MAX_GAP_RATIO = 100.0
 
 The samples before such a gap do not determine the motion after it.
 """
-_FEW = 10
+_MIN_CHECKED_SAMPLES = 10
 """Minimum number of samples of a run that is checked."""
-_UNITS = {1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds"}
+_TIME_UNITS = {1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds"}
 
 
 def check_recording_plausible(
@@ -97,7 +97,7 @@ def find_anomalies(recording: Recording, kind: type[Simulator]) -> Iterator[Anom
         kind: Simulator class of its system.
     """
     for run in recording.runs:
-        if run.times.size < _FEW:
+        if run.times.size < _MIN_CHECKED_SAMPLES:
             continue
         anomaly = _check_gap(run) or _check_time_scale(recording, run, kind)
         if anomaly is not None:
@@ -138,16 +138,16 @@ def _check_time_scale(recording: Recording, run: Run, kind: type[Simulator]) -> 
     else:
         accelerations = _compute_rest_accelerations(recording, run, system)
     # A servo holds its position by force, so large forces at rest are normal.
-    servo = kind.has_model and _has_inputs(run)
-    sizes = {channel.name: channel.scale for channel in system.channels}
-    first: Anomaly | None = None
+    is_driven = kind.has_model and _has_inputs(run)
+    typical_sizes = {channel.name: channel.scale for channel in system.channels}
+    doubtful: Anomaly | None = None
     for column, name in enumerate(system.coordinates):
         x = run.channels.get(name)
         if x is None:
             continue
         spread = float(np.nanstd(x))
         rms_acceleration = float(np.sqrt(np.nanmean(accelerations[:, column] ** 2)))
-        if not (spread > MIN_MOTION_SHARE * sizes.get(name, 1.0) and rms_acceleration > 0):
+        if not (spread > MIN_MOTION_SHARE * typical_sizes.get(name, 1.0) and rms_acceleration > 0):
             continue
         expected_seconds = (spread / rms_acceleration) ** 0.5  # Equation (2).
         recorded_seconds = interval * _estimate_lag(x)
@@ -157,22 +157,26 @@ def _check_time_scale(recording: Recording, run: Run, kind: type[Simulator]) -> 
                 f"{name} moves in {recorded_seconds:.3g} s as {kind.name} would within "
                 f"{expected_seconds:.2g} s"
             )
-            first = first or Anomaly(f"run {run.name}: {moves}; are the stamps seconds?", False)
+            doubtful = doubtful or Anomaly(
+                f"run {run.name}: {moves}; are the stamps seconds?", False
+            )
             continue
         if ratio < TIME_UNIT_RATIO_THRESHOLD or interval < (
-            DRIVEN_SYSTEM_FACTOR * expected_seconds if servo else expected_seconds
+            DRIVEN_SYSTEM_FACTOR * expected_seconds if is_driven else expected_seconds
         ):
             return None
-        unit = min(_UNITS, key=lambda factor: abs(np.log(ratio / factor)))
+        unit = min(_TIME_UNITS, key=lambda factor: abs(np.log(ratio / factor)))
         moves = (
             f"{name} takes {recorded_seconds:.3g} s to move as {kind.name} would within "
             f"{expected_seconds:.2g} s"
         )
         interval_text = f"samples lie {interval:.3g} s apart"
-        remedy = f"are the stamps {_UNITS[unit]}? then divide t by {unit:g}"
+        remedy = f"are the stamps {_TIME_UNITS[unit]}? then divide t by {unit:g}"
         certain = not _has_inputs(run) or interval >= DRIVEN_SYSTEM_FACTOR * expected_seconds
-        first = first or Anomaly(f"run {run.name}: {moves}, and {interval_text}; {remedy}", certain)
-    return first
+        doubtful = doubtful or Anomaly(
+            f"run {run.name}: {moves}, and {interval_text}; {remedy}", certain
+        )
+    return doubtful
 
 
 def _has_inputs(run: Run) -> bool:

@@ -48,7 +48,7 @@ MAX_INTERVAL_RATIO = 3.0
 """Largest time between two samples, in usual sampling intervals, over which a velocity is
 integrated; over a longer gap it is not known.
 """
-_UNITS = {180.0 / np.pi: "degrees", 1e3: "thousandths"}
+_UNIT_BY_RATIO = {180.0 / np.pi: "degrees", 1e3: "thousandths"}
 """Ratios of velocity to position derivative that a wrong unit causes, and the unit."""
 
 
@@ -267,7 +267,7 @@ def _check_pair(runs: Sequence[Run], position: str, rate: str) -> Iterator[Quali
 
 def _recommend_correction(log_ratio: float, rate: str) -> str:
     """Recommend a correction for a velocity that is wrong by a ratio, given as its logarithm."""
-    for factor, unit in _UNITS.items():
+    for factor, unit in _UNIT_BY_RATIO.items():
         if abs(log_ratio - np.log(factor)) < 0.1:
             return f"one of the two is in {unit}: correct its unit"
     return f"correct the unit or the gain of {rate}, or leave it out"

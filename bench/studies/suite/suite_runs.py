@@ -20,7 +20,7 @@ from bench.benchmark.problem.experiment import Experiment
 from bench.benchmark.results_report import REQUIRED_RUN_COLUMNS
 from bench.benchmark.storage.journal_segments import SEGMENTS_FOLDER
 from bench.benchmark.storage.result_folder import CONFIGURATION_FILE, read_comparison
-from bench.misspecification.calibration import MODEL_LABELS, PLAIN
+from bench.misspecification.comparison_experiments import MODEL_LABELS, PLAIN
 from sims.core.atomic_files import atomic_replacement, write_atomically
 from sims.core.simulator import Array, InputError
 

@@ -40,7 +40,7 @@ _ZERO_VECTOR = (0.0, 0.0, 0.0)
 """Zero vector: the origin, or zero velocity."""
 _IMPACT_STEP_SECONDS = 1e-4
 """Length of the time step of an impact, in seconds."""
-_REACH = 0.02 * math.sqrt(3)
+_CONTACT_REACH = 0.02 * math.sqrt(3)
 """Height above the ground, in radii of the ball, at which Bullet's contact begins."""
 
 
@@ -291,7 +291,7 @@ class BulletNativeBall(_BulletMover):
     def reset_world(self, constants: dict[str, float]) -> None:
         """Prepare a world for these constants."""
         super().reset_world(constants)
-        self._reach = _REACH * constants["radius"]
+        self._reach = _CONTACT_REACH * constants["radius"]
 
     def set_contact_parameters(self, restitution: float, friction: float) -> None:
         """Set the ball's restitution and the friction of the contact.

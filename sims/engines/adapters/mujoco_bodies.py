@@ -40,7 +40,7 @@ _IMPACT_STEP_SECONDS = 1e-4
 
 MuJoCo treats accelerations above 1e10 as a failure.
 """
-_IMPEDANCE = 0.9999
+_CONTACT_IMPEDANCE = 0.9999
 """Impedance d of the contact: the largest value that MuJoCo allows."""
 
 
@@ -168,7 +168,7 @@ class MujocoMover:
         self._force = self._data.qfrc_applied
         self._no_contact = int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
         # Width, midpoint and power of the impedance are MuJoCo's defaults.
-        self._model.geom_solimp[:] = _IMPEDANCE, _IMPEDANCE, 1e-3, 0.5, 2.0
+        self._model.geom_solimp[:] = _CONTACT_IMPEDANCE, _CONTACT_IMPEDANCE, 1e-3, 0.5, 2.0
         self._step = mujoco.mj_step
         self._inverse_step = math.nan
         self._set_contact(False)

@@ -33,7 +33,7 @@ _effects: dict[tuple[type[System], InputNames, type[Effect]], bool] = {}
 _lock = Lock()
 _TOLERANCE = 1e-9
 """Largest relative difference between a program and the functions from which it was traced."""
-_RESTITUTION, _FRICTION = 0.6, 0.2
+_TEST_RESTITUTION, _TEST_FRICTION = 0.6, 0.2
 """Restitution and friction of the ground with which effects are tested."""
 
 
@@ -182,7 +182,7 @@ def _evaluate_program(
         if flags[HAS_FRICTION]:
             results.append(r[rows[OUT_LIMIT], :1].copy())
     for speed in (0.3, 2.0):
-        r[rows[IN_E] : rows[IN_E] + 3, 0] = _RESTITUTION, _FRICTION, speed
+        r[rows[IN_E] : rows[IN_E] + 3, 0] = _TEST_RESTITUTION, _TEST_FRICTION, speed
         compute_impact()
         results.append(r[rows[[OUT_E, OUT_MU]], 0])
     return results

@@ -21,9 +21,9 @@ from sims.recording.log_formats.read_errors import convert_read_errors
 
 ENDINGS = (".h5", ".hdf5", ".hdf")
 """Endings of the names of HDF5 files."""
-LARGEST_DATASET = 250_000_000
+MAX_DATASET_ENTRIES = 250_000_000
 """Maximum number of entries of a dataset that is read (2 GB of 64-bit numbers)."""
-_RUN = re.compile(r"[A-Za-z_ -]*\d+")
+_RUN_NAME_PATTERN = re.compile(r"[A-Za-z_ -]*\d+")
 
 
 def is_hdf5(path: Path) -> bool:
@@ -41,7 +41,7 @@ def group_of(path: Path) -> tuple[Path, str] | None:
     return None
 
 
-def runs_in(path: Path) -> list[Path]:
+def list_run_paths(path: Path) -> list[Path]:
     """List the log of each run of a file: its numbered groups, or the file itself.
 
     Raises:
@@ -51,7 +51,7 @@ def runs_in(path: Path) -> list[Path]:
         for name in ("", "data"):
             group = file.get(name or "/")
             groups = [key for key, entry in _list_members(group) if hasattr(entry, "items")]
-            runs = [key for key in groups if _RUN.fullmatch(key)]
+            runs = [key for key in groups if _RUN_NAME_PATTERN.fullmatch(key)]
             if runs and len(runs) == len(groups):
                 return [path / name / run for run in sorted(runs, key=_make_natural_sort_key)]
     return [path]
@@ -87,7 +87,7 @@ def read_group(path: Path, group: str) -> tuple[dict[str, Array], dict[str, list
             is_wide = dataset.ndim > 1 and dataset.shape[1] > MAX_COLUMNS
             if dataset.dtype.kind not in "fiub" or dataset.ndim not in (1, 2) or is_wide:
                 texts[name] = _read_texts(dataset)
-            elif dataset.size > LARGEST_DATASET:
+            elif dataset.size > MAX_DATASET_ENTRIES:
                 raise InputError(f"{path}: {name} has {dataset.size} entries; at most 250 million")
             else:
                 columns[name] = make_read_only(np.asarray(dataset[()], dtype=np.float64))

@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 from sims.core.atomic_files import require_file
 from sims.core.simulator import InputError
 
-COUNTS = 4096
+COUNTS_PER_TURN = 4096
 """Encoder counts per turn of a Feetech or Dynamixel servo."""
 LARGEST_FILE = 1_000_000
 """Maximum size of a file that is read as a possible calibration, in bytes."""
@@ -107,7 +107,7 @@ def motor_of(column: str, motors: Iterable[str]) -> str | None:
     return max(matching_motors, key=len, default=None)
 
 
-def angle_scale(motor: MotorRange, from_zero: bool) -> AngleScale:
+def compute_angle_scale(motor: MotorRange, from_zero: bool) -> AngleScale:
     """Return the conversion of a normalised position to an angle in degrees.
 
     Args:
@@ -115,7 +115,7 @@ def angle_scale(motor: MotorRange, from_zero: bool) -> AngleScale:
         from_zero: Whether positions are 0 to 100, equation (2), instead of -100 to 100, equation
             (1).
     """
-    degrees = 360.0 / (COUNTS - 1) * (motor.highest - motor.lowest)
+    degrees = 360.0 / (COUNTS_PER_TURN - 1) * (motor.highest - motor.lowest)
     sign = -1.0 if motor.reversed else 1.0
     if from_zero:
         return AngleScale(sign * degrees / 100.0, -sign * degrees / 2.0)

@@ -40,7 +40,7 @@ LOG_SUFFIXES = (
 """File name endings of the files that can be read."""
 MAX_FILE_BYTES = 2_000_000_000
 """Maximum size of a file in bytes, because its content must fit into memory."""
-_ENTRY = re.compile(r"(?P<base>.*)\[(?P<place>\d{1,5})\]")
+_LIST_ENTRY_PATTERN = re.compile(r"(?P<base>.*)\[(?P<place>\d{1,5})\]")
 
 
 class FileVersion(NamedTuple):
@@ -100,7 +100,7 @@ class LogFile:
 
     def _find_column(self, name: str) -> tuple[str, int | None]:
         """Find a column regardless of case, and the index into its lists if the name has one."""
-        match = _ENTRY.fullmatch(name)
+        match = _LIST_ENTRY_PATTERN.fullmatch(name)
         for base, place in (
             ((name, None), (match["base"], int(match["place"]))) if match else ((name, None),)
         ):
@@ -172,10 +172,10 @@ def read_log(path: str | Path, columns_to_read: frozenset[str] = frozenset()) ->
         topics = ", ".join(ros_bags.list_topics(path))
         raise InputError(f"{path}: a bag; name a topic of it, as {path.name}/TOPIC: {topics}")
     require_file(path)
-    kind = path.suffix.lower()
-    if kind not in _READERS:
+    suffix = path.suffix.lower()
+    if suffix not in _READERS:
         kinds = ", ".join(LOG_SUFFIXES)
-        raise InputError(f"{path}: expected a log that ends in one of {kinds}, found '{kind}'")
+        raise InputError(f"{path}: expected a log that ends in one of {kinds}, found '{suffix}'")
     file_stat = path.stat()
     if file_stat.st_size > MAX_FILE_BYTES:
         raise InputError(f"{path}: has {file_stat.st_size / 1e9:.1f} GB; at most 2 are read")

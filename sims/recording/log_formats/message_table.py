@@ -29,7 +29,7 @@ NANOSECONDS_FIELDS = ("nanosec", "nsec", "nsecs", "nanos", "nanoseconds")
 """Names of the parts of a time stamp."""
 NANOSECONDS = 1_000_000_000
 """Nanoseconds in a second."""
-_NANO = 1e-9
+_SECONDS_PER_NANOSECOND = 1e-9
 
 
 class MessageTable:
@@ -62,7 +62,7 @@ class MessageTable:
         """
         row = len(self._stamps)
         self._stamps.append(_get_stamp(message))
-        self._written.append(_NANO * written)
+        self._written.append(_SECONDS_PER_NANOSECOND * written)
         for name, value in _iterate_numbers("", message, 0):
             if self._wanted and name.lower() not in self._wanted:
                 continue
@@ -115,16 +115,16 @@ def _get_fields(value: Any) -> dict[str, Any] | None:
 def _get_stamp(message: Any) -> float:
     """Return the time stamp of a message in seconds; 0 if it has none."""
     fields = _get_fields(message) or {}
-    for holder in (_get_fields(fields.get("header")) or {}, fields):
+    for table in (_get_fields(fields.get("header")) or {}, fields):
         for name in STAMP_FIELDS:
-            parts = _get_fields(holder.get(name)) or {}
+            parts = _get_fields(table.get(name)) or {}
             seconds = [parts[key] for key in SECONDS_FIELDS if key in parts]
             nanoseconds = [parts[key] for key in NANOSECONDS_FIELDS if key in parts]
             if seconds and all(
                 isinstance(part, int | np.integer) for part in (*seconds, *nanoseconds)
             ):
                 # Whole nanoseconds, so that equal stamps of two topics become equal numbers.
-                return _NANO * _to_float(
+                return _SECONDS_PER_NANOSECOND * _to_float(
                     NANOSECONDS * int(seconds[0]) + sum(map(int, nanoseconds[:1]))
                 )
     return 0.0
@@ -155,9 +155,9 @@ def _iterate_numbers(path: str, value: Any, depth: int) -> Iterator[tuple[str, f
     if isinstance(value, str | bytes) or not hasattr(value, "__len__"):
         return
     if 0 < len(value) <= MAX_LIST_LENGTH:
-        for place, entry in enumerate(value):
+        for index, entry in enumerate(value):
             name = (_get_fields(entry) or {}).get("name")
-            entry_path = f"{path}.{name}" if name and isinstance(name, str) else f"{path}[{place}]"
+            entry_path = f"{path}.{name}" if name and isinstance(name, str) else f"{path}[{index}]"
             yield from _iterate_numbers(entry_path, entry, depth + 1)
 
 

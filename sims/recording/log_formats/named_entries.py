@@ -17,12 +17,14 @@ import numpy as np
 from sims.core.simulator import Array, make_read_only
 
 _NAMES_WORD = r"(?:joint[_ ]?|motor[_ ]?)?names?"
-_PLACED = re.compile(r"(?P<stem>.*?)(?P<left>[\[(._]?)(?P<place>\d{1,4})(?P<right>[\])]?)")
+_NUMBERED_COLUMN_PATTERN = re.compile(
+    r"(?P<stem>.*?)(?P<left>[\[(._]?)(?P<place>\d{1,4})(?P<right>[\])]?)"
+)
 _NAMES_COLUMN = re.compile(rf"(?:(?P<prefix>.*?)[._/ ])??{_NAMES_WORD}", re.IGNORECASE)
 _LIST_OF_TEXTS = re.compile(r"[\[(](?P<inside>.*)[\])]")
 
 
-def entries_by_name(
+def name_numbered_columns(
     columns: Mapping[str, Array], texts: Mapping[str, Sequence[str]]
 ) -> tuple[dict[str, Array], frozenset[str]]:
     """Name the numbered columns of a table by the columns that hold their names.
@@ -38,7 +40,7 @@ def entries_by_name(
     """
     groups: dict[tuple[str, str, str], dict[int, str]] = {}
     for column in texts:
-        match = _PLACED.fullmatch(column)
+        match = _NUMBERED_COLUMN_PATTERN.fullmatch(column)
         stem = _NAMES_COLUMN.fullmatch(match["stem"]) if match else None
         if match and stem:
             prefix = column[: len(stem["prefix"]) + 1] if stem["prefix"] else ""
@@ -46,13 +48,15 @@ def entries_by_name(
             groups.setdefault(style, {})[int(match["place"])] = column
     named_columns: dict[str, Array] = {}
     unlisted: set[str] = set()
-    for style, places in groups.items():
-        names = [list(texts[places[place]]) for place in sorted(places)]
+    for style, columns_by_position in groups.items():
+        names = [
+            list(texts[columns_by_position[position]]) for position in sorted(columns_by_position)
+        ]
         for siblings, columns_by_number in _group_numbered_columns(columns, *style).items():
-            if set(columns_by_number) != set(places):
+            if set(columns_by_number) != set(columns_by_position):
                 continue
             values = np.column_stack(
-                [columns[columns_by_number[place]] for place in sorted(columns_by_number)]
+                [columns[columns_by_number[position]] for position in sorted(columns_by_number)]
             )
             entries = _sort_by_name(values, names, f"{siblings}.")
             if entries and not entries.keys() & columns.keys():
@@ -61,7 +65,7 @@ def entries_by_name(
     return named_columns, frozenset(unlisted)
 
 
-def lists_by_name(
+def name_list_entries(
     columns: Mapping[str, Array], texts: Mapping[str, Sequence[str]]
 ) -> tuple[dict[str, Array], frozenset[str]]:
     """Name the entries of lists by a column that holds a list of names in each row.
@@ -133,7 +137,7 @@ def _group_numbered_columns(
     """
     columns_by_stem: dict[str, dict[int, str]] = {}
     for column, values in columns.items():
-        match = _PLACED.fullmatch(column)
+        match = _NUMBERED_COLUMN_PATTERN.fullmatch(column)
         if match is None or values.ndim > 1 or not column.startswith(prefix):
             continue
         if (match["left"], match["right"]) == (opening, closing):

@@ -71,28 +71,28 @@ def find_layout(path: Path) -> Layout:
         InputError: The table has no rows, or its header has another number of cells than its rows.
     """
     with path.open("rb") as file:
-        head = file.read(_HEAD_BYTES)
+        first_bytes = file.read(_HEAD_BYTES)
         is_complete = not file.read(1)
-    encoding = _detect_encoding(path, head)
-    lines = head.decode(encoding, errors="replace").splitlines()
+    encoding = _detect_encoding(path, first_bytes)
+    lines = first_bytes.decode(encoding, errors="replace").splitlines()
     if not is_complete and len(lines) > 1:
         lines.pop()  # the last line is incomplete
     lines = lines[:_HEAD_LINES]
     if not any(line.strip() for line in lines):
         raise InputError(f"{path}: expected a table with a header and rows, found an empty file")
-    body = [line for line in lines if line.strip() and not COMMENT.match(line)]
-    separator = _detect_separator(body)
+    data_lines = [line for line in lines if line.strip() and not COMMENT.match(line)]
+    separator = _detect_separator(data_lines)
     rows = {
         n: _split_line(line, separator) for n, line in enumerate(lines, start=1) if line.strip()
     }
     width = _find_row_width([row for n, row in rows.items() if not COMMENT.match(lines[n - 1])])
     columns = _find_numeric_columns(rows.values(), width)
-    first = next((n for n, row in rows.items() if _is_data(row, width, columns)), 0)
-    rows_above = [n for n in rows if n < first] if first else list(rows)
+    first_data_line = next((n for n, row in rows.items() if _is_data(row, width, columns)), 0)
+    rows_above = [n for n in rows if n < first_data_line] if first_data_line else list(rows)
     units_row: dict[int, str] = {}
     if (
         rows_above
-        and first
+        and first_data_line
         and (row_units := _parse_units(_normalise_row(rows[rows_above[-1]], width), columns))
     ):
         units_row = row_units
@@ -101,20 +101,22 @@ def find_layout(path: Path) -> Layout:
         names = _parse_header(lines[n - 1], separator, width, columns)
         if names is not None:
             units = {names[place]: unit for place, unit in units_row.items()}
-            return Layout(encoding, separator, names, units, n, first or n + 1, width)
-    if not first:
+            return Layout(encoding, separator, names, units, n, first_data_line or n + 1, width)
+    if not first_data_line:
         first_line = format_value(lines[0].strip())
         raise InputError(f"{path}: expected a header and rows of numbers, found {first_line}")
     rows_above = [n for n in rows_above if not COMMENT.match(lines[n - 1])]
-    if not rows_above and (column_numbers := _make_column_numbers(rows, first)):
-        return Layout(encoding, separator, column_numbers, {}, first, first + 1, width)
+    if not rows_above and (column_numbers := _make_column_numbers(rows, first_data_line)):
+        return Layout(
+            encoding, separator, column_numbers, {}, first_data_line, first_data_line + 1, width
+        )
     if rows_above and len(rows[rows_above[-1]]) > 1 and width > 1:
         n = rows_above[-1]
         raise InputError(
-            f"{path}, row {n}: expected {width} names, one for each cell of row {first}, found "
-            f"{len(rows[n])}; give each column a name"
+            f"{path}, row {n}: expected {width} names, one for each cell of row "
+            f"{first_data_line}, found {len(rows[n])}; give each column a name"
         )
-    return Layout(encoding, separator, (), {}, 0, first, width)
+    return Layout(encoding, separator, (), {}, 0, first_data_line, width)
 
 
 def _detect_encoding(path: Path, head: bytes) -> str:
@@ -176,10 +178,10 @@ def _find_numeric_columns(rows: Iterable[Sequence[str]], width: int) -> list[int
     # The second half of the inspected rows is data, whatever precedes it.
     body = full_rows[len(full_rows) // 2 :]
     result = []
-    for place in range(width):
-        filled = [row[place] for row in body if row[place].strip()]
+    for column in range(width):
+        filled = [row[column] for row in body if row[column].strip()]
         if filled and 2 * sum(map(is_numeric, filled)) >= len(filled):
-            result.append(place)
+            result.append(column)
     return result
 
 
@@ -206,12 +208,12 @@ def _parse_header(
     """
     comment = COMMENT.match(line)
     # `%time,field.data` of rostopic begins with a name, `% t q1` of Matlab with a comment.
-    marked = comment is not None and not re.match(r"%\w", line.strip())
-    text = line[comment.end() :] if comment is not None and marked else line
+    is_comment = comment is not None and not re.match(r"%\w", line.strip())
+    text = line[comment.end() :] if comment is not None and is_comment else line
     names = _split_line(text, separator)
     while len(names) > width and not names[-1].strip():
         names.pop()
-    if len(names) != width and marked:
+    if len(names) != width and is_comment:
         # NumPy writes the header as given by the user, who may use a separator other than that of
         # the rows.
         for other_separator in SEPARATORS:
@@ -220,28 +222,32 @@ def _parse_header(
                 names = parts
     if len(names) != width:
         return None
-    stripped = [name.strip(", ;\t" if separator == " " else None) for name in names]
-    missing = sum(not stripped[place] for place in columns)
-    numbers = [stripped[place] for place in columns if is_numeric(stripped[place])]
-    if missing > 1 or (columns and is_numeric(stripped[columns[0]])):
+    stripped_names = [name.strip(", ;\t" if separator == " " else None) for name in names]
+    missing = sum(not stripped_names[place] for place in columns)
+    numeric_names = [
+        stripped_names[place] for place in columns if is_numeric(stripped_names[place])
+    ]
+    if missing > 1 or (columns and is_numeric(stripped_names[columns[0]])):
         return None
     # Joints may be numbered, `time,1,2,3`, but a note with a number is not a header, `Rate;100`.
-    if not all(number.isdigit() for number in numbers) or len(set(numbers)) < len(numbers):
+    if not all(number.isdigit() for number in numeric_names) or len(set(numeric_names)) < len(
+        numeric_names
+    ):
         return None
-    return tuple(stripped)
+    return tuple(stripped_names)
 
 
 def _parse_units(row: Sequence[str], columns: Sequence[int]) -> dict[int, str]:
     """Return the units by position if a row contains units only; otherwise nothing."""
     units_by_place = {}
-    for place in columns:
-        text = row[place].strip("[](){}<> ") if row[place] else ""
+    for column in columns:
+        text = row[column].strip("[](){}<> ") if row[column] else ""
         if not text:
             continue
         unit = read_unit(text)
-        if unit is None or is_numeric(row[place]):
+        if unit is None or is_numeric(row[column]):
             return {}
-        units_by_place[place] = unit[0]
+        units_by_place[column] = unit[0]
     return units_by_place
 
 

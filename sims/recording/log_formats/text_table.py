@@ -17,7 +17,7 @@ import numpy as np
 
 from sims.core.simulator import Array, InputError, make_read_only
 from sims.core.toml_validation import format_value
-from sims.recording.log_formats.named_entries import entries_by_name, lists_by_name
+from sims.recording.log_formats.named_entries import name_list_entries, name_numbered_columns
 from sims.recording.log_formats.parquet_columns import MAX_COLUMNS
 from sims.recording.log_formats.table_layout import (
     COMMENT,
@@ -75,8 +75,8 @@ def read_text_table(path: Path) -> TextTable:
             texts[name] = kind.texts.tolist()
         else:
             columns[name] = make_read_only(values)
-    named_columns, unlisted = entries_by_name(columns, texts)
-    list_columns, replaced = lists_by_name(columns, texts)
+    named_columns, unlisted = name_numbered_columns(columns, texts)
+    list_columns, replaced = name_list_entries(columns, texts)
     return TextTable(
         {**columns, **named_columns, **list_columns},
         tuple(texts),

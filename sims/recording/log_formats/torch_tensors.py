@@ -27,7 +27,7 @@ MAX_ENTRIES = 250_000_000
 """Maximum number of entries of a tensor (2 GB of 64-bit numbers)."""
 MAX_DEPTH = 8
 """Maximum depth of nested containers."""
-_TYPES = {
+_NUMBER_TYPES = {
     "FloatStorage": "<f4", "DoubleStorage": "<f8", "HalfStorage": "<f2", "LongStorage": "<i8",
     "IntStorage": "<i4", "ShortStorage": "<i2", "CharStorage": "i1", "ByteStorage": "u1",
     "BoolStorage": "?", "BFloat16Storage": "<u2",
@@ -155,27 +155,27 @@ def _read_storage(path: Path, archive: zipfile.ZipFile, folder: str, tensor: _Te
     Raises:
         InputError: the tensor holds no numbers, is too large, or exceeds its storage.
     """
-    kind = _TYPES.get(tensor.storage.kind)
-    if kind is None:
+    number_type = _NUMBER_TYPES.get(tensor.storage.kind)
+    if number_type is None:
         raise InputError(f"{path}: expected tensors of numbers, found {tensor.storage.kind}")
     if np.prod(tensor.size, dtype=np.float64) > MAX_ENTRIES:
         raise InputError(f"{path}: a tensor has more than {MAX_ENTRIES} entries")
     entry = f"{folder}data/{tensor.storage.key}"
     if archive.getinfo(entry).file_size > 8 * MAX_ENTRIES:
         raise InputError(f"{path}: {entry} is too large for a log of tensors")
-    flat = np.frombuffer(archive.read(entry), dtype=kind)
+    stored_numbers = np.frombuffer(archive.read(entry), dtype=number_type)
     if tensor.storage.kind == "BFloat16Storage":
         # A bfloat16 is the upper half of a 32-bit number.
-        flat = (flat.astype(np.uint32) << 16).view(np.float32)
+        stored_numbers = (stored_numbers.astype(np.uint32) << 16).view(np.float32)
     if 0 in tensor.size:
         return make_read_only(np.empty(tensor.size))
     steps = [(n - 1) * s for n, s in zip(tensor.size, tensor.stride, strict=True)]
-    if min(tensor.offset, *tensor.stride) < 0 or tensor.offset + sum(steps) >= flat.size:
+    if min(tensor.offset, *tensor.stride) < 0 or tensor.offset + sum(steps) >= stored_numbers.size:
         raise InputError(f"{path}: {entry} has fewer numbers than its tensor")
-    places = np.full((), tensor.offset)
+    indices = np.full((), tensor.offset)
     for length, stride in zip(tensor.size, tensor.stride, strict=True):
-        places = places[..., None] + stride * np.arange(length)
-    return make_read_only(flat[places].astype(np.float64))
+        indices = indices[..., None] + stride * np.arange(length)
+    return make_read_only(stored_numbers[indices].astype(np.float64))
 
 
 def _run_pickle_program(program: bytes) -> Any:
@@ -187,35 +187,35 @@ def _run_pickle_program(program: bytes) -> Any:
     stack: list[Any] = []
     memo: dict[int, Any] = {}
     for step, argument, _ in pickletools.genops(program):
-        name = step.name
-        if name in ("PROTO", "FRAME"):
+        opcode = step.name
+        if opcode in ("PROTO", "FRAME"):
             continue
-        if name == "STOP":
+        if opcode == "STOP":
             return stack[-1]
-        if name == "MARK":
+        if opcode == "MARK":
             stack.append(_MARK)
-        elif name in ("BINPUT", "LONG_BINPUT", "PUT"):
+        elif opcode in ("BINPUT", "LONG_BINPUT", "PUT"):
             memo[int(str(argument))] = stack[-1]
-        elif name == "MEMOIZE":
+        elif opcode == "MEMOIZE":
             memo[len(memo)] = stack[-1]
-        elif name in ("BINGET", "LONG_BINGET", "GET"):
+        elif opcode in ("BINGET", "LONG_BINGET", "GET"):
             stack.append(memo[int(str(argument))])
-        elif name in _CONSTANTS:
-            stack.append(_CONSTANTS[name])
-        elif name in ("EMPTY_DICT", "EMPTY_LIST", "EMPTY_TUPLE"):
+        elif opcode in _CONSTANTS:
+            stack.append(_CONSTANTS[opcode])
+        elif opcode in ("EMPTY_DICT", "EMPTY_LIST", "EMPTY_TUPLE"):
             empty: dict[str, Any] = {"EMPTY_DICT": {}, "EMPTY_LIST": [], "EMPTY_TUPLE": ()}
-            stack.append(empty[name])
-        elif name == "GLOBAL":
+            stack.append(empty[opcode])
+        elif opcode == "GLOBAL":
             stack.append(_Name(str(argument).replace(" ", ".")))
-        elif name == "STACK_GLOBAL":
+        elif opcode == "STACK_GLOBAL":
             attribute, module = stack.pop(), stack.pop()
             stack.append(_Name(f"{module}.{attribute}"))
-        elif name == "POP":
+        elif opcode == "POP":
             stack.pop()
-        elif argument is not None and name.startswith(_NUMBERS_AND_TEXTS):
+        elif argument is not None and opcode.startswith(_NUMBERS_AND_TEXTS):
             stack.append(argument)
         else:
-            _build_object(name, stack)
+            _build_object(opcode, stack)
     raise ValueError("the program has no end")
 
 
@@ -227,47 +227,47 @@ _NUMBERS_AND_TEXTS = (
 """Beginnings of the names of steps that push a number or a text onto the stack."""
 
 
-def _build_object(name: str, stack: list[Any]) -> None:
+def _build_object(opcode: str, stack: list[Any]) -> None:
     """Carry out one instruction of the pickle program that builds an object from the stack.
 
     Only containers and tensors are built; nothing is imported or called.
     """
-    if name in ("TUPLE", "LIST", "DICT", "APPENDS", "SETITEMS"):
-        place = max(i for i, value in enumerate(stack) if value is _MARK)
-        values = stack[place + 1 :]
-        del stack[place:]
-        if name == "TUPLE":
+    if opcode in ("TUPLE", "LIST", "DICT", "APPENDS", "SETITEMS"):
+        mark_index = max(i for i, value in enumerate(stack) if value is _MARK)
+        values = stack[mark_index + 1 :]
+        del stack[mark_index:]
+        if opcode == "TUPLE":
             stack.append(tuple(values))
-        elif name == "LIST":
+        elif opcode == "LIST":
             stack.append(values)
-        elif name == "DICT":
+        elif opcode == "DICT":
             stack.append(dict(zip(values[::2], values[1::2], strict=True)))
-        elif name == "APPENDS":
+        elif opcode == "APPENDS":
             _as_list(stack[-1]).extend(values)
         else:
             _as_dict(stack[-1]).update(zip(values[::2], values[1::2], strict=True))
-    elif name in ("TUPLE1", "TUPLE2", "TUPLE3"):
-        count = int(name[-1])
+    elif opcode in ("TUPLE1", "TUPLE2", "TUPLE3"):
+        count = int(opcode[-1])
         values = stack[-count:]
         del stack[-count:]
         stack.append(tuple(values))
-    elif name == "APPEND":
+    elif opcode == "APPEND":
         value = stack.pop()
         _as_list(stack[-1]).append(value)
-    elif name == "SETITEM":
+    elif opcode == "SETITEM":
         value, key = stack.pop(), stack.pop()
         _as_dict(stack[-1])[key] = value
-    elif name == "BINPERSID":
+    elif opcode == "BINPERSID":
         # ("storage", class, key, device, number of entries)
         _, kind, key, *_ = stack.pop()
         stack.append(_Storage(kind.text.rpartition(".")[2], str(key)))
-    elif name in ("REDUCE", "NEWOBJ"):
+    elif opcode in ("REDUCE", "NEWOBJ"):
         arguments, made_by = stack.pop(), stack.pop()
         stack.append(_evaluate_call(made_by, arguments))
-    elif name == "BUILD":
+    elif opcode == "BUILD":
         stack.pop()  # attributes of an object
     else:
-        raise ValueError(f"unknown step {name}")
+        raise ValueError(f"unknown step {opcode}")
 
 
 def _evaluate_call(made_by: Any, arguments: Any) -> Any:

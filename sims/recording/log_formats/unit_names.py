@@ -60,10 +60,14 @@ _NEEDS_BRACKETS = frozenset(
     {"s", "m", "n", "a", "v", "1", "-", "%", "raw", "inc", "digit", "digits", "steps", "amp",
      "second", "count", "grad", "cm", "turn", "turns", "rev", "n_m", "ma"}
 )  # fmt: skip
-_BRACKETS = re.compile(r"(?P<name>.*?)\s*[_.]?[\[({<](?P<unit>[^\[\](){}<>]{1,24})[\])}>]\s*")
+_BRACKETED_UNIT_PATTERN = re.compile(
+    r"(?P<name>.*?)\s*[_.]?[\[({<](?P<unit>[^\[\](){}<>]{1,24})[\])}>]\s*"
+)
 _JOINERS = " _,:;./-\t"
 """Characters between a name and the unit that follows it."""
-_CAMEL = re.compile(r"(?P<name>.+[a-z0-9])(?P<unit>Deg|Degrees|Rad|Radians|Nm|RadPerSec|Ms|Us|Ns)")
+_CAMEL_CASE_UNIT_PATTERN = re.compile(
+    r"(?P<name>.+[a-z0-9])(?P<unit>Deg|Degrees|Rad|Radians|Nm|RadPerSec|Ms|Us|Ns)"
+)
 
 
 class NamedUnit(NamedTuple):
@@ -89,23 +93,23 @@ def read_unit(text: str) -> tuple[str, Quantity] | None:
 
 def split_unit(name: str) -> NamedUnit:
     """Split the name of a column into the name proper and the unit that follows it."""
-    bracketed = _BRACKETS.fullmatch(name)
+    bracket_match = _BRACKETED_UNIT_PATTERN.fullmatch(name)
     # The brackets of `q[1]` hold an index and no unit.
-    if bracketed and bracketed["name"] and not bracketed["unit"].strip().isdigit():
-        unit = read_unit(bracketed["unit"])
+    if bracket_match and bracket_match["name"] and not bracket_match["unit"].strip().isdigit():
+        unit = read_unit(bracket_match["unit"])
         if unit is not None:
-            return NamedUnit(bracketed["name"], *unit)
+            return NamedUnit(bracket_match["name"], *unit)
     # `q_rad_s` is in rad/s: use the longest unit at the end of the name.
-    for place in range(1, len(name)):
-        if name[place] not in _JOINERS:
+    for position in range(1, len(name)):
+        if name[position] not in _JOINERS:
             continue
-        unit_text = name[place:].strip(_JOINERS).removeprefix("in_").removeprefix("in ")
+        unit_text = name[position:].strip(_JOINERS).removeprefix("in_").removeprefix("in ")
         unit = read_unit(unit_text)
         if unit is not None and unit_text.lower() not in _NEEDS_BRACKETS:
-            return NamedUnit(name[:place], *unit)
-    camel = _CAMEL.fullmatch(name)
-    if camel:
-        unit = read_unit(camel["unit"]) or read_unit("rad/s")
+            return NamedUnit(name[:position], *unit)
+    camel_match = _CAMEL_CASE_UNIT_PATTERN.fullmatch(name)
+    if camel_match:
+        unit = read_unit(camel_match["unit"]) or read_unit("rad/s")
         assert unit is not None
-        return NamedUnit(camel["name"], *unit)
+        return NamedUnit(camel_match["name"], *unit)
     return NamedUnit(name)

@@ -34,7 +34,7 @@ With it, MuJoCo makes a constraint whose limit the callback replaces.
 """
 LAST_FIELD = "iefc_frictionloss"
 """Last of `DATA_FIELDS` in MuJoCo's data."""
-_PROBE = """
+_PROBE_MODEL = """
 <mujoco><size nuserdata="1"/><worldbody><body>
 <joint name="slide" type="slide" axis="1 0 0" frictionloss="1"/><geom size="0.1" mass="1"/>
 </body></worldbody></mujoco>
@@ -207,7 +207,7 @@ def find_data_offsets() -> dict[str, int] | None:
     """
     import mujoco
 
-    model = mujoco.MjModel.from_xml_string(_PROBE)
+    model = mujoco.MjModel.from_xml_string(_PROBE_MODEL)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     field_at_address = {getattr(data, name).ctypes.data: name for name in DATA_FIELDS}

@@ -53,13 +53,13 @@ from sims.system_simulator import SystemSimulator
 
 SingleArray = NDArray[np.float32]
 
-FARTHEST = 1e3
+MAX_DEVIATION = 1e3
 """Maximum deviation of a smoothed state from the measured motion, in SI units."""
-BLOCK = 64
+CANDIDATES_PER_BLOCK = 64
 """Number of candidates whose responses are computed together."""
-LONGEST_HELD = 0.02
+MAX_JACOBIAN_SECONDS = 0.02
 """Maximum time, in seconds, for which a Jacobian is reused."""
-SMALL = 1e-4
+STATE_DIFFERENCE = 1e-4
 """Size of the state difference for finite-difference derivatives of readings."""
 
 
@@ -133,14 +133,14 @@ class MeasuredLinear(RunLinearisation):
         """Linearise about the given motion, and compute its readings and the step of each sample.
 
         Difference quotients are held for one sample interval, but not for less than
-        `LINEARISATION_INTERVAL_SECONDS` or more than `LONGEST_HELD`. `knots` (T,) are the
+        `LINEARISATION_INTERVAL_SECONDS` or more than `MAX_JACOBIAN_SECONDS`. `knots` (T,) are the
         numbers of the steps at the samples.
         """
         self._trajectory, self._measured, self._nearby = trajectory, measured or {}, nearby
         if nearby is not None and is_alike:
             self.quotients = nearby._tangent.quotients
         spacing = float(np.median(np.diff(scenario.times))) if scenario.times.size > 1 else 0.0
-        self.held = float(np.clip(spacing, LINEARISATION_INTERVAL_SECONDS, LONGEST_HELD))
+        self.held = float(np.clip(spacing, LINEARISATION_INTERVAL_SECONDS, MAX_JACOBIAN_SECONDS))
         super().__init__(simulator, theta, scenario, *start)
         if self._sensor_channels:
             # The readings belong to the given motion, not to the simulated one.
@@ -208,7 +208,9 @@ class MeasuredLinear(RunLinearisation):
     def _interpolate_samples(self, motion: RobotMotion) -> Trajectory:
         """Interpolate the measured joints between samples by quintic Hermite polynomials."""
         # Joints that are not recorded may diverge in the simulation.
-        x, v = (np.clip(np.nan_to_num(u), -FARTHEST, FARTHEST) for u in (motion.x, motion.v))
+        x, v = (
+            np.clip(np.nan_to_num(u), -MAX_DEVIATION, MAX_DEVIATION) for u in (motion.x, motion.v)
+        )
         steps: Array = self._simulator.time_step * np.arange(float(len(x)))
         for joint, samples in self._measured.items():
             x[:, joint], v[:, joint] = interpolate_quintic(self._times, samples, steps)
@@ -267,17 +269,17 @@ class MeasuredLinear(RunLinearisation):
             )
         count = self._motion.x.shape[0]
         unit_changes = np.broadcast_to(
-            SMALL * np.eye(state_size)[:, None, :], (state_size, count, state_size)
+            STATE_DIFFERENCE * np.eye(state_size)[:, None, :], (state_size, count, state_size)
         )
         reading_changes = np.zeros((state_size, count, len(self._sensor_channels)))
         if self._sensor_channels:
             rows = points[np.minimum(np.arange(count), points.size - 1)]
-            reading_changes = SMALL * np.moveaxis(quotients.read_states[rows], 2, 0)
+            reading_changes = STATE_DIFFERENCE * np.moveaxis(quotients.read_states[rows], 2, 0)
         with np.errstate(all="ignore"), capture_mujoco_warnings():
             observations = self._compute_observations(
                 unit_changes, reading_changes, [()] * state_size
             )
-        readings = np.moveaxis((observations - self.observed) / SMALL, 0, 2)
+        readings = np.moveaxis((observations - self.observed) / STATE_DIFFERENCE, 0, 2)
         return IntervalMaps(
             states,
             defect,
@@ -357,8 +359,8 @@ class MeasuredLinear(RunLinearisation):
         readings = np.zeros((samples, self.observed.shape[1], count), dtype=np.float32)
         if driven is None:
             (driven,) = compute_control_changes([self], effects)
-        for begin in range(0, count, BLOCK):
-            block = range(begin, min(begin + BLOCK, count))
+        for begin in range(0, count, CANDIDATES_PER_BLOCK):
+            block = range(begin, min(begin + CANDIDATES_PER_BLOCK, count))
             changes: list[Perturbation] = []
             sensors: list[ActiveEffects] = []
             for owner, number in enumerate(block):
@@ -470,7 +472,7 @@ class MeasuredLinear(RunLinearisation):
     def moved(self, deviations: Array) -> Trajectory:
         """Return the motion plus deviations (S + 1, Z) of its states, such as a smoother's."""
         # The motion is not changed where the linear model diverges.
-        deviations = np.where(np.abs(deviations) < FARTHEST, deviations, 0.0)
+        deviations = np.where(np.abs(deviations) < MAX_DEVIATION, deviations, 0.0)
         joints, motion = len(self._simulator.addresses.positions), self._motion
         size, na = motion.x.shape[1], motion.act.shape[1]
         floating = self._simulator.make_linearisation_batch(self._work.acting).floating

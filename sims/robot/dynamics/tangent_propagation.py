@@ -35,7 +35,12 @@ from sims.robot.dynamics.linearisation_points import LinearisationPoints
 from sims.robot.dynamics.midpoint_state import IndexArray, Mask
 from sims.robot.dynamics.mujoco_batch import MujocoBatch
 
-POSITION, VELOCITY, CONTROL, SHARE = 1e-6, 1e-5, 1e-5, 1e-3
+POSITION_DIFFERENCE, VELOCITY_DIFFERENCE, CONTROL_DIFFERENCE, FORCE_DIFFERENCE_SHARE = (
+    1e-6,
+    1e-5,
+    1e-5,
+    1e-3,
+)
 """Finite differences of a position (rad or m), a velocity, a control, and a force.
 
 The difference of a force is a share of its typical size.
@@ -154,16 +159,17 @@ class TangentModel:
         floating_count = self._sizes.size - joint_count
         na, nu = self._motion.act.shape[1], self._motion.controls.shape[1]
         displacements: dict[str, list[tuple[str, int, float]]] = {
-            "z": [("q", j, POSITION) for j in range(joint_count)]
-            + [("v", j, VELOCITY) for j in range(joint_count)]
-            + [("a", j, CONTROL) for j in range(na)]
-            + [("w", k, CONTROL) for k in self._at.hidden_state_effects]
-            + [("p", j, POSITION) for j in range(floating_count)]
-            + [("r", j, VELOCITY) for j in range(floating_count)],
+            "z": [("q", j, POSITION_DIFFERENCE) for j in range(joint_count)]
+            + [("v", j, VELOCITY_DIFFERENCE) for j in range(joint_count)]
+            + [("a", j, CONTROL_DIFFERENCE) for j in range(na)]
+            + [("w", k, CONTROL_DIFFERENCE) for k in self._at.hidden_state_effects]
+            + [("p", j, POSITION_DIFFERENCE) for j in range(floating_count)]
+            + [("r", j, VELOCITY_DIFFERENCE) for j in range(floating_count)],
             "f": [
-                ("f", j, SHARE * float(self._sizes[j])) for j in range(joint_count + floating_count)
+                ("f", j, FORCE_DIFFERENCE_SHARE * float(self._sizes[j]))
+                for j in range(joint_count + floating_count)
             ],
-            "u": [("u", j, CONTROL) for j in range(nu)],
+            "u": [("u", j, CONTROL_DIFFERENCE) for j in range(nu)],
         }
         quotients: dict[str, tuple[Array, Array]] = {}
         for kind, columns in displacements.items():

@@ -18,7 +18,7 @@ from sims.robot.export.write_model_file import EQUAL_NUMBERS_TOLERANCE, compile_
 from sims.robot.export.xml_editing import NotEditableError, format_number
 from sims.robot.robot_model import RobotModel
 
-_USUAL: Mapping[str, Values] = {
+_MUJOCO_DEFAULTS: Mapping[str, Values] = {
     "solreffriction": (0.02, 1.0),
     "solimpfriction": (0.9, 0.95, 0.001, 0.5, 2.0),
 }
@@ -85,7 +85,7 @@ def _format_default_element(
 
 
 def _is_usual(name: str, values: Values) -> bool:
-    return values == _USUAL[name] if name in _USUAL else not any(values)
+    return values == _MUJOCO_DEFAULTS[name] if name in _MUJOCO_DEFAULTS else not any(values)
 
 
 def _is_servo(values: Mapping[str, Values]) -> bool:

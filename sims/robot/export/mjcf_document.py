@@ -12,7 +12,7 @@ from typing import Any
 from sims.robot.export.mjcf_attributes import ModelElement
 from sims.robot.export.xml_editing import NotEditableError, XmlElement, XmlText
 
-_TWICE = ("replicate", "attach", "composite", "flexcomp", "model")
+_UNSUPPORTED_ELEMENTS = ("replicate", "attach", "composite", "flexcomp", "model")
 """Elements that generate several elements, or refer to those of another file."""
 
 FILE_ELEMENTS = ("mesh", "texture", "hfield", "skin")
@@ -87,7 +87,7 @@ class MjcfDocument:
             NotEditableError: the compiled model has other elements than the text.
         """
         for tag in self.walk():
-            if tag.name in _TWICE:
+            if tag.name in _UNSUPPORTED_ELEMENTS:
                 raise NotEditableError(f"it has an element <{tag.name}>")
         bodies: list[XmlElement] = []
         joints: list[XmlElement] = []

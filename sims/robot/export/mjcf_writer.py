@@ -29,10 +29,10 @@ _ORIENTATIONS = ("axisangle", "euler", "xyaxes", "zaxis", "fullinertia")
 SHORTCUT_ATTRIBUTES = ("kp", "kv", "ki", "dampratio", "timeconst", "inheritrange")
 """Attributes of MuJoCo's actuator shortcuts that ``general`` does not have."""
 
-_INPUTS = {"position": "pos", "velocity": "vel"}
+_INPUT_BY_SHORTCUT = {"position": "pos", "velocity": "vel"}
 """Values of the attribute ``input`` (MuJoCo 4.0 and later) that replace an actuator shortcut."""
 
-_SERVO = {"gainprm", "biasprm"}
+_GAIN_ATTRIBUTES = {"gainprm", "biasprm"}
 
 _LISTS = {"damping", "stiffness", "dynprm", "gainprm", "biasprm"}
 
@@ -177,7 +177,10 @@ class MjcfWriter:
         if gains is not None:
             if "kv" in gains:
                 tag.removed.add("dampratio")
-            return format_attributes({k: v for k, v in changed.items() if k not in _SERVO}) | gains
+            return (
+                format_attributes({k: v for k, v in changed.items() if k not in _GAIN_ATTRIBUTES})
+                | gains
+            )
         if tag.name != "general":
             tag.renamed = "general"
             tag.removed |= set(SHORTCUT_ATTRIBUTES)
@@ -185,8 +188,8 @@ class MjcfWriter:
             changed = {
                 k: v for k, v in target_attributes.items() if k in changed or _is_needed(k, v)
             }
-            if tag.name in _INPUTS and hasattr(self.model, "actuator_ctrlspec"):
-                tag.new["input"] = _INPUTS[tag.name]
+            if tag.name in _INPUT_BY_SHORTCUT and hasattr(self.model, "actuator_ctrlspec"):
+                tag.new["input"] = _INPUT_BY_SHORTCUT[tag.name]
         return format_attributes(changed)
 
 
@@ -219,7 +222,7 @@ def _format_shortcut(
     """
     if set(changed) & {"dyntype", "dynprm", "gaintype", "biastype"}:
         return None
-    if not set(changed) & _SERVO:
+    if not set(changed) & _GAIN_ATTRIBUTES:
         return {}
     gain = target_attributes["gainprm"][0]
     offset, stiffness, damping = target_attributes["biasprm"][:3]

@@ -12,7 +12,7 @@ import numpy as np
 EXACT_DIGITS = 17
 """Number of significant digits with which every float64 number is read back exactly."""
 
-_TEXTS = ("name", "path", "text", "signature", "tex_data", "nbuffer")
+_IGNORED_NAME_PARTS = ("name", "path", "text", "signature", "tex_data", "nbuffer")
 """Parts of the names of model fields that do not influence the motion."""
 
 
@@ -76,7 +76,7 @@ def find_first_difference(first_model: Any, second_model: Any, tolerance: float)
         ("opt.", first_model.opt, second_model.opt),
     ):
         for name in sorted(dir(first_struct)):
-            if name.startswith("_") or any(part in name for part in _TEXTS):
+            if name.startswith("_") or any(part in name for part in _IGNORED_NAME_PARTS):
                 continue
             first_value, second_value = getattr(first_struct, name), getattr(second_struct, name)
             if isinstance(first_value, np.ndarray | int | float) and _fields_differ(

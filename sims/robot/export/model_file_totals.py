@@ -90,7 +90,7 @@ class Reading(NamedTuple):
     slide: str = ""
 
 
-_TOTALS: Mapping[str, Reading] = {
+_READING_BY_EFFECT: Mapping[str, Reading] = {
     "drag.linear": Reading(_make_dof_reader("dof_damping")),
     "drag.quadratic": Reading(_make_dof_reader("dof_dampingpoly", 0)),
     "friction.coulomb": Reading(_make_dof_reader("dof_frictionloss")),
@@ -148,7 +148,7 @@ def compute_file_totals(robot: RobotModel, fitted: Fitted) -> list[list[Total | 
     for effect, values in sorted(
         fitted, key=lambda entry: get_write_order(_get_effect_name(entry[0]))
     ):
-        if _get_effect_name(effect) in _TOTALS:
+        if _get_effect_name(effect) in _READING_BY_EFFECT:
             c = np.array(values, dtype=float)[:, None]
             MODEL_FIELD_EFFECTS[_get_effect_name(effect)].write(
                 changed_fields, robot, effect.place, c
@@ -178,9 +178,9 @@ def _list_totals(
         file_fields: fields of the model file.
         changed_fields: fields with the effect.
     """
-    if _get_effect_name(effect) not in _TOTALS:
+    if _get_effect_name(effect) not in _READING_BY_EFFECT:
         return [None] * count
-    reading = _TOTALS[_get_effect_name(effect)]
+    reading = _READING_BY_EFFECT[_get_effect_name(effect)]
     number_totals: list[Total | None] = []
     pairs = (
         np.array(reading.read(f, robot, effect.place), dtype=float)

@@ -37,7 +37,7 @@ from sims.robot.model_field_effects import (
 )
 from sims.robot.robot_model import RobotModel
 
-_TENSOR = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+_TENSOR_ATTRIBUTES = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
 class UrdfWriter:
@@ -136,7 +136,7 @@ class UrdfWriter:
         for _, inertial in inertials:
             self._add_comment(inertial, cause)
             _scale_attributes(inertial, "mass", ("value",), factor)  # (1)
-            _scale_attributes(inertial, "inertia", _TENSOR, factor)
+            _scale_attributes(inertial, "inertia", _TENSOR_ATTRIBUTES, factor)
         return None
 
     def _write_inertia_tensor(self, cause: FittedCause) -> str | None:
@@ -152,7 +152,7 @@ class UrdfWriter:
         ((_, inertial),) = inertials
         self._add_comment(inertial, cause)
         _scale_attributes(
-            inertial, "inertia", _TENSOR, float(compute_factor(cause.coefficients[0]))
+            inertial, "inertia", _TENSOR_ATTRIBUTES, float(compute_factor(cause.coefficients[0]))
         )
         return None
 
@@ -246,7 +246,7 @@ class UrdfWriter:
             _read_origin(inertial, "xyz"),
             _compute_rotation(_read_origin(inertial, "rpy")),
         )
-        values = [float(tensor_tag.get_attribute(key) or 0.0) for key in _TENSOR]
+        values = [float(tensor_tag.get_attribute(key) or 0.0) for key in _TENSOR_ATTRIBUTES]
         tensor = np.zeros((3, 3))
         tensor[np.triu_indices(3)] = values
         tensor += np.triu(tensor, 1).T
@@ -257,7 +257,7 @@ class UrdfWriter:
         tensor = axes.T @ tensor @ axes
         self._add_comment(inertial, cause)
         mass_tag.new["value"] = format_number(mass + added_mass)
-        for key, value in zip(_TENSOR, tensor[np.triu_indices(3)].tolist(), strict=True):
+        for key, value in zip(_TENSOR_ATTRIBUTES, tensor[np.triu_indices(3)].tolist(), strict=True):
             tensor_tag.new[key] = format_number(value)
         _set_vector(inertial, "origin", "xyz", middle)
         return None
@@ -317,7 +317,7 @@ def _has_mass(inertial: XmlElement) -> bool:
     """Return whether an inertial specifies a nonzero mass or moment of inertia."""
     stated_values = (
         (_find_child(inertial, "mass"), ("value",)),
-        (_find_child(inertial, "inertia"), _TENSOR),
+        (_find_child(inertial, "inertia"), _TENSOR_ATTRIBUTES),
     )
     return any(
         float(tag.get_attribute(key) or 0.0) for tag, keys in stated_values if tag for key in keys

@@ -30,7 +30,7 @@ MOVING_JOINT_TYPES = (*ONE_DOF_JOINT_TYPES, "floating", "planar", "spherical")
 JOINT_TYPES = ("fixed", *MOVING_JOINT_TYPES)
 WORLD = "world"
 """Name of the link that is the fixed world by a convention of many files."""
-RIGID = (1e-4, 1.0)
+RIGID_SOLREF = (1e-4, 1.0)
 """Parameter `solref` of a rigid mimic relation.
 
 MuJoCo raises its time constant, in s, to two time steps.
@@ -307,7 +307,7 @@ def stiffen_mimics(spec: Any) -> None:
         spec: mujoco.MjSpec of a URDF, whose only equalities are those of mimic joints.
     """
     for equality in spec.equalities:
-        equality.solref = RIGID
+        equality.solref = RIGID_SOLREF
         equality.solimp = FRICTION_SOLIMP
 
 

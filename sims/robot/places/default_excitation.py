@@ -23,9 +23,9 @@ MAX_MARGIN_SHARE = 0.8
 """Maximum amplitude, as a share of the distance from the pose to the nearer joint limit."""
 MIN_GRAVITY_FORCE_SHARE = 0.5
 """Minimum force amplitude, as a share of the typical force of the joint."""
-SLOW, FAST = 0.3, 2.0
+MIN_COMMAND_HZ, MAX_COMMAND_HZ = 0.3, 2.0
 """Lowest and highest frequency of a command, in Hz."""
-CENTRE_FREQUENCY = 2.0 * np.pi * np.sqrt(SLOW * FAST)
+CENTRE_FREQUENCY = 2.0 * np.pi * np.sqrt(MIN_COMMAND_HZ * MAX_COMMAND_HZ)
 """Geometric mean of the lowest and highest frequency, in rad/s."""
 TRIAL_SECONDS = 4.0
 """Duration of the trial simulation of commands, in seconds."""
@@ -50,7 +50,7 @@ class ExcitationCommand(NamedTuple):
 
     def to_signal_text(self, share: float) -> str:
         """Format as a signal text, with the amplitude multiplied by a share."""
-        signal_text = f"multisine:{share * self.size:.4g}:{SLOW:g}:{FAST:g}"
+        signal_text = f"multisine:{share * self.size:.4g}:{MIN_COMMAND_HZ:g}:{MAX_COMMAND_HZ:g}"
         return f"{self.centre:.6g} + {signal_text}" if self.centre else signal_text
 
 

@@ -16,7 +16,7 @@ import pytest
 from bench.api.explain import explain
 from bench.cli.main import main
 from bench.cli.search_progress import (
-    HINT,
+    BUDGET_HINT,
     HINT_AFTER,
     LOG_INTERVAL,
     TERMINAL_INTERVAL,
@@ -144,7 +144,7 @@ def test_a_log_has_a_line_at_most_every_ten_seconds(clock):
         shown.completed(second / 100)
     lines = stream.getvalue().splitlines()
     assert lines[0] == "simgap: fitting the base model ..."
-    assert len([line for line in lines if HINT not in line]) == 1 + 65 // LOG_INTERVAL
+    assert len([line for line in lines if BUDGET_HINT not in line]) == 1 + 65 // LOG_INTERVAL
     assert re.fullmatch(
         r"simgap: testing 29 effects, 0 of 4; 0:30, about \d:\d\d left \.\.\.", lines[4]
     )
@@ -158,11 +158,11 @@ def test_the_hint_at_a_budget_comes_once_and_only_without_one(clock, stream):
         for _ in range(100):
             shown.stage("testing 38 effects")
             clock.now += 1.0
-        assert shown._stream.getvalue().count(HINT) == hints
+        assert shown._stream.getvalue().count(BUDGET_HINT) == hints
     early = display(clock, stream())
     clock.now += HINT_AFTER - 1.0
     early.stage("testing 38 effects")
-    assert HINT not in early._stream.getvalue()
+    assert BUDGET_HINT not in early._stream.getvalue()
 
 
 def test_a_budget_is_counted_down(clock):

@@ -25,12 +25,11 @@ from bench.benchmark.runner.study_setup import prepare_study
 from bench.cli.main import main
 from bench.core.plugin_registries import simulators
 from bench.misspecification import misspecification_scores
-from bench.misspecification.calibration import (
+from bench.misspecification.calibration import write_calibration_recording
+from bench.misspecification.comparison_experiments import (
     MODEL_LABELS,
-    list_coefficients,
     make_base_experiment,
     make_extended_experiment,
-    write_calibration_recording,
 )
 from bench.misspecification.misspecification_study import MisspecificationStudy
 from bench.studies.study import begin_studies, get_study_class
@@ -216,7 +215,9 @@ def test_coefficients_stand_in_the_effects_order(tmp_path):
         '[effects.wind]\ny = {value = 2.0, unit = "m/s"}\ndrag = {value = 0.1, unit = "1/m"}\n'
     )
     found = extending.open_extended(file, simulators.get)[0]
-    assert list_coefficients(found, simulators.get("ball")) == {"wind": [0.1, 0.0, 2.0]}
+    assert extending.list_effect_coefficients(found, simulators.get("ball")) == {
+        "wind": [0.1, 0.0, 2.0]
+    }
 
 
 @pytest.mark.parametrize("name", ["ball", "pendulum", "slider", "servo", "shot"])

@@ -129,7 +129,7 @@ def test_a_short_film_is_decoded_once_and_a_long_one_each_time_with_the_same_tra
 
     short, long = Source(), Source()
     kept = tracking.track_ball(short)
-    monkeypatch.setattr(tracking, "_HELD", 10_000)
+    monkeypatch.setattr(tracking, "_MAX_CACHED_BYTES", 10_000)
     again = tracking.track_ball(long)
     assert (short.passes, long.passes) == (1, 3)
     np.testing.assert_array_equal(kept.u, again.u)
