@@ -256,7 +256,7 @@ class TrajectoryFitter:
                 break
             make_points = (
                 self._simulate_without_derivatives
-                if self.evaluator.has_linearisation
+                if self._updates_derivatives
                 else self._simulate_points
             )
             for (problem, _), point in zip(trials, make_points(trials, sample_mask), strict=True):
@@ -292,6 +292,16 @@ class TrajectoryFitter:
                     ),
                 )
                 problem.has_own_jacobian = False
+
+    @property
+    def _updates_derivatives(self) -> bool:
+        """True if accepted steps update derivatives instead of recomputing them.
+
+        Half of the trial points are rejected, and updated derivatives serve for several steps. For
+        initial states alone, and where each call of the engine is slow, it would not save time.
+        """
+        evaluator = self.evaluator
+        return evaluator.has_linearisation or (evaluator.is_cheap_to_split and self.parameters)
 
     def _has_derivatives(self, problem: FitState) -> bool:
         """Return whether the derivatives by all fitted parameters are known near the start.
@@ -587,14 +597,16 @@ class TrajectoryFitter:
     def _judge_trial(self, problem: FitState, point: FitPoint) -> None:
         """Accept a trial point if its cost is lower, else reject it, and update the damping.
 
-        The derivatives of a robot are updated by Broyden's method instead of simulations.
+        Derivatives are updated by Broyden's method if the trial was simulated without them.
         """
         decrease = problem.point.cost - point.cost
         is_own_jacobian = problem.has_own_jacobian
         if point.cost < problem.point.cost:
-            if self.evaluator.has_linearisation:
+            if self._updates_derivatives:
                 problem.point = replace(point, jacobian=problem.update_jacobian(point))
-                problem.has_own_jacobian = not problem.free_indices.size
+                # A robot's derivatives by initial states come from a linearisation.
+                is_linearised = self.evaluator.has_linearisation
+                problem.has_own_jacobian = is_linearised and not problem.free_indices.size
             else:
                 self._move_to_point(problem, point)
             problem.accept_step(decrease, point.cost, is_own_jacobian)
