@@ -301,7 +301,7 @@ class TrajectoryFitter:
         initial states alone, and where each call of the engine is slow, it would not save time.
         """
         evaluator = self.evaluator
-        return evaluator.has_linearisation or (evaluator.is_cheap_to_split and self.parameters)
+        return evaluator.has_linearisation or (evaluator.is_cheap_to_split and self.fits_parameters)
 
     def _has_derivatives(self, problem: FitState) -> bool:
         """Return whether the derivatives by all fitted parameters are known near the start.

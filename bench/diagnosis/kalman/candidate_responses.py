@@ -37,8 +37,9 @@ from bench.diagnosis.kalman.filter_and_smoother import (
 )
 from bench.diagnosis.kalman.measured_states import estimate_measured_states
 from bench.diagnosis.search.candidate_directions import CandidateDirection
-from sims.core.effect import Effect
+from sims.core.effect import Effect, members_of
 from sims.core.simulator import Array
+from sims.robot.dynamics.effect_forces import TIME_DEPENDENT_EFFECTS
 from sims.robot.dynamics.measured_linearisation import MeasuredLinear, SingleArray, Trajectory
 from sims.robot.dynamics.run_linearisation import compute_control_changes
 from sims.robot.places.typical_forces import compute_floating_forces, compute_joint_scales
@@ -210,10 +211,11 @@ class FollowedRuns:
             simulator: simulator to use instead of that of the evaluator.
             alike: filter of a similar model, whose Jacobians are reused.
         """
+        is_alike = alike is not None or (simulator is None and self._has_jacobians_of(theta))
         linear = [
             _linearise_run(
                 *(self.evaluator, theta, self.noise, run, motion, neighbour, simulator),
-                is_alike=alike is not None,
+                is_alike=is_alike,
             )
             for run, (motion, neighbour) in enumerate(
                 zip(self.trajectories, (alike or self).linear, strict=True)
@@ -221,6 +223,22 @@ class FollowedRuns:
         ]
         given = self.noise, linear, self.force, self.typical
         return self._filter_linear(self.evaluator, theta, *given)
+
+    def _has_jacobians_of(self, theta: Array) -> bool:
+        """Return whether a model has the Jacobians of this one.
+
+        This is the case if only effects at sensors, and forces that depend on time alone, differ.
+
+        Args:
+            theta: (P,) parameters of the model.
+        """
+        evaluator = self.evaluator
+        changed = set(np.flatnonzero(theta != self.theta).tolist())
+        for name, slot in evaluator.coefficient_slices.items():
+            members = members_of(evaluator.available_effects[name])
+            if all(m.hook == "sensor" or m.of in TIME_DEPENDENT_EFFECTS for m in members):
+                changed -= set(range(slot.start, slot.stop))
+        return not changed
 
     @classmethod
     def _filter_linear(

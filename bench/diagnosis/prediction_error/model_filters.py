@@ -30,7 +30,7 @@ from sims.robot.robot_simulator import RobotSimulator
 
 RELINEARISATION_THRESHOLD = 100.0
 """Minimum change of the smoothed motion, in units of the noise, for another linearisation."""
-MAX_CACHED_FILTERS = 6
+MAX_CACHED_FILTERS = 12
 """Maximum number of cached filters of tried effects."""
 GAUSS_NEWTON_STEPS = 2
 """Maximum number of Gauss-Newton steps for an effect that is tried in the model."""
@@ -64,6 +64,7 @@ class ModelFilters:
     _of_models: dict[bytes, FollowedRuns] = field(default_factory=dict)
     _of_sets: dict[frozenset[str], FollowedRuns] = field(default_factory=dict)
     _of_tried: dict[bytes, FollowedRuns] = field(default_factory=dict)
+    _newest: FollowedRuns | None = None
     _likelihoods: dict[tuple[bytes, bool], float] = field(default_factory=dict)
     _soft_friction: dict[tuple[str, float], FitStart | None] = field(default_factory=dict)
 
@@ -146,9 +147,22 @@ class ModelFilters:
             return self.base.log_likelihood
         key = theta.tobytes(), is_soft
         if key not in self._likelihoods:
-            simulator = self._soft_simulator if is_soft else None
-            self._likelihoods[key] = self.base.with_parameters(theta, simulator).log_likelihood
+            followed = (
+                self.base.with_parameters(theta, self._soft_simulator)
+                if is_soft
+                else self._follow_about_base(theta)
+            )
+            self._likelihoods[key] = followed.log_likelihood
         return self._likelihoods[key]
+
+    def _follow_about_base(self, theta: Array) -> FollowedRuns:
+        """Follow the runs with other parameters, linearised about the motion of the base model.
+
+        The newest filter is kept, because a model that is likelier than the base model is refined.
+        """
+        if self._newest is None or not np.array_equal(self._newest.theta, theta):
+            self._newest = self.base.with_parameters(theta)
+        return self._newest
 
     def compute_gain(self, followed: FollowedRuns) -> float:
         """Return the gain of a filter over the base model in twice the log-likelihood."""
@@ -173,7 +187,8 @@ class ModelFilters:
 
     def _follow_near(self, theta: Array, neighbour: FollowedRuns) -> FollowedRuns:
         """Follow the runs with other parameters, linearised about a known motion."""
-        followed = neighbour.with_parameters(theta)
+        is_base = neighbour is self.base
+        followed = self._follow_about_base(theta) if is_base else neighbour.with_parameters(theta)
         deviations = np.abs(followed.smoothed.states[:, :, : followed.linear[0].positions])
         # With an encoder offset, the true motion is far from the readings.
         is_far = deviations.max() > RELINEARISATION_THRESHOLD * float(np.nanmax(self.noise.sigma))
