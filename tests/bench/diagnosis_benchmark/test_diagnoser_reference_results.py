@@ -8,7 +8,7 @@ import pandas as pd
 from bench.diagnosis_benchmark.result_tables import build_all_tables
 from bench.diagnosis_benchmark.table_columns import read_table
 from bench.diagnosis_benchmark.training_costs import read_training_costs
-from tests.docs.documentation_pages import ROOT
+from tests.docs.documentation_pages import ROOT, section
 
 FOLDER = ROOT / "results/reference/diagnosis"
 PAGE = (FOLDER / "README.md").read_text(encoding="utf-8")
@@ -29,12 +29,13 @@ def test_numbers_of_questions_agree_with_the_answers():
     assert set(answers.groupby("question")["diagnoser"].nunique()) == {8}
 
 
-def test_the_first_section_counts_the_causes_that_simgap_names():
+def test_the_section_on_failures_counts_the_causes_that_simgap_names():
     table = pd.read_csv(FOLDER / "table.csv").set_index(["diagnoser", "metric"])
     row = table.loc["simgap", "the same, up to equivalence"]
-    first = PAGE[PAGE.index("## Where simgap fails") : PAGE.index("## Who is good at what")]
-    assert f"Of {row['of']:.0f} single effects" in first
-    assert f"names {row['count']:.0f}, alone" in first
+    failures = section(PAGE, "## Where simgap fails")
+    assert f"Of {row['of']:.0f} single effects" in failures
+    assert f"names {row['count']:.0f}, alone" in failures
+    assert f"`simgap` names {row['count']:.0f} of {row['of']:.0f} single causes" in PAGE
 
 
 def test_every_count_of_the_page_is_in_a_table():
