@@ -80,7 +80,10 @@ def count_confusion(table):
     hidden = hidden.fillna("(" + rows.kind + ")")
     first = rows.causes.str.split(r"\||@| \+ ", regex=True).str[0]
     is_named = (first != "") & ~rows.verdict.isin(["adequate", "unknown", "unidentifiable"])
-    first = first.where(is_named, "(" + rows.verdict.replace("", "failed") + ")")
+    # Tables of imported answers have no verdicts.
+    without_verdict = rows.outcome.where(rows.outcome == "failed", "no cause")
+    verdict = rows.verdict.where(rows.verdict != "", without_verdict)
+    first = first.where(is_named, "(" + verdict + ")")
     return pd.crosstab(hidden, first)
 
 

@@ -171,7 +171,7 @@ def accuracy(row, heading):
     """Count, total, percentage and interval of the exams of systems and robots."""
     if heading == "":
         return None
-    path = "robots/again.csv" if "robots" in heading else "exam/items.csv"
+    path = "robots/items.csv" if "robots" in heading else "exam/items.csv"
     kinds = {
         "one cause: named, or": ("single", "fair"), "one cause: named alone": ("single", "strict"),
         "two causes": ("double", "fair"), "a cause that": ("foreign", "strict"),

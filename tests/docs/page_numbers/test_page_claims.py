@@ -156,8 +156,8 @@ def test_exams_of_systems_have_no_alarm_and_find_every_foreign_cause():
     for kind in ("clean", "foreign"):
         count, total, *_ = grade("exam/items.csv", kind, "strict")
         assert count == total
-    assert (answers("robots/again.csv", kind="clean").outcome == "right").all()
-    assert len(answers("robots/items.csv", outcome="failed")) == 3
+    assert (answers("robots/items.csv", kind="clean").outcome == "right").all()
+    assert len(answers("robots/items.csv", outcome="failed")) == 1
     assert (frame("robots/transmission.csv").outcome == "not drawn").sum() == 1
 
 

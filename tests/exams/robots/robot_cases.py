@@ -392,7 +392,7 @@ def spread():
 TARGETS = (
     Target("a single cause: effect and place, alone", "single", "strict"),
     Target("the same, or in a set of at most 4", "single", "few"),
-    Target("the same, or in a set whose members do as well, refitted", "single", "fair", 0.95),
+    Target("the same, or in a set whose other members fit equally well", "single", "fair", 0.95),
     Target("the same, or in any set", "single", "any"),
     Target("a family", "family", "any"),
     Target("two causes: both found", "double", "any", 0.80),
