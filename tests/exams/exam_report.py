@@ -118,7 +118,7 @@ def target_rows(exam, table):
     if count:
         low, high = COVERAGE
         got = share([True] * held + [False] * (count - held))
-        rows.append(("95 % intervals that hold the truth", f"{low:.0%} to {high:.0%}", got,
+        rows.append(("95 % intervals that contain the true value", f"{low:.0%} to {high:.0%}", got,
                      low <= got[2] <= high))  # fmt: skip
     return rows
 
@@ -162,7 +162,8 @@ def format_times(table):
         return "no times"
     middle, high, most = seconds.median(), seconds.quantile(0.95), seconds.max()
     return (
-        f"{word}seconds an answer: median {middle:.1f}, 95th percentile {high:.1f}, most {most:.1f}"
+        f"{word}seconds per answer: median {middle:.1f}, 95th percentile {high:.1f}, "
+        f"maximum {most:.1f}"
     )
 
 
@@ -182,9 +183,10 @@ def format_page(exam, table):
     """Return the results as Markdown: targets, times, counts by group, outcomes."""
     table = table[table.version == table.version.iloc[-1]]
     words = {None: "", True: "yes", False: "no"}
-    lines = ["| mark | wanted | reached (95 % interval) | met |", "|---|---|---|---|"]
+    lines = ["| criterion | goal | result (95 % interval) | met |", "|---|---|---|---|"]
     for description, wanted, got, is_met in target_rows(exam, table):
-        lines.append(f"| {description} | {wanted} | {format_share(got)} | {words[is_met]} |")
+        if got[1]:
+            lines.append(f"| {description} | {wanted} | {format_share(got)} | {words[is_met]} |")
     lines += ["", f"{format_times(table)[0].upper()}{format_times(table)[1:]}.", ""]
     summary = summarise(exam, table)
     for group in dict.fromkeys(summary.group):
@@ -201,8 +203,12 @@ def format_page(exam, table):
         lines.append(f"- {kind}: " + ", ".join(f"{n} {name}" for name, n in counts.items()))
     undrawn = table[table.outcome == NOT_DRAWN]
     if len(undrawn):
-        lines += ["", f"No drawing of {len(undrawn)} questions shows the cause: "
-                  + ", ".join(sorted(undrawn.item)) + "."]  # fmt: skip
+        count = "1 question is" if len(undrawn) == 1 else f"{len(undrawn)} questions are"
+        names = ", ".join(f"`{item}`" for item in sorted(undrawn.item))
+        lines += [
+            "",
+            f"{count} not graded, because no sampled recording shows the cause: {names}.",
+        ]
     return "\n".join(lines) + "\n"
 
 

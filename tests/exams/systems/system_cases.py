@@ -178,8 +178,8 @@ EXAM = Exam(
         Target("the same, or in a set of at most 2", "single", "few", 0.97),
         Target("the same, equivalent effects counted as one", "single", "equivalent", 0.97),
         Target(
-            "the same, or in a larger set whose others explain these data as well", "single",
-            "fair", 0.97,
+            "the same, or in a larger set whose other members explain the data equally well",
+            "single", "fair", 0.97,
         ),
         Target("two effects: both found", "double", "few", 0.85),
         Target("the same, equivalent effects counted as one", "double", "equivalent", 0.85),
