@@ -6,7 +6,7 @@ import sys
 import pandas as pd
 import pytest
 
-from tests.exams import answer_rows, exam_report, explain_calls, runner
+from tests.exams import answer_rows, exam_figures, exam_report, explain_calls, runner
 from tests.exams.__main__ import EXAMS, main
 from tests.exams.exam import Exam, Target
 from tests.exams.explain_calls import ExplainCall
@@ -153,15 +153,37 @@ def test_the_page_keeps_text_outside_its_marks(tmp_path):
     (tmp_path / "README.md").write_text(
         f"# Mine\n\n{exam_report.BEGIN}\nold\n{exam_report.END}\nEnd.\n"
     )
-    table = answer_rows.write_table(tmp_path / "items.csv", [row(1), row(2, "wrong")])
+    rows = [row(1), row(2, "wrong"), row(3, case=None)]
+    table = answer_rows.write_table(tmp_path / "items.csv", rows)
     exam_report.write_report(tmp_path, EXAM, table)
     page = (tmp_path / "README.md").read_text()
-    assert page.startswith("# Mine\n\n<!-- results -->\n| mark |")
+    assert page.startswith("# Mine\n\n<!-- results -->\n| criterion |")
+    assert (
+        "1 question is not graded, because no sampled recording shows the cause: `single/3`."
+        in page
+    )
     assert page.endswith("<!-- /results -->\nEnd.\n")
     assert "| named | at least 50% | 1/2 = 50.0%" in page
     assert "old" not in page
     assert (tmp_path / "figures" / "confusion.png").stat().st_size > 0
     assert pd.read_csv(tmp_path / "summary.csv").strict.iloc[0] == 1
+
+
+def test_the_page_omits_criteria_without_cases(tmp_path):
+    table = answer_rows.write_table(tmp_path / "items.csv", [row(1, "right", "clean")])
+    page = exam_report.format_page(EXAM, table)
+    assert "| named |" not in page
+    assert "| clean recordings: false alarms | at most 1% | 0/1 = 0.0%" in page
+
+
+def test_answers_without_a_verdict_have_no_cause_in_the_confusion(tmp_path):
+    rows = [row(1, "failed"), row(2, "right", "clean"), row(3, "unnamed")]
+    for answer in rows:
+        answer["mark"]["causes"] = ""
+    table = answer_rows.write_table(tmp_path / "items.csv", rows)
+    counts = exam_figures.count_confusion(table)
+    assert counts.loc["(clean)", "(no cause)"] == 1
+    assert counts.loc["drag.linear", ["(failed)", "(no cause)"]].tolist() == [1, 1]
 
 
 def test_versions_with_different_recordings_are_reported():
