@@ -254,7 +254,7 @@ class ComparisonCollection:
 
     def build_figures(self) -> dict[str, Figure]:
         """Draw runtime-distribution, and critical-difference if `has_enough_problems`."""
-        figures = {"runtime-distribution": self._draw_joint_figure()}
+        figures = {"runtime-distribution": self._draw_runtime_distribution()}
         if self.has_enough_problems:
             friedman, p_values = self.rank_tests
             figures["critical-difference"] = draw_critical_difference_figure(
@@ -264,7 +264,7 @@ class ComparisonCollection:
             name: add_trust_note(figure, self.has_trusted_runs) for name, figure in figures.items()
         }
 
-    def _draw_joint_figure(self) -> Figure:
+    def _draw_runtime_distribution(self) -> Figure:
         """Draw the runtime distribution over all problems.
 
         It is the share of solved targets against the number of simulations. The tuners are ordered
@@ -297,12 +297,12 @@ class ComparisonCollection:
         return {t: np.mean([problem[t] for problem in each], axis=0) for t in self.tuners}
 
 
-def _compute_runtime_shares(curves: RunCurves, spread: Array) -> list[dict[str, Array]]:
+def _compute_runtime_shares(curves: RunCurves, thresholds: Array) -> list[dict[str, Array]]:
     """Compute the share of thresholds that each tuner has reached after 0..100 % of the budget.
 
     Args:
         curves: errors of all runs of one comparison.
-        spread: thresholds of the runtime distribution.
+        thresholds: thresholds of the runtime distribution.
 
     Returns:
         For each range: the shares (101,) by tuner.
@@ -311,11 +311,11 @@ def _compute_runtime_shares(curves: RunCurves, spread: Array) -> list[dict[str, 
     points = np.floor(np.linspace(0, budget, 101)).astype(np.int64)
     shares = []
     for kind in dict.fromkeys(curves.keys["range"]):
-        part = curves.select(range=str(kind))
+        range_curves = curves.select(range=str(kind))
         shares.append(
             {
-                t: compute_solved_fraction(part.select(tuner=t), spread, points)
-                for t in part.list_tuners()
+                t: compute_solved_fraction(range_curves.select(tuner=t), thresholds, points)
+                for t in range_curves.list_tuners()
             }
         )
     return shares

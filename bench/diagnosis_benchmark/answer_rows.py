@@ -50,7 +50,7 @@ def _iterate_rows(diagnoser: str, answers: AnswersByCase) -> Iterator[dict[str, 
 
 
 def build_answer_row(
-    question: str, item: BenchmarkCase, stored_answer: Mapping[str, Any]
+    question: str, case: BenchmarkCase, stored_answer: Mapping[str, Any]
 ) -> dict[str, Any]:
     """Build the result row of one answer: its case, true causes, answer, grade and cost.
 
@@ -58,7 +58,7 @@ def build_answer_row(
 
     Args:
         question: name of the case.
-        item: the case with its true causes.
+        case: the case with its true causes.
         stored_answer: stored answer of one diagnoser, with its status, reason and cost.
 
     Returns:
@@ -68,33 +68,35 @@ def build_answer_row(
         number of closed 95 % intervals, ``holding`` how many of them contain the true value.
     """
     answer = stored_answer["answer"]
-    mark = grade_answer(item, answer)
-    covered = [is_covered for is_covered in mark.covered.values() if is_covered is not None]
+    grade = grade_answer(case, answer)
+    is_covered_by_interval = [
+        is_covered for is_covered in grade.covered.values() if is_covered is not None
+    ]
     causes = answer["causes"] if answer else []
-    case_columns = {name: getattr(item, name) for name in CASE_COLUMNS}
+    case_columns = {name: getattr(case, name) for name in CASE_COLUMNS}
     case_columns[RUN_SECONDS_COLUMN] = case_columns.pop("seconds")
     return {
         "question": question,
         "diagnoser": stored_answer["diagnoser"],
-        "kind": item.kind,
-        "system": item.system,
-        "hidden": " + ".join(item.effects),
+        "kind": case.kind,
+        "system": case.system,
+        "hidden": " + ".join(case.effects),
         **case_columns,
-        "channels": " ".join(item.channels),
+        "channels": " ".join(case.channels),
         "status": stored_answer["status"],
         "reason": (stored_answer["reason"].strip().splitlines() or [""])[-1][:200],
         "verdict": answer["verdict"] if answer else "",
-        "named": mark.named,
-        "outcome": SKIPPED_STATUS if stored_answer["status"] == SKIPPED_STATUS else mark.outcome,
-        "set_size": mark.set_size,
-        "class_size": mark.class_size,
+        "named": grade.named,
+        "outcome": SKIPPED_STATUS if stored_answer["status"] == SKIPPED_STATUS else grade.outcome,
+        "set_size": grade.set_size,
+        "class_size": grade.class_size,
         "largest_set": max((1 + len(c["alternatives"]) for c in causes), default=0),
-        "found": mark.is_correct,
-        "found_class": mark.is_correct_up_to_equivalence,
+        "found": grade.is_correct,
+        "found_class": grade.is_correct_up_to_equivalence,
         "alarm": answer is None or answer["verdict"] != "adequate",
         "p_value": answer["p_value"] if answer else None,
-        "intervals": len(covered),
-        "holding": sum(covered),
+        "intervals": len(is_covered_by_interval),
+        "holding": sum(is_covered_by_interval),
         "simulations": stored_answer["simulations"],
         "seconds": stored_answer["seconds"],
         "processor_seconds": stored_answer["processor_seconds"],

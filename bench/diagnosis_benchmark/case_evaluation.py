@@ -103,16 +103,16 @@ def evaluate_case(
         (``item``, {} if the sensors cannot show the cause), and one row per diagnoser (``rows``).
     """
     case_spec = CaseSpec.from_json(question)
-    item = (
+    case = (
         case_spec.draw_case(seed, salt)
         if known_item is None
         else BenchmarkCase.from_json(known_item)
         if known_item
         else None
     )
-    if item is None:
+    if case is None:
         return {"question": case_spec.name, "item": {}, "rows": []}
-    written = render_recording(item)
+    recording_text = render_recording(case)
     rows = []
     for diagnoser in examined:
         request = {
@@ -121,16 +121,16 @@ def evaluate_case(
                 "module": diagnoser.code.module,
                 "file": diagnoser.code.file,
             },
-            "table": written.table,
-            "description": written.description,
-            "beside": written.beside,
-            "system": item.system,
+            "table": recording_text.table,
+            "description": recording_text.description,
+            "beside": recording_text.beside,
+            "system": case.system,
             "budget": limits.simulations,
             "seconds": limits.seconds,
             "seed": make_seed_words("diagnosis", diagnoser.label, case_spec.name).tolist(),
         }
         rows.append(_evaluate_case(diagnoser, request, case_spec.name, limits, hidden))
-    return {"question": case_spec.name, "item": item.to_json(), "rows": rows}
+    return {"question": case_spec.name, "item": case.to_json(), "rows": rows}
 
 
 def _evaluate_case(

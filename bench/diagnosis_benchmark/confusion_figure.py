@@ -46,15 +46,15 @@ def draw_confusion_matrices(rows: pd.DataFrame, order: Sequence[str], title: str
         1.4 + row_count * max(1.4, 0.17 * len(hidden)),
     )
     figure, axes = style.make_panel_grid(row_count, column_count, size, sharex=True, sharey=True)
-    for place, axis in enumerate(axes.flat):
-        if place >= len(order):
+    for panel_index, axis in enumerate(axes.flat):
+        if panel_index >= len(order):
             axis.set_axis_off()
             continue
-        diagnoser_rows = graded_rows[graded_rows["diagnoser"] == order[place]]
+        diagnoser_rows = graded_rows[graded_rows["diagnoser"] == order[panel_index]]
         counts = pd.crosstab(diagnoser_rows["family"], diagnoser_rows["answer"]).reindex(
             index=hidden, columns=answer_labels, fill_value=0
         )
-        _draw_confusion_matrix(axis, counts, order[place])
+        _draw_confusion_matrix(axis, counts, order[panel_index])
     figure.suptitle(title, fontsize=11)
     figure.supylabel("hidden", fontsize=9)
     cases = graded_rows.drop_duplicates("question")

@@ -80,7 +80,7 @@ def draw_outcomes(rows: pd.DataFrame, order: Sequence[str], title: str) -> Figur
     """
     figure, axes = style.make_panel_grid(1, 1, (8.6, 0.5 * len(order) + 2.2))
     axis: Axes = axes[0][0]
-    places = np.arange(len(order))[::-1]
+    bar_positions = np.arange(len(order))[::-1]
     bar_starts = np.zeros(len(order))
     total = max(int((rows["diagnoser"] == name).sum()) for name in order)
     for outcome, colour, label in OUTCOME_STYLES:
@@ -92,7 +92,7 @@ def draw_outcomes(rows: pd.DataFrame, order: Sequence[str], title: str) -> Figur
             continue
         widths = 100.0 * np.array(counts) / max(total, 1)
         axis.barh(
-            places,
+            bar_positions,
             widths,
             left=bar_starts,
             color=colour,
@@ -100,13 +100,15 @@ def draw_outcomes(rows: pd.DataFrame, order: Sequence[str], title: str) -> Figur
             linewidth=0.5,
             label=label,
         )
-        for place, width, bar_start, count in zip(places, widths, bar_starts, counts, strict=True):
+        for bar_position, width, bar_start, count in zip(
+            bar_positions, widths, bar_starts, counts, strict=True
+        ):
             # A narrower part has no room for its number.
             if width > 4:
                 is_dark = colour in (style.BLACK, style.BLUE, style.VERMILION)
                 axis.text(
                     bar_start + width / 2,
-                    place,
+                    bar_position,
                     str(count),
                     ha="center",
                     va="center",
@@ -114,7 +116,7 @@ def draw_outcomes(rows: pd.DataFrame, order: Sequence[str], title: str) -> Figur
                     color="white" if is_dark else style.NEUTRAL_MARK,
                 )
         bar_starts += widths
-    axis.set_yticks(places, order)
+    axis.set_yticks(bar_positions, order)
     axis.set_xlim(0, 100)
     axis.set_xlabel("recordings with one hidden effect of at least one noise [%]")
     style.style_axis(axis)

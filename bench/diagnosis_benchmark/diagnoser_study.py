@@ -364,8 +364,8 @@ class _EvaluationRun:
         files: dict[str, dict[str, Path]] = {name: {} for name in codes}
         training_costs = []
         step = self._progress("training", len(calls)) if calls else None
-        for place, result in workers.iterate_results(calls, math.inf) if calls else ():
-            name, system = pairs[place]
+        for index, result in workers.iterate_results(calls, math.inf) if calls else ():
+            name, system = pairs[index]
             if isinstance(result, TrainedDiagnoser):
                 files[name][system] = result.path
                 training_costs.append(
@@ -409,10 +409,10 @@ class _EvaluationRun:
             calls.append((evaluate_case, (*case_args, self._limits, self._hidden)))
         step = self._progress("asking", len(calls))
         longest = _CASE_DRAW_SECONDS + len(evaluated) * (self._limits.seconds + _CASE_DRAW_SECONDS)
-        for place, result in workers.iterate_results(calls, longest):
+        for index, result in workers.iterate_results(calls, longest):
             if isinstance(result, BaseException):
                 result = _make_failed_answers(
-                    questions[place], [answer.label for answer in calls[place][1][4]], result
+                    questions[index], [answer.label for answer in calls[index][1][4]], result
                 )
             self._answer_store.append(result)
             step()

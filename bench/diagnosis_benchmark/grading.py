@@ -128,8 +128,8 @@ def _grade_library(
     """Grade an answer on one or two effects of the library.
 
     An answer is right if each effect is in a set of its own and no set is without an effect. The
-    sets are matched twice: to the effects themselves (`strict`), and to effects that are equivalent
-    in any data (`loose`).
+    sets are matched twice: to the effects themselves (`exact_matches`), and to effects that are
+    equivalent in any data (`equivalent_matches`).
 
     Args:
         effects: the hidden effects.
@@ -142,20 +142,22 @@ def _grade_library(
     """
     if not sets or word == "unknown":  # effects listed with the verdict "unknown" are not named
         return "unnamed", 0, 0
-    strict = _match_sets_to_effects(effects, sets, lambda effect, names: effect in names)
-    loose = _match_sets_to_effects(
+    exact_matches = _match_sets_to_effects(effects, sets, lambda effect, names: effect in names)
+    equivalent_matches = _match_sets_to_effects(
         effects, sets, lambda effect, names: bool(equivalents(effect) & set(names))
     )
-    if len(loose) < len(effects):
-        return ("one" if loose else "wrong"), 0, 0
-    sizes = max(len(sets[place]) for place in loose.values())
-    classes = max(_count_classes(sets[place], equivalents) for place in loose.values())
+    if len(equivalent_matches) < len(effects):
+        return ("one" if equivalent_matches else "wrong"), 0, 0
+    largest_set = max(len(sets[set_index]) for set_index in equivalent_matches.values())
+    class_count = max(
+        _count_classes(sets[set_index], equivalents) for set_index in equivalent_matches.values()
+    )
     if len(sets) > len(effects):
-        return "extra", sizes, classes
-    if len(strict) < len(effects):
-        return "class", 0, classes  # only equivalent effects are named
-    sizes = max(len(sets[place]) for place in strict.values())
-    return ("right" if sizes == 1 else "set"), sizes, classes
+        return "extra", largest_set, class_count
+    if len(exact_matches) < len(effects):
+        return "class", 0, class_count  # only equivalent effects are named
+    largest_set = max(len(sets[set_index]) for set_index in exact_matches.values())
+    return ("right" if largest_set == 1 else "set"), largest_set, class_count
 
 
 def _match_sets_to_effects(
@@ -171,20 +173,20 @@ def _match_sets_to_effects(
     Returns:
         Index of the set of each effect, for the assignment with the most effects.
     """
-    best: dict[str, int] = {}
+    most_matches: dict[str, int] = {}
     for order in (list(effects), list(effects)[::-1]):
         for reverse in (False, True):
             matches: dict[str, int] = {}
             for effect in order:
-                places = [
+                matching_sets = [
                     i
                     for i, names in enumerate(sets)
                     if is_in_set(effect, names) and i not in matches.values()
                 ]
-                if places:
-                    matches[effect] = places[-1 if reverse else 0]
-            best = max(best, matches, key=len)
-    return best
+                if matching_sets:
+                    matches[effect] = matching_sets[-1 if reverse else 0]
+            most_matches = max(most_matches, matches, key=len)
+    return most_matches
 
 
 def _count_classes(names: Sequence[str], equivalents: EquivalentEffects) -> int:

@@ -117,7 +117,7 @@ def _make_median_chart(
         medians = statistics.compute_median_curves(metric, kind)
         frames.append(medians.assign(range=kind, metric=metric))
         conditions = {"range": kind, "metric": metric}
-        lines = _make_lines(view, medians, "median", "line", "low", "high", **conditions)
+        lines = _make_tuner_series(view, medians, "median", "line", "low", "high", **conditions)
         label = view.format_metric_label(metric)
         panel = _make_panel(
             view, kind, table, "simulations", lines, x_axis, Axis(f"{label}, median", "log")
@@ -185,7 +185,9 @@ def make_runtime_chart(view: ComparisonView) -> ComparisonChart:
     panels = []
     for kind in dict.fromkeys(table["range"]):
         # Steps, not slopes: no threshold is reached between two simulations.
-        lines = _make_lines(view, table[table["range"] == kind], "share", "steps", range=kind)
+        lines = _make_tuner_series(
+            view, table[table["range"] == kind], "share", "steps", range=kind
+        )
         panel = _make_panel(view, kind, "runtime", "simulations", lines, x_axis, y_axis)
         targets = view.statistics.curves.select(range=str(kind)).keys["target"].nunique()
         panels.append(replace(panel, title=f"{PANEL_TITLES[str(kind)]} ({targets} targets)"))
@@ -202,7 +204,7 @@ def make_ert_chart(view: ComparisonView) -> ComparisonChart:
     y_axis = Axis("expected simulations (ERT)", "log")
     panels = []
     for kind in view.ranges:
-        lines = _make_lines(view, table, "ert", "line", "low", "high", range=kind)
+        lines = _make_tuner_series(view, table, "ert", "line", "low", "high", range=kind)
         panels.append(_make_panel(view, kind, "ert", "threshold", lines, x_axis, y_axis))
     return ComparisonChart(_select_panels_with_data(panels), {}, notes=_make_notes(view))
 
@@ -227,7 +229,7 @@ def make_cost_chart(view: ComparisonView) -> ComparisonChart:
                 for low, high, tuner in winners
             )
             conditions = {"range": kind, "threshold": str(level)}
-            lines = _make_lines(
+            lines = _make_tuner_series(
                 view, table[table["range"] == kind], "seconds", "line", **conditions
             )
             panel = _make_panel(view, kind, "seconds", "simulation_seconds", lines, x_axis, y_axis)
@@ -264,9 +266,9 @@ def make_amortisation_chart(view: ComparisonView) -> ComparisonChart:
                     "low",
                     "high",
                     "points",
-                    0.6 * ((place + 0.5) / len(trained) - 0.5),
+                    0.6 * ((tuner_index + 0.5) / len(trained) - 0.5),
                 )
-                for place, name in enumerate(trained)
+                for tuner_index, name in enumerate(trained)
             )
             panel = _make_panel(view, kind, "even", "row", series, x_axis, y_axis)
             panels.append(_add_error_threshold(replace(panel, rules=rules), view, level))
@@ -348,7 +350,7 @@ def _add_error_threshold(panel: Panel, view: ComparisonView, level: float) -> Pa
     return replace(panel, facets={**panel.facets, "error reached": reached})
 
 
-def _make_lines(
+def _make_tuner_series(
     view: ComparisonView,
     table: pd.DataFrame,
     y: str,

@@ -29,7 +29,7 @@ def draw_critical_difference_figure(
     axis = axes[0, 0]
     # Each tuner has its colour of every other figure; text stays dark, since light colours are hard
     # to read.
-    colours = {str(name): get_colour(place) for place, name in enumerate(ranked.columns)}
+    colours = {str(name): get_colour(index) for index, name in enumerate(ranked.columns)}
     artists = critical_difference_diagram(
         ranked.mean(axis=0), p_values, ax=axis, label_props={"fontsize": 9}, color_palette=colours
     )

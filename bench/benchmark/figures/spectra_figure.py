@@ -72,17 +72,23 @@ def _draw_spectra(axis: Axes, table: pd.DataFrame, directions: int) -> None:
     are not. The ranges of targets are drawn side by side.
     """
     ranges = list(dict.fromkeys(table["range"]))
-    for place, (kind, (marker, colour)) in enumerate(zip(ranges, _RANGE_MARKERS, strict=False)):
-        part = table[table["range"] == kind]
-        targets = part["target"].nunique()
+    for range_index, (kind, (marker, colour)) in enumerate(
+        zip(ranges, _RANGE_MARKERS, strict=False)
+    ):
+        range_rows = table[table["range"] == kind]
+        targets = range_rows["target"].nunique()
         # Markers of one direction lie side by side within 0.3, the ranges 0.4 apart.
-        places = part.groupby("direction").cumcount()
-        target_offsets = (places / (targets - 1) - 0.5) * 0.3 if targets > 1 else 0.0 * places
-        x_values = part["direction"] + target_offsets + (place - 0.5 * (len(ranges) - 1)) * 0.4
+        target_indices = range_rows.groupby("direction").cumcount()
+        target_offsets = (
+            (target_indices / (targets - 1) - 0.5) * 0.3 if targets > 1 else 0.0 * target_indices
+        )
+        x_values = (
+            range_rows["direction"] + target_offsets + (range_index - 0.5 * (len(ranges) - 1)) * 0.4
+        )
         axis.plot(
             x_values,
             # A direction without effect on the data has an infinite sigma and is drawn at the edge.
-            part["sigma"].clip(_MIN_DRAWN_SIGMA, _MAX_DRAWN_SIGMA),
+            range_rows["sigma"].clip(_MIN_DRAWN_SIGMA, _MAX_DRAWN_SIGMA),
             marker,
             color=colour,
             markersize=3.5,

@@ -83,8 +83,8 @@ def serve_fork_requests(descriptor: int) -> None:
                 finally:
                     # Without the exit, the fork would continue as a second fork server.
                     os._exit(1)
-            for each in descriptors:
-                os.close(each)
+            for descriptor_copy in descriptors:
+                os.close(descriptor_copy)
             link.sendall(b"K")
     shutil.rmtree(os.getcwd(), ignore_errors=True)
 
@@ -125,8 +125,8 @@ def _supervise_service(request: dict[str, Any], descriptors: list[int], layers: 
         except BaseException:
             os._exit(1)
         os._exit(0)
-    for each in pipes:
-        os.close(each)
+    for pipe in pipes:
+        os.close(pipe)
     code = _wait_for_child(child, control)
     socket.socket(fileno=control).sendall(EXIT_CODE.pack(code))
 

@@ -87,14 +87,23 @@ def _combine_availability(experiment: Experiment) -> Availability:
     A suite leaves out the problems that cannot run, see `leave_out_missing_problems`: something is
     missing for it only if no problem can run.
     """
-    parts = {each.name: availability(each) for each in expand_sweep(experiment)}
-    runnable = {n: part for n, part in parts.items() if not (part.data_set or part.skipped)}
+    availability_by_name = {
+        part_experiment.name: availability(part_experiment)
+        for part_experiment in expand_sweep(experiment)
+    }
+    runnable = {
+        n: part for n, part in availability_by_name.items() if not (part.data_set or part.skipped)
+    }
     if experiment.suite and runnable:
-        parts = runnable
-    data_sets = [part.data_set for part in parts.values() if part.data_set]
-    skipped = [f"{name} {part.skipped}" for name, part in parts.items() if part.skipped]
+        availability_by_name = runnable
+    data_sets = [part.data_set for part in availability_by_name.values() if part.data_set]
+    skipped = [
+        f"{name} {part.skipped}" for name, part in availability_by_name.items() if part.skipped
+    ]
     missing_tuners = {
-        label: reason for part in parts.values() for label, reason in part.tuners.items()
+        label: reason
+        for part in availability_by_name.values()
+        for label, reason in part.tuners.items()
     }
     return Availability(next(iter(data_sets), None), "; ".join(skipped), missing_tuners)
 

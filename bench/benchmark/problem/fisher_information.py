@@ -138,10 +138,12 @@ def compute_spectrum_from_jacobian(jacobian: Array) -> InformationSpectrum:
     """
     dim = jacobian.shape[1]
     # J = Q R, and Q is orthogonal, so R (dim, dim) has the singular values of J.
-    _, sizes, rows = np.linalg.svd(np.linalg.qr(jacobian, mode="r"))
-    values, vectors = np.zeros(dim), rows.T
-    values[: sizes.size] = sizes**2  # (2); with fewer samples than parameters the others are 0
+    _, singular_values, right_vectors = np.linalg.svd(np.linalg.qr(jacobian, mode="r"))
+    values, vectors = np.zeros(dim), right_vectors.T
+    values[: singular_values.size] = (
+        singular_values**2
+    )  # (2); with fewer samples than parameters the others are 0
     # The sign of an eigenvector is arbitrary; it is fixed so that results are reproducible.
-    places = np.abs(vectors).argmax(axis=0)[None]
-    largest = np.take_along_axis(vectors, places, axis=0)
-    return InformationSpectrum(values, vectors * np.where(largest < 0, -1.0, 1.0))
+    largest_rows = np.abs(vectors).argmax(axis=0)[None]
+    largest_entries = np.take_along_axis(vectors, largest_rows, axis=0)
+    return InformationSpectrum(values, vectors * np.where(largest_entries < 0, -1.0, 1.0))

@@ -190,7 +190,7 @@ def _draw_target(problem: TargetProblem, kind: str, index: int, number: int) -> 
     )
     fitting = ObservedRuns(scenarios, _round_to_resolution(observed, problem))
     held_out = _simulate_held_out(problem, theta, streams)
-    if any(_is_divergent(each, problem.channels) for each in (noise_free, held_out.observed)):
+    if any(_is_divergent(y, problem.channels) for y in (noise_free, held_out.observed)):
         return None
     sealed = BlindedTarget(name, kind, start, fitting, held_out)
     return Target(sealed, problem.cube.to_physical(truth), number)

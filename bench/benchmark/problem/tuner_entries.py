@@ -54,8 +54,8 @@ def parse_entries(path: Path, value: Any) -> tuple[TunerEntry, ...]:
     if not isinstance(value, list):
         raise make_error(path, "tuners", "a list of names or a table for each tuner", value)
     entries: list[TunerEntry] = []
-    for place, item in enumerate(value):
-        entry = _parse_list_item(path, f"tuners[{place}]", item)
+    for index, item in enumerate(value):
+        entry = _parse_list_item(path, f"tuners[{index}]", item)
         # Tables and figures distinguish tuners by label; TOML keys cannot occur twice, list items
         # can.
         if entry.label in [listed_entry.label for listed_entry in entries]:

@@ -108,8 +108,8 @@ def _format_running_times(results: ComparisonReportData, kind: str) -> str:
     view, table = results.view, results.tables["ert"]
     statistics, level = view.statistics, view.statistics.reference_level
     ranking = statistics.ranking[statistics.ranking["range"] == kind]
-    last = ranking[ranking["simulations"] == ranking["simulations"].max()]
-    best = list(last.loc[last["verdict"].isin((BEST, EQUAL)), "tuner"])
+    final_rows = ranking[ranking["simulations"] == ranking["simulations"].max()]
+    best = list(final_rows.loc[final_rows["verdict"].isin((BEST, EQUAL)), "tuner"])
     rows = table[
         (table["range"] == kind)
         & (table["threshold"] == level)
@@ -119,11 +119,11 @@ def _format_running_times(results: ComparisonReportData, kind: str) -> str:
     if rows.empty:
         return ""
     ordered = sorted(rows.to_dict("records"), key=lambda row: statistics.order.index(row["tuner"]))
-    each = ", ".join(_format_running_time(view, row) for row in ordered)
+    tuner_texts = ", ".join(_format_running_time(view, row) for row in ordered)
     unit = view.unit_of_levels or f" in {view.format_metric_label(statistics.metric)}"
     return (
         "expected simulations of the best tuners until the error stays at or below "
-        f"{format_number(level)}{unit.replace('[', '').replace(']', '')}: {each}."
+        f"{format_number(level)}{unit.replace('[', '').replace(']', '')}: {tuner_texts}."
     )
 
 

@@ -73,19 +73,19 @@ def _sort_by_verdict(statistics: ComparisonStatistics, k: int, part: pd.DataFram
     `part` are the rows of the ranking for this range and this number of simulations.
     """
 
-    def named(*verdicts: str) -> pd.DataFrame:
+    def select_verdicts(*verdicts: str) -> pd.DataFrame:
         return part[part["verdict"].isin(verdicts)]
 
     # Equal tuners are in the order of legends, so that a page has one order.
-    best = sorted(named(BEST, EQUAL)["tuner"], key=statistics.order.index)
-    first = named(BEST)
+    best = sorted(select_verdicts(BEST, EQUAL)["tuner"], key=statistics.order.index)
+    first = select_verdicts(BEST)
     return TunerRanking(
         k,
         [str(name) for name in best],
         _format_best_error(statistics, float(first["median"].iloc[0])) if len(first) else "",
-        [_format_worse_tuner(row) for row in named(WORSE).to_dict("records")],
-        [str(name) for name in named(UNDECIDED)["tuner"]],
-        [str(name) for name in named(FAILED)["tuner"]],
+        [_format_worse_tuner(row) for row in select_verdicts(WORSE).to_dict("records")],
+        [str(name) for name in select_verdicts(UNDECIDED)["tuner"]],
+        [str(name) for name in select_verdicts(FAILED)["tuner"]],
     )
 
 

@@ -175,9 +175,9 @@ class ClusterPool:
 
         waiting: dict[Any, int] = {}
         # The number of workers that each call has lost, and the calls to be executed again.
-        losses: dict[int, int] = {}
-        remaining_places = iter(range(len(calls)))
-        repeated_places: list[int] = []
+        lost_workers: dict[int, int] = {}
+        new_indices = iter(range(len(calls)))
+        repeated_indices: list[int] = []
         try:
             while True:
                 max_queued = _QUEUED_CALLS_PER_THREAD * max(
@@ -186,34 +186,34 @@ class ClusterPool:
                 while (
                     len(waiting) < max_queued
                     and (
-                        place := repeated_places.pop()
-                        if repeated_places
-                        else next(remaining_places, None)
+                        index := repeated_indices.pop()
+                        if repeated_indices
+                        else next(new_indices, None)
                     )
                     is not None
                 ):
-                    waiting[self._submit_call(calls[place], seconds)] = place
+                    waiting[self._submit_call(calls[index], seconds)] = index
                 if not waiting:
                     return
                 for future in self._wait_for_results(list(waiting)):
-                    place = waiting.pop(future)
+                    index = waiting.pop(future)
                     end_status = future.status
                     error = future.exception() if end_status in ("error", "cancelled") else None
                     killed = isinstance(error, KilledWorker | CancelledError)
                     # The loss of a worker gives no information about the call.
                     if killed or end_status in ("lost", "cancelled"):
-                        losses[place] = losses.get(place, 0) + 1
-                        if losses[place] > _MAX_LOST_WORKERS_PER_CALL:
+                        lost_workers[index] = lost_workers.get(index, 0) + 1
+                        if lost_workers[index] > _MAX_LOST_WORKERS_PER_CALL:
                             raise PoolLostError(
                                 f"cluster {self.address}: lost {_MAX_LOST_WORKERS_PER_CALL} "
                                 "workers on one run"
                             )
-                        repeated_places.append(place)
+                        repeated_indices.append(index)
                         continue
                     result = error if error is not None else self._receive_result(future.result())
                     # The cluster stores a result until its future is released.
                     future.release()
-                    yield place, result
+                    yield index, result
         except (OSError, TimeoutError, CancelledError) as error:
             raise PoolLostError(
                 f"cluster {self.address}: the scheduler cannot be reached ({type(error).__name__})"

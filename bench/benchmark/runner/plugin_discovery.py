@@ -286,12 +286,14 @@ def inspect_plugins(paths: Sequence[str], needed: Iterable[str]) -> list[Plugin]
             plugins.append(Plugin(path))
             continue
         parts = _ask_isolated_process({"file": path, "kind": "", "name": ""}, path)
-        worlds = {part["name"] for part in parts if part["kind"] not in _ISOLATED_REGISTRIES}
+        simulated_parts = {
+            part["name"] for part in parts if part["kind"] not in _ISOLATED_REGISTRIES
+        }
         for part in parts:
             if part["name"] in needed_names and part["kind"] not in _ISOLATED_REGISTRIES:
                 _check_name_free(part["kind"], part["name"], path, paths_by_name)
         methods = [tuple(p for p in parts if p["kind"] == kind) for kind in _ISOLATED_REGISTRIES]
-        plugins.append(Plugin(path, bool(worlds & needed_names), *methods))
+        plugins.append(Plugin(path, bool(simulated_parts & needed_names), *methods))
     return plugins
 
 

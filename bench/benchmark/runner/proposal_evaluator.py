@@ -31,8 +31,9 @@ class ProposalEvaluator:
     def __init__(self, problem: TuningProblem, side: ObservedRuns) -> None:
         """Prepare factors that convert sums of squared errors to the loss (1) and to the RMSE (2).
 
-        `_missing` marks missing samples (T, C), or is None. `_per_sample` and
-        `_per_loss` (C,) are the factors 1/N_c of (2) and 1/(C N_c s_c^2) of (1). `_seen` collects
+        `_missing` marks missing samples (T, C), or is None. `_mean_factors` and
+        `_loss_factors` (C,) are the factors 1/N_c of (2) and 1/(C N_c s_c^2) of (1).
+        `_evaluated_squares` collects
         the sums of squares (n, C) of all batches, from which `compute_rmse` looks up points.
         """
         self._problem = problem
@@ -42,10 +43,10 @@ class ProposalEvaluator:
         self._observed = np.where(missing, 0.0, side.observed)
         # For a channel without samples the divisor must not be zero.
         sample_counts = np.maximum((~missing).sum(axis=0), 1)
-        self._per_sample = 1.0 / sample_counts  # (2)
-        self._per_loss = 1.0 / (sample_counts * problem.scale**2 * len(problem.scale))  # (1)
-        self._only_per_loss = float(self._per_loss[0])
-        self._seen: list[Array] = []
+        self._mean_factors = 1.0 / sample_counts  # (2)
+        self._loss_factors = 1.0 / (sample_counts * problem.scale**2 * len(problem.scale))  # (1)
+        self._single_loss_factor = float(self._loss_factors[0])
+        self._evaluated_squares: list[Array] = []
 
     def __call__(self, points: Array) -> tuple[Array, Array]:
         """Simulate points and compute their losses.
@@ -61,8 +62,8 @@ class ProposalEvaluator:
         if single and self._missing is None:
             return observations, self._compute_single_loss(observations)
         squares = self._sum_squared_errors(observations)
-        self._seen.append(squares)
-        losses: Array = np.sqrt(squares @ self._per_loss)  # (1)
+        self._evaluated_squares.append(squares)
+        losses: Array = np.sqrt(squares @ self._loss_factors)  # (1)
         # The loss of a failed simulation is infinite, because comparisons with NaN are always
         # false.
         if not all(map(math.isfinite, losses.tolist())):
@@ -76,8 +77,8 @@ class ProposalEvaluator:
         """
         difference = (observations - self._observed).ravel()
         square = float(difference.dot(difference))  # S of (1)
-        self._seen.append(np.array([[square]]))
-        loss = square * self._only_per_loss
+        self._evaluated_squares.append(np.array([[square]]))
+        loss = square * self._single_loss_factor
         return np.array([math.sqrt(loss) if math.isfinite(loss) else math.inf])
 
     def _sum_squared_errors(self, observations: Array) -> Array:
@@ -107,7 +108,7 @@ class ProposalEvaluator:
             point.tobytes(): row
             for point, row in zip(proposals, self._stack_evaluated_rows(), strict=True)
         }
-        result = np.empty((len(recommendations), len(self._per_sample)))
+        result = np.empty((len(recommendations), len(self._mean_factors)))
         for i, point in enumerate(recommendations):
             # Points are compared by their bytes, so that only an identical point is looked up.
             key = point.tobytes()
@@ -116,8 +117,12 @@ class ProposalEvaluator:
                     self._problem.simulate(point[None], self._scenarios)
                 )[0]
             result[i] = rows_by_point[key]
-        errors: Array = np.sqrt(result * self._per_sample)  # (2)
+        errors: Array = np.sqrt(result * self._mean_factors)  # (2)
         return errors
 
     def _stack_evaluated_rows(self) -> Array:
-        return np.concatenate(self._seen) if self._seen else np.empty((0, len(self._per_sample)))
+        return (
+            np.concatenate(self._evaluated_squares)
+            if self._evaluated_squares
+            else np.empty((0, len(self._mean_factors)))
+        )

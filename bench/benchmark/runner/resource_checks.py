@@ -143,50 +143,52 @@ def estimate_comparison_need(
         jobs: number of worker processes; 0 for none.
         cluster: True if a cluster executes the runs.
     """
-    sizes = _Experiment(experiment)
+    quantities = _Experiment(experiment)
     # For a bounce shot this counts its shots with one ball; it has only a few balls.
     targets = experiment.targets * len(experiment.ranges)
-    each = [(count_seeds(experiment, e), e.budget or experiment.budget) for e in sizes.tuners]
-    runs = targets * sum(seeds for seeds, _ in each)
-    simulations = targets * sum(seeds * budget for seeds, budget in each)
+    seeds_and_budgets = [
+        (count_seeds(experiment, e), e.budget or experiment.budget) for e in quantities.tuners
+    ]
+    runs = targets * sum(seeds for seeds, _ in seeds_and_budgets)
+    simulations = targets * sum(seeds * budget for seeds, budget in seeds_and_budgets)
     rows = runs + simulations
     held_out = experiment.held_out.scenarios if experiment.held_out else 0
-    longest = max((budget for _, budget in each), default=0)
-    trained = experiment.training_budget if sizes.learned else 0
+    max_budget = max((budget for _, budget in seeds_and_budgets), default=0)
+    training_simulations = experiment.training_budget if quantities.learned else 0
     workers = _MAX_CLUSTER_WORKERS if cluster else max(jobs, 1)
     memory = (
         runs * _RUN_MEMORY
-        + targets * (1 + held_out) * sizes.observation
+        + targets * (1 + held_out) * quantities.observation
         + rows * _ROW_MEMORY
         + (0 if cluster else jobs * _WORKER_BYTES)
-        + longest * (sizes.dim + 1) * BYTES_PER_NUMBER
-        + trained * sizes.observation
-        + sizes.steps * BYTES_PER_STEP
+        + max_budget * (quantities.dim + 1) * BYTES_PER_NUMBER
+        + training_simulations * quantities.observation
+        + quantities.steps * BYTES_PER_STEP
     )
     seconds = (
-        simulations * sizes.simulation * (1 + held_out) / workers
-        + trained * sizes.simulation
+        simulations * quantities.simulation * (1 + held_out) / workers
+        + training_simulations * quantities.simulation
         + rows * _ROW_SECONDS
         + runs * _RUN_SECONDS
     )
     counts = {
         "targets": targets,
-        "seeds": max((seeds for seeds, _ in each), default=0),
-        "budget": longest,
-        "training_budget": trained,
+        "seeds": max((seeds for seeds, _ in seeds_and_budgets), default=0),
+        "budget": max_budget,
+        "training_budget": training_simulations,
         "held_out.scenarios": held_out,
-        "sampling.samples": sizes.samples,
-        "steps": sizes.steps,
+        "sampling.samples": quantities.samples,
+        "steps": quantities.steps,
         "jobs": jobs,
     }
     counts_text = ", ".join(f"{name} {count:.4g}" for name, count in counts.items() if count)
     return ResourceNeed(
-        f"tuners {len(each)}, {counts_text}",
+        f"tuners {len(seeds_and_budgets)}, {counts_text}",
         _suggest_reduction(counts),
         memory,
         rows * _ROW_DISK,
         runs / _RUNS_PER_PART,
-        sizes.steps,
+        quantities.steps,
         seconds,
     )
 

@@ -97,13 +97,14 @@ def compute_resampled_medians(values: Array, counts: ResampleCounts) -> Array:
     """
     n = len(values)
     result = np.empty((values.shape[1], counts.shape[1]))
-    for column, place in zip(values.T, result, strict=True):
+    for column, medians in zip(values.T, result, strict=True):
         order = np.argsort(column)
-        upto = np.cumsum(counts[order], axis=0, dtype=counts.dtype)
+        cumulative_counts = np.cumsum(counts[order], axis=0, dtype=counts.dtype)
         # With k counted from 0, the k-th smallest value of a resample is the first sorted value
         # whose cumulative count is larger than k.
         lower, upper = (
-            np.add.reduce(upto <= k, axis=0, dtype=counts.dtype) for k in ((n - 1) // 2, n // 2)
+            np.add.reduce(cumulative_counts <= k, axis=0, dtype=counts.dtype)
+            for k in ((n - 1) // 2, n // 2)
         )
-        place[:] = 0.5 * (column[order[lower]] + column[order[upper]])
+        medians[:] = 0.5 * (column[order[lower]] + column[order[upper]])
     return result

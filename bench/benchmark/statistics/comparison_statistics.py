@@ -109,10 +109,11 @@ class ComparisonStatistics:
         """Sort rows that have the columns range and tuner: range by range, the best tuner first."""
         kinds = [str(kind) for kind in dict.fromkeys(self._all_runs.keys["range"])]
         order = [(kind, tuner) for kind in kinds for tuner in self.order_in(kind)]
-        places = {key: place for place, key in enumerate(order)}
+        position_of_key = {key: position for position, key in enumerate(order)}
         # A tuner that could not be used has no range.
         keys = [
-            places.get(key, len(places)) for key in zip(frame["range"], frame["tuner"], strict=True)
+            position_of_key.get(key, len(position_of_key))
+            for key in zip(frame["range"], frame["tuner"], strict=True)
         ]
         return frame.iloc[np.argsort(keys, kind="stable")].reset_index(drop=True)
 

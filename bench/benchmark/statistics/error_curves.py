@@ -162,9 +162,9 @@ def average_over_seeds(values: Array, groups: Sequence[NDArray[np.int64]]) -> Ar
         warnings.simplefilter("ignore", RuntimeWarning)
         # Targets with the same number of seeds are averaged in one array operation.
         for count in np.unique(counts):
-            places = np.flatnonzero(counts == count).tolist()
-            rows = np.array([groups[place] for place in places])
-            result[places] = np.nanmean(values[rows], axis=1)
+            target_indices = np.flatnonzero(counts == count).tolist()
+            rows = np.array([groups[target] for target in target_indices])
+            result[target_indices] = np.nanmean(values[rows], axis=1)
     return result
 
 

@@ -203,9 +203,9 @@ def build_ert_table(curves: RunCurves, levels: tuple[float, ...], budget: int) -
     """
     lines = []
     for (experiment, kind), _ in curves.keys.groupby(["experiment", "range"], sort=False):
-        part = curves.select(experiment=str(experiment), range=str(kind))
-        for tuner in part.list_tuners():
-            tuner_curves = part.select(tuner=tuner)
+        range_curves = curves.select(experiment=str(experiment), range=str(kind))
+        for tuner in range_curves.list_tuners():
+            tuner_curves = range_curves.select(tuner=tuner)
             for level in levels:
                 effort = compute_effort(tuner_curves, level, budget)
                 # All tuners use the same draws, so that differences between targets cancel in
@@ -248,14 +248,14 @@ def compute_solved_fraction(curves: RunCurves, spread: Array, points: NDArray[np
     return np.array([(times <= k).mean() for k in points])
 
 
-def build_runtime_table(curves: RunCurves, spread: Array) -> pd.DataFrame:
+def build_runtime_table(curves: RunCurves, thresholds: Array) -> pd.DataFrame:
     """Compute runtime distributions: the share of (run, threshold) pairs that are reached.
 
     The numbers of simulations are those on a logarithmic scale and those of the tables.
 
     Args:
         curves: values of the deciding metric in all ranges.
-        spread: thresholds of that metric.
+        thresholds: thresholds of that metric.
 
     Returns:
         Table with the columns `RUNTIME_SHARE_COLUMNS`.
@@ -265,9 +265,9 @@ def build_runtime_table(curves: RunCurves, spread: Array) -> pd.DataFrame:
     points = np.unique(np.concatenate([[0], log_points, select_checkpoints(budget)]))
     parts = []
     for kind in dict.fromkeys(curves.keys["range"]):
-        part = curves.select(range=str(kind))
-        for tuner in part.list_tuners():
-            share = compute_solved_fraction(part.select(tuner=tuner), spread, points)
+        range_curves = curves.select(range=str(kind))
+        for tuner in range_curves.list_tuners():
+            share = compute_solved_fraction(range_curves.select(tuner=tuner), thresholds, points)
             columns = (str(kind), tuner, points, share)
             parts.append(pd.DataFrame(dict(zip(RUNTIME_SHARE_COLUMNS, columns, strict=True))))
     return pd.concat(parts, ignore_index=True)

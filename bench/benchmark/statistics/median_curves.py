@@ -203,11 +203,11 @@ def _group_by_distance(distances: pd.Series[float]) -> dict[int, list[str]]:
 
 
 def _compute_median_with_interval(
-    values: Array, tuner: str, place: int
+    values: Array, tuner: str, group: int
 ) -> tuple[float, float, float]:
     """Return the median of values (n,) with its interval; the interval of one value is NaN."""
     # The stream's name numbers the group inside the training range -1.
-    names = ("distance", tuner, str(place - 1))
+    names = ("distance", tuner, str(group - 1))
     low, high = compute_bootstrap_interval(
         values[:, None], compute_resampled_medians, *names, resamples=_BOOTSTRAP_RESAMPLES
     )

@@ -201,24 +201,24 @@ def find_cheapest_tuners(
         tuner that needs the least time between them. Empty if no tuner reaches the threshold.
     """
     names = [
-        name for name, price in costs_by_tuner.items() if np.isfinite(price.effort.compute_ert())
+        name for name, cost in costs_by_tuner.items() if np.isfinite(cost.effort.compute_ert())
     ]
     if not names:
         return []
-    best = np.argmin(
+    cheapest = np.argmin(
         [
             costs_by_tuner[name].compute_seconds_per_target(SIMULATION_COST_GRID, targets)
             for name in names
         ],
         axis=0,
     )
-    changes = np.flatnonzero(np.diff(best)) + 1
+    changes = np.flatnonzero(np.diff(cheapest)) + 1
     edges = [0, *changes.tolist(), len(SIMULATION_COST_GRID)]
     return [
         (
             float(SIMULATION_COST_GRID[first]),
             float(SIMULATION_COST_GRID[last - 1]),
-            names[best[first]],
+            names[cheapest[first]],
         )
         for first, last in itertools.pairwise(edges)
     ]

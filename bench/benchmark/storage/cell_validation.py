@@ -147,9 +147,9 @@ def parse_json_column(column: ColumnSpec, values: Sequence[Any]) -> pa.Array:
 
     kinds = (int, float) if column.kind is float else (column.kind,)
     for row, value in enumerate(values):
-        none = value is None and column.kind is float  # JSON has no NaN.
+        is_null = value is None and column.kind is float  # JSON has no NaN.
         is_wrong_bool = isinstance(value, bool) and column.kind is not bool
-        if not none and (is_wrong_bool or not isinstance(value, kinds) or _exceeds_int64(value)):
+        if not is_null and (is_wrong_bool or not isinstance(value, kinds) or _exceeds_int64(value)):
             raise CellError(row, column.name, column.expected_text, format_value(value))
     numbers = [np.nan if v is None else v for v in values]
     return pa.array(numbers, type=_get_arrow_type(column))

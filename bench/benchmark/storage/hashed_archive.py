@@ -130,20 +130,22 @@ def unpack_archive(archive: Path) -> Iterator[UnpackedArchive]:
         InputError: It is not an archive of simgap, or unpacking it could be harmful.
     """
     try:
-        with zipfile.ZipFile(archive) as packed, TemporaryDirectory(prefix="simgap-") as place:
+        with zipfile.ZipFile(archive) as packed, TemporaryDirectory(prefix="simgap-") as folder:
             entries = _check_entries(archive, packed)
-            top = _find_top_folder(archive, entries)
-            manifest = _read_manifest(archive, packed, top)
+            top_folder = _find_top_folder(archive, entries)
+            manifest = _read_manifest(archive, packed, top_folder)
             sizes_and_hashes = {}
             for entry in entries:
-                path = Path(place, *PurePosixPath(entry.filename).parts)
+                path = Path(folder, *PurePosixPath(entry.filename).parts)
                 path.parent.mkdir(parents=True, exist_ok=True)
-                sizes_and_hashes[entry.filename.removeprefix(f"{top}/")] = _unpack_file(
+                sizes_and_hashes[entry.filename.removeprefix(f"{top_folder}/")] = _unpack_file(
                     archive, packed, entry, path
                 )
             del sizes_and_hashes[MANIFEST_FILE]
             yield UnpackedArchive(
-                Path(place, top), manifest, list(_compare_with_manifest(manifest, sizes_and_hashes))
+                Path(folder, top_folder),
+                manifest,
+                list(_compare_with_manifest(manifest, sizes_and_hashes)),
             )
     except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, ValueError) as error:
         raise InputError(f"{archive}: expected an archive of simgap bundle; {error}") from None

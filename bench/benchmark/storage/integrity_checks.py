@@ -241,39 +241,43 @@ def check_rows_match_statuses(
     """
     import pandas as pd
 
-    places = pd.Index(statuses["run"]).get_indexer(runs["run"])
-    row_of = runs["row"].to_numpy()
+    status_rows = pd.Index(statuses["run"]).get_indexer(runs["run"])
+    file_rows = runs["row"].to_numpy()
     names = runs["run"]
 
-    def at(i: int, reason: str) -> InputError:
-        return file.make_error(int(row_of[i]), reason)
+    def make_row_error(i: int, reason: str) -> InputError:
+        return file.make_error(int(file_rows[i]), reason)
 
     raise_for_first_bad_row(
-        places < 0, at, lambda i: f"run: expected one of {source}, found {names[i]}"
+        status_rows < 0,
+        make_row_error,
+        lambda i: f"run: expected one of {source}, found {names[i]}",
     )
     is_executed = (statuses["status"] != "skipped").to_numpy()
     raise_for_first_bad_row(
-        ~is_executed[places], at, lambda i: f"run: {names[i]} is skipped by {source}, and has rows"
+        ~is_executed[status_rows],
+        make_row_error,
+        lambda i: f"run: {names[i]} is skipped by {source}, and has rows",
     )
     has_rows = np.zeros(len(statuses), dtype=bool)
-    has_rows[places] = True
+    has_rows[status_rows] = True
     ids = statuses["run"]
     raise_for_first_bad_row(
         is_executed & ~has_rows,
         make_error,
         lambda row: f"run: {ids[row]} has no rows in {file.path.name}",
     )
-    run_statuses, used_counts = statuses.iloc[places].reset_index(drop=True), runs["used"]
+    run_statuses, used_counts = statuses.iloc[status_rows].reset_index(drop=True), runs["used"]
     raise_for_first_bad_row(
         run_statuses["simulations"] != used_counts,
-        lambda i, reason: make_error(int(places[i]), reason),
+        lambda i, reason: make_error(int(status_rows[i]), reason),
         lambda i: (
             f"simulations: expected {used_counts[i]}, the last k of {names[i]} in "
             f"{file.path.name}, found {run_statuses['simulations'][i]}"
         ),
     )
     for name in ("tuner", "simulator", "target", "seed"):
-        check_equal(runs[name], run_statuses[name], name, f"as in {source}", at)
+        check_equal(runs[name], run_statuses[name], name, f"as in {source}", make_row_error)
 
 
 def check_runs(runs: pd.DataFrame, file: RunsTable, experiment: Experiment) -> None:
@@ -330,17 +334,23 @@ def check_segment_statuses(
     """
     import pandas as pd
 
-    places = list(statuses_by_index)
+    plan_indices = list(statuses_by_index)
 
-    def at(row: int | None, problem: str) -> InputError:
-        place = "" if row is None else f", run {places[row]}"
+    def make_status_error(row: int | None, problem: str) -> InputError:
+        place = "" if row is None else f", run {plan_indices[row]}"
         return InputError(f"{path}{place}: {problem}; {remedy}")
 
     statuses = pd.DataFrame(
         [vars(status) for status in statuses_by_index.values()], columns=STATUS_COLUMN_NAMES
     )
-    check_statuses(statuses, experiment, at)
+    check_statuses(statuses, experiment, make_status_error)
     if plan is not None:
-        expected = [plan[place] if place < len(plan) else "none" for place in places]
-        check_equal(statuses["run"], pd.Series(expected, dtype=object), "run", "by plan.txt", at)
+        expected = [plan[place] if place < len(plan) else "none" for place in plan_indices]
+        check_equal(
+            statuses["run"],
+            pd.Series(expected, dtype=object),
+            "run",
+            "by plan.txt",
+            make_status_error,
+        )
     return statuses

@@ -71,9 +71,9 @@ def read_records(path: Path) -> Iterator[tuple[int, RunStatus, pa.Table, int]]:
 
     data, end = path.read_bytes(), 0
     while end + _RECORD_HEADER.size <= len(data):
-        mark, length, checksum = _RECORD_HEADER.unpack_from(data, end)
+        record_mark, length, checksum = _RECORD_HEADER.unpack_from(data, end)
         payload = data[end + _RECORD_HEADER.size : end + _RECORD_HEADER.size + length]
-        if mark != _RECORD_MARK or len(payload) < length or zlib.crc32(payload) != checksum:
+        if record_mark != _RECORD_MARK or len(payload) < length or zlib.crc32(payload) != checksum:
             return
         end += _RECORD_HEADER.size + length
         try:
@@ -81,8 +81,8 @@ def read_records(path: Path) -> Iterator[tuple[int, RunStatus, pa.Table, int]]:
             statuses = _convert_statuses([json.loads(rows.schema.metadata[b"status"])])
         except _DAMAGE_ERRORS as error:
             raise _make_damage_error(path, f"a record of a run: {get_first_line(error)}") from None
-        ((place, status),) = statuses.items()
-        yield place, status, rows.replace_schema_metadata(), end
+        ((plan_index, status),) = statuses.items()
+        yield plan_index, status, rows.replace_schema_metadata(), end
 
 
 def read_part_statuses(path: Path) -> dict[int, RunStatus]:
@@ -136,21 +136,21 @@ def _make_damage_error(path: Path, expected: str) -> InputError:
 
 
 def check_no_duplicate_runs(
-    path: Path, places: Iterable[int], known_places: Container[int]
+    path: Path, plan_indices: Iterable[int], known_places: Container[int]
 ) -> None:
     """Reject runs that another file contains already.
 
     Args:
         path: Path of the file.
-        places: Indices of its runs.
+        plan_indices: Indices of its runs.
         known_places: Indices of the runs in other files.
 
     Raises:
         InputError: A run is in both.
     """
-    if repeated_places := [place for place in places if place in known_places]:
+    if repeated_indices := [place for place in plan_indices if place in known_places]:
         raise _make_damage_error(
-            path, f"every run once, found that of line {repeated_places[0] + 1} of the plan again"
+            path, f"every run once, found that of line {repeated_indices[0] + 1} of the plan again"
         )
 
 

@@ -48,7 +48,7 @@ def check_plan(plan: Sequence[str], experiment: Experiment, path: Path, remedy: 
     """
     import pandas as pd
 
-    def at(row: int | None, problem: str) -> InputError:
+    def make_line_error(row: int | None, problem: str) -> InputError:
         place = "" if row is None else f", line {row + 1}"
         return InputError(f"{path}{place}: {problem}; {remedy}")
 
@@ -56,16 +56,20 @@ def check_plan(plan: Sequence[str], experiment: Experiment, path: Path, remedy: 
     for row, name in enumerate(plan):
         parts = name.rsplit("/", 3)
         if len(parts) != 4 or not _SEED_PATTERN.fullmatch(parts[2]):
-            raise at(row, f"expected TUNER/TARGET/SEED/HASH, found {format_value(name)}")
+            raise make_line_error(
+                row, f"expected TUNER/TARGET/SEED/HASH, found {format_value(name)}"
+            )
         rows.append((name, parts[0], parts[1], int(parts[2])))
     plan_table = pd.DataFrame(rows, columns=["run", "tuner", "target", "seed"])
     names = plan_table["run"]
     raise_for_first_bad_row(
-        names.duplicated(), at, lambda row: f"expected every run once, found {names[row]} twice"
+        names.duplicated(),
+        make_line_error,
+        lambda row: f"expected every run once, found {names[row]} twice",
     )
-    check_known(plan_table["tuner"], list_tuner_labels(experiment), "tuner", at)
-    check_known(plan_table["target"], list_target_names(experiment), "target", at)
-    check_complete(plan_table, experiment, at)
+    check_known(plan_table["tuner"], list_tuner_labels(experiment), "tuner", make_line_error)
+    check_known(plan_table["target"], list_target_names(experiment), "target", make_line_error)
+    check_complete(plan_table, experiment, make_line_error)
 
 
 def check_complete(

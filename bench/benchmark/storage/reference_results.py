@@ -158,15 +158,15 @@ class ReferenceResult:
 def list_reference_names() -> list[str]:
     """List the names of the references of simgap, which are the names of their folders."""
     names = [
-        table.parent.relative_to(place).as_posix()
-        for place in REFERENCE_FOLDERS
-        for table in sorted(place.rglob(_TABLE))
-        if _is_one(table.parent)
+        table.parent.relative_to(folder).as_posix()
+        for folder in REFERENCE_FOLDERS
+        for table in sorted(folder.rglob(_TABLE))
+        if _is_reference_folder(table.parent)
     ]
     return sorted(set(names))
 
 
-def _is_one(folder: Path) -> bool:
+def _is_reference_folder(folder: Path) -> bool:
     """Return whether a folder is a comparison's; a bounce shot has no error curves."""
     if not (folder / CONFIGURATION_FILE).is_file():
         return False

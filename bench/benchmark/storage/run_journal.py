@@ -104,10 +104,10 @@ class RunJournal:
         end = 0
         if path.exists():
             # Appending continues at the last end.
-            for place, status, rows, end in read_records(path):  # noqa: B007
-                check_no_duplicate_runs(path, [place], self.statuses)
-                self._records.append((place, status, rows))
-                self.statuses[place] = status
+            for plan_index, status, rows, end in read_records(path):  # noqa: B007
+                check_no_duplicate_runs(path, [plan_index], self.statuses)
+                self._records.append((plan_index, status, rows))
+                self.statuses[plan_index] = status
         # Unbuffered: what is written must survive a kill of this process.
         file = path.open("r+b" if path.exists() else "w+b", buffering=0)
         # Remove a record that was cut off by a kill, or the next one would follow an incomplete
@@ -165,19 +165,19 @@ class RunJournal:
         import pyarrow as pa
         from pyarrow import compute, parquet
 
-        rows_by_place = {place: rows for place, _, rows in self._records}
-        places = sorted(self.statuses)
+        rows_by_index = {place: rows for place, _, rows in self._records}
+        plan_indices = sorted(self.statuses)
         # In chunks, since all rows of a million runs would not fit in memory.
-        for first in range(0, len(places), runs):
-            chunk = places[first : first + runs]
+        for first in range(0, len(plan_indices), runs):
+            chunk = plan_indices[first : first + runs]
             low, high = chunk[0], chunk[-1]
             parts = [
-                _add_place_column(place, rows_by_place[place])
+                _add_place_column(place, rows_by_index[place])
                 for place in chunk
-                if place in rows_by_place
+                if place in rows_by_index
             ]
-            for path, file_places in self._index.items():
-                if file_places[0] <= high and file_places[-1] >= low:
+            for path, file_indices in self._index.items():
+                if file_indices[0] <= high and file_indices[-1] >= low:
                     is_in_chunk = (compute.field("place") >= low) & (compute.field("place") <= high)
                     parts.append(parquet.read_table(path, filters=is_in_chunk))
             table = pa.concat_tables([part.replace_schema_metadata() for part in parts])

@@ -333,11 +333,14 @@ def expand_columns(
     names = {"PARAMETER": list(parameters), "CHANNEL": list(channels)}
     result = []
     for column in columns:
-        marks = [mark for mark in names if mark in column.name]
-        if not marks:
+        placeholders = [placeholder for placeholder in names if placeholder in column.name]
+        if not placeholders:
             result.append(column)
-        for mark in marks:
-            result += [replace(column, name=column.name.replace(mark, n)) for n in names[mark]]
+        for placeholder in placeholders:
+            result += [
+                replace(column, name=column.name.replace(placeholder, n))
+                for n in names[placeholder]
+            ]
     return result
 
 

@@ -26,18 +26,21 @@ class FlightDynamics:
     """Accelerations of a ball in flight.
 
     Args:
-        world: the true system.
+        true_system: the true system.
         number: index of the run in the recording.
     """
 
-    def __init__(self, world: TrueSystem, number: int) -> None:
+    def __init__(self, true_system: TrueSystem, number: int) -> None:
         """Collect the laws of the hidden causes, and the times between which a gust blows.
 
         `gust` is (acceleration along x, upward acceleration, begin, end) in this run, in m/s^2 and
         s; None without a gust. `breaks` are the times at which the acceleration jumps: the solver
         must not step over them.
         """
-        self.g, self.acting = world.constants["gravity"], {**world.effects, **world.foreign}
+        self.g, self.acting = (
+            true_system.constants["gravity"],
+            {**true_system.effects, **true_system.foreign},
+        )
         self.laws = [
             (ACCELERATION_LAWS[name], c)
             for name, c in self.acting.items()
@@ -119,8 +122,8 @@ def _compute_layer_drag(
 ) -> Acceleration:
     """Compute the acceleration by quadratic drag that acts only above a height, m/s^2.
 
-    This is the unmodelled cause `layer`. The drag fades in over about 0.02 m (`share` rises from 0
-    to 1), because a jump would reduce the order of the solver.
+    This is the unmodelled cause `layer`. The drag fades in over about 0.02 m (`fade_in` rises from
+    0 to 1), because a jump would reduce the order of the solver.
 
     Args:
         c: drag coefficient in 1/m, and height in m.
@@ -133,8 +136,8 @@ def _compute_layer_drag(
         v: velocity along y, m/s.
         w: upward velocity, m/s.
     """
-    share = 0.5 * (1 + tanh((z - c[1]) / 0.02))
-    return _compute_quadratic_drag(c[0] * share, u, v, w, sqrt(u * u + v * v + w * w))
+    fade_in = 0.5 * (1 + tanh((z - c[1]) / 0.02))
+    return _compute_quadratic_drag(c[0] * fade_in, u, v, w, sqrt(u * u + v * v + w * w))
 
 
 ACCELERATION_LAWS: dict[str, Callable[..., Acceleration]] = {
@@ -157,14 +160,16 @@ ACCELERATION_LAWS: dict[str, Callable[..., Acceleration]] = {
 }
 
 
-def simulate_ball(world: TrueSystem, scenario: Scenario, number: int, instants: Array) -> Array:
+def simulate_ball(
+    true_system: TrueSystem, scenario: Scenario, number: int, instants: Array
+) -> Array:
     """Simulate a run: flights between impacts, until the last sample.
 
     Each flight is integrated until the ball meets the ground. The first part of the rise after an
     impact is integrated without looking for the ground, because the ball starts there.
 
     Args:
-        world: the true system.
+        true_system: the true system.
         scenario: the run.
         number: index of the run in the recording.
         instants: increasing times >= 0, (T,).
@@ -172,32 +177,39 @@ def simulate_ball(world: TrueSystem, scenario: Scenario, number: int, instants: 
     Returns:
         Positions and velocities, (T, 6).
     """
-    air, until = FlightDynamics(world, number), float(instants[-1])
+    dynamics, end_time = FlightDynamics(true_system, number), float(instants[-1])
     state = np.array([scenario.initial[name] for name in STATES])
     states = np.empty((instants.size, 6))
     states[instants <= 0] = state
     time, rise_duration, resting = 0.0, 0.0, False
-    while time < until:
-        end = min([until, *(b for b in air.breaks if b > time)], default=until)
+    while time < end_time:
+        end = min([end_time, *(b for b in dynamics.breaks if b > time)], default=end_time)
         has_impact_event = not (rise_duration or resting)
         if rise_duration:  # the ground, where the rise after a bounce begins, is no event
             end = min(end, time + rise_duration)
         solved = _integrate_flight(
-            air, time, end, state, world.constants["radius"] if has_impact_event else None, resting
+            dynamics,
+            time,
+            end,
+            state,
+            true_system.constants["radius"] if has_impact_event else None,
+            resting,
         )
-        reached, state = float(solved.t[-1]), solved.y[:, -1].copy()
-        first, last = np.searchsorted(instants, [time, reached], side="right")
+        time_reached, state = float(solved.t[-1]), solved.y[:, -1].copy()
+        first, last = np.searchsorted(instants, [time, time_reached], side="right")
         if last > first:
             states[first:last] = solved.sol(instants[first:last]).T
-        time, rise_duration = reached, 0.0
+        time, rise_duration = time_reached, 0.0
         if has_impact_event and solved.t_events[0].size:
-            state, resting = _compute_bounce(world, time, state)
-            state[2] = world.constants["radius"]
+            state, resting = _compute_bounce(true_system, time, state)
+            state[2] = true_system.constants["radius"]
             # Seconds of the rise, 0.4 of the time to its top, in which no impact is possible.
             rise_duration = (
                 0.0
                 if resting
-                else 0.4 * state[5] / max(-air.compute_acceleration(time, state, time)[2], 1e-3)
+                else 0.4
+                * state[5]
+                / max(-dynamics.compute_acceleration(time, state, time)[2], 1e-3)
             )
     return states
 
@@ -246,14 +258,14 @@ def _integrate_flight(
     return solved
 
 
-def _compute_bounce(world: TrueSystem, t: float, state: Array) -> tuple[Array, bool]:
+def _compute_bounce(true_system: TrueSystem, t: float, state: Array) -> tuple[Array, bool]:
     """Compute the state after an impact on the ground.
 
     Restitution reverses the vertical velocity, and contact friction slows the horizontal one by at
     most the friction coefficient times the vertical impulse, (1 + e) times the impact speed.
 
     Args:
-        world: the true system.
+        true_system: the true system.
         t: time of the impact, s.
         state: position and velocity before the impact, (6,).
 
@@ -261,13 +273,13 @@ def _compute_bounce(world: TrueSystem, t: float, state: Array) -> tuple[Array, b
         The state after it (6,), and whether the ball stays at rest because the rebound is slower
         than `REST_SPEED`.
     """
-    speed, e = -state[5], world.parameters["restitution"]
-    if "restitution.speed" in world.effects:
-        e = min(e * speed ** world.effects["restitution.speed"][0], 1.0)
-    if "wear" in world.foreign:  # unmodelled: restitution that decreases with time
-        e = min(max(e * (1.0 - world.foreign["wear"][0] * t), 0.0), 1.0)
+    speed, e = -state[5], true_system.parameters["restitution"]
+    if "restitution.speed" in true_system.effects:
+        e = min(e * speed ** true_system.effects["restitution.speed"][0], 1.0)
+    if "wear" in true_system.foreign:  # unmodelled: restitution that decreases with time
+        e = min(max(e * (1.0 - true_system.foreign["wear"][0] * t), 0.0), 1.0)
     tangential_speed = hypot(state[3], state[4])
-    speed_loss = world.effects.get("contact.friction", [0.0])[0] * (1 + e) * speed
+    speed_loss = true_system.effects.get("contact.friction", [0.0])[0] * (1 + e) * speed
     rebound_state = state.copy()
     rebound_state[3:5] *= (
         max(1.0 - speed_loss / tangential_speed, 0.0) if tangential_speed > 0 else 1.0

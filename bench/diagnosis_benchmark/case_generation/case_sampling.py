@@ -132,7 +132,7 @@ def draw_case(
     rng = make_case_rng(name, "cause")
     hidden = _choose_hidden_causes(kind, system, effect, rng)
     setting = _draw_conditions(name, system, hidden, requested)
-    item = BenchmarkCase(
+    case = BenchmarkCase(
         name, system, kind, {}, 0.0, setting.noise.kind, setting.noise.stated, setting.rate,
         setting.seconds,
         len(setting.scenarios), str(rng.choice(["scipy", "mujoco"])), setting.is_driven,
@@ -145,19 +145,19 @@ def draw_case(
     # The effect must be observable in the runs for fitting, because the held-out runs are not
     # fitted.
     fitted_setting = replace(
-        setting, scenarios=setting.scenarios[: item.runs - count_held_out_runs(item)]
+        setting, scenarios=setting.scenarios[: case.runs - count_held_out_runs(case)]
     )
     return {
         "clean": _draw_clean,
         "single": _draw_single,
         "double": _draw_pair,
         "foreign": _draw_unmodelled,
-    }[kind](item, fitted_setting, hidden, target_size, rng)
+    }[kind](case, fitted_setting, hidden, target_size, rng)
 
 
-def count_held_out_runs(item: BenchmarkCase) -> int:
+def count_held_out_runs(case: BenchmarkCase) -> int:
     """Return the number of held-out runs; they are the last runs of the recording."""
-    return max(1, item.runs // 3)
+    return max(1, case.runs // 3)
 
 
 @lru_cache(maxsize=16)
@@ -168,9 +168,9 @@ def _draw_conditions(
     return draw_conditions(system, make_case_rng(name, "setting"), hidden, requested=requested)
 
 
-def restore_conditions(item: BenchmarkCase) -> RecordingConditions:
+def restore_conditions(case: BenchmarkCase) -> RecordingConditions:
     """Restore the recording conditions of a case from its name; a case stores no runs."""
-    return _draw_conditions(item.name, item.system, tuple(item.effects), item.asked)
+    return _draw_conditions(case.name, case.system, tuple(case.effects), case.asked)
 
 
 def _choose_hidden_causes(
@@ -205,7 +205,7 @@ def _choose_hidden_causes(
 
 
 def _draw_clean(
-    item: BenchmarkCase,
+    case: BenchmarkCase,
     setting: RecordingConditions,
     hidden: tuple[str, ...],
     target_size: float,
@@ -216,11 +216,11 @@ def _draw_clean(
     The parameters are those of the functions for the other kinds of cases, among which `draw_case`
     chooses.
     """
-    return item
+    return case
 
 
 def _draw_single(
-    item: BenchmarkCase,
+    case: BenchmarkCase,
     setting: RecordingConditions,
     hidden: tuple[str, ...],
     target_size: float,
@@ -233,7 +233,7 @@ def _draw_single(
     the simpler form would be a correct answer.
 
     Args:
-        item: the case without its hidden cause.
+        case: the case without its hidden cause.
         setting: recording conditions with the runs for fitting only.
         hidden: the name of the effect.
         target_size: size in units of the noise.
@@ -255,7 +255,7 @@ def _draw_single(
         )
         if unexplained < MIN_SIMPLER_RESIDUAL:
             return None
-    return replace(item, effects={name: c}, size=target_size, beyond=unexplained)
+    return replace(case, effects={name: c}, size=target_size, beyond=unexplained)
 
 
 def find_coefficients(
@@ -286,7 +286,7 @@ def find_coefficients(
 
 
 def _draw_pair(
-    item: BenchmarkCase,
+    case: BenchmarkCase,
     setting: RecordingConditions,
     hidden: tuple[str, ...],
     target_size: float,
@@ -298,7 +298,7 @@ def _draw_pair(
     (`unexplained`) must be at least `MIN_DISTINCT_SIZE`.
 
     Args:
-        item: the case without its hidden causes.
+        case: the case without its hidden causes.
         setting: recording conditions with the runs for fitting only.
         hidden: the two names.
         target_size: size of each effect alone, in units of the noise.
@@ -323,7 +323,7 @@ def _draw_pair(
         for name in effects
     )
     return (
-        replace(item, effects=effects, size=target_size, beyond=unexplained)
+        replace(case, effects=effects, size=target_size, beyond=unexplained)
         if unexplained >= MIN_DISTINCT_SIZE
         else None
     )
@@ -335,7 +335,7 @@ def _order_input_effects(effects: dict[str, tuple[float, ...]]) -> dict[str, tup
 
 
 def _draw_unmodelled(
-    item: BenchmarkCase,
+    case: BenchmarkCase,
     setting: RecordingConditions,
     hidden: tuple[str, ...],
     target_size: float,
@@ -347,7 +347,7 @@ def _draw_unmodelled(
     `MIN_DISTINCT_SIZE`: that effect would then be a correct answer.
 
     Args:
-        item: the case without its hidden cause.
+        case: the case without its hidden cause.
         setting: recording conditions with the runs for fitting only.
         hidden: the name of the cause.
         target_size: size in units of the noise.
@@ -364,10 +364,10 @@ def _draw_unmodelled(
 
         The batch engine cannot be used here, because it does not know unmodelled causes.
         """
-        world = setting.make_true_system(foreign={name: compute_coefficients(strength)})
+        true_system = setting.make_true_system(foreign={name: compute_coefficients(strength)})
         return np.array(
             [
-                simulate_with_scipy(world, s, setting.channels, i)
+                simulate_with_scipy(true_system, s, setting.channels, i)
                 for i, s in enumerate(setting.scenarios)
             ]
         )
@@ -381,7 +381,7 @@ def _draw_unmodelled(
         return None
     _, unexplained = competing_effects.find_best_effect(setting, observed(strength))
     hidden_case = replace(
-        item,
+        case,
         effects={name: compute_coefficients(strength)},
         size=target_size,
         beyond=unexplained,
@@ -390,31 +390,31 @@ def _draw_unmodelled(
     return hidden_case if unexplained >= MIN_DISTINCT_SIZE else None
 
 
-def write_case(item: BenchmarkCase, folder: str | Path, truth: bool = True) -> Path:
+def write_case(case: BenchmarkCase, folder: str | Path, truth: bool = True) -> Path:
     """Write the recording of a case as NAME.csv and NAME.toml.
 
     Args:
-        item: the case.
+        case: the case.
         folder: folder for the files.
         truth: whether to write NAME.truth.json too.
 
     Returns:
         Path of the CSV file.
     """
-    setting = restore_conditions(item)
-    runs = _simulate_runs(item, setting)
-    system = SIMULATORS[item.system].system
-    noise = setting.noise.sigma if item.stated else {}
-    constants = {} if item.system == "slider" else setting.constants
-    path = Path(folder) / f"{item.name}.csv"
+    setting = restore_conditions(case)
+    runs = _simulate_runs(case, setting)
+    system = SIMULATORS[case.system].system
+    noise = setting.noise.sigma if case.stated else {}
+    constants = {} if case.system == "slider" else setting.constants
+    path = Path(folder) / f"{case.name}.csv"
     other_files = (
-        {path.with_suffix(".truth.json"): json.dumps(item.to_json(), indent=1) + "\n"}
+        {path.with_suffix(".truth.json"): json.dumps(case.to_json(), indent=1) + "\n"}
         if truth
         else {}
     )
     write_recording(
         path,
-        Recording(path, item.system, "", constants, noise, runs),
+        Recording(path, case.system, "", constants, noise, runs),
         system,
         digits=9,
         beside=other_files,
@@ -422,23 +422,23 @@ def write_case(item: BenchmarkCase, folder: str | Path, truth: bool = True) -> P
     return path
 
 
-def _simulate_runs(item: BenchmarkCase, setting: RecordingConditions) -> tuple[Run, ...]:
+def _simulate_runs(case: BenchmarkCase, setting: RecordingConditions) -> tuple[Run, ...]:
     """Simulate every run of a case, add sensor noise, and mark the last runs as held out.
 
     Args:
-        item: the case; it states the simulator of the recording (`source`).
+        case: the case; it states the simulator of the recording (`source`).
         setting: its recording conditions, with all runs.
     """
-    rng, held_out = make_case_rng(item.name, "noise"), count_held_out_runs(item)
-    hidden = {"foreign": item.effects} if item.kind == "foreign" else {"effects": item.effects}
-    world, runs = setting.make_true_system(**hidden), []
+    rng, held_out = make_case_rng(case.name, "noise"), count_held_out_runs(case)
+    hidden = {"foreign": case.effects} if case.kind == "foreign" else {"effects": case.effects}
+    true_system, runs = setting.make_true_system(**hidden), []
     for number, scenario in enumerate(setting.scenarios):
-        if item.source == "mujoco":
-            observed = simulate_with_mujoco(world, scenario, setting.channels)
+        if case.source == "mujoco":
+            observed = simulate_with_mujoco(true_system, scenario, setting.channels)
         else:
-            observed = simulate_with_scipy(world, scenario, setting.channels, number)
+            observed = simulate_with_scipy(true_system, scenario, setting.channels, number)
         recorded = setting.noise.add_to(observed, rng)
         channels = dict(zip(setting.channels, recorded.T, strict=True))
-        last = number >= item.runs - held_out
+        last = number >= case.runs - held_out
         runs.append(Run(str(number), scenario.times, channels, scenario.inputs, {}, {}, last))
     return tuple(runs)

@@ -129,10 +129,10 @@ def _iterate_stop_starts(
     low, high = float(path.min()), float(path.max())
     # Scale of the stiffness, N m/rad for a pendulum and N/m for a slider.
     max_stiffness = 20.0 if setting.system == "pendulum" else 5000.0
-    for share, part in product((0.03, 0.15), (0.001, 0.01, 0.1)):
-        inset = share * (high - low)
-        yield part * max_stiffness, high - inset, 0.05
-        yield -part * max_stiffness, low + inset, 0.05
+    for inset_share, stiffness_share in product((0.03, 0.15), (0.001, 0.01, 0.1)):
+        inset = inset_share * (high - low)
+        yield stiffness_share * max_stiffness, high - inset, 0.05
+        yield -stiffness_share * max_stiffness, low + inset, 0.05
 
 
 def _compute_residual(

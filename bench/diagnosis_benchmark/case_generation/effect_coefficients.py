@@ -436,14 +436,14 @@ def _draw_end_stop(
         damping.
     """
     side, share_beyond = float(rng.choice([-1, 1])), float(rng.uniform(0.05, 0.2))
-    place = float(
+    stop_position = float(
         np.quantile(
             np.concatenate(_simulate_base_motion(setting)),
             1 - share_beyond if side > 0 else share_beyond,
         )
     )
     loss = float(rng.uniform(0.0, 0.4)) / (5.0 if setting.system == "pendulum" else 1.0)
-    return lambda s: (side * coefficient_scale * s, place, loss)
+    return lambda s: (side * coefficient_scale * s, stop_position, loss)
 
 
 SHAPE_SAMPLERS: dict[str, Callable[..., CoefficientFunction]] = {

@@ -293,6 +293,6 @@ def _choose_next_strength(
         return low[0] * min(target_size / max(low[1], 1e-9), MAX_STRENGTH_FACTOR)
     if not np.isfinite(high[1]) or high[0] / low[0] > MAX_STRENGTH_FACTOR**2:
         return float(np.sqrt(low[0] * high[0]))
-    share = float(np.log(target_size / low[1]) / np.log(high[1] / low[1]))
-    part = min(max(share, 0.05), 0.95)
-    return float(low[0] * (high[0] / low[0]) ** part)
+    log_position = float(np.log(target_size / low[1]) / np.log(high[1] / low[1]))
+    limited_position = min(max(log_position, 0.05), 0.95)
+    return float(low[0] * (high[0] / low[0]) ** limited_position)

@@ -69,22 +69,22 @@ class InputSegment:
 
 
 def compute_applied_input(
-    scenario: Scenario, effects: EffectCoefficients, until: float
+    scenario: Scenario, effects: EffectCoefficients, end_time: float
 ) -> list[InputSegment]:
-    """Compute the first input as applied to the plant, from time 0 to `until`.
+    """Compute the first input as applied to the plant, from time 0 to `end_time`.
 
     A lag must follow the nonlinear input effects.
 
     Args:
         scenario: the run.
         effects: the hidden effects.
-        until: end time.
+        end_time: end time.
 
     Raises:
         NotImplementedError: a nonlinear input effect follows a lag.
     """
     if "u" not in scenario.inputs:
-        return [InputSegment(0.0, until, 0.0, effects.get("input.bias", [0.0])[0], 0.0)]
+        return [InputSegment(0.0, end_time, 0.0, effects.get("input.bias", [0.0])[0], 0.0)]
     levels, edges, lag = np.array(scenario.inputs["u"]), scenario.times - scenario.times[0], 0.0
     if "input.hold" in effects:
         levels, edges = _interpolate_input(levels, edges, effects["input.hold"][0])
@@ -103,9 +103,11 @@ def compute_applied_input(
     starts, targets = [0.0, *edges[changes]], [levels[0], *levels[changes]]
     segments, state = [], levels[0]
     for start, end, target in zip(starts, [*starts[1:], inf], targets, strict=True):
-        if start < until:
+        if start < end_time:
             segments.append(
-                InputSegment(float(start), float(min(end, until)), float(state), float(target), lag)
+                InputSegment(
+                    float(start), float(min(end, end_time)), float(state), float(target), lag
+                )
             )
             state = segments[-1].evaluate(segments[-1].end)
     return segments
@@ -197,7 +199,7 @@ class JointDynamics:
         behind: hidden-state effects: driven loads and hysteresis.
     """
 
-    def __init__(self, world: TrueSystem, number: int) -> None:
+    def __init__(self, true_system: TrueSystem, number: int) -> None:
         """Collect the laws of the system and of its hidden causes, for one run.
 
         Further attributes are `sideways`, the generalised force of a unit horizontal acceleration;
@@ -206,14 +208,14 @@ class JointDynamics:
         coordinate rests. The inertia of driven loads is subtracted from that of the drive side.
 
         Args:
-            world: the true system.
+            true_system: the true system.
             number: index of the run in the recording.
         """
-        k, p = world.constants, world.parameters
+        k, p = true_system.constants, true_system.parameters
         self.weight: GravityForce
         self.sideways: GravityForce
         self.latched = number % 2 == 0
-        if world.system == "pendulum":
+        if true_system.system == "pendulum":
             arm = k["mass"] * k["length"]
             self.inertia, gravity = p["inertia"], k["gravity"]
             self.weight = lambda x: -arm * gravity * sin(x)
@@ -223,7 +225,7 @@ class JointDynamics:
             self.weight = lambda x: 0.0
             self.sideways = lambda x: self.inertia
         self.gravity = gravity
-        active_effects = {**world.effects, **world.foreign}
+        active_effects = {**true_system.effects, **true_system.foreign}
         self.forces = [
             FORCE_EFFECTS[name](self, list(c))
             for name, c in active_effects.items()
@@ -415,14 +417,14 @@ class BacklashReferenceLoad(ReferenceLoad):
 
             (1 - share) (k^2 d + 4 k w d / (d + gap / 100)), but never a pull.
         """
-        over = abs(x - y) - self.gap / 2
-        if over <= 0:
+        excess = abs(x - y) - self.gap / 2
+        if excess <= 0:
             return 0.0
         # 22500 = k^2 and 600 = 4 k; at the depth gap / 100, half of the damping acts.
         side = copysign(1.0, x - y)
-        damped = 600 * (v - w) * over / (over + self.gap / 100)
-        push = side * (1 - self.share) * (22500 * side * over + damped)
-        return side * max(push, 0.0)
+        damping_term = 600 * (v - w) * excess / (excess + self.gap / 100)
+        contact_acceleration = side * (1 - self.share) * (22500 * side * excess + damping_term)
+        return side * max(contact_acceleration, 0.0)
 
 
 class DahlReferenceFriction:
@@ -540,7 +542,7 @@ def compute_transmitted_force(drive: float, against: float) -> float:
 
 
 def compute_end_stop_force(
-    x: float, v: float, stiffness: float, place: float, loss: float
+    x: float, v: float, stiffness: float, position: float, loss: float
 ) -> float:
     """Compute the magnitude of the force of an end stop, by Hertz's contact law.
 
@@ -549,14 +551,14 @@ def compute_end_stop_force(
         v: velocity.
         stiffness: force at a depth of 0.01, divided by that depth; its sign is the side of the
             stop.
-        place: position of the stop.
+        position: position of the stop.
         loss: damping, as a factor of the approach velocity.
     """
     # 0.1 is the root of the depth 0.01, so that the force there is stiffness times depth.
     side = copysign(1.0, stiffness)
-    depth = max(side * (x - place), 0.0)
-    push: float = depth**1.5
-    return abs(stiffness) * push / 0.1 * max(1.0 + loss * side * v, 0.0)
+    depth = max(side * (x - position), 0.0)
+    depth_power: float = depth**1.5
+    return abs(stiffness) * depth_power / 0.1 * max(1.0 + loss * side * v, 0.0)
 
 
 def compute_region_indicator(x: float, centre: float, half: float) -> float:
@@ -575,11 +577,13 @@ def compute_region_indicator(x: float, centre: float, half: float) -> float:
     )
 
 
-def simulate_joint(world: TrueSystem, scenario: Scenario, number: int, instants: Array) -> Array:
+def simulate_joint(
+    true_system: TrueSystem, scenario: Scenario, number: int, instants: Array
+) -> Array:
     """Simulate a run.
 
     Args:
-        world: the true system.
+        true_system: the true system.
         scenario: the run.
         number: index of the run in the recording.
         instants: increasing times >= 0, (T,).
@@ -587,20 +591,20 @@ def simulate_joint(world: TrueSystem, scenario: Scenario, number: int, instants:
     Returns:
         Positions and velocities, (T, 2).
     """
-    joint, until = JointDynamics(world, number), float(instants[-1])
-    names = ("q", "qd") if world.system == "pendulum" else ("x", "v")
+    joint, end_time = JointDynamics(true_system, number), float(instants[-1])
+    names = ("q", "qd") if true_system.system == "pendulum" else ("x", "v")
     state = np.array([scenario.initial[name] for name in names])
-    hidden = [value for part in joint.behind for value in part.get_initial_state(*state)]
+    hidden = [value for load in joint.behind for value in load.get_initial_state(*state)]
     state = np.concatenate([state, hidden])
     states = np.empty((instants.size, 2))
     states[instants <= 0] = state[:2]
-    for segment in compute_applied_input(scenario, world.effects, until):
-        marks = [
+    for segment in compute_applied_input(scenario, true_system.effects, end_time):
+        boundaries = [
             segment.begin,
             *(b for b in sorted(joint.breaks) if segment.begin < b < segment.end),
             segment.end,
         ]
-        for start, end in pairwise(marks):
+        for start, end in pairwise(boundaries):
             joint.set_input_segment(segment.slice(start, end))
             state = _integrate_segment(joint, state, instants, states)
     return states
@@ -622,11 +626,11 @@ def _integrate_segment(joint: JointDynamics, state: Array, instants: Array, stat
     for _ in range(10_000):
         if time >= end:
             return state
-        reached, end_state, solution = _integrate_until_stop(joint, time, state)
-        first, last = np.searchsorted(instants, [time, reached], side="right")
+        time_reached, end_state, solution = _integrate_until_stop(joint, time, state)
+        first, last = np.searchsorted(instants, [time, time_reached], side="right")
         if last > first:
             states[first:last] = solution(instants[first:last]).T[:, :2] if solution else state[:2]
-        time, state = reached, end_state
+        time, state = time_reached, end_state
     raise RuntimeError("no solution: the joint stops too often")
 
 
@@ -658,7 +662,7 @@ def _integrate_until_stop(joint: JointDynamics, start: float, state: Array) -> S
             )
         direction = copysign(1.0, force)
 
-    def rate(t: float, y: Array) -> list[float]:
+    def compute_derivatives(t: float, y: Array) -> list[float]:
         """Return the time derivatives of position, velocity and hidden states.
 
         Dry friction is `dry_friction`, with the fixed sign `direction` of the motion, so that the
@@ -671,22 +675,22 @@ def _integrate_until_stop(joint: JointDynamics, start: float, state: Array) -> S
             *joint.compute_hidden_rates(*y),
         ]
 
-    def turns(t: float, y: Array) -> float:
+    def compute_directed_velocity(t: float, y: Array) -> float:
         return float(direction * y[1])
 
-    stop_event: Any = turns
+    stop_event: Any = compute_directed_velocity
     stop_event.terminal, stop_event.direction = True, -1
-    events, first = (
+    events, first_step = (
         (stop_event, min(0.01, end - start)) if joint.limits else (None, min(0.02, end - start))
     )
     settings: dict[str, Any] = {
         "dense_output": True,
         "max_step": 0.05,
-        "first_step": first,
+        "first_step": first_step,
         **SOLVER_TOLERANCES,
     }
     method: Any = "RK45" if end - start < INTERPOLATION_INTERVAL else "DOP853"
-    solved = solve_ivp(rate, (start, end), state, method, events=events, **settings)
+    solved = solve_ivp(compute_derivatives, (start, end), state, method, events=events, **settings)
     if not solved.success:
         raise RuntimeError(solved.message)
     end_state = solved.y[:, -1].copy()

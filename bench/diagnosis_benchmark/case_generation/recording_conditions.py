@@ -334,11 +334,11 @@ def draw_input_signal(
     """
     if form == "steps":
         level_duration = rng.uniform(0.25, 1.0)
-        place = np.floor(times / level_duration).astype(int)
-        levels: Array = rng.uniform(-1.0, 1.0, place[-1] + 1)[place]
+        level_index = np.floor(times / level_duration).astype(int)
+        levels: Array = rng.uniform(-1.0, 1.0, level_index[-1] + 1)[level_index]
         return levels
-    bottom, top = np.log(hertz)
-    low, high = np.sort(np.exp(rng.uniform(bottom, top, 2)))
+    log_low, log_high = np.log(hertz)
+    low, high = np.sort(np.exp(rng.uniform(log_low, log_high, 2)))
     cycles = (
         low * times if form == "sine" else low * times + (high - low) * times**2 / (2 * times[-1])
     )

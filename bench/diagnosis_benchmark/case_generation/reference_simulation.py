@@ -72,12 +72,12 @@ def get_constants(system: str, **changed: float) -> dict[str, float]:
 
 
 def simulate_with_scipy(
-    world: TrueSystem, scenario: Scenario, channels: Sequence[str], number: int = 0
+    true_system: TrueSystem, scenario: Scenario, channels: Sequence[str], number: int = 0
 ) -> Array:
     """Simulate a run with scipy and return noise-free sensor readings.
 
     Args:
-        world: the true system.
+        true_system: the true system.
         scenario: the run.
         channels: names of the C channels.
         number: index of the run in the recording.
@@ -87,7 +87,7 @@ def simulate_with_scipy(
     """
     times = scenario.times - scenario.times[0]
     instants = times
-    for name, c in world.effects.items():
+    for name, c in true_system.effects.items():
         if name == "sensor.delay":
             instants = instants - c[0]
         elif name == "clock.skew":
@@ -95,53 +95,59 @@ def simulate_with_scipy(
     instants = np.maximum.accumulate(np.maximum(instants, 0.0))
     grid, rows = (
         _refine_time_grid(instants)
-        if "sensor.lag" in world.effects
+        if "sensor.lag" in true_system.effects
         else (instants, np.arange(instants.size))
     )
-    move = (
-        ball_reference.simulate_ball if world.system == "ball" else joint_reference.simulate_joint
+    simulate_motion = (
+        ball_reference.simulate_ball
+        if true_system.system == "ball"
+        else joint_reference.simulate_joint
     )
-    states = move(world, scenario, number, grid)
-    observed = states[:, [CHANNELS[world.system].index(name) for name in channels]]
-    reads = _get_read_column(world.system, channels)
-    for name, c in world.effects.items():
+    states = simulate_motion(true_system, scenario, number, grid)
+    observed = states[:, [CHANNELS[true_system.system].index(name) for name in channels]]
+    read_column = _get_read_column(true_system.system, channels)
+    for name, c in true_system.effects.items():
         if name == "sensor.gain":
-            observed[:, reads] *= 1 + c[0]
+            observed[:, read_column] *= 1 + c[0]
         elif name == "sensor.bias":
-            observed[:, reads] += c[0]
+            observed[:, read_column] += c[0]
         elif name == "sensor.drift":
-            observed[:, reads] += c[0] * grid
+            observed[:, read_column] += c[0] * grid
         elif name == "sensor.eccentricity":
-            angle = observed[:, reads].copy()
-            observed[:, reads] += c[0] * np.sin(angle) + c[1] * np.cos(angle)
+            angle = observed[:, read_column].copy()
+            observed[:, read_column] += c[0] * np.sin(angle) + c[1] * np.cos(angle)
         elif name == "sensor.slip":
-            observed[:, reads] += np.where(scenario.times[0] + grid >= c[1], c[0], 0.0)
+            observed[:, read_column] += np.where(scenario.times[0] + grid >= c[1], c[0], 0.0)
         elif name == "sensor.lag":
             observed = _apply_lag(observed, grid, c[0])
     return observed[rows]
 
 
-def simulate_with_mujoco(world: TrueSystem, scenario: Scenario, channels: Sequence[str]) -> Array:
+def simulate_with_mujoco(
+    true_system: TrueSystem, scenario: Scenario, channels: Sequence[str]
+) -> Array:
     """Simulate a run with MuJoCo, without unmodelled causes, and return noise-free sensor readings.
 
     Hidden-state effects move more than one coordinate, so they are simulated by the batch engine,
     with a step of 2.5 ms.
 
     Args:
-        world: the true system.
+        true_system: the true system.
         scenario: the run.
         channels: names of the C channels.
 
     Returns:
         Readings, (T, C).
     """
-    assert not world.foreign
-    has_hidden_states = any(library.get_effect(name).hook == "hidden" for name in world.effects)
+    assert not true_system.foreign
+    has_hidden_states = any(
+        library.get_effect(name).hook == "hidden" for name in true_system.effects
+    )
     engine, step = ("batch", 2.5e-3) if has_hidden_states else ("mujoco", MUJOCO_STEP_SECONDS)
-    effects = {name: list(c) for name, c in world.effects.items()}
-    kind = SIMULATORS[world.system]
-    simulator = kind(world.constants, channels, engine=engine, fixed=effects, time_step=step)
-    theta = np.array([[world.parameters[p.name] for p in kind.system.parameters]])
+    effects = {name: list(c) for name, c in true_system.effects.items()}
+    kind = SIMULATORS[true_system.system]
+    simulator = kind(true_system.constants, channels, engine=engine, fixed=effects, time_step=step)
+    theta = np.array([[true_system.parameters[p.name] for p in kind.system.parameters]])
     try:
         observed: Array = simulator.simulate(theta, scenario)[0]
         return observed

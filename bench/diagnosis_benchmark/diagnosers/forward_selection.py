@@ -281,9 +281,9 @@ def _add_refit(evidence: RegressionEvidence, fit: TrajectoryFit) -> RefittedMode
         evidence: the recording and its noise.
         fit: a fitted model. A fit that diverged gets an infinite sum of squares.
     """
-    residual = (evidence.world.observed - fit.simulated) / evidence.noise.sigma
+    residual = (evidence.evaluator.observed - fit.simulated) / evidence.noise.sigma
     squares = float(np.square(residual[evidence.observed_mask]).sum())
-    numbers = fit.free_indices.size + int((~evidence.world.known_state_mask).sum())
+    numbers = fit.free_indices.size + int((~evidence.evaluator.known_state_mask).sum())
     return RefittedModel(fit, squares if np.isfinite(squares) else np.inf, numbers)
 
 
@@ -302,10 +302,10 @@ def _refit_with_one_more_effect(
     Returns:
         The best fit for each effect.
     """
-    world = evidence.world
-    names = [name for name in world.library if name not in current_fit.effects]
+    evaluator = evidence.evaluator
+    names = [name for name in evaluator.library if name not in current_fit.effects]
     evidence = _replace_base_model(evidence, current_fit)
-    directions = compute_directions(world, current_fit, names)
+    directions = compute_directions(evaluator, current_fit, names)
     # The cached property; its value for the base model would include the effects of the model.
     evidence.__dict__["sensitivity_directions"] = directions
     residual, effects = evidence.build_trajectory_regression().project_out_base()
@@ -318,7 +318,7 @@ def _refit_with_one_more_effect(
     ]
     if not starts:
         return []
-    fits = TrajectoryFitter(world, evidence.noise, evidence.base.fixed_parameters).fit_models(
+    fits = TrajectoryFitter(evaluator, evidence.noise, evidence.base.fixed_parameters).fit_models(
         starts, MAX_FIT_ITERATIONS, race=True
     )
     by_name: dict[str, TrajectoryFit] = {}
@@ -338,7 +338,7 @@ def _replace_base_model(
     copied, because they belong to the old model.
     """
     copied = object.__new__(RegressionEvidence)
-    copied_attributes = ("world", "noise", "stated", "base", "fitted", "held_out")
+    copied_attributes = ("evaluator", "noise", "stated", "base", "fitted", "held_out")
     copied.__dict__.update({name: evidence.__dict__[name] for name in copied_attributes})
     copied.base = type(evidence.base)(
         current_fit, evidence.base.insensitive_parameters, evidence.base.unidentified_parameters
@@ -367,18 +367,20 @@ def _choose_starts(
         residual: residual after parameters and initial states are projected out, (N,).
         effects: columns of all directions after this projection, (N, K).
     """
-    world = evidence.world
-    probes = [evidence.sensitivity_directions.candidates[place] for place in column.places]
-    bounds = compute_coefficient_bounds(world, name)
+    evaluator = evidence.evaluator
+    probes = [evidence.sensitivity_directions.candidates[index] for index in column.places]
+    bounds = compute_coefficient_bounds(evaluator, name)
     sizes = np.linalg.lstsq(effects[:, list(column.places)], residual, rcond=1e-9)[0]
     starts = []
-    for share in (1.0,) if probes[0].is_single_size else (1.0, 0.3):
+    for factor in (1.0,) if probes[0].is_single_size else (1.0, 0.3):
         c = probes[0].coefficients.copy()
         for probe, size in zip(probes, sizes.tolist(), strict=True):
             if not probe.is_single_size:
-                c[probe.coefficient_index] = np.clip(share * size, *bounds[probe.coefficient_index])
+                c[probe.coefficient_index] = np.clip(
+                    factor * size, *bounds[probe.coefficient_index]
+                )
         theta = current_fit.theta.copy()
-        theta[world.coefficient_slices[name]] = c
+        theta[evaluator.coefficient_slices[name]] = c
         starts.append(FitStart((*current_fit.effects, name), theta, current_fit.initial_states))
     return starts
 
@@ -395,20 +397,23 @@ def _compute_intervals(
         evidence: the recording and its noise.
         model: the fitted model.
     """
-    world, fit = evidence.world, model.fit
-    columns = compute_base_jacobian(world, fit) / evidence.noise.sigma[:, None]
-    rows = columns[evidence.observed_mask]
-    rows = rows[np.isfinite(rows).all(axis=1)]
-    scale = np.sqrt(np.square(rows).sum(axis=0))
+    evaluator, fit = evidence.evaluator, model.fit
+    columns = compute_base_jacobian(evaluator, fit) / evidence.noise.sigma[:, None]
+    whitened_rows = columns[evidence.observed_mask]
+    whitened_rows = whitened_rows[np.isfinite(whitened_rows).all(axis=1)]
+    scale = np.sqrt(np.square(whitened_rows).sum(axis=0))
     scale[scale == 0] = 1.0
-    inverse = np.linalg.pinv((rows / scale).T @ (rows / scale), rcond=1e-12)
-    spread = np.sqrt(np.abs(np.diag(inverse))) / scale
-    residual_variance = model.squares / max(len(rows) - model.numbers, 1)
-    spread = spread * np.sqrt(max(residual_variance, 1e-12))
+    inverse = np.linalg.pinv((whitened_rows / scale).T @ (whitened_rows / scale), rcond=1e-12)
+    standard_errors = np.sqrt(np.abs(np.diag(inverse))) / scale
+    residual_variance = model.squares / max(len(whitened_rows) - model.numbers, 1)
+    standard_errors = standard_errors * np.sqrt(max(residual_variance, 1e-12))
     intervals: dict[str, tuple[float | None, float | None]] = {}
-    for i, place in enumerate(fit.free_indices.tolist()):
-        value, half_width = float(fit.theta[place]), Z95 * float(spread[i])
-        intervals[world.parameters[place].name] = value - half_width, value + half_width
+    for i, parameter_index in enumerate(fit.free_indices.tolist()):
+        value, half_width = float(fit.theta[parameter_index]), Z95 * float(standard_errors[i])
+        intervals[evaluator.parameters[parameter_index].name] = (
+            value - half_width,
+            value + half_width,
+        )
     return intervals
 
 

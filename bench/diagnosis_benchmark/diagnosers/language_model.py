@@ -65,7 +65,7 @@ def summarise_case(case: DiagnosisCase) -> dict[str, Any]:
     """
     evidence = RegressionEvidence(case)
     try:
-        names = list(evidence.world.channels)
+        names = list(evidence.evaluator.channels)
         sigma = dict(zip(names, map(float, evidence.noise.sigma), strict=True))
         residual = evidence.residual / np.asarray(evidence.noise.sigma)
         runs = [*case.recording.training(), *case.recording.held_out()]

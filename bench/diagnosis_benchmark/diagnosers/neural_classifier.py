@@ -199,7 +199,7 @@ def _draw_coefficients(training_task: DiagnoserTrainingTask, name: str) -> tuple
     """
     rng = training_task.rng
     values = []
-    for place, parameter in enumerate(
+    for index, parameter in enumerate(
         make_effect_parameters(training_task.library[name], training_task.kind.system)
     ):
         low, high = parameter.bounds
@@ -207,7 +207,7 @@ def _draw_coefficients(training_task: DiagnoserTrainingTask, name: str) -> tuple
             values.append(float(np.exp(rng.uniform(np.log(low), np.log(high)))))
             continue
         # The first coefficient scales the effect and may be small; the others only modify it.
-        share = 10 ** rng.uniform(-2.5, 0.0) if place == 0 else rng.uniform(0.1, 1.0)
+        share = 10 ** rng.uniform(-2.5, 0.0) if index == 0 else rng.uniform(0.1, 1.0)
         sign = rng.choice([-1.0, 1.0]) if low < 0 else 1.0
         values.append(float(sign * share * high))
     return tuple(values)
@@ -224,39 +224,41 @@ def _compute_network_input(
     """
     with closing(
         RunEvaluator(kind, recording, list(recording.runs), "batch", candidates=())
-    ) as world:
+    ) as evaluator:
         noise = NoiseModel(
-            compute_noise_floor(world, recording).sigma, np.zeros(len(world.channels))
+            compute_noise_floor(evaluator, recording).sigma, np.zeros(len(evaluator.channels))
         )
-        fit = fit_base_model(world, noise).fit
-        residual = (world.observed - fit.simulated) / noise.sigma
+        fit = fit_base_model(evaluator, noise).fit
+        residual = (evaluator.observed - fit.simulated) / noise.sigma
         rms = float(np.sqrt(np.nanmean(np.square(residual))))
         names = [c.name for c in kind.channels]
         inputs = [c.name for c in kind.inputs]
         image = np.zeros(
-            (len(world.prepared_runs), 3 * len(names) + len(inputs) + 1, GRID_POINT_COUNT)
+            (len(evaluator.prepared_runs), 3 * len(names) + len(inputs) + 1, GRID_POINT_COUNT)
         )
         grid = np.linspace(0.0, 1.0, GRID_POINT_COUNT)
-        for r, track in enumerate(world.prepared_runs):
-            size = int(world.lengths[r])
-            clock = np.linspace(0.0, 1.0, size)
-            for c, name in enumerate(world.channels):
-                place = names.index(name)
+        for r, track in enumerate(evaluator.prepared_runs):
+            size = int(evaluator.lengths[r])
+            relative_times = np.linspace(0.0, 1.0, size)
+            for c, name in enumerate(evaluator.channels):
+                channel_index = names.index(name)
                 is_recorded = np.isfinite(residual[r, :size, c])
-                path = np.clip(
+                clipped_residual = np.clip(
                     np.nan_to_num(residual[r, :size, c]), -_RESIDUAL_CLIP, _RESIDUAL_CLIP
                 )
-                image[r, place] = np.arcsinh(np.interp(grid, clock[is_recorded], path[is_recorded]))
+                image[r, channel_index] = np.arcsinh(
+                    np.interp(grid, relative_times[is_recorded], clipped_residual[is_recorded])
+                )
                 motion = fit.simulated[r, :size, c]
                 spread = float(motion.std()) or 1.0
-                image[r, len(names) + place] = np.interp(
-                    grid, clock, (motion - motion.mean()) / spread
+                image[r, len(names) + channel_index] = np.interp(
+                    grid, relative_times, (motion - motion.mean()) / spread
                 )
-                image[r, 2 * len(names) + place] = 1.0
+                image[r, 2 * len(names) + channel_index] = 1.0
             for i, name in enumerate(inputs):
                 signal = np.asarray(track.scenario.inputs.get(name, np.zeros(size)))[:size]
                 spread = float(np.abs(signal).max()) or 1.0
-                image[r, 3 * len(names) + i] = np.interp(grid, clock, signal / spread)
+                image[r, 3 * len(names) + i] = np.interp(grid, relative_times, signal / spread)
             image[r, -1] = np.log(track.duration)
     return np.nan_to_num(image), rms
 

@@ -107,7 +107,7 @@ class RegressionEvidence:
         every: whether held-out runs are fitted too.
 
     Attributes:
-        world: the runs and the simulator.
+        evaluator: the runs and the simulator.
         noise: noise of each channel, stated or estimated.
         stated: whether the noise of each channel is stated.
         base: fitted base model.
@@ -126,35 +126,37 @@ class RegressionEvidence:
         runs = [*recording.training(), *(recording.held_out() if has_held_out else ())]
         # The simulator of a robot uses the step that its model file states.
         engine = None if case.kind.own_engine else "batch"
-        self.world = RunEvaluator(case.kind, recording, runs, engine, candidates=list(case.library))
-        floor = compute_noise_floor(self.world, recording)
+        self.evaluator = RunEvaluator(
+            case.kind, recording, runs, engine, candidates=list(case.library)
+        )
+        floor = compute_noise_floor(self.evaluator, recording)
         self.noise = NoiseModel(floor.sigma, np.zeros(floor.sigma.size))
         self.stated: Mask = floor.is_stated
-        self.base: BaseFit = fit_base_model(self.world, self.noise)
+        self.base: BaseFit = fit_base_model(self.evaluator, self.noise)
         count = len(recording.training())
         self.fitted = range(count)
         self.held_out = range(count, len(runs))
 
     def close(self) -> None:
         """Release the resources of the engine."""
-        self.world.close()
+        self.evaluator.close()
 
     @cached_property
     def observed_mask(self) -> Mask:
         """Mask of the samples that are not missing, (R, T, C)."""
-        return np.isfinite(self.world.observed)
+        return np.isfinite(self.evaluator.observed)
 
     @cached_property
     def residual(self) -> Array:
         """Observed minus simulated, (R, T, C); zero where a sample is missing."""
-        difference = self.world.observed - self.base.fit.simulated
+        difference = self.evaluator.observed - self.base.fit.simulated
         residual: Array = np.where(self.observed_mask, difference, 0.0)
         return residual
 
     @cached_property
     def sensitivity_directions(self) -> DirectionSet:
         """Directions of all effects."""
-        return compute_directions(self.world, self.base.fit, self.world.library)
+        return compute_directions(self.evaluator, self.base.fit, self.evaluator.library)
 
     @cached_property
     def effect_columns(self) -> list[EffectColumn]:
@@ -205,7 +207,7 @@ class RegressionEvidence:
 
     def _compute_base_columns(self) -> Array:
         """Return the columns of parameters and initial states in equation (1), (R, T, C, B)."""
-        return compute_base_jacobian(self.world, self.base.fit)
+        return compute_base_jacobian(self.evaluator, self.base.fit)
 
     def _flatten_to_rows(
         self, residual: Array, base: Array, effects: Array, sigma: Array, is_observed: Mask
@@ -242,12 +244,12 @@ class RegressionEvidence:
 
         They are the arguments of a discrepancy function, such as a Gaussian process.
         """
-        world = self.world
-        runs, length, channels = world.observed.shape
-        names = [channel.name for channel in world.simulator.inputs]
+        evaluator = self.evaluator
+        runs, length, channels = evaluator.observed.shape
+        names = [channel.name for channel in evaluator.simulator.inputs]
         states = np.zeros((runs, length, 1 + channels + len(names)))
-        for r, track in enumerate(world.prepared_runs):
-            size = int(world.lengths[r])
+        for r, track in enumerate(evaluator.prepared_runs):
+            size = int(evaluator.lengths[r])
             times, inputs = track.scenario.times, track.scenario.inputs
             states[r, :size, 0] = times - times[0]
             for i, name in enumerate(names):
@@ -271,25 +273,25 @@ class RegressionEvidence:
         """
         from scipy.signal import savgol_coeffs, savgol_filter
 
-        world, system = self.world, self.world.simulator.system
+        evaluator, system = self.evaluator, self.evaluator.simulator.system
         runs, length, channels, _ = values.shape
         result = np.full_like(values, np.nan)
         sigma = np.ones((runs, length, channels))
         is_used = np.zeros((runs, length, channels), dtype=bool)
         pairs = dict(zip(system.rates, system.coordinates, strict=False))
-        for r, track in enumerate(world.prepared_runs):
-            size = int(world.lengths[r])
+        for r, track in enumerate(evaluator.prepared_runs):
+            size = int(evaluator.lengths[r])
             step = float(np.median(np.diff(track.scenario.times)))
             window = _round_down_to_odd(
                 min(max(MIN_WINDOW_SAMPLES, round(seconds / step)), size // 2)
             )
-            stiff, damped = self._linearise(r)
-            for c, name in enumerate(world.channels):
-                rate = name in pairs
-                if not rate and name not in system.coordinates:
+            stiffness, damping = self._linearise(r)
+            for c, name in enumerate(evaluator.channels):
+                is_rate = name in pairs
+                if not is_rate and name not in system.coordinates:
                     continue
                 part = values[r, :size, c]
-                order = 1 if rate else 2
+                order = 1 if is_rate else 2
 
                 def smooth(
                     deriv: int, part: Array = part, window: int = window, step: float = step
@@ -309,14 +311,14 @@ class RegressionEvidence:
                     )
                     return filtered
 
-                place = system.coordinates.index(pairs[name] if rate else name)
-                operated = smooth(order)
-                if rate:
-                    operated -= damped[:size, place, None] * smooth(0)
+                coordinate = system.coordinates.index(pairs[name] if is_rate else name)
+                filtered_residual = smooth(order)
+                if is_rate:
+                    filtered_residual -= damping[:size, coordinate, None] * smooth(0)
                 else:
-                    operated -= stiff[:size, place, None] * smooth(0)
-                    operated -= damped[:size, place, None] * smooth(1)
-                result[r, :size, c] = operated
+                    filtered_residual -= stiffness[:size, coordinate, None] * smooth(0)
+                    filtered_residual -= damping[:size, coordinate, None] * smooth(1)
+                result[r, :size, c] = filtered_residual
                 weights = savgol_coeffs(window, POLYNOMIAL_DEGREE, deriv=order, delta=step)
                 sigma[r, :size, c] = self.noise.sigma[c] * np.sqrt(np.square(weights).sum())
                 is_used[r, :size, c] = self._find_smooth_samples(r, size, window)
@@ -336,12 +338,12 @@ class RegressionEvidence:
         is_smooth = np.ones(size, dtype=bool)
         half_window = window // 2
         is_smooth[:half_window] = is_smooth[size - half_window :] = False
-        system = self.world.simulator.system
+        system = self.evaluator.simulator.system
         name = system.coordinates[-1] if system.bounces else ""
-        if name in self.world.channels:
-            c = self.world.channels.index(name)
+        if name in self.evaluator.channels:
+            c = self.evaluator.channels.index(name)
             simulated = self.base.fit.simulated[run, :size, c]
-            for path in (simulated, self.world.observed[run, :size, c]):
+            for path in (simulated, self.evaluator.observed[run, :size, c]):
                 lowest = np.flatnonzero((path[1:-1] < path[:-2]) & (path[1:-1] <= path[2:])) + 1
                 for impact in lowest[path[lowest] < _IMPACT_HEIGHT]:
                     is_smooth[max(0, impact - half_window - 1) : impact + half_window + 2] = False
@@ -357,33 +359,33 @@ class RegressionEvidence:
         Args:
             run: index of the run.
         """
-        world, system = self.world, self.world.simulator.system
-        track = world.prepared_runs[run]
-        size, dimensions = int(world.lengths[run]), len(system.coordinates)
+        evaluator, system = self.evaluator, self.evaluator.simulator.system
+        track = evaluator.prepared_runs[run]
+        size, dimensions = int(evaluator.lengths[run]), len(system.coordinates)
         zeros = np.zeros((size, dimensions))
         if system.uniform or dimensions != 1:
             return zeros, zeros
         times = track.scenario.times
         name = system.coordinates[0]
-        if name not in world.channels:
+        if name not in evaluator.channels:
             return zeros, zeros
-        x = self.base.fit.simulated[run, :size, world.channels.index(name)][:, None]
+        x = self.base.fit.simulated[run, :size, evaluator.channels.index(name)][:, None]
         v = np.gradient(x[:, 0], times)[:, None]
-        values = {c.name: c.value for c in world.kind.constants}
-        values |= {**world.simulator.constant_values, **track.scenario.constants}
+        values = {c.name: c.value for c in evaluator.kind.constants}
+        values |= {**evaluator.simulator.constant_values, **track.scenario.constants}
         constants = {key: np.full((size, 1), float(value)) for key, value in values.items()}
-        theta = np.tile(self.base.fit.theta[: world.system_parameter_count], (size, 1))
+        theta = np.tile(self.base.fit.theta[: evaluator.system_parameter_count], (size, 1))
         inputs = {
             channel.name: np.asarray(track.scenario.inputs.get(channel.name, np.zeros(size)))[
                 :size, None
             ]
-            for channel in world.simulator.inputs
+            for channel in evaluator.simulator.inputs
         }
-        clock = (times - times[0])[:, None]
+        elapsed = (times - times[0])[:, None]
 
         def compute_acceleration(x: Array, v: Array) -> Array:
             """Return the base model's acceleration (T, D) at positions x and velocities v."""
-            moment = StateSnapshot(system(), theta, constants, clock, x, v, inputs)
+            moment = StateSnapshot(system(), theta, constants, elapsed, x, v, inputs)
             force: Array = moment.system.force(moment) / moment.inertia
             return force
 
@@ -404,29 +406,31 @@ def _round_down_to_odd(samples: int) -> int:
     return max(samples - 1 + samples % 2, POLYNOMIAL_DEGREE + 2)
 
 
-def compute_base_jacobian(world: RunEvaluator, fit: TrajectoryFit) -> Array:
+def compute_base_jacobian(evaluator: RunEvaluator, fit: TrajectoryFit) -> Array:
     """Compute the columns of a fit's parameters and of each run's own initial states.
 
     A parameter affects all runs. An unknown initial state affects its own run only, so its column
     is zero in the other runs.
 
     Args:
-        world: the runs and the simulator.
+        evaluator: the runs and the simulator.
         fit: a fitted model with its Jacobian.
 
     Returns:
         Columns, (R, T, C, q + n), for q free parameters and n unknown initial states of all runs.
     """
-    shared = fit.free_indices.size
+    parameter_count = fit.free_indices.size
     runs, length, channels, _ = fit.jacobian.shape
-    unknown_states = [np.flatnonzero(~world.known_state_mask[r]) for r in range(runs)]
-    width = shared + sum(places.size for places in unknown_states)
-    columns = np.zeros((runs, length, channels, width))
-    columns[..., :shared] = fit.jacobian[..., :shared]
-    first = shared
-    for r, places in enumerate(unknown_states):
-        columns[r, :, :, first : first + places.size] = fit.jacobian[r][..., shared + places]
-        first += places.size
+    unknown_states = [np.flatnonzero(~evaluator.known_state_mask[r]) for r in range(runs)]
+    column_count = parameter_count + sum(unknown.size for unknown in unknown_states)
+    columns = np.zeros((runs, length, channels, column_count))
+    columns[..., :parameter_count] = fit.jacobian[..., :parameter_count]
+    first_column = parameter_count
+    for r, unknown in enumerate(unknown_states):
+        columns[r, :, :, first_column : first_column + unknown.size] = fit.jacobian[r][
+            ..., parameter_count + unknown
+        ]
+        first_column += unknown.size
     return columns
 
 

@@ -96,31 +96,38 @@ class _SparseRegression(Diagnoser):
             The named causes and their significance; None if there are too few samples.
         """
         rows = evidence.build_acceleration_regression(window)
-        fitted, held_out = rows.select_runs(evidence.fitted), rows.select_runs(evidence.held_out)
+        fitting_rows, held_out_rows = (
+            rows.select_runs(evidence.fitted),
+            rows.select_runs(evidence.held_out),
+        )
         if (
-            min(len(fitted.residual), len(held_out.residual))
-            <= fitted.base.shape[1] + 2 * HELD_OUT_BLOCK_COUNT
+            min(len(fitting_rows.residual), len(held_out_rows.residual))
+            <= fitting_rows.base.shape[1] + 2 * HELD_OUT_BLOCK_COUNT
         ):
             return None
-        residual, effects = fitted.project_out_base()
-        best = find_strongest_columns(residual, effects, evidence.effect_columns)
-        chosen_columns = [column for _, column in best.values()]
+        residual, effects = fitting_rows.project_out_base()
+        strongest_columns = find_strongest_columns(residual, effects, evidence.effect_columns)
+        chosen_columns = [column for _, column in strongest_columns.values()]
         terms, library = _drop_duplicate_columns(
-            [(column.effect, place) for column in chosen_columns for place in column.places],
+            [
+                (column.effect, column_index)
+                for column in chosen_columns
+                for column_index in column.places
+            ],
             effects,
         )
         if not terms:
             return _RegressionResult(0.0, ())
-        places = [place for _, place in terms]
+        columns = [column_index for _, column_index in terms]
         scale = np.sqrt(np.square(library).mean(axis=0))
-        left_out, effects_out = held_out.project_out_base()
+        held_out_residual, held_out_effects = held_out_rows.project_out_base()
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             models = [
                 c for c in self._iterate_models(library / scale, residual) if np.isfinite(c).all()
             ]
         model, sigmas = _select_by_one_standard_error(
-            models, left_out, effects_out[:, places] / scale
+            models, held_out_residual, held_out_effects[:, columns] / scale
         )
         selected_effects = list(dict.fromkeys(terms[i][0] for i in np.flatnonzero(model)))
         causes = [

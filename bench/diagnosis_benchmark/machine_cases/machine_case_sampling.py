@@ -80,7 +80,7 @@ def draw_case(
     words += [str(part) for part in requested if part is not None]
     name = "-".join([*words, str(seed)])
     conditions, rng = restore_conditions(name, system, requested), make_case_rng(name, "cause")
-    item = BenchmarkCase(
+    case = BenchmarkCase(
         name,
         system,
         kind,
@@ -99,7 +99,7 @@ def draw_case(
         asked=requested,
     )
     if kind == "clean":
-        return item
+        return case
     low = 3.0 if kind in ("double", "foreign") else 1.0
     target_size = size or float(np.exp(rng.uniform(np.log(low), np.log(10.0))))
     hidden = {
@@ -107,7 +107,7 @@ def draw_case(
         "double": _hide_two_effects,
         "foreign": _hide_unmodelled_cause,
     }[kind]
-    return hidden(item, conditions, effect, target_size, rng)
+    return hidden(case, conditions, effect, target_size, rng)
 
 
 @lru_cache(maxsize=4)
@@ -125,12 +125,12 @@ def restore_conditions(
 
 
 def _draw_place(
-    item: BenchmarkCase, effect: str | None, rng: np.random.Generator, excluded_place: str = ""
+    case: BenchmarkCase, effect: str | None, rng: np.random.Generator, excluded_place: str = ""
 ) -> str:
     """Draw the effect, if it is not given, and its place: a joint, body, motor or sensor channel.
 
     Args:
-        item: the case; its system determines the effects and places.
+        case: the case; its system determines the effects and places.
         effect: name of the effect; None to draw it.
         rng: random generator.
         excluded_place: effect with place that must not be drawn, because the case already hides it.
@@ -138,17 +138,17 @@ def _draw_place(
     Returns:
         ``effect@place`` or ``effect``; empty if the only place is excluded by `excluded_place`.
     """
-    chosen_effect = effect or str(rng.choice(hidden_causes.EFFECTS_BY_MACHINE[item.system]))
+    chosen_effect = effect or str(rng.choice(hidden_causes.EFFECTS_BY_MACHINE[case.system]))
     places = [
         name
-        for name in hidden_causes.list_effect_places(item.system, chosen_effect)
+        for name in hidden_causes.list_effect_places(case.system, chosen_effect)
         if name != excluded_place
     ]
     return str(rng.choice(places)) if places else ""
 
 
 def _hide_one_effect(
-    item: BenchmarkCase,
+    case: BenchmarkCase,
     conditions: MachineRecordingConditions,
     effect: str | None,
     target_size: float,
@@ -161,7 +161,7 @@ def _hide_one_effect(
     `MIN_SIMPLER_RESIDUAL`.
 
     Args:
-        item: the case without its hidden cause.
+        case: the case without its hidden cause.
         conditions: recording conditions.
         effect: name of the effect; None to draw it.
         target_size: size in units of the noise.
@@ -170,7 +170,7 @@ def _hide_one_effect(
     Returns:
         The case; None if it is rejected or no coefficients give this size.
     """
-    name = _draw_place(item, effect, rng)
+    name = _draw_place(case, effect, rng)
     c = _find_sized_coefficients(name, conditions, target_size, rng)
     if c is None:
         return None
@@ -182,7 +182,7 @@ def _hide_one_effect(
         unexplained = _compute_unexplained_size(conditions, {name: c}, {}, other_effects, rng)
         if unexplained < MIN_SIMPLER_RESIDUAL:
             return None
-    return replace(item, effects={name: c}, size=target_size, beyond=unexplained)
+    return replace(case, effects={name: c}, size=target_size, beyond=unexplained)
 
 
 def _find_sized_coefficients(
@@ -218,7 +218,7 @@ def _find_sized_coefficients(
 
 
 def _hide_two_effects(
-    item: BenchmarkCase,
+    case: BenchmarkCase,
     conditions: MachineRecordingConditions,
     effect: str | None,
     target_size: float,
@@ -227,7 +227,7 @@ def _hide_two_effects(
     """Hide two effects, each of the requested size alone; reject the case if one explains both.
 
     Args:
-        item: the case without its hidden causes.
+        case: the case without its hidden causes.
         conditions: recording conditions.
         effect: name of the first effect; None to draw it.
         target_size: size of each effect alone, in units of the noise.
@@ -237,9 +237,9 @@ def _hide_two_effects(
         The case; None if it is rejected, the effects are equivalent, or no coefficients give this
         size.
     """
-    first = _draw_place(item, effect, rng)
-    second = _draw_place(item, None, rng, excluded_place=first)
-    if not second or second in find_equivalent_causes(item.system, first):
+    first = _draw_place(case, effect, rng)
+    second = _draw_place(case, None, rng, excluded_place=first)
+    if not second or second in find_equivalent_causes(case.system, first):
         return None
     coefficients_by_effect = {
         name: _find_sized_coefficients(name, conditions, target_size, rng)
@@ -252,14 +252,14 @@ def _hide_two_effects(
         _compute_unexplained_size(conditions, effects, {}, [name], rng) for name in effects
     )
     return (
-        replace(item, effects=effects, size=target_size, beyond=unexplained)
+        replace(case, effects=effects, size=target_size, beyond=unexplained)
         if unexplained >= MIN_DISTINCT_SIZE
         else None
     )
 
 
 def _hide_unmodelled_cause(
-    item: BenchmarkCase,
+    case: BenchmarkCase,
     conditions: MachineRecordingConditions,
     cause: str | None,
     target_size: float,
@@ -271,7 +271,7 @@ def _hide_unmodelled_cause(
     `MIN_DISTINCT_SIZE`.
 
     Args:
-        item: the case without its hidden cause.
+        case: the case without its hidden cause.
         conditions: recording conditions.
         cause: name of the cause; None to draw it.
         target_size: size in units of the noise.
@@ -281,7 +281,7 @@ def _hide_unmodelled_cause(
         The case; None if it is rejected or no strength gives this size.
     """
     chosen_cause = cause or str(rng.choice(hidden_causes.UNMODELLED_CAUSES))
-    joint = str(rng.choice(MACHINES[item.system].joints))
+    joint = str(rng.choice(MACHINES[case.system].joints))
     name = f"{chosen_cause}@{joint}" if joint else chosen_cause
     c = _find_sized_coefficients(name, conditions, target_size, rng, is_modelled=False)
     if c is None:
@@ -289,12 +289,12 @@ def _hide_unmodelled_cause(
     hidden = {name: c}
     library_effects = [
         n
-        for e in hidden_causes.EFFECTS_BY_MACHINE[item.system]
-        for n in hidden_causes.list_effect_places(item.system, e)
+        for e in hidden_causes.EFFECTS_BY_MACHINE[case.system]
+        for n in hidden_causes.list_effect_places(case.system, e)
     ]
     unexplained = _compute_unexplained_size(conditions, {}, hidden, library_effects, rng)
     return (
-        replace(item, effects=hidden, size=target_size, beyond=unexplained)
+        replace(case, effects=hidden, size=target_size, beyond=unexplained)
         if unexplained >= MIN_DISTINCT_SIZE
         else None
     )
@@ -354,31 +354,33 @@ class _ResidualGauge:
         """
         self.conditions = conditions
         runs, joints = conditions.fitted_runs.q.shape
-        numbers = list(conditions.free_parameters)
-        lanes = 1 + len(numbers) + 2 * joints
+        parameters = list(conditions.free_parameters)
+        variants = 1 + len(parameters) + 2 * joints
         # Each run once as it is, and once for each fitted parameter and initial state.
         fitted = MachineRuns(
             conditions.fitted_runs.times,
-            np.repeat(conditions.fitted_runs.commands, lanes, axis=0),
-            np.repeat(conditions.fitted_runs.q, lanes, axis=0),
-            np.repeat(conditions.fitted_runs.v, lanes, axis=0),
+            np.repeat(conditions.fitted_runs.commands, variants, axis=0),
+            np.repeat(conditions.fitted_runs.q, variants, axis=0),
+            np.repeat(conditions.fitted_runs.v, variants, axis=0),
         )
-        values = {name: np.full((runs, lanes), value) for name, value in conditions.numbers.items()}
-        for k, name in enumerate(numbers):
+        values = {
+            name: np.full((runs, variants), value) for name, value in conditions.numbers.items()
+        }
+        for k, name in enumerate(parameters):
             values[name][:, 1 + k] *= 1 + _FINITE_DIFFERENCE_STEP
-        q, v = (part.reshape(runs, lanes, joints).copy() for part in (fitted.q, fitted.v))
+        q, v = (part.reshape(runs, variants, joints).copy() for part in (fitted.q, fitted.v))
         for j in range(joints):
-            q[:, 1 + len(numbers) + j, j] += _FINITE_DIFFERENCE_STEP
-            v[:, 1 + len(numbers) + joints + j, j] += _FINITE_DIFFERENCE_STEP
+            q[:, 1 + len(parameters) + j, j] += _FINITE_DIFFERENCE_STEP
+            v[:, 1 + len(parameters) + joints + j, j] += _FINITE_DIFFERENCE_STEP
         plant = MACHINES[conditions.system]({n: a.ravel() for n, a in values.items()}, {}, {})
         start_runs = fitted._replace(q=q.reshape(-1, joints), v=v.reshape(-1, joints))
         readings = read_encoders(simulate_machine(plant, start_runs), plant, conditions.runs.times)
-        readings = readings.reshape(runs, lanes, -1)
+        readings = readings.reshape(runs, variants, -1)
         slopes = (readings[:, 1:] - readings[:, :1]) / _FINITE_DIFFERENCE_STEP
-        shared = np.concatenate(slopes[:, : len(numbers)], axis=1).T
+        shared = np.concatenate(slopes[:, : len(parameters)], axis=1).T
         state_columns = np.zeros((runs, slopes.shape[2], runs, 2 * joints))
         for r in range(runs):
-            state_columns[r, :, r] = slopes[r, len(numbers) :].T
+            state_columns[r, :, r] = slopes[r, len(parameters) :].T
         columns = np.column_stack([shared, state_columns.reshape(runs * slopes.shape[2], -1)])
         self.bare = readings[:, 0].reshape(runs, len(conditions.runs.times), joints)
         self._basis = _compute_orthonormal_basis(columns)
@@ -464,45 +466,45 @@ def find_equivalent_causes(system: str, name: str) -> frozenset[str]:
     return frozenset({name}).union(*(names for names in EQUIVALENT_CAUSES[system] if name in names))
 
 
-def record_case(item: BenchmarkCase) -> tuple[MachineRecordingConditions, Array]:
+def record_case(case: BenchmarkCase) -> tuple[MachineRecordingConditions, Array]:
     """Simulate the recording of a case with all its runs, and add the sensor noise.
 
     Args:
-        item: the case.
+        case: the case.
 
     Returns:
         The recording conditions and the noisy encoder readings, (R, T, N).
     """
-    conditions = restore_conditions(item.name, item.system, item.asked)
-    hidden = item.effects
-    foreign = item.kind == "foreign"
+    conditions = restore_conditions(case.name, case.system, case.asked)
+    hidden = case.effects
+    foreign = case.kind == "foreign"
     plant = conditions.make_machine({} if foreign else hidden, hidden if foreign else {})
     readings = read_encoders(simulate_machine(plant, conditions.runs), plant, conditions.runs.times)
-    rng = make_case_rng(item.name, "noise")
+    rng = make_case_rng(case.name, "noise")
     return conditions, np.array([conditions.noise.add_to(run, rng) for run in readings])
 
 
 def build_description(
-    item: BenchmarkCase, conditions: MachineRecordingConditions
+    case: BenchmarkCase, conditions: MachineRecordingConditions
 ) -> dict[str, object]:
     """Build the description of the recording, as the document of a TOML file.
 
     Args:
-        item: the case.
+        case: the case.
         conditions: its recording conditions.
     """
-    robot = item.system == "arm2"
-    plant = MACHINES[item.system]
-    noise_entry = {"noise": conditions.noise_sigmas} if item.stated else {}
+    robot = case.system == "arm2"
+    plant = MACHINES[case.system]
+    noise_entry = {"noise": conditions.noise_sigmas} if case.stated else {}
     channels = {name: {"unit": "rad", **noise_entry} for name in plant.channels}
     inputs = (
         {f"u.{name}": {"unit": "N*m"} for name in plant.motors}
         if robot
         else {"goal": {"unit": "rad"}, "torque_enable": {"unit": "1"}}
     )
-    first = item.runs - conditions.held_out
-    runs = {str(number): {"held_out": True} for number in range(first, item.runs)}
-    source_entry = {"model": MODEL_FILE_NAME} if robot else {"system": item.system}
+    first = case.runs - conditions.held_out
+    runs = {str(number): {"held_out": True} for number in range(first, case.runs)}
+    source_entry = {"model": MODEL_FILE_NAME} if robot else {"system": case.system}
     constants = {} if robot else {"constants": _get_stated_constants(conditions)}
     return {**source_entry, "channels": channels, "inputs": inputs, **constants, "runs": runs}
 
@@ -515,16 +517,16 @@ def _get_stated_constants(conditions: MachineRecordingConditions) -> dict[str, f
 
 
 def format_table(
-    item: BenchmarkCase, conditions: MachineRecordingConditions, readings: Array
+    case: BenchmarkCase, conditions: MachineRecordingConditions, readings: Array
 ) -> str:
     """Format the recording as CSV text.
 
     Args:
-        item: the case.
+        case: the case.
         conditions: its recording conditions.
         readings: encoder readings, (R, T, N).
     """
-    plant, robot = MACHINES[item.system], item.system == "arm2"
+    plant, robot = MACHINES[case.system], case.system == "arm2"
     inputs = [f"u.{name}" for name in plant.motors] if robot else ["goal", "torque_enable"]
     lines = [",".join(["run", "t", *inputs, *plant.channels])]
     for number, run in enumerate(readings):
@@ -535,11 +537,11 @@ def format_table(
     return "\n".join(lines) + "\n"
 
 
-def write_case(item: BenchmarkCase, folder: Path) -> Path:
+def write_case(case: BenchmarkCase, folder: Path) -> Path:
     """Write the recording, its description and, for an arm, its model file.
 
     Args:
-        item: the case.
+        case: the case.
         folder: folder for the files.
 
     Returns:
@@ -547,11 +549,11 @@ def write_case(item: BenchmarkCase, folder: Path) -> Path:
     """
     import tomli_w
 
-    conditions, readings = record_case(item)
-    if item.system == "arm2":
+    conditions, readings = record_case(case)
+    if case.system == "arm2":
         (folder / MODEL_FILE_NAME).write_text(render_arm_mjcf(conditions.numbers), encoding="utf-8")
     path = folder / "recording.csv"
-    path.write_text(format_table(item, conditions, readings), encoding="utf-8")
-    description = tomli_w.dumps(build_description(item, conditions))
+    path.write_text(format_table(case, conditions, readings), encoding="utf-8")
+    description = tomli_w.dumps(build_description(case, conditions))
     path.with_suffix(".toml").write_text(description, encoding="utf-8")
     return path

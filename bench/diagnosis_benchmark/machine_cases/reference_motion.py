@@ -70,12 +70,12 @@ def simulate_machine(
     parts = int(np.ceil(rate / max_step - 1e-9))
     times = np.linspace(0.0, runs.times[-1], (len(runs.times) - 1) * parts + 1)
     applied_inputs = compute_applied_inputs(runs, plant, times)
-    mover = _MachineIntegrator(plant, runs.q, runs.v)
-    q, v = [mover.q], [mover.v]
+    integrator = _MachineIntegrator(plant, runs.q, runs.v)
+    q, v = [integrator.q], [integrator.v]
     for k, t in enumerate(times[:-1].tolist()):
-        mover.step(t, float(times[k + 1]) - t, applied_inputs[:, k])
-        q.append(mover.q)
-        v.append(mover.v)
+        integrator.step(t, float(times[k + 1]) - t, applied_inputs[:, k])
+        q.append(integrator.q)
+        v.append(integrator.v)
     return MachineMotion(times, np.array(q), np.array(v))
 
 
@@ -230,21 +230,21 @@ def compute_applied_inputs(runs: MachineRuns, plant: MachineDynamics, times: Arr
     Returns:
         Applied inputs, (L, K, N).
     """
-    lanes, _, joints = runs.commands.shape
-    applied_inputs = np.empty((lanes, len(times) - 1, joints))
+    run_count, _, joints = runs.commands.shape
+    applied_inputs = np.empty((run_count, len(times) - 1, joints))
     for joint, motor in enumerate(plant.motors):
         input_effects = {
             name.partition("@")[0]: c
             for name, c in plant.effects.items()
             if name.startswith("input.") and name.partition("@")[2] in ("", motor)
         }
-        for lane in range(lanes):
-            levels: Array = runs.commands[lane, :, joint]
+        for run in range(run_count):
+            levels: Array = runs.commands[run, :, joint]
             for name, c in input_effects.items():
                 levels = np.asarray(_apply_static_effects(name, c[0], levels), dtype=np.float64)
             delay = input_effects.get("input.delay", (0.0,))[0]
             lag = input_effects.get("input.lag", (0.0,))[0]
-            applied_inputs[lane, :, joint] = _average_input(runs.times, levels, times, delay, lag)
+            applied_inputs[run, :, joint] = _average_input(runs.times, levels, times, delay, lag)
     return applied_inputs
 
 
@@ -311,14 +311,16 @@ def _apply_lag(stamps: Array, levels: Array, query_times: Array, lag: float) -> 
         query_times: times, s, (K,).
         lag: time constant, s.
     """
-    reached = np.empty_like(levels)
-    reached[0] = levels[0]
+    lagged_at_samples = np.empty_like(levels)
+    lagged_at_samples[0] = levels[0]
     decay = np.exp(-np.diff(stamps) / lag)
     for k in range(len(stamps) - 1):
-        reached[k + 1] = levels[k] + (reached[k] - levels[k]) * decay[k]
-    place = np.clip(np.searchsorted(stamps, query_times, side="right") - 1, 0, None)
-    seconds_since = np.maximum(query_times - stamps[place], 0.0)
-    lagged: Array = levels[place] + (reached[place] - levels[place]) * np.exp(-seconds_since / lag)
+        lagged_at_samples[k + 1] = levels[k] + (lagged_at_samples[k] - levels[k]) * decay[k]
+    sample_before = np.clip(np.searchsorted(stamps, query_times, side="right") - 1, 0, None)
+    seconds_since = np.maximum(query_times - stamps[sample_before], 0.0)
+    lagged: Array = levels[sample_before] + (
+        lagged_at_samples[sample_before] - levels[sample_before]
+    ) * np.exp(-seconds_since / lag)
     return lagged
 
 

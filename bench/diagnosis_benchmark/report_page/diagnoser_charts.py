@@ -47,14 +47,14 @@ def build_chart_tables(data: DiagnoserReportData) -> dict[str, pd.DataFrame]:
     named_rows = table[(table["metric"] == PRIMARY_METRIC) & (table["of"] > 0)]
     leaderboard = named_rows.assign(alarms=100 * named_rows["diagnoser"].map(alarms))
     leaderboard[["share", "low", "high"]] *= 100
-    places = {metric: place for place, metric in enumerate(_list_shares(data))}
-    shares = table[table["metric"].isin(places)]
+    metric_position = {metric: position for position, metric in enumerate(_list_shares(data))}
+    shares = table[table["metric"].isin(metric_position)]
     levels = pd.DataFrame({"diagnoser": "", "level": P_VALUE_LEVELS, "share": P_VALUE_LEVELS})
     calibration, sets = data.tables["calibration"], data.tables["sets"]
-    sizes = {label: place for place, label in enumerate(SET_SIZE_LABELS)}
+    sizes = {label: position for position, label in enumerate(SET_SIZE_LABELS)}
     return {
         "board": leaderboard.dropna(subset="alarms"),
-        "shares": shares.assign(place=shares["metric"].map(places)),
+        "shares": shares.assign(place=shares["metric"].map(metric_position)),
         "calibration": pd.concat([calibration, levels], ignore_index=True)
         if len(calibration)
         else calibration,

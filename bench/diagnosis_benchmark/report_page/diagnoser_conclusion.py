@@ -99,19 +99,25 @@ def find_leader(data: DiagnoserReportData) -> Leader | None:
     candidates = [name for name in with_few_alarms if named_shares[name]["of"]]
     if not candidates:
         return Leader("")
-    best = max(candidates, key=lambda name: float(named_shares[name]["share"]))
-    other_names = [name for name in candidates if name != best]
-    low, high = (format_percent(named_shares[best][end]) for end in ("low", "high"))
-    share = (
-        f"{int(named_shares[best]['count'])} of {int(named_shares[best]['of'])}, "
-        f"{format_percent(named_shares[best]['share'])} (95 % interval {low} to {high})"
+    leader = max(candidates, key=lambda name: float(named_shares[name]["share"]))
+    other_names = [name for name in candidates if name != leader]
+    low, high = (format_percent(named_shares[leader][end]) for end in ("low", "high"))
+    share_text = (
+        f"{int(named_shares[leader]['count'])} of {int(named_shares[leader]['of'])}, "
+        f"{format_percent(named_shares[leader]['share'])} (95 % interval {low} to {high})"
     )
-    row, text = alarms[best], ""
+    row, text = alarms[leader], ""
     if row["high"] > TARGET_FALSE_ALARM_RATE:
         text = f"{int(row['count'])} false alarm{'s' * (row['count'] != 1)}"
-    significance = _format_significance(data, best, other_names)
+    significance = _format_significance(data, leader, other_names)
     return Leader(
-        best, tuple(candidates), share, significance, int(row["of"]), text, float(row["high"])
+        leader,
+        tuple(candidates),
+        share_text,
+        significance,
+        int(row["of"]),
+        text,
+        float(row["high"]),
     )
 
 
