@@ -70,7 +70,7 @@ from bench.diagnosis.prediction_error.simulated_fits import (
 )
 from bench.diagnosis.search.candidate_directions import DirectionSet
 from bench.diagnosis.search.effect_search import EffectSearch
-from bench.diagnosis.search.refit_starts import with_effect
+from bench.diagnosis.search.refit_starts import add_effect_to_start
 from bench.diagnosis.search.score_test import CandidateScores
 from bench.diagnosis.search.verdict_rules import EFFECT_P_VALUE_THRESHOLD
 from sims.core.simulator import Array
@@ -212,7 +212,7 @@ class PredictionErrorSearch(EffectSearch):
             scores.effects[0],
         )
         c = columns.coefficients(*scores.peaks[0][0])
-        start = with_effect(self.evaluator, model.fit.make_start(), name, c)
+        start = add_effect_to_start(self.evaluator, model.fit.make_start(), name, c)
         places, count = self.evaluator.get_coefficient_indices(name), len(self.evaluator.library)
         # A filter with the effect in the model is faster than a fit, and not linear in the effect.
         log_likelihood = filters.get_filter(model).log_likelihood
