@@ -129,7 +129,7 @@ class ModelMoves(ScoredModelSet):
         # and fits the data immediately.
         if len(contained_laws) > 1:
             yield contained_laws
-        yield from self._find_most_active_member(model, name)
+        yield from self._find_dominant_member(model, name)
 
     def _split_into_contained_laws(self, model: FittedModel, name: str) -> EffectStarts:
         """Return the simpler laws that an effect contains, with its fitted coefficients.
@@ -147,7 +147,7 @@ class ModelMoves(ScoredModelSet):
                 laws[law], begin = coefficients[begin:end], end
         return laws
 
-    def _find_most_active_member(self, model: FittedModel, name: str) -> Iterator[EffectStarts]:
+    def _find_dominant_member(self, model: FittedModel, name: str) -> Iterator[EffectStarts]:
         """Yield the member of a family that changes the runs most, with its coefficients.
 
         The members are one effect at several joints or bodies. Nothing is yielded for other
