@@ -275,8 +275,8 @@ class _DetectionLimitCalculator:
         shapes: dict[tuple[str, int], list[int]] = {}
         for k in np.argsort(-self.powers, kind="stable").tolist():
             probe = self.direction_set.candidates[k]
-            if not probe.fixed:
-                shapes.setdefault((probe.effect, probe.place), []).append(k)
+            if not probe.is_single_size:
+                shapes.setdefault((probe.effect, probe.coefficient_index), []).append(k)
         best = {key: probe_indices[0] for key, probe_indices in shapes.items()}
         limits = dict.fromkeys(
             probe.effect for probe in self.direction_set.candidates if probe.is_single_size

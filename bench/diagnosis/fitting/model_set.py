@@ -329,8 +329,8 @@ class ModelSet:
             gain = refitted.penalised_log_likelihood - model.penalised_log_likelihood
             if gain < MIN_GAIN_FOR_REWEIGHTING:
                 if gain > 0:
-                    # `_store_if_better` would discard the scores of effects about the old fit, which
-                    # remain valid for a fit that is so close.
+                    # Stored directly, because `_store_if_better` would discard the scores about the
+                    # old fit, which remain valid for a fit that is so close.
                     model = self.models[frozenset(refitted.effects)] = refitted
                 break
             model = self._store_if_better(refitted)
