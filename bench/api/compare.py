@@ -148,17 +148,21 @@ def build_experiment(
     """Load the experiment that the options describe, with their changes, and its plugins.
 
     Args:
-        experiment: Name of an experiment, path of its TOML file, or an `Experiment`; None for the
-            robot of the options.
-        options: Options of the comparison.
+        experiment: Name of an experiment, path of its TOML file, or an `Experiment`; None to tune
+            the robot whose model file the options name.
+        options: Options of the comparison. With a command of a language model, this model is
+            compared as well.
 
     Raises:
         InputError: The experiment, a tuner or a plugin does not exist or cannot be used.
     """
-    # An isolated process cannot start the user's command.
-    trust = options.trust or not options.jobs or options.model_command is not None
-    source = resolve_experiment(experiment, options)
-    loaded = load_experiment_plugins(source, _list_plugin_files(options), trust, options.isolation)
+    # Without worker processes tuners are not isolated, and an isolated process cannot start the
+    # user's command of a language model.
+    is_trusted = options.trust or not options.jobs or options.model_command is not None
+    requested = resolve_experiment(experiment, options)
+    complete = load_experiment_plugins(
+        requested, _list_plugin_files(options), is_trusted, options.isolation
+    )
     labels = (
         None if options.tuners is None else [_get_tuner_label(tuner) for tuner in options.tuners]
     )
@@ -167,7 +171,7 @@ def build_experiment(
         os.environ[language_model.COMMAND_VARIABLE] = options.model_command
         labels = [*(labels or ()), language_model.LanguageModel.name]
     changes = {name: getattr(options, name) for name in _EXPERIMENT_OPTIONS}
-    return _apply_changes(loaded, labels, options.seeds, changes)
+    return _apply_changes(complete, labels, options.seeds, changes)
 
 
 def _list_plugin_files(options: ComparisonOptions) -> list[str]:

@@ -78,15 +78,17 @@ def list_sources(
             describes recordings that are not data frames.
     """
     frame_description = frame_description or FrameDescription()
-    single = isinstance(recording, str | Path | Recording | SimulatedRecording | Frame)
-    each: list[Any] = [recording] if single else [*cast(Sequence[RecordingSource], recording)]
-    if not each:
+    is_single = isinstance(recording, str | Path | Recording | SimulatedRecording | Frame)
+    given_sources: list[Any] = (
+        [recording] if is_single else [*cast(Sequence[RecordingSource], recording)]
+    )
+    if not given_sources:
         raise InputError(f"recording: expected {_EXPECTED_RECORDING}, found an empty list")
-    frames = [source for source in each if isinstance(source, Frame)]
+    frames = [source for source in given_sources if isinstance(source, Frame)]
     sources: list[str | Path | Recording] = []
-    for source in each:
+    for source in given_sources:
         if isinstance(source, Frame):
-            number = f" {len(sources) + 1}" if len(each) > 1 else ""
+            number = f" {len(sources) + 1}" if len(given_sources) > 1 else ""
             sources.append(read_frame_recording(source, frame_description, f"DataFrame{number}"))
         else:
             if not frames:

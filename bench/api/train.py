@@ -66,8 +66,8 @@ def select_training(
         experiment = simulator
         simulator = load_experiment(experiment).simulator
     # A robot's simulator is not registered; it is defined by its experiment.
-    robotic = experiment is not None and load_experiment(experiment).model
-    if not plugins and not robotic:
+    has_model = experiment is not None and load_experiment(experiment).model
+    if not plugins and not has_model:
         simulators.get(simulator)
     chosen_experiment = load_experiment(experiment or default_experiment(simulator)).chosen(
         training_budget=budget

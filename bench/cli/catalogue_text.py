@@ -39,26 +39,26 @@ def _format_sentence(each: JsonDocument) -> str:
     return f"skipped: {skipped}" if skipped else each["says"]
 
 
-def _format_experiment(each: JsonDocument) -> list[str]:
+def _format_experiment(experiment: JsonDocument) -> list[str]:
     """Format an experiment: what is missing on this machine, its description, its tags."""
     missing = []
-    if each["skipped"]:
-        missing.append(f"skipped: {each['skipped']}")
-    if each["needs"]:
-        missing.append(f"needs `{each['needs']}`")
-    if each["tuners_skipped"] and not each["skipped"]:
-        reasons = "; ".join(sorted(set(each["tuners_skipped"].values())))
-        missing.append(f"without {', '.join(each['tuners_skipped'])}: {reasons}")
-    words = f"{'; '.join(missing)}. {each['says']}" if missing else each["says"]
-    return [f"{each['name']:22} {words} [{', '.join(each['tags'])}]"]
+    if experiment["skipped"]:
+        missing.append(f"skipped: {experiment['skipped']}")
+    if experiment["needs"]:
+        missing.append(f"needs `{experiment['needs']}`")
+    if experiment["tuners_skipped"] and not experiment["skipped"]:
+        reasons = "; ".join(sorted(set(experiment["tuners_skipped"].values())))
+        missing.append(f"without {', '.join(experiment['tuners_skipped'])}: {reasons}")
+    words = f"{'; '.join(missing)}. {experiment['says']}" if missing else experiment["says"]
+    return [f"{experiment['name']:22} {words} [{', '.join(experiment['tags'])}]"]
 
 
-def _format_system(each: JsonDocument) -> list[str]:
+def _format_system(system: JsonDocument) -> list[str]:
     """Format a system: its description, then a line for each of its declared quantities."""
-    result = [f"{each['name']}: {_format_sentence(each)}"]
-    if each["skipped"]:
+    result = [f"{system['name']}: {_format_sentence(system)}"]
+    if system["skipped"]:
         return result
-    for p in each["parameters"]:
+    for p in system["parameters"]:
         low, high = p["bounds"]
         training = p["training"]
         training_text = f", training {training[0]:g} to {training[1]:g}" if training else ""
@@ -68,11 +68,11 @@ def _format_system(each: JsonDocument) -> list[str]:
         )
     result += [
         f"  constant  {c['name']:18} {c['unit']:12} {c['value']:g}  {c['says']}"
-        for c in each["constants"]
+        for c in system["constants"]
     ]
-    result += _format_channels("input", each["inputs"])
-    result += [f"  state     {s['name']:18} {s['value']:>12g}" for s in each["states"]]
-    return result + _format_channels("channel", each["channels"])
+    result += _format_channels("input", system["inputs"])
+    result += [f"  state     {s['name']:18} {s['value']:>12g}" for s in system["states"]]
+    return result + _format_channels("channel", system["channels"])
 
 
 def _format_channels(role: str, channels: list[JsonDocument]) -> list[str]:

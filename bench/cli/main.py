@@ -322,7 +322,7 @@ def build_parser(only: str | None = "") -> _Parser:
     # If an option precedes the command, the program's parser reports it.
     parser.set_defaults(command_parser=parser)
     commands = parser.add_subparsers(required=True, metavar="COMMAND", title="commands")
-    for name, place, summary, example in COMMANDS:
+    for name, function_path, summary, example in COMMANDS:
         command = commands.add_parser(
             name,
             help=summary,
@@ -332,7 +332,7 @@ def build_parser(only: str | None = "") -> _Parser:
         )
         if only not in ("", name):
             continue
-        module, _, add_arguments = place.partition(":")
+        module, _, add_arguments = function_path.partition(":")
         getattr(import_module(f"bench.cli.commands.{module}"), add_arguments)(command)
         command.set_defaults(command_parser=command)
         command.add_argument(

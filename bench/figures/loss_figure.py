@@ -61,7 +61,7 @@ def draw_loss_figure(title: str, rows: Sequence[LossRow]) -> Figure:
         axis.grid(alpha=0.3)
     axes[0, 0].set_ylabel("loss (weighted squared error of\nthe estimated difference)")
     axes[0, 0].legend()
-    count = f"{len(seeds)} training{'s' * (len(seeds) > 1)}"
+    count = f"{len(seeds)} training{'s' if len(seeds) > 1 else ''}"
     figure.suptitle(f"{title} (held out: others); {count}", fontsize=11)
     return figure
 

@@ -249,13 +249,13 @@ def _format_constant(recording: Recording, name: str, default: float, unit: str)
 
 
 def _format_run_names(names: Sequence[str]) -> str:
-    runs = f"run{'s' * (len(names) > 1)} {', '.join(names[:_MOST_NAMES])}"
+    runs = f"run{'s' if len(names) > 1 else ''} {', '.join(names[:_MOST_NAMES])}"
     unnamed_count = len(names) - _MOST_NAMES
     return f"{runs} and {unnamed_count} more" if unnamed_count > 0 else runs
 
 
 def _format_count(number: int, noun: str) -> str:
-    return f"{number} {noun}{'s' * (number != 1)}"
+    return f"{number} {noun}{'s' if number != 1 else ''}"
 
 
 def _align_columns(rows: Sequence[Sequence[str]], left_columns: int) -> Iterator[str]:

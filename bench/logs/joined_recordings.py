@@ -81,7 +81,7 @@ def load_joined(
     joined_recording = replace(
         first,
         title=f"{first.title or first.path.stem} and {other_count} more "
-        f"log{'s' * (other_count > 1)}",
+        f"log{'s' if other_count > 1 else ''}",
         constants=constants,
         noise=_compute_rms_noise(recordings),
         runs=tuple(runs),

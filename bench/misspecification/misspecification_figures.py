@@ -65,24 +65,28 @@ class StudyResult(Protocol):
         """Return the names of the targets."""
 
 
-def draw_bias_figure(systems: Sequence[StudyResult], table: pd.DataFrame) -> Figure:
-    """Draw the signed error of each system's most biased parameter, by tuner.
+def draw_bias_figure(studies: Sequence[StudyResult], table: pd.DataFrame) -> Figure:
+    """Draw the signed error of each study's most biased parameter, by tuner.
+
+    That parameter is the one with the largest error of least squares in the original simulator.
 
     Args:
-        systems: The studies, one panel each.
+        studies: The studies, one panel each.
         table: Rows of their error tables.
     """
-    figure, panels = _make_panels(len(systems))
-    for panel, study in zip(panels, systems, strict=False):
-        lines = table[(table["experiment"] == study.experiment.name) & (table["metric"] == "bias")]
-        parameter = _find_most_biased(lines)
-        _draw_means(panel, study, lines[lines["parameter"] == parameter])
+    figure, panels = _make_panels(len(studies))
+    for panel, study in zip(panels, studies, strict=False):
+        bias_rows = table[
+            (table["experiment"] == study.experiment.name) & (table["metric"] == "bias")
+        ]
+        parameter = _find_most_biased_parameter(bias_rows)
+        _draw_means(panel, study, bias_rows[bias_rows["parameter"] == parameter])
         panel.axvline(0.0, color=ZERO_LINE_GREY, linewidth=0.8)
         panel.set_title(f"{study.name}: {parameter}\n{_format_missing_effects(study)}", fontsize=9)
         panel.set_xlabel("mean signed error [training widths]", fontsize=8)
     caption = (
         "The parameter with the largest error of least squares in the simulator as it is. Point: "
-        f"mean over {_format_target_count(systems)} of the recommendation after the whole budget "
+        f"mean over {_format_target_count(studies)} of the recommendation after the whole budget "
         "minus the true value. "
         "Bar: 95 % bootstrap interval. Left and right of zero: too small, too large."
     )
@@ -91,22 +95,22 @@ def draw_bias_figure(systems: Sequence[StudyResult], table: pd.DataFrame) -> Fig
     )
 
 
-def draw_prediction_figure(systems: Sequence[StudyResult], table: pd.DataFrame) -> Figure:
+def draw_prediction_figure(studies: Sequence[StudyResult], table: pd.DataFrame) -> Figure:
     """Draw the prediction error in unseen runs, by tuner.
 
     Args:
-        systems: The studies, one panel each.
+        studies: The studies, one panel each.
         table: Rows of their error tables.
     """
-    figure, panels = _make_panels(len(systems))
-    for panel, study in zip(panels, systems, strict=False):
+    figure, panels = _make_panels(len(studies))
+    for panel, study in zip(panels, studies, strict=False):
         is_of_study = table["experiment"] == study.experiment.name
         _draw_means(panel, study, table[is_of_study & (table["metric"] == "heldout_error")])
         panel.set_xscale("log")
         panel.set_title(f"{study.name}\n{_format_missing_effects(study)}", fontsize=9)
         panel.set_xlabel(f"RMSE of {study.channel} in unseen runs [{study.unit}]", fontsize=8)
     caption = (
-        f"Point: mean over {_format_target_count(systems)} of the error of the tuned simulator in "
+        f"Point: mean over {_format_target_count(studies)} of the error of the tuned simulator in "
         "runs that no tuner saw, without sensor noise. Bar: 95 % bootstrap interval."
     )
     heading = "Prediction of unseen runs where an effect is missing"
@@ -200,7 +204,7 @@ def _draw_means(panel: Axes, study: StudyResult, lines: pd.DataFrame) -> None:
     panel.invert_yaxis()
 
 
-def _find_most_biased(lines: pd.DataFrame) -> str:
+def _find_most_biased_parameter(lines: pd.DataFrame) -> str:
     """Return the parameter with the largest bias in the simulator as it is.
 
     The bias is that of the reference tuner, least squares, or of all tuners if it did not take

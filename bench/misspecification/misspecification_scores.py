@@ -234,9 +234,10 @@ def build_score_table(scores: StudyScores) -> pd.DataFrame:
 
 
 def build_rank_table(scores: StudyScores) -> pd.DataFrame:
-    """Build the table of each tuner's mean rank in both simulators; columns as `RANK_COLUMNS`.
+    """Build the table of each tuner's mean rank in the original and in the extended simulator.
 
-    Tuners are ranked on each target, 1 for the smallest error; ranks are averaged over targets.
+    Tuners are ranked on each target, 1 for the smallest error; ranks are averaged over targets. The
+    columns are `RANK_COLUMNS`.
 
     Args:
         scores: the scores of a study.
@@ -249,8 +250,8 @@ def build_rank_table(scores: StudyScores) -> pd.DataFrame:
             for model in MODEL_LABELS
         ]
         lines += [
-            (scores.experiment.name, metric, t, *r)
-            for t, *r in zip(tuners, *mean_ranks, strict=True)
+            (scores.experiment.name, metric, tuner, *ranks_of_tuner)
+            for tuner, *ranks_of_tuner in zip(tuners, *mean_ranks, strict=True)
         ]
     return pd.DataFrame(lines, columns=RANK_COLUMNS)
 

@@ -175,20 +175,23 @@ class ComparisonDiff:
         the error of b relative to a, and infinite errors count as failures.
         """
         a, b = (side.index_errors(kind, tuner, k) for side in (self.a, self.b))
-        shared = self.shared_targets
-        common_keys = [key for key in a.index if key in b.index and key[0] in shared]
-        paired = bool(common_keys)
-        if paired:
+        shared_targets = self.shared_targets
+        common_keys = [key for key in a.index if key in b.index and key[0] in shared_targets]
+        is_paired = bool(common_keys)
+        if is_paired:
             a, b = a[common_keys], b[common_keys]
-        by_target = [each.groupby(level="target").mean() for each in (a, b)]
-        first, second = (
-            compute_log_errors(np.asarray(each, dtype=np.float64)) for each in by_target
+        target_means = [errors.groupby(level="target").mean() for errors in (a, b)]
+        log_errors_a, log_errors_b = (
+            compute_log_errors(np.asarray(errors, dtype=np.float64)) for errors in target_means
         )
-        if paired:
-            count, _, _, ratio, p = compare_pair(second, first)
+        if is_paired:
+            count, _, _, ratio, p = compare_pair(log_errors_b, log_errors_a)
         else:
-            count, ratio, p = min(len(first), len(second)), *_compare_unpaired(first, second)
-        medians = [float(each.median()) for each in by_target]
+            count, ratio, p = (
+                min(len(log_errors_a), len(log_errors_b)),
+                *_compare_unpaired(log_errors_a, log_errors_b),
+            )
+        medians = [float(errors.median()) for errors in target_means]
         return {
             "range": kind,
             "tuner": tuner,
@@ -198,7 +201,7 @@ class ComparisonDiff:
             "median_b": medians[1],
             "ratio": ratio,
             "targets": count,
-            "paired": paired,
+            "paired": is_paired,
             "p_value": p,
             "failures_a": int(np.isinf(a).sum()),
             "failures_b": int(np.isinf(b).sum()),
@@ -340,28 +343,32 @@ class ComparisonDiff:
         document = self.to_document()
         head = ("range", "tuner", "", "simulations", "a", "b", "b / a", "targets", "p (Holm)")
         yield f"{self.metric}, median over targets; p of a difference, corrected for all lines"
-        rows = [head]
-        lines: list[dict[str, Any]] = document["errors"]
-        last = max((each["simulations"] for each in lines), default=0)
-        listed = [each for each in lines if each["significant"] or each["simulations"] == last]
-        for each in listed:
-            mark = "" if not each["significant"] else "WORSE" if each["ratio"] > 1 else "better"
-            rows.append(
+        table_rows = [head]
+        error_rows: list[dict[str, Any]] = document["errors"]
+        max_simulations = max((row["simulations"] for row in error_rows), default=0)
+        listed_rows = [
+            row for row in error_rows if row["significant"] or row["simulations"] == max_simulations
+        ]
+        for row in listed_rows:
+            change_text = (
+                "" if not row["significant"] else "WORSE" if row["ratio"] > 1 else "better"
+            )
+            table_rows.append(
                 (
-                    each["range"],
-                    each["tuner"],
-                    mark,
-                    str(each["simulations"]),
-                    format_number(each["median_a"]),
-                    format_number(each["median_b"]),
-                    format_number(each["ratio"]),
-                    f"{each['targets']}{'' if each['paired'] else ' not paired'}",
-                    format_number(each["p_holm"]),
+                    row["range"],
+                    row["tuner"],
+                    change_text,
+                    str(row["simulations"]),
+                    format_number(row["median_a"]),
+                    format_number(row["median_b"]),
+                    format_number(row["ratio"]),
+                    f"{row['targets']}{'' if row['paired'] else ' not paired'}",
+                    format_number(row["p_holm"]),
                 )
             )
-        yield from format_columns(rows)
-        if len(lines) > len(listed):
-            count = len(lines) - len(listed)
+        yield from format_columns(table_rows)
+        if len(error_rows) > len(listed_rows):
+            count = len(error_rows) - len(listed_rows)
             yield f"({count} more lines without a significant difference; --json has all)"
         yield from self._format_status_changes()
         for name, tuners in self.unshared_tuners.items():
@@ -395,7 +402,9 @@ def _compute_min_attainable_p_value(targets: int, paired: bool) -> float:
 
 
 def diff_comparisons(a: Path, b: Path) -> ComparisonDiff:
-    """Compare two comparisons.
+    """Compare two comparisons by the errors of their tuners.
+
+    Both are compared by the primary metric of the first one.
 
     Args:
         a: folder of the first comparison.

@@ -297,15 +297,15 @@ def _pair_coefficients(
     """
     rows = []
     for name in dict.fromkeys([*a, *b]):
-        first, second = a.get(name), b.get(name)
-        number = first or second
-        assert number is not None
-        row: dict[str, Any] = {"name": name, "unit": number.unit}
-        for mark, each in (("a", first), ("b", second)):
+        value_a, value_b = a.get(name), b.get(name)
+        any_value = value_a or value_b
+        assert any_value is not None
+        row: dict[str, Any] = {"name": name, "unit": any_value.unit}
+        for side_name, value in (("a", value_a), ("b", value_b)):
             row |= {
-                mark: each.value if each else None,
-                f"low_{mark}": each.low if each else None,
-                f"high_{mark}": each.high if each else None,
+                side_name: value.value if value else None,
+                f"low_{side_name}": value.low if value else None,
+                f"high_{side_name}": value.high if value else None,
             }
         rows.append(row)
     return rows

@@ -217,29 +217,30 @@ def _verify_losses(
     """Yield rows of a target whose losses and errors differ from repeated simulations.
 
     The proposals are simulated again for the losses, the recommendations for the errors on the
-    fitted and on the held-out scenarios.
+    fitted and on the held-out scenarios. The row k = 0 of a run has no proposal, only the first
+    recommendation.
     """
     names = [parameter.name for parameter in problem.cube.parameters]
     channel = problem.error_channel
-    simulated_rows = rows[rows["k"] > 0]
+    proposal_rows = rows[rows["k"] > 0]
     fitting = ProposalEvaluator(problem, target.blinded.fitting)
-    if len(simulated_rows):
+    if len(proposal_rows):
         proposed = _convert_to_unit_cube(
-            problem, simulated_rows[[f"proposal_{name}" for name in names]]
+            problem, proposal_rows[[f"proposal_{name}" for name in names]]
         )
         losses = np.concatenate([fitting(point[None])[1] for point in proposed])
         yield from _find_first_difference(
-            simulated_rows, "loss", losses, _SIMULATION_TOLERANCE, _SIMULATION_TOLERANCE
+            proposal_rows, "loss", losses, _SIMULATION_TOLERANCE, _SIMULATION_TOLERANCE
         )
     recommended = _convert_to_unit_cube(problem, rows[[f"recommendation_{name}" for name in names]])
-    for column, side in (
+    for column, observed_runs in (
         ("obs_error", target.blinded.fitting),
         ("heldout_error", target.blinded.held_out),
     ):
         # A run that ended before its first result has no error.
         has_value = rows[column].notna().to_numpy()
-        if side.scenarios and has_value.any():
-            rmse = ProposalEvaluator(problem, side).compute_rmse(
+        if observed_runs.scenarios and has_value.any():
+            rmse = ProposalEvaluator(problem, observed_runs).compute_rmse(
                 recommended[:0], recommended[has_value]
             )
             tolerance = _SIMULATION_TOLERANCE * float(problem.scale[channel])
@@ -269,11 +270,11 @@ def _find_first_difference(
         values, expected, rtol=relative_tolerance, atol=absolute_tolerance, equal_nan=True
     )
     if not is_close.all():
-        place = int(np.argmin(is_close))
+        first_row = int(np.argmin(is_close))
         count = int((~is_close).sum())
-        message = f"{column}: expected {expected[place]:.9g}, found {values[place]:.9g}"
+        message = f"{column}: expected {expected[first_row]:.9g}, found {values[first_row]:.9g}"
         suffix = f" ({count} rows of {rows['target'].iloc[0]})" if count > 1 else ""
-        yield VerificationFailure("runs.parquet", int(rows.index[place]) + 1, message + suffix)
+        yield VerificationFailure("runs.parquet", int(rows.index[first_row]) + 1, message + suffix)
 
 
 def _select_rows(runs: pd.DataFrame, max_count: int) -> pd.DataFrame:

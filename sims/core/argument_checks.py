@@ -165,7 +165,7 @@ def _bind_arguments(
                     f"{function_name}: expected {name}, {expected}; found none"
                 ) from None
         max_count = sum(p.kind is not p.KEYWORD_ONLY for p in signature.parameters.values())
-        plural = "s" * (max_count != 1)
+        plural = "" if max_count == 1 else "s"
         problem = f"expected at most {max_count} argument{plural} without a name, found {len(args)}"
         raise InputError(
             f"{function_name}: {problem}; name the others, as {names[-1]}=..."

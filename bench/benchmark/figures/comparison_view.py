@@ -102,7 +102,11 @@ class ComparisonView:
         return " [training widths]" if in_widths else ""
 
     def format_metric_label(self, metric: str) -> str:
-        """Return the axis label of an error."""
+        """Return the axis label of an error.
+
+        Errors along stiff directions are those of parameter combinations that the data determine,
+        sloppy ones those of the others.
+        """
         channel, parameter = self.labels
         return {
             "param_abs_error": (
@@ -113,7 +117,7 @@ class ComparisonView:
             "param_error": "mean parameter error [training widths]",
             "stiff_error": "error along stiff directions [training widths]",
             "sloppy_error": "error along sloppy directions [training widths]",
-            "obs_error": f"RMSE of {channel}" + ", runs tuned on" * self.is_recording,
+            "obs_error": f"RMSE of {channel}" + (", runs tuned on" if self.is_recording else ""),
             "heldout_error": f"RMSE of {channel}, "
             + ("held-out runs" if self.is_recording else "unseen scenarios"),
         }[metric]

@@ -122,7 +122,7 @@ def format_target_count(statistics: ComparisonStatistics, kind: str) -> str:
         _select_range(statistics, kind)["targets"],
     )
     deciding_count = int(deciding_counts.max()) if len(deciding_counts) else 0
-    unit = ("starting point" if kind == "real" else "target") + "s" * (count != 1)
+    unit = ("starting point" if kind == "real" else "target") + ("" if count == 1 else "s")
     # Targets whose data identify no direction have no deciding error.
     return (
         f"{count} {unit}"
@@ -149,7 +149,7 @@ def explain_ranking(statistics: ComparisonStatistics, kind: str) -> str:
     return (
         f"5.8x (8/10): median error 5.8 times the best one's, larger on 8 of 10 targets. Worse: "
         f"p < {SIGNIFICANCE:g} in Wilcoxon's signed-rank test against the best, Holm-corrected for "
-        f"{comparison_count} comparison{'s' * (comparison_count > 1)}."
+        f"{comparison_count} comparison{'s' if comparison_count > 1 else ''}."
     )
 
 
@@ -176,7 +176,8 @@ def warn_about_target_count(statistics: ComparisonStatistics, kind: str) -> str:
         return ""
     targets = int(ranked.max())
     return (
-        f"{targets} target{'s' * (targets != 1)} cannot decide between {comparison_count + 1} "
+        f"{targets} target{'s' if targets != 1 else ''} cannot decide between "
+        f"{comparison_count + 1} "
         f"tuners: at least {required_targets} are needed (--targets {required_targets})."
     )
 

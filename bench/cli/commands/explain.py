@@ -201,12 +201,12 @@ def _run_explain_batch(options: argparse.Namespace, print_line: PrintLine) -> Co
     logs = list_logs(options.recordings, output_folder, settings)
     started = get_utc_time()
 
-    finished = 0
+    finished_count = 0
 
-    def done(row: LogResult) -> None:
+    def print_finished_recording(row: LogResult) -> None:
         """Print the result of one log (recording) as soon as it is explained."""
-        nonlocal finished
-        finished += 1
+        nonlocal finished_count
+        finished_count += 1
         causes = [format_cause(cause) for cause in row.causes]
         seconds = "" if row.seconds is None else f" ({row.seconds:.0f} s)"
         with display.paused():
@@ -214,7 +214,7 @@ def _run_explain_batch(options: argparse.Namespace, print_line: PrintLine) -> Co
                 f"{row.log}: {row.error or row.verdict} {'; '.join(causes)}".rstrip() + seconds
             )
         display.advance()
-        display.completed(finished / len(logs))
+        display.completed(finished_count / len(logs))
 
     display = ProgressDisplay(silent=options.json, hint=False)
     with display, InterruptHandler(display.note) as interrupts:
@@ -225,15 +225,20 @@ def _run_explain_batch(options: argparse.Namespace, print_line: PrintLine) -> Co
         with pool:
             pool.load_plugins([Plugin(str(path)) for path in options.plugin])
             rows = explain_batch(
-                logs, output_folder, settings, pool, done, interrupts.is_stop_requested
+                logs,
+                output_folder,
+                settings,
+                pool,
+                print_finished_recording,
+                interrupts.is_stop_requested,
             )
     remaining = len(logs) - len(rows)
     folders = {log.name: log.folder for log in logs}
     relevant = {name: getattr(options, name) for name in _RESULT_RELEVANT_OPTIONS} | {"each": True}
-    words = format_explain_command(options.recordings, {**relevant, "out": output_folder})
+    command_words = format_explain_command(options.recordings, {**relevant, "out": output_folder})
     recordings = dict(zip(folders, options.recordings, strict=True))
     report = write_summary_page(
-        rows, BatchPageInput(output_folder, folders, recordings, words, remaining)
+        rows, BatchPageInput(output_folder, folders, recordings, command_words, remaining)
     )
     write_explanation_environment(output_folder, started, relevant, options.recordings)
     summary_lines = summarise_causes(rows)

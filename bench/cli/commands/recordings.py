@@ -182,7 +182,7 @@ def _run_simulate(options: argparse.Namespace, print_line: PrintLine) -> Command
     simulated.write(options.out)
     first = simulated.recording.runs[0]
     truth = options.out.with_suffix(".truth.toml")
-    runs = f"{options.runs} run{'s' * (options.runs > 1)}"
+    runs = f"{options.runs} run{'s' if options.runs > 1 else ''}"
     print_line(
         f"{options.out}: {runs} of {options.seconds:g} s at {options.rate:g} Hz, channels "
         f"{', '.join(first.channels)}"

@@ -105,9 +105,11 @@ class MachineRecordingConditions:
     ) -> Array:
         """Simulate noise-free encoder readings of the runs for fitting.
 
+        The held-out runs at the end of `runs` are left out.
+
         Args:
             effects: hidden effects of the library.
-            foreign: hidden unmodelled causes.
+            foreign: hidden causes that no effect of the library models.
             coarse: factor of the step size.
 
         Returns:
@@ -235,7 +237,8 @@ def _draw_runs(
 ) -> MachineRuns:
     """Draw runs whose commands keep the joints within the angle limit.
 
-    Commands are scaled down until the motion stays below `MAX_JOINT_ANGLE`. A servo gets goal
+    Commands are scaled down until the motion stays below `MAX_JOINT_ANGLE`, in at most
+    `MAX_COMMAND_ATTEMPTS` attempts; the last commands are used in any case. A servo gets goal
     angles of up to 0.7 rad, an arm torques of up to 1.5 times the gravity torque at 0.4 rad.
 
     Args:
@@ -246,22 +249,19 @@ def _draw_runs(
     """
     signal_form = str(rng.choice(["steps", "sine", "chirp"]))
     joints = len(plant.joints)
-    waves = np.array(
+    signals = np.array(
         [
             [draw_input_signal(signal_form, times, rng, (0.3, 2.0)) for _ in range(joints)]
             for _ in range(count)
         ]
     )
-    commands = np.moveaxis(waves, 1, 2)
+    commands = np.moveaxis(signals, 1, 2)
     initial_positions = rng.uniform(-0.4, 0.4, (count, joints))
     probe_positions = 0.4 * np.ones((1, joints))
     # Amplitude of the commands: rad for a servo, N m for an arm.
-    size = (
-        0.7
-        if plant.motors == ("goal",)
-        else np.abs(plant.compute_gravity_force(probe_positions))[0] * 1.5
-    )
-    commands = commands * size * rng.uniform(0.5, 1.0, (count, 1, joints))
+    is_servo = plant.motors == ("goal",)
+    amplitude = 0.7 if is_servo else np.abs(plant.compute_gravity_force(probe_positions))[0] * 1.5
+    commands = commands * amplitude * rng.uniform(0.5, 1.0, (count, 1, joints))
     for _ in range(MAX_COMMAND_ATTEMPTS):
         runs = MachineRuns(times, commands, initial_positions, np.zeros_like(initial_positions))
         max_angles = np.abs(simulate_machine(plant, runs, coarse=2.0).q).max(axis=(0, 2))

@@ -108,7 +108,7 @@ def find_leader(data: DiagnoserReportData) -> Leader | None:
     )
     row, text = alarms[leader], ""
     if row["high"] > TARGET_FALSE_ALARM_RATE:
-        text = f"{int(row['count'])} false alarm{'s' * (row['count'] != 1)}"
+        text = f"{int(row['count'])} false alarm{'s' if row['count'] != 1 else ''}"
     significance = _format_significance(data, leader, other_names)
     return Leader(
         leader,

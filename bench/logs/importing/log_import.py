@@ -43,7 +43,7 @@ def describe_logs(
     """
     options = options or ImportOptions()
     check_known_names(
-        "position unit", [options.position_unit] * bool(options.position_unit), POSITION_UNITS
+        "position unit", [options.position_unit] if options.position_unit else [], POSITION_UNITS
     )
     if options.rate is not None and not 0 < options.rate < np.inf:
         raise InputError(f"rate {options.rate:g}: expected a number of rows a second, more than 0")

@@ -151,8 +151,8 @@ def _count_quantisation_steps(values: Array) -> Array:
     """Return the (T - 1,) changes of a signal in units of its smallest change."""
     changes = np.diff(values)
     sizes = np.abs(changes[np.isfinite(changes)])
-    moving = sizes[sizes > 1e-9 * np.max(sizes, initial=0.0)]
-    if not moving.size:
+    nonzero_sizes = sizes[sizes > 1e-9 * np.max(sizes, initial=0.0)]
+    if not nonzero_sizes.size:
         return np.zeros_like(changes)
-    # A signal without quantisation has a tiny smallest change, so all of its motion counts as fast.
-    return np.asarray(np.round(changes / moving.min()), dtype=np.float64)
+    # Without quantisation the smallest change is tiny, so that any motion is many steps.
+    return np.asarray(np.round(changes / nonzero_sizes.min()), dtype=np.float64)

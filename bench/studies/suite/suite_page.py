@@ -145,8 +145,9 @@ def _build_guide_rows(tables: SuiteTables) -> list[dict[str, Any]]:
 def _build_rank_rows(tables: SuiteTables, k: int, order: Sequence[str]) -> list[dict[str, Any]]:
     """Build the rows of methods x cells after k simulations, best mean rank first.
 
-    Each entry has the rank of the method in the cell and a colour class from it. Methods that do
-    not have results in every cell come last, without a mean. `order` are the methods.
+    A cell is a problem with one range of targets. Each entry has the rank of the method in the cell
+    and a colour class from it. Methods that do not have results in every cell come last, without a
+    mean. `order` are the methods.
     """
     ranks = tables.get_ranks(k)
     errors = tables.errors[tables.errors["simulations"] == k].set_index(["cell", "tuner"])
@@ -177,7 +178,7 @@ def _build_rank_rows(tables: SuiteTables, k: int, order: Sequence[str]) -> list[
 def _build_cells(
     tables: SuiteTables, page: HtmlPage, styles: dict[str, MarkStyle]
 ) -> list[dict[str, Any]]:
-    """Build name, description and panel of each cell."""
+    """Build name, description and error curves of each cell, a problem with one target range."""
     points = [k for k in _CURVE_POINTS if k <= tables.suite.budget]
     parts = []
     for cell, curves in tables.curves.items():

@@ -158,7 +158,7 @@ def _collect_comparison(folder: Path, condition: str) -> SuiteRuns:
     statistics = compute_statistics(stored)
     curves = statistics.curves
     statuses = stored.statuses.drop_duplicates("run").set_index("run")
-    status = statuses.reindex(curves.keys["run"])
+    run_statuses = statuses.reindex(curves.keys["run"])
     keys = curves.keys
     cells = [name_cell(problem, str(kind), condition, experiment) for kind in keys["range"]]
     runs = pd.DataFrame(
@@ -168,15 +168,17 @@ def _collect_comparison(folder: Path, condition: str) -> SuiteRuns:
             "target": keys["target"].astype(str),
             "seed": keys["seed"],
             "simulations": curves.used,
-            "seconds": status["seconds"].to_numpy(),
+            "seconds": run_statuses["seconds"].to_numpy(),
             "failed": curves.failed,
         }
     )
     errors = curves.values.copy()
     # A run that used up a smaller budget says nothing about more simulations.
-    has_ended_early = (status["status"] == "done").to_numpy() & (curves.used < experiment.budget)
-    later = np.arange(errors.shape[1]) > curves.used[:, None]
-    errors[has_ended_early[:, None] & later] = np.nan
+    has_ended_early = (run_statuses["status"] == "done").to_numpy() & (
+        curves.used < experiment.budget
+    )
+    is_after_end = np.arange(errors.shape[1]) > curves.used[:, None]
+    errors[has_ended_early[:, None] & is_after_end] = np.nan
     errors[curves.failed] = np.inf
     parameter_count = _count_parameters(experiment)
     cell_rows = [

@@ -188,7 +188,10 @@ class SuiteTables:
 
     @cached_property
     def errors(self) -> pd.DataFrame:
-        """Median errors and ranks by cell, tuner and number of simulations."""
+        """Median errors and ranks by cell, tuner and number of simulations.
+
+        A cell is a problem with one range of targets. The columns are `ERROR_COLUMNS`.
+        """
         lines = []
         for k in self.checkpoints:
             ranks = self.get_ranks(k)
@@ -211,8 +214,10 @@ class SuiteTables:
     def ranks(self) -> pd.DataFrame:
         """Mean ranks over cells with 95 % bootstrap intervals, best first.
 
-        The intervals come from resampled cells: they say how far the mean rank depends on the
-        chosen problems. Only tuners with results in every cell are ranked.
+        A cell is a problem with one range of targets. The cost of training is left out (FREE) or
+        shared by the targets (COUNTED). The intervals come from resampled cells: they say how far
+        the mean rank depends on the chosen problems. Only tuners with results in every cell are
+        ranked.
         """
         lines = []
         for training in (FREE, COUNTED):
@@ -243,9 +248,9 @@ class SuiteTables:
     def pairs(self) -> pd.DataFrame:
         """Test the best tuner against each other one over all cells.
 
-        The test is Wilcoxon's signed-rank test of the median log errors, with Holm's correction for
-        the number of tuners. One row per tuner, number of simulations, and with or without training
-        cost.
+        A cell is a problem with one range of targets. The test is Wilcoxon's signed-rank test of
+        the median log errors, with Holm's correction for the number of tuners. One row per tuner,
+        number of simulations, and with or without training cost.
         """
         lines = []
         for training in (FREE, COUNTED):
@@ -333,7 +338,7 @@ class SuiteTables:
         dimension = cells["parameters"].astype(int)
         kind = cells["range"]
 
-        def pick(mask: pd.Series[bool]) -> list[str]:
+        def list_cells(mask: pd.Series[bool]) -> list[str]:
             return [str(cell) for cell in cells.loc[mask, "cell"]]
 
         def find_tagged(tag: str) -> pd.Series[bool]:
@@ -341,17 +346,17 @@ class SuiteTables:
 
         # Once explain has extended a simulator, nothing is missing any more.
         misspecified = find_tagged("misspecified") & (kind != "after")
-        yield "parameters", "1", pick(dimension == 1)
-        yield "parameters", "2 or 3", pick((dimension > 1) & (dimension <= 3))
-        yield "parameters", "4 to 10", pick(dimension > 3)
+        yield "parameters", "1", list_cells(dimension == 1)
+        yield "parameters", "2 or 3", list_cells((dimension > 1) & (dimension <= 3))
+        yield "parameters", "4 to 10", list_cells(dimension > 3)
         for tag in ("noise-free", "low-noise", "noisy"):
-            yield "noise", tag, pick(find_tagged(tag))
-        yield "range", "in range", pick(kind.isin(["in", "before", "after"]))
-        yield "range", "wide", pick(kind == "wide")
-        yield "simulator", "complete", pick(~misspecified & (kind != "real"))
-        yield "simulator", "an effect is missing", pick(misspecified & (kind != "real"))
-        yield "data", "measured", pick(kind == "real")
-        yield "data", "robot from a model file", pick(find_tagged("robot"))
+            yield "noise", tag, list_cells(find_tagged(tag))
+        yield "range", "in range", list_cells(kind.isin(["in", "before", "after"]))
+        yield "range", "wide", list_cells(kind == "wide")
+        yield "simulator", "complete", list_cells(~misspecified & (kind != "real"))
+        yield "simulator", "an effect is missing", list_cells(misspecified & (kind != "real"))
+        yield "data", "measured", list_cells(kind == "real")
+        yield "data", "robot from a model file", list_cells(find_tagged("robot"))
 
     def find_losses(self, tuner: str, k: int, factor: float = 3.0) -> pd.DataFrame:
         """Find the cells in which a tuner's error is larger than the best one's by a factor.

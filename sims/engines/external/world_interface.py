@@ -112,6 +112,9 @@ def find_world_module(
 ) -> tuple[ModuleType | None, str]:
     """Find the world module of a system and check its interface.
 
+    A world module builds the system as bodies of an external physics engine, such as MuJoCo or
+    Bullet. It is in the package of the system.
+
     Args:
         system: system whose world is needed.
         name: name of the module in the package of the system's own module.
@@ -146,8 +149,8 @@ def describe_missing_members(module: ModuleType, protocol: type) -> str:
     Returns:
         The end of a sentence; empty if the module is complete.
     """
-    # The check begins with the most general protocol, so that members required of all worlds are
-    # reported first.
+    # The check begins with the most general protocol, so that members required of all world modules
+    # are reported first.
     for part in reversed(protocol.__mro__):
         if part in (object, Generic, Protocol):
             continue
