@@ -208,7 +208,7 @@ def _unobserved(world: SteppableSimulator, observation: object, name: str) -> In
 def inertia_of(world: SteppableSimulator) -> float | Array:
     """Return the current generalised inertia of a simulator.
 
-    It is needed to find the dry friction that stops the motion (2).
+    It is needed to find the dry friction that stops the motion in the next step.
 
     Returns:
         A number, which applies to every coordinate, or a matrix (D, D).

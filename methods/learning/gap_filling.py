@@ -35,10 +35,11 @@ A smaller one means that the pole of the map is near, where the motion reaches t
 
 
 def fill_gaps(channel: Array, simulated: Array) -> Array:
-    """Fill the gaps of a sensor's channel from a simulation, through the map (1) between them.
+    """Fill the gaps of a sensor's channel from a simulation, through a fitted map between them.
 
-    The three numbers of the map are fitted to the available samples, as (2) and with Cauchy's
-    weights, because an inaccurate model agrees with the sensor only in parts of a run.
+    The map is y = (a + b x) / (1 + c x), as a camera maps a line (1). Its three numbers are fitted
+    to the available samples in linear form (2) and with Cauchy's weights, because an inaccurate
+    model agrees with the sensor only in parts of a run.
 
     Args:
         channel: (T,) channel with NaN for missing samples.

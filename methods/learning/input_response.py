@@ -42,7 +42,10 @@ With it, two collinear regressors, such as a constant input and 1, share a coeff
 def compute_response_coefficients(
     observations: Array, inputs: Array, lengths: tuple[int, ...]
 ) -> Array:
-    """Compute the coefficients of (1) for each run and channel, with time in samples.
+    """Fit an equation of motion (1) to each run and channel, with time in samples.
+
+    The acceleration of a channel is fitted by a constant, and by position, its cube, a smoothed
+    sign of the velocity, velocity and inputs.
 
     Args:
         observations: (n, T, C) observations with the runs concatenated along T; NaN for missing

@@ -285,6 +285,8 @@ def _make_loss(
 ) -> Callable[[Any, Any, Any], Any]:
     """Return a function that computes the loss (3) without the penalty on the weights.
 
+    It is the mean squared error of the estimated parameter differences, relative to their size.
+
     The function's arguments are the input rows of the proposed side (n, m, D) and of the target's
     side (n, m, E), and the parameters (n, m, dim), for n scenarios of m simulations. `w` are the
     weights as tensors. `is_target_only` is True for a network that sees the target only (direct

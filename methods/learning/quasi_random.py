@@ -20,7 +20,8 @@ _FIXED_POINT_ITERATIONS = 60
 def generate_quasi_random_points(count: int, shift: Array) -> Array:
     """Return quasi-random points of the unit cube by the additive recurrence (2).
 
-    They fill the cube more evenly than random points. A random shift gives another set of points.
+    Point n is (s + n g^-k) mod 1 in dimension k, with the generalised golden ratio g. They fill the
+    cube more evenly than random points. A random shift gives another set of points.
 
     Args:
         count: number of points.

@@ -273,7 +273,9 @@ class LinearModel:
         return bool(mean_square > _MIN_RELATIVE_SENSITIVITY * (self.jacobian**2).mean())
 
     def compute_step(self, chosen: Mask, mu: float) -> tuple[Array, float]:
-        """Compute Marquardt's step (1) from the model's point, clipped to the unit cube.
+        """Compute Marquardt's step from the model's point, clipped to the unit cube.
+
+        The step s solves (J^T J + mu D) s = -J^T r (1), with the diagonal D of J^T J.
 
         Args:
             chosen: mask of the fitted samples.

@@ -235,10 +235,12 @@ class BroydenSearch:
         return self._limit_to_bracket(guess, point, residual) if len(point) == 1 else guess
 
     def _update_slope(self, step: Array, change: Array) -> None:
-        """Correct the slope by Broyden's update (3), so that it explains the last step.
+        """Correct the slope B by Broyden's update, B + (y - B s) s^T / (s^T s) (3).
 
-        `step` (dim,) is the difference of two points and `change` (dim,) that of their estimates h.
-        A step of length zero is ignored.
+            Then B explains the last step: `step` s (dim,) is the difference of two points and
+            `change` y
+        (dim,) that of their estimates h.
+            A step of length zero is ignored.
         """
         square = step @ step
         if square > 0.0:

@@ -139,7 +139,8 @@ class TuRBO(Tuner):
 
         A random function of the Gaussian process is drawn at candidates in the region, and the
         candidate where it is largest (it models the negative loss) is chosen. The region is a box
-        around the best point with the sides (1). Without a successful simulation the point is
+        around the best point, whose sides are proportional to the length scales and have the
+        geometric mean `length` (1). Without a successful simulation the point is
         uniformly random.
 
         Args:

@@ -284,7 +284,7 @@ class UnitCube:
     """
 
     def __init__(self, parameters: Sequence[Parameter]) -> None:
-        """Compute the bounds of the cube for (1), as logarithms for log-scaled parameters."""
+        """Compute the bounds of the unit cube, as logarithms for log-scaled parameters."""
         self.parameters = tuple(parameters)
         self._log = np.array([p.log for p in self.parameters])
         self._any_log = bool(self._log.any())

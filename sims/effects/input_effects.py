@@ -269,7 +269,11 @@ def _apply_lag(signal: Signal, lag: Array) -> Array:
 
 
 def _apply_play(signal: Signal, half: Array) -> Array:
-    """Return the input (L, S) after backlash (7), with clearance `half` (L, 1) to either side."""
+    """Return the input (L, S) after backlash (7), with clearance `half` (L, 1) to either side.
+
+    The output is constant while it is within the clearance of the input; otherwise the nearer flank
+    pushes it.
+    """
     # The loop runs over contiguous rows, one per step.
     low = np.ascontiguousarray((signal.values - half).T)
     high = np.ascontiguousarray((signal.values + half).T)
@@ -284,7 +288,9 @@ def _apply_play(signal: Signal, half: Array) -> Array:
 
 
 def _apply_rate_limit(signal: Signal, limit: Array) -> Array:
-    """Return means (L, S) of the rate-limited input (9) over each step.
+    """Return means (L, S) over each step of an input w whose rate is limited (9).
+
+    With the command u and a step h, dw/dt = clip((u - w) / h, -limit, limit).
 
     `limit` (L, 1) is the largest rate, infinite for no limit.
     """

@@ -232,7 +232,8 @@ def _smooth_step(instant: Array, times: Array) -> Array:
 def _apply_lag(signal: Signal, lag: Array) -> Array:
     """Return a signal (L, S) after a first-order lag (4), at the end of each step.
 
-    The signal counts as linear within a step. `lag` (L, 1) is the time constant in seconds.
+    The result r obeys lag dr/dt = y - r, with the signal y linear within a step. `lag` (L, 1) is
+    the time constant in seconds.
     """
     decay, mean = compute_lag_response(signal.steps, lag)
     old = shift_by_one_step(signal.values, signal.start)

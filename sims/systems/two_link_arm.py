@@ -192,9 +192,10 @@ class TwoLinkArm(OwnSimulator):
                 self._heun(torques, seconds / _FRICTION_SUBSTEPS)
 
     def _heun(self, torques: tuple[float, float], seconds: float) -> bool:
-        """Make one step of Heun's method, (2) and (3), from two steps of Bullet.
+        """Make one step of Heun's method from two steps of Bullet, v to v1 and v1 to v2.
 
-        Bullet's step is of first order; the mean is of second order.
+        The result is q + h (v + v1) / 2 (2) and (v + v2) / 2 (3). Bullet's step is of first order;
+        these means are of second order.
 
         Returns:
             Whether a joint with dry friction came to rest or changed its direction.

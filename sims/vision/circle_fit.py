@@ -46,8 +46,9 @@ _MAX_RADIUS = 1e4
 def fit_circle(points: Array, start: tuple[float, float, float | None] | None) -> CircleFit | None:
     """Fit a circle to most of the points by Gauss-Newton with Tukey's weights.
 
-    The normal equations of (2) are solved explicitly, because the call of numpy's solver would take
-    most of the time.
+    A point at the distance d from the centre has the residual d - R, which is to first order
+    n . (du, dv) + dR with the direction n from the centre to the point (2). The normal equations
+    are solved explicitly, because the call of numpy's solver would take most of the time.
 
     Args:
         points: Points (n, 2), pixels.

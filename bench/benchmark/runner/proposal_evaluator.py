@@ -32,8 +32,8 @@ class ProposalEvaluator:
         """Prepare factors that convert sums of squared errors to the loss (1) and to the RMSE (2).
 
         `_missing` marks missing samples (T, C), or is None. `_mean_factors` and
-        `_loss_factors` (C,) are the factors 1/N_c of (2) and 1/(C N_c s_c^2) of (1).
-        `_evaluated_squares` collects
+        `_loss_factors` (C,) are the factors 1/N_c of (2) and 1/(C N_c s_c^2) of (1), for C channels
+        with N_c samples and the scale s_c. `_evaluated_squares` collects
         the sums of squares (n, C) of all batches, from which `compute_rmse` looks up points.
         """
         self._problem = problem

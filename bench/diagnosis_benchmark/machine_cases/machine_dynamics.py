@@ -252,7 +252,7 @@ class ServoDynamics(MachineDynamics):
     motors = ("goal",)
 
     def compute_mass_matrix(self, q: Array) -> Array:
-        """Compute the inertia (L, 1, 1) of equation (1), with that of hidden causes.
+        """Compute the inertia J + m l^2 (L, 1, 1) about the joint, with that of hidden causes.
 
         Args:
             q: positions, (L, 1); only their number is used.
@@ -263,7 +263,7 @@ class ServoDynamics(MachineDynamics):
         return inertia
 
     def compute_own_force(self, q: Array, v: Array, u: Array) -> Array:
-        """Compute motor torque and gravity, the right-hand side of equation (1).
+        """Compute motor torque k (d V - k q') / R and gravity, the right-hand side of equation (1).
 
         The position controller sets the duty d from the error of the goal; the motor's back EMF, k
         q', reduces the torque.
@@ -338,7 +338,7 @@ class ArmDynamics(MachineDynamics):
         return inertia
 
     def compute_own_force(self, q: Array, v: Array, u: Array) -> Array:
-        """Compute the right-hand side of (4): inputs, gravity, Coriolis forces and damping.
+        """Compute the forces of inputs, gravity, Coriolis effects and damping, as in (4).
 
         Args:
             q: positions, (L, 2).

@@ -62,7 +62,9 @@ def follow(commands: Sequence[Array], positions: Sequence[Array]) -> bool:
 
 
 def find_best_order(distances: Array) -> list[int]:
-    """Return the order that minimises (1), by linear assignment.
+    """Return the order of columns with the smallest sum of mean square distances (1).
+
+    It is found by linear assignment.
 
     Args:
         distances: (J, J) mean square distance of each command (rows) from each position (columns).

@@ -132,7 +132,9 @@ def _iterate_orders(names: Sequence[str]) -> Iterator[tuple[int, ...]]:
 def _compute_order_residual(
     robot: RobotModel, driven: Sequence[tuple[Joint, Actuator]], commands: Array, motion: Array
 ) -> float:
-    """Compute R of (1) for an order; infinite if joints would be far beyond their ranges.
+    """Compute the RMS force that actuators do not explain, relative to their forces (1).
+
+    It is infinite if joints would be far beyond their ranges.
 
     Args:
         robot: The model.

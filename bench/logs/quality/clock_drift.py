@@ -120,8 +120,9 @@ def _list_driven_positions(kind: type[Simulator]) -> list[tuple[str, str]]:
 def _estimate_run_drifts(run: Run, command: str, position: str) -> Iterator[_Estimate]:
     """Estimate the drift of the sensors' clock against the commands' clock in one run, by eq. (2).
 
-    The position is predicted by past commands, eq. (1); a drift makes the error of this prediction
-    grow with time. Nothing is yielded if the commands explain too little of the motion.
+    The position is predicted by means of past commands, eq. (1). A drift makes the delay grow with
+    time t, so that the error of the prediction has a part proportional to t times the velocity.
+    Nothing is yielded if the commands explain too little of the motion.
     """
     t, u, y = run.times, run.inputs[command], run.channels[position]
     is_recorded = np.isfinite(y)

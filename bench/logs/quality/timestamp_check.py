@@ -208,7 +208,7 @@ def _compute_rest_accelerations(recording: Recording, run: Run, system: System) 
 
 
 def _estimate_lag(x: Array) -> float:
-    """Return the lag of (1) in samples.
+    """Return the shortest lag in samples after which values differ by their spread (1).
 
     Returns 0 if the first lag exceeds the spread already, since motion between samples is not
     recorded.

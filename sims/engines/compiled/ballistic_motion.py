@@ -95,7 +95,8 @@ def record_arc(
 ) -> None:
     """Record the state of slot 0 on its present parabola at a time, by (1) and (2).
 
-    The record is position, velocity and acceleration, D numbers each.
+    The position is x + v s + a s^2 / 2 and the velocity v + a s, with the time s since the
+    beginning of the parabola. The record is position, velocity and acceleration, D numbers each.
 
     Args:
         program: program of the system and its effects.

@@ -199,9 +199,11 @@ def is_newly_loaded(block: BlockBuffers, i: int) -> bool:
 
 
 def try_step(program: ProgramArrays, block: BlockBuffers, w: int) -> None:
-    """Try a step of H seconds of every element, equations (2) to (6).
+    """Try a step of H seconds of every element by the classical Runge-Kutta method, (2) to (6).
 
-    The result is stored in rows NEXT_X and NEXT_V.
+    The acceleration k1 at the beginning is in rows K1. Stages 1 and 2 evaluate k2 and k3 in the
+    middle of the step, stage 3 evaluates k4 at its end. The result is stored in rows NEXT_X and
+    NEXT_V.
 
     Args:
         program: program of the system and its effects.

@@ -334,8 +334,8 @@ def handle_impact(
 ) -> None:
     """Apply the impact to which a step led up to rounding.
 
-    The remaining distance to the ground is removed by a time correction (10), then the velocity
-    changes.
+    The remaining distance d to the ground is removed by the time correction (10), which is
+    -d / r (1 + d a / (2 r^2)) with the rate r and acceleration a. Then the velocity changes.
 
     Args:
         program: program of the system and its effects.

@@ -309,8 +309,9 @@ class BallRollout:
     def _advance_with_forces(self, step: float) -> None:
         """Advance by one step of `step` seconds under all forces, in flight or at rest.
 
-        It applies the force of (4), which gives the velocity of (3) second order in the
-        step.
+        The engine's velocity w belongs to the time half a step before the position. The applied
+        force per unit mass, (v + h/2 a - w) / h - g (4), makes the velocity v' = w' + h/2 a' (3)
+        of second order in the step h.
         """
         half_step = 0.5 * step
         wx, wy, wz = self._prepare_step(step)

@@ -157,8 +157,8 @@ class LinearisedForces:
     def linearise(self, t: float, x: float, v: float) -> None:
         """Evaluate all forces at a state, and their slope by the velocity as a difference quotient.
 
-        The half steps (1) and (3) then find the force at other velocities without
-        evaluating it again.
+        The half steps of the velocity at both ends of a step then find the force at other
+        velocities without evaluating it again.
         """
         # The second velocity is farther from zero, where forces may be discontinuous.
         velocity_step = math.copysign(VELOCITY_STEP, v)
@@ -195,7 +195,9 @@ class LinearisedForces:
 
 
 def subtract_dry_friction(velocity: float, force: float, limit: float) -> float:
-    """Return a force minus dry friction, equations (9) and (10).
+    """Return a force F minus dry friction with the limit L.
+
+    In motion it is F - L sign(v) (9), at rest F - L sign(F), or 0 if |F| <= L (10).
 
     Args:
         velocity: velocity of the body.
@@ -322,7 +324,10 @@ def _read_trajectory(
 
 
 def _to_full_step_velocity(w: Any, force: Any, inertia: Any, damping: Any, step: Any) -> Any:
-    """Return the velocity at the time of the position, equation (6); numbers or arrays.
+    """Return the velocity at the time of the position, (w + h/2 F / M) / (1 + h/2 c / M) (6).
+
+    The engine's velocity w belongs to the time half a step h before. All arguments are numbers or
+    arrays.
 
     Args:
         w: the engine's velocity, half a step before the position.
@@ -354,7 +359,9 @@ def _to_half_step_velocity(v: Any, force: Any, inertia: Any, damping: Any, step:
 def _compute_transition_force(
     drive_force: Any, u: Any, inertia: Any, damping: Any, step: Any
 ) -> Any:
-    """Return the force over the step in which the input changes, equation (8).
+    """Return the force over the step in which the input changes from u to u', equation (8).
+
+    It is u' + (1/2 - h c / (4 M)) (u - u'), so that the step has half an impulse of each.
 
     Args:
         drive_force: force of the input before the change.
@@ -367,7 +374,11 @@ def _compute_transition_force(
 
 
 def _integrate_stepwise(joint: JointBody, element: ElementWork, inertia: float) -> Trajectory:
-    """Integrate a joint by (1) to (4), with forces that are evaluated in each step.
+    """Integrate a joint, with forces that are evaluated in each step, by equations (1) to (4).
+
+    The engine's velocity w belongs to the time half a step before the position. Each step begins
+    with half a step of the velocity (1), which is applied as one force (4); the engine moves the
+    joint (2); the second half of the velocity is implicit in the damping (3).
 
     It is used unless the forces are those of the inputs and linear damping alone. `inertia` is in
     kg m^2 or kg. A failed integration is NaN throughout.

@@ -66,7 +66,10 @@ class ActivationFilter(NamedTuple):
     def compute_activations(
         self, controls: Array, initial: Array, step: float, is_rk4: bool
     ) -> Array:
-        """Compute activations at the beginnings of steps, by Euler's method (1) or exactly (2).
+        """Compute activations a at the beginnings of steps of length h, with the time constant T.
+
+        They approach the control by the share h / T in each step (Euler's method) or by
+        1 - exp(-h / T) (exactly).
 
         Args:
             controls: (n, S) controls of the steps.

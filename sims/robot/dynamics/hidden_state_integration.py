@@ -26,9 +26,11 @@ STATE_STEP = 1e-6
 def advance_state(
     effect: HiddenStateEffect, c: Array, snapshot: StateSnapshot, state: HiddenState, step: float
 ) -> HiddenState:
-    """Advance a hidden state by one exponential Rosenbrock-Euler step (1).
+    """Advance a hidden state w by one exponential Rosenbrock-Euler step (1).
 
-    The derivative dr/dw is a difference quotient.
+    With the rate r(w) and the step h, w changes by h phi(z) r, z = h dr/dw and
+    phi(z) = (e^z - 1) / z, which is exact if the rate is linear in w. The derivative dr/dw is a
+    difference quotient.
 
     Args:
         effect: effect with the hidden state.

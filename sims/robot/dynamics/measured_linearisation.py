@@ -243,10 +243,12 @@ class MeasuredLinear(RunLinearisation):
     # -- the model from sample to sample
 
     def interval_maps(self) -> IntervalMaps:
-        """Compose the steps between samples into the linear maps (3), and the readings (4).
+        """Compose the steps between samples into linear maps (3), and linearise the readings (4).
 
-        The maps give the deviation at the next sample from that at a sample, which a Kalman
-        smoother needs. The defect of each step is composed in the same way.
+        A deviation of the state from the given motion has one map A per step; the map of an
+        interval is the product of these. The maps give the deviation at the next sample from that
+        at a sample, which a Kalman smoother needs. The defect of each step is composed in the same
+        way.
         """
         tangent, state_size = self._tangent, self._tangent.state_size
         forces = tangent.quotients.forces.shape[2]
@@ -336,7 +338,7 @@ class MeasuredLinear(RunLinearisation):
         predicted: Array,
         driven: Mapping[int, Sequence[Perturbation]] | None = None,
     ) -> tuple[SingleArray, SingleArray]:
-        """Compute what candidate effects add to (3) and (4).
+        """Compute what candidate effects add to the states (3) and to the readings (4).
 
         A force is replaced by its mean over the interval between two samples. Sensor effects are
         applied to predicted readings: a gain applied to the recorded reading would contain the
@@ -413,7 +415,7 @@ class MeasuredLinear(RunLinearisation):
     def _compute_direct_readings(
         self, read: Array, sensors: Sequence[ActiveEffects], predicted: Array
     ) -> Array:
-        """Compute the direct changes ψ (T, C, K) of readings by K candidates, in (4).
+        """Compute the direct changes ψ (T, C, K) of readings by K candidates.
 
         They do not pass through the motion, such as the bias of a sensor. Sensor effects
         may be nonlinear, so they are applied to the predicted readings and the readings
@@ -449,6 +451,8 @@ class MeasuredLinear(RunLinearisation):
 
     def propagated(self, begun: Array, forces: Array) -> Array:
         """Propagate deviations at samples to all steps, (S + 1, Z), by the linear model (2).
+
+        In each step a deviation δ becomes A δ - d + B f, with the defect d of the step.
 
         Args:
             begun: δ (T, Z) at the samples.

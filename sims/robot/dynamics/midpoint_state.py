@@ -60,7 +60,7 @@ class JointStates(NamedTuple):
 
 
 def predict_midpoint(x: Array, v: Array, a: Array, step: Array | float) -> tuple[Array, Array]:
-    """Predict positions and velocities half a step later, by constant acceleration (1).
+    """Predict positions and velocities half a step later, for a constant acceleration.
 
     Args:
         x: positions.

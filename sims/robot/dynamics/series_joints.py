@@ -256,6 +256,8 @@ def is_compliant_flank(elements: SeriesElement) -> Flags:
 def convert_flank_parameters(fields: Mapping[str, Any], robot: RobotModel) -> None:
     """Convert stiffness and damping of compliant flanks to parameters of MuJoCo's limit by (6).
 
+    They are multiplied by the inverse inertia that MuJoCo has derived.
+
     Args:
         fields: model fields of the batch elements.
         robot: robot of `add_series_joints`.

@@ -148,12 +148,13 @@ class TangentModel:
         return int(self._base_states.shape[1])
 
     def _compute_difference_quotients(self) -> DifferenceQuotients:
-        """Compute the matrices A, B and C of (1) by forward differences at all points.
+        """Compute the derivatives of a step by states, forces and controls at all points.
 
-        `displacements` lists the displacements as (quantity, index, size). The quantities are q
-        position, v velocity, a activation, w hidden state of an effect, p and r
-        displacement and velocity of floating bodies, f force, u control. `quotients` has those
-        of states and readings by the state z, the forces f and the controls u.
+        They are forward differences (1). `displacements` lists the displacements as (quantity,
+        index, size). The quantities are q position, v velocity, a activation, w hidden state of an
+        effect, p and r displacement and velocity of floating bodies, f force, u control.
+        `quotients` has those of states and readings by the state z, the forces f and the controls
+        u.
         """
         joint_count = self._motion.x.shape[1]
         floating_count = self._sizes.size - joint_count
@@ -194,7 +195,8 @@ class TangentModel:
     ) -> Perturbation:
         """Return the change of motion by other model parameters, per unit of `change`.
 
-        By (2), another acceleration at the same state acts like the force M da.
+        A change da of the acceleration at the same state acts like the force M da, with the inertia
+        matrix M.
 
         Args:
             owner: number of the effect candidate.
@@ -263,8 +265,9 @@ class TangentModel:
     def propagate(self, changes: Sequence[Perturbation], count: int) -> tuple[Array, Array]:
         """Propagate changes along the motion by (2), added up for each owner.
 
-        An owner is the candidate to which a change belongs; all n owners are propagated in
-        one matrix product per step.
+        A step multiplies a change of the state by A and adds B times the change of forces and C
+        times that of controls (2). An owner is the candidate to which a change belongs; all n
+        owners are propagated in one matrix product per step.
 
         Args:
             changes: changes with owners from 0 to `count` - 1.

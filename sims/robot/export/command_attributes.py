@@ -116,7 +116,7 @@ _NOT_LINEAR = "its actuator is not a gain and a bias of one control"
 
 
 def _write_input_gain(fields: Fields, robot: RobotModel, cause: FittedCause) -> UnstatableReason:
-    """Write an input gain into the actuator: scale its gain, eq. (1), and its range, eq. (2)."""
+    """Write an input gain a into the actuator: gain times 1 + a (1), range divided by it (2)."""
     actuator, (a,) = _Actuator(fields, robot, cause.place), cause.coefficients
     can_scale = actuator.single and actuator.fixed and (actuator.direct or actuator.filtered)
     if not can_scale:
@@ -131,7 +131,7 @@ def _write_input_gain(fields: Fields, robot: RobotModel, cause: FittedCause) -> 
 
 
 def _write_input_bias(fields: Fields, robot: RobotModel, cause: FittedCause) -> UnstatableReason:
-    """Write an input bias into the actuator: shift its force, eq. (1), and its range, eq. (2).
+    """Write an input bias b into the actuator: shift its force by gain b (1), its range by -b (2).
 
     `input_factor` is the factor 1 + a of an input gain that is in the fields already.
     """

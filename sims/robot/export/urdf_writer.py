@@ -125,7 +125,7 @@ class UrdfWriter:
         return inertials or None
 
     def _write_mass(self, cause: FittedCause) -> str | None:
-        """Scale mass and inertia tensor of each link in the body, by eq. (1).
+        """Scale mass and inertia tensor of each link in the body by 1 + c, eq. (1).
 
         The result is None, or the reason why the URDF cannot state the cause.
         """
