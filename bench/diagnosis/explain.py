@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import replace
 from itertools import combinations
@@ -225,7 +225,6 @@ class _ExplainRun:
         self.seed = options.seed
         self.tuner = options.tuner
         self.say = say = options.say
-        self.notes: tuple[str, ...] = ()
         self.force = force = options.force
         self.thorough = options.thorough
         self.watch = options.make_search_control()
@@ -251,18 +250,32 @@ class _ExplainRun:
         self.free = () if kind.has_model else tuple(options.free)
         kind = self._add_contact_effects(kind)
         # This check precedes the run evaluators, which plan every step of every run.
-        for anomaly in check_recording_plausible(self.recording, kind, force):
-            say(f"{self.path}: {anomaly}")
-        self._prepare_recording(kind, options)
+        for odd in check_recording_plausible(self.recording, kind, force):
+            say(f"{self.path}: {odd}")
+        self.recording, thinned = thin_recording(self.recording, kind)
+        self.recording, settled = leave_out_settling(self.recording, kind)
+        self.recording, note = segment_recording(
+            self.recording, kind, options.pieces, options.whole
+        )
+        recorded = self.recording.runs[0].channels
+        names = [channel.name for channel in kind.channels if channel.name in recorded]
+        self.recording, quiet = add_least_noise(self.recording, names)
+        said = thinned, settled, note, _format_added_noise(quiet)
+        self.notes = tuple(text for text in said if text)
+        for note in self.notes:
+            say(note)
         check_recording_size(self.recording, kind(engine=self.engine), force)
         # By name, the declared range of a base parameter and the wider range that replaced it.
         self.wider: dict[str, tuple[Bounds, Bounds]] = {}
         # Base parameters of a robot, identified by prediction errors; starting values of the fit.
         self.identified: Array | None = None
         self._set_up(kind)
-        self._add_notes(
-            f"{effect} is not tested: {reason}" for effect, reason in kind.system.left_out.items()
-        )
+        left_out = [
+            f"{effect} is not tested: {why}" for effect, why in kind.system.left_out.items()
+        ]
+        for line in left_out:
+            say(line)
+        self.notes = (*self.notes, *left_out)
         self.coarse: CoarseStepFinding | None = None
         self._filtered: FollowedRuns | None = None
         # Finer steps than the file's, and the run evaluators with the file's step if one is used.
@@ -271,30 +284,6 @@ class _ExplainRun:
         self.found: tuple[EffectSearch, DiagnosisResult] | None = None
         self.faults: tuple[RecordingFault, ...] = ()
         self._check_recording()
-
-    def _prepare_recording(self, kind: type[SystemSimulator], options: ExplainOptions) -> None:
-        """Thin and split the runs, leave out their settling, and add noise where there is none.
-
-        The recording is replaced, and each change is noted.
-        """
-        self.recording, thinning_note = thin_recording(self.recording, kind)
-        self.recording, settling_note = leave_out_settling(self.recording, kind)
-        self.recording, segment_note = segment_recording(
-            self.recording, kind, options.pieces, options.whole
-        )
-        recorded = self.recording.runs[0].channels
-        names = [channel.name for channel in kind.channels if channel.name in recorded]
-        self.recording, noise_free_channels = add_least_noise(self.recording, names)
-        noise_note = _format_added_noise(noise_free_channels)
-        notes = thinning_note, settling_note, segment_note, noise_note
-        self._add_notes(note for note in notes if note)
-
-    def _add_notes(self, notes: Iterable[str]) -> None:
-        """Report notes to the user, and keep them for the report."""
-        added_notes = tuple(notes)
-        for note in added_notes:
-            self.say(note)
-        self.notes = (*self.notes, *added_notes)
 
     def _add_contact_effects(self, kind: type[SystemSimulator]) -> type[SystemSimulator]:
         """Return the simulator of a robot with effects at the contacts of the recording."""
@@ -418,9 +407,9 @@ class _ExplainRun:
         base = self._fit_base()
         if not np.isfinite(base.fit.simulated[np.isfinite(self.fitting.observed)]).all():
             raise self._make_simulation_error()
-        result = self._search_with_friction_forms(base)
-        result = self._search_with_better_step(result.search, result.finding) or result
-        base, search, finding, rng = result
+        found = self._search_with_friction_forms(base)
+        found = self._search_with_better_step(found.search, found.finding) or found
+        base, search, finding, rng = found
         self.watch.begin_stage("measuring the gain")
         verdict = self.assessor.build_verdict(search, finding, rng, self.started)
         verdict = replace(
@@ -433,10 +422,10 @@ class _ExplainRun:
             *describe_unusual_values(self.fitting, finding.model.fit.theta, self.wider),
             *self.notes,
         )
-        report_data = DiagnosisReportDataBuilder(
+        story = DiagnosisReportDataBuilder(
             self.assessor, search, base, finding, notes
         ).build_report_data(verdict)
-        return Explanation(verdict, report_data, self._build_extended_simulator(search, finding))
+        return Explanation(verdict, story, self._build_extended_simulator(search, finding))
 
     def _search_with_friction_forms(self, base: BaseFit) -> _SearchResult:
         """Search for causes; repeat with MuJoCo's soft dry friction if the data support that form.
@@ -453,38 +442,33 @@ class _ExplainRun:
         from bench.diagnosis.prediction_error.prediction_error_search import PredictionErrorSearch
         from bench.diagnosis.prediction_error.selection_fits import SoftFrictionError
 
-        stiff_evaluators = _RunEvaluators(self.kind, self.fitting, self.validation)
+        stiff = _RunEvaluators(self.kind, self.fitting, self.validation)
         try:
-            result = _SearchResult(base, search, self._find_causes(search), rng)
-            # The search itself compares the forms of friction that it selects, but not of friction
-            # that is a free number.
-            is_comparison_needed = (
-                has_dry_friction(self.fitting, ())
-                and not self.faults
-                and not self.watch.has_abandoned_fits()
-            )
-            if not is_comparison_needed or not is_likelier_soft(
-                search, result.finding.model, INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
+            found = _SearchResult(base, search, self._find_causes(search), rng)
+            # A search does not select dry friction that is a free number.
+            is_free = has_dry_friction(self.fitting, ())
+            done = self.watch.has_abandoned_fits() or bool(self.faults) or not is_free
+            if done or not is_likelier_soft(
+                search, found.finding.model, INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
             ):
-                return result
+                return found
             return self._search_with_soft_friction(base, search)
         except SoftFrictionError as error:
-            soft_result = self._search_with_soft_friction(base, search, error.start)
+            soft = self._search_with_soft_friction(base, search, error.start)
             if (
                 not error.is_preliminary
-                or self._is_explained(soft_result)
+                or self._is_explained(soft)
                 or self.watch.has_abandoned_fits()
             ):
-                return soft_result
+                return soft
         self.say(STIFF_FRICTION)
-        self._restore_evaluators(stiff_evaluators, self.assessor.before)
-        stiff_search = self._create_search(base, rng, is_form_given=True)
-        if isinstance(search, PredictionErrorSearch) and isinstance(
-            stiff_search, PredictionErrorSearch
-        ):
-            stiff_search.take_over(search)
+        before = self.assessor.before
+        self._restore_evaluators(stiff, before)
+        again = self._create_search(base, rng, is_form_given=True)
+        if isinstance(search, PredictionErrorSearch) and isinstance(again, PredictionErrorSearch):
+            again.take_over(search)
         try:
-            return _SearchResult(base, stiff_search, self._find_causes(stiff_search), rng)
+            return _SearchResult(base, again, self._find_causes(again), rng)
         except SoftFrictionError as error:
             return self._search_with_soft_friction(base, search, error.start)
 
@@ -515,9 +499,9 @@ class _ExplainRun:
                 "or write a corrected description: "
                 f"simgap inspect {self.path.name} --fix NAME.toml"
             )
-        description = "; ".join(difference.description for difference in differences)
+        what = "; ".join(one.description for one in differences)
         raise InputError(
-            f"{self.path}: {description}; expected the conventions of the model file: {remedy} "
+            f"{self.path}: {what}; expected the conventions of the model file: {remedy} "
             "(--force explains the log as it is)"
         )
 
@@ -527,35 +511,33 @@ class _ExplainRun:
         return found.finding.verdict in EXPLAINED_VERDICTS
 
     def _search_with_soft_friction(
-        self, base: BaseFit, stiff_search: EffectSearch, likely: FitStart | None = None
+        self, base: BaseFit, before: EffectSearch, likely: FitStart | None = None
     ) -> _SearchResult:
-        """Refit the base model with MuJoCo's soft dry friction, and search for causes again.
+        """Search and judge with MuJoCo's soft dry friction.
 
         Args:
-            base: Base model, fitted with stiff friction.
-            stiff_search: Search with stiff friction; its results are reused where they are valid.
+            base: Base model.
+            before: Search with stiff friction.
             likely: Model that may explain the runs.
         """
         # This import is needed for robots only.
         from bench.diagnosis.prediction_error.prediction_error_search import PredictionErrorSearch
 
         self.say(SOFT_FRICTION)
-        base_prediction = self.assessor.before
+        held_out = self.assessor.before
         self._set_up(make_soft_kind(self.kind))
-        self.assessor = replace(self.assessor, before=base_prediction)
+        self.assessor = replace(self.assessor, before=held_out)
         fitter = TrajectoryFitter(self.fitting, self.noise, base.fixed_parameters)
         start = replace(base.fit.make_start(), initial_states=self.fitting.initial_state_guesses)
         (fit,) = fitter.fit_models([start], FINAL_ITERATIONS)
         base = self._correct_step_errors(replace(base, fit=fit))
         rng = self._make_rng()
         search = self._create_search(base, rng)
-        if isinstance(search, PredictionErrorSearch) and isinstance(
-            stiff_search, PredictionErrorSearch
-        ):
+        if isinstance(search, PredictionErrorSearch) and isinstance(before, PredictionErrorSearch):
             search.likely = likely
             # Friction of the file keeps its form unless it is a free number.
             if not has_dry_friction(self.fitting, ()):
-                search.take_over(stiff_search)
+                search.take_over(before)
         return _SearchResult(base, search, self._find_causes(search), rng)
 
     def _finish_base_and_search(self, base: BaseFit) -> _SearchResult:
@@ -601,13 +583,14 @@ class _ExplainRun:
 
         For a robot, units are usually tested only if no effect has explained the gap before.
         """
-        is_explained = finding.verdict in EXPLAINED_VERDICTS
-        if not self._checks_units_late or is_explained or self.watch.has_abandoned_fits():
+        explained = finding.verdict in EXPLAINED_VERDICTS
+        if not self._checks_units_late or explained or self.watch.has_abandoned_fits():
             return ()
-        remaining_excess = search.compute_excess_residual(finding.model)
-        base_excess = search.compute_excess_residual(search.base_model)
+        left, before = (
+            search.compute_excess_residual(model) for model in (finding.model, search.base_model)
+        )
         # With a wrong unit or sign, effects would leave more of the discrepancy.
-        if remaining_excess < MAX_EXCESS_SHARE_WITH_RIGHT_UNITS * base_excess:
+        if left < MAX_EXCESS_SHARE_WITH_RIGHT_UNITS * before:
             return ()
         base = BaseFit(search.base_model.fit, frozenset(search.fixed_parameters))
         fault = find_wrong_units(self._unit_check_subject, self.fitting, self.noise, base)
@@ -617,11 +600,11 @@ class _ExplainRun:
         self, search: EffectSearch, finding: DiagnosisResult
     ) -> tuple[RecordingFault, ...]:
         """Return wrong units and signs that the diagnosed causes imitate."""
-        faults = [
+        found = [
             find_imitated_unit(self._unit_check_subject, self.fitting, cause, search.base_model.fit)
             for cause in self.assessor.causes(search, finding)
         ]
-        return tuple(fault for fault in faults if fault is not None)
+        return tuple(fault for fault in found if fault is not None)
 
     @property
     def _unit_check_subject(self) -> Subject:
@@ -648,8 +631,8 @@ class _ExplainRun:
             return None
         search, finding = self.found
         for cause in finding.causes:
-            other_causes = {name for name in finding.model.effects if name != cause.effect}
-            keys = [frozenset({*other_causes, effect}) for effect in cause.alternatives]
+            rest = {name for name in finding.model.effects if name != cause.effect}
+            keys = [frozenset({*rest, other}) for other in cause.alternatives]
             competing_models = [search.models[key] for key in keys if key in search.models]
             if competing_models:
                 return design_next_run(search, finding.model, competing_models, seconds, longest)
@@ -704,12 +687,12 @@ class _ExplainRun:
 
         This is so for a robot's recording, unless its free numbers could not be identified.
         """
-        has_unidentified_base = (
+        lost = (
             self.has_base_parameters
             and self.identified is None
             and self.fitting.filtered_runs is not None
         )
-        return self.kind.has_model and not has_unidentified_base
+        return self.kind.has_model and not lost
 
     @property
     def has_base_parameters(self) -> bool:
@@ -727,9 +710,9 @@ class _ExplainRun:
 
         self.watch.begin_stage("computing prediction errors")
         evaluator, *held_out = self._list_run_evaluators()
-        filtered_runs = self._get_filter()
+        followed = self._get_filter()
         # Where the linear model diverges, causes are searched by simulation.
-        if not filtered_runs.is_sound or self._is_linear_model_wrong_at_contacts(filtered_runs):
+        if not followed.is_sound or self._is_linear_model_wrong_at_contacts(followed):
             if self._has_contacts:
                 # This import is needed for robots only.
                 from bench.diagnosis.kalman.contact_proposals import set_first_states_in_contact
@@ -738,27 +721,25 @@ class _ExplainRun:
                 set_first_states_in_contact(self._list_run_evaluators(), theta, self.noise.sigma)
             return
         if self.has_base_parameters and self.tuner is None:
-            filtered_runs = self._filter_with_fitted_parameters(filtered_runs)
-        evaluator.follow(filtered_runs)
+            followed = self._filter_with_fitted_parameters(followed)
+        evaluator.follow(followed)
         for evaluator in held_out:
             # Held-out runs are only simulated; without a filter they begin at their measured
             # values.
             theta = evaluator.get_nominal_theta()
-            filtered_held_out = FollowedRuns.follow(
-                evaluator, theta, self.noise, max_linearisations=1
-            )
-            if filtered_held_out.is_sound:
-                evaluator.follow(filtered_held_out)
+            found = FollowedRuns.follow(evaluator, theta, self.noise, max_linearisations=1)
+            if found.is_sound:
+                evaluator.follow(found)
 
-    def _is_linear_model_wrong_at_contacts(self, filtered_runs: FollowedRuns) -> bool:
+    def _is_linear_model_wrong_at_contacts(self, followed: FollowedRuns) -> bool:
         """Return whether the linear model of a robot fails at the contacts of the recording.
 
         The depth of a contact is smaller than the noise of most encoders, so that a model that is
         linearised about the readings has wrong contact forces. The filter then needs a missing
         force that is larger than all typical forces.
         """
-        force_share = float((filtered_runs.force / filtered_runs.typical).max())
-        return self._has_contacts and not force_share <= MAX_FORCE_SHARE_AT_CONTACTS
+        share = float((followed.force / followed.typical).max())
+        return self._has_contacts and not share <= MAX_FORCE_SHARE_AT_CONTACTS
 
     @property
     def _has_contacts(self) -> bool:
@@ -778,37 +759,28 @@ class _ExplainRun:
             )
         return self._filtered
 
-    def _filter_with_fitted_parameters(self, filtered_runs: FollowedRuns) -> FollowedRuns:
+    def _filter_with_fitted_parameters(self, followed: FollowedRuns) -> FollowedRuns:
         """Return the runs, filtered with base parameters from a prediction-error fit."""
         # These imports are needed for robots only.
         from bench.diagnosis.kalman.likelihood_fit import identify_base
         from bench.diagnosis.prediction_error.incomplete_model import is_long
 
         evaluator = self.fitting
-        declared_bounds = {p.name: p.bounds for p in evaluator.parameters}
+        declared = {p.name: p.bounds for p in evaluator.parameters}
         # The joints of a real robot have friction, and long recordings are those of real robots.
-        refiltered_runs, wider_bounds = identify_base(
-            evaluator, self.noise, filtered_runs, is_long(evaluator)
-        )
-        if refiltered_runs is not filtered_runs:
-            self.identified = evaluator.identified_base = refiltered_runs.theta[
-                evaluator.base_indices
-            ]
-        self._widen_ranges(wider_bounds, declared_bounds)
-        return refiltered_runs
+        found, wider = identify_base(evaluator, self.noise, followed, is_long(evaluator))
+        if found is not followed:
+            self.identified = evaluator.identified_base = found.theta[evaluator.base_indices]
+        self._widen_ranges(wider, declared)
+        return found
 
-    def _widen_ranges(
-        self, wider_bounds: Mapping[str, Bounds], declared_bounds: Mapping[str, Bounds]
-    ) -> None:
+    def _widen_ranges(self, found: Mapping[str, Bounds], declared: Mapping[str, Bounds]) -> None:
         """Report the wider ranges of base parameters, and use them for all runs."""
         for evaluator in self._list_run_evaluators()[1:]:
-            use_bounds(evaluator, wider_bounds)
-        for name, (low, high) in wider_bounds.items():
-            self.say(f"{name} ends at a bound of its range: widened to {low:g} to {high:g}")
-        self.wider |= {
-            parameter: (declared_bounds[parameter], bounds)
-            for parameter, bounds in wider_bounds.items()
-        }
+            use_bounds(evaluator, found)
+        for parameter, (low, high) in found.items():
+            self.say(f"{parameter} ends at a bound of its range: widened to {low:g} to {high:g}")
+        self.wider |= {one: (declared[one], bounds) for one, bounds in found.items()}
 
     def _prepare_robot_base(self, base: BaseFit) -> BaseFit:
         """Return the base model of a robot with the step that the data support.
@@ -821,8 +793,8 @@ class _ExplainRun:
 
     def _shows_step_errors(self, base: BaseFit) -> bool:
         """Return whether the recording shows the discretisation error of the engine's steps."""
-        has_no_filter = self.fitting.filtered_runs is None or not np.isfinite(base.fit.cost)
-        if self.watch.has_abandoned_fits() or has_no_filter:
+        lost = self.fitting.filtered_runs is None or not np.isfinite(base.fit.cost)
+        if self.watch.has_abandoned_fits() or lost:
             return True
         # These imports are needed for robots only.
         from bench.diagnosis.kalman.candidate_responses import FollowedRuns
@@ -840,8 +812,8 @@ class _ExplainRun:
         # This import is needed for robots only.
         from bench.diagnosis.prediction_error.effect_selection import shows_step_errors
 
-        filtered_runs = self.fitting.filtered_runs
-        if filtered_runs is not None and not shows_step_errors(filtered_runs):
+        followed = self.fitting.filtered_runs
+        if followed is not None and not shows_step_errors(followed):
             return base
         return correct_discretisation(self.fitting, self.noise, base)
 
@@ -853,10 +825,10 @@ class _ExplainRun:
 
     def _widen_bounds_at_fit(self, base: BaseFit) -> BaseFit:
         """Widen the ranges of base parameters that the fit leaves at a bound."""
-        declared_bounds = {p.name: p.bounds for p in self.fitting.parameters}
-        declared_bounds |= {name: bounds for name, (bounds, _) in self.wider.items()}
-        base, wider_bounds = fit_wider(self.fitting, self.noise, base)
-        self._widen_ranges(wider_bounds, declared_bounds)
+        declared = {p.name: p.bounds for p in self.fitting.parameters}
+        declared |= {name: bounds for name, (bounds, _) in self.wider.items()}
+        base, found = fit_wider(self.fitting, self.noise, base)
+        self._widen_ranges(found, declared)
         return base
 
     def _freeze_unidentified(self, base: BaseFit) -> BaseFit:
@@ -867,19 +839,18 @@ class _ExplainRun:
         """
         if self.watch.has_abandoned_fits() or not np.isfinite(base.fit.cost):
             return base
-        reduced_base = freeze_unidentified_parameters(
+        kept = freeze_unidentified_parameters(
             self.fitting, self.noise, base, lambda base: self._create_search(base, self._make_rng())
         )
-        if reduced_base.unidentified_parameters:
+        if kept.unidentified_parameters:
             names = ", ".join(
-                self.fitting.parameters[i].name
-                for i in sorted(reduced_base.unidentified_parameters)
+                self.fitting.parameters[i].name for i in sorted(kept.unidentified_parameters)
             )
             self.say(
                 "kept at the nominal value, because the recording does not identify it "
                 f"together with the others: {names}"
             )
-        return reduced_base
+        return kept
 
     def _choose_base_step(self, base: BaseFit) -> BaseFit:
         """Choose the step of the base model: the file's own, or a finer one.
@@ -891,49 +862,41 @@ class _ExplainRun:
         from bench.diagnosis.evaluation.integrator_check import find_step_refinements
 
         self.finer = Reusable(find_step_refinements(self.fitting, self.noise))
-        file_evaluators = _RunEvaluators(self.kind, self.fitting, self.validation)
-        file_log_likelihood, residual = self._rate_base(base)
-        gap = residual - 1.0
-        for refinement in self.finer:
+        file = _RunEvaluators(self.kind, self.fitting, self.validation)
+        value, left = self._rate_base(base)
+        gap = left - 1.0
+        for fine in self.finer:
             # A finer step leaves a smaller residual; a step that is too coarse for it is not tried.
-            if not refinement.is_accurate_enough(residual):
+            if not fine.is_accurate_enough(left):
                 continue
-            self._set_up(refinement.kind)
+            self._set_up(fine.kind)
             if self.fitting.filtered_runs is None:
                 # A model that diverges with the file's step may be filtered with a finer one.
                 self._filter_runs()
-            finer_base = fit_base_model(self.fitting, self.noise, self._get_nearby_starts(base))
-            finer_log_likelihood, residual = self._rate_base(finer_base)
-            if not is_finer_step_better(
-                finer_log_likelihood - file_log_likelihood, gap, residual - 1.0
-            ):
+            other = fit_base_model(self.fitting, self.noise, self._get_nearby_starts(base))
+            reached, left = self._rate_base(other)
+            if not is_finer_step_better(reached - value, gap, left - 1.0):
                 # Another missing effect may affect both models: they are compared again with it.
-                if refinement.is_accurate_enough(0.0):
+                if fine.is_accurate_enough(0.0):
                     break
-                residual = 0.0
-            elif refinement.is_accurate_enough(residual):
-                self._use_finer(
-                    refinement, finer_log_likelihood - file_log_likelihood, base, file_evaluators
-                )
-                return finer_base
-        self._restore_evaluators(file_evaluators)
+                left = 0.0
+            elif fine.is_accurate_enough(left):
+                self._use_finer(fine, reached - value, base, file)
+                return other
+        self._restore_evaluators(file)
         return base
 
     def _use_finer(
-        self,
-        refinement: StepRefinement,
-        gain: float,
-        base: BaseFit,
-        file_evaluators: _RunEvaluators,
+        self, fine: StepRefinement, gain: float, base: BaseFit, file: _RunEvaluators
     ) -> None:
         """Record that the file's own step is too coarse; the finer step is in use already."""
-        numerics = refinement.numerics
+        numerics = fine.numerics
         self.say(
             f"simulated with a smaller time step: {numerics.integrator}, {numerics.timestep:g} s"
         )
-        self.coarse, self.file = CoarseStepFinding(refinement, gain), file_evaluators
+        self.coarse, self.file = CoarseStepFinding(fine, gain), file
         self.assessor = replace(
-            self.assessor, before=self._predict_with_file_step(base, file_evaluators.validation)
+            self.assessor, before=self._predict_with_file_step(base, file.validation)
         )
 
     def _search_with_better_step(
@@ -957,15 +920,15 @@ class _ExplainRun:
             return None
         if not finding.causes and (self.coarse is not None or finding.verdict == "adequate"):
             return None
-        present_merit = (
+        found = (
             finding.model.penalised_log_likelihood,
             search.compute_excess_residual(finding.model),
         )
-        present_evaluators = _RunEvaluators(self.kind, self.fitting, self.validation)
+        here = _RunEvaluators(self.kind, self.fitting, self.validation)
         if self.coarse is not None:
             before = self.assessor.before
             self._restore_evaluators(self.file)
-            if not is_finer_model_better(self._rate_best_subset(search, finding), present_merit):
+            if not is_finer_model_better(self._rate_best_subset(search, finding), found):
                 self.say(
                     "the time step of the model file explains the data equally well: it is used"
                 )
@@ -974,20 +937,20 @@ class _ExplainRun:
                 return self._finish_base_and_search(
                     fit_base_model(self.fitting, self.noise, self._get_nearby_starts(base))
                 )
-            self._restore_evaluators(present_evaluators, before)
+            self._restore_evaluators(here, before)
             return None
-        refinement = next((one for one in self.finer or () if one.is_accurate_enough(0.0)), None)
-        if refinement is None:
+        fine = next((one for one in self.finer or () if one.is_accurate_enough(0.0)), None)
+        if fine is None:
             return None
-        self._set_up(refinement.kind)
-        finer_merit = self._rate_best_subset(search, finding)
-        if not is_finer_model_better(present_merit, finer_merit):
-            self._restore_evaluators(present_evaluators)
+        self._set_up(fine.kind)
+        best = self._rate_best_subset(search, finding)
+        if not is_finer_model_better(found, best):
+            self._restore_evaluators(here)
             return None
         base = BaseFit(search.base_model.fit, search.fixed_parameters)
-        finer_base = fit_base_model(self.fitting, self.noise, self._get_nearby_starts(base))
-        self._use_finer(refinement, finer_merit[0] - present_merit[0], base, present_evaluators)
-        return self._finish_base_and_search(finer_base)
+        other = fit_base_model(self.fitting, self.noise, self._get_nearby_starts(base))
+        self._use_finer(fine, best[0] - found[0], base, here)
+        return self._finish_base_and_search(other)
 
     def _rate_best_subset(
         self, search: EffectSearch, finding: DiagnosisResult
@@ -998,16 +961,14 @@ class _ExplainRun:
             Penalised log-likelihood and excess RMS residual of the best model.
         """
         names, fit = finding.model.effects, finding.model.fit
-        coefficient_slices = self.fitting.coefficient_slices
+        slots = self.fitting.coefficient_slices
         starts = []
         for count in range(len(names) + 1):
-            for subset in combinations(names, count):
+            for some in combinations(names, count):
                 theta = fit.theta.copy()
-                for omitted in set(names) - set(subset):
-                    theta[coefficient_slices[omitted]] = self.fitting.get_nominal_theta()[
-                        coefficient_slices[omitted]
-                    ]
-                starts.append(FitStart(subset, theta, fit.initial_states))
+                for left_out in set(names) - set(some):
+                    theta[slots[left_out]] = self.fitting.get_nominal_theta()[slots[left_out]]
+                starts.append(FitStart(some, theta, fit.initial_states))
         fits = TrajectoryFitter(self.fitting, self.noise, search.fixed_parameters).fit_models(
             starts, MAX_ITERATIONS
         )
@@ -1015,8 +976,7 @@ class _ExplainRun:
             BaseFit(search.base_model.fit, search.fixed_parameters), self._make_rng()
         )
         best = max(
-            (models.add_fit(subset_fit) for subset_fit in fits),
-            key=lambda model: model.penalised_log_likelihood,
+            (models.add_fit(one) for one in fits), key=lambda model: model.penalised_log_likelihood
         )
         return best.penalised_log_likelihood, models.compute_excess_residual(best)
 
@@ -1044,9 +1004,9 @@ class _ExplainRun:
 
     def _rate_base(self, base: BaseFit) -> tuple[float, float]:
         """Return twice the log-likelihood and the RMS residual, in noise units, of a base model."""
-        search = self._create_search(base, self._make_rng())
-        return float(search.base_model.likelihood.value), 1.0 + search.compute_excess_residual(
-            search.base_model
+        found = self._create_search(base, self._make_rng())
+        return float(found.base_model.likelihood.value), 1.0 + found.compute_excess_residual(
+            found.base_model
         )
 
     def _make_rng(self) -> np.random.Generator:
@@ -1083,41 +1043,41 @@ class _ExplainRun:
     ) -> ExtendedSimulator:
         """Build the extended simulator: the base simulator with fitted values and found effects.
 
-        `base_values` has the fitted base parameters, `freed_constants` the constants fitted like
-        parameters, and `added_effects` the coefficients of each found effect, all by name.
+        `own` has the fitted base parameters, `freed` the constants fitted like parameters, and
+        `added` the coefficients of each found effect, all by name.
         """
         evaluator, numbers = (
             self.fitting,
             self.assessor.collect_parameter_estimates(search, finding.model),
         )
-        base_values = {
+        own = {
             p.name: numbers[i]
             for i, p in enumerate(evaluator.parameters[: evaluator.system_parameter_count])
         }
         # A freed constant becomes a constant of the extended simulator, with its fitted value.
-        freed_constants = {
+        freed = {
             p.name: numbers[evaluator.system_parameter_count + i].value
             for i, p in enumerate(evaluator.freed_constants)
         }
-        added_effects = {}
+        added = {}
         # The simulator's order keeps the file independent of the order of the search.
-        for effect, coefficient_slice in evaluator.coefficient_slices.items():
+        for effect, slot in evaluator.coefficient_slices.items():
             if effect not in finding.model.effects:
                 continue
             coefficients = evaluator.available_effects[effect].on(evaluator.simulator.system)
-            indices = range(*coefficient_slice.indices(len(evaluator.parameters)))
-            added_effects[effect] = {
-                coefficient.name: numbers[index]
-                for coefficient, index in zip(coefficients, indices, strict=True)
+            places = range(*slot.indices(len(evaluator.parameters)))
+            added[effect] = {
+                coefficient.name: numbers[place]
+                for coefficient, place in zip(coefficients, places, strict=True)
             }
         return ExtendedSimulator(
             extend.make_extended_name(self.recording.system),
             self.recording.system,
             self.engine,
             self.recording.title,
-            base_values,
-            added_effects,
-            {**self.recording.constants, **freed_constants},
+            own,
+            added,
+            {**self.recording.constants, **freed},
             evaluator.channels,
             self.kind,
             extend.get_robot_reference(self.kind),

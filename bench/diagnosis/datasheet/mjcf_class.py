@@ -9,22 +9,29 @@ from __future__ import annotations
 
 import re
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from os.path import relpath
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from bench.diagnosis.datasheet.constants_groups import ConstantsGroup, group_runs_by_constants
-from bench.diagnosis.datasheet.exported_log_description import describe_log_for_model
-from bench.diagnosis.datasheet.mean_friction_limit import compute_mean_friction_limit
+import numpy as np
+
 from bench.diagnosis.datasheet.sheet_content import SheetContent
 from bench.diagnosis.extended_robot_files import collect_causes
 from sims import effects as library
 from sims.core.effect import Friction
-from sims.core.system import RenderedModelFile
+from sims.core.simulator import Array
+from sims.core.system import RenderedModelFile, StateSnapshot
+from sims.core.toml_validation import read_toml
 from sims.extended_simulator import FittedValue
+from sims.recording.recording import Run
+from sims.recording.recording_description import get_description_path
 
 CLASS_FILE = "class.xml"
 """File name of the classes."""
+MOTOR_ON_THRESHOLD = 0.5
+"""Value of a switching input above which the motor is on."""
 
 
 class MjcfFiles(NamedTuple):
@@ -34,82 +41,82 @@ class MjcfFiles(NamedTuple):
     notes: tuple[str, ...]
 
 
-class _DefaultClass(NamedTuple):
+class _Class(NamedTuple):
     """Default class, notes on what it cannot express, and a model that uses it, if there is one."""
 
     text: str
-    notes: Sequence[str]
+    said: Sequence[str]
     model: str = ""
 
 
-def build_mjcf(sheet: SheetContent, folder: Path) -> MjcfFiles:
+def build_mjcf(facts: SheetContent, folder: Path) -> MjcfFiles:
     """Build the class and the models that use it.
 
     Args:
-        sheet: Content of the data sheet.
+        facts: Content of the data sheet.
         folder: Folder of the files; the path of the log is relative to it.
     """
     from sims.robot.mujoco_messages import capture_mujoco_warnings
 
     with capture_mujoco_warnings():
-        if sheet.subject.kind.has_model:
-            return _build_robot_files(sheet)
-        return _build_system_files(sheet, folder)
+        if facts.subject.kind.has_model:
+            return _build_robot_files(facts)
+        return _build_system_files(facts, folder)
 
 
-def _build_robot_files(sheet: SheetContent) -> MjcfFiles:
+def _build_robot_files(facts: SheetContent) -> MjcfFiles:
     """Build the MJCF default class of a joint of a robot, and the robot's model with this class.
 
     The class is for the joint and its first actuator. The model is omitted if the class cannot be
     used in it.
     """
-    kind: Any = sheet.subject.kind
-    causes = collect_causes(sheet.extended)
-    actuator = next(iter(sheet.subject.actuators), None)
+    kind: Any = facts.subject.kind
+    causes = collect_causes(facts.extended)
+    actuator = next(iter(facts.subject.actuators), None)
     rendered = _render_class(
-        kind.robot, causes, sheet.subject.joint, actuator, make_class_name(sheet.name), sheet
+        kind.robot, causes, facts.subject.joint, actuator, make_class_name(facts.name), facts
     )
-    files = {CLASS_FILE: _format_file(sheet, [rendered])}
+    files = {CLASS_FILE: _format_file(facts, [rendered])}
     if rendered.model:
         files["model.xml"] = rendered.model
-    return MjcfFiles(files, tuple(rendered.notes))
+    return MjcfFiles(files, tuple(rendered.said))
 
 
-def _build_system_files(sheet: SheetContent, folder: Path) -> MjcfFiles:
+def _build_system_files(facts: SheetContent, folder: Path) -> MjcfFiles:
     """Build a class, a model and a log description for each group of runs with equal constants."""
     from sims.robot.parsing.read_model_file import read_robot
 
-    classes: list[_DefaultClass] = []
+    classes: list[_Class] = []
     files: dict[str, str] = {}
-    for group in group_runs_by_constants(sheet):
-        model = _render_model_file(sheet, group)
+    for setting in group_runs_by_constants(facts):
+        model = _model_file(facts, setting)
         if model is None:
-            return MjcfFiles({}, (f"{sheet.subject.kind.name} has no form in MJCF",))
-        name = make_class_name("_".join([sheet.name, group.name]) if group.name else sheet.name)
-        with tempfile.TemporaryDirectory() as folder_name:
-            path = Path(folder_name) / f"{sheet.subject.kind.name}.xml"
+            return MjcfFiles({}, (f"{facts.subject.kind.name} has no form in MJCF",))
+        name = make_class_name("_".join([facts.name, setting.name]) if setting.name else facts.name)
+        with tempfile.TemporaryDirectory() as place:
+            path = Path(place) / f"{facts.subject.kind.name}.xml"
             path.write_text(model.text)
             robot = read_robot(path)
-        causes, notes = _map_effects_to_model(sheet, group, model)
+        causes, notes = _map_effects_to_model(facts, setting, model)
         rendered = _render_class(
-            robot, causes, model.joint, model.actuator, name, sheet, (*model.said, *notes)
+            robot, causes, model.joint, model.actuator, name, facts, (*model.said, *notes)
         )
         classes.append(rendered)
-        stem = f"model_{group.name}" if group.name else "model"
+        stem = f"model_{setting.name}" if setting.name else "model"
         if rendered.model:
             files[f"{stem}.xml"] = rendered.model
-            files |= describe_log_for_model(sheet, group, model, stem, folder)
-    lines = dict.fromkeys(line for rendered in classes for line in rendered.notes)
-    return MjcfFiles({CLASS_FILE: _format_file(sheet, classes), **files}, tuple(lines))
+            files |= _describe_log_for_model(facts, setting, model, stem, folder)
+    lines = dict.fromkeys(line for rendered in classes for line in rendered.said)
+    return MjcfFiles({CLASS_FILE: _format_file(facts, classes), **files}, tuple(lines))
 
 
-def _render_model_file(sheet: SheetContent, group: ConstantsGroup) -> RenderedModelFile | None:
+def _model_file(facts: SheetContent, setting: ConstantsGroup) -> RenderedModelFile | None:
     """Render the system with the constants of one group of runs as an MJCF model.
 
     Return None if the constants give no valid model, or if the system has no form in MJCF.
     """
     try:
-        return sheet.subject.kind.system.model_file(group.numbers)
+        return facts.subject.kind.system.model_file(setting.numbers)
     except ZeroDivisionError:
         # The file may contain a value that was edited by hand.
         return None
@@ -121,9 +128,9 @@ def _render_class(
     joint: str,
     actuator: str | None,
     name: str,
-    sheet: SheetContent,
+    facts: SheetContent,
     notes: Sequence[str] = (),
-) -> _DefaultClass:
+) -> _Class:
     """Write the fitted effects into a robot's model, and render its joint as a default class.
 
     Args:
@@ -132,25 +139,23 @@ def _render_class(
         joint: Joint of the class.
         actuator: Actuator of the class; None for an undriven joint.
         name: Name of the class.
-        sheet: Content of the data sheet.
+        facts: Content of the data sheet.
         notes: Notes for the comment of the class.
     """
     from sims.robot.export.apply_causes import apply_causes
     from sims.robot.export.default_class import render_default_class, render_model_using_class
     from sims.robot.export.xml_editing import NotEditableError
 
-    applied = apply_causes(robot, causes, sheet.extended.title)
-    ids = robot.joint(joint).id, robot.actuator(actuator).id if actuator else None
+    applied = apply_causes(robot, causes, facts.extended.title)
+    places = robot.joint(joint).id, robot.actuator(actuator).id if actuator else None
     class_notes = [*notes, *applied.notes]
-    text = render_default_class(applied, *ids, name, class_notes)
+    text = render_default_class(applied, *places, name, class_notes)
     try:
-        return _DefaultClass(
-            text, class_notes, render_model_using_class(robot, applied, *ids, name, text)
+        return _Class(
+            text, class_notes, render_model_using_class(robot, applied, *places, name, text)
         )
     except NotEditableError as unfit:
-        return _DefaultClass(
-            text, [*class_notes, f"no model that uses the class is written: {unfit}"]
-        )
+        return _Class(text, [*class_notes, f"no model that uses the class is written: {unfit}"])
 
 
 def make_class_name(name: str) -> str:
@@ -159,10 +164,10 @@ def make_class_name(name: str) -> str:
     return valid_name or "drive"
 
 
-def _format_file(sheet: SheetContent, classes: Sequence[_DefaultClass]) -> str:
+def _format_file(facts: SheetContent, classes: Sequence[_Class]) -> str:
     """Format the classes as a file that MuJoCo loads and that others can include."""
-    title = sheet.recording.title or sheet.recording.path.stem
-    heading = f"{make_class_name(sheet.name)}: data sheet from {title}; written by simgap datasheet"
+    title = facts.recording.title or facts.recording.path.stem
+    heading = f"{make_class_name(facts.name)}: data sheet from {title}; written by simgap datasheet"
     escaped_heading = re.sub(r"-(?=-)", "- ", heading)
     inner = "\n".join(rendered.text for rendered in classes).replace("\n", "\n    ")
     return (
@@ -171,8 +176,45 @@ def _format_file(sheet: SheetContent, classes: Sequence[_DefaultClass]) -> str:
     )
 
 
+@dataclass(frozen=True)
+class ConstantsGroup:
+    """Runs of a recording with equal constants.
+
+    Attributes:
+        name: Short name from the constants; empty if there are none.
+        numbers: Parameters and constants.
+        runs: Runs of the recording.
+    """
+
+    name: str
+    numbers: Mapping[str, float]
+    runs: tuple[Run, ...]
+
+
+def group_runs_by_constants(facts: SheetContent) -> list[ConstantsGroup]:
+    """Group the runs with equal constants, such as one load, in the order of the recording.
+
+    An MJCF model has fixed numbers, so each group needs its own model.
+    """
+    by_constants: dict[tuple[tuple[str, float], ...], list[Run]] = {}
+    for run in facts.recording.runs:
+        by_constants.setdefault(tuple(sorted(run.constants.items())), []).append(run)
+    defaults = {c.name: c.value for c in facts.subject.kind.constants}
+    defaults |= {p.name: p.nominal for p in facts.subject.kind.parameters}
+    fitted_values = {name: number.value for name, number in facts.extended.parameters.items()}
+    numbers = {**defaults, **facts.recording.constants, **facts.extended.constants, **fitted_values}
+    return [
+        ConstantsGroup(
+            "_".join(f"{name}{value:g}" for name, value in constants) if by_constants else "",
+            {**numbers, **dict(constants)},
+            tuple(runs),
+        )
+        for constants, runs in by_constants.items()
+    ]
+
+
 def _map_effects_to_model(
-    sheet: SheetContent, group: ConstantsGroup, model: RenderedModelFile
+    facts: SheetContent, setting: ConstantsGroup, model: RenderedModelFile
 ) -> tuple[dict[str, Mapping[str, FittedValue]], list[str]]:
     """Map the fitted effects of a system to the joint, actuator and channel of its MJCF model.
 
@@ -181,27 +223,23 @@ def _map_effects_to_model(
     """
     from sims.robot.model_field_effects import MODEL_FIELD_EFFECTS
 
-    place_by_kind = {
-        "joint": model.joint,
-        "actuator": model.actuator,
-        "channel": model.signals["q"],
-    }
+    places = {"joint": model.joint, "actuator": model.actuator, "channel": model.signals["q"]}
     causes: dict[str, Mapping[str, FittedValue]] = {}
     dry_friction, notes = 0.0, []
-    for name, numbers in sheet.extended.effects.items():
+    for name, numbers in facts.extended.effects.items():
         effect = library.get_effect(name)
         if issubclass(effect, Friction) and name not in MODEL_FIELD_EFFECTS:
-            mean_limit = compute_mean_friction_limit(sheet, group, effect, numbers)
+            mean_limit = _compute_mean_friction_limit(facts, setting, effect, numbers)
             dry_friction += mean_limit
             notes.append(
                 f"{name}: MuJoCo has no such law; frictionloss is its mean over these runs, "
                 f"{mean_limit:.4g} N·m"
             )
             continue
-        place = place_by_kind.get(effect.at, "")
+        place = places.get(effect.at, "")
         zero_value = FittedValue(0.0, "1", None, None)
         coefficients = {
-            c.name: numbers.get(c.name, zero_value) for c in effect.on(sheet.subject.kind.system)
+            c.name: numbers.get(c.name, zero_value) for c in effect.on(facts.subject.kind.system)
         }
         causes[f"{name}@{place}" if place else name] = coefficients
     if dry_friction:
@@ -210,3 +248,86 @@ def _map_effects_to_model(
         total = dry_friction + (fitted_friction.value if fitted_friction else 0.0)
         causes[key] = {"coefficient": FittedValue(total, "N*m", None, None)}
     return causes, notes
+
+
+def _compute_mean_friction_limit(
+    facts: SheetContent,
+    setting: ConstantsGroup,
+    effect: type[Friction],
+    numbers: Mapping[str, FittedValue],
+) -> float:
+    """Compute the mean limit of a friction law over the samples of some runs."""
+    limits = [
+        _compute_friction_limits(facts, setting, run, effect, numbers) for run in setting.runs
+    ]
+    values = np.concatenate(limits)
+    return float(values[np.isfinite(values)].mean())
+
+
+def _compute_friction_limits(
+    facts: SheetContent,
+    setting: ConstantsGroup,
+    run: Run,
+    effect: type[Friction],
+    numbers: Mapping[str, FittedValue],
+) -> Array:
+    """Compute the limit (T,) of a friction law at each sample of a run, as one batch."""
+    kind = facts.subject.kind
+    system = kind.system()
+    (coordinate,) = system.coordinates
+    position = run.channels[coordinate]
+    rate = np.gradient(position, run.times)
+    shape = (len(position), 1)
+    theta = np.array([[setting.numbers[p.name] for p in kind.parameters]])
+    effect_coefficients = effect.on(system)
+    coefficients = [
+        numbers[c.name].value if c.name in numbers else 0.0 for c in effect_coefficients
+    ]
+    moment = StateSnapshot(
+        system,
+        np.repeat(theta, len(position), axis=0),
+        {c.name: np.full(shape, setting.numbers[c.name]) for c in kind.constants},
+        (run.times - run.times[0])[:, None],
+        position[:, None],
+        rate[:, None],
+        {name: values[:, None] for name, values in run.inputs.items()},
+    )
+    c = np.array(coefficients)[:, None, None]
+    limit: Array = effect().limit(np.broadcast_to(c, (len(c), *shape)), moment)[:, 0]
+    return limit
+
+
+def _describe_log_for_model(
+    facts: SheetContent, setting: ConstantsGroup, model: RenderedModelFile, stem: str, folder: Path
+) -> Iterator[tuple[str, str]]:
+    """Yield a description of the log for the model, in which its runs are marked held out.
+
+    Nothing is yielded for a log of several files.
+    """
+    import tomli_w
+
+    path = facts.recording.path
+    if path.suffix != ".csv" or any(run.log for run in facts.recording.runs):
+        return
+    log_description = read_toml(get_description_path(path))
+    file = relpath(path.resolve(), folder.resolve())
+    document: dict[str, Any] = {
+        "model": f"{stem}.xml",
+        "title": f"{facts.name} as {stem}.xml",
+        "channels": {},
+        "inputs": {},
+        "runs": {
+            run.name: {"held_out": True} for run in setting.runs if _is_motor_always_on(run, model)
+        },
+    }
+    for kind in ("channels", "inputs"):
+        for name, description in log_description.get(kind, {}).items():
+            if name in model.signals:
+                document[kind][model.signals[name]] = {"file": file, "column": name, **description}
+    yield f"{stem}.toml", tomli_w.dumps(document)
+
+
+def _is_motor_always_on(run: Run, model: RenderedModelFile) -> bool:
+    """Return whether the inputs that switch the motor are on all the time."""
+    switches = [values for name, values in run.inputs.items() if name not in model.signals]
+    return all(bool((values > MOTOR_ON_THRESHOLD).all()) for values in switches)

@@ -107,6 +107,8 @@ def test_a_gain_counts_less_what_luck_gives_its_effects(monkeypatch):
         (1.31, True, 1.0, False),
         (1.31, False, 0.011, True),
         (1.31, False, 0.009, False),
+        (6.9, False, 1.0, True),
+        (7.1, False, 1.0, False),
     ],
 )
 def test_the_residual_may_be_noise_up_to_the_floor_or_if_its_correlation_decays(
