@@ -8,7 +8,8 @@ Syst. Technol. 21, 428, 2013, doi:10.1109/TCST.2012.2185697).
 
     1. Put the standard joint model and the inertia of every body into the filter's model, and
        maximise the likelihood of the innovations.
-    2. Add effects of the library, chosen by regression of the innovations, while each pays.
+    2. Add effects of the library, chosen by regression of the innovations, while each pays and
+       predicts left-out runs better.
     3. Remove effects that do not pay.
 
 If the filter then lacks no force, the model may be complete, and simulation decides.
@@ -46,7 +47,7 @@ from bench.diagnosis.prediction_error.selection_fits import (
     MIN_FURTHER_GAIN_SHARE,
 )
 from bench.diagnosis.search.candidate_directions import CandidateDirection
-from bench.diagnosis.search.refit_starts import add_effect_to_start
+from bench.diagnosis.search.refit_starts import with_effect
 from sims.core.simulator import Array
 
 MIN_SECONDS = 8.0
@@ -250,13 +251,17 @@ def _add_next_effect(
 ) -> FilteredSet | None:
     """Add the effect that gains most by regression, in place of the effects that it contains.
 
+    It must predict left-out runs better, because a model that stays incomplete lets an effect
+    imitate what is missing in some of the runs.
+
     Args:
         context: context of the search.
         current: the set.
         columns: inputs of the effects that may be added.
 
     Returns:
-        The larger set; None if no effect gains enough.
+        The larger set; None if no effect gains enough, or if the best one does not predict
+        left-out runs better.
     """
     evaluator = context.evaluator
     regression, _ = build_regression_about(current, columns, current.followed)
@@ -264,12 +269,12 @@ def _add_next_effect(
     for i, group in enumerate(regression.groups):
         gains[i] *= group.effect not in current.names
     best = regression.groups[int(np.argmax(gains))]
-    if not gains.max() > 0.0:
+    if not gains.max() > 0.0 or not regression.generalises([], [best]):
         return None
     name, (solution,) = best.effect, regression.solve([best])[1]
     c = group_coefficients(evaluator, columns.probes, best, solution)
     present = FitStart(current.names, current.followed.theta, evaluator.initial_state_guesses)
-    start = add_effect_to_start(evaluator, present, name, c)
+    start = with_effect(evaluator, present, name, c)
     larger = _fit_set(context, current.followed.with_parameters(start.theta), start.effects)
     gain = 2.0 * (larger.followed.log_likelihood - current.followed.log_likelihood)
     return larger if gain > _compute_min_gain(context, larger, name) else None

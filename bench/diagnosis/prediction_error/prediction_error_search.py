@@ -62,7 +62,7 @@ from bench.diagnosis.prediction_error.selection_fits import (
     select_with_shapes,
 )
 from bench.diagnosis.prediction_error.simulated_fits import (
-    fit_by_simulation,
+    fit,
     is_explained,
     is_nearly_explained,
     remove_idle_effects,
@@ -70,7 +70,7 @@ from bench.diagnosis.prediction_error.simulated_fits import (
 )
 from bench.diagnosis.search.candidate_directions import DirectionSet
 from bench.diagnosis.search.effect_search import EffectSearch
-from bench.diagnosis.search.refit_starts import add_effect_to_start
+from bench.diagnosis.search.refit_starts import with_effect
 from bench.diagnosis.search.score_test import CandidateScores
 from bench.diagnosis.search.verdict_rules import EFFECT_P_VALUE_THRESHOLD
 from sims.core.simulator import Array
@@ -106,7 +106,7 @@ class PredictionErrorSearch(EffectSearch):
         """
         context, self.best_supported_model, best = self._search_context, self.base_model, None
         if self.likely is not None:
-            best = remove_idle_effects(context, fit_by_simulation(context, self.likely))
+            best = remove_idle_effects(context, fit(context, self.likely))
         else:
             self.identified = identify_incomplete(context)
         if self.identified is not None:
@@ -151,9 +151,9 @@ class PredictionErrorSearch(EffectSearch):
         This is the case if a force is missing, the best model does not explain the runs, and there
         is time left.
         """
-        is_force_missing = self._search_context.filters.base.lacks_force
+        lacks = self._search_context.filters.base.lacks_force
         return (
-            is_force_missing
+            lacks
             and not is_explained(self._search_context, best)
             and not self.evaluator.search_control.has_abandoned_fits()
         )
@@ -211,36 +211,33 @@ class PredictionErrorSearch(EffectSearch):
             self._search_context.columns,
             scores.effects[0],
         )
-        coefficients = columns.coefficients(*scores.peaks[0][0])
-        start = add_effect_to_start(self.evaluator, model.fit.make_start(), name, coefficients)
-        indices, library_size = (
-            self.evaluator.get_coefficient_indices(name),
-            len(self.evaluator.library),
-        )
+        c = columns.coefficients(*scores.peaks[0][0])
+        start = with_effect(self.evaluator, model.fit.make_start(), name, c)
+        places, count = self.evaluator.get_coefficient_indices(name), len(self.evaluator.library)
         # A filter with the effect in the model is faster than a fit, and not linear in the effect.
         log_likelihood = filters.get_filter(model).log_likelihood
         gains = []
         for share in TRIED_SHARES:
             theta = start.theta.copy()
-            theta[indices] *= share
+            theta[places] *= share
             gains.append(2.0 * (filters.log_likelihood(theta) - log_likelihood))
-        p_value_by_filter = compute_p_value_of_gain(max(gains), len(indices), library_size)
-        if p_value_by_filter > EFFECT_P_VALUE_THRESHOLD:
-            return p_value_by_filter
+        by_filter = compute_p_value_of_gain(max(gains), len(places), count)
+        if by_filter > EFFECT_P_VALUE_THRESHOLD:
+            return by_filter
         larger = self.fit_one(start)
         gain = larger.likelihood.value - model.likelihood.value
-        return compute_p_value_of_gain(gain, len(indices), library_size)
+        return compute_p_value_of_gain(gain, len(places), count)
 
     def score_missing_effects(
         self,
         model: FittedModel,
-        noise_residual: Array | None = None,  # noqa: ARG002
+        against: Array | None = None,  # noqa: ARG002
     ) -> CandidateScores:
         """Score every effect that the model lacks by the innovations.
 
         Args:
             model: the model.
-            noise_residual: not used.
+            against: not used.
         """
         key = frozenset(model.effects)
         if key not in self.scores_by_effects:
@@ -254,8 +251,8 @@ class PredictionErrorSearch(EffectSearch):
             return replace(self.score_missing_effects(self.base_model), p_value=1.0)
         self._report_scoring(model)
         regression, _ = self._search_context.columns.regression(model)
-        rng = self.make_rng("library", model.effects)
-        return score_by_regression(regression, set(self._list_addable_effects(model)), rng)
+        stream = self.make_rng("library", model.effects)
+        return score_by_regression(regression, set(self._list_addable_effects(model)), stream)
 
     def score_unmodelled_force(self, model: FittedModel) -> tuple[float, str] | None:
         """Return the p-value of the best additional force and the signal it depends on."""
@@ -288,11 +285,9 @@ class PredictionErrorSearch(EffectSearch):
 
     def with_sensitivities(self, start: FitStart) -> FitStart:
         """Return a start with derivatives by its coefficients about the measured motion."""
-        has_free_base = set(self.evaluator.base_indices.tolist()) - self.fixed_parameters
-        needs_jacobian = start.known_jacobian is None and start.effects
-        # The derivatives are those by coefficients of effects alone, and linear without states of
-        # elastic joints.
-        if not needs_jacobian or has_free_base or has_series(self.evaluator, start.effects):
+        free = set(self.evaluator.base_indices.tolist()) - self.fixed_parameters
+        has_jacobian = start.known_jacobian is not None or not start.effects
+        if has_jacobian or free or has_series(self.evaluator, start.effects):
             return start
         return replace(start, known_jacobian=self._search_context.columns.sensitivities(start))
 

@@ -79,11 +79,13 @@ def test_inertias_stated_about_the_joints_and_dry_friction_are_found(tmp_path):
     causes = {cause.effect: cause.coefficients for cause in answer.causes}
     first = 0.0319 * (1.0 + causes["inertia.scale@Link1"]["coefficient"].value)
     second = 0.0509 * (1.0 + causes["inertia.scale@Link2"]["coefficient"].value)
-    assert first == pytest.approx(0.0109, abs=0.004)
-    assert second == pytest.approx(0.0100, abs=0.004)
+    assert first == pytest.approx(0.0109, abs=0.0025)
+    assert second == pytest.approx(0.0100, abs=0.0025)
+    # A centre of mass that one run shows does not predict the others.
+    assert not any(name.startswith("mass.offset") for name in causes)
     added = causes["friction.coulomb@Joint2"]["coefficient"].value
     assert 0.12 + added == pytest.approx(0.18, abs=0.03)
-    assert answer.heldout.rmse_extended < 0.06
+    assert answer.heldout.rmse_extended < 0.056
 
 
 @pytest.mark.parametrize(
