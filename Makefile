@@ -94,7 +94,6 @@ benchmark: $(STAMP)
 	$(BIN)/python -m tests.benchmarks.harness_overhead
 	$(BIN)/python -m tests.benchmarks.stepping_speed
 	$(BIN)/python -m tests.benchmarks.comparison_scaling
-	$(BIN)/python -m tests.benchmarks.peer_libraries
 	$(BIN)/python -m tests.benchmarks.isolation_overhead
 
 chaos: $(STAMP)

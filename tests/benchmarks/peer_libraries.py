@@ -1,29 +1,22 @@
-"""Compare the overhead with benchopt and nevergrad on a trivial problem without cost.
+"""Measure the overhead of benchopt and nevergrad on a trivial problem without cost.
 
-Run: `python -m tests.benchmarks.peer_libraries`. The other libraries are installed into a temporary
-environment, or come from the Python in $PEERS.
+Part of `python -m tests.benchmarks.isolation_overhead`. The libraries are installed into a
+temporary environment, or come from the Python in $PEERS.
 
-- An evaluation: random search over two numbers, with a sum of squares as the objective, evaluated a
-  few thousand times, minus the bare loop over the same numbers; nevergrad by
-  `RandomSearch.minimize`, simgap by `drive_tuner` and its evaluator.
-- A run: a method that does nothing, in isolation: simgap by a worker process of its pool, benchopt
-  by `run_benchmark` (its smallest benchmark: one objective, data set, solver), as the slope between
-  a few and many repetitions.
+- An evaluation: random search over two numbers, with a sum of squares as the objective, minus the
+  bare loop over the same numbers, by nevergrad's `RandomSearch.minimize`.
+- A run: a method that does nothing, by benchopt's smallest benchmark (one objective, data set,
+  solver), as the slope between a few and many repetitions.
 """
 
 from __future__ import annotations
 
 import json
 import os
-import statistics
 import subprocess
 import sys
-import tempfile
 import textwrap
-from pathlib import Path
 from time import perf_counter
-
-from bench.benchmark.runner.worker_pools import LocalPool
 
 EVALUATIONS = 3000
 NEVERGRAD = """
@@ -78,41 +71,6 @@ BENCHMARK = {
             def get_result(self): return dict(w=self.w)
     """,
 }
-
-
-def nothing(x):
-    return x
-
-
-def simgap_run():
-    """Return milliseconds of a call in an isolated worker that is already started."""
-    with LocalPool(1) as pool:
-        list(pool.iterate_results([(nothing, (1,))], 60.0))
-        started = perf_counter()
-        list(pool.iterate_results([(nothing, (i,)) for i in range(300)], 60.0))
-        return 1e3 * (perf_counter() - started) / 300
-
-
-def simgap_fresh():
-    """Return milliseconds of the first call in a new worker, which is the cost of a killed run."""
-    times = []
-    for _ in range(3):
-        started = perf_counter()
-        with LocalPool(1) as pool:
-            list(pool.iterate_results([(nothing, (1,))], 60.0))
-            times.append(1e3 * (perf_counter() - started))
-    return statistics.median(times)
-
-
-def simgap_evaluation():
-    """Return the microseconds that the harness adds to an evaluation, from its own benchmark."""
-    done = subprocess.run(
-        [sys.executable, "-m", "tests.benchmarks.harness_overhead"],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    return json.loads(done.stdout.splitlines()[0])["harness_microseconds_an_evaluation"]
 
 
 def nevergrad_evaluation(python):
@@ -172,33 +130,3 @@ def environment(folder, packages=("benchopt", "nevergrad")):
         print("peers: cannot be installed here, nothing to compare with", file=sys.stderr)
         return None
     return python
-
-
-def main():
-    mine = {
-        "evaluation_us": simgap_evaluation(),
-        "run_ms": simgap_run(),
-        "fresh_worker_ms": simgap_fresh(),
-    }
-    print(json.dumps({"simgap": {k: round(v, 2) for k, v in mine.items()}}), flush=True)
-    with tempfile.TemporaryDirectory() as place:
-        folder = Path(place)
-        python = environment(folder)
-        if python is None:
-            return
-        evaluation = nevergrad_evaluation(python)
-        ratio = round(evaluation / mine["evaluation_us"], 2)
-        print(
-            json.dumps({"nevergrad": {"evaluation_us": round(evaluation, 2), "ratio": ratio}}),
-            flush=True,
-        )
-        run = benchopt_run(python, folder)
-        print(
-            json.dumps(
-                {"benchopt": {"run_ms": round(run, 1), "ratio": round(run / mine["run_ms"], 1)}}
-            )
-        )
-
-
-if __name__ == "__main__":
-    sys.exit(main())
