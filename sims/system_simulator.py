@@ -28,10 +28,10 @@ from sims.core.toml_validation import format_value
 from sims.core.value_limits import is_plausible_number
 from sims.engines import HIDDEN_STATE_ENGINES, make_engine
 from sims.engines.hidden_states import integrate_with_hidden_states
+from sims.engines.step_inputs import compute_applied_inputs
 from sims.engines.time_grid import (
     TimeGrid,
     build_time_grid,
-    compute_applied_inputs,
     group_by_identity,
     group_scenarios,
     is_active,

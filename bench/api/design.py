@@ -16,8 +16,9 @@ from bench.diagnosis.experiment_design.next_run import NextRunDesign
 from bench.diagnosis.explain_options import ExplainOptions
 from bench.diagnosis.explanation import Explanation
 from sims.core.argument_checks import Seconds, check_arguments
+from sims.core.atomic_files import write_files
+from sims.core.path_checks import check_absent
 from sims.core.simulator import InputError
-from sims.recording.recording_writer import check_absent, write_files
 
 MAX_RUN_SECONDS = 600.0
 """Maximum duration of a designed run, in seconds."""

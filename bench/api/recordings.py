@@ -12,15 +12,15 @@ from bench.core.options import takes_options
 from bench.logs.data_frames import FrameDescription, Units
 from bench.logs.importing.import_result import ImportOptions, ImportResult
 from bench.logs.importing.log_import import describe_logs, write_checked_description
-from bench.logs.inspection import load_recording
+from bench.logs.recording_loading import load_recording
 from bench.logs.synthetic_recording import (
     SimulationSpec,
     simulate_recording,
 )
 from sims.core.argument_checks import Expected, Name, check_arguments
+from sims.core.path_checks import check_absent
 from sims.core.simulator import InputError
 from sims.recording.recording import Recording
-from sims.recording.recording_writer import check_absent
 from sims.robot.parsing.read_model_file import read_robot
 
 Logs: TypeAlias = Annotated[

@@ -22,10 +22,7 @@ from bench.benchmark.report_page.multi_problem_page import (
 from bench.benchmark.results_report import REPORT_FILE, REQUIRED_RUN_COLUMNS
 from bench.benchmark.statistics.comparison_statistics import ComparisonStatistics
 from bench.benchmark.statistics.error_curves import RunCurves
-from bench.benchmark.statistics.expected_running_time import (
-    build_ert_table,
-    compute_solved_fraction,
-)
+from bench.benchmark.statistics.expected_running_time import build_ert_table
 from bench.benchmark.statistics.paired_tests import (
     MIN_PROBLEMS_FOR_RANKS,
     compare_all_pairs,
@@ -33,6 +30,7 @@ from bench.benchmark.statistics.paired_tests import (
     compute_problem_ranks,
 )
 from bench.benchmark.statistics.provenance_columns import add_trust_column
+from bench.benchmark.statistics.runtime_distribution import compute_solved_fraction
 from bench.benchmark.storage.result_folder import read_comparison
 from bench.figures.style import (
     FigureFiles,

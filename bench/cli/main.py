@@ -98,7 +98,7 @@ COMMANDS = (
     ),
     Command(
         "simulate",
-        "recordings:add_simulate_arguments",
+        "simulate:add_simulate_arguments",
         "write a recording of a simulated system, with its true parameters in a separate file",
         "simgap simulate pendulum --effect drag.linear=2e-4 --noise 0.002 --out swing.csv",
     ),
@@ -110,7 +110,7 @@ COMMANDS = (
     ),
     Command(
         "inspect",
-        "recordings:add_inspect_arguments",
+        "inspect_recording:add_inspect_arguments",
         "summarise and draw a recording",
         "simgap inspect swing.csv --check",
     ),
@@ -134,7 +134,7 @@ COMMANDS = (
     ),
     Command(
         "score",
-        "explain:add_score_arguments",
+        "score:add_score_arguments",
         "compute the error of an extended simulator on another recording",
         "simgap score results/swing/extended.toml other.csv --held-out",
     ),
@@ -146,7 +146,7 @@ COMMANDS = (
     ),
     Command(
         "track",
-        "film:add_track_arguments",
+        "track:add_track_arguments",
         "track a ball in a video, and write a recording",
         "simgap track drop.mp4 --ball-diameter 0.067 --out drop.csv",
     ),

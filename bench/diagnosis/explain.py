@@ -290,7 +290,7 @@ class _ExplainRun:
         if not kind.has_model:
             return kind
         # These imports are needed for robots only.
-        from bench.logs.quality.pose_check import find_recorded_contacts
+        from bench.logs.quality.recorded_poses import find_recorded_contacts
         from sims.robot.robot_simulator import RobotSimulator
 
         assert issubclass(kind, RobotSimulator)

@@ -34,7 +34,7 @@ from bench.core.diagnoser import (
     list_observable_effects,
 )
 from bench.core.plugin_registries import simulators
-from bench.logs.inspection import get_simulator_class
+from bench.logs.recording_loading import get_simulator_class
 from sims import effects
 from sims.core.simulation_counter import SIMULATION_COUNTER
 from sims.core.simulator import Array

@@ -8,9 +8,9 @@ import numpy as np
 
 from bench.core.random_streams import make_rng
 from bench.logs.size_limits import check_film_size
+from sims.core.path_checks import check_absent
 from sims.core.simulator import InputError, make_unknown_name_error
 from sims.recording.recording import read_recording, read_system_name
-from sims.recording.recording_writer import check_absent
 from sims.systems.ball import BallSystem
 from sims.vision.ball_renderer import BallScene
 from sims.vision.camera_file import FilmDescription, format_camera_file, get_camera_file_path

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.logs.inspection import load_recording
+from bench.logs.recording_loading import load_recording
 from sims.core.simulator import InputError, Simulator
 from sims.recording.recording import MAX_FOLDS, Recording, Run, split_held_out
 

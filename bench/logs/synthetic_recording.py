@@ -20,6 +20,7 @@ from bench.core.random_streams import make_rng
 from bench.logs.size_limits import check_simulation_size
 from sims import effects as library
 from sims.core.argument_checks import Expected, Name, Names, check_arguments
+from sims.core.path_checks import check_absent
 from sims.core.simulator import Array, InputError, Scenario, Simulator
 from sims.core.system import DefaultRecording
 from sims.core.toml_validation import check_known_names
@@ -33,7 +34,7 @@ from sims.core.value_limits import (
 )
 from sims.recording.recording import Recording, Run
 from sims.recording.recording_description import ModelFileReference, get_floating_state_units
-from sims.recording.recording_writer import check_absent, write_recording
+from sims.recording.recording_writer import write_recording
 from sims.system_simulator import SystemSimulator
 
 _TABLE_DIGITS = 9

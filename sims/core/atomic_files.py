@@ -10,63 +10,13 @@ import os
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from datetime import datetime, timezone
-from itertools import islice
 from pathlib import Path
 
+from sims.core.path_checks import check_absent, make_exists_error
 from sims.core.simulator import InputError
-from sims.core.value_limits import truncate_text
 
 Content = str | bytes
 """Content of a file; text is written as UTF-8."""
-
-
-_MOST_LISTED = 10_000
-"""Maximum number of a folder's entries among which similar names are searched."""
-
-
-def require_file(path: Path, wanted: str = "") -> None:
-    """Refuse a path that is not a file.
-
-    Args:
-        path: Path of the file.
-        wanted: Description of the expected file for the message; may be empty.
-
-    Raises:
-        InputError: The file does not exist; the message names similar files in its folder.
-    """
-    expected = f"; expected {wanted}" if wanted else ""
-    try:
-        if path.is_file():
-            return
-        exists = path.exists()
-    except (OSError, ValueError) as error:  # too long, or with a null character
-        reason = getattr(error, "strerror", None) or error
-        raise InputError(f"{truncate_text(str(path))}: not a path ({reason})") from None
-    if exists:
-        raise InputError(f"{path}: not a file{expected}")
-    raise InputError(f"{path}: no such file{expected}{_format_similar_names(path)}")
-
-
-def is_existing_file(path: Path) -> bool:
-    """Return whether a path is a file; False for a path that no file can have."""
-    try:
-        return path.is_file()
-    except (OSError, ValueError):  # too long, or with a null character
-        return False
-
-
-def _format_similar_names(path: Path) -> str:
-    """Format the names of similar files in the folder as the end of a message."""
-    from difflib import get_close_matches
-
-    try:
-        entries = list(islice(path.parent.iterdir(), _MOST_LISTED))
-    except OSError:
-        return "" if path.parent.is_dir() else f"; there is no folder '{path.parent}'"
-    stems = {entry.stem: entry.name for entry in entries if entry.suffix == path.suffix}
-    similar_files = [stems[stem] for stem in get_close_matches(path.stem, stems, n=3)]
-    return f"; did you mean {' or '.join(similar_files)}?" if similar_files else ""
 
 
 def write_atomically(path: Path, content: Content) -> None:
@@ -171,33 +121,6 @@ def atomic_new_folder(folder: Path) -> Iterator[Path]:
         shutil.rmtree(partial, ignore_errors=True)
 
 
-def check_folder_empty(folder: Path) -> None:
-    """Check that a folder is empty or does not exist.
-
-    Raises:
-        InputError: The folder is not empty.
-    """
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise InputError(
-            f"{folder}: exists and is not empty; results are never overwritten: name another folder"
-        )
-
-
-def make_timestamped_path(parent: Path, name: str) -> Path:
-    """Return the path of a new folder named with the time, numbered if it exists.
-
-    Args:
-        parent: Parent folder.
-        name: Beginning of the folder's name.
-    """
-    stamp = datetime.now(timezone.utc).strftime("%Y%m%dT%H%M%SZ")
-    folder, number = parent / f"{name}-{stamp}", 1
-    while folder.exists():
-        number += 1
-        folder = parent / f"{name}-{stamp}-{number}"
-    return folder
-
-
 def get_first_line(error: BaseException) -> str:
     """Return the first line of an error's message; its class if the message is empty."""
     return (str(error).strip().splitlines() or [type(error).__name__])[0]
@@ -219,3 +142,18 @@ def _flush_to_disk(path: Path) -> None:
     """Flush a file's content to disk, so that it is there before the rename."""
     with path.open("rb") as file:
         os.fsync(file.fileno())
+
+
+def write_files(contents: Mapping[Path, Content]) -> None:
+    """Write all files or none; readers never see a partly written file.
+
+    Raises:
+        InputError: A file exists already, or cannot be written.
+    """
+    check_absent(contents)
+    try:
+        write_new_files(contents)
+    except FileExistsError as error:
+        raise make_exists_error(error.filename) from None
+    except OSError as error:
+        raise InputError(f"{error.filename}: cannot be written ({error.strerror})") from None

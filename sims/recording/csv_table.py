@@ -16,7 +16,7 @@ from typing import NamedTuple, NoReturn
 
 import numpy as np
 
-from sims.core.atomic_files import require_file
+from sims.core.path_checks import require_file
 from sims.core.simulator import Array, InputError, make_read_only
 from sims.core.toml_validation import format_value
 from sims.core.value_limits import MAX_NAME_LENGTH, MAX_TIMESTAMP_SECONDS, MIN_RUN_SECONDS

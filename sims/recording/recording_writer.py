@@ -9,11 +9,11 @@ import csv
 import io
 import math
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from sims.core.atomic_files import Content, write_new_files
+from sims.core.atomic_files import Content, write_files
 from sims.core.simulator import Array, InputError, make_unknown_name_error
 from sims.recording.recording import DeclaredSignals, Recording, Run
 from sims.recording.recording_description import get_description_path
@@ -53,39 +53,6 @@ def write_recording(
         get_description_path(table): _format_description(recording, declared, table.parent),
     }
     write_files({**texts, **(beside or {})})
-
-
-def write_files(contents: Mapping[Path, Content]) -> None:
-    """Write all files or none; readers never see a partly written file.
-
-    Raises:
-        InputError: A file exists already, or cannot be written.
-    """
-    check_absent(contents)
-    try:
-        write_new_files(contents)
-    except FileExistsError as error:
-        raise _make_exists_error(error.filename) from None
-    except OSError as error:
-        raise InputError(f"{error.filename}: cannot be written ({error.strerror})") from None
-
-
-def check_absent(paths: Iterable[Path]) -> None:
-    """Check that none of the files exists.
-
-    Raises:
-        InputError: A file exists already.
-    """
-    for path in paths:
-        if path.exists():
-            raise _make_exists_error(path)
-
-
-def _make_exists_error(path: Path | str) -> InputError:
-    """Make the error for a recording that exists already and would be overwritten."""
-    return InputError(
-        f"{path}: exists already; recordings are never overwritten, name another file"
-    )
 
 
 def _format_table(runs: Sequence[Run], digits: int) -> str:

@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from sims.core.atomic_files import atomic_replacement, require_file
+from sims.core.atomic_files import atomic_replacement, write_files
+from sims.core.path_checks import check_absent, require_file
 from sims.core.simulator import Array, InputError
-from sims.recording.recording_writer import check_absent, write_files
 from sims.vision.ball_renderer import RgbImage
 from sims.vision.video_packages import import_package
 

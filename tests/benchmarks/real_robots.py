@@ -22,7 +22,7 @@ import numpy as np
 
 from bench.core.plugin_registries import simulators
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.logs.inspection import load_recording
+from bench.logs.recording_loading import load_recording
 from sims.extended_simulator import open_extended
 
 ROBOTS = Path(os.environ.get("SIMGAP_ROBOTS", Path(__file__).parents[3] / "shared" / "robots"))

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.logs.inspection import load_recording
+from bench.logs.recording_loading import load_recording
 
 LOG = Path(__file__).parents[2] / "results/reference/real/datasheets/so101-base/base.toml"
 PLACE, JOINT, FITTED, UPTO = "m_shoulder_pan", "shoulder_pan", "chirp_sweep", 80.0

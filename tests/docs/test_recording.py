@@ -6,7 +6,7 @@ import re
 
 import pytest
 
-from bench.logs.inspection import format_summary
+from bench.logs.recording_summary import format_summary
 from sims.core.simulator import InputError
 from sims.recording.recording import read_recording, read_system_name
 from sims.systems.pendulum import Pendulum

@@ -2,7 +2,7 @@ import os
 
 import pytest
 
-from sims.core import atomic_files
+from sims.core import atomic_files, path_checks
 from sims.core.simulator import InputError
 
 
@@ -107,17 +107,17 @@ def test_a_folder_is_made_whole_or_not_at_all_and_only_where_nothing_is(tmp_path
 
 
 def test_full_folders_are_refused_and_new_ones_get_a_name_of_their_own(tmp_path):
-    atomic_files.check_folder_empty(tmp_path)
-    atomic_files.check_folder_empty(tmp_path / "nowhere")
-    one = atomic_files.make_timestamped_path(tmp_path, "x")
+    path_checks.check_folder_empty(tmp_path)
+    path_checks.check_folder_empty(tmp_path / "nowhere")
+    one = path_checks.make_timestamped_path(tmp_path, "x")
     one.mkdir()
-    two = atomic_files.make_timestamped_path(tmp_path, "x")
+    two = path_checks.make_timestamped_path(tmp_path, "x")
     assert two != one
     with pytest.raises(InputError, match="exists and is not empty"):
-        atomic_files.check_folder_empty(tmp_path)
+        path_checks.check_folder_empty(tmp_path)
     (one / "file").write_text("")
     with pytest.raises(InputError, match="exists and is not empty"):
-        atomic_files.check_folder_empty(one / "file")
+        path_checks.check_folder_empty(one / "file")
 
 
 def test_first_line_of_an_error():

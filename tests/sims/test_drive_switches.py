@@ -5,7 +5,8 @@ messages.
 import numpy as np
 import pytest
 
-from bench.logs.inspection import format_summary, load_recording
+from bench.logs.recording_loading import load_recording
+from bench.logs.recording_summary import format_summary
 from sims.core.simulator import InputError
 
 ROBOT = """

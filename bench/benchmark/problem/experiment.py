@@ -24,7 +24,7 @@ from bench.benchmark.problem.suite_version import (
     compute_problem_hash,
 )
 from bench.benchmark.problem.tuner_entries import TunerEntry, parse_entries
-from sims.core.atomic_files import is_existing_file
+from sims.core.path_checks import is_existing_file
 from sims.core.simulator import InputError, make_unknown_name_error
 from sims.core.toml_validation import (
     Range,

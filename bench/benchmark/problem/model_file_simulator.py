@@ -11,7 +11,7 @@ from bench.benchmark.problem.experiment import Experiment
 from bench.benchmark.problem.recorded_runs import find_recording
 from bench.core.plugin_registries import make_robot_simulator, simulators
 from bench.datasets import dataset_catalogue as datasets
-from sims.core.atomic_files import is_existing_file
+from sims.core.path_checks import is_existing_file
 from sims.core.registry import PartUnavailableError
 from sims.core.simulator import InputError, Simulator
 from sims.core.value_limits import truncate_text

@@ -10,12 +10,13 @@ import pandas as pd
 
 from bench.benchmark.problem.experiment import Experiment
 from bench.benchmark.statistics.error_curves import RunCurves, RunRowTable, select_primary_metric
-from bench.benchmark.statistics.expected_running_time import build_runtime_table, select_thresholds
+from bench.benchmark.statistics.expected_running_time import select_thresholds
 from bench.benchmark.statistics.median_curves import (
     compute_median_curves,
     compute_medians_by_distance,
     find_coinciding_curves,
 )
+from bench.benchmark.statistics.runtime_distribution import build_runtime_table
 from bench.benchmark.statistics.training_amortisation import TuningCost, compute_tuning_costs
 from bench.benchmark.statistics.tuner_ranking import (
     format_failure_notes,
@@ -224,7 +225,7 @@ class ComparisonStatistics:
 
     @cached_property
     def runtime_distribution(self) -> pd.DataFrame:
-        """Runtime distribution of every range; see `expected_running_time.build_runtime_table`."""
+        """Runtime distribution of every range; see `runtime_distribution.build_runtime_table`."""
         return build_runtime_table(self.curves, self.spread)
 
     @cached_property

@@ -27,11 +27,10 @@ from bench.benchmark.storage.table_schemas import (
 from sims.core.atomic_files import (
     atomic_new_folder,
     atomic_replacement,
-    check_folder_empty,
     get_first_line,
-    make_timestamped_path,
     write_atomically,
 )
+from sims.core.path_checks import check_folder_empty, make_timestamped_path
 from sims.core.plain_values import to_toml_value
 from sims.core.simulator import InputError
 from sims.core.toml_validation import check_entries, format_value, read_toml

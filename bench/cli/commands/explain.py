@@ -1,4 +1,4 @@
-"""The commands `simgap explain` and `simgap score`."""
+"""Command `simgap explain`: explain recordings, together or each separately."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from bench.cli.output import (
     PrintLine,
 )
 from bench.cli.shared_options import (
-    add_force_option,
     add_options,
     add_out_option,
     add_pdf,
@@ -24,7 +23,6 @@ from bench.cli.shared_options import (
     collect_options,
     make_cluster_pool,
     parse_name_list,
-    parse_path,
 )
 
 _FIGURE_SUFFIXES = (".html", ".png", ".pdf")
@@ -80,28 +78,6 @@ def add_explain_arguments(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(command=_run_explain)
 
 
-def add_score_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `simgap score`."""
-    parser.add_argument(
-        "model",
-        metavar="MODEL",
-        type=parse_path,
-        help="extended.toml as `simgap explain` writes it, or a robot's extended.xml",
-    )
-    parser.add_argument(
-        "recording",
-        metavar="OTHER.csv",
-        type=parse_path,
-        help="the recording; its .toml is in the same folder",
-    )
-    parser.add_argument(
-        "--held-out", action="store_true", help="use only the runs that are marked held_out"
-    )
-    add_plugin_option(parser, "systems")
-    add_force_option(parser)
-    parser.set_defaults(command=_run_score)
-
-
 def _run_explain(options: argparse.Namespace, print_line: PrintLine) -> CommandResult:
     """Explain a recording, write the results, print the text summary."""
     from bench.api.explain import explain
@@ -110,7 +86,7 @@ def _run_explain(options: argparse.Namespace, print_line: PrintLine) -> CommandR
     from bench.core.plugin_registries import load_plugins
     from bench.diagnosis.explain_options import ExplainOptions
     from bench.diagnosis.report.summary_text import format_summary
-    from sims.core.atomic_files import check_folder_empty, make_timestamped_path
+    from sims.core.path_checks import check_folder_empty, make_timestamped_path
     from sims.core.simulator import InputError
 
     if options.cluster and not options.each:
@@ -188,7 +164,7 @@ def _run_explain_batch(options: argparse.Namespace, print_line: PrintLine) -> Co
     )
     from bench.diagnosis.batch.run_batch import explain_batch, list_logs
     from bench.diagnosis.batch.summary_page import BatchPageInput, write_summary_page
-    from sims.core.atomic_files import make_timestamped_path
+    from sims.core.path_checks import make_timestamped_path
 
     settings = {
         name: getattr(options, name)
@@ -264,19 +240,3 @@ def _run_explain_batch(options: argparse.Namespace, print_line: PrintLine) -> Co
         "report": report,
     }
     return CommandResult(document, code)
-
-
-def _run_score(options: argparse.Namespace, print_line: PrintLine) -> CommandResult:
-    """Print a model's error on a recording."""
-    from bench.api.explain import score
-    from bench.core.plugin_registries import load_plugins
-
-    load_plugins(options.plugin)
-    result = score(options.model, options.recording, held_out=options.held_out, force=options.force)
-    units = result.pop("units")
-    for channel, error in result["rmse"].items():
-        print_line(f"{channel}: RMSE {error:.4g} {units[channel]}")
-    runs = "1 run" if result["runs"] == 1 else f"{result['runs']} runs"
-    counts = f"{runs}, {result['samples']} samples"
-    print_line(f"{result['normalised_rmse']:.4g} times the noise; {counts}")
-    return CommandResult(result)

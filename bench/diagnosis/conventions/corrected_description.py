@@ -11,10 +11,10 @@ from typing import Any
 from bench.diagnosis.conventions.convention_comparison import ConventionDifference
 from bench.diagnosis.conventions.convention_hypotheses import ConventionHypothesis, SignalChange
 from bench.diagnosis.conventions.copied_commands import UNKNOWN_COLUMN
+from sims.core.atomic_files import write_files
 from sims.core.simulator import InputError
 from sims.core.toml_validation import toml_key, toml_text
 from sims.recording.recording_description import DeclaredSignals, dotted, read_meta
-from sims.recording.recording_writer import write_files
 from sims.recording.unit_conversion import compute_unit_scale
 
 KINDS = ("channels", "inputs")

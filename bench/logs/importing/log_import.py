@@ -15,10 +15,10 @@ from bench.logs.importing.log_runs import group_logs_by_run
 from bench.logs.importing.run_logs import RunLogs
 from bench.logs.importing.signal_assignment import SignalAssignment
 from bench.logs.importing.velocity_assignment import assign_velocities
-from bench.logs.inspection import load_recording
+from bench.logs.recording_loading import load_recording
+from sims.core.atomic_files import write_files
 from sims.core.simulator import InputError
 from sims.core.toml_validation import check_known_names
-from sims.recording.recording_writer import write_files
 from sims.robot.robot_model import RobotModel
 
 

@@ -11,17 +11,16 @@ are the slope and the correlation.
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from bench.logs.quality.anomaly import Anomaly
 from bench.logs.quality.quality_finding import QualityFinding
+from bench.logs.quality.recorded_poses import iterate_poses
 from sims.core.simulator import Array, Simulator
-from sims.recording.recording import Recording, Run
-from sims.robot.mujoco_messages import capture_mujoco_warnings
+from sims.recording.recording import Recording
 
 MAX_RANGE_EXCESS = 1.0
 """Maximum plausible distance of a position beyond its joint's range, as a fraction of the range."""
@@ -37,10 +36,6 @@ MAX_REVERSED_SLOPE = -0.3
 """Maximum slope b of (1) for a servo that follows its command with reversed sign."""
 DEGREE_SLOPE_RANGE = (40.0, 80.0)
 """Range of slopes b of (1) which show that one of the two signals is in degrees (57.3)."""
-CHECKED_INSTANTS = 100
-"""Maximum number of times of a run at which forces or contacts are evaluated."""
-MAX_CONTACTS = 12
-"""Maximum number of contacts at which effects are candidates."""
 MIN_OVERLAP_METRES = 1e-3
 """Smallest depth, in m, at which two bodies overlap; feet on the ground sink in by less."""
 MIN_OVERLAP_SHARE = 0.9
@@ -111,69 +106,6 @@ def _check_range(recording: Recording, joint: Any) -> Iterator[Anomaly]:
         return
 
 
-def compute_static_accelerations(run: Run, kind: type[Simulator]) -> Array:
-    """Compute accelerations of a robot at rest in recorded positions under recorded commands.
-
-    Args:
-        run: Run with the positions and commands.
-        kind: Simulator class of the robot.
-
-    Returns:
-        (N, D) accelerations at up to `CHECKED_INSTANTS` times of the run.
-    """
-    joints = [
-        joint
-        for joint in kind.robot.joints  # type: ignore[attr-defined]
-        if joint.has_one_coordinate
-    ]
-    return np.array(
-        [
-            [data.qacc[joint.velocity] for joint in joints]
-            for data in _iterate_poses(kind, run.channels, run.inputs)
-        ]
-    )
-
-
-def find_contacts(
-    kind: type[Simulator], positions: Mapping[str, Array]
-) -> frozenset[tuple[int, int]]:
-    """Find pairs of a robot's geoms that touch at some of `CHECKED_INSTANTS` times of a motion.
-
-    Args:
-        kind: Simulator class of the robot.
-        positions: (N,) position of each joint, rad or m, by channel; other joints keep their
-            initial position.
-    """
-    pairs: set[tuple[int, int]] = set()
-    for data in _iterate_poses(kind, positions):
-        pairs |= {(int(min(pair)), int(max(pair))) for pair in data.contact.geom[: data.ncon]}
-    return frozenset(pairs)
-
-
-def find_recorded_contacts(recording: Recording, kind: type[Simulator]) -> tuple[str, ...]:
-    """Return the names of the pairs of a robot's geoms that touch in the recorded poses.
-
-    Joints that are not recorded keep their initial position.
-
-    Args:
-        recording: Recording of the robot.
-        kind: Simulator class of the robot.
-
-    Returns:
-        Names of at most `MAX_CONTACTS` pairs, the most frequent ones, in alphabetical order.
-    """
-    # This import is needed for robots only.
-    from sims.robot.contact_pairs import make_pair_name
-
-    model = kind.robot.compiled  # type: ignore[attr-defined]
-    counts = Counter[str]()
-    for run in recording.training():
-        for data in _iterate_poses(kind, run.channels):
-            touching = data.contact.geom[: data.ncon][data.contact.dist[: data.ncon] <= 0.0]
-            counts.update({make_pair_name(model, pair) for pair in touching.tolist()})
-    return tuple(sorted(name for name, _ in counts.most_common(MAX_CONTACTS)))
-
-
 def find_overlaps(recording: Recording, kind: type[Simulator]) -> Iterator[QualityFinding]:
     """Find bodies of a robot that overlap in most of the recorded poses.
 
@@ -191,7 +123,7 @@ def find_overlaps(recording: Recording, kind: type[Simulator]) -> Iterator[Quali
     depths: dict[tuple[str, str], list[float]] = {}
     count = 0
     for run in recording.training():
-        for data in _iterate_poses(kind, run.channels):
+        for data in iterate_poses(kind, run.channels):
             count += 1
             deepest: dict[tuple[str, str], float] = {}
             for contact in data.contact[: data.ncon]:
@@ -213,39 +145,6 @@ def find_overlaps(recording: Recording, kind: type[Simulator]) -> Iterator[Quali
                 "always acts between them",
                 f"{remedy} in {robot.path.name}",
             )
-
-
-def _iterate_poses(
-    kind: type[Simulator], positions: Mapping[str, Array], inputs: Mapping[str, Array] | None = None
-) -> Iterator[Any]:
-    """Yield MuJoCo's data (mujoco.MjData) of a robot at rest at some of its recorded poses.
-
-    The same object is yielded each time, with up to `CHECKED_INSTANTS` poses one after another.
-    Commands and forces that `inputs` lacks are zero.
-    """
-    import mujoco
-
-    robot = kind.robot  # type: ignore[attr-defined]
-    inputs = inputs or {}
-    model = robot.compiled
-    data = mujoco.MjData(model)
-    joints = [joint for joint in robot.joints if joint.has_one_coordinate]
-    count = max((values.size for values in positions.values()), default=0)
-    rows = np.unique(np.linspace(0, max(count - 1, 0), CHECKED_INSTANTS).astype(np.intp))
-    with capture_mujoco_warnings():
-        for row in rows:
-            mujoco.mj_resetData(model, data)
-            for joint in joints:
-                values = positions.get(f"q.{joint.name}")
-                if values is not None and np.isfinite(values[row]):
-                    data.qpos[joint.position] = values[row]
-                if f"force.{joint.name}" in inputs:
-                    data.qfrc_applied[joint.velocity] = inputs[f"force.{joint.name}"][row]
-            for actuator in robot.actuators:
-                if f"u.{actuator.name}" in inputs:
-                    data.ctrl[actuator.control] = inputs[f"u.{actuator.name}"][row]
-            mujoco.mj_forward(model, data)
-            yield data
 
 
 class _Pair(NamedTuple):

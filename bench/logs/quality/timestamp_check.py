@@ -23,7 +23,7 @@ import numpy as np
 
 from bench.core.resource_estimates import FORCE_HINT
 from bench.logs.importing.normalised_positions import check_normalised_positions
-from bench.logs.quality import pose_check
+from bench.logs.quality import pose_check, recorded_poses
 from bench.logs.quality.anomaly import Anomaly
 from bench.logs.quality.floating_base_check import find_missing_base_poses
 from sims.core.simulator import Array, InputError, Simulator
@@ -134,7 +134,7 @@ def _check_time_scale(recording: Recording, run: Run, kind: type[Simulator]) -> 
     system = kind.system()
     interval = float(np.median(np.diff(run.times)))
     if kind.has_model:
-        accelerations = pose_check.compute_static_accelerations(run, kind)
+        accelerations = recorded_poses.compute_static_accelerations(run, kind)
     else:
         accelerations = _compute_rest_accelerations(recording, run, system)
     # A servo holds its position by force, so large forces at rest are normal.

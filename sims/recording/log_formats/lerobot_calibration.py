@@ -19,7 +19,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from sims.core.atomic_files import require_file
+from sims.core.path_checks import require_file
 from sims.core.simulator import InputError
 
 COUNTS_PER_TURN = 4096

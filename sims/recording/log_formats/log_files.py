@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sims.core.atomic_files import require_file
+from sims.core.path_checks import require_file
 from sims.core.simulator import Array, InputError, make_read_only
 from sims.recording.log_formats import hdf5_files, lerobot_dataset, ros_bags
 from sims.recording.log_formats.message_table import TIME_COLUMN

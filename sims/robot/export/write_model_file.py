@@ -133,7 +133,7 @@ def render_with_series_joints(applied: ModifiedModel) -> bytes:
 
 
 def _fix_base(document: MjcfDocument) -> None:
-    """Remove free joints and keyframes, as `parsing.added_actuators.fix_bases` does."""
+    """Remove free joints and keyframes, as `parsing.engine_settings.fix_bases` does."""
     for tag in document.walk():
         is_free = tag.name == "joint" and tag.attributes.get("type") == "free"
         if tag.name in ("freejoint", "keyframe") or is_free:

@@ -1,4 +1,4 @@
-"""Actuators and engine settings that a recording adds to a model file."""
+"""Actuators that a recording adds to a model file."""
 
 from __future__ import annotations
 
@@ -29,14 +29,6 @@ class ActuatorTable(TypedDict, total=False):
     disable: str
 
 
-class EngineTable(TypedDict, total=False):
-    """Table ``[engine]`` of a recording."""
-
-    timestep: float
-    integrator: str
-    fix_base: bool
-
-
 COMMON_ACTUATOR_KEYS = ("joint", "kind", "gear", "control_range", "force_range")
 GAIN_KEYS_BY_KIND: Mapping[str, tuple[str, ...]] = {
     "motor": (),
@@ -45,10 +37,6 @@ GAIN_KEYS_BY_KIND: Mapping[str, tuple[str, ...]] = {
     "pid": ("kp", "ki", "kd", "kv"),
 }
 """Gains by kind of actuator; the first one is required."""
-INTEGRATORS = ("Euler", "RK4", "implicit", "implicitfast")
-"""Names of integrators, in the order of MuJoCo's mjtIntegrator."""
-MIN_TIME_STEP, MAX_TIME_STEP = 1e-9, 1.0
-"""Smallest and largest allowed time step, in seconds."""
 
 
 def add_actuators(spec: Any, tables: Mapping[str, Any], source: str) -> tuple[str, ...]:
@@ -184,60 +172,3 @@ def _set_pid(actuator: Any, gains: dict[str, float], kd: float | None) -> None:
         inputs |= int(mujoco.mjtCtrlInput.mjINPUT_VEL)
         gains["kv"] = float(kd)
     actuator.set_to_pid(**gains, ctrlspec=inputs)
-
-
-def apply_engine_settings(spec: Any, table: Mapping[str, Any], source: str) -> list[str]:
-    """Apply the time step and integrator of a recording to a model, and fix its base.
-
-    Args:
-        spec: a mujoco.MjSpec; it is changed in place.
-        table: ``timestep`` in s, ``integrator`` by MuJoCo's name, and whether to ``fix_base``.
-        source: beginning of error messages.
-
-    Returns:
-        Notes about the fixed bodies and omitted keyframes.
-
-    Raises:
-        InputError: the table is invalid.
-    """
-    import mujoco
-
-    settings = toml_validation.check_entries(
-        source, "engine", table, toml_validation.get_type_hints_of(EngineTable)
-    )
-    if "timestep" in settings:
-        step = toml_validation.check_finite(source, "engine.timestep", settings["timestep"])
-        if not MIN_TIME_STEP <= step <= MAX_TIME_STEP:
-            raise toml_validation.make_error(
-                source, "engine.timestep", f"{MIN_TIME_STEP:g} to {MAX_TIME_STEP:g} s", step
-            )
-        spec.option.timestep = step
-    if "integrator" in settings:
-        name = settings["integrator"]
-        if name not in INTEGRATORS:
-            raise InputError(
-                f"{source}: engine: {make_unknown_name_error('integrator', name, INTEGRATORS)}"
-            )
-        spec.option.integrator = int(mujoco.mjtIntegrator(INTEGRATORS.index(name)))
-    return fix_bases(spec) if settings.get("fix_base") else []
-
-
-def fix_bases(spec: Any) -> list[str]:
-    """Fix all free bodies where the model file has them, and return notes about it.
-
-    Keyframes are left out, since they have the coordinates of free joints.
-
-    Args:
-        spec: a mujoco.MjSpec; it is changed in place.
-    """
-    import mujoco
-
-    free = [joint for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_FREE]
-    if not free:
-        return ["fix_base: no body of the model file floats"]
-    names = [joint.parent.name for joint in free]
-    keyframes = list(spec.keys)
-    for element in (*free, *keyframes):
-        spec.delete(element)
-    left_out = f"; {len(keyframes)} keyframes are left out" if keyframes else ""
-    return [f"fixed in the pose of the model file: {', '.join(names)}{left_out}"]

@@ -6,7 +6,7 @@ import os
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
-from sims.core.atomic_files import is_existing_file
+from sims.core.path_checks import is_existing_file
 from sims.robot.note_text import format_name_list
 from sims.robot.parsing.xml_files import MAX_ASSET_BYTES, ModelFileReader
 

@@ -9,7 +9,7 @@ from pathlib import PurePosixPath
 from typing import Any
 from xml.etree.ElementTree import Element
 
-from sims.core.atomic_files import is_existing_file
+from sims.core.path_checks import is_existing_file
 from sims.core.value_limits import truncate_text
 from sims.robot.parsing.missing_meshes import OmittedShapes
 from sims.robot.parsing.xml_files import MAX_ASSET_BYTES, ModelFileReader, find_children, parse_tree

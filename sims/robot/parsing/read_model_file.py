@@ -19,6 +19,7 @@ from sims.robot.parsing import (
     added_actuators,
     contact_exclusion,
     element_names,
+    engine_settings,
     mjcf_loading,
     urdf_loading,
 )
@@ -104,7 +105,7 @@ def _make_robot(
         spec = _parse_repaired_file(files, root)
         missing_files.remove_from_spec(spec, repairs.left)
     rate_controlled = added_actuators.add_actuators(spec, actuators, source)
-    notes += added_actuators.apply_engine_settings(spec, engine, source)
+    notes += engine_settings.apply_engine_settings(spec, engine, source)
     notes += element_names.name_unnamed_elements(spec)
     parents = {body.name: body.parent.name for body in spec.bodies if body.parent is not None}
     spec, model = repairs.compile(spec)
@@ -154,8 +155,8 @@ def _check_model(files: ModelFileReader, model: Any) -> None:
     if model.njnt == 0:
         raise InputError(f"{files.path}: it has no movable joint")
     step = float(model.opt.timestep)
-    if not added_actuators.MIN_TIME_STEP <= step <= added_actuators.MAX_TIME_STEP:
-        span = f"{added_actuators.MIN_TIME_STEP:g} to {added_actuators.MAX_TIME_STEP:g} s"
+    if not engine_settings.MIN_TIME_STEP <= step <= engine_settings.MAX_TIME_STEP:
+        span = f"{engine_settings.MIN_TIME_STEP:g} to {engine_settings.MAX_TIME_STEP:g} s"
         raise InputError(f"{files.path}: option timestep: expected {span}, found {step:g}")
     for field in CHECKED_MODEL_FIELDS:
         values = np.asarray(getattr(model, field), dtype=float)

@@ -14,7 +14,7 @@ from typing import Any
 from xml.etree.ElementTree import Element, tostring
 from xml.parsers import expat
 
-from sims.core.atomic_files import require_file
+from sims.core.path_checks import require_file
 from sims.core.simulator import InputError
 
 MAX_MODEL_BYTES = 50 * 2**20

@@ -5,8 +5,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from bench.diagnosis.explain import explain
-from bench.logs.inspection import load_recording
 from bench.logs.quality.log_quality import check_log_quality
+from bench.logs.recording_loading import load_recording
 
 NOISE, MASS, INTERVAL = 1e-3, 2.0, 0.02
 

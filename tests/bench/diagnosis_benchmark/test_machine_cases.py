@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from bench.core.diagnoser import DiagnosisCase, list_observable_effects
+from bench.core.plugin_registries import make_robot_simulator
 from bench.diagnosis_benchmark.case_catalogue import list_coefficient_names, render_recording
 from bench.diagnosis_benchmark.case_generation.benchmark_case import BenchmarkCase
 from bench.diagnosis_benchmark.case_generation.recording_conditions import RequestedConditions
@@ -35,7 +36,7 @@ from bench.diagnosis_benchmark.machine_cases.reference_motion import (
     read_encoders,
     simulate_machine,
 )
-from bench.logs.inspection import load_recording, make_robot_simulator
+from bench.logs.recording_loading import load_recording
 from sims.core.simulator import Scenario
 from sims.systems.servo import Servo as ServoSimulator
 

@@ -22,7 +22,7 @@ from bench.figures.recording_figure import draw_recording_figure
 from bench.figures.style import make_panel_grid, render_all_formats, render_png, write_figure
 from bench.figures.track_figure import draw_track_figure
 from bench.logs.ball_heights import BallHeights
-from bench.logs.inspection import load_recording
+from bench.logs.recording_loading import load_recording
 from sims.core.simulator import InputError
 from sims.vision.ball_tracker import BallTrack
 from tests.bench.diagnosis.report_tables import swing, table

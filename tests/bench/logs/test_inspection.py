@@ -4,8 +4,9 @@ import pytest
 
 from bench.cli.main import main
 from bench.figures.recording_figure import _reduce_points
-from bench.logs.inspection import format_summary, load_recording
 from bench.logs.quality.noise_estimation import count_gaps, estimate_noise
+from bench.logs.recording_loading import load_recording
+from bench.logs.recording_summary import format_summary
 from sims.core.simulator import InputError
 from sims.recording.recording import read_recording
 from sims.systems.servo import Servo

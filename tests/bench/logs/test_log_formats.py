@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bench.cli.main import main
-from bench.logs.inspection import load_recording
+from bench.logs.recording_loading import load_recording
 from tests.bench.logs.log_writers import JOINTS, NEEDED, OPTIONS, WRITERS, motion, write_folder
 from tests.malformed_input.input_strategies import log_folders, made
 from tests.malformed_input.malformed_case import tried

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 import simgap
 from bench.cli.main import main
 from bench.core.plugin_registries import make_robot_simulator
-from bench.logs.inspection import load_recording
+from bench.logs.recording_loading import load_recording
 from sims.core.simulator import InputError, Scenario
 from tests.bench.diagnosis.test_robot_input_errors import ARM
 

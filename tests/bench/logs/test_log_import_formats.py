@@ -13,8 +13,8 @@ import simgap
 from bench.cli.main import main
 from bench.core.plugin_registries import make_robot_simulator
 from bench.logs.importing.joint_order import order_of_commands
-from bench.logs.inspection import load_recording
 from bench.logs.quality.timestamp_check import check_recording_plausible
+from bench.logs.recording_loading import load_recording
 from sims.core.simulator import InputError, Scenario
 
 CASES = Path(os.environ.get("SIMGAP_DATA", "")).parent / "cases"

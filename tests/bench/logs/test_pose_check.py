@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from bench.cli.main import main
-from bench.logs.inspection import load_recording
 from bench.logs.quality.pose_check import find_overlaps
+from bench.logs.recording_loading import load_recording
 
 LEG = """<mujoco model="leg"><worldbody>
 <body name="base"><geom name="block" type="box" size="0.1 0.1 0.05"/>

@@ -5,7 +5,7 @@ import pytest
 
 from bench.cli.main import main
 from bench.core.input_signals import evaluate_signal
-from bench.logs.inspection import load_recording
+from bench.logs.recording_loading import load_recording
 from bench.logs.synthetic_recording import SimulationSpec, simulate_recording
 from sims.core.simulator import InputError
 from sims.core.toml_validation import read_toml

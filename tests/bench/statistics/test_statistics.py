@@ -13,13 +13,13 @@ from bench.benchmark.statistics.expected_running_time import (
     build_ert_table,
     compute_effort,
     compute_hitting_times,
-    compute_solved_fraction,
 )
 from bench.benchmark.statistics.paired_tests import (
     compare_all_pairs,
     compute_nemenyi_p_values,
     compute_problem_ranks,
 )
+from bench.benchmark.statistics.runtime_distribution import compute_solved_fraction
 from bench.benchmark.statistics.training_amortisation import (
     TuningCost,
     build_break_even_table,

@@ -73,7 +73,7 @@ class ConventionCase(exam.Case):
         """Compare the conventions of log and model, as `simgap explain` does before it explains."""
         from bench.diagnosis.conventions.convention_comparison import ConventionComparison
         from bench.diagnosis.conventions.unit_check import Subject
-        from bench.logs.inspection import load_recording
+        from bench.logs.recording_loading import load_recording
 
         log, kind = load_recording(recording)
         cpu, wall = time.process_time(), time.perf_counter()

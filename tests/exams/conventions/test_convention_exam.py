@@ -19,7 +19,7 @@ from bench.diagnosis.conventions.corrected_description import (
     list_changed_tables,
 )
 from bench.diagnosis.conventions.unit_check import Subject
-from bench.logs.inspection import load_recording
+from bench.logs.recording_loading import load_recording
 from sims.core.toml_validation import read_toml
 from sims.recording.angle_unwrapping import unwrapped
 from sims.recording.recording_description import read_meta

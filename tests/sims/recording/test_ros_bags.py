@@ -8,7 +8,7 @@ import pytest
 
 import simgap
 from bench.cli.main import main
-from bench.logs.inspection import load_recording
+from bench.logs.recording_loading import load_recording
 from sims.core.simulator import InputError
 from sims.recording.log_formats import ros_bags
 from sims.recording.log_formats.log_files import list_logs, read_log

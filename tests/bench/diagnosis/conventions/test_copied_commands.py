@@ -6,7 +6,7 @@ import pytest
 
 from bench.cli.main import main
 from bench.diagnosis.conventions.copied_commands import find_copied_commands
-from bench.logs.inspection import load_recording
+from bench.logs.recording_loading import load_recording
 
 ARM = """<mujoco model="arm"><option timestep="0.002"/><worldbody>
 <body><joint name="hip" axis="0 1 0" damping="0.1" armature="0.02"/>

@@ -7,7 +7,7 @@ from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.linearised_runs import compute_state_jacobian
 from bench.diagnosis.fitting.multiple_shooting import forgets_initial_state
-from bench.logs.inspection import load_recording
+from bench.logs.recording_loading import load_recording
 from sims.core.simulator import Scenario
 from tests.sims.robot.test_robot_motion import kind_of
 

@@ -13,7 +13,7 @@ from bench.diagnosis.prediction_error.inactive_drives import (
     find_inactive_drives,
     remove_inactive_drives,
 )
-from bench.logs.inspection import load_recording
+from bench.logs.recording_loading import load_recording
 
 NOISE = 5e-4
 ARM = """

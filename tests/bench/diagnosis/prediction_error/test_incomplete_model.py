@@ -14,7 +14,7 @@ from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.explain import explain
 from bench.diagnosis.prediction_error.incomplete_model import is_long
 from bench.diagnosis.validation.held_out_runs import HeldOutRuns
-from bench.logs.inspection import load_recording
+from bench.logs.recording_loading import load_recording
 from bench.logs.segmentation import segment_recording
 from sims.extended_simulator import open_extended
 from tests.exams.recordings.recording_cases import RecordingQuestion

@@ -1,0 +1,341 @@
+"""Applied inputs of many batch elements: mean of each command over each step, changed by effects.
+
+Effects on the input change the signal before the integration starts, since it does not depend on
+the plant. Therefore every engine supports them.
+
+A command u is held from one sample to the next (zero-order hold). Over a step from a to b its mean
+is applied to the plant; its integral A is piecewise linear:
+
+    (A(b) - A(a)) / (b - a),    A(t) = sum of u_i (t_{i+1} - t_i) up to t  (1)
+
+Where a scenario states linear interpolation between samples, A is piecewise quadratic instead.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sims.core.effect import ActiveEffects, Effect, Input, Signal
+from sims.core.simulator import Array, Indices, Scenario
+from sims.engines.time_grid import (
+    Commands,
+    ScenarioGroups,
+    TimeGrid,
+    divide_intervals,
+    get_command_times,
+    get_history_times,
+    is_active,
+    pad_with_last,
+    shifts_time,
+)
+
+MAX_LEAD_IN_STEP_SECONDS = 2e-3
+"""Maximum step before the run in seconds, unless a step within the run is longer."""
+
+
+def _get_command_values(scenario: Scenario, name: str, values: Array) -> Array:
+    """Return the values (K + T,) of an input, including its known history before the run.
+
+    Args:
+        scenario: Scenario with the history.
+        name: Name of the input.
+        values: (T,) values in the run.
+    """
+    if name not in scenario.before:
+        return values
+    return np.concatenate([scenario.before[name][1], values])
+
+
+def compute_applied_inputs(
+    plan: TimeGrid, runs: ScenarioGroups, commands: Commands, acting: ActiveEffects
+) -> dict[str, Array]:
+    """Return the applied inputs: the mean of each command over each step, changed by the effects.
+
+    A command is held between recorded samples, and had its first value before the first sample,
+    unless its history is known. Effects act on the first input; effects with memory begin at the
+    start of the known history.
+
+    Args:
+        plan: Time grid.
+        runs: Scenarios of the batch elements.
+        commands: Inputs of each distinct scenario.
+        acting: Input effects in the order in which the signal passes them.
+
+    Returns:
+        Applied inputs (L, S) by name.
+    """
+    effects = tuple((effect, c, is_active(c)) for effect, c in acting if c.any())
+    starts, ends, steps = _step_begins(plan.ends), plan.ends, plan.steps
+    input_name, *other_names = commands[0]
+    applied = {}
+    for name in other_names if effects else (input_name, *other_names):
+        applied[name] = _average_command(runs, name, commands, starts, ends, plan.has_uniform_steps)
+    if not effects:
+        return applied
+    lead_in = _build_lead_in_steps(
+        runs, input_name, max(float(steps.max(initial=0.0)), MAX_LEAD_IN_STEP_SECONDS)
+    )
+    if lead_in[0].size:
+        parts = zip(lead_in, (starts, ends, steps), strict=True)
+        starts, ends, steps = (
+            np.hstack([lead_part[runs.scenario_index], run_part]) for lead_part, run_part in parts
+        )
+    step_ends = ends
+    # Backwards from the plant to the command: map the times through the effects.
+    for effect, c, is_acting in reversed(effects):
+        assert isinstance(effect, Input)
+        # Most effects do not shift time; skip them.
+        if not shifts_time(effect):
+            continue
+        starts = np.where(is_acting, effect.times(c, starts), starts)
+        ends = np.where(is_acting, effect.times(c, ends), ends)
+    # Forwards with the values. Rows that share their memory are equal.
+    has_uniform_steps = plan.has_uniform_steps or ends.strides[0] == 0
+    means = _average_command(runs, input_name, commands, starts, ends, has_uniform_steps)
+    for effect, c, is_acting in effects:
+        if isinstance(effect, Input) and effect.between:
+            other_means = _average_command(
+                runs,
+                input_name,
+                commands,
+                starts,
+                ends,
+                has_uniform_steps,
+                is_other_interpolation=True,
+            )
+            means = np.where(is_acting, means + c[0] * (other_means - means), means)
+    pairs = zip(runs.unique_scenarios, commands, strict=True)
+    initial_values = np.array(
+        [_get_command_values(s, input_name, u[input_name])[0] for s, u in pairs]
+    )
+    result = _apply_input_effects(
+        effects, steps, step_ends, means, initial_values[runs.scenario_index, None]
+    )
+    return {input_name: result[:, lead_in[0].shape[1] :], **applied}
+
+
+def _build_lead_in_steps(
+    runs: ScenarioGroups, name: str, largest: float
+) -> tuple[Array, Array, Array]:
+    """Build the steps before the runs in which the history of an input is known.
+
+    Args:
+        runs: Scenarios of the batch elements.
+        name: Name of the input.
+        largest: Maximum length of a step, s.
+
+    Returns:
+        Beginnings, ends and lengths (N, K) of the steps, s; the length is zero where the history is
+        unknown.
+    """
+    event_times = [get_history_times(s, name) for s in runs.unique_scenarios]
+    event_times = [np.append(row[row < 0], 0.0) for row in event_times]
+    size = max(row.size for row in event_times)
+    if size == 1:
+        no_steps = np.empty((len(event_times), 0))
+        return no_steps, no_steps, no_steps
+    first = np.array([[row[0]] for row in event_times])
+    steps, step_ends, _, _ = divide_intervals(
+        np.stack([pad_with_last(row, size) for row in event_times]) - first, largest
+    )
+    step_ends = step_ends + first
+    return np.hstack([first, step_ends[:, :-1]]), step_ends, steps
+
+
+def _apply_input_effects(
+    effects: Sequence[tuple[Effect, Array, NDArray[np.bool_]]],
+    steps: Array,
+    ends: Array,
+    means: Array,
+    start: Array,
+) -> Array:
+    """Pass the means of the command through the effects on the input.
+
+    Args:
+        effects: Effects with their coefficients, and masks (L, 1) of the batch elements in which
+            they are active.
+        steps: (L, S) lengths of the steps, s.
+        ends: (L, S) ends of the steps, s.
+        means: (L, S) mean of the command over each step.
+        start: (L, 1) first value of the command, which it also had before the first step.
+
+    Returns:
+        Applied values (L, S).
+    """
+    distinct_steps = steps[:1] if steps.strides[0] == 0 else steps
+    last_steps = None if (distinct_steps > 0).all() else _find_last_nonzero_step(steps)
+    values = means.copy() if last_steps is None else np.take_along_axis(means, last_steps, axis=1)
+    start = start.copy()
+    for effect, c, is_acting in effects:
+        assert isinstance(effect, Input)
+        # An effect may be active in few of the batch elements; evaluate only these.
+        elements = np.flatnonzero(is_acting)
+        coefficients, begin = c[:, elements], start[elements]
+        zeros = np.zeros_like(begin)
+        signal = Signal(values[elements], steps[elements], begin, ends[elements])
+        result = effect.feel(coefficients, signal)
+        if last_steps is not None:
+            result = np.take_along_axis(result, last_steps[elements], axis=1)
+        values[elements] = result
+        start[elements] = effect.feel(coefficients, Signal(begin, zeros, begin, zeros))
+    return values
+
+
+def _step_begins(ends: Array) -> Array:
+    """Return the beginnings (L, S) of steps from their ends; memory is shared as in `ends`."""
+    distinct_ends = ends[:1] if ends.strides[0] == 0 else ends
+    start = np.zeros((len(distinct_ends), 1))
+    starts = np.concatenate([start, distinct_ends[:, :-1]], axis=1)
+    return np.broadcast_to(starts, ends.shape)
+
+
+def _find_last_nonzero_step(steps: Array) -> Indices:
+    """Return the number (L, S) of each step, or of the last step before it with nonzero length.
+
+    The input does not change while a batch element waits.
+    """
+    step_numbers = np.arange(steps.shape[1])
+    last_steps = np.where(steps > 0, step_numbers, 0)
+    last: Indices = np.maximum.accumulate(last_steps, axis=1)
+    return last
+
+
+def _average_command(
+    runs: ScenarioGroups,
+    name: str,
+    commands: Commands,
+    starts: Array,
+    ends: Array,
+    has_uniform_steps: bool,
+    is_other_interpolation: bool = False,
+) -> Array:
+    """Return the mean of each batch element's signal over each step.
+
+    Args:
+        runs: Scenarios of the batch elements.
+        name: Name of the input.
+        commands: Inputs of each distinct scenario.
+        starts: (L, S) beginnings of the steps, s.
+        ends: (L, S) ends of the steps, s.
+        has_uniform_steps: Whether batch elements with the same scenario have the same steps, so
+            that only the first of them is evaluated.
+        is_other_interpolation: Whether to interpolate held signals linearly, and to hold linear
+            ones.
+
+    Returns:
+        Means (L, S).
+    """
+    count = len(commands) if has_uniform_steps else len(starts)
+    result = np.empty((count, starts.shape[1]))
+    # Process all batch elements with the same scenario in one call.
+    order = np.argsort(runs.scenario_index, kind="stable")
+    borders = np.flatnonzero(np.diff(runs.scenario_index[order])) + 1
+    for elements in np.split(order, borders):
+        run = runs.scenario_index[elements[0]]
+        scenario = runs.unique_scenarios[run]
+        average_signal = (
+            _average_linear_signal
+            if (name in scenario.linear) != is_other_interpolation
+            else _average_held_signal
+        )
+        target_rows, source_rows = (
+            (slice(run, run + 1), elements[:1]) if has_uniform_steps else (elements, elements)
+        )
+        instants = np.concatenate([get_history_times(scenario, name), get_command_times(scenario)])
+        signal = _get_command_values(scenario, name, commands[run][name])
+        result[target_rows] = average_signal(
+            instants, signal, starts[source_rows], ends[source_rows]
+        )
+    return runs.expand_rows(result) if has_uniform_steps else result
+
+
+def _average_held_signal(times: Array, values: Array, starts: Array, end: Array) -> Array:
+    """Return the means of a held signal over intervals; its value where an interval has no length.
+
+    Args:
+        times: (T,) times from which the values hold, s.
+        values: (T,) values.
+        starts: Beginnings of the intervals, s.
+        end: Ends of the intervals, s.
+    """
+    index = np.searchsorted(times, starts, side="right") - 1
+    index = np.clip(index, 0, times.size - 1)
+    value: Array = values[index]
+    last = np.searchsorted(times, end, side="left") - 1
+    last = np.clip(last, 0, times.size - 1)
+    # Equation (1) only where the command changes within the interval; elsewhere its value is exact.
+    crossing = last > index
+    if crossing.any():
+        areas = values[:-1] * np.diff(times)
+        area = np.concatenate([[0.0], np.cumsum(areas)])
+        a = starts[crossing]
+        b = end[crossing]
+        integral = _compute_held_integral(times, values, area, b) - _compute_held_integral(
+            times, values, area, a
+        )
+        value[crossing] = integral / (b - a)  # (1)
+    return value
+
+
+def _average_linear_signal(times: Array, values: Array, starts: Array, end: Array) -> Array:
+    """Return the means of a linearly interpolated signal over intervals.
+
+    The signal is constant before the first and after the last sample.
+
+    Args:
+        times: (T,) sample times, s.
+        values: (T,) values.
+        starts: Beginnings of the intervals, s.
+        end: Ends of the intervals, s.
+    """
+    halves = 0.5 * (values[:-1] + values[1:]) * np.diff(times)
+    area = np.concatenate([[0.0], np.cumsum(halves)])
+    value = np.interp(0.5 * (starts + end), times, values)
+    # The mean over a part of one linear segment is its middle value; over several segments, (1).
+    first = np.searchsorted(times, starts, side="right")
+    crossing = np.searchsorted(times, end, side="left") > first
+    if crossing.any():
+        a, b = starts[crossing], end[crossing]
+        integral = _compute_linear_integral(times, values, area, b) - _compute_linear_integral(
+            times, values, area, a
+        )
+        value[crossing] = integral / (b - a)  # (1)
+    result: Array = value
+    return result
+
+
+def _compute_linear_integral(times: Array, values: Array, area: Array, t: Array) -> Array:
+    """Return the integral A(t) (1) of a signal that is interpolated linearly between samples.
+
+    The difference of A over a step, divided by its length, is the mean that the engine applies.
+
+    Args:
+        times: (T,) sample times, s.
+        values: (T,) values.
+        area: (T,) integral up to each of `times`.
+        t: Times, s.
+    """
+    index = np.clip(np.searchsorted(times, t, side="right") - 1, 0, times.size - 1)
+    value_at_t = np.interp(t, times, values)
+    result: Array = area[index] + 0.5 * (values[index] + value_at_t) * (t - times[index])
+    return result
+
+
+def _compute_held_integral(times: Array, values: Array, area: Array, t: Array) -> Array:
+    """Return the integral A(t) (1) of a signal that is held between samples.
+
+    The difference of A over a step, divided by its length, is the mean that the engine applies.
+
+    Args:
+        times: (T,) sample times, s.
+        values: (T,) values.
+        area: (T,) integral up to each of `times`.
+        t: Times, s.
+    """
+    index = np.searchsorted(times, t, side="right") - 1
+    index = np.clip(index, 0, times.size - 1)
+    result: Array = area[index] + values[index] * (t - times[index])
+    return result
