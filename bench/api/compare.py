@@ -11,13 +11,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeAlias
 
 from bench.api.comparison_options import ComparisonOptions, StudyOptions
+from bench.benchmark.comparison_tables import build_tables
 from bench.benchmark.figures import comparison_figures, comparison_view
 from bench.benchmark.problem.availability import leave_out_missing_problems
 from bench.benchmark.problem.experiment import Experiment, list_experiment_names, load_experiment
 from bench.benchmark.problem.model_file_simulator import complete_robot_experiment
 from bench.benchmark.problem.robot_experiment import make_robot_experiment
 from bench.benchmark.problem.tuning_problem import TuningProblem
-from bench.benchmark.results_report import build_tables
 from bench.benchmark.runner.plugin_discovery import load_plugins_for_experiment
 from bench.benchmark.runner.resource_checks import check_comparison_size
 from bench.benchmark.storage.csv_reader import CsvTable

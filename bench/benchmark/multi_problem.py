@@ -23,9 +23,9 @@ from bench.benchmark.results_report import REPORT_FILE, REQUIRED_RUN_COLUMNS
 from bench.benchmark.statistics.comparison_statistics import ComparisonStatistics
 from bench.benchmark.statistics.error_curves import RunCurves
 from bench.benchmark.statistics.expected_running_time import build_ert_table
-from bench.benchmark.statistics.paired_tests import (
+from bench.benchmark.statistics.paired_tests import compare_all_pairs
+from bench.benchmark.statistics.problem_ranks import (
     MIN_PROBLEMS_FOR_RANKS,
-    compare_all_pairs,
     compute_nemenyi_p_values,
     compute_problem_ranks,
 )

@@ -21,7 +21,7 @@ from bench.diagnosis_benchmark.case_generation.reference_simulation import (
     SIMULATORS,
     UNMODELLED_CAUSES,
 )
-from bench.diagnosis_benchmark.machine_cases import hidden_causes
+from bench.diagnosis_benchmark.machine_cases import hidden_causes, machine_case_files
 from bench.diagnosis_benchmark.machine_cases import machine_case_sampling as machines
 from sims import effects as library
 from sims.systems.servo import Servo
@@ -118,7 +118,7 @@ def render_recording(item: BenchmarkCase) -> RecordingFiles:
     """
     with tempfile.TemporaryDirectory() as folder:
         if item.system in machines.MACHINE_NAMES:
-            path = machines.write_case(item, Path(folder))
+            path = machine_case_files.write_case(item, Path(folder))
         else:
             path = case_sampling.write_case(item, folder, truth=False)
         description = path.with_suffix(".toml")

@@ -19,7 +19,10 @@ from bench.benchmark.problem.experiment import Experiment
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.benchmark.statistics.bootstrap import compute_bootstrap_interval, compute_resampled_means
 from bench.benchmark.statistics.error_curves import RunRowTable
-from bench.benchmark.statistics.paired_tests import MIN_PROBLEMS_FOR_RANKS, compute_nemenyi_p_values
+from bench.benchmark.statistics.problem_ranks import (
+    MIN_PROBLEMS_FOR_RANKS,
+    compute_nemenyi_p_values,
+)
 from bench.benchmark.statistics.rank_agreement import (
     compute_kendall_tau,
     compute_mean_ranks,

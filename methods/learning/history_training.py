@@ -16,12 +16,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from methods.learning.deterministic_torch import deterministic_training
 from methods.learning.history_transformer import (
     HistoryTransformerDesign,
     get_weight_shapes,
     predict_proposals,
 )
-from methods.learning.pair_network import deterministic_training
 from methods.learning.tuning_histories import HistoryIndices
 from methods.tuner import Array
 

@@ -9,7 +9,7 @@ from contextlib import contextmanager, redirect_stdout
 
 import numpy as np
 
-from methods.learning.pair_network import deterministic_training
+from methods.learning.deterministic_torch import deterministic_training
 
 
 @contextmanager

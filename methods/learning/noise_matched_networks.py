@@ -9,7 +9,7 @@ from typing import Generic, Protocol, TypeVar
 import numpy as np
 
 from methods.learning.input_features import FeatureConfig
-from methods.learning.observation_features import estimate_noise_sigma
+from methods.learning.noise_estimation import estimate_noise_sigma
 from methods.learning.training_data import TrainingData
 from methods.tuner import Array, Task
 

@@ -15,13 +15,13 @@ Eq. 1 of the paper is (3) without the denominator: there the difference's size d
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from methods.learning.deterministic_torch import deterministic_training
 from methods.tuner import Array
 
 if TYPE_CHECKING:
@@ -224,23 +224,6 @@ def train_pair_network(
         for name, weight in weights.items():
             trained[name] = weight.detach().cpu().numpy().astype(np.float64)
         return trained
-
-
-@contextmanager
-def deterministic_training() -> Iterator[None]:
-    """Make torch reproducible: one thread, so that sums have a fixed order.
-
-    Other runs can use the machine's other cores.
-    """
-    import torch
-
-    threads = torch.get_num_threads()
-    # A sum that is distributed over threads depends on their number.
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 def _convert_to_tensors(rows: PairInputs, parameters: Array) -> tuple[Any, Any, Any]:

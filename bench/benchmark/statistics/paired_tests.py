@@ -1,9 +1,8 @@
-"""Paired tests of tuners over targets with effect sizes, and mean ranks over problems.
+"""Paired tests of tuners over targets with effect sizes.
 
 Sources: F. Wilcoxon, Biometrics Bulletin 1(6), 1945 (scipy); S. Holm, Scand. J. Statist. 6, 65,
 1979; D. S. Kerby, Comprehensive Psychology 3, 2014, for the matched-pairs rank-biserial
-correlation; J. Demsar, JMLR 7, 2006, for ranks over problems, Friedman's and Nemenyi's tests
-(scikit-posthocs).
+correlation.
 """
 
 from __future__ import annotations
@@ -34,8 +33,6 @@ MIN_ERROR = 1e-12
 """Errors below this value count as equal, because they consist of rounding."""
 _FAILED_RUN_LOG_ERROR = 1e3
 """Logarithm that represents a failed run: larger than any error, and equal for all failures."""
-MIN_PROBLEMS_FOR_RANKS = 5
-"""Minimum number of problems for mean ranks."""
 
 
 def build_log_error_table(curves: RunCurves, k: int = -1, floor: float = MIN_ERROR) -> pd.DataFrame:
@@ -164,49 +161,3 @@ def compare_pair(a: Array, b: Array) -> PairedTest:
     # The ratio of a failed run and a successful one would overflow.
     ratio = float(np.exp(np.clip(np.median(difference), -700, 700)))
     return PairedTest(len(difference), win_share, effect, ratio, p)
-
-
-def compute_problem_ranks(curves: RunCurves, floor: float = MIN_ERROR) -> pd.DataFrame:
-    """Rank tuners on each problem by their median error over targets.
-
-    A problem is an experiment and a range. The best tuner has rank 1 and failures are last. Tuners
-    that miss a problem are left out.
-
-    Args:
-        curves: error of every run.
-        floor: errors below this value count as equal to it.
-
-    Returns:
-        Ranks with one row per problem and one column per tuner.
-    """
-    rows = {}
-    for (experiment, kind), _ in curves.keys.groupby(["experiment", "range"], sort=False):
-        logs = build_log_error_table(
-            curves.select(experiment=str(experiment), range=str(kind)), floor=floor
-        )
-        rows[f"{experiment} {kind}"] = logs.median(axis=0)
-    medians = pd.DataFrame(rows).T.dropna(axis="columns")
-    # Rounding gives errors that differ by the last bit the same rank.
-    return medians.round(9).rank(axis=1)
-
-
-def compute_nemenyi_p_values(ranked: pd.DataFrame) -> tuple[float, pd.DataFrame]:
-    """Test ranks (problems, tuners) with Friedman's test and Nemenyi's post-hoc test.
-
-    Returns:
-        Friedman's p-value, and Nemenyi's p-value for each pair of tuners.
-
-    Raises:
-        ValueError: there are fewer than `MIN_PROBLEMS_FOR_RANKS` problems or fewer than three
-            tuners.
-    """
-    if len(ranked) < MIN_PROBLEMS_FOR_RANKS or ranked.shape[1] < 3:
-        raise ValueError(
-            f"mean ranks need {MIN_PROBLEMS_FOR_RANKS} problems and 3 tuners, found {ranked.shape}"
-        )
-    from scikit_posthocs import posthoc_nemenyi_friedman
-    from scipy.stats import friedmanchisquare
-
-    table = posthoc_nemenyi_friedman(ranked.to_numpy())
-    table.index = table.columns = ranked.columns
-    return float(friedmanchisquare(*ranked.to_numpy().T).pvalue), table

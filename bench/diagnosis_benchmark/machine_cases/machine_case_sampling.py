@@ -1,4 +1,4 @@
-"""Sampling of cases for servo and arm, and their recordings.
+"""Sampling of cases for servo and arm.
 
 Sizes are computed to first order: the RMS of the change that a cause makes to the noise-free
 motion, after the part is projected out that changes of parameters and initial states can explain.
@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 
@@ -25,7 +24,6 @@ from bench.diagnosis_benchmark.machine_cases.machine_recording_conditions import
     MachineRecordingConditions,
     draw_conditions,
 )
-from bench.diagnosis_benchmark.machine_cases.model_file import MODEL_FILE_NAME, render_arm_mjcf
 from bench.diagnosis_benchmark.machine_cases.reference_motion import (
     MachineRuns,
     read_encoders,
@@ -482,78 +480,3 @@ def record_case(case: BenchmarkCase) -> tuple[MachineRecordingConditions, Array]
     readings = read_encoders(simulate_machine(plant, conditions.runs), plant, conditions.runs.times)
     rng = make_case_rng(case.name, "noise")
     return conditions, np.array([conditions.noise.add_to(run, rng) for run in readings])
-
-
-def build_description(
-    case: BenchmarkCase, conditions: MachineRecordingConditions
-) -> dict[str, object]:
-    """Build the description of the recording, as the document of a TOML file.
-
-    Args:
-        case: the case.
-        conditions: its recording conditions.
-    """
-    robot = case.system == "arm2"
-    plant = MACHINES[case.system]
-    noise_entry = {"noise": conditions.noise_sigmas} if case.stated else {}
-    channels = {name: {"unit": "rad", **noise_entry} for name in plant.channels}
-    inputs = (
-        {f"u.{name}": {"unit": "N*m"} for name in plant.motors}
-        if robot
-        else {"goal": {"unit": "rad"}, "torque_enable": {"unit": "1"}}
-    )
-    first = case.runs - conditions.held_out
-    runs = {str(number): {"held_out": True} for number in range(first, case.runs)}
-    source_entry = {"model": MODEL_FILE_NAME} if robot else {"system": case.system}
-    constants = {} if robot else {"constants": _get_stated_constants(conditions)}
-    return {**source_entry, "channels": channels, "inputs": inputs, **constants, "runs": runs}
-
-
-def _get_stated_constants(conditions: MachineRecordingConditions) -> dict[str, float]:
-    """Return the parameters of a servo that its recording states and that are not fitted."""
-    return {
-        name: v for name, v in conditions.numbers.items() if name not in conditions.free_parameters
-    }
-
-
-def format_table(
-    case: BenchmarkCase, conditions: MachineRecordingConditions, readings: Array
-) -> str:
-    """Format the recording as CSV text.
-
-    Args:
-        case: the case.
-        conditions: its recording conditions.
-        readings: encoder readings, (R, T, N).
-    """
-    plant, robot = MACHINES[case.system], case.system == "arm2"
-    inputs = [f"u.{name}" for name in plant.motors] if robot else ["goal", "torque_enable"]
-    lines = [",".join(["run", "t", *inputs, *plant.channels])]
-    for number, run in enumerate(readings):
-        for k, t in enumerate(conditions.runs.times.tolist()):
-            commands = conditions.runs.commands[number, k].tolist() + ([] if robot else [1.0])
-            cells = [t, *commands, *run[k].tolist()]
-            lines.append(",".join([str(number), *(f"{value:.9g}" for value in cells)]))
-    return "\n".join(lines) + "\n"
-
-
-def write_case(case: BenchmarkCase, folder: Path) -> Path:
-    """Write the recording, its description and, for an arm, its model file.
-
-    Args:
-        case: the case.
-        folder: folder for the files.
-
-    Returns:
-        Path of the CSV file.
-    """
-    import tomli_w
-
-    conditions, readings = record_case(case)
-    if case.system == "arm2":
-        (folder / MODEL_FILE_NAME).write_text(render_arm_mjcf(conditions.numbers), encoding="utf-8")
-    path = folder / "recording.csv"
-    path.write_text(format_table(case, conditions, readings), encoding="utf-8")
-    description = tomli_w.dumps(build_description(case, conditions))
-    path.with_suffix(".toml").write_text(description, encoding="utf-8")
-    return path

@@ -20,10 +20,10 @@ from bench.diagnosis_benchmark.machine_cases.hidden_causes import (
     EFFECTS_BY_MACHINE,
     list_effect_places,
 )
+from bench.diagnosis_benchmark.machine_cases.machine_case_files import write_case
 from bench.diagnosis_benchmark.machine_cases.machine_case_sampling import (
     draw_case,
     restore_conditions,
-    write_case,
 )
 from bench.diagnosis_benchmark.machine_cases.machine_dynamics import (
     MACHINES,

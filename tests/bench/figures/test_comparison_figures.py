@@ -7,6 +7,7 @@ import pandas as pd
 import pytest
 from matplotlib.figure import Figure
 
+from bench.benchmark.comparison_tables import build_tables
 from bench.benchmark.figures import comparison_figures
 from bench.benchmark.figures.comparison_figures import (
     FIGURE_FILES,
@@ -14,7 +15,6 @@ from bench.benchmark.figures.comparison_figures import (
     draw_figure,
     list_figure_names,
 )
-from bench.benchmark.results_report import build_tables
 from bench.benchmark.statistics.error_table import build_error_table
 from sims.core.simulator import InputError
 from tests.bench.figures.sample_comparisons import LABELS, stored

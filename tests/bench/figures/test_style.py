@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 import bench
 from bench.benchmark.figures.comparison_figures import draw_figure, list_figure_names
 from bench.benchmark.figures.rank_figure import draw_critical_difference_figure
-from bench.benchmark.statistics.paired_tests import compute_nemenyi_p_values
+from bench.benchmark.statistics.problem_ranks import compute_nemenyi_p_values
 from bench.diagnosis.report import explanation_figures
 from bench.figures import loss_figure, style
 from bench.figures.figure_files import pdf_figures

@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from bench.benchmark.comparison_tables import build_tables
 from bench.benchmark.figures import comparison_figures
 from bench.benchmark.figures.comparison_view import ComparisonView
 from bench.benchmark.report_page.comparison_conclusion import (
@@ -20,7 +21,6 @@ from bench.benchmark.report_page.comparison_conclusion import (
 )
 from bench.benchmark.report_page.comparison_page import render_page
 from bench.benchmark.report_page.comparison_page_data import ComparisonReportData
-from bench.benchmark.results_report import build_tables
 from bench.benchmark.statistics.training_amortisation import build_time_per_target_table
 from bench.figures.style import render_all_formats
 from bench.pages.text_format import format_number

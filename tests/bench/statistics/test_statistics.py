@@ -14,11 +14,8 @@ from bench.benchmark.statistics.expected_running_time import (
     compute_effort,
     compute_hitting_times,
 )
-from bench.benchmark.statistics.paired_tests import (
-    compare_all_pairs,
-    compute_nemenyi_p_values,
-    compute_problem_ranks,
-)
+from bench.benchmark.statistics.paired_tests import compare_all_pairs
+from bench.benchmark.statistics.problem_ranks import compute_nemenyi_p_values, compute_problem_ranks
 from bench.benchmark.statistics.runtime_distribution import compute_solved_fraction
 from bench.benchmark.statistics.training_amortisation import (
     TuningCost,

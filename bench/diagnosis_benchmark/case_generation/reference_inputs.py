@@ -1,0 +1,170 @@
+"""Input of a run as applied to the plant of the reference simulation, after all input effects."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import copysign, exp, inf
+
+import numpy as np
+
+from bench.diagnosis_benchmark.case_generation.true_system import EffectCoefficients
+from sims.core.simulator import Array, Scenario
+
+SLEW_STEP = 2e-3  # seconds for which an input with limited rate is held constant
+
+
+SUBDIVISIONS = 10  # number of parts of an interval in which a linear command is held constant
+
+
+NONLINEAR_INPUT_EFFECTS = (
+    "input.deadband",
+    "input.saturation",
+    "backlash",
+    "input.rate",
+    "input.power",
+)
+
+
+@dataclass(frozen=True)
+class InputSegment:
+    """Time interval in which the applied input approaches `target` from `start`.
+
+    With `lag` zero, the input jumps to `target` at once.
+    """
+
+    begin: float
+    end: float
+    start: float
+    target: float
+    lag: float
+
+    def evaluate(self, t: float) -> float:
+        """Return the applied input at time t."""
+        return self.target + (
+            (self.start - self.target) * exp((self.begin - t) / self.lag) if self.lag > 0 else 0.0
+        )
+
+    def slice(self, begin: float, end: float) -> InputSegment:
+        """Return the part of this interval from `begin` to `end`."""
+        return InputSegment(begin, end, self.evaluate(begin), self.target, self.lag)
+
+
+def compute_applied_input(
+    scenario: Scenario, effects: EffectCoefficients, end_time: float
+) -> list[InputSegment]:
+    """Compute the first input as applied to the plant, from time 0 to `end_time`.
+
+    A lag must follow the nonlinear input effects.
+
+    Args:
+        scenario: the run.
+        effects: the hidden effects.
+        end_time: end time.
+
+    Raises:
+        NotImplementedError: a nonlinear input effect follows a lag.
+    """
+    if "u" not in scenario.inputs:
+        return [InputSegment(0.0, end_time, 0.0, effects.get("input.bias", [0.0])[0], 0.0)]
+    levels, edges, lag = np.array(scenario.inputs["u"]), scenario.times - scenario.times[0], 0.0
+    if "input.hold" in effects:
+        levels, edges = _interpolate_input(levels, edges, effects["input.hold"][0])
+    for name, c in effects.items():
+        if name in NONLINEAR_INPUT_EFFECTS and lag:
+            raise NotImplementedError(f"{name} behind input.lag")
+        if name == "input.delay":
+            edges = edges + c[0]
+        elif name == "input.lag":
+            lag = c[0]
+        elif name == "input.rate":
+            levels, edges = _limit_input_rate(levels, edges, c[0])
+        elif name in STEPWISE_INPUT_EFFECTS:
+            levels = STEPWISE_INPUT_EFFECTS[name](levels, *c)
+    changes = np.flatnonzero(np.diff(levels)) + 1
+    starts, targets = [0.0, *edges[changes]], [levels[0], *levels[changes]]
+    segments, state = [], levels[0]
+    for start, end, target in zip(starts, [*starts[1:], inf], targets, strict=True):
+        if start < end_time:
+            segments.append(
+                InputSegment(
+                    float(start), float(min(end, end_time)), float(state), float(target), lag
+                )
+            )
+            state = segments[-1].evaluate(segments[-1].end)
+    return segments
+
+
+def _interpolate_input(levels: Array, edges: Array, share: float) -> tuple[Array, Array]:
+    """Divide each interval into parts, to approximate an input between hold and linear.
+
+    Args:
+        levels: input at each sample.
+        edges: time of each sample.
+        share: 0 for a zero-order hold, 1 for linear interpolation.
+
+    Returns:
+        Levels and begins of the parts.
+    """
+    parts = (np.arange(SUBDIVISIONS) + 0.5) / SUBDIVISIONS
+    fine_levels = levels[:-1, None] + share * np.diff(levels)[:, None] * parts
+    starts = edges[:-1, None] + np.diff(edges)[:, None] * np.arange(SUBDIVISIONS) / SUBDIVISIONS
+    return np.append(fine_levels.ravel(), levels[-1]), np.append(starts.ravel(), edges[-1])
+
+
+def _limit_input_rate(levels: Array, edges: Array, max_rate: float) -> tuple[Array, Array]:
+    """Limit the rate of an input to `max_rate` per second, in short parts of constant level.
+
+    Returns:
+        Levels and begins of the parts.
+    """
+    # The last level is held for another second, in which it may still be approached.
+    end_times = [*edges[1:].tolist(), edges[-1] + 1.0]
+    values, starts, state = [], [], float(levels[0])
+    for level, start, end in zip(levels.tolist(), edges.tolist(), end_times, strict=True):
+        while start < end and state != level:
+            last = min(start + SLEW_STEP, end)
+            deviation = level - state
+            ramp_duration = min(abs(deviation) / max_rate, last - start)
+            next_state = (
+                level
+                if ramp_duration >= abs(deviation) / max_rate
+                else state + copysign(max_rate * ramp_duration, deviation)
+            )
+            # mean over the part, in which the rise may end
+            values.append(0.5 * (state + next_state) * ramp_duration / (last - start))
+            values[-1] += next_state * (1 - ramp_duration / (last - start))
+            starts.append(start)
+            state, start = next_state, last
+        if start < end:
+            values.append(level)
+            starts.append(start)
+    return np.array(values), np.array(starts)
+
+
+def _apply_backlash(levels: Array, width: float) -> Array:
+    """Apply backlash to an input: the output follows only when the input leaves the gap around it.
+
+    Args:
+        levels: input at each sample, (T,).
+        width: whole width of the gap, in units of the input.
+
+    Returns:
+        Output at each sample, (T,); it begins at the first level.
+    """
+    result, state = [], levels[0]
+    for level in levels:
+        if abs(level - state) > width / 2:
+            state = level - copysign(width / 2, level - state)
+        result.append(state)
+    return np.array(result)
+
+
+STEPWISE_INPUT_EFFECTS: dict[str, Callable[..., Array]] = {
+    "input.gain": lambda u, c: u * (1 + c),
+    "input.bias": lambda u, c: u + c,
+    "input.deadband": lambda u, c: np.sign(u) * np.maximum(np.abs(u) - c, 0.0),
+    "input.saturation": lambda u, c: np.minimum(np.maximum(u, -c), c),
+    "input.power": lambda u, gain, power: (1 + gain) * np.sign(u) * np.abs(u) ** (1 + power),
+    "backlash": _apply_backlash,
+}
