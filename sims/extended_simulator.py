@@ -46,7 +46,7 @@ MAX_SYSTEM_NAME_LENGTH = 40
 _MIN_HALF_WIDTH = 1e-12
 """Minimum half width of the training range in the number's unit; otherwise it is empty about 0."""
 
-_KEYS = (
+_ALLOWED_KEYS = (
     "format",
     "name",
     "system",
@@ -217,7 +217,7 @@ def read_extended(path: Path) -> ExtendedSimulator:
     if document.get("format") != FORMAT_VERSION:
         expected = f"an extended simulator with format = {FORMAT_VERSION}"
         raise make_error(path, "", expected, document.get("format"))
-    check_known_names(f"key of {path}", document, _KEYS)
+    check_known_names(f"key of {path}", document, _ALLOWED_KEYS)
     name = _name(path, document.get("name"))
     robot = robot_reference.read_robot_reference(path, document) if "model" in document else None
     system, engine = (robot.path.stem, None) if robot else _system(path, document)

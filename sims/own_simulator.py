@@ -183,7 +183,7 @@ class OwnSimulator(SystemSimulator):
             InputError: the name is taken.
         """
         # Otherwise a user's `self.engine = ...` would break the base class far from its cause.
-        if name in _TAKEN and name in self.__dict__:
+        if name in _RESERVED_ATTRIBUTES and name in self.__dict__:
             raise InputError(
                 f"simulator {self.name}: the attribute '{name}' belongs to the base class;"
                 " rename yours"
@@ -267,7 +267,15 @@ class OwnSimulator(SystemSimulator):
         """Release resources of the simulator."""
 
 
-_TAKEN = ("channels", "columns", "constant_values", "effects", "engine", "fixed", "parameters")
+_RESERVED_ATTRIBUTES = (
+    "channels",
+    "columns",
+    "constant_values",
+    "effects",
+    "engine",
+    "fixed",
+    "parameters",
+)
 """Attributes that are set once, by the base classes."""
 
 

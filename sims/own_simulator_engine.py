@@ -75,63 +75,63 @@ class OwnSimulatorEngine:
     def close(self) -> None:
         """Do nothing, because there are no resources."""
 
-    def integrate(self, lanes: IntegrationBatch) -> Trajectories:
+    def integrate(self, batch: IntegrationBatch) -> Trajectories:
         """Return readings (L, R, C) instead of positions.
 
-        There is one row before the first step, and one after every `lanes.every` steps.
+        There is one row before the first step, and one after every `batch.every` steps.
 
         Raises:
             InputError: A method of the simulator raised an exception or returned a wrong value.
         """
-        count = lanes.steps.shape[1] // lanes.steps_per_sample + 1
-        width = len(lanes.system.channels)
-        shape = len(lanes.theta), count, width
+        count = batch.steps.shape[1] // batch.steps_per_sample + 1
+        width = len(batch.system.channels)
+        shape = len(batch.theta), count, width
         result = np.full(shape, np.nan)
-        for lane in range(len(lanes.theta)):
+        for element in range(len(batch.theta)):
             try:
-                rows = self._run(lanes, lane)
+                rows = self._run(batch, element)
             except InputError:
                 raise
             except Exception as error:
-                raise _fault(self.world, error) from error
+                raise _make_simulator_error(self.world, error) from error
             if rows is not None and np.isfinite(rows).all():
-                result[lane] = rows
+                result[element] = rows
         return Trajectories(result, result, result)
 
-    def _run(self, lanes: IntegrationBatch, lane: int) -> Array | None:
+    def _run(self, batch: IntegrationBatch, element: int) -> Array | None:
         """Simulate one batch element, given by its number, with the user's simulator.
 
         Returns:
             (N, C) readings of all channels, at the start and after each `steps_per_sample` steps.
             None if a parameter, constant or initial state is not finite.
         """
-        system = lanes.system
+        system = batch.system
         world = self.world
         names = [p.name for p in system.parameters]
-        theta = dict(zip(names, lanes.theta[lane].tolist(), strict=True))
-        constants = {name: float(value[lane, 0]) for name, value in lanes.constants.items()}
+        theta = dict(zip(names, batch.theta[element].tolist(), strict=True))
+        constants = {name: float(value[element, 0]) for name, value in batch.constants.items()}
         states = (*system.coordinates, *system.rates)
-        start = [*lanes.x[lane].tolist(), *lanes.v[lane].tolist()]
+        start = [*batch.x[element].tolist(), *batch.v[element].tolist()]
         initial = dict(zip(states, start, strict=True))
         # Never pass NaN to a user's model: it may hang or never recover.
         arguments = [*theta.values(), *constants.values(), *initial.values()]
         if not np.isfinite(arguments).all():
             return None
         world.reset(theta, constants, initial)
-        forces = _Forces(lanes, lane, world)
-        rims = _LevelLimits(lanes, lane, world)
+        forces = _Forces(batch, element, world)
+        rims = _LevelLimits(batch, element, world)
         rims.keep()
-        steps = lanes.steps[lane].copy()
+        steps = batch.steps[element].copy()
         # Steps of zero length, in which this batch element waits for others, are skipped.
         moving = steps > 0
-        steps[moving] = equalise_steps(steps[moving], lanes.steps_per_sample)
+        steps[moving] = equalise_steps(steps[moving], batch.steps_per_sample)
         row = self._row(system)
         t = 0.0
         has_moved = False
         rows = [row]
         for i, seconds in enumerate(steps.tolist()):
             if seconds > 0:
-                inputs = {name: float(u[lane, i]) for name, u in lanes.inputs.items()}
+                inputs = {name: float(u[element, i]) for name, u in batch.inputs.items()}
                 if forces.any:
                     world.apply_force(forces.at(t, inputs, seconds))
                 world.step(inputs, seconds)
@@ -139,7 +139,7 @@ class OwnSimulatorEngine:
                 t = t + seconds
                 has_moved = True
             # Without a step, the previous row is still valid.
-            if (i + 1) % lanes.steps_per_sample == 0:
+            if (i + 1) % batch.steps_per_sample == 0:
                 row = self._row(system) if has_moved else row
                 has_moved = False
                 rows.append(row)
@@ -151,7 +151,7 @@ class OwnSimulatorEngine:
         return [observed(self.world, observation, c.name) for c in system.channels]
 
 
-def _fault(world: SteppableSimulator, error: Exception) -> InputError:
+def _make_simulator_error(world: SteppableSimulator, error: Exception) -> InputError:
     """Make the error for an exception in the simulator's code, with its line."""
     frames = traceback.extract_tb(error.__traceback__)
     module = sys.modules.get(type(world).__module__)
@@ -238,17 +238,17 @@ def inertia_of(world: SteppableSimulator) -> float | Array:
 class _LevelLimits:
     """Limits of the levels of one batch element."""
 
-    def __init__(self, lanes: IntegrationBatch, lane: int, world: SteppableSimulator) -> None:
+    def __init__(self, batch: IntegrationBatch, element: int, world: SteppableSimulator) -> None:
         """Select the effects that limit a level of this element, with coefficients (K, 1, 1).
 
         An effect without a place limits the first level of the system.
         """
         self.acting = []
-        for effect, c in lanes.effects:
-            lane_coefficients = c[:, lane : lane + 1]
-            if isinstance(effect, Level) and lane_coefficients.any():
+        for effect, c in batch.effects:
+            element_coefficients = c[:, element : element + 1]
+            if isinstance(effect, Level) and element_coefficients.any():
                 self.acting.append(
-                    (effect, lane_coefficients, effect.place or lanes.system.levels[0])
+                    (effect, element_coefficients, effect.place or batch.system.levels[0])
                 )
         self.world = world
 
@@ -267,23 +267,25 @@ class _LevelLimits:
 class _Forces:
     """Forces of the effects on one batch element."""
 
-    def __init__(self, lanes: IntegrationBatch, lane: int, world: SteppableSimulator) -> None:
+    def __init__(self, batch: IntegrationBatch, element: int, world: SteppableSimulator) -> None:
         """Select the forces and dry frictions of this element, with coefficients (K, 1, 1).
 
         `_last` holds velocity, forces and length of the previous step, from which (1) estimates
         the simulator's own force; None at the first step.
         """
-        lane_effects = [(effect, c[:, lane : lane + 1]) for effect, c in lanes.effects]
-        active_effects = [(effect, c) for effect, c in lane_effects if c.any()]
+        element_effects = [(effect, c[:, element : element + 1]) for effect, c in batch.effects]
+        active_effects = [(effect, c) for effect, c in element_effects if c.any()]
         self.forces = [(effect, c) for effect, c in active_effects if isinstance(effect, Force)]
         self.frictions = [
             (effect, c) for effect, c in active_effects if isinstance(effect, Friction)
         ]
         self.any = bool(self.forces or self.frictions)
         self.world = world
-        self.system = lanes.system
-        self.theta = lanes.theta[lane : lane + 1]
-        self.constants = {name: value[lane : lane + 1] for name, value in lanes.constants.items()}
+        self.system = batch.system
+        self.theta = batch.theta[element : element + 1]
+        self.constants = {
+            name: value[element : element + 1] for name, value in batch.constants.items()
+        }
         self._last: tuple[Array, Array, float] | None = None
 
     def at(self, t: float, inputs: Mapping[str, float], seconds: float) -> Array:

@@ -4,7 +4,7 @@ from bench.cli.key_value_args import build_simulation_spec_args
 from bench.logs import synthetic_recording
 
 
-def Wish(  # noqa: N802 - stands for the class of that name
+def simulation_spec(
     system,
     theta=(),
     effects=(),
@@ -25,9 +25,9 @@ def Wish(  # noqa: N802 - stands for the class of that name
     return synthetic_recording.SimulationSpec(system, **values, observe=observe, **options)
 
 
-def write(wished, out):
+def write(spec, out):
     """Simulate a recording and write it like the command."""
     synthetic_recording.check_output_path(out)
-    made = synthetic_recording.simulate_recording(wished)
+    made = synthetic_recording.simulate_recording(spec)
     made.write(out)
     return made

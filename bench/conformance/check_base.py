@@ -34,17 +34,17 @@ Check = Callable[[Any], NotApplicable | None]
 """Function that raises `CheckError` if its subject does not conform."""
 
 
-def check(condition: bool, expected: str, found: object, look: str) -> None:
+def check(condition: bool, expected: str, found: object, location: str) -> None:
     """Raise `CheckError` unless a condition holds.
 
     Args:
         condition: the condition.
         expected: what was expected.
         found: what was found.
-        look: where the author of the subject should look.
+        location: where the author of the subject should look.
     """
     if not condition:
-        raise CheckError(f"expected {expected}; found {found}; see {look}")
+        raise CheckError(f"expected {expected}; found {found}; see {location}")
 
 
 def is_bitwise_equal(a: Array, b: Array) -> bool:
@@ -53,7 +53,7 @@ def is_bitwise_equal(a: Array, b: Array) -> bool:
 
 
 @contextmanager
-def check_global_random_state(look: str) -> Iterator[None]:
+def check_global_random_state(location: str) -> Iterator[None]:
     """Check that a block does not use the global random generators.
 
     The generators are those of `random`, NumPy and, if it is loaded, torch. Before the block, the
@@ -61,7 +61,7 @@ def check_global_random_state(look: str) -> Iterator[None]:
     they are restored.
 
     Args:
-        look: where the author of the subject should look.
+        location: where the author of the subject should look.
 
     Raises:
         CheckError: the block draws from a global generator or seeds it.
@@ -85,7 +85,7 @@ def check_global_random_state(look: str) -> Iterator[None]:
         not changed_generators,
         "global random state unchanged",
         f"changed: {', '.join(changed_generators)}",
-        look,
+        location,
     )
 
 

@@ -124,7 +124,7 @@ def _bind_check(check: Check, subject: type, failed: set[Check]) -> Callable[[],
         failed: failed checks of this subject; this check is added if it fails.
     """
 
-    def made() -> None:
+    def run_check() -> None:
         """Run the check as a pytest test; skip it if an earlier check that it needs has failed."""
         import pytest
 
@@ -139,4 +139,4 @@ def _bind_check(check: Check, subject: type, failed: set[Check]) -> Callable[[],
         if outcome is not None:
             pytest.skip(f"not applicable: {outcome.reason}")
 
-    return made
+    return run_check

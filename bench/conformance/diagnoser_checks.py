@@ -162,13 +162,13 @@ class _Run(NamedTuple):
         answer: the answer.
         foreign: named effects that the recording could not show.
         changed: whether the recording or its files were changed.
-        touched: description of changes of the global random state; empty for none.
+        random_state_error: description of changes of the global random state; empty for none.
     """
 
     answer: Answer
     foreign: tuple[str, ...]
     changed: bool
-    touched: str
+    random_state_error: str
 
 
 @cache
@@ -251,7 +251,7 @@ def check_leaves_the_recording_alone(kind: type[Diagnoser]) -> None:
 
 def check_leaves_global_chance_alone(kind: type[Diagnoser]) -> None:
     """Check that all random numbers come from case.rng."""
-    if message := _diagnose_cached(kind).touched:
+    if message := _diagnose_cached(kind).random_state_error:
         raise CheckError(message)
 
 

@@ -134,7 +134,7 @@ class DiagnosisCase:
         budget: maximum number of simulations.
         seconds: maximum time.
         learned: trained arrays by name, from the method `train`.
-        begun: start of the diagnosis, on the clock of `time.perf_counter`.
+        start_time: start of the diagnosis, on the clock of `time.perf_counter`.
     """
 
     path: Path
@@ -145,7 +145,7 @@ class DiagnosisCase:
     budget: int
     seconds: float
     learned: Mapping[str, Array] = field(default_factory=dict)
-    begun: float = field(default_factory=perf_counter)
+    start_time: float = field(default_factory=perf_counter)
 
     @property
     def used(self) -> int:
@@ -155,7 +155,7 @@ class DiagnosisCase:
     @property
     def left(self) -> float:
         """Remaining time in seconds."""
-        return self.begun + self.seconds - perf_counter()
+        return self.start_time + self.seconds - perf_counter()
 
     def simulate(
         self,
@@ -236,7 +236,7 @@ class Diagnoser(ABC):
         """
         return ""
 
-    def train(self, lesson: DiagnoserTrainingTask) -> Mapping[str, Array]:  # noqa: ARG002
+    def train(self, task: DiagnoserTrainingTask) -> Mapping[str, Array]:  # noqa: ARG002
         """Train once for a system, before any recording is available.
 
         Returns:

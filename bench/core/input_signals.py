@@ -15,7 +15,7 @@ from sims.core.value_limits import MAX_NUMBER, truncate_text
 _TAU = 2 * np.pi
 """Radians of one period."""
 
-_MOST_CHANGES = 1e8
+_MAX_CHANGES = 1e8
 """Maximum number of periods or levels of a signal; a larger number is a typing error."""
 
 _MULTISINE_COUNT = 6
@@ -171,7 +171,7 @@ def _compute_signal(text: str, times: Array, rng: np.random.Generator) -> Array:
         raise InputError(f"signal '{truncate_text(text)}': expected {expected}")
     span = float(times[-1])
     changes = [span / n if compute_form is _compute_random_steps else span * n for n in numbers[1:]]
-    if max(map(abs, numbers)) > MAX_NUMBER or max([0.0, *changes]) > _MOST_CHANGES:
-        expected = f"numbers within {MAX_NUMBER:g}, and at most {_MOST_CHANGES:g} periods or levels"
+    if max(map(abs, numbers)) > MAX_NUMBER or max([0.0, *changes]) > _MAX_CHANGES:
+        expected = f"numbers within {MAX_NUMBER:g}, and at most {_MAX_CHANGES:g} periods or levels"
         raise InputError(f"signal '{truncate_text(text)}': expected {expected} in its {span:g} s")
     return compute_form(times, rng, *numbers)

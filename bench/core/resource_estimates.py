@@ -54,7 +54,7 @@ class ResourceNeed:
     """Minimum resources that work needs.
 
     Attributes:
-        made: what the work consists of, for example ``2 runs x budget 100``.
+        work: what the work consists of, for example ``2 runs x budget 100``.
         change: what to change to need less.
         memory: memory in bytes.
         disk: disk space in bytes.
@@ -63,7 +63,7 @@ class ResourceNeed:
         seconds: duration in seconds.
     """
 
-    made: str
+    work: str
     change: str
     memory: float = 0.0
     disk: float = 0.0
@@ -110,7 +110,7 @@ def check_feasible(
         InputError: the work needs more than is available.
     """
     if not force and (excess := need.find_excess(machine)):
-        raise InputError(f"{subject}: {need.made} would need {excess}; {need.change}, {FORCE_HINT}")
+        raise InputError(f"{subject}: {need.work} would need {excess}; {need.change}, {FORCE_HINT}")
 
 
 def get_machine_resources(folder: Path | None = None) -> MachineResources:

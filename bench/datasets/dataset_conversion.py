@@ -51,7 +51,7 @@ def free_swing(files: Mapping[str, bytes]) -> dict[str, Content]:
         InputError: the file does not have this form.
     """
     (name,) = [name for name in files if name.endswith(".mat")]
-    swing = _join_pieces(name, files[name])[:, ::_DECIMATION]
+    swing = _join_records(name, files[name])[:, ::_DECIMATION]
     q = np.round(swing[0], _DECIMALS) - np.pi
     qd = np.round(swing[1], _DECIMALS)
     runs = swing.shape[1] // _SAMPLES_PER_RUN
@@ -70,7 +70,7 @@ def free_swing(files: Mapping[str, bytes]) -> dict[str, Content]:
     return {"recording.csv": "\n".join(lines) + "\n", "recording.toml": description}
 
 
-def _join_pieces(name: str, content: bytes) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
+def _join_records(name: str, content: bytes) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
     """Join the angles and rates (2, T) of all pieces of a MATLAB file, in their order.
 
     Args:
@@ -84,8 +84,8 @@ def _join_pieces(name: str, content: bytes) -> np.ndarray[tuple[int, int], np.dt
 
     try:
         arrays = loadmat(io.BytesIO(content))  # type: ignore[arg-type]  # the stubs know no streams
-        pieces = [piece for key in ("Y_id", "Y_vad") for piece in arrays[key].ravel()]
-        joined_samples = np.concatenate([np.asarray(piece, float) for piece in pieces], axis=1)
+        records = [record for key in ("Y_id", "Y_vad") for record in arrays[key].ravel()]
+        joined_samples = np.concatenate([np.asarray(record, float) for record in records], axis=1)
     except Exception as error:  # the reader raises various errors for a damaged file
         reason = f"{type(error).__name__}: {error}"
         expected = "a MATLAB file with cell arrays Y_id and Y_vad of (2, T) numbers"

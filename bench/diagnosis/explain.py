@@ -20,7 +20,7 @@ from bench.diagnosis.evaluation.noise_floor import (
     NoiseFloor,
     compute_noise_floor,
 )
-from bench.diagnosis.evaluation.noise_free_runs import add_least_noise
+from bench.diagnosis.evaluation.noise_free_runs import add_minimal_noise
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.evaluation.search_control import STAGES
@@ -171,7 +171,7 @@ def explain_and_design(
     """
     with _explain_run(recording, options) as run:
         explanation = run.run()
-        run.watch.begin_stage("designing the next recording")
+        run.search_control.begin_stage("designing the next recording")
         return ExplanationAndDesign(explanation, run.design(seconds, longest))
 
 
@@ -227,7 +227,7 @@ class _ExplainRun:
         self.say = say = options.say
         self.force = force = options.force
         self.thorough = options.thorough
-        self.watch = options.make_search_control()
+        self.search_control = options.make_search_control()
         self.worker_pool = worker_pool
         self.recording, kind = load_joined(
             sources,
@@ -259,7 +259,7 @@ class _ExplainRun:
         )
         recorded = self.recording.runs[0].channels
         names = [channel.name for channel in kind.channels if channel.name in recorded]
-        self.recording, quiet = add_least_noise(self.recording, names)
+        self.recording, quiet = add_minimal_noise(self.recording, names)
         said = thinned, settled, note, _format_added_noise(quiet)
         self.notes = tuple(text for text in said if text)
         for note in self.notes:
@@ -282,7 +282,7 @@ class _ExplainRun:
         self.finer: Reusable[StepRefinement] | None = None
         self.file = _RunEvaluators(self.kind, self.fitting, self.validation)
         self.found: tuple[EffectSearch, DiagnosisResult] | None = None
-        self.faults: tuple[RecordingFault, ...] = ()
+        self.unit_errors: tuple[RecordingFault, ...] = ()
         self._check_recording()
 
     def _add_contact_effects(self, kind: type[SystemSimulator]) -> type[SystemSimulator]:
@@ -350,7 +350,7 @@ class _ExplainRun:
         evaluator = RunEvaluator(
             kind, self.recording, runs, self.engine, list_hat_effects(kind), self.free
         )
-        evaluator.search_control = self.watch
+        evaluator.search_control = self.search_control
         evaluator.worker_pool = self.worker_pool
         self.worker_pool.register(evaluator)
         use_bounds(evaluator, {name: bounds for name, (_, bounds) in self.wider.items()})
@@ -403,17 +403,17 @@ class _ExplainRun:
                 base model can simulate the recording.
         """
         self._refuse_broken_conventions()
-        self.watch.begin_stage(STAGES["base_fit"])
+        self.search_control.begin_stage(STAGES["base_fit"])
         base = self._fit_base()
         if not np.isfinite(base.fit.simulated[np.isfinite(self.fitting.observed)]).all():
             raise self._make_simulation_error()
         found = self._search_with_friction_forms(base)
         found = self._search_with_better_step(found.search, found.finding) or found
         base, search, finding, rng = found
-        self.watch.begin_stage("measuring the gain")
+        self.search_control.begin_stage("measuring the gain")
         verdict = self.assessor.build_verdict(search, finding, rng, self.started)
         verdict = replace(
-            verdict, recording_faults=self.faults, recording_notes=self.recording.notes
+            verdict, recording_faults=self.unit_errors, recording_notes=self.recording.notes
         )
         if self.coarse is not None:
             verdict = add_numerics_cause(verdict, self.coarse)
@@ -447,7 +447,7 @@ class _ExplainRun:
             found = _SearchResult(base, search, self._find_causes(search), rng)
             # A search does not select dry friction that is a free number.
             is_free = has_dry_friction(self.fitting, ())
-            done = self.watch.has_abandoned_fits() or bool(self.faults) or not is_free
+            done = self.search_control.has_abandoned_fits() or bool(self.unit_errors) or not is_free
             if done or not is_likelier_soft(
                 search, found.finding.model, INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
             ):
@@ -458,7 +458,7 @@ class _ExplainRun:
             if (
                 not error.is_preliminary
                 or self._is_explained(soft)
-                or self.watch.has_abandoned_fits()
+                or self.search_control.has_abandoned_fits()
             ):
                 return soft
         self.say(STIFF_FRICTION)
@@ -484,7 +484,7 @@ class _ExplainRun:
         from bench.diagnosis.conventions.convention_comparison import ConventionComparison
         from bench.diagnosis.conventions.corrected_description import list_changed_tables
 
-        self.watch.begin_stage("comparing conventions of log and model")
+        self.search_control.begin_stage("comparing conventions of log and model")
         if self._has_contacts and self._is_linear_model_wrong_at_contacts(self._get_filter()):
             return
         differences = ConventionComparison(self._unit_check_subject).differences()
@@ -550,12 +550,12 @@ class _ExplainRun:
         Every cause would only imitate the wrong unit or sign.
         """
         base = search.base_model
-        if not self.faults:
+        if not self.unit_errors:
             finding = self.assessor.restrict_verdict(search, self._search_and_decide(search))
-            self.faults = self._check_units_imitated_by_causes(
+            self.unit_errors = self._check_units_imitated_by_causes(
                 search, finding
             ) or self._check_units_of_unexplained(search, finding)
-            if not self.faults:
+            if not self.unit_errors:
                 return finding
         return DiagnosisResult("unknown", base, base, (), assess_lack_of_fit(search, base))
 
@@ -584,7 +584,7 @@ class _ExplainRun:
         For a robot, units are usually tested only if no effect has explained the gap before.
         """
         explained = finding.verdict in EXPLAINED_VERDICTS
-        if not self._checks_units_late or explained or self.watch.has_abandoned_fits():
+        if not self._checks_units_late or explained or self.search_control.has_abandoned_fits():
             return ()
         left, before = (
             search.compute_excess_residual(model) for model in (finding.model, search.base_model)
@@ -670,10 +670,10 @@ class _ExplainRun:
         base = fit_base_model(self.fitting, self.noise, self._get_given_starts())
         if self._checks_units_late:
             return self._prepare_robot_base(base)
-        if not self.watch.has_abandoned_fits():
+        if not self.search_control.has_abandoned_fits():
             fault = find_wrong_units(self._unit_check_subject, self.fitting, self.noise, base)
-            self.faults = (fault,) if fault is not None else ()
-        if self.faults:
+            self.unit_errors = (fault,) if fault is not None else ()
+        if self.unit_errors:
             return base
         return (
             self._prepare_robot_base(base)
@@ -708,11 +708,13 @@ class _ExplainRun:
         # This import is needed for robots only.
         from bench.diagnosis.kalman.candidate_responses import FollowedRuns
 
-        self.watch.begin_stage("computing prediction errors")
+        self.search_control.begin_stage("computing prediction errors")
         evaluator, *held_out = self._list_run_evaluators()
         followed = self._get_filter()
         # Where the linear model diverges, causes are searched by simulation.
-        if not followed.is_sound or self._is_linear_model_wrong_at_contacts(followed):
+        if not followed.has_expected_innovations or self._is_linear_model_wrong_at_contacts(
+            followed
+        ):
             if self._has_contacts:
                 # This import is needed for robots only.
                 from bench.diagnosis.kalman.contact_proposals import set_first_states_in_contact
@@ -728,7 +730,7 @@ class _ExplainRun:
             # values.
             theta = evaluator.get_nominal_theta()
             found = FollowedRuns.follow(evaluator, theta, self.noise, max_linearisations=1)
-            if found.is_sound:
+            if found.has_expected_innovations:
                 evaluator.follow(found)
 
     def _is_linear_model_wrong_at_contacts(self, followed: FollowedRuns) -> bool:
@@ -794,7 +796,7 @@ class _ExplainRun:
     def _shows_step_errors(self, base: BaseFit) -> bool:
         """Return whether the recording shows the discretisation error of the engine's steps."""
         lost = self.fitting.filtered_runs is None or not np.isfinite(base.fit.cost)
-        if self.watch.has_abandoned_fits() or lost:
+        if self.search_control.has_abandoned_fits() or lost:
             return True
         # These imports are needed for robots only.
         from bench.diagnosis.kalman.candidate_responses import FollowedRuns
@@ -837,7 +839,7 @@ class _ExplainRun:
         A system has few parameters, and would have no result without them; there the verdict
         reports it.
         """
-        if self.watch.has_abandoned_fits() or not np.isfinite(base.fit.cost):
+        if self.search_control.has_abandoned_fits() or not np.isfinite(base.fit.cost):
             return base
         kept = freeze_unidentified_parameters(
             self.fitting, self.noise, base, lambda base: self._create_search(base, self._make_rng())
@@ -913,9 +915,9 @@ class _ExplainRun:
         """
         if (
             self.finer is None
-            or self.faults
+            or self.unit_errors
             or finding.early_stop is not None
-            or self.watch.has_abandoned_fits()
+            or self.search_control.has_abandoned_fits()
         ):
             return None
         if not finding.causes and (self.coarse is not None or finding.verdict == "adequate"):
@@ -1014,9 +1016,9 @@ class _ExplainRun:
 
     def _make_simulation_error(self) -> InputError:
         """Return the error that explains why nothing could be simulated."""
-        if self.faults:
-            return InputError(f"{self.path}: {self.faults[0].says}")
-        if self.watch.has_abandoned_fits():
+        if self.unit_errors:
+            return InputError(f"{self.path}: {self.unit_errors[0].says}")
+        if self.search_control.has_abandoned_fits():
             return InputError(
                 f"{self.path}: the search was stopped before the first fit of the recording was "
                 "finished"

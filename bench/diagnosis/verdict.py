@@ -89,8 +89,8 @@ class Cause:
 class HeldOutResult:
     """Errors on held-out runs, or on runs left out in turn (cross-validation).
 
-    Cross-validation is used for recordings of two or three runs without marked ones. A value is
-    None if the data give no number.
+    Cross-validation is used for recordings of two or three runs without marked ones. A value that
+    the data do not give is None.
 
     Attributes:
         rmse_base: RMSE of the fitted base model, in `unit`.

@@ -38,12 +38,12 @@ class RecordingFiles(NamedTuple):
     Attributes:
         table: CSV text.
         description: TOML text.
-        beside: texts of other files, by file name.
+        extra_files: texts of other files, by file name.
     """
 
     table: str
     description: str
-    beside: Mapping[str, str]
+    extra_files: Mapping[str, str]
 
 
 def draw_case(

@@ -123,7 +123,7 @@ def evaluate_case(
             },
             "table": recording_text.table,
             "description": recording_text.description,
-            "beside": recording_text.beside,
+            "beside": recording_text.extra_files,
             "system": case.system,
             "budget": limits.simulations,
             "seconds": limits.seconds,
@@ -316,13 +316,13 @@ def _load_trained_arrays(path: Path | None) -> dict[str, Array]:
 
 
 def train_isolated(
-    code: TunerSpec, lesson: dict[str, Any], seconds: float, hidden: tuple[str, ...], trusted: bool
+    code: TunerSpec, request: dict[str, Any], seconds: float, hidden: tuple[str, ...], trusted: bool
 ) -> tuple[dict[str, Array], int, float]:
     """Train a diagnoser for a system, in an isolated process unless it is trusted.
 
     Args:
         code: where its code is.
-        lesson: request with ``wanted``, ``system``, ``budget`` and ``seed``.
+        request: request with ``wanted``, ``system``, ``budget`` and ``seed``.
         seconds: maximum time.
         hidden: folders that the diagnoser must not read.
         trusted: whether it runs in this process.
@@ -335,12 +335,12 @@ def train_isolated(
     """
     started_at = perf_counter()
     if trusted:
-        arrays, used_simulations = diagnoser_process.train_diagnoser(lesson)
+        arrays, used_simulations = diagnoser_process.train_diagnoser(request)
         return dict(arrays), used_simulations, perf_counter() - started_at
     child = _start_process(code, 0, hidden)
     try:
         deadline = started_at + seconds
-        child.send(b"F", json.dumps(lesson).encode(), deadline=deadline)
+        child.send(b"F", json.dumps(request).encode(), deadline=deadline)
         message = child.receive(MAX_STATE_BYTES, deadline)
         try:
             if message.kind != b"L":

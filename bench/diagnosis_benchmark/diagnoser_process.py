@@ -47,7 +47,9 @@ _MAX_DOCUMENT_BYTES = 1 << 30
 """Maximum size in bytes of a case document."""
 
 
-def serve_requests(channel: MessageChannel, reach: AccessPolicy, first_document: list[str]) -> None:
+def serve_requests(
+    channel: MessageChannel, policy: AccessPolicy, first_document: list[str]
+) -> None:
     """Answer requests of the harness until the channel is closed.
 
     Requests have a kind of one letter: L brings trained arrays, Q a case, F a training. The answers
@@ -56,7 +58,7 @@ def serve_requests(channel: MessageChannel, reach: AccessPolicy, first_document:
 
     Args:
         channel: message channel to the harness.
-        reach: access policy of this process, with its own writable folder.
+        policy: access policy of this process, with its own writable folder.
         first_document: sent in the first message of this process.
     """
     channel.send_document(b"R", first_document)
@@ -72,7 +74,7 @@ def serve_requests(channel: MessageChannel, reach: AccessPolicy, first_document:
                     case b"Q":
                         question = message.to_document(_MAX_DOCUMENT_BYTES)
                         channel.send_document(
-                            b"A", diagnose_case(question, Path(reach.folder), trained_arrays)
+                            b"A", diagnose_case(question, Path(policy.folder), trained_arrays)
                         )
                     case b"F":
                         arrays, used_simulations = train_diagnoser(
@@ -173,24 +175,24 @@ def diagnose_case(
     }
 
 
-def train_diagnoser(lesson: Mapping[str, Any]) -> tuple[Mapping[str, Array], int]:
+def train_diagnoser(request: Mapping[str, Any]) -> tuple[Mapping[str, Array], int]:
     """Train a diagnoser for a system.
 
     Args:
-        lesson: request with ``wanted``, ``system``, ``budget`` and ``seed``.
+        request: request with ``wanted``, ``system``, ``budget`` and ``seed``.
 
     Returns:
         The trained arrays by name, and the number of simulations used.
     """
-    kind = get_simulator(lesson["system"])
-    SIMULATION_COUNTER.reset(int(lesson["budget"]))
+    kind = get_simulator(request["system"])
+    SIMULATION_COUNTER.reset(int(request["budget"]))
     try:
-        arrays = load_diagnoser(lesson["wanted"]).train(
+        arrays = load_diagnoser(request["wanted"]).train(
             DiagnoserTrainingTask(
                 kind,
                 effects.list_effects_for(kind.system),
-                np.random.default_rng(lesson["seed"]),
-                int(lesson["budget"]),
+                np.random.default_rng(request["seed"]),
+                int(request["budget"]),
             )
         )
         return {name: np.asarray(array) for name, array in arrays.items()}, SIMULATION_COUNTER.used

@@ -32,14 +32,14 @@ class TrainingCost(NamedTuple):
     fault: str = ""
 
 
-def write_training_costs(folder: Path, taught: Iterable[TrainingCost]) -> None:
+def write_training_costs(folder: Path, costs: Iterable[TrainingCost]) -> None:
     """Write training.csv; write no file if no diagnoser was trained.
 
     Args:
         folder: result folder.
-        taught: training costs, one per diagnoser and system.
+        costs: training costs, one per diagnoser and system.
     """
-    rows = [cost._asdict() for cost in taught]
+    rows = [cost._asdict() for cost in costs]
     if not rows:
         return
     text = io.StringIO()

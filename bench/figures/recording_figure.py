@@ -26,11 +26,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
-_MOST_RUNS = 40
+_MAX_DRAWN_RUNS = 40
 """Maximum number of runs that are drawn; of more, evenly spaced ones are drawn."""
-_MOST_POINTS = 4000
+_MAX_POINTS_PER_RUN = 4000
 """Maximum number of points per run; of a longer run the extremes of each part are drawn."""
-_FEW_SAMPLES = 60
+_MAX_SAMPLES_WITH_MARKERS = 60
 """Maximum number of samples of a run for which each sample has a marker."""
 _RUN_GAP_SHARE = 0.015
 """Gap between runs on the time axis, times the root of their number, over their total length."""
@@ -101,8 +101,8 @@ def draw_recording_figure(recording: Recording, kind: type[Simulator]) -> Figure
 
 def _place_runs(runs: Sequence[Run]) -> list[_PlacedRun]:
     """Place runs end to end with small gaps; of too many runs, use evenly spaced ones."""
-    if len(runs) > _MOST_RUNS:
-        chosen_indices = np.linspace(0, len(runs) - 1, _MOST_RUNS).round().astype(int)
+    if len(runs) > _MAX_DRAWN_RUNS:
+        chosen_indices = np.linspace(0, len(runs) - 1, _MAX_DRAWN_RUNS).round().astype(int)
         runs = [runs[i] for i in chosen_indices]
     # The more runs, the smaller the gaps between them.
     lengths = [float(run.times[-1] - run.times[0]) for run in runs]
@@ -122,7 +122,7 @@ def _draw_signal(axis: Axes, part: _PlacedRun, values: Array) -> None:
     missing = np.isnan(values)
     t, y = _reduce_points(times, values)
     # A sample between two missing ones forms no line and needs a marker to be visible.
-    marked = values.size <= _FEW_SAMPLES or missing.mean() > 0.2
+    marked = values.size <= _MAX_SAMPLES_WITH_MARKERS or missing.mean() > 0.2
     colour = _HELD_OUT if part.run.held_out else _FITTING
     marker = "." if marked else ""
     axis.plot(t, y, color=colour, linewidth=0.9, marker=marker, markersize=3, linestyle="-")
@@ -133,13 +133,13 @@ def _draw_signal(axis: Axes, part: _PlacedRun, values: Array) -> None:
 
 
 def _reduce_points(times: Array, values: Array) -> tuple[Array, Array]:
-    """Reduce a signal (T,) to about `_MOST_POINTS` points: minimum and maximum of each part.
+    """Reduce a signal (T,) to about `_MAX_POINTS_PER_RUN` points: minimum and maximum of each part.
 
     The curve then looks the same, and the file stays small.
     """
-    if values.size <= _MOST_POINTS:
+    if values.size <= _MAX_POINTS_PER_RUN:
         return times, values
-    size = -(-values.size // (_MOST_POINTS // 2))
+    size = -(-values.size // (_MAX_POINTS_PER_RUN // 2))
     kept_indices = set()
     for start in range(0, values.size, size):
         stretch = values[start : start + size]

@@ -38,7 +38,7 @@ MAX_NAMED_JOINTS = 12
 """Maximum number of joints that are all named; with more, only marked joints are named."""
 MAX_LABEL_LINE_LENGTH = 34
 """Maximum length of a line of a label, in characters."""
-MOST_LETTERS = 120
+MAX_LABEL_LENGTH = 120
 """Maximum length of a text in a label, which may have several lines, in characters."""
 _LINE_SPACING = 0.155
 """Distance between lines of a label, in inches."""
@@ -207,7 +207,7 @@ def _make_labels(
             continue
         # A name without a kind is a joint's.
         title = name if kind == "joint" else f"{kind} {name}"
-        texts = [line[:MOST_LETTERS] for line in (title, *lines)]
+        texts = [line[:MAX_LABEL_LENGTH] for line in (title, *lines)]
         lines = [
             line for text in texts for line in break_name(text, MAX_LABEL_LINE_LENGTH).split("\n")
         ]
@@ -360,7 +360,7 @@ def _draw_scale_bar(axis: Axes, projection: Projection, scale: float, tall: floa
     )
 
 
-def round_down_length(most: float) -> float:
-    """Return the largest of 1, 2, 5 times a power of ten that is at most `most`, in metres."""
-    power = 10.0 ** np.floor(np.log10(most))
-    return float(max(step * power for step in (1.0, 2.0, 5.0) if step * power <= most))
+def round_down_length(length: float) -> float:
+    """Return the largest of 1, 2, 5 times a power of ten that is at most `length`, in metres."""
+    power = 10.0 ** np.floor(np.log10(length))
+    return float(max(step * power for step in (1.0, 2.0, 5.0) if step * power <= length))

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bench.figures.robot_view import Projection
-from bench.figures.style import CAPTION_GREY, CHANCE_LEVEL_GREY, NEUTRAL_MARK
+from bench.figures.style import CAPTION_GREY, NEUTRAL_MARK, NULL_LEVEL_GREY
 from sims.core.simulator import Array
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ def draw_skeleton(axis: Axes, robot: RobotModel, data: Any, view: Projection) ->
         line = view.project(np.stack([start, end]))
         axis.plot(
             *line.T,
-            color=CHANCE_LEVEL_GREY,
+            color=NULL_LEVEL_GREY,
             linewidth=5,
             solid_capstyle="round",
             zorder=1,

@@ -35,17 +35,19 @@ def break_name(name: str, longest: int) -> str:
     )
 
 
-def shorten_name(name: str, most: int) -> str:
+def shorten_name(name: str, max_length: int) -> str:
     """Shorten a long name of a joint's quantity to the quantity.
 
-    Names with more than `most` characters are shortened, such as ``velocity of elbow`` to
+    Names with more than `max_length` characters are shortened, such as ``velocity of elbow`` to
     ``velocity`` and ``u.elbow`` to ``u``.
 
     Args:
         name: Name to shorten.
-        most: Maximum length.
+        max_length: Maximum length.
     """
-    return name if len(name) <= most else re.split(r" of |\.", name, maxsplit=1)[0][:most]
+    return (
+        name if len(name) <= max_length else re.split(r" of |\.", name, maxsplit=1)[0][:max_length]
+    )
 
 
 def measure_text_width(texts: Sequence[str], size: float, weight: str = "normal") -> float:

@@ -119,7 +119,7 @@ def track_film(
         if content is not None
     }
     recording = _build_recording(track, heights, noise, part, video)
-    write_recording(out, recording, BallSystem, digits=_TABLE_DIGITS, beside=figure_contents)
+    write_recording(out, recording, BallSystem, digits=_TABLE_DIGITS, extra_files=figure_contents)
 
     count, frames = int(np.isfinite(heights.z[part]).sum()), part.stop - part.start
     lines = (

@@ -18,9 +18,9 @@ from sims.recording.recording import (
     Run,
 )
 
-_MOST_RUNS = 40
+_MAX_LISTED_RUNS = 40
 """Maximum number of runs that are listed."""
-_MOST_NAMES = 12
+_MAX_LISTED_NAMES = 12
 """Maximum number of runs that are named in one line."""
 _CAVEAT = (
     "estimated: from second and third differences, white noise assumed; it is too small "
@@ -66,9 +66,9 @@ def format_summary(recording: Recording, kind: type[Simulator]) -> Iterator[str]
     yield f"{recording.path}: system {recording.system}, {size}"
     yield from recording.notes
     yield ""
-    yield from _align_columns([_RUN_HEAD, *map(_run_row, runs[:_MOST_RUNS])], left_columns=2)
-    if len(runs) > _MOST_RUNS:
-        yield f"... and {len(runs) - _MOST_RUNS} more runs"
+    yield from _align_columns([_RUN_HEAD, *map(_run_row, runs[:_MAX_LISTED_RUNS])], left_columns=2)
+    if len(runs) > _MAX_LISTED_RUNS:
+        yield f"... and {len(runs) - _MAX_LISTED_RUNS} more runs"
     yield ""
     yield from _align_columns(
         [_SIGNAL_HEAD, *_iterate_signal_rows(recording, kind)], left_columns=3
@@ -131,7 +131,7 @@ def _format_constants(recording: Recording, kind: type[Simulator]) -> Iterator[s
             states = ", ".join(f"{name} = {value:g}" for name, value in run.initial.items())
             run_texts.append(f"{run.name} ({states})")
     if run_texts:
-        yield f"initial states stated: {', '.join(run_texts[:_MOST_RUNS])}"
+        yield f"initial states stated: {', '.join(run_texts[:_MAX_LISTED_RUNS])}"
 
 
 def _format_constant(recording: Recording, name: str, default: float, unit: str) -> str:
@@ -153,8 +153,8 @@ def _format_constant(recording: Recording, name: str, default: float, unit: str)
 
 
 def _format_run_names(names: Sequence[str]) -> str:
-    runs = f"run{'s' if len(names) > 1 else ''} {', '.join(names[:_MOST_NAMES])}"
-    unnamed_count = len(names) - _MOST_NAMES
+    runs = f"run{'s' if len(names) > 1 else ''} {', '.join(names[:_MAX_LISTED_NAMES])}"
+    unnamed_count = len(names) - _MAX_LISTED_NAMES
     return f"{runs} and {unnamed_count} more" if unnamed_count > 0 else runs
 
 

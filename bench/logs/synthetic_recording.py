@@ -39,7 +39,7 @@ from sims.system_simulator import SystemSimulator
 
 _TABLE_DIGITS = 9
 """Number of significant digits in the table: finer than any sensor, but files stay small."""
-_MOST_SAMPLES = 1e8
+_MAX_SAMPLES = 1e8
 """Number of samples per run above which a length or rate is considered a typing error."""
 ALL_CHANNELS = "*"
 """Name that stands for every channel that is not named."""
@@ -148,7 +148,7 @@ class SimulatedRecording:
             self.recording,
             type(self.simulator),
             digits=_TABLE_DIGITS,
-            beside=truth_file,
+            extra_files=truth_file,
         )
         return [table_path, table_path.with_suffix(".toml"), truth]
 
@@ -188,7 +188,7 @@ class _RecordingSimulation:
         """Check the specification, and build the simulator with the true effects and constants.
 
         What the specification leaves open is taken from the default recording of the system
-        (`usual`). `theta` has the true parameters by name, `effects` the true coefficients by
+        (`defaults`). `theta` has the true parameters by name, `effects` the true coefficients by
         effect, and `ranges` the interval from which each initial state is drawn.
 
         Raises:
@@ -197,7 +197,7 @@ class _RecordingSimulation:
         self.options = options
         self.kind = kind = _get_simulator_class(options)
         self.name = options.system or kind.name
-        self.usual = _get_default_recording(kind)
+        self.defaults = _get_default_recording(kind)
         self.held_out = _count_held_out_runs(options)
         self.theta = _make_parameters(
             {} if options.parameters is None else options.parameters, kind
@@ -213,9 +213,9 @@ class _RecordingSimulation:
         initial, inputs = options.initial or {}, options.inputs or {}
         check_known_names("initial state", initial, list(kind.states))
         stated_ranges = {name: _check_interval(name, value) for name, value in initial.items()}
-        self.ranges = {**self.usual.initial, **stated_ranges}
+        self.ranges = {**self.defaults.initial, **stated_ranges}
         check_known_names("input", inputs, [c.name for c in kind.inputs])
-        inputs = {**self.usual.inputs, **inputs}
+        inputs = {**self.defaults.inputs, **inputs}
         self.inputs = {name: _format_signal(name, value) for name, value in inputs.items()}
         samples = _count_samples(options)
         check_simulation_size(options.runs, samples, options.seconds, self.simulator, options.force)
@@ -263,7 +263,7 @@ class _RecordingSimulation:
         constants = self.options.constants or {}
         check_known_names("constant", constants, [c.name for c in self.kind.constants])
         values = {n: _check_number("constant", n, value) for n, value in constants.items()}
-        observe = list(self.options.observe) or list(self.usual.observe) or None
+        observe = list(self.options.observe) or list(self.defaults.observe) or None
         if issubclass(self.kind, SystemSimulator):
             return self.kind(values, observe, engine=self.engine, fixed=self.effects)
         if self.effects or self.engine:
@@ -368,11 +368,11 @@ def _count_samples(options: SimulationSpec) -> int:
         InputError: The number is below 2 or too large, the run too short, or the rate too high.
     """
     product = options.seconds * options.rate
-    samples = round(product) if 0 < product < _MOST_SAMPLES else 0
+    samples = round(product) if 0 < product < _MAX_SAMPLES else 0
     if samples < 2 or options.seconds < MIN_RUN_SECONDS or options.rate > MAX_SAMPLING_RATE_HZ:
         raise InputError(
             f"seconds = {options.seconds:g}, rate = {options.rate:g}: expected at least 2 samples "
-            f"and below {_MOST_SAMPLES:g}"
+            f"and below {_MAX_SAMPLES:g}"
         )
     return samples
 

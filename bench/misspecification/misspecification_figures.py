@@ -79,7 +79,7 @@ def draw_bias_figure(studies: Sequence[StudyResult], table: pd.DataFrame) -> Fig
         bias_rows = table[
             (table["experiment"] == study.experiment.name) & (table["metric"] == "bias")
         ]
-        parameter = _find_most_biased_parameter(bias_rows)
+        parameter = _find_largest_bias(bias_rows)
         _draw_means(panel, study, bias_rows[bias_rows["parameter"] == parameter])
         panel.axvline(0.0, color=ZERO_LINE_GREY, linewidth=0.8)
         panel.set_title(f"{study.name}: {parameter}\n{_format_missing_effects(study)}", fontsize=9)
@@ -204,7 +204,7 @@ def _draw_means(panel: Axes, study: StudyResult, lines: pd.DataFrame) -> None:
     panel.invert_yaxis()
 
 
-def _find_most_biased_parameter(lines: pd.DataFrame) -> str:
+def _find_largest_bias(lines: pd.DataFrame) -> str:
     """Return the parameter with the largest bias in the simulator as it is.
 
     The bias is that of the reference tuner, least squares, or of all tuners if it did not take

@@ -10,7 +10,7 @@ from pathlib import Path
 from sims.core.simulator import InputError
 from sims.core.value_limits import truncate_text
 
-_MOST_LISTED = 10_000
+_MAX_SEARCHED_ENTRIES = 10_000
 """Maximum number of a folder's entries among which similar names are searched."""
 
 
@@ -50,7 +50,7 @@ def _format_similar_names(path: Path) -> str:
     from difflib import get_close_matches
 
     try:
-        entries = list(islice(path.parent.iterdir(), _MOST_LISTED))
+        entries = list(islice(path.parent.iterdir(), _MAX_SEARCHED_ENTRIES))
     except OSError:
         return "" if path.parent.is_dir() else f"; there is no folder '{path.parent}'"
     stems = {entry.stem: entry.name for entry in entries if entry.suffix == path.suffix}

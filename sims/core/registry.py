@@ -65,7 +65,7 @@ class Registry(Generic[T]):
         """Start without parts; installed parts are imported on first request."""
         self.kind, self.group, self.base = kind, group, base
         self._added: dict[str, AddedPart[T]] = {}
-        self._announced: dict[str, AddedPart[T]] = {}
+        self._stubs: dict[str, AddedPart[T]] = {}
         self._imported: dict[str, Any] = {}
 
     @cached_property
@@ -74,7 +74,7 @@ class Registry(Generic[T]):
 
     def names(self) -> list[str]:
         """Return all registered names, sorted."""
-        return sorted({*self._entry_points, *self._announced, *self._added})
+        return sorted({*self._entry_points, *self._stubs, *self._added})
 
     def get(self, name: str) -> type[T]:
         """Return the class registered as `name`.
@@ -87,8 +87,8 @@ class Registry(Generic[T]):
         """
         if name in self._added:
             part: Any = self._added[name].part
-        elif name in self._announced:
-            part = self._announced[name].part
+        elif name in self._stubs:
+            part = self._stubs[name].part
         elif name in self._entry_points:
             part = self._load_entry_point(name)
         else:
@@ -155,8 +155,8 @@ class Registry(Generic[T]):
         if self._is_registered(name, part):
             return part
         # The loaded class replaces the stub of the same file.
-        if name in self._announced and self._announced[name].path == path:
-            del self._announced[name]
+        if name in self._stubs and self._stubs[name].path == path:
+            del self._stubs[name]
         if name in self.names() and not self._may_replace(name, part, path):
             raise InputError(f"{source}{self.kind} '{name}' exists already; give it another name")
         self._added[name] = AddedPart(part, path)
@@ -175,11 +175,11 @@ class Registry(Generic[T]):
         """
         source = f"plugin {path}: " if path else ""
         name = _name_of(part, source)
-        existing = self._announced.get(name) or self._added.get(name)
+        existing = self._stubs.get(name) or self._added.get(name)
         is_taken = existing is not None and existing.path != path
         if is_taken or (path is not None and name in self._entry_points):
             raise InputError(f"{source}{self.kind} '{name}' exists already; give it another name")
-        self._announced[name] = AddedPart(part, path)
+        self._stubs[name] = AddedPart(part, path)
 
     def entry(self, name: str) -> str | None:
         """Return the ``module:class`` of an installed part; None if no package has this name."""
@@ -187,7 +187,7 @@ class Registry(Generic[T]):
 
     def place(self, name: str) -> Path | None:
         """Return the plugin file of a loaded part or stub; None if it is not from a file."""
-        registered = self._added.get(name) or self._announced.get(name)
+        registered = self._added.get(name) or self._stubs.get(name)
         return registered.path if registered else None
 
     def _is_registered(self, name: str, part: type[T]) -> bool:
@@ -223,7 +223,7 @@ class Registry(Generic[T]):
     def restore(self, snapshot: Mapping[str, AddedPart[T]]) -> None:
         """Restore the added parts of a snapshot, and remove later parts and all stubs."""
         self._added = dict(snapshot)
-        self._announced = {}
+        self._stubs = {}
 
 
 def _get_qualified_name(part: type) -> tuple[str, str]:

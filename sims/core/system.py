@@ -195,14 +195,14 @@ class RenderedModelFile:
         joint: Name of the joint.
         actuator: Name of the actuator that drives the joint.
         signals: Channels and inputs of the robot, by those of the system.
-        said: Properties that the file cannot express, one clause each.
+        notes: Properties that the file cannot express, one clause each.
     """
 
     text: str
     joint: str
     actuator: str
     signals: Mapping[str, str]
-    said: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
 
 
 class System(ABC):
@@ -224,8 +224,8 @@ class System(ABC):
             part of a run.
         sensed: Channels on which sensor effects may act, in order of preference.
         primary: Index of the coordinate on which biases and springs act.
-        servo: Input that is the set point of the servo of the primary coordinate; empty if there is
-            none.
+        servo: Input that is the set point of the servo of the primary coordinate; empty without a
+            servo.
         uniform: Whether its own force is constant in space and time, so that it moves on parabolas.
         bends: Whether its own force may change sharply, so that steps must be shortened there.
         fastest: Maximum angular frequency in rad/s of oscillations that are not visible in its

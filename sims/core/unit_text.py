@@ -6,12 +6,12 @@ import re
 
 SUPERSCRIPT_DIGITS = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 """Translation of digits and minus sign to superscripts."""
-_POWER = re.compile(r"(?:\^|\*\*)(-?\d+)")
+_POWER_PATTERN = re.compile(r"(?:\^|\*\*)(-?\d+)")
 
 
 def format_unit(unit: str) -> str:
     """Format a unit for print, such as ``kg·m²`` for ``kg*m^2``; empty for a pure number."""
-    raised = _POWER.sub(lambda match: match[1].translate(SUPERSCRIPT_DIGITS), unit)
+    raised = _POWER_PATTERN.sub(lambda match: match[1].translate(SUPERSCRIPT_DIGITS), unit)
     return "" if raised == "1" else raised.replace("*", "·")
 
 

@@ -23,10 +23,10 @@ from sims.core.simulator import Array
 
 _MIN_IMPACT_SPEED = 1e-9
 """Minimum impact speed in m/s for the power law, so that a negative power is finite."""
-_POWER = ((-0.4, 0.2), (-0.4, 0.2), (0, 0))
+_POWER_RANGES = ((-0.4, 0.2), (-0.4, 0.2), (0, 0))
 """Plausible powers of the impact speed: yielding bodies have about -1/4, viscoelastic ones less."""
-_NUMBERS = ("1", "1", "1")
-_FACTORS = ((-0.8, 4.0), (-0.8, 4.0), (-0.8, 4.0))
+_DIMENSIONLESS = ("1", "1", "1")
+_RELATIVE_ERROR_RANGES = ((-0.8, 4.0), (-0.8, 4.0), (-0.8, 4.0))
 """Plausible relative errors of the solver parameters of a contact."""
 
 
@@ -38,7 +38,7 @@ class SpeedDependentRestitution(Contact):
     says = "the restitution depends on the speed of the impact"
     source = "K. L. Johnson, Contact Mechanics (1985), chapter 11, doi:10.1017/CBO9781139171731"
     needs = "ground"
-    coefficients = (Coefficient("coefficient", ("1", "1", None), _POWER),)
+    coefficients = (Coefficient("coefficient", ("1", "1", None), _POWER_RANGES),)
 
     def restitution(self, c: Array, restitution: Array, speed: Array) -> Array:
         """Return the restitution (L, 1): its value at 1 m/s, times a power of the speed.
@@ -83,7 +83,9 @@ class ContactSoftness(ModelValueEffect):
     says = "the contact yields or bounces in another way than the model file states"
     source = "MuJoCo documentation, Modeling, solver parameters"
     at = "contact"
-    coefficients = (Coefficient("coefficient", _NUMBERS, _FACTORS, least=-0.99),)
+    coefficients = (
+        Coefficient("coefficient", _DIMENSIONLESS, _RELATIVE_ERROR_RANGES, least=-0.99),
+    )
 
 
 class ContactDamping(ContactSoftness):

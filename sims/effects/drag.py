@@ -19,8 +19,10 @@ from sims.core.effect import Coefficient, Force
 from sims.core.simulator import Array
 from sims.core.system import StateSnapshot
 
-_FLUIDS = "G. K. Batchelor, An Introduction to Fluid Dynamics (1967), doi:10.1017/CBO9780511800955"
-_FLUID = ("1/m", "N*s^2/m^2", "N*m*s^2/rad^2")
+_BATCHELOR_1967 = (
+    "G. K. Batchelor, An Introduction to Fluid Dynamics (1967), doi:10.1017/CBO9780511800955"
+)
+_QUADRATIC_DRAG_UNITS = ("1/m", "N*s^2/m^2", "N*m*s^2/rad^2")
 """Units of the coefficient of drag that is quadratic in speed."""
 
 
@@ -52,7 +54,9 @@ class QuadraticDrag(Force):
     noun = "quadratic drag"
     says = "motion is resisted in proportion to the square of speed"
     source = "J. R. Taylor, Classical Mechanics (2005), section 2.4"
-    coefficients = (Coefficient("coefficient", _FLUID, ((0, 0.3), (0, 5), (0, 0.02))),)
+    coefficients = (
+        Coefficient("coefficient", _QUADRATIC_DRAG_UNITS, ((0, 0.3), (0, 5), (0, 0.02))),
+    )
 
     def force(self, c: Array, moment: StateSnapshot) -> Array:
         """Return the force (L, D), opposite to the velocity.
@@ -70,7 +74,7 @@ class Wind(Force):
     name = "wind"
     noun = "wind"
     says = "moving air exerts drag on the body"
-    needs, contains, source = "push", ("drag.quadratic",), _FLUIDS
+    needs, contains, source = "push", ("drag.quadratic",), _BATCHELOR_1967
     coefficients = (
         Coefficient("drag", ("1/m", "N*s^2/m^2", None), ((0, 0.3), (0, 5), (0, 0))),
         Coefficient("x", ("m/s", "m/s", None), ((-10, 10), (-10, 10), (0, 0))),

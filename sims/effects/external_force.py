@@ -22,14 +22,14 @@ from sims.core.system import StateSnapshot
 
 _MIN_PERIOD = 1e-9
 """Smallest period in m or rad, which replaces zero to avoid division by zero."""
-_USUAL = ("m/s^2", "N", "N*m")
+_FORCE_UNITS = ("m/s^2", "N", "N*m")
 """Units of a force on the three kinds of system."""
 _COGGING = (
     "T. M. Jahns, W. L. Soong, IEEE Trans. Ind. Electron. 43(2), 321 (1996), doi:10.1109/41.491356"
 )
-_RIPPLE = ((-2, 2), (-2, 2), (-0.2, 0.2))
+_RIPPLE_RANGES = ((-2, 2), (-2, 2), (-0.2, 0.2))
 """Plausible amplitudes of ripple, in the units of a force."""
-_PERIOD = ((0.01, 1), (0.01, 1), (0.05, 3.1416))
+_PERIOD_RANGES = ((0.01, 1), (0.01, 1), (0.05, 3.1416))
 """Plausible periods in m or rad.
 
 The longest is half a turn, because a force with the period of one turn is equivalent to gravity.
@@ -43,7 +43,7 @@ class ForceBias(Force):
     noun = "a constant force"
     says = "a constant force acts in one direction"
     source = "J. R. Taylor, Classical Mechanics (2005), section 1.4"
-    coefficients = (Coefficient("coefficient", _USUAL, ((-2, 2), (-5, 5), (-0.5, 0.5))),)
+    coefficients = (Coefficient("coefficient", _FORCE_UNITS, ((-2, 2), (-5, 5), (-0.5, 0.5))),)
 
     def force(self, c: Array, moment: StateSnapshot) -> Array:
         """Return the force (L, D), equal to the coefficient along the primary coordinate.
@@ -63,9 +63,9 @@ class ForceRipple(Force):
     says = "a force varies periodically with position, such as motor cogging"
     needs, source = "guide", _COGGING
     coefficients = (
-        Coefficient("sine", _USUAL, _RIPPLE),
-        Coefficient("cosine", _USUAL, _RIPPLE),
-        Coefficient("period", ("m", "m", "rad"), _PERIOD),
+        Coefficient("sine", _FORCE_UNITS, _RIPPLE_RANGES),
+        Coefficient("cosine", _FORCE_UNITS, _RIPPLE_RANGES),
+        Coefficient("period", ("m", "m", "rad"), _PERIOD_RANGES),
     )
 
     def force(self, c: Array, moment: StateSnapshot) -> Array:
@@ -88,8 +88,8 @@ class PeriodicForce(Force):
     says = "a force varies periodically with time, such as from a vibration"
     source = "L. D. Landau, E. M. Lifshitz, Mechanics (1976), section 22"
     coefficients = (
-        Coefficient("sine", _USUAL, ((-2, 2), (-5, 5), (-0.5, 0.5))),
-        Coefficient("cosine", _USUAL, ((-2, 2), (-5, 5), (-0.5, 0.5))),
+        Coefficient("sine", _FORCE_UNITS, ((-2, 2), (-5, 5), (-0.5, 0.5))),
+        Coefficient("cosine", _FORCE_UNITS, ((-2, 2), (-5, 5), (-0.5, 0.5))),
         Coefficient("frequency", ("Hz", "Hz", "Hz"), ((0.1, 10), (0.1, 10), (0.1, 10))),
     )
 

@@ -45,31 +45,31 @@ _PLACE = (
 )
 _MIN_DIVISOR = 1e-9
 """Smallest speed, period or time, which replaces zero to avoid 0 / 0."""
-_USUAL = ("m/s^2", "N", "N*m")
+_FORCE_UNITS = ("m/s^2", "N", "N*m")
 """Units of a force on the three kinds of system."""
-_VISCOUS = (None, "N*s/m", "N*m*s/rad")
+_VISCOUS_UNITS = (None, "N*s/m", "N*m*s/rad")
 """Units of viscous friction on the kinds of system that can move in two directions."""
-_DAMPED = ((0, 0), (0, 5), (0, 0.05))
-"""Plausible viscous friction, in the units of `_VISCOUS`."""
-_LOAD = Coefficient("coefficient", (None, "1", "1"), ((0, 0), (0, 0.5), (0, 0.5)))
+_VISCOUS_RANGES = ((0, 0), (0, 5), (0, 0.05))
+"""Plausible viscous friction, in the units of `_VISCOUS_UNITS`."""
+_LOAD_COEFFICIENT = Coefficient("coefficient", (None, "1", "1"), ((0, 0), (0, 0.5), (0, 0.5)))
 """Coefficient of load-dependent friction, as a fraction of the load."""
-_DRY = ((0, 5), (0, 5), (0, 0.5))
+_DRY_RANGES = ((0, 5), (0, 5), (0, 0.5))
 """Plausible friction limits, in the units of a force."""
-_WAVE = ((-5, 5), (-5, 5), (-0.5, 0.5))
+_WAVE_RANGES = ((-5, 5), (-5, 5), (-0.5, 0.5))
 """Plausible amplitudes of friction that varies with position, in the units of a force."""
-_PERIOD = ((0.2, 5), (0.2, 5), (0.5, 6.2832))
+_PERIOD_RANGES = ((0.2, 5), (0.2, 5), (0.5, 6.2832))
 """Plausible periods in m or rad: from one period per turn to several."""
-_OVER = (
-    Coefficient("sine", _USUAL, _WAVE),
-    Coefficient("cosine", _USUAL, _WAVE),
-    Coefficient("period", ("m", "m", "rad"), _PERIOD),
+_WAVE_COEFFICIENTS = (
+    Coefficient("sine", _FORCE_UNITS, _WAVE_RANGES),
+    Coefficient("cosine", _FORCE_UNITS, _WAVE_RANGES),
+    Coefficient("period", ("m", "m", "rad"), _PERIOD_RANGES),
 )
 """Coefficients of a wave over position."""
-_SQUARE = ((None, "1/N", "1/(N*m)"), ((0, 0), (0, 0.1), (0, 1)))
+_SQUARED_FORCE = ((None, "1/N", "1/(N*m)"), ((0, 0), (0, 0.1), (0, 1)))
 """Units and plausible values of the coefficient of a squared force."""
-_COLD = (
-    Coefficient("dry", _USUAL, _DRY),
-    Coefficient("viscous", _VISCOUS, _DAMPED),
+_WARMING_COEFFICIENTS = (
+    Coefficient("dry", _FORCE_UNITS, _DRY_RANGES),
+    Coefficient("viscous", _VISCOUS_UNITS, _VISCOUS_RANGES),
     Coefficient("time", ("s", "s", "s"), ((0.5, 500), (0.5, 500), (0.5, 500))),
 )
 """Coefficients of friction that decreases by warming."""
@@ -83,7 +83,7 @@ class CoulombFriction(Friction):
     says = "a constant friction opposes motion, and smaller forces do not start motion"
     source = _SURVEY
     needs = "guide"
-    coefficients = (Coefficient("coefficient", _USUAL, _DRY),)
+    coefficients = (Coefficient("coefficient", _FORCE_UNITS, _DRY_RANGES),)
 
     def limit(self, c: Array, moment: StateSnapshot) -> Array:  # noqa: ARG002
         """Return the limit (L, 1), equal to the coefficient.
@@ -103,8 +103,8 @@ class StribeckFriction(Friction):
     says = "friction is greatest at rest and decreases with speed"
     needs, contains, source = "guide", ("friction.coulomb",), _SURVEY
     coefficients = (
-        Coefficient("coulomb", _USUAL, _DRY),
-        Coefficient("extra", _USUAL, _DRY),
+        Coefficient("coulomb", _FORCE_UNITS, _DRY_RANGES),
+        Coefficient("extra", _FORCE_UNITS, _DRY_RANGES),
         Coefficient("speed", ("m/s", "m/s", "rad/s"), ((0.005, 0.5), (0.005, 0.5), (0.02, 2))),
     )
 
@@ -126,7 +126,7 @@ class LoadFriction(Friction):
     says = "friction increases with the load of the drive"
     source = _SERVOS + "M3"
     needs = "input"
-    coefficients = (_LOAD,)
+    coefficients = (_LOAD_COEFFICIENT,)
 
     def limit(self, c: Array, moment: StateSnapshot) -> Array:
         """Return the limit (L, 1), proportional to the load.
@@ -148,7 +148,10 @@ class DirectionalLoadFriction(Friction):
     noun = "load-dependent friction by direction"
     says = "friction differs between the motor driving the load and the load driving the motor"
     needs, contains, source = "input", ("friction.load",), _SERVOS + "M5"
-    coefficients = (replace(_LOAD, name="motor"), replace(_LOAD, name="external"))
+    coefficients = (
+        replace(_LOAD_COEFFICIENT, name="motor"),
+        replace(_LOAD_COEFFICIENT, name="external"),
+    )
 
     def limit(self, c: Array, moment: StateSnapshot) -> Array:
         """Return the limit (L, 1): absolute weighted sum of drive and external load.
@@ -168,7 +171,7 @@ class QuadraticLoadFriction(Friction):
     noun = "friction that increases with load and its square"
     says = "friction increases with the drive's load and with the square of the load"
     needs, contains, source = "input", ("friction.load",), _SERVOS + "M6"
-    coefficients = (_LOAD, Coefficient("quadratic", *_SQUARE))
+    coefficients = (_LOAD_COEFFICIENT, Coefficient("quadratic", *_SQUARED_FORCE))
 
     def limit(self, c: Array, moment: StateSnapshot) -> Array:
         """Return the limit (L, 1) from the load and the square of the transmitted force.
@@ -188,7 +191,7 @@ class PositionFriction(Friction):
     noun = "friction that varies over the joint"
     says = "friction varies periodically with position"
     needs, contains, source = "guide", ("friction.coulomb",), _PLACE
-    coefficients = (Coefficient("least", _USUAL, _DRY), *_OVER)
+    coefficients = (Coefficient("least", _FORCE_UNITS, _DRY_RANGES), *_WAVE_COEFFICIENTS)
 
     def limit(self, c: Array, moment: StateSnapshot) -> Array:
         """Return the limit (L, 1), periodic in the primary coordinate.
@@ -212,7 +215,7 @@ class WarmingFriction(Friction):
         "warms"
     )
     needs, contains, source = "guide", ("friction.coulomb", "drag.linear"), _WARM
-    coefficients = _COLD
+    coefficients = _WARMING_COEFFICIENTS
 
     def limit(self, c: Array, moment: StateSnapshot) -> Array:
         """Return the remaining limit (L, 1); the viscous part is zero at rest.
@@ -235,7 +238,9 @@ class DirectionalViscousFriction(Force):
     says = "friction is larger in one direction than in the other"
     source = "A. Janot, M. Gautier, M. Brunot, Nonlinear System Identification Benchmarks (2019)"
     needs, contains = "guide", ("drag.linear",)
-    coefficients = tuple(Coefficient(f"viscous{way}", _VISCOUS, _DAMPED) for way in "+-")
+    coefficients = tuple(
+        Coefficient(f"viscous{way}", _VISCOUS_UNITS, _VISCOUS_RANGES) for way in "+-"
+    )
 
     def force(self, c: Array, moment: StateSnapshot) -> Array:
         """Return the force (L, D), proportional to speed, with a coefficient per direction.

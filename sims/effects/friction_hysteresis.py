@@ -24,11 +24,11 @@ It is far above the rates visible in a log, and low enough to be integrated.
 """
 _MIN_DEFLECTION = 1e-9
 """Smallest deflection in m or rad, which replaces zero to avoid division by zero."""
-_WAY = ((2e-4, 0.05), (2e-4, 0.05), (1e-3, 0.3))
+_DEFLECTION_RANGES = ((2e-4, 0.05), (2e-4, 0.05), (1e-3, 0.3))
 """Plausible deflections in m or rad before surfaces slide."""
-_DAHL = (
+_DAHL_COEFFICIENTS = (
     Coefficient("coulomb", ("m/s^2", "N", "N*m"), ((0, 5), (0, 5), (0, 0.5))),
-    Coefficient("deflection", ("m", "m", "rad"), _WAY),
+    Coefficient("deflection", ("m", "m", "rad"), _DEFLECTION_RANGES),
 )
 
 
@@ -40,7 +40,7 @@ class FrictionHysteresis(HiddenStateEffect):
     says = "friction builds up over a small distance after each reversal, like a spring"
     source = "P. R. Dahl, AIAA Journal 14(12), 1675 (1976), doi:10.2514/3.61511"
     needs, contains = "joint", ("friction.coulomb",)
-    coefficients = _DAHL
+    coefficients = _DAHL_COEFFICIENTS
 
     def act(self, c: Array, moment: StateSnapshot, state: HiddenState) -> tuple[Array, Array]:
         """Return the force (L, D), and the rate (L, 1) of the hidden state.

@@ -25,15 +25,15 @@ _CALIBRATION = (
     "J. M. Hollerbach, W. Khalil, M. Gautier, Model Identification, in Springer Handbook of "
     "Robotics (2016), chapter 6"
 )
-_ANGLES = ((0.0, 0.0), (-0.2, 0.2), (-0.2, 0.2))
+_TILT_RANGES = ((0.0, 0.0), (-0.2, 0.2), (-0.2, 0.2))
 """Plausible tilts of an axis in rad."""
-_RADIANS = (None, "rad", "rad")
-_LENGTH = ("m", "m", "m")
-_OFFSET = ((-0.1, 0.1), (-0.1, 0.1), (-0.1, 0.1))
+_ANGLE_UNITS = (None, "rad", "rad")
+_LENGTH_UNITS = ("m", "m", "m")
+_OFFSET_RANGES = ((-0.1, 0.1), (-0.1, 0.1), (-0.1, 0.1))
 """Plausible distances of a payload from the centre of mass of its body, in metres."""
 _SMALL_MASS = 1e-4
 """Mass whose change of the motion is linear in it, as a share of the largest plausible one."""
-_MASS = ((0.0, 1.0), (0.0, 1.0), (0.0, 1.0))
+_MASS_RANGES = ((0.0, 1.0), (0.0, 1.0), (0.0, 1.0))
 """Plausible mass of a payload in kg."""
 
 
@@ -59,7 +59,7 @@ class JointAxisTilt(ModelValueEffect):
     source = _CALIBRATION
     at = "joint"
     coefficients = tuple(
-        Coefficient(axis, _RADIANS, _ANGLES, least=-np.pi, most=np.pi) for axis in "xyz"
+        Coefficient(axis, _ANGLE_UNITS, _TILT_RANGES, least=-np.pi, most=np.pi) for axis in "xyz"
     )
 
 
@@ -87,8 +87,8 @@ class PayloadMass(ModelValueEffect):
     source = "W. Khalil, E. Dombre, Modeling, Identification and Control of Robots (2002), ch. 12"
     at = "body"
     coefficients = (
-        Coefficient("mass", ("kg", "kg", "kg"), _MASS, least=0.0),
-        *(Coefficient(axis, _LENGTH, _OFFSET) for axis in "xyz"),
+        Coefficient("mass", ("kg", "kg", "kg"), _MASS_RANGES, least=0.0),
+        *(Coefficient(axis, _LENGTH_UNITS, _OFFSET_RANGES) for axis in "xyz"),
     )
 
     def probe_points(self) -> Sequence[Array]:

@@ -12,9 +12,9 @@ from sims.core.effect import Coefficient, Force, ModelValueEffect
 from sims.core.simulator import Array
 from sims.core.system import StateSnapshot
 
-_PURE = ("1", "1", "1")
+_DIMENSIONLESS = ("1", "1", "1")
 """Units of a dimensionless coefficient on every kind of system."""
-_FIFTH = ((-0.2, 0.2), (-0.2, 0.2), (-0.2, 0.2))
+_SCALE_RANGES = ((-0.2, 0.2), (-0.2, 0.2), (-0.2, 0.2))
 """Plausible relative changes of gravity: up to a fifth."""
 
 
@@ -26,7 +26,7 @@ class GravityScale(Force):
     says = "gravity is stronger or weaker than the stated value"
     source = "J. R. Taylor, Classical Mechanics (2005), section 1.4"
     needs, at = "gravity", "world"
-    coefficients = (Coefficient("coefficient", _PURE, _FIFTH),)
+    coefficients = (Coefficient("coefficient", _DIMENSIONLESS, _SCALE_RANGES),)
 
     def force(self, c: Array, moment: StateSnapshot) -> Array:
         """Return the force (L, D), a fraction of the weight.
@@ -47,7 +47,7 @@ class GravityTilt(Force):
     source = "J. R. Taylor, Classical Mechanics (2005), section 1.4"
     needs, at = "push", "world"
     coefficients = (
-        Coefficient("x", _PURE, _FIFTH),
+        Coefficient("x", _DIMENSIONLESS, _SCALE_RANGES),
         Coefficient("y", ("1", None, None), ((-0.2, 0.2), (0, 0), (0, 0))),
     )
 
@@ -69,4 +69,4 @@ class GravityCompensation(ModelValueEffect):
     says = "part of the body's weight is compensated, such as by a counterweight or the controller"
     source = "V. Arakelian, Gravity compensation in robotics, Advanced Robotics 30(2), 79 (2016)"
     at = "body"
-    coefficients = (Coefficient("coefficient", _PURE, ((0, 1), (0, 1), (0, 1))),)  # (3)
+    coefficients = (Coefficient("coefficient", _DIMENSIONLESS, ((0, 1), (0, 1), (0, 1))),)  # (3)

@@ -27,28 +27,28 @@ from sims.effects.first_order_lag import apply_recursion, compute_lag_response, 
 
 _FORCE_UNITS = ("m/s^2", "N", "N*m")
 """Units of an input that is a force, on the three kinds of system; an input may have another."""
-_TIME = ("s", "s", "s")
+_SECONDS = ("s", "s", "s")
 """Seconds, on every kind of system."""
-_PURE = ("1", "1", "1")
+_DIMENSIONLESS = ("1", "1", "1")
 """Units of a dimensionless coefficient on every kind of system."""
-_SHARE = ((-0.5, 0.5), (-0.5, 0.5), (-0.5, 0.5))
+_GAIN_RANGES = ((-0.5, 0.5), (-0.5, 0.5), (-0.5, 0.5))
 """Plausible gains: up to 50 % more or less."""
-_SCALE = ((-0.9, 9), (-0.9, 9), (-0.9, 9))
+_WIDE_GAIN_RANGES = ((-0.9, 9), (-0.9, 9), (-0.9, 9))
 """Plausible gains combined with a power, which changes the scale far from one unit."""
-_EXPONENT = ((-0.5, 2), (-0.5, 2), (-0.5, 2))
+_EXPONENT_RANGES = ((-0.5, 2), (-0.5, 2), (-0.5, 2))
 """Plausible additions to the exponent one."""
 _MIN_EXPONENT = 0.01
 """Smallest exponent; with zero, only the sign of the input would act."""
-_OFFSET = ((-2, 2), (-2, 2), (-0.2, 0.2))
+_BIAS_RANGES = ((-2, 2), (-2, 2), (-0.2, 0.2))
 """Plausible biases, in the units of `_FORCE_UNITS`."""
-_WIDTH = ((0, 2), (0, 2), (0, 0.2))
+_WIDTH_RANGES = ((0, 2), (0, 2), (0, 0.2))
 """Plausible widths of dead band and backlash, in the units of `_FORCE_UNITS`."""
-_LIMIT = ((0, 10), (0, 10), (0, 2))
+_LIMIT_RANGES = ((0, 10), (0, 10), (0, 2))
 """Plausible limits, in the units of `_FORCE_UNITS`."""
-_PER_SECOND = ("m/s^3", "N/s", "N*m/s")
+_FORCE_RATE_UNITS = ("m/s^3", "N/s", "N*m/s")
 """Units of `_FORCE_UNITS`, per second."""
-_SLEW = ((0, 50), (0, 50), (0, 10))
-"""Plausible limits of the rate, in the units of `_PER_SECOND`."""
+_RATE_LIMIT_RANGES = ((0, 50), (0, 50), (0, 10))
+"""Plausible limits of the rate, in the units of `_FORCE_RATE_UNITS`."""
 _DELAY = (-0.05, 0.2)
 """Plausible delays in s.
 
@@ -69,7 +69,7 @@ class InputHold(Input):
         "interpolated"
     )
     source = "K. J. Astrom, B. Wittenmark, Computer-Controlled Systems (1997), chapter 7"
-    coefficients = (Coefficient("coefficient", _PURE, ((0, 1), (0, 1), (0, 1))),)
+    coefficients = (Coefficient("coefficient", _DIMENSIONLESS, ((0, 1), (0, 1), (0, 1))),)
     between = True  # (0), applied where means over steps are computed: `sims.engines.time_grid`
 
 
@@ -80,7 +80,7 @@ class InputGain(Input):
     noun = "an input gain"
     says = "the input is larger or smaller than commanded"
     source = _FEEDBACK
-    coefficients = (Coefficient("coefficient", _PURE, _SHARE),)
+    coefficients = (Coefficient("coefficient", _DIMENSIONLESS, _GAIN_RANGES),)
 
     def feel(self, c: Array, signal: Signal) -> Array:
         """Return the scaled input (L, S).
@@ -99,7 +99,7 @@ class InputBias(Input):
     noun = "an input bias"
     says = "a constant is added to the input"
     source = _FEEDBACK
-    coefficients = (Coefficient("coefficient", _FORCE_UNITS, _OFFSET, of="input"),)
+    coefficients = (Coefficient("coefficient", _FORCE_UNITS, _BIAS_RANGES, of="input"),)
 
     def feel(self, c: Array, signal: Signal) -> Array:
         """Return the shifted input (L, S).
@@ -120,7 +120,7 @@ class InputDelay(Input):
         "the input acts later than commanded; a negative value means that its time stamps are late"
     )
     source = _FEEDBACK
-    coefficients = (Coefficient("coefficient", _TIME, (_DELAY, _DELAY, _DELAY)),)
+    coefficients = (Coefficient("coefficient", _SECONDS, (_DELAY, _DELAY, _DELAY)),)
 
     def times(self, c: Array, t: Array) -> Array:
         """Return the earlier times (L, S) whose command is applied.
@@ -139,7 +139,7 @@ class InputLag(Input):
     noun = "an input lag"
     says = "the input follows its command with a first-order lag"
     source = _FEEDBACK
-    coefficients = (Coefficient("coefficient", _TIME, ((0, 0.5), (0, 0.5), (0, 0.5))),)
+    coefficients = (Coefficient("coefficient", _SECONDS, ((0, 0.5), (0, 0.5), (0, 0.5))),)
 
     def feel(self, c: Array, signal: Signal) -> Array:
         """Return the mean (L, S) of the lagged input over each step.
@@ -159,7 +159,7 @@ class InputDeadBand(Input):
     noun = "an input dead band"
     says = "small inputs have no effect"
     source = _NONLINEAR
-    coefficients = (Coefficient("coefficient", _FORCE_UNITS, _WIDTH, of="input"),)
+    coefficients = (Coefficient("coefficient", _FORCE_UNITS, _WIDTH_RANGES, of="input"),)
 
     def feel(self, c: Array, signal: Signal) -> Array:
         """Return the excess (L, S) over the half width.
@@ -181,7 +181,7 @@ class InputSaturation(Input):
     noun = "input saturation"
     says = "the input is clipped at a limit"
     source = _NONLINEAR
-    coefficients = (Coefficient("coefficient", _FORCE_UNITS, _LIMIT, of="input"),)
+    coefficients = (Coefficient("coefficient", _FORCE_UNITS, _LIMIT_RANGES, of="input"),)
 
     def feel(self, c: Array, signal: Signal) -> Array:
         """Return the limited input (L, S).
@@ -203,7 +203,7 @@ class InputBacklash(Input):
     noun = "backlash"
     says = "after a reversal, the input acts only when the backlash is crossed"
     source = _PLAY
-    coefficients = (Coefficient("coefficient", _FORCE_UNITS, _WIDTH, of="input"),)
+    coefficients = (Coefficient("coefficient", _FORCE_UNITS, _WIDTH_RANGES, of="input"),)
 
     def feel(self, c: Array, signal: Signal) -> Array:
         """Return the input (L, S) on the load side of the backlash.
@@ -224,7 +224,10 @@ class InputPower(Input):
     says = "the force is proportional to a power of the input, such as a propeller's thrust"
     source = "R. Mahony, V. Kumar, P. Corke, IEEE Robot. Autom. Mag. 19(3), 20 (2012), equation 6"
     needs, contains = "input", ("input.gain",)
-    coefficients = (Coefficient("gain", _PURE, _SCALE), Coefficient("power", _PURE, _EXPONENT))
+    coefficients = (
+        Coefficient("gain", _DIMENSIONLESS, _WIDE_GAIN_RANGES),
+        Coefficient("power", _DIMENSIONLESS, _EXPONENT_RANGES),
+    )
 
     def feel(self, c: Array, signal: Signal) -> Array:
         """Return the input (L, S) to a power; an input of one unit changes only by the gain.
@@ -245,7 +248,9 @@ class InputRateLimit(Input):
     noun = "a rate limit of the input"
     says = "the rate of change of the input is limited"
     source = _NONLINEAR
-    coefficients = (Coefficient("coefficient", _PER_SECOND, _SLEW, of="input/s"),)
+    coefficients = (
+        Coefficient("coefficient", _FORCE_RATE_UNITS, _RATE_LIMIT_RANGES, of="input/s"),
+    )
 
     def feel(self, c: Array, signal: Signal) -> Array:
         """Return the mean (L, S) of the rate-limited input over each step.

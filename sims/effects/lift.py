@@ -13,9 +13,9 @@ from sims.core.system import StateSnapshot
 
 _SPINNING = "G. Robinson, I. Robinson, Physica Scripta 88, 018101 (2013), "
 _SPINNING += "doi:10.1088/0031-8949/88/01/018101"
-_FLYING = ("1/s", None, None)
+_LIFT_UNITS = ("1/s", None, None)
 """Units of the lift coefficient; it exists only for bodies in free flight."""
-_EITHER_WAY = ((-1, 1), (0, 0), (0, 0))
+_LIFT_RANGES = ((-1, 1), (0, 0), (0, 0))
 """Plausible lift in 1/s; spin has two directions."""
 
 
@@ -27,8 +27,8 @@ class MagnusLift(Force):
     says = "spin causes a force perpendicular to the direction of flight"
     needs, source = "space", _SPINNING
     coefficients = (
-        Coefficient("coefficient", _FLYING, _EITHER_WAY),
-        Coefficient("vertical", _FLYING, _EITHER_WAY),
+        Coefficient("coefficient", _LIFT_UNITS, _LIFT_RANGES),
+        Coefficient("vertical", _LIFT_UNITS, _LIFT_RANGES),
     )
 
     def force(self, c: Array, moment: StateSnapshot) -> Array:

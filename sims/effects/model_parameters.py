@@ -18,12 +18,12 @@ from __future__ import annotations
 
 from sims.core.effect import Coefficient, ModelValueEffect
 
-_PURE = ("1", "1", "1")
+_DIMENSIONLESS = ("1", "1", "1")
 """Units of a dimensionless coefficient on every kind of system."""
-_HALF = ((-0.5, 0.5), (-0.5, 0.5), (-0.5, 0.5))
+_RELATIVE_ERROR_RANGES = ((-0.5, 0.5), (-0.5, 0.5), (-0.5, 0.5))
 """Plausible relative errors: up to 50 % more or less."""
-_LENGTH = ("m", "m", "m")
-_TENTH = ((-0.1, 0.1), (-0.1, 0.1), (-0.1, 0.1))
+_LENGTH_UNITS = ("m", "m", "m")
+_OFFSET_RANGES = ((-0.1, 0.1), (-0.1, 0.1), (-0.1, 0.1))
 """Plausible offsets of a centre of mass in metres."""
 _IDENTIFICATION = "W. Khalil, E. Dombre, Modeling, Identification and Control of Robots (2002)"
 _MIN_RELATIVE_ERROR = -0.99
@@ -38,7 +38,11 @@ class MassScale(ModelValueEffect):
     says = "the body is heavier or lighter than the model file states"
     source = _IDENTIFICATION + ", chapter 12"
     at = "body"
-    coefficients = (Coefficient("coefficient", _PURE, _HALF, least=_MIN_RELATIVE_ERROR),)
+    coefficients = (
+        Coefficient(
+            "coefficient", _DIMENSIONLESS, _RELATIVE_ERROR_RANGES, least=_MIN_RELATIVE_ERROR
+        ),
+    )
 
 
 class CentreOfMassOffset(ModelValueEffect):
@@ -49,7 +53,7 @@ class CentreOfMassOffset(ModelValueEffect):
     says = "the body's centre of mass differs from the model file"
     source = _IDENTIFICATION + ", chapter 12"
     at = "body"
-    coefficients = tuple(Coefficient(axis, _LENGTH, _TENTH) for axis in "xyz")
+    coefficients = tuple(Coefficient(axis, _LENGTH_UNITS, _OFFSET_RANGES) for axis in "xyz")
 
 
 class InertiaScale(ModelValueEffect):
@@ -60,7 +64,11 @@ class InertiaScale(ModelValueEffect):
     says = "the body's moment of inertia differs from the model file"
     source = _IDENTIFICATION + ", chapter 12"
     at = "body"
-    coefficients = (Coefficient("coefficient", _PURE, _HALF, least=_MIN_RELATIVE_ERROR),)
+    coefficients = (
+        Coefficient(
+            "coefficient", _DIMENSIONLESS, _RELATIVE_ERROR_RANGES, least=_MIN_RELATIVE_ERROR
+        ),
+    )
 
 
 class ArmatureOffset(ModelValueEffect):
@@ -84,7 +92,11 @@ class ActuatorStiffnessScale(ModelValueEffect):
     says = "the servo's proportional gain differs from the model file"
     source = "K. J. Astrom, R. M. Murray, Feedback Systems (2008), chapter 10"
     at = "actuator"
-    coefficients = (Coefficient("coefficient", _PURE, _HALF, least=_MIN_RELATIVE_ERROR),)
+    coefficients = (
+        Coefficient(
+            "coefficient", _DIMENSIONLESS, _RELATIVE_ERROR_RANGES, least=_MIN_RELATIVE_ERROR
+        ),
+    )
 
 
 class ActuatorDampingScale(ModelValueEffect):
@@ -95,7 +107,11 @@ class ActuatorDampingScale(ModelValueEffect):
     says = "the servo's damping gain differs from the model file"
     source = "K. J. Astrom, R. M. Murray, Feedback Systems (2008), chapter 10"
     at = "actuator"
-    coefficients = (Coefficient("coefficient", _PURE, _HALF, least=_MIN_RELATIVE_ERROR),)
+    coefficients = (
+        Coefficient(
+            "coefficient", _DIMENSIONLESS, _RELATIVE_ERROR_RANGES, least=_MIN_RELATIVE_ERROR
+        ),
+    )
 
 
 class ActuatorForceLimit(ModelValueEffect):

@@ -31,9 +31,9 @@ from sims.core.effect import Coefficient, Force
 from sims.core.simulator import Array
 from sims.core.system import StateSnapshot
 
-_SHARE = ((0, 0), (0, 0.2), (0, 2))
+_VOLTAGE_LOSS_RANGES = ((0, 0), (0, 0.2), (0, 2))
 """Plausible voltage losses per unit of force, in 1/N and 1/(N m)."""
-_LOST = ((0, 0), (0, 1), (0, 1))
+_LOST_FRACTION_RANGES = ((0, 0), (0, 1), (0, 1))
 """Plausible lost fractions of a braking force."""
 
 
@@ -46,7 +46,7 @@ class SupplySag(Force):
     source = "R. Krishnan, Electric Motor Drives (2001), chapter 2: a source with resistance"
     at = "actuator"
     needs = "input"
-    coefficients = (Coefficient("coefficient", (None, "1/N", "1/(N*m)"), _SHARE),)
+    coefficients = (Coefficient("coefficient", (None, "1/N", "1/(N*m)"), _VOLTAGE_LOSS_RANGES),)
 
     def force(self, c: Array, moment: StateSnapshot) -> Array:
         """Return the force (L, D), opposite to the drive.
@@ -69,7 +69,7 @@ class SupplyBrakingLoss(Force):
     source = "R. Krishnan, Electric Motor Drives (2001), chapter 4: choppers of one quadrant"
     at = "actuator"
     needs = "input"
-    coefficients = (Coefficient("coefficient", (None, "1", "1"), _LOST),)
+    coefficients = (Coefficient("coefficient", (None, "1", "1"), _LOST_FRACTION_RANGES),)
 
     def force(self, c: Array, moment: StateSnapshot) -> Array:
         """Return the force (L, D), in the direction of motion.

@@ -27,36 +27,36 @@ from sims.core.effect import Coefficient, Sensor, Signal
 from sims.core.simulator import Array
 from sims.effects.first_order_lag import apply_recursion, compute_lag_response, shift_by_one_step
 
-_TIME = ("s", "s", "s")
+_SECONDS = ("s", "s", "s")
 """Seconds, on every kind of system."""
-_PURE = ("1", "1", "1")
+_DIMENSIONLESS = ("1", "1", "1")
 """Units of a dimensionless coefficient on every kind of system."""
-_FIFTH = ((-0.2, 0.2), (-0.2, 0.2), (-0.2, 0.2))
+_GAIN_RANGES = ((-0.2, 0.2), (-0.2, 0.2), (-0.2, 0.2))
 """Plausible gains: up to a fifth too much or too little."""
-_LEAST_GAIN = -0.8
+_MIN_GAIN = -0.8
 """Smallest gain: a sensor shows at least a fifth of the true value.
 
 A reading that hardly depends on the measured quantity would agree with any constant signal.
 """
-_MOST_GAIN = 4.0
+_MAX_GAIN = 4.0
 """Largest gain: a sensor shows at most five times the true value."""
-_LENGTH = ("m", "m", "rad")
+_POSITION_UNITS = ("m", "m", "rad")
 """Units of a reading that is a position; a reading may have another unit."""
-_OFFSET = ((-1, 1), (-0.2, 0.2), (-0.2, 0.2))
-"""Plausible biases, in the units of `_LENGTH`."""
-_OFF = Coefficient("coefficient", _LENGTH, _OFFSET, of="reading")
+_BIAS_RANGES = ((-1, 1), (-0.2, 0.2), (-0.2, 0.2))
+"""Plausible biases, in the units of `_POSITION_UNITS`."""
+_BIAS_COEFFICIENT = Coefficient("coefficient", _POSITION_UNITS, _BIAS_RANGES, of="reading")
 """Coefficient for a constant error of a reading."""
-_SPEED = ("m/s", "m/s", "rad/s")
-"""Units of `_LENGTH`, per second."""
-_DRIFT = ((-0.2, 0.2), (-0.05, 0.05), (-0.1, 0.1))
-"""Plausible drifts, in the units of `_SPEED`."""
-_SLOW = ((-0.05, 0.05), (-0.05, 0.05), (-0.05, 0.05))
+_SPEED_UNITS = ("m/s", "m/s", "rad/s")
+"""Units of `_POSITION_UNITS`, per second."""
+_DRIFT_RANGES = ((-0.2, 0.2), (-0.05, 0.05), (-0.1, 0.1))
+"""Plausible drifts, in the units of `_SPEED_UNITS`."""
+_CLOCK_ERROR_RANGES = ((-0.05, 0.05), (-0.05, 0.05), (-0.05, 0.05))
 """Plausible clock errors in seconds per second."""
-_ANGLE = (None, None, "rad")
+_ANGLE_UNITS = (None, None, "rad")
 """Units of the reading of an angle encoder."""
 _OFF_AXIS = ((0, 0), (0, 0), (-0.1, 0.1))
-"""Plausible errors of an eccentric encoder, in the units of `_ANGLE`."""
-_INSTANT = ((0.01, 10), (0.01, 10), (0.01, 10))
+"""Plausible errors of an eccentric encoder, in the units of `_ANGLE_UNITS`."""
+_TIME_RANGES = ((0.01, 10), (0.01, 10), (0.01, 10))
 """Plausible times in seconds on a recording's clock; a fit searches the duration of the runs."""
 _MIN_SAMPLE_INTERVAL = 1e-12
 """Smallest time in seconds between two different samples."""
@@ -70,7 +70,9 @@ class SensorGain(Sensor):
     noun = "a sensor gain"
     says = "the sensor reading is too large or too small by a constant factor"
     source = _VOCABULARY + ", 4.12"
-    coefficients = (Coefficient("coefficient", _PURE, _FIFTH, least=_LEAST_GAIN, most=_MOST_GAIN),)
+    coefficients = (
+        Coefficient("coefficient", _DIMENSIONLESS, _GAIN_RANGES, least=_MIN_GAIN, most=_MAX_GAIN),
+    )
 
     def read(self, c: Array, signal: Signal) -> Array:
         """Return the scaled reading (L, S).
@@ -89,7 +91,7 @@ class SensorBias(Sensor):
     noun = "a sensor bias"
     says = "the sensor has a constant offset"
     source = _VOCABULARY + ", 4.20"
-    coefficients = (_OFF,)
+    coefficients = (_BIAS_COEFFICIENT,)
 
     def read(self, c: Array, signal: Signal) -> Array:
         """Return the shifted reading (L, S).
@@ -108,7 +110,7 @@ class SensorDelay(Sensor):
     noun = "a sensor delay"
     says = "the sensor reading is late by a constant time"
     source = "K. J. Astrom, R. M. Murray, Feedback Systems (2008)"
-    coefficients = (Coefficient("coefficient", _TIME, ((0, 0.2), (0, 0.2), (0, 0.2))),)
+    coefficients = (Coefficient("coefficient", _SECONDS, ((0, 0.2), (0, 0.2), (0, 0.2))),)
 
     def times(self, c: Array, t: Array) -> Array:
         """Return the earlier times (L, S) of the recorded values.
@@ -128,7 +130,7 @@ class SensorLag(Sensor):
     says = "the sensor reading follows with a first-order lag"
     source = _VOCABULARY + ", 4.23"
     filters = True  # the lag evolves between samples, so every step is needed
-    coefficients = (Coefficient("coefficient", _TIME, ((0, 0.2), (0, 0.2), (0, 0.2))),)
+    coefficients = (Coefficient("coefficient", _SECONDS, ((0, 0.2), (0, 0.2), (0, 0.2))),)
 
     def read(self, c: Array, signal: Signal) -> Array:
         """Return the lagged reading (L, S), exact for a reading that is linear over each step.
@@ -148,7 +150,7 @@ class SensorDrift(Sensor):
     noun = "a sensor drift"
     says = "the sensor's offset changes linearly with time"
     source = _VOCABULARY + ", 4.21"
-    coefficients = (Coefficient("coefficient", _SPEED, _DRIFT, of="reading/s"),)
+    coefficients = (Coefficient("coefficient", _SPEED_UNITS, _DRIFT_RANGES, of="reading/s"),)
 
     def read(self, c: Array, signal: Signal) -> Array:
         """Return the reading (L, S) with an error proportional to time.
@@ -168,7 +170,7 @@ class EncoderEccentricity(Sensor):
     says = "the encoder is eccentric, so its error repeats once per turn"
     source = "X.-D. Lu et al., CIRP Annals 59(1), 529 (2010), introduction"
     needs = "guide"
-    coefficients = tuple(Coefficient(of, _ANGLE, _OFF_AXIS) for of in ("sine", "cosine"))
+    coefficients = tuple(Coefficient(of, _ANGLE_UNITS, _OFF_AXIS) for of in ("sine", "cosine"))
 
     def read(self, c: Array, signal: Signal) -> Array:
         """Return the reading (L, S) with an error periodic in the angle.
@@ -190,7 +192,7 @@ class EncoderSlip(Sensor):
     source = "M. Basseville, I. V. Nikiforov, Detection of Abrupt Changes (1993), chapter 2"
     needs = "guide"
     contains = ("sensor.bias",)
-    coefficients = (_OFF, Coefficient("instant", _TIME, _INSTANT))
+    coefficients = (_BIAS_COEFFICIENT, Coefficient("instant", _SECONDS, _TIME_RANGES))
 
     def read(self, c: Array, signal: Signal) -> Array:
         """Return the reading (L, S) with a constant error after the slip.
@@ -210,7 +212,7 @@ class ClockSkew(Sensor):
     says = "the recorder's clock runs slow or fast"
     source = "V. Paxson et al., Framework for IP Performance Metrics, RFC 2330 (1998), section 10.1"
     at = "world"
-    coefficients = (Coefficient("coefficient", _PURE, _SLOW),)
+    coefficients = (Coefficient("coefficient", _DIMENSIONLESS, _CLOCK_ERROR_RANGES),)
 
     def times(self, c: Array, t: Array) -> Array:
         """Return the times (L, S) on the true clock.

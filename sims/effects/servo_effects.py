@@ -22,16 +22,16 @@ from sims.core.effect import Coefficient, Force, Input, Signal
 from sims.core.simulator import Array
 from sims.core.system import StateSnapshot
 
-_USUAL = ("m/s^2", "m", "rad")
+_SET_POINT_UNITS = ("m/s^2", "m", "rad")
 """Units of a set point; point systems have no servo."""
-_WIDTH = ((0, 1), (0, 0.05), (0, 0.2))
-"""Plausible half widths of a dead zone, in the units of `_USUAL`."""
-_TIME = ("s", "s", "s")
+_HALF_WIDTH_RANGES = ((0, 1), (0, 0.05), (0, 0.2))
+"""Plausible half widths of a dead zone, in the units of `_SET_POINT_UNITS`."""
+_SECONDS = ("s", "s", "s")
 """Seconds, on every kind of system."""
-_ACCELERATION = ("m/s^4", "m/s^2", "rad/s^2")
-"""Units of `_USUAL`, per second squared."""
-_REACHED = ((0, 500), (0, 50), (0, 200))
-"""Plausible limits of a set point's acceleration, in the units of `_ACCELERATION`."""
+_ACCELERATION_UNITS = ("m/s^4", "m/s^2", "rad/s^2")
+"""Units of `_SET_POINT_UNITS`, per second squared."""
+_ACCELERATION_LIMIT_RANGES = ((0, 500), (0, 50), (0, 200))
+"""Plausible limits of a set point's acceleration, in the units of `_ACCELERATION_UNITS`."""
 
 
 class ServoDeadBand(Force):
@@ -43,7 +43,7 @@ class ServoDeadBand(Force):
     source = "H. K. Khalil, Nonlinear Systems (2002), section 1.2"
     at = "actuator"
     needs = "servo"
-    coefficients = (Coefficient("coefficient", _USUAL, _WIDTH, of="error"),)
+    coefficients = (Coefficient("coefficient", _SET_POINT_UNITS, _HALF_WIDTH_RANGES, of="error"),)
 
     def force(self, c: Array, moment: StateSnapshot) -> Array:
         """Return the force (L, D) that is missing in comparison with the proportional law.
@@ -64,7 +64,7 @@ class ServoDerivativeAction(Input):
     says = "the servo's D term acts on the error, so it also responds to the set point's rate"
     source = "K. J. Astrom, R. M. Murray, Feedback Systems (2008), section 10.5"
     needs = "servo"
-    coefficients = (Coefficient("coefficient", _TIME, ((0, 0.2), (0, 0.2), (0, 0.2))),)
+    coefficients = (Coefficient("coefficient", _SECONDS, ((0, 0.2), (0, 0.2), (0, 0.2))),)
 
     def feel(self, c: Array, signal: Signal) -> Array:
         """Return the set point (L, S) plus its change in the last c seconds.
@@ -87,7 +87,9 @@ class ServoMotionProfile(Input):
     says = "the servo's set point moves to the command with limited acceleration"
     source = "L. Biagiotti, C. Melchiorri, Trajectory Planning (2008), section 4.6"
     needs = "servo"
-    coefficients = (Coefficient("coefficient", _ACCELERATION, _REACHED, of="input/s^2"),)
+    coefficients = (
+        Coefficient("coefficient", _ACCELERATION_UNITS, _ACCELERATION_LIMIT_RANGES, of="input/s^2"),
+    )
 
     def feel(self, c: Array, signal: Signal) -> Array:
         """Return the mean (L, S) of the limited set point over each step.

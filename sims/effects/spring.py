@@ -13,10 +13,10 @@ from sims.core.system import StateSnapshot
 _DUFFING = (
     "I. Kovacic, M. J. Brennan (eds.), The Duffing Equation (2011), doi:10.1002/9780470977859"
 )
-_CUBIC = ("1/(m^2*s^2)", "N/m^3", "N*m/rad^3")
+_CUBIC_STIFFNESS_UNITS = ("1/(m^2*s^2)", "N/m^3", "N*m/rad^3")
 """Units of a force per cube of position."""
-_EITHER_WAY = ((-5, 5), (-50, 50), (-0.5, 0.5))
-"""Plausible cubic terms, in the units of `_CUBIC`: springs harden or soften."""
+_CUBIC_STIFFNESS_RANGES = ((-5, 5), (-50, 50), (-0.5, 0.5))
+"""Plausible cubic terms, in the units of `_CUBIC_STIFFNESS_UNITS`: springs harden or soften."""
 
 
 class LinearSpring(Force):
@@ -49,7 +49,7 @@ class CubicSpring(Force):
     says = "a spring pulls back in proportion to the cube of the distance from zero"
     source = _DUFFING
     needs = "guide"
-    coefficients = (Coefficient("coefficient", _CUBIC, _EITHER_WAY),)
+    coefficients = (Coefficient("coefficient", _CUBIC_STIFFNESS_UNITS, _CUBIC_STIFFNESS_RANGES),)
 
     def force(self, c: Array, moment: StateSnapshot) -> Array:
         """Return the force (L, D), towards zero for c > 0.

@@ -20,24 +20,24 @@ from sims.core.effect import Coefficient, Force, Level
 from sims.core.simulator import Array
 from sims.core.system import StateSnapshot
 
-_LEVEL = ("m", "m", "m")
+_LEVEL_UNITS = ("m", "m", "m")
 """Units of a level; a level may have another unit."""
-_TYPICAL = ((0, 4), (0, 4), (0, 4))
+_RIM_RANGES = ((0, 4), (0, 4), (0, 4))
 """Plausible rims, relative to the typical size of the level."""
 _REFERENCE_PENETRATION = 0.01
 """Penetration in m or rad at which the stiffness of a stop is specified."""
-_STIFF = (None, "N/m", "N*m/rad")
+_STIFFNESS_UNITS = (None, "N/m", "N*m/rad")
 """Units of a stop's stiffness; a body in free flight meets the ground instead."""
-_STIFFNESS = ((0, 0), (-5000, 5000), (-20, 20))
-"""Plausible stiffnesses of a stop, in the units of `_STIFF`."""
-_PLACE = ((0, 0), (-0.5, 0.5), (-0.5, 0.5))
+_STIFFNESS_RANGES = ((0, 0), (-5000, 5000), (-20, 20))
+"""Plausible stiffnesses of a stop, in the units of `_STIFFNESS_UNITS`."""
+_STOP_POSITION_RANGES = ((0, 0), (-0.5, 0.5), (-0.5, 0.5))
 """Plausible places of a stop in m or rad; a fit searches the range of the recorded motion."""
-_LOSS = ((0, 0), (0, 2), (0, 1))
+_LOSS_RANGES = ((0, 0), (0, 2), (0, 1))
 """Plausible losses of a stop in s/m or s/rad."""
-_STOP = (
-    Coefficient("stiffness", _STIFF, _STIFFNESS, of="stop"),
-    Coefficient("place", (None, "m", "rad"), _PLACE),
-    Coefficient("loss", (None, "s/m", "s/rad"), _LOSS),
+_STOP_COEFFICIENTS = (
+    Coefficient("stiffness", _STIFFNESS_UNITS, _STIFFNESS_RANGES, of="stop"),
+    Coefficient("place", (None, "m", "rad"), _STOP_POSITION_RANGES),
+    Coefficient("loss", (None, "s/m", "s/rad"), _LOSS_RANGES),
 )
 """Coefficients of an end stop."""
 _CONTACT = "K. H. Hunt, F. R. E. Crossley, J. Appl. Mech. 42(2), 440 (1975), doi:10.1115/1.3423596"
@@ -50,7 +50,7 @@ class LevelOverflow(Level):
     noun = "an overflow"
     says = "a level cannot rise above a rim; the excess overflows and is lost"
     source = "M. Schoukens, J. P. Noel, IFAC-PapersOnLine 50(1), 446 (2017)"
-    coefficients = (Coefficient("coefficient", _LEVEL, _TYPICAL, of="level"),)
+    coefficients = (Coefficient("coefficient", _LEVEL_UNITS, _RIM_RANGES, of="level"),)
 
     def keep(self, c: Array, level: Array) -> Array:
         """Return the level (L, 1), limited by the rim.
@@ -69,7 +69,7 @@ class EndStop(Force):
     noun = "an end stop"
     says = "it hits an end stop, which limits its position and absorbs some of its speed"
     needs, source, sharp = "guide", _CONTACT, True
-    coefficients = _STOP
+    coefficients = _STOP_COEFFICIENTS
 
     def force(self, c: Array, moment: StateSnapshot) -> Array:
         """Return the force (L, D), which pushes away from the stop and never towards it.

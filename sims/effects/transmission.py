@@ -54,45 +54,52 @@ _MAX_LOAD_SHARE = 0.98
 """Maximum share of the inertia on the load side of a transmission."""
 _MIN_COMPLIANCE = 1e-12
 """Smallest compliance in rad/(N m) or m/N, which counts as zero."""
-_ELASTIC = "M. W. Spong, J. Dyn. Syst. Meas. Control 109(4), 310 (1987), doi:10.1115/1.3143860"
-_PLAY = "M. Nordin, P.-O. Gutman, Automatica 38(10), 1633 (2002), doi:10.1016/S0005-1098(02)00047-X"
-_WRIST = (
+_SPONG_1987 = "M. W. Spong, J. Dyn. Syst. Meas. Control 109(4), 310 (1987), doi:10.1115/1.3143860"
+_NORDIN_2002 = (
+    "M. Nordin, P.-O. Gutman, Automatica 38(10), 1633 (2002), doi:10.1016/S0005-1098(02)00047-X"
+)
+_CORKE_1994 = (
     "P. I. Corke, B. Armstrong-Helouvry, Proc. IEEE ICRA, 1608 (1994),"
     " doi:10.1109/ROBOT.1994.351360: the wrist of the Puma 560"
 )
-_PURE = ("1", "1", "1")
+_DIMENSIONLESS = ("1", "1", "1")
 """Units of a dimensionless coefficient on every kind of system."""
-_ANY_SHARE = ((0, 0.9), (0, 0.9), (0, 0.9))
+_SPRING_SHARE_RANGES = ((0, 0.9), (0, 0.9), (0, 0.9))
 """Plausible shares of the inertia on the load side of a spring."""
-_SOME_SHARE = ((0.1, 0.9), (0.1, 0.9), (0.1, 0.9))
+_BACKLASH_SHARE_RANGES = ((0.1, 0.9), (0.1, 0.9), (0.1, 0.9))
 """Plausible shares of the inertia on the load side of backlash."""
-_SWING = ((5, 400), (5, 400), (5, 400))
+_FREQUENCY_RANGES = ((5, 400), (5, 400), (5, 400))
 """Plausible frequencies in rad/s at which a load oscillates on its drive."""
-_RATIO = ((0.005, 1), (0.005, 1), (0.005, 1))
+_DAMPING_RATIO_RANGES = ((0.005, 1), (0.005, 1), (0.005, 1))
 """Plausible damping ratios."""
-_GAP = ((0, 0.02), (0, 0.02), (0, 0.1))
+_GAP_RANGES = ((0, 0.02), (0, 0.02), (0, 0.1))
 """Plausible gaps in m or rad."""
-_SPRUNG = (
-    Coefficient("share", _PURE, _ANY_SHARE, most=_MAX_LOAD_SHARE),
-    Coefficient("frequency", ("rad/s", "rad/s", "rad/s"), _SWING),
-    Coefficient("damping", _PURE, _RATIO, tried=(0.03, 0.3)),
+_LOAD_SPRING_COEFFICIENTS = (
+    Coefficient("share", _DIMENSIONLESS, _SPRING_SHARE_RANGES, most=_MAX_LOAD_SHARE),
+    Coefficient("frequency", ("rad/s", "rad/s", "rad/s"), _FREQUENCY_RANGES),
+    Coefficient("damping", _DIMENSIONLESS, _DAMPING_RATIO_RANGES, tried=(0.03, 0.3)),
 )
-_GAPPED = (
-    Coefficient("gap", ("m", "m", "rad"), _GAP, of="travel"),
-    Coefficient("share", _PURE, _SOME_SHARE, tried=(0.2, 0.5, 0.8)),
+_LOAD_BACKLASH_COEFFICIENTS = (
+    Coefficient("gap", ("m", "m", "rad"), _GAP_RANGES, of="travel"),
+    Coefficient("share", _DIMENSIONLESS, _BACKLASH_SHARE_RANGES, tried=(0.2, 0.5, 0.8)),
 )
-_GIVING = ("m/N", "m/N", "rad/(N*m)")
-_GIVE = ((0, 1e-3), (0, 1e-3), (0, 0.1))
+_COMPLIANCE_UNITS = ("m/N", "m/N", "rad/(N*m)")
+_COMPLIANCE_RANGES = ((0, 1e-3), (0, 1e-3), (0, 0.1))
 """Plausible compliances, if nothing is known about the load."""
-_DRIVE = ((0.01, 1), (0.01, 1), (0.01, 1))
+_DRIVE_SHARE_RANGES = ((0.01, 1), (0.01, 1), (0.01, 1))
 """Plausible inertias of a drive, as a share of the joint's."""
-_ROTOR = Coefficient("rotor", _PURE, _DRIVE, of="rotor", tried=(0.03,))
-_SPRING = (
-    Coefficient("compliance", _GIVING, _GIVE, of="give"),
-    Coefficient("damping", _PURE, _RATIO, tried=(0.05,)),
-    _ROTOR,
+_ROTOR_COEFFICIENT = Coefficient(
+    "rotor", _DIMENSIONLESS, _DRIVE_SHARE_RANGES, of="rotor", tried=(0.03,)
 )
-_FLANKS = (Coefficient("gap", ("m", "m", "rad"), _GAP, of="travel"), _ROTOR)
+_SERIES_SPRING_COEFFICIENTS = (
+    Coefficient("compliance", _COMPLIANCE_UNITS, _COMPLIANCE_RANGES, of="give"),
+    Coefficient("damping", _DIMENSIONLESS, _DAMPING_RATIO_RANGES, tried=(0.05,)),
+    _ROTOR_COEFFICIENT,
+)
+_SERIES_BACKLASH_COEFFICIENTS = (
+    Coefficient("gap", ("m", "m", "rad"), _GAP_RANGES, of="travel"),
+    _ROTOR_COEFFICIENT,
+)
 
 
 class DrivenLoad(HiddenStateEffect):
@@ -174,7 +181,11 @@ class JointFlexibility(DrivenLoad):
 
     name, noun = "joint.flexibility", "a flexible transmission"
     says = "the load is connected to the drive by a spring, and oscillates"
-    source, coefficients, between = _ELASTIC, _SPRUNG, _SPRING
+    source, coefficients, between = (
+        _SPONG_1987,
+        _LOAD_SPRING_COEFFICIENTS,
+        _SERIES_SPRING_COEFFICIENTS,
+    )
 
     def compute_static_deflection(self, c: Array, fall: Array) -> Array:
         """Return the static deflection (L, 1) of the spring.
@@ -202,8 +213,8 @@ class JointCoupling(ModelValueEffect):
 
     name, noun = "joint.coupling", "a coupled drive"
     says = "the joint's drive also acts on the previous joint, such as in a coupled wrist"
-    source, at = _WRIST, "joint"
-    coefficients = (Coefficient("coefficient", _PURE, ((-1, 1), (-1, 1), (-1, 1))),)  # (5)
+    source, at = _CORKE_1994, "joint"
+    coefficients = (Coefficient("coefficient", _DIMENSIONLESS, ((-1, 1), (-1, 1), (-1, 1))),)  # (5)
 
 
 class JointBacklash(DrivenLoad):
@@ -211,7 +222,11 @@ class JointBacklash(DrivenLoad):
 
     name, noun = "joint.backlash", "backlash in the transmission"
     says = "there is backlash between the drive and its load"
-    source, coefficients, between = _PLAY, _GAPPED, _FLANKS
+    source, coefficients, between = (
+        _NORDIN_2002,
+        _LOAD_BACKLASH_COEFFICIENTS,
+        _SERIES_BACKLASH_COEFFICIENTS,
+    )
     share, fastest = 1, CONTACT_FREQUENCY
 
     def compute_coupling_force(self, c: Array, moment: StateSnapshot, state: HiddenState) -> Array:

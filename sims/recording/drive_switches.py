@@ -26,7 +26,7 @@ SWITCH_KEYS = ("enable", "disable")
 """Keys of ``[actuators.NAME]`` that name a switch column."""
 MIN_PART_SAMPLES = 10
 """Minimum number of samples of a part of a run; fewer determine no more than an initial state."""
-MOST_RUNS = 6
+MAX_LISTED_RUNS = 6
 """Maximum number of runs named in a message."""
 
 
@@ -193,8 +193,12 @@ def spans_of_runs(runs: Sequence[Run], off: Sequence[Mask]) -> str:
         for run, mask in zip(runs, off, strict=True)
         if mask.any()
     ]
-    suffix = f"; and {len(run_texts) - MOST_RUNS} more runs" if len(run_texts) > MOST_RUNS else ""
-    return f"{'; '.join(run_texts[:MOST_RUNS])}{suffix}"
+    suffix = (
+        f"; and {len(run_texts) - MAX_LISTED_RUNS} more runs"
+        if len(run_texts) > MAX_LISTED_RUNS
+        else ""
+    )
+    return f"{'; '.join(run_texts[:MAX_LISTED_RUNS])}{suffix}"
 
 
 def _make_subject_and_verb(names: Sequence[str]) -> str:

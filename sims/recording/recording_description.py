@@ -34,7 +34,7 @@ from sims.recording.unit_conversion import UnitScale, compute_unit_scale
 DeclaredSignals: TypeAlias = type[Simulator] | type[System]
 """System or simulator that declares the channels, inputs, constants and states of a recording."""
 
-_KEYS = (
+_TOP_LEVEL_KEYS = (
     "system",
     "model",
     "actuators",
@@ -271,7 +271,7 @@ def check_description(
     Raises:
         InputError: The description is malformed; the message is one line.
     """
-    _check_known_names(path, "", meta, _KEYS)
+    _check_known_names(path, "", meta, _TOP_LEVEL_KEYS)
     if "free" in meta and "model" not in meta:
         raise make_error(path, "free", "it with model = FILE alone (else --free A,B)", meta["free"])
     title = check_text(path, "title", meta.get("title", path.stem))

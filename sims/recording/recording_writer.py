@@ -28,7 +28,7 @@ def write_recording(
     declared: DeclaredSignals,
     *,
     digits: int = _LOSSLESS_DIGITS,
-    beside: Mapping[Path, Content] | None = None,
+    extra_files: Mapping[Path, Content] | None = None,
 ) -> None:
     """Write a recording such that `read_recording` gives it back unchanged, in SI units.
 
@@ -37,7 +37,7 @@ def write_recording(
         recording: Recording to write; its runs have different names and the same columns.
         declared: System, for the units.
         digits: Significant digits of a number; with 17, nothing is lost.
-        beside: Other files to write together with it, all or none.
+        extra_files: Other files to write together with it, all or none.
 
     Raises:
         InputError: A file exists already or cannot be written, or the runs do not fit into one
@@ -52,7 +52,7 @@ def write_recording(
         table: _format_table(recording.runs, digits),
         get_description_path(table): _format_description(recording, declared, table.parent),
     }
-    write_files({**texts, **(beside or {})})
+    write_files({**texts, **(extra_files or {})})
 
 
 def _format_table(runs: Sequence[Run], digits: int) -> str:

@@ -14,7 +14,7 @@ from sims.core.simulator import InputError
 
 _MAX_UNIT_LENGTH = 60
 """Maximum number of characters of a unit."""
-_ROUNDING = 1e-9
+_LINEARITY_TOLERANCE = 1e-9
 """Relative deviation from a linear conversion that is accepted as rounding error."""
 # Allow names, 1 and small powers only, so that the parser of pint cannot be made to compute for
 # long.
@@ -74,7 +74,7 @@ def compute_unit_scale(unit: str, target: str) -> UnitScale:
             f"expected a unit that converts to {target}, found {unit!r}{hint}"
         ) from None
     gain = value_at_one - value_at_zero
-    if abs(value_at_two - value_at_one - gain) > _ROUNDING * abs(gain):
+    if abs(value_at_two - value_at_one - gain) > _LINEARITY_TOLERANCE * abs(gain):
         raise InputError(f"expected a unit that converts to {target} in proportion, found {unit!r}")
     # A gain that differs from 1 by rounding is 1.
     return (

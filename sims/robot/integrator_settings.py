@@ -40,7 +40,7 @@ class RobotEngine:
         self.numerics = numerics
         self.largest_step = numerics.timestep
 
-    def integrate(self, lanes: IntegrationBatch) -> Trajectories:
+    def integrate(self, batch: IntegrationBatch) -> Trajectories:
         """Raise an error: robots are simulated by `RobotSimulator`, not through this interface."""
         raise NotImplementedError
 

@@ -323,7 +323,7 @@ COUPLING_FIELD = "wrap_prm"
 """Model field of coupling coefficients, which a model without tendons lacks."""
 CONTACT_FIELDS = frozenset({"pair_friction", "pair_solref"})
 """Model fields of pairs of geoms, which a model without elements `<pair>` lacks."""
-_SERVO = ("actuator_gainprm", "actuator_biasprm")
+_SERVO_FIELDS = ("actuator_gainprm", "actuator_biasprm")
 
 MODEL_FIELD_EFFECTS: Mapping[str, ModelFieldEffect] = {
     "drag.linear": ModelFieldEffect(("dof_damping",), _add_dof("dof_damping")),
@@ -343,8 +343,8 @@ MODEL_FIELD_EFFECTS: Mapping[str, ModelFieldEffect] = {
     "inertia.scale": ModelFieldEffect(
         ("body_inertia",), _scale_inertia, changes_derived_constants=True
     ),
-    "actuator.stiffness": ModelFieldEffect(_SERVO, _scale_stiffness),
-    "actuator.damping": ModelFieldEffect(_SERVO, _scale_damping),
+    "actuator.stiffness": ModelFieldEffect(_SERVO_FIELDS, _scale_stiffness),
+    "actuator.damping": ModelFieldEffect(_SERVO_FIELDS, _scale_damping),
     "joint.zero": ModelFieldEffect(("qpos0",), _move_zero),
     "joint.axis": ModelFieldEffect(("jnt_axis",), _turn_axis, changes_derived_constants=True),
     "link.length": ModelFieldEffect(("body_pos",), _scale_length, changes_derived_constants=True),

@@ -18,7 +18,7 @@ OPEN_LOOP = True
 """True if the torque depends on the input alone."""
 LENGTH_REDUCTION_FACTOR = 1000.0
 """Factor by which the body is heavier and its arm is shorter than in the system."""
-_TINY = 1e-14
+_BODY_INERTIA = 1e-14
 """Inertia of the body in kg m^2: MuJoCo requires a positive value."""
 
 
@@ -26,13 +26,14 @@ def model(constants: Mapping[str, float]) -> str:
     """Return the world as MJCF."""
     mass = constants["mass"] * LENGTH_REDUCTION_FACTOR
     arm = constants["length"] / LENGTH_REDUCTION_FACTOR
+    inertia = f"{_BODY_INERTIA} {_BODY_INERTIA} {_BODY_INERTIA}"
     return f"""
     <mujoco>
       <option gravity="0 0 {-constants["gravity"]!r}"/>
       <worldbody>
         <body>
           <joint type="hinge" axis="0 1 0"/>
-          <inertial mass="{mass!r}" pos="0 0 {-arm!r}" diaginertia="{_TINY} {_TINY} {_TINY}"/>
+          <inertial mass="{mass!r}" pos="0 0 {-arm!r}" diaginertia="{inertia}"/>
         </body>
       </worldbody>
     </mujoco>"""
@@ -47,7 +48,9 @@ def load(model: Any, inertia: float, constants: Mapping[str, float]) -> bool:
         constants: constants of the system by name.
     """
     armature = (
-        inertia - constants["mass"] * constants["length"] ** 2 / LENGTH_REDUCTION_FACTOR - _TINY
+        inertia
+        - constants["mass"] * constants["length"] ** 2 / LENGTH_REDUCTION_FACTOR
+        - _BODY_INERTIA
     )
     model.dof_armature[0] = armature
     return armature > 0.0

@@ -28,7 +28,7 @@ from sims.core.value_limits import (
 from sims.system_simulator import SystemSimulator
 from sims.systems.servo_mjcf import render_model_file
 
-_KT = slice(0, 1)
+_TORQUE_CONSTANT = slice(0, 1)
 """Column of the torque constant among the parameters."""
 _RESISTANCE = slice(1, 2)
 """Column of the winding's resistance among the parameters."""
@@ -166,7 +166,7 @@ class ServoSystem(System):
     def drive(self, moment: StateSnapshot) -> Array:
         """Return the motor's torque (L, 1), including its back electromotive force."""
         k = moment.constants
-        kt = moment.theta[:, _KT]
+        kt = moment.theta[:, _TORQUE_CONSTANT]
         error = moment.inputs["goal"] - moment.x
         unlimited_duty = k["kp"] * k["error_gain"] * error
         duty = np.minimum(np.maximum(unlimited_duty, -1.0), 1.0)  # (2)

@@ -35,7 +35,7 @@ from sims.own_simulator import BulletWorld, OwnSimulator
 
 _IDENTITY_QUATERNION = (0.0, 0.0, 0.0, 1.0)
 """Not turned, as a quaternion x, y, z, w."""
-_AXIS = (0.0, 1.0, 0.0)
+_JOINT_AXIS = (0.0, 1.0, 0.0)
 """Of both joints: the arm swings in the plane of x and z."""
 _FRICTION_SUBSTEPS = 16
 """Parts of a step in which dry friction changes sides."""
@@ -174,7 +174,7 @@ class TwoLinkArm(OwnSimulator):
             linkInertialFrameOrientations=[_IDENTITY_QUATERNION, _IDENTITY_QUATERNION],
             linkParentIndices=[0, 1],
             linkJointTypes=[p.JOINT_REVOLUTE, p.JOINT_REVOLUTE],
-            linkJointAxis=[_AXIS, _AXIS],
+            linkJointAxis=[_JOINT_AXIS, _JOINT_AXIS],
         )
         # By default Bullet adds air resistance, sleep when nothing moves, and a speed limit.
         p.changeDynamics(arm, -1, linearDamping=0.0, angularDamping=0.0, maxJointVelocity=NO_LIMIT)
@@ -200,7 +200,7 @@ class TwoLinkArm(OwnSimulator):
         Returns:
             Whether a joint with dry friction came to rest or changed its direction.
         """
-        self._pace(seconds)
+        self._set_step_length(seconds)
         q = self._q
         v = self._v
         for joint in (0, 1):
@@ -230,7 +230,7 @@ class TwoLinkArm(OwnSimulator):
             if name not in _UNPICKLABLE_ATTRIBUTES
         }
 
-    def _pace(self, seconds: float) -> None:
+    def _set_step_length(self, seconds: float) -> None:
         """Set the step length in seconds, and with it the joint friction, if the length changes."""
         # Bullet turns a motor's force into an impulse when the motor is set, so a motor holds for
         # one length of step.

@@ -24,7 +24,7 @@ _RAY_COUNT = 36
 """Number of rays, evenly spaced over the full circle, along which an edge is located."""
 _MIN_REGION_AREA = 6
 """Minimum area of a region in pixels; smaller ones are noise."""
-_LEAST_LEVEL = 12.0
+_MIN_THRESHOLD = 12.0
 """Minimum threshold of the difference in grey levels, because compression adds noise."""
 _MIN_RAY_AGREEMENT = 0.6
 """Minimum fraction of the rays that must agree on a circle."""
@@ -50,7 +50,7 @@ _SHADOW_FACTOR_RANGE = (0.25, 0.97)
 """Range of brightness factors of shadow; darker is an object, lighter is noise."""
 _MAX_SHADOW_DEVIATION = 6.0
 """Maximum deviation of the colours from a common factor for shadow, grey levels."""
-_OUTSIDE_PICTURE_VALUE = -1000.0
+_PADDING_VALUE = -1000.0
 """Value for pixels outside the picture, far below every difference."""
 _MIN_DETERMINANT = 1e-6
 """Determinant below which an edge does not determine a centre."""
@@ -141,7 +141,7 @@ class BallDetector:
         self.sigma = sigma
         self.shadows = shadows
         # With six sigma, none of ten thousand pixels exceeds the threshold by noise alone.
-        self.level = max(_LEAST_LEVEL, 6 * sigma)
+        self.level = max(_MIN_THRESHOLD, 6 * sigma)
         self._plain = background.astype(np.float32)
         cv2 = import_package("cv2")
         self._grey = cv2.cvtColor(background, cv2.COLOR_RGB2GRAY)
@@ -418,7 +418,7 @@ class BallDetector:
         value_after = values[rays, crossing_index + 1]
         has_edge = is_crossing.any(axis=1) & (half_level > 0.4 * self.level)
         # A fall to the value for outside is the end of the picture, not of the ball.
-        has_edge &= value_after > 0.5 * _OUTSIDE_PICTURE_VALUE
+        has_edge &= value_after > 0.5 * _PADDING_VALUE
         if has_edge.sum() < 0.5 * _RAY_COUNT:
             return None
         # Interpolate linearly between the two samples.
@@ -492,7 +492,7 @@ def _compute_surrounding_colour(picture: RgbImage, detection: BallDetection) -> 
 
 
 def _interpolate_window(window: GreyLevels, u: GreyLevels, v: GreyLevels) -> GreyLevels:
-    """Interpolate a window at subpixel positions; `_OUTSIDE_PICTURE_VALUE` outside it."""
+    """Interpolate a window at subpixel positions; `_PADDING_VALUE` outside it."""
     cv2 = import_package("cv2")
     result: GreyLevels = cv2.remap(
         window,
@@ -500,7 +500,7 @@ def _interpolate_window(window: GreyLevels, u: GreyLevels, v: GreyLevels) -> Gre
         v,
         cv2.INTER_LINEAR,
         borderMode=cv2.BORDER_CONSTANT,
-        borderValue=_OUTSIDE_PICTURE_VALUE,
+        borderValue=_PADDING_VALUE,
     )
     return result
 

@@ -52,24 +52,28 @@ class BallScene:
 
     Args:
         camera: Camera.
-        look: Colours, light and noise.
+        appearance: Colours, light and noise.
         radius: Radius of the ball, m.
         rng: Random number generator for the camera noise.
     """
 
     def __init__(
-        self, camera: PinholeCamera, look: SceneAppearance, radius: float, rng: np.random.Generator
+        self,
+        camera: PinholeCamera,
+        appearance: SceneAppearance,
+        radius: float,
+        rng: np.random.Generator,
     ) -> None:
         """Render the background once, and create the ball's mesh."""
         self.camera = camera
-        self.look = look
+        self.appearance = appearance
         self.radius = radius
         self._rng = rng
         p = bullet_world.import_pybullet()
         self._client: int = p.connect(p.DIRECT)
         self.close = weakref.finalize(self, p.disconnect, self._client)
         extents = [_HALF_GROUND_SIDE, _HALF_GROUND_SIDE, _HALF_GROUND_THICKNESS]
-        ground = self._create_body(p.GEOM_BOX, look.ground, halfExtents=extents)
+        ground = self._create_body(p.GEOM_BOX, appearance.ground, halfExtents=extents)
         self._move_body(ground, (0, 0, -_HALF_GROUND_THICKNESS))
         width, height = camera.size
         full_window = 0, 0, width, height
@@ -77,11 +81,11 @@ class BallScene:
         picture, covered = self._render_body(full_window, 1, ground)
         # Frames are rendered without the ground, because it does not change.
         p.removeBody(ground, physicsClientId=self._client)
-        self._still = self._render_background(picture, covered)
+        self._background = self._render_background(picture, covered)
         points, faces = make_sphere_mesh()
         self._ball = self._create_body(
             p.GEOM_MESH,
-            look.ball,
+            appearance.ball,
             vertices=(radius * points).tolist(),
             indices=faces,
             # Normals of the sphere instead of its faces, for smooth shading.
@@ -94,13 +98,13 @@ class BallScene:
 
     def render_frame(self, position: Array) -> RgbImage:
         """Render a frame with the ball's centre at `position` (3,), m."""
-        picture = self._still.copy()
+        picture = self._background.copy()
         # The shadow comes first, because the ball may hide a part of it.
         self._cast_shadow(picture, position)
         self._draw_ball(picture, position)
-        if self.look.noise > 0:
+        if self.appearance.noise > 0:
             grain = self._rng.standard_normal(picture.shape, dtype=np.float32)
-            picture += self.look.noise * grain
+            picture += self.appearance.noise * grain
         # Add half a grey level, because the conversion to integers truncates.
         return (picture + 0.5).clip(0, 255).astype(np.uint8)
 
@@ -151,14 +155,14 @@ class BallScene:
         points = self.camera.position + ray_lengths[..., None] * self._rays
         self._points = points.astype(np.float32)
         self._open = is_ground
-        brightness = self.look.compute_ground_brightness(points[..., 0], points[..., 1])
+        brightness = self.appearance.compute_ground_brightness(points[..., 0], points[..., 1])
         ground = picture * brightness[..., None]
-        sky = 255 * np.array(self.look.sky)
+        sky = 255 * np.array(self.appearance.sky)
         return np.where(is_ground[..., None], ground, sky).astype(np.float32)
 
     def _cast_shadow(self, picture: ColourArray, position: Array) -> None:
         """Darken the ground in the ball's shadow; the sun's disc softens its edge."""
-        light = self.look.light
+        light = self.appearance.light
         slant = 1 / light[2]
         travel = position[2] / light[2]
         # Intersection of the ground with the line through the ball's centre along the light.
@@ -187,7 +191,7 @@ class BallScene:
         edge_half_width = _MIN_SHADOW_EDGE * self.radius + _SUN_ANGLE * travel
         depth = (self.radius + edge_half_width - distance) / (2 * edge_half_width)
         shadow = np.clip(depth, 0, 1) * self._open[window_slice]
-        brightness = 1 - self.look.shadow * shadow
+        brightness = 1 - self.appearance.shadow * shadow
         picture[window_slice] *= brightness[..., None].astype(np.float32)
 
     def _draw_ball(self, picture: ColourArray, position: Array) -> None:
@@ -250,7 +254,7 @@ class BallScene:
             height * oversampling,
             view,
             projection,
-            lightDirection=self.look.light.tolist(),
+            lightDirection=self.appearance.light.tolist(),
             shadow=0,
             renderer=p.ER_TINY_RENDERER,
             physicsClientId=self._client,

@@ -36,7 +36,7 @@ from numpy.typing import ArrayLike
 
 from sims.core.simulator import Array, InputError, make_read_only
 
-_REFINEMENTS = 4
+_REFINEMENT_COUNT = 4
 """Number of iterations in which the offset between outline and projected centre is subtracted."""
 
 
@@ -235,7 +235,7 @@ class PinholeCamera:
         vertical = self.axes[:, 2]
         shift: Array = np.zeros_like(pixels)
         z: Array = np.full(pixels.shape[:-1], np.nan)
-        for _ in range(_REFINEMENTS):
+        for _ in range(_REFINEMENT_COUNT):
             ratio = (pixels - shift - self.principal_point) / self.focal
             constant = base[:2] - ratio * base[2]
             slope = vertical[:2] - ratio * vertical[2]

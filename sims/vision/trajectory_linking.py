@@ -16,7 +16,7 @@ _RADIUS_RATIO_RANGE = (0.65, 1.55)
 """Range of the ratio of two radii of one object, which approaches the camera or is blurred."""
 _MIN_PATH_FRAMES = 3
 """Minimum number of frames of a path; shorter ones are noise."""
-_CHANCE_RAY_AGREEMENT = 0.5
+_RANDOM_RAY_AGREEMENT = 0.5
 """Fraction of the rays that agree on a circle at random."""
 _COLOUR_MEMORY_FRAMES = 20
 """Number of frames over which the colour of a path is averaged."""
@@ -152,7 +152,7 @@ class TrackedPath:
         A count of frames alone would prefer a permanent remnant of shadow to a ball.
         """
         return sum(
-            (detection.ray_agreement - _CHANCE_RAY_AGREEMENT) * detection.radius
+            (detection.ray_agreement - _RANDOM_RAY_AGREEMENT) * detection.radius
             for detection in self.detections
         )
 

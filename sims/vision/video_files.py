@@ -34,7 +34,7 @@ def write_video(
     frames: Iterable[RgbImage],
     times: Array,
     crf: int = 18,
-    beside: Mapping[Path, str] | None = None,
+    extra_files: Mapping[Path, str] | None = None,
 ) -> None:
     """Write frames as H.264 in an .mp4 file, completely or not at all.
 
@@ -43,8 +43,8 @@ def write_video(
         frames: Pictures (height, width, 3) of one size with even height and width.
         times: (n,) time of each frame in seconds, increasing; rounded to 1/90000 s.
         crf: Constant rate factor, 0 (lossless) to 51.
-        beside: Texts of other new files that belong to it; they are written before the film becomes
-            visible.
+        extra_files: Texts of other new files that belong to it; they are written before the film
+            becomes visible.
 
     Raises:
         InputError: The file exists or cannot be written, or the size of the frames cannot be
@@ -59,7 +59,7 @@ def write_video(
             _encode_frames(partial, frames, times, crf)
             # Encoding takes long; the file may have been created meanwhile.
             check_absent([path])
-            write_files(beside or {})
+            write_files(extra_files or {})
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror or error})") from None
 

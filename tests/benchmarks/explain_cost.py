@@ -28,9 +28,9 @@ from bench.diagnosis.search.score_test import ScoreTest
 from sims import effects
 from sims.systems.slider import SliderSystem
 from tests.bench.diagnosis.explained_samples import linear_fit
-from tests.simulation_arguments import Wish, write
+from tests.simulation_arguments import simulation_spec, write
 
-USUAL = Wish(
+USUAL = simulation_spec(
     # Record with the engine that explains, so that numerical errors do not grow with the length.
     "slider",
     effects=["friction.coulomb=0.3"],

@@ -14,7 +14,7 @@ import numpy as np
 
 from bench.diagnosis.evaluation import run_thinning
 from bench.diagnosis.explain import explain
-from tests.simulation_arguments import Wish, write
+from tests.simulation_arguments import simulation_spec, write
 
 SLIDER = {"system": "slider", "observe": ["x"], "inputs": ["u=steps:2:0.5"]}
 LONG = {"runs": 3, "seconds": 8.0, "rate": 1000.0}
@@ -71,7 +71,7 @@ def main():
     with tempfile.TemporaryDirectory() as folder:
         for number, (name, wish) in enumerate(MADE.items()):
             path = Path(folder) / f"{number}.csv"
-            write(Wish(**wish, **LONG), path)
+            write(simulation_spec(**wish, **LONG), path)
             # Run once before measuring, so that imports and tracing are not counted.
             if not number:
                 explain(path)

@@ -16,22 +16,24 @@ from pathlib import Path
 
 from bench.diagnosis.evaluation.worker_pool import ForkedWorkerPool
 from bench.diagnosis.explain import explain
-from tests.simulation_arguments import Wish, write
+from tests.simulation_arguments import simulation_spec, write
 
 USUAL = {"runs": 4, "seconds": 4.0, "rate": 100.0, "engine": "mujoco"}
 PAIRS = {
-    "pendulum": Wish(
+    "pendulum": simulation_spec(
         "pendulum", effects=["drag.linear=6e-4", "friction.coulomb=2e-3"],
         noise=["q=0.003", "qd=0.02"], **USUAL,
     ),
-    "slider": Wish(
+    "slider": simulation_spec(
         "slider", effects=["drag.quadratic=0.4", "friction.coulomb=0.3"],
         inputs=["u=chirp:3:0.3:2"], noise=["x=0.002", "v=0.01"], **USUAL,
     ),
-    "servo": Wish(
+    "servo": simulation_spec(
         "servo", effects=["friction.coulomb=0.01", "input.delay=0.03"], noise=["0.002"], **USUAL
     ),
-    "ball": Wish("ball", effects=["wind=3,0.004", "sensor.delay=0.03"], noise=["0.005"], **USUAL),
+    "ball": simulation_spec(
+        "ball", effects=["wind=3,0.004", "sensor.delay=0.03"], noise=["0.005"], **USUAL
+    ),
 }  # fmt: skip
 
 

@@ -41,7 +41,7 @@ GROUPS = {
         "The contract of a [diagnoser](../diagnosers.md).",
         "Diagnoser DiagnosisCase Answer NamedCause DiagnoserTrainingTask",
     ),
-    "Faults": ("What is the user's to mend.", "InputError"),
+    "Faults": ("Errors that the user has to correct.", "InputError"),
 }
 """Headings of the page: introductory sentence and names."""
 OPTIONS = (

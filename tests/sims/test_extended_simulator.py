@@ -19,7 +19,7 @@ from sims.extended_simulator import (
     write_extended,
 )
 from sims.systems.pendulum import Pendulum
-from tests.simulation_arguments import Wish
+from tests.simulation_arguments import simulation_spec
 
 MODEL = ExtendedSimulator(
     "pendulum_extended", "pendulum", "batch", "A swing, measured",
@@ -277,7 +277,9 @@ def test_as_a_plugin_it_is_registered_once_by_its_name(path, tmp_path):
 def test_it_makes_recordings_as_its_system_does(path):
     load_plugins([path])
     made = simulate_recording(
-        Wish("pendulum_extended", runs=2, seconds=0.5, engine="mujoco", effects=["force.bias=1e-3"])
+        simulation_spec(
+            "pendulum_extended", runs=2, seconds=0.5, engine="mujoco", effects=["force.bias=1e-3"]
+        )
     )
     assert made.truth["parameters"] == {
         "inertia": 3.1e-3,
@@ -288,7 +290,7 @@ def test_it_makes_recordings_as_its_system_does(path):
     assert made.recording.constants["mass"] == 0.2
     assert list(made.recording.runs[0].channels) == ["qd", "q"]
     with pytest.raises(InputError, match=r"effect drag.linear is named twice"):
-        simulate_recording(Wish("pendulum_extended", runs=1, effects=["drag.linear=1"]))
+        simulate_recording(simulation_spec("pendulum_extended", runs=1, effects=["drag.linear=1"]))
 
 
 def test_an_extended_simulator_is_not_extended_again(path, tmp_path):

@@ -13,7 +13,7 @@ from sims.core.system import DefaultRecording
 from sims.system_simulator import SystemSimulator
 from sims.systems.slider import SliderSystem
 from tests.sims.simulation_cases import SIMULATORS
-from tests.simulation_arguments import Wish
+from tests.simulation_arguments import simulation_spec
 
 SYSTEMS = {name: kind.system for name, kind in SIMULATORS.items()}
 
@@ -84,7 +84,7 @@ def test_a_recording_of_a_system_is_made_from_its_declaration(fresh_registries):
         system = TestedSystem
 
     simulators.register(Tested)
-    made = simulate_recording(Wish("slider-tested", runs=2, seconds=0.1))
+    made = simulate_recording(simulation_spec("slider-tested", runs=2, seconds=0.1))
     assert [c.name for c in made.simulator.channels] == ["v"]
     for run in made.recording.runs:
         assert 4.0 <= made.truth["runs"][run.name]["initial"]["x"] <= 4.5

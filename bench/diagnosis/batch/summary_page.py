@@ -118,7 +118,7 @@ def render_summary_page(rows: Sequence[LogResult], batch: BatchPageInput) -> str
         failed=[row for row in rows if row.error],
         is_numbered=not charts.has_names,
         number_panels=charts.numbers,
-        number_figure=_make_still(
+        number_figure=_make_printed_figure(
             charts.numbers[:MAX_PANELS],
             charts.tables,
             "numbers",
@@ -126,7 +126,7 @@ def render_summary_page(rows: Sequence[LogResult], batch: BatchPageInput) -> str
             "Point: the value from one log. Bar: its 95 % interval.",
         ),
         held_out_panels=charts.held_out,
-        held_out_figure=_make_still(
+        held_out_figure=_make_printed_figure(
             charts.held_out,
             charts.tables,
             "held-out",
@@ -299,7 +299,7 @@ def draw_summary_figure(
     return figure
 
 
-def _make_still(
+def _make_printed_figure(
     panels: Sequence[Panel],
     tables: Mapping[str, pd.DataFrame],
     name: str,

@@ -224,7 +224,11 @@ class ConventionComparison:
         It is infinite if the filter diverges.
         """
         followed = self._filter_runs(self._select_parts(recording))
-        return float((followed.force / followed.typical).max()) if followed.is_sound else np.inf
+        return (
+            float((followed.force / followed.typical).max())
+            if followed.has_expected_innovations
+            else np.inf
+        )
 
     def _list_suspect_joints(self, followed: FollowedRuns) -> list[JointSignals]:
         """Return the joints at which the filter needs a large missing force.
@@ -232,7 +236,7 @@ class ConventionComparison:
         A wrong sign, unit or joint order shows as such a force. If the filter diverges, all joints
         are suspects.
         """
-        if not followed.is_sound:
+        if not followed.has_expected_innovations:
             return self._generator.joints
         coordinates = self.subject.kind.system.coordinates
         shares = (followed.force / followed.typical)[: len(coordinates)]
@@ -407,7 +411,7 @@ class ConventionComparison:
         followed = FollowedRuns.follow(
             evaluator, evaluator.get_nominal_theta(), _estimate_white_noise(evaluator, parts), None
         )
-        if not followed.is_sound:
+        if not followed.has_expected_innovations:
             evaluator.close()
             return -np.inf
         left_out = MANY_SHAPES | CONVENTION_EFFECTS
@@ -474,7 +478,7 @@ def _cut_to_common_samples(one: Recording, other: Recording) -> tuple[Recording,
 def _get_log_likelihood(followed: FollowedRuns) -> float:
     """Return the log-likelihood of the innovations; minus infinity if the filter diverges."""
     likelihood = followed.log_likelihood
-    return likelihood if np.isfinite(likelihood) and followed.is_sound else -np.inf
+    return likelihood if np.isfinite(likelihood) and followed.has_expected_innovations else -np.inf
 
 
 def _compute_log_scales(hypotheses: Sequence[ConventionHypothesis], recording: Recording) -> float:

@@ -163,7 +163,7 @@ class Signal:
     scale: float = 1.0
 
     @property
-    def said(self) -> str:
+    def signal_text(self) -> str:
         """Signal in words, such as ``channel q``."""
         return f"{self.kind.removesuffix('s')} {self.name}"
 
@@ -187,7 +187,7 @@ class Hypothesis:
         pairs = zip(self.signals, self.units, strict=True)
         return {s.name: self.scale * _get_unit_gain(s, unit) / s.gain for s, unit in pairs}
 
-    def fault(self, file: str, before: float | None, after: float | None) -> RecordingFault:
+    def make_error(self, file: str, before: float | None, after: float | None) -> RecordingFault:
         """Describe the hypothesis as a fault of the recording, with the lines to change.
 
         Args:
@@ -224,7 +224,7 @@ class Hypothesis:
         which the recorded values have to be multiplied; it is shown for a wrong unit.
         """
         first, unit = self.signals[0], self.units[0]
-        names = join_first_names([signal.said for signal in self.signals], _NAMED)
+        names = join_first_names([signal.signal_text for signal in self.signals], _NAMED)
         table = f"[{first.kind}.{first.name}]" if len(self.signals) == 1 else "the tables of each"
         scale = f"set scale = {self._get_corrected_scale(first):.9g} in {table} of {file}"
         if unit == first.specified_unit and self.scale == -1.0:
@@ -341,9 +341,12 @@ def find_wrong_units(
     # Hypotheses that differ only in the sign are not alternatives.
     same = best.signals, best.units
     rest = [pair for pair in others_alike if (pair[0].signals, pair[0].units) != same]
-    others = [*(hypothesis.fault(subject.file, None, None).says for hypothesis, _ in rest), *others]
+    others = [
+        *(hypothesis.make_error(subject.file, None, None).says for hypothesis, _ in rest),
+        *others,
+    ]
     alternatives = tuple(dict.fromkeys(others))
-    return replace(best.fault(subject.file, known, after), alternatives=alternatives)
+    return replace(best.make_error(subject.file, known, after), alternatives=alternatives)
 
 
 def find_imitated_unit(
@@ -387,12 +390,14 @@ def find_imitated_unit(
             alternatives = tuple(
                 _BEYOND.format(name) for name in _list_parameters_at_bounds(evaluator, base)
             )
-            return replace(hypothesis.fault(subject.file, None, None), alternatives=alternatives)
+            return replace(
+                hypothesis.make_error(subject.file, None, None), alternatives=alternatives
+            )
     if kind == "channels" and abs(gain) <= MIN_SENSOR_GAIN:
         message = (
-            f"The fit makes {signal.said} nearly independent of the simulation (a sensor gain of "
-            f"{coefficient.value:.4g}), which is not an answer: check the unit, the column and the "
-            f"sign of {signal.said} in {subject.file}"
+            f"The fit makes {signal.signal_text} nearly independent of the simulation "
+            f"(a sensor gain of {coefficient.value:.4g}), which is not an answer: "
+            f"check the unit, the column and the sign of {signal.signal_text} in {subject.file}"
         )
         alternatives = tuple(
             _BEYOND.format(name) for name in _list_parameters_at_bounds(evaluator, base)

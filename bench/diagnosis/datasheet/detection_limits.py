@@ -79,14 +79,14 @@ class DetectionLimit:
         limit: ``above`` for backlash, which is detectable from that size on; ``below`` for a limit,
             which is detectable up to it; empty for proportional effects.
         confounded_with: Parameters of the model that are confounded with it.
-        vague: Whether it could be larger than all plausible values.
+        is_unbounded: Whether it could be larger than all plausible values.
     """
 
     size: float
     estimate_if_fitted: float = 0.0
     limit: str = ""
     confounded_with: tuple[str, ...] = ()
-    vague: bool = False
+    is_unbounded: bool = False
 
     @property
     def is_nonzero_if_fitted(self) -> bool:
@@ -317,7 +317,7 @@ class _DetectionLimitCalculator:
         # The interval exceeds all plausible values, so the data say nothing about the coefficient.
         if 2.0 * size > MAX_INTERVAL_WIDTH * (high - low):
             return DetectionLimit(
-                float(size), confounded_with=self._list_confounded_parameters(k), vague=True
+                float(size), confounded_with=self._list_confounded_parameters(k), is_unbounded=True
             )
         return DetectionLimit(
             float(size),

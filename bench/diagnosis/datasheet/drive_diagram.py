@@ -92,7 +92,7 @@ class DriveDiagram:
         breakaway: Drive force that moves the joint without a load.
         backdrive: Load that moves the joint without drive force; infinite if no load does.
         laws: Names of the effects that are included.
-        reach: Range of the axes.
+        axis_limit: Range of the axes.
         without: Names of effects at the joint that have a hidden state, so no law at rest.
     """
 
@@ -103,7 +103,7 @@ class DriveDiagram:
     breakaway: float
     backdrive: float
     laws: tuple[str, ...]
-    reach: float
+    axis_limit: float
     without: tuple[str, ...] = ()
 
     def to_document(self) -> dict[str, Any]:

@@ -83,7 +83,7 @@ def draw_diagram(axes: Axes, diagram: DriveDiagram) -> None:
         axes: Axes to draw on.
         diagram: Diagram to draw.
     """
-    load_range, unit = diagram.reach, format_unit(diagram.unit)
+    load_range, unit = diagram.axis_limit, format_unit(diagram.unit)
     load = diagram.load
     forward, backward = (
         np.clip(boundary, -2 * load_range, 2 * load_range)

@@ -41,82 +41,82 @@ class MjcfFiles(NamedTuple):
     notes: tuple[str, ...]
 
 
-class _Class(NamedTuple):
+class _DefaultClass(NamedTuple):
     """Default class, notes on what it cannot express, and a model that uses it, if there is one."""
 
     text: str
-    said: Sequence[str]
+    notes: Sequence[str]
     model: str = ""
 
 
-def build_mjcf(facts: SheetContent, folder: Path) -> MjcfFiles:
+def build_mjcf(sheet: SheetContent, folder: Path) -> MjcfFiles:
     """Build the class and the models that use it.
 
     Args:
-        facts: Content of the data sheet.
+        sheet: Content of the data sheet.
         folder: Folder of the files; the path of the log is relative to it.
     """
     from sims.robot.mujoco_messages import capture_mujoco_warnings
 
     with capture_mujoco_warnings():
-        if facts.subject.kind.has_model:
-            return _build_robot_files(facts)
-        return _build_system_files(facts, folder)
+        if sheet.subject.kind.has_model:
+            return _build_robot_files(sheet)
+        return _build_system_files(sheet, folder)
 
 
-def _build_robot_files(facts: SheetContent) -> MjcfFiles:
+def _build_robot_files(sheet: SheetContent) -> MjcfFiles:
     """Build the MJCF default class of a joint of a robot, and the robot's model with this class.
 
     The class is for the joint and its first actuator. The model is omitted if the class cannot be
     used in it.
     """
-    kind: Any = facts.subject.kind
-    causes = collect_causes(facts.extended)
-    actuator = next(iter(facts.subject.actuators), None)
+    kind: Any = sheet.subject.kind
+    causes = collect_causes(sheet.extended)
+    actuator = next(iter(sheet.subject.actuators), None)
     rendered = _render_class(
-        kind.robot, causes, facts.subject.joint, actuator, make_class_name(facts.name), facts
+        kind.robot, causes, sheet.subject.joint, actuator, make_class_name(sheet.name), sheet
     )
-    files = {CLASS_FILE: _format_file(facts, [rendered])}
+    files = {CLASS_FILE: _format_file(sheet, [rendered])}
     if rendered.model:
         files["model.xml"] = rendered.model
-    return MjcfFiles(files, tuple(rendered.said))
+    return MjcfFiles(files, tuple(rendered.notes))
 
 
-def _build_system_files(facts: SheetContent, folder: Path) -> MjcfFiles:
+def _build_system_files(sheet: SheetContent, folder: Path) -> MjcfFiles:
     """Build a class, a model and a log description for each group of runs with equal constants."""
     from sims.robot.parsing.read_model_file import read_robot
 
-    classes: list[_Class] = []
+    classes: list[_DefaultClass] = []
     files: dict[str, str] = {}
-    for setting in group_runs_by_constants(facts):
-        model = _model_file(facts, setting)
+    for setting in group_runs_by_constants(sheet):
+        model = _model_file(sheet, setting)
         if model is None:
-            return MjcfFiles({}, (f"{facts.subject.kind.name} has no form in MJCF",))
-        name = make_class_name("_".join([facts.name, setting.name]) if setting.name else facts.name)
+            return MjcfFiles({}, (f"{sheet.subject.kind.name} has no form in MJCF",))
+        name = make_class_name("_".join([sheet.name, setting.name]) if setting.name else sheet.name)
         with tempfile.TemporaryDirectory() as place:
-            path = Path(place) / f"{facts.subject.kind.name}.xml"
+            path = Path(place) / f"{sheet.subject.kind.name}.xml"
             path.write_text(model.text)
             robot = read_robot(path)
-        causes, notes = _map_effects_to_model(facts, setting, model)
+        causes, notes = _map_effects_to_model(sheet, setting, model)
         rendered = _render_class(
-            robot, causes, model.joint, model.actuator, name, facts, (*model.said, *notes)
+            robot, causes, model.joint, model.actuator, name, sheet, (*model.notes, *notes)
         )
         classes.append(rendered)
         stem = f"model_{setting.name}" if setting.name else "model"
         if rendered.model:
             files[f"{stem}.xml"] = rendered.model
-            files |= _describe_log_for_model(facts, setting, model, stem, folder)
-    lines = dict.fromkeys(line for rendered in classes for line in rendered.said)
-    return MjcfFiles({CLASS_FILE: _format_file(facts, classes), **files}, tuple(lines))
+            files |= _describe_log_for_model(sheet, setting, model, stem, folder)
+    lines = dict.fromkeys(line for rendered in classes for line in rendered.notes)
+    return MjcfFiles({CLASS_FILE: _format_file(sheet, classes), **files}, tuple(lines))
 
 
-def _model_file(facts: SheetContent, setting: ConstantsGroup) -> RenderedModelFile | None:
+def _model_file(sheet: SheetContent, setting: ConstantsGroup) -> RenderedModelFile | None:
     """Render the system with the constants of one group of runs as an MJCF model.
 
     Return None if the constants give no valid model, or if the system has no form in MJCF.
     """
     try:
-        return facts.subject.kind.system.model_file(setting.numbers)
+        return sheet.subject.kind.system.model_file(setting.numbers)
     except ZeroDivisionError:
         # The file may contain a value that was edited by hand.
         return None
@@ -128,9 +128,9 @@ def _render_class(
     joint: str,
     actuator: str | None,
     name: str,
-    facts: SheetContent,
+    sheet: SheetContent,
     notes: Sequence[str] = (),
-) -> _Class:
+) -> _DefaultClass:
     """Write the fitted effects into a robot's model, and render its joint as a default class.
 
     Args:
@@ -139,23 +139,25 @@ def _render_class(
         joint: Joint of the class.
         actuator: Actuator of the class; None for an undriven joint.
         name: Name of the class.
-        facts: Content of the data sheet.
+        sheet: Content of the data sheet.
         notes: Notes for the comment of the class.
     """
     from sims.robot.export.apply_causes import apply_causes
     from sims.robot.export.default_class import render_default_class, render_model_using_class
     from sims.robot.export.xml_editing import NotEditableError
 
-    applied = apply_causes(robot, causes, facts.extended.title)
+    applied = apply_causes(robot, causes, sheet.extended.title)
     places = robot.joint(joint).id, robot.actuator(actuator).id if actuator else None
     class_notes = [*notes, *applied.notes]
     text = render_default_class(applied, *places, name, class_notes)
     try:
-        return _Class(
+        return _DefaultClass(
             text, class_notes, render_model_using_class(robot, applied, *places, name, text)
         )
     except NotEditableError as unfit:
-        return _Class(text, [*class_notes, f"no model that uses the class is written: {unfit}"])
+        return _DefaultClass(
+            text, [*class_notes, f"no model that uses the class is written: {unfit}"]
+        )
 
 
 def make_class_name(name: str) -> str:
@@ -164,10 +166,10 @@ def make_class_name(name: str) -> str:
     return valid_name or "drive"
 
 
-def _format_file(facts: SheetContent, classes: Sequence[_Class]) -> str:
+def _format_file(sheet: SheetContent, classes: Sequence[_DefaultClass]) -> str:
     """Format the classes as a file that MuJoCo loads and that others can include."""
-    title = facts.recording.title or facts.recording.path.stem
-    heading = f"{make_class_name(facts.name)}: data sheet from {title}; written by simgap datasheet"
+    title = sheet.recording.title or sheet.recording.path.stem
+    heading = f"{make_class_name(sheet.name)}: data sheet from {title}; written by simgap datasheet"
     escaped_heading = re.sub(r"-(?=-)", "- ", heading)
     inner = "\n".join(rendered.text for rendered in classes).replace("\n", "\n    ")
     return (
@@ -191,18 +193,18 @@ class ConstantsGroup:
     runs: tuple[Run, ...]
 
 
-def group_runs_by_constants(facts: SheetContent) -> list[ConstantsGroup]:
+def group_runs_by_constants(sheet: SheetContent) -> list[ConstantsGroup]:
     """Group the runs with equal constants, such as one load, in the order of the recording.
 
     An MJCF model has fixed numbers, so each group needs its own model.
     """
     by_constants: dict[tuple[tuple[str, float], ...], list[Run]] = {}
-    for run in facts.recording.runs:
+    for run in sheet.recording.runs:
         by_constants.setdefault(tuple(sorted(run.constants.items())), []).append(run)
-    defaults = {c.name: c.value for c in facts.subject.kind.constants}
-    defaults |= {p.name: p.nominal for p in facts.subject.kind.parameters}
-    fitted_values = {name: number.value for name, number in facts.extended.parameters.items()}
-    numbers = {**defaults, **facts.recording.constants, **facts.extended.constants, **fitted_values}
+    defaults = {c.name: c.value for c in sheet.subject.kind.constants}
+    defaults |= {p.name: p.nominal for p in sheet.subject.kind.parameters}
+    fitted_values = {name: number.value for name, number in sheet.extended.parameters.items()}
+    numbers = {**defaults, **sheet.recording.constants, **sheet.extended.constants, **fitted_values}
     return [
         ConstantsGroup(
             "_".join(f"{name}{value:g}" for name, value in constants) if by_constants else "",
@@ -214,7 +216,7 @@ def group_runs_by_constants(facts: SheetContent) -> list[ConstantsGroup]:
 
 
 def _map_effects_to_model(
-    facts: SheetContent, setting: ConstantsGroup, model: RenderedModelFile
+    sheet: SheetContent, setting: ConstantsGroup, model: RenderedModelFile
 ) -> tuple[dict[str, Mapping[str, FittedValue]], list[str]]:
     """Map the fitted effects of a system to the joint, actuator and channel of its MJCF model.
 
@@ -226,10 +228,10 @@ def _map_effects_to_model(
     places = {"joint": model.joint, "actuator": model.actuator, "channel": model.signals["q"]}
     causes: dict[str, Mapping[str, FittedValue]] = {}
     dry_friction, notes = 0.0, []
-    for name, numbers in facts.extended.effects.items():
+    for name, numbers in sheet.extended.effects.items():
         effect = library.get_effect(name)
         if issubclass(effect, Friction) and name not in MODEL_FIELD_EFFECTS:
-            mean_limit = _compute_mean_friction_limit(facts, setting, effect, numbers)
+            mean_limit = _compute_mean_friction_limit(sheet, setting, effect, numbers)
             dry_friction += mean_limit
             notes.append(
                 f"{name}: MuJoCo has no such law; frictionloss is its mean over these runs, "
@@ -239,7 +241,7 @@ def _map_effects_to_model(
         place = places.get(effect.at, "")
         zero_value = FittedValue(0.0, "1", None, None)
         coefficients = {
-            c.name: numbers.get(c.name, zero_value) for c in effect.on(facts.subject.kind.system)
+            c.name: numbers.get(c.name, zero_value) for c in effect.on(sheet.subject.kind.system)
         }
         causes[f"{name}@{place}" if place else name] = coefficients
     if dry_friction:
@@ -251,28 +253,28 @@ def _map_effects_to_model(
 
 
 def _compute_mean_friction_limit(
-    facts: SheetContent,
+    sheet: SheetContent,
     setting: ConstantsGroup,
     effect: type[Friction],
     numbers: Mapping[str, FittedValue],
 ) -> float:
     """Compute the mean limit of a friction law over the samples of some runs."""
     limits = [
-        _compute_friction_limits(facts, setting, run, effect, numbers) for run in setting.runs
+        _compute_friction_limits(sheet, setting, run, effect, numbers) for run in setting.runs
     ]
     values = np.concatenate(limits)
     return float(values[np.isfinite(values)].mean())
 
 
 def _compute_friction_limits(
-    facts: SheetContent,
+    sheet: SheetContent,
     setting: ConstantsGroup,
     run: Run,
     effect: type[Friction],
     numbers: Mapping[str, FittedValue],
 ) -> Array:
     """Compute the limit (T,) of a friction law at each sample of a run, as one batch."""
-    kind = facts.subject.kind
+    kind = sheet.subject.kind
     system = kind.system()
     (coordinate,) = system.coordinates
     position = run.channels[coordinate]
@@ -298,7 +300,7 @@ def _compute_friction_limits(
 
 
 def _describe_log_for_model(
-    facts: SheetContent, setting: ConstantsGroup, model: RenderedModelFile, stem: str, folder: Path
+    sheet: SheetContent, setting: ConstantsGroup, model: RenderedModelFile, stem: str, folder: Path
 ) -> Iterator[tuple[str, str]]:
     """Yield a description of the log for the model, in which its runs are marked held out.
 
@@ -306,14 +308,14 @@ def _describe_log_for_model(
     """
     import tomli_w
 
-    path = facts.recording.path
-    if path.suffix != ".csv" or any(run.log for run in facts.recording.runs):
+    path = sheet.recording.path
+    if path.suffix != ".csv" or any(run.log for run in sheet.recording.runs):
         return
     log_description = read_toml(get_description_path(path))
     file = relpath(path.resolve(), folder.resolve())
     document: dict[str, Any] = {
         "model": f"{stem}.xml",
-        "title": f"{facts.name} as {stem}.xml",
+        "title": f"{sheet.name} as {stem}.xml",
         "channels": {},
         "inputs": {},
         "runs": {

@@ -91,7 +91,7 @@ def _make_limit_keys(detection_limit: DetectionLimit) -> dict[str, Any]:
         row[
             {"": "resolved", "above": "none_above", "below": "none_below"}[detection_limit.limit]
         ] = detection_limit.size
-        if detection_limit.vague:
+        if detection_limit.is_unbounded:
             row["vague"] = True
         if detection_limit.is_nonzero_if_fitted:
             row["leans_to"] = detection_limit.estimate_if_fitted

@@ -71,7 +71,7 @@ class SheetSubject:
         """Names of the actuators that drive the joint."""
         return tuple(
             effect_place.name
-            for effect_place in self._get_spots().get("actuator", ())
+            for effect_place in self._get_places().get("actuator", ())
             if self._is_on_joint(effect_place)
         )
 
@@ -80,7 +80,7 @@ class SheetSubject:
         """Return whether the joint is prismatic, not rotary."""
         if not self.joint:
             return self.kind.system.kind != "rotary"
-        (joint,) = (s for s in self._get_spots()["joint"] if s.name == self.joint)
+        (joint,) = (s for s in self._get_places()["joint"] if s.name == self.joint)
         return bool(joint.kind == "slide")
 
     def is_driven(self, recording: Recording) -> bool:
@@ -140,7 +140,7 @@ class SheetSubject:
         """Return the value in the model file that an effect changes; None if there is none."""
         base, _, place = effect.partition("@")
         for kind in ("joint", "actuator"):
-            for effect_place in self._get_spots().get(kind, ()):
+            for effect_place in self._get_places().get(kind, ()):
                 if effect_place.name == place and base in effect_place.stated:
                     return self._get_file_value(base, effect_place)
         return None
@@ -160,12 +160,12 @@ class SheetSubject:
         value = abs(effect_place.stated[base])
         return ModelFileValue(value, unit.format(force=force, length=length), share)
 
-    def _get_spots(self) -> Mapping[str, Any]:
-        spots: Mapping[str, Any] = getattr(self.kind.system, "places", {})
-        return spots
+    def _get_places(self) -> Mapping[str, Any]:
+        places: Mapping[str, Any] = getattr(self.kind.system, "places", {})
+        return places
 
     def _is_on_joint(self, effect_place: Any) -> bool:
-        (joint,) = (s for s in self._get_spots()["joint"] if s.name == self.joint)
+        (joint,) = (s for s in self._get_places()["joint"] if s.name == self.joint)
         return bool(effect_place.coordinate == joint.coordinate)
 
 
@@ -183,8 +183,8 @@ def make_subject(kind: type[SystemSimulator], joint: str | None) -> SheetSubject
         if joint is not None:
             raise InputError(f"--joint: expected none, as {kind.name} is no robot; found {joint}")
         return SheetSubject(kind, "", frozenset())
-    spots: Mapping[str, Any] = vars(kind.system)["places"]
-    joints = [effect_place.name for effect_place in spots["joint"]]
+    places: Mapping[str, Any] = vars(kind.system)["places"]
+    joints = [effect_place.name for effect_place in places["joint"]]
     if joint is None and len(joints) > 1:
         raise InputError(f"robot {kind.name}: expected --joint, one of {', '.join(joints)}")
     joint = joints[0] if joint is None else joint

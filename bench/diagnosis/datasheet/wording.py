@@ -94,7 +94,7 @@ def format_detection_limit(row: SheetRow) -> str:
     if detection_limit is None or detection_limit.size == float("inf"):
         return "none: the data do not depend on it"
     size = format_number(detection_limit.size, 2)
-    if detection_limit.vague:
+    if detection_limit.is_unbounded:
         return append_unit(f"± {size}", row.unit) + ", larger than any plausible value"
     if detection_limit.limit:
         return append_unit(f"none {detection_limit.limit} {size}", row.unit)

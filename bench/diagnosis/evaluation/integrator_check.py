@@ -93,11 +93,11 @@ def find_step_refinements(evaluator: RunEvaluator, noise: NoiseModel) -> Iterato
     reference = motions.reference(model_settings)
     if reference is None:
         return
-    error = motions.apart(motions.of(model_settings), reference)
+    error = motions.compute_rms_difference(motions.of(model_settings), reference)
     if not error > MIN_DISCRETISATION_ERROR:
         return
     for numerics in _iterate_settings(model_settings):
-        corrected_error = motions.apart(motions.of(numerics), reference)
+        corrected_error = motions.compute_rms_difference(motions.of(numerics), reference)
         if corrected_error < max(
             MAX_CORRECTED_ERROR, min(MAX_CORRECTED_ERROR_FAR_FIT, error / MIN_ERROR_REDUCTION)
         ):
@@ -172,7 +172,7 @@ class _ReferenceMotions:
                 self.of(IntegratorSettings(model_settings.timestep / n, "RK4"))
                 for n in (parts, 2 * parts)
             )
-            if self.apart(coarse, refined) < CONVERGENCE_TOLERANCE:
+            if self.compute_rms_difference(coarse, refined) < CONVERGENCE_TOLERANCE:
                 return refined
         for parts in (2, 5):
             pairs = []
@@ -182,11 +182,11 @@ class _ReferenceMotions:
                     for k in (n, 2 * n)
                 )
                 pairs.append(2.0 * refined - coarse)  # (1)
-            if self.apart(*pairs) < CONVERGENCE_TOLERANCE:
+            if self.compute_rms_difference(*pairs) < CONVERGENCE_TOLERANCE:
                 return pairs[1]
         return None
 
-    def apart(self, first: Array, second: Array) -> float:
+    def compute_rms_difference(self, first: Array, second: Array) -> float:
         """Return the RMS difference in units of the noise; infinite if a simulation fails.
 
         Only available samples of the recording are compared.

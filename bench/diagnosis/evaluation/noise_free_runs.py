@@ -34,7 +34,7 @@ The remainder due to rounding to six digits is smaller.
 """
 
 
-def add_least_noise(recording: Recording, channels: Sequence[str]) -> tuple[Recording, list[str]]:
+def add_minimal_noise(recording: Recording, channels: Sequence[str]) -> tuple[Recording, list[str]]:
     """Add white noise to each channel without noise.
 
     Its standard deviation is the fraction `INTEGRATION_ERROR_SHARE` of the channel's range.

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from bench.diagnosis.evaluation.noise_model import Mask
 from bench.diagnosis.evaluation.run_data import RunData, prepare_run, take_first_samples
 from bench.diagnosis.evaluation.search_control import SearchControl
-from bench.diagnosis.evaluation.simulation_cache import LaneCache
+from bench.diagnosis.evaluation.simulation_cache import SimulationCache
 from bench.diagnosis.evaluation.time_scale import adapt_to_time_scale
 from bench.diagnosis.evaluation.worker_pool import ForkedWorkerPool
 from sims import effects as library
@@ -199,7 +199,7 @@ class RunEvaluator:
         self.state_prior: Array | None = None
         self.measured_states: dict[int, Mapping[int, Array]] = {}
         self.simulation_count = 0
-        self._cache = LaneCache()
+        self._cache = SimulationCache()
         self.search_control = SearchControl()
         self.worker_pool = ForkedWorkerPool()
         self._shortened_scenarios: dict[float, list[Scenario]] = {}

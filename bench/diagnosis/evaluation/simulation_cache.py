@@ -10,7 +10,7 @@ CACHE_BYTES = 64 << 20
 """Maximum memory for the cached results of one `World`, in bytes; the oldest are dropped first."""
 
 
-class LaneCache:
+class SimulationCache:
     """Observations (T, C) of batch elements, cached by their inputs, with a memory limit.
 
     A fit simulates a trial, accepts it, and then needs it again as the centre of finite

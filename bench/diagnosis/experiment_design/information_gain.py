@@ -114,9 +114,9 @@ class RunRanker:
         """Prepare the noise, the limits of the setup, and the covariances of the parameters.
 
         `known` has the covariance of the parameters of each model, as C in eq. (1). `pairs` has all
-        ordered pairs (true model, competing model). `most` is the total value above which a run
-        gains nothing more, and `patience` the maximum number of exact evaluations in a row. `free`
-        (s,) marks the initial states that have to be estimated.
+        ordered pairs (true model, competing model). `max_useful_gain` is the total value above
+        which a run gains nothing more, and `patience` the maximum number of exact evaluations in a
+        row. `free` (s,) marks the initial states that have to be estimated.
         """
         self.models, self.evaluator = models, models.evaluator
         self.known = [_compute_prior_covariance(models, model) for model in competing_models]
@@ -124,7 +124,9 @@ class RunRanker:
         self.limits = RigLimits(self.evaluator, competing_models[0])
         count = len(competing_models)
         self.pairs = list(permutations(range(count), 2))
-        self.most = MAX_USEFUL_DISCRIMINATION * len(self.pairs) / 2 if self.pairs else np.inf
+        self.max_useful_gain = (
+            MAX_USEFUL_DISCRIMINATION * len(self.pairs) / 2 if self.pairs else np.inf
+        )
         self.patience = FEWER if self.evaluator.kind.has_model else MANY
         self.free = ~self.evaluator.known_state_mask.all(axis=0)
 

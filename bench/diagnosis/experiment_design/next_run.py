@@ -117,7 +117,7 @@ def design_next_run(
         ranked_runs = _evaluate_fully(ranker, ranked_runs)
         if (
             not ranked_runs
-            or ranked_runs[0].value >= ranker.most
+            or ranked_runs[0].value >= ranker.max_useful_gain
             or models.evaluator.search_control.has_abandoned_fits()
         ):
             break
@@ -169,7 +169,7 @@ def _evaluate_fully(ranker: RunRanker, runs: Sequence[RunValue]) -> list[RunValu
             (k for k, entry in enumerate(ranked[:PLANS_VARIED_PER_ROUND]) if not entry.is_exact),
             None,
         )
-        if first is None or (ranked[0].is_exact and ranked[0].value >= ranker.most):
+        if first is None or (ranked[0].is_exact and ranked[0].value >= ranker.max_useful_gain):
             break
         ranked[first] = ranker.evaluate_exactly(ranked[first])
         ranked.sort(key=get_sort_key)

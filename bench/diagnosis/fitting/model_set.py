@@ -209,7 +209,7 @@ class ModelSet:
         starts: Sequence[FitStart],
         noise: NoiseModel | None = None,
         is_staged: bool = False,
-        race: bool = True,
+        is_racing: bool = True,
         iterations: int = MAX_ITERATIONS,
     ) -> None:
         """Fit models from their starts and store them.
@@ -219,7 +219,7 @@ class ModelSet:
             noise: noise that weights the samples; None for `self.noise`.
             is_staged: whether to fit the beginnings of the runs first, as in the base fit, and
                 continue with the best models.
-            race: whether to stop fits that fall far behind.
+            is_racing: whether to stop fits that fall far behind.
             iterations: maximum number of steps of each fit.
         """
         watch = self.evaluator.search_control
@@ -229,12 +229,12 @@ class ModelSet:
         if is_staged:
             starts = self._select_promising_starts(starts, noise)
         # Sums of squares with different weights are not comparable.
-        is_race = race and noise is self.noise
+        is_race = is_racing and noise is self.noise
         lowest_cost = self._find_lowest_cost(starts) if is_race else np.inf
         fitter = TrajectoryFitter(self.evaluator, noise, self.fixed_parameters)
         watch.begin_stage(_name_stage(starts), len(starts))
         for fit in fitter.fit_models(
-            starts, iterations, race=race, lowest_cost=lowest_cost, finished=watch.advance
+            starts, iterations, is_racing=is_racing, lowest_cost=lowest_cost, finished=watch.advance
         ):
             self.add_fit(fit)
         # A fit that was stopped early is stored, but not evaluated.
@@ -252,7 +252,7 @@ class ModelSet:
             starts: starts of the fits.
             iterations: maximum number of steps of each fit.
         """
-        self.refit_models(starts, race=False, iterations=iterations)
+        self.refit_models(starts, is_racing=False, iterations=iterations)
         return [self.models[frozenset(start.effects)] for start in starts]
 
     def fit_one(self, start: FitStart, iterations: int = MAX_ITERATIONS) -> FittedModel:

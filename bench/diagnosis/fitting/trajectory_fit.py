@@ -56,18 +56,19 @@ class RacingRound(NamedTuple):
     all: int
 
 
-def iterate_rounds(iterations: int, race: bool) -> Iterator[RacingRound]:
+def iterate_rounds(iterations: int, is_racing: bool) -> Iterator[RacingRound]:
     """Yield the rounds of a fit.
 
     Args:
         iterations: total number of iterations; with 0, one empty round is generated.
-        race: whether the fits race, and so exchange their best cost after each short round.
+        is_racing: whether the fits exchange their best cost after each short round, to stop those
+            that are far behind.
             Otherwise there is only one round.
     """
     first = 0
     while first < iterations or not first:
         end = iterations
-        if race:
+        if is_racing:
             end = min(
                 iterations,
                 first + ITERATIONS_PER_ROUND if first else MIN_ITERATIONS_BEFORE_ELIMINATION,
@@ -136,7 +137,7 @@ class TrajectoryFitter:
         self,
         starts: Sequence[FitStart],
         iterations: int = 12,
-        race: bool = False,
+        is_racing: bool = False,
         lowest_cost: float = np.inf,
         finished: Callable[[], None] = lambda: None,
     ) -> list[TrajectoryFit]:
@@ -145,7 +146,8 @@ class TrajectoryFitter:
         Args:
             starts: starts of the fits; one or more.
             iterations: maximum number of steps of each fit.
-            race: whether to stop fits that are far behind the best fit or behind `lowest_cost`.
+            is_racing: whether to stop fits that are far behind the best fit or behind
+                `lowest_cost`.
             lowest_cost: lowest cost of other models.
             finished: called once for each model whose fit has ended.
 
@@ -153,7 +155,7 @@ class TrajectoryFitter:
             The fits in the order of their starts.
         """
         problems = [self._create_fit_state(start) for start in starts]
-        for racing_round in iterate_rounds(iterations, race):
+        for racing_round in iterate_rounds(iterations, is_racing):
             # Unfinished fits continue in groups, which exchange nothing within a round.
             unfinished = [i for i, problem in enumerate(problems) if not problem.is_finished]
             if not unfinished or (
@@ -166,7 +168,7 @@ class TrajectoryFitter:
             best = min(lowest_cost, *(problem.point.cost for problem in problems))
             groups = self._group_fits(problems, unfinished)
             calls = [
-                (self._list_terms(), [problems[i] for i in g], racing_round, race, best)
+                (self._list_terms(), [problems[i] for i in g], racing_round, is_racing, best)
                 for g in groups
             ]
             for number, members in self.evaluator.worker_pool.map_unordered(
@@ -219,7 +221,7 @@ class TrajectoryFitter:
         self,
         problems: Sequence[FitState],
         racing_round: RacingRound,
-        race: bool,
+        is_racing: bool,
         lowest_cost: float,
     ) -> list[FitState]:
         """Advance fits by one racing round.
@@ -227,7 +229,8 @@ class TrajectoryFitter:
         Args:
             problems: states of the fits.
             racing_round: the steps to make.
-            race: whether to stop fits that are far behind the best fit or behind `lowest_cost`.
+            is_racing: whether to stop fits that are far behind the best fit or behind
+                `lowest_cost`.
             lowest_cost: lowest cost of other models, including those of other groups.
 
         Returns:
@@ -239,12 +242,12 @@ class TrajectoryFitter:
             self._simulate_starts(problems, sample_mask)
         for iteration in range(racing_round.first, racing_round.last):
             # In the first steps even the correct model may be far behind.
-            if race and iteration >= MIN_ITERATIONS_BEFORE_ELIMINATION:
+            if is_racing and iteration >= MIN_ITERATIONS_BEFORE_ELIMINATION:
                 eliminate_losing_fits(problems, lowest_cost)
             self._renew_derivatives(
                 problems,
                 sample_mask,
-                includes_waiting=not race or iteration >= MIN_ITERATIONS_BEFORE_ELIMINATION,
+                includes_waiting=not is_racing or iteration >= MIN_ITERATIONS_BEFORE_ELIMINATION,
             )
             trials = list(self._propose_trials(problems, sample_mask))
             if not trials and any(p.is_waiting and not p.is_finished for p in problems):
@@ -260,7 +263,7 @@ class TrajectoryFitter:
                 else self._simulate_points
             )
             for (problem, _), point in zip(trials, make_points(trials, sample_mask), strict=True):
-                self._judge_trial(problem, point)
+                self._accept_or_reject(problem, point)
         return list(problems)
 
     def _simulate_starts(self, problems: Sequence[FitState], sample_mask: Mask) -> None:
@@ -422,7 +425,7 @@ class TrajectoryFitter:
     ) -> list[FitPoint]:
         """Simulate trial points, and give each the derivatives of its fit's present point.
 
-        `_judge_trial` updates these derivatives if the point is accepted.
+        `_accept_or_reject` updates these derivatives if the point is accepted.
         """
         runs = len(self.evaluator.initial_state_guesses)
         simulated = self.evaluator.simulate(
@@ -594,7 +597,7 @@ class TrajectoryFitter:
             point.start, theta=theta, initial_states=point.start.initial_states + step.state_steps
         )
 
-    def _judge_trial(self, problem: FitState, point: FitPoint) -> None:
+    def _accept_or_reject(self, problem: FitState, point: FitPoint) -> None:
         """Accept a trial point if its cost is lower, else reject it, and update the damping.
 
         Derivatives are updated by Broyden's method if the trial was simulated without them.

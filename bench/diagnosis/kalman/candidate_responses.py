@@ -199,7 +199,7 @@ class FollowedRuns:
         self,
         theta: Array,
         simulator: RobotSimulator | None = None,
-        alike: FollowedRuns | None = None,
+        similar: FollowedRuns | None = None,
     ) -> FollowedRuns:
         """Return the filter of a model with other parameters.
 
@@ -209,16 +209,18 @@ class FollowedRuns:
         Args:
             theta: (P,) the parameters.
             simulator: simulator to use instead of that of the evaluator.
-            alike: filter of a similar model, whose Jacobians are reused.
+            similar: filter of a similar model, whose Jacobians are reused.
         """
-        is_alike = alike is not None or (simulator is None and self._has_jacobians_of(theta))
+        reuses_jacobians = similar is not None or (
+            simulator is None and self._has_jacobians_of(theta)
+        )
         linear = [
             _linearise_run(
                 *(self.evaluator, theta, self.noise, run, motion, neighbour, simulator),
-                is_alike=is_alike,
+                reuses_jacobians=reuses_jacobians,
             )
             for run, (motion, neighbour) in enumerate(
-                zip(self.trajectories, (alike or self).linear, strict=True)
+                zip(self.trajectories, (similar or self).linear, strict=True)
             )
         ]
         given = self.noise, linear, self.force, self.typical
@@ -255,7 +257,8 @@ class FollowedRuns:
         `linear` has the model of each run, linearised at its samples; other arguments are those of
         `_fit_noise`.
         """
-        # A model that diverges between two samples overflows; `is_sound` is then false.
+        # A model that diverges between two samples overflows; `has_expected_innovations` is then
+        # false.
         with np.errstate(all="ignore"):
             maps = [run_model.interval_maps() for run_model in linear]
             # An effect may have its own states.
@@ -344,7 +347,7 @@ class FollowedRuns:
         return mask
 
     @property
-    def lacks_force(self) -> bool:
+    def has_missing_force(self) -> bool:
         """True if the model lacks a force at any coordinate."""
         return bool(self.missing_forces.any())
 
@@ -369,7 +372,7 @@ class FollowedRuns:
             count = linear.knots.size
             states = self.smoothed.states[run, :count, :size]
             forces = self.smoothed.forces[run, : count - 1, : self.force.size]
-            trajectories.append(linear.moved(linear.propagated(states, forces)))
+            trajectories.append(linear.moved(linear.propagate_deviations(states, forces)))
         return trajectories
 
     def columns(self, probes: Sequence[CandidateDirection]) -> Columns:
@@ -492,7 +495,7 @@ class FollowedRuns:
         return result
 
     @property
-    def is_sound(self) -> bool:
+    def has_expected_innovations(self) -> bool:
         """True if the filter follows the runs: its innovations have the expected size."""
         with np.errstate(all="ignore"):
             size = float(np.square(self.filtered.whitened).sum()) / max(self.runs.recorded.sum(), 1)
@@ -627,7 +630,7 @@ def _linearise_run(
     trajectory: Trajectory | None,
     neighbour: MeasuredLinear | None,
     simulator: RobotSimulator | None = None,
-    is_alike: bool = True,
+    reuses_jacobians: bool = True,
 ) -> MeasuredLinear:
     """Linearise the model of one run about a motion.
 
@@ -640,7 +643,9 @@ def _linearise_run(
     if trajectory is None:
         states = estimate_measured_states(evaluator, noise.sigma, run)
         return MeasuredLinear(robot, theta, scenario, start, measured=states)
-    return MeasuredLinear(robot, theta, scenario, start, trajectory, None, neighbour, is_alike)
+    return MeasuredLinear(
+        robot, theta, scenario, start, trajectory, None, neighbour, reuses_jacobians
+    )
 
 
 def _compute_prior_deviations(

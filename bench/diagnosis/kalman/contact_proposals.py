@@ -60,7 +60,7 @@ def propose_contact_effects(search: EffectSearch, evaluators: Sequence[RunEvalua
             theta = base.theta.copy()
             theta[evaluator.coefficient_slices[name]] = c
             starts.append(FitStart((name,), theta, base.initial_states))
-    search.refit_models(starts, race=False)
+    search.refit_models(starts, is_racing=False)
     fits = [search.models[frozenset((name,))] for name in names]
     best = max([search.base_model, *fits], key=lambda model: model.penalised_log_likelihood)
     if not best.effects:
@@ -74,6 +74,6 @@ def propose_contact_effects(search: EffectSearch, evaluators: Sequence[RunEvalua
             FitStart(model.effects, model.fit.theta, evaluator.initial_state_guesses)
             for model in known
         ],
-        race=False,
+        is_racing=False,
     )
     search.fit_to_convergence(search.models[frozenset(best.effects)])

@@ -205,8 +205,8 @@ class _CubatureFilter:
             part = slice(first, first + LINEARISATION_BATCH_SIZE)
             own = states[part]
             n = len(own)
-            afloat = FloatingState(np.zeros((n, 0)), np.zeros((n, 0)))
-            mujoco_batch.set_initial_state(own[:, :joints], own[:, joints:], afloat)
+            floating_state = FloatingState(np.zeros((n, 0)), np.zeros((n, 0)))
+            mujoco_batch.set_initial_state(own[:, :joints], own[:, joints:], floating_state)
             pushed = np.repeat(self._given.forces[:, begin:end], n, axis=0)
             pushed[:, :, dofs] += forces[part, None]
             controls = np.repeat(self._given.controls[:, begin:end], n, axis=0)

@@ -75,10 +75,10 @@ def identify_base(
             followed, limits | further, MAX_BASE_ITERATIONS, follow
         )
         ends = [bound_of(float(tried.theta[i]), *bounds) for i, bounds in limits.items()]
-        if tried.is_sound and not any(ends):
+        if tried.has_expected_innovations and not any(ends):
             found.append(tried)
         # The base parameters alone leave no force missing, so friction is not needed.
-        if found and not tried.lacks_force:
+        if found and not tried.has_missing_force:
             break
     best = max(found, key=lambda one: one.log_likelihood, default=followed)
     if best.log_likelihood - followed.log_likelihood < MIN_BASE_GAIN:

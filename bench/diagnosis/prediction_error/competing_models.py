@@ -31,13 +31,13 @@ from bench.diagnosis.prediction_error.simulated_fits import (
     fit_filtered,
     is_explained,
     make_replacing_start,
-    select_higher_merit,
+    select_more_likely,
 )
 from sims.core.simulator import Array
 
 MAX_COMPETING_EFFECTS = 5
 """Maximum number of competing models of each effect that are fitted by simulation."""
-ALIKE_SHARE = 0.5
+MIN_SAME_JOINT_GAIN_SHARE = 0.5
 """Minimum gain of an effect at the same joint that is tried as a replacement.
 
 It is a share of the gain by regression of the effect that it replaces.
@@ -50,12 +50,12 @@ class _CompetingEffect(NamedTuple):
     Attributes:
         effect: its name.
         c: (k,) its coefficients from the regression.
-        behind: loss in twice the log-likelihood.
+        loss: loss in twice the log-likelihood.
     """
 
     effect: str
     c: Array
-    behind: float
+    loss: float
 
 
 def fit_single_in_place(context: SearchContext, best: FittedModel) -> FittedModel:
@@ -83,7 +83,7 @@ def fit_single_in_place(context: SearchContext, best: FittedModel) -> FittedMode
     loss = filters.get_filter(best).log_likelihood - single_sets[0].followed.log_likelihood
     if 2.0 * loss > penalty + COMPETING_MODEL_MARGIN:
         return best
-    return select_higher_merit(
+    return select_more_likely(
         fit_competing_models(context, fit_filtered(context, single_sets[0])), best
     )
 
@@ -111,7 +111,7 @@ def fit_competing_models(context: SearchContext, best: FittedModel) -> FittedMod
             confirmed = _confirm_by_filter(context, best, competing_effect, start)
             starts += [confirmed] if confirmed is not None else []
     if starts:
-        search.refit_models(starts, race=False)
+        search.refit_models(starts, is_racing=False)
     size = len(best.effects)
     if size == 1 and context.filters.base.runs.jumps.any():
         # Fits at force limits may stop in local minima.
@@ -141,20 +141,20 @@ def _find_competing_effects(
     competing_effects, near_count = dict[str, _CompetingEffect](), 0
     for i in np.argsort(-gains, kind="stable").tolist():
         group = remaining.groups[i]
-        effect, behind = group.effect, own_gain - float(gains[i])
+        effect, loss = group.effect, own_gain - float(gains[i])
         if effect not in evaluator.library or effect in (*model.effects, *competing_effects):
             continue
         is_near = (
-            behind <= COMPETING_MODEL_MARGIN + LINEARISATION_ERROR * own_gain
+            loss <= COMPETING_MODEL_MARGIN + LINEARISATION_ERROR * own_gain
             and near_count < MAX_COMPETING_EFFECTS
         )
         # Regression is inaccurate for a large effect, so effects at the same joint are tried.
-        is_alike = effect in same_joint and gains[i] > ALIKE_SHARE * own_gain
+        is_promising = effect in same_joint and gains[i] > MIN_SAME_JOINT_GAIN_SHARE * own_gain
         # A law that contains this one never replaces it.
-        if (is_near or is_alike) and name not in evaluator.available_effects[effect].contains:
+        if (is_near or is_promising) and name not in evaluator.available_effects[effect].contains:
             near_count += is_near
             c = context.columns.coefficients(group, remaining.solve([group])[1][0])
-            competing_effects[effect] = _CompetingEffect(effect, c, behind)
+            competing_effects[effect] = _CompetingEffect(effect, c, loss)
     return list(competing_effects.values())
 
 
@@ -165,7 +165,7 @@ def _confirm_by_filter(
 
     A filter is used only if the competing model is far behind by the regression, which is linear.
     """
-    if competing_effect.behind <= COMPETING_MODEL_MARGIN:
+    if competing_effect.loss <= COMPETING_MODEL_MARGIN:
         return start
     filters = context.filters
     has_few_coefficients = (
@@ -200,7 +200,7 @@ def _fit_at_coupled_joints(context: SearchContext, size: int) -> None:
                 if other not in model.effects and key not in search.models:
                     starts[key] = start
     if starts:
-        search.refit_models(list(starts.values()), race=False)
+        search.refit_models(list(starts.values()), is_racing=False)
 
 
 def _refine_near(context: SearchContext, size: int) -> None:

@@ -32,7 +32,7 @@ from bench.diagnosis.prediction_error.simulated_fits import (
     fit_filtered,
     is_explained,
     remove_idle_effects,
-    select_higher_merit,
+    select_more_likely,
 )
 
 MAX_STEPS = 4
@@ -96,7 +96,7 @@ def select_in_model(context: SearchContext, friction: FitStart | None = None) ->
     Raises:
         SoftFrictionError: dry friction is likelier in MuJoCo's soft form.
     """
-    watch, filters, base = (
+    search_control, filters, base = (
         context.evaluator.search_control,
         context.filters,
         context.search.base_model,
@@ -110,15 +110,19 @@ def select_in_model(context: SearchContext, friction: FitStart | None = None) ->
         return base
     best = base if larger_sets else fit_filtered(context, current)
     for trial in _select_nearly_as_likely(context, larger_sets):
-        best = select_higher_merit(best, fit_filtered(context, trial))
-        if watch.has_abandoned_fits():
+        best = select_more_likely(best, fit_filtered(context, trial))
+        if search_control.has_abandoned_fits():
             break
-    if friction is None and not is_explained(context, best) and not watch.has_abandoned_fits():
+    if (
+        friction is None
+        and not is_explained(context, best)
+        and not search_control.has_abandoned_fits()
+    ):
         check_filter(context, larger_sets[0].followed.log_likelihood)
-        best = select_higher_merit(best, _fit_all_servos(context))
+        best = select_more_likely(best, _fit_all_servos(context))
     # Two effects together may explain what neither explains alone.
-    if larger_sets and not is_explained(context, best) and not watch.has_abandoned_fits():
-        best = select_higher_merit(best, fit_filtered(context, _grow_set(context, larger_sets[0])))
+    if larger_sets and not is_explained(context, best) and not search_control.has_abandoned_fits():
+        best = select_more_likely(best, fit_filtered(context, _grow_set(context, larger_sets[0])))
     if not np.isfinite(best.fit.cost) or not best.effects:
         return base
     if not is_explained(context, best):
@@ -132,7 +136,9 @@ def _grow_set(context: SearchContext, current: FilteredSet) -> FilteredSet:
     It stops if no effect is worth its penalty, or if the filter lacks no force any more.
     """
     for _ in range(MAX_STEPS - 1):
-        larger = _list_larger_that_pay(context, current) if current.followed.lacks_force else []
+        larger = (
+            _list_larger_that_pay(context, current) if current.followed.has_missing_force else []
+        )
         if not larger:
             break
         current = larger[0]
@@ -165,13 +171,15 @@ def try_one_more_effect(context: SearchContext, current: FilteredSet) -> list[Fi
     Returns:
         The larger sets, the likeliest first; empty if no effect gains.
     """
-    watch, filters = context.evaluator.search_control, context.filters
-    watch.begin_stage("testing the effects of the model one by one", MAX_REGRESSION_PROPOSALS)
+    search_control, filters = context.evaluator.search_control, context.filters
+    search_control.begin_stage(
+        "testing the effects of the model one by one", MAX_REGRESSION_PROPOSALS
+    )
     larger_sets = []
     for start in context.proposals.of(current):
         larger_sets.append(filters.follow_with_effects(start.theta, start.effects, 0))
-        watch.advance()
-        watch.check_not_stopped()
+        search_control.advance()
+        search_control.check_not_stopped()
     larger_sets.sort(key=lambda one: _compute_criterion(context, one))
     # The coefficients of the best are improved before they are compared.
     compared = list[FilteredSet]()
@@ -186,9 +194,11 @@ def try_one_more_effect(context: SearchContext, current: FilteredSet) -> list[Fi
 
 def _is_settled(context: SearchContext, best: FilteredSet, other: FilteredSet) -> bool:
     """Return whether a set explains the runs, and another one is far worse."""
-    behind = _compute_criterion(context, other) - _compute_criterion(context, best)
+    loss = _compute_criterion(context, other) - _compute_criterion(context, best)
     gain = context.filters.compute_gain(best.followed)
-    return behind > COMPETING_MODEL_MARGIN + SETTLED_SHARE * gain and not best.followed.lacks_force
+    return (
+        loss > COMPETING_MODEL_MARGIN + SETTLED_SHARE * gain and not best.followed.has_missing_force
+    )
 
 
 def _select_nearly_as_likely(

@@ -72,7 +72,7 @@ MAX_RESIDUAL_SHARE = 0.4
 """Maximum residual of a hypothesis over all intervals, as a share of the force."""
 MAX_STRETCH_SHARE = 0.6
 """Maximum residual of a hypothesis in a single interval, as a share of the force."""
-MAX_STILL_SPEED = 0.1
+MAX_REST_SPEED = 0.1
 """Maximum velocity of a joint that is held, as a share of its usual velocity."""
 MAX_STRETCHES = 3
 """Maximum number of inactive intervals in a run."""
@@ -355,7 +355,7 @@ class _Intervals:
                     self._compute_residual_magnitudes(self.state, own)
                 ) <= MAX_STRETCH_SHARE * sum(self._compute_residual_magnitudes(ON, own))
                 standing[first:end] = better and (
-                    self.state == OFF or self._is_still(run, own[run], (first, end), fast)
+                    self.state == OFF or self._is_at_rest(run, own[run], (first, end), fast)
                 )
             result.append(standing)
         return result
@@ -373,12 +373,14 @@ class _Intervals:
             for of_runs in self._residuals
         ]
 
-    def _is_still(self, run: int, mask: Mask, ends: tuple[int, int], fast: Sequence[float]) -> bool:
+    def _is_at_rest(
+        self, run: int, mask: Mask, ends: tuple[int, int], fast: Sequence[float]
+    ) -> bool:
         """Return whether all joints are at rest in an interval at an end of the run."""
         velocity = self._forces[run].velocity
         at_end = ends[0] <= EDGE_SAMPLES or ends[1] >= mask.size - EDGE_SAMPLES
         still = [
-            _compute_magnitude(velocity[mask, j]) <= MAX_STILL_SPEED * f
+            _compute_magnitude(velocity[mask, j]) <= MAX_REST_SPEED * f
             for j, f in zip(self._joints, fast, strict=True)
         ]
         return at_end and all(still)

@@ -138,7 +138,7 @@ def identify_incomplete(context: SearchContext) -> IdentifiedSet | None:
         current, gains = _prune_set(context, larger)
         if larger.names[-1] not in current.names:
             break
-    if not current.names or not current.followed.lacks_force:
+    if not current.names or not current.followed.has_missing_force:
         return None
     return IdentifiedSet(_simulate_set(context, current), gains)
 
@@ -152,7 +152,7 @@ def is_long(evaluator: RunEvaluator) -> bool:
 def _is_negligible(context: SearchContext, current: FilteredSet) -> bool:
     """Return whether a set leaves a negligible share of the base model's missing forces."""
     share = NEGLIGIBLE_FORCE_SHARE * context.filters.base.force
-    return not current.followed.lacks_force or bool((current.followed.force < share).all())
+    return not current.followed.has_missing_force or bool((current.followed.force < share).all())
 
 
 def _get_bounds(context: SearchContext, names: Sequence[str]) -> dict[int, Bounds]:

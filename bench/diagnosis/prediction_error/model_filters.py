@@ -123,7 +123,7 @@ class ModelFilters:
             same_effects = self._of_sets.get(names)
             followed = (same_effects or self.base).with_parameters(model.fit.theta)
             if same_effects is None:
-                followed = followed.with_parameters(model.fit.theta, alike=followed)
+                followed = followed.with_parameters(model.fit.theta, similar=followed)
             self._of_sets[names] = followed
             if self.numerics:
                 defects = followed.runs.defects - self.numerics * followed.runs.step_errors

@@ -66,7 +66,7 @@ from bench.diagnosis.prediction_error.simulated_fits import (
     is_explained,
     is_nearly_explained,
     remove_idle_effects,
-    select_higher_merit,
+    select_more_likely,
 )
 from bench.diagnosis.search.candidate_directions import DirectionSet
 from bench.diagnosis.search.effect_search import EffectSearch
@@ -130,17 +130,17 @@ class PredictionErrorSearch(EffectSearch):
         friction = fit_dry_friction(context, selected)
         best = friction
         if not is_explained(context, best):
-            best = select_higher_merit(best, fit_quick_selection(context, selected))
+            best = select_more_likely(best, fit_quick_selection(context, selected))
         if self._should_continue(best):
             best = self._add_missing_effects(best, selected, friction)
         if not is_explained(context, best):
             selected = select_with_shapes(context, selected)
-            best = select_higher_merit(best, fit_quick_selection(context, selected))
+            best = select_more_likely(best, fit_quick_selection(context, selected))
         if (
             not is_explained(context, best)
             and not self.evaluator.search_control.has_abandoned_fits()
         ):
-            best = select_higher_merit(best, fit_series_effects(context, selected))
+            best = select_more_likely(best, fit_series_effects(context, selected))
         if not best.effects:
             best = fit_selection(context, selected)
         return fit_single_in_place(context, best)
@@ -151,7 +151,7 @@ class PredictionErrorSearch(EffectSearch):
         This is the case if a force is missing, the best model does not explain the runs, and there
         is time left.
         """
-        lacks = self._search_context.filters.base.lacks_force
+        lacks = self._search_context.filters.base.has_missing_force
         return (
             lacks
             and not is_explained(self._search_context, best)
@@ -173,12 +173,12 @@ class PredictionErrorSearch(EffectSearch):
         if is_nearly_explained(context, best):
             check_fit(context, best)
             if len(best.effects) > 1:
-                return select_higher_merit(best, add_to_model(context, best))
-        best = select_higher_merit(best, fit_single_effects(context))
+                return select_more_likely(best, add_to_model(context, best))
+        best = select_more_likely(best, fit_single_effects(context))
         if self._should_continue(best):
-            best = select_higher_merit(best, add_to_dry_friction(context, selected, friction))
+            best = select_more_likely(best, add_to_dry_friction(context, selected, friction))
         if self._should_continue(best):
-            best = select_higher_merit(best, select_in_model(context))
+            best = select_more_likely(best, select_in_model(context))
         return best
 
     def fit_competing_models(self, best: FittedModel) -> FittedModel:
@@ -279,7 +279,7 @@ class PredictionErrorSearch(EffectSearch):
         followed = self._search_context.filters.get_similar_filter(model)
         return (
             replace(start, state_jacobian=followed.compute_state_sensitivities())
-            if followed.is_sound
+            if followed.has_expected_innovations
             else start
         )
 

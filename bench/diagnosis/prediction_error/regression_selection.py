@@ -218,15 +218,15 @@ class Regression:
         held = [group.effect for group in chosen]
         return held + [name for own in held for name in self.contains.get(own, ())]
 
-    def select(self, most: int, begin: Sequence[DirectionGroup] = ()) -> list[DirectionGroup]:
+    def select(self, max_groups: int, begin: Sequence[DirectionGroup] = ()) -> list[DirectionGroup]:
         """Select effects by forward and backward steps with (2).
 
         Args:
-            most: maximum number of effects.
+            max_groups: maximum number of effects.
             begin: initial set.
         """
         chosen = list(begin)
-        while len(chosen) < most:
+        while len(chosen) < max_groups:
             gains = self.compute_net_gains(chosen)
             best = int(np.argmax(gains))
             if gains[best] <= 0.0:
@@ -335,19 +335,19 @@ def compute_p_value_of_gain(gain: float, coefficients: int, candidates: int) -> 
 
 
 def score_by_regression(
-    regression: Regression, lacking: Collection[str], rng: np.random.Generator
+    regression: Regression, names: Collection[str], rng: np.random.Generator
 ) -> CandidateScores:
     """Score effects by a regression.
 
     Args:
         regression: regression about the model that lacks the effects.
-        lacking: names of the effects to score.
+        names: names of the effects to score.
         rng: random numbers for draws from the null distribution.
     """
     gains = regression.gains([])
     by_effect: dict[str, list[int]] = {}
     for i, group in enumerate(regression.groups):
-        if group.effect in lacking:
+        if group.effect in names:
             by_effect.setdefault(group.effect, []).append(i)
     names = list(by_effect)
     score = np.array([max(gains[i] for i in by_effect[name]) for name in names])

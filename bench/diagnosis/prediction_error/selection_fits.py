@@ -36,8 +36,8 @@ from bench.diagnosis.prediction_error.simulated_fits import (
     is_nearly_explained,
     list_nearby_starts,
     remove_idle_effects,
-    select_higher_merit,
     select_lowest_of_each,
+    select_more_likely,
 )
 from bench.diagnosis.search.verdict_rules import INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
 from sims.core.effect import members_of
@@ -76,7 +76,7 @@ def fit_quick_selection(context: SearchContext, selected: Selected) -> FittedMod
     """
     paying = drop_surplus_effects(context, selected)
     is_slow = len(paying.groups) > MAX_SLOW_EFFECTS and _is_slow(context, paying.effects)
-    if is_slow and selected.followed.lacks_force:
+    if is_slow and selected.followed.has_missing_force:
         return context.search.base_model
     return fit_selection(context, paying)
 
@@ -99,7 +99,7 @@ def fit_selection(context: SearchContext, selected: Selected) -> FittedModel:
     fitted = remove_idle_effects(context, fitted)
     if selected.shows_steps:
         fitted = context.search.correct_step_errors(fitted)
-    return select_higher_merit(fitted, base)
+    return select_more_likely(fitted, base)
 
 
 def drop_surplus_effects(context: SearchContext, selected: Selected) -> Selected:
@@ -193,7 +193,7 @@ def check_selection(context: SearchContext, selected: Selected) -> None:
         SoftFrictionError: soft friction is likelier than the selection.
     """
     filters = context.filters
-    if filters.is_soft or not filters.base.lacks_force:
+    if filters.is_soft or not filters.base.has_missing_force:
         return
     friction = make_dry_friction_start(context, selected)
     # Stiff friction that explains the runs needs no comparison.
@@ -309,7 +309,7 @@ def fit_dry_friction(context: SearchContext, selected: Selected) -> FittedModel:
         missing.
     """
     friction = make_dry_friction_start(context, selected)
-    if not friction.effects or not selected.followed.lacks_force:
+    if not friction.effects or not selected.followed.has_missing_force:
         return context.search.base_model
     fitted_before = context.search.models.get(frozenset(friction.effects))
     if fitted_before is not None and is_explained(context, fitted_before):
@@ -399,7 +399,7 @@ def fit_single_effects(context: SearchContext) -> FittedModel:
             fitted += search.fit_all([replace(start, initial_states=states) for start in group])
             best = max(fitted, key=lambda model: model.penalised_log_likelihood)
     if not is_explained(context, best):
-        best = select_higher_merit(best, refine_single_effects(context, fitted))
+        best = select_more_likely(best, refine_single_effects(context, fitted))
     if is_explained(context, best):
         return remove_idle_effects(context, best)
     check_filter(context, filters.get_filter(best).log_likelihood)
@@ -428,7 +428,7 @@ def refine_single_effects(context: SearchContext, fitted: Sequence[FittedModel])
         refined = fit(context, start)
         if not is_at_noise(context, refined) and is_nearly_explained(context, refined):
             refined = fit_nearby(context, refined, refined.effects[0])
-        best = select_higher_merit(best, refined)
+        best = select_more_likely(best, refined)
         if is_explained(context, best) or context.evaluator.search_control.has_abandoned_fits():
             break
     return best

@@ -169,7 +169,7 @@ def is_nearly_explained(context: SearchContext, model: FittedModel) -> bool:
     return excess(model) < NEARLY_EXPLAINED_SHARE * excess(context.search.base_model)
 
 
-def select_higher_merit(one: FittedModel, other: FittedModel) -> FittedModel:
+def select_more_likely(one: FittedModel, other: FittedModel) -> FittedModel:
     """Return the model with the higher merit; the first one if they are equal."""
     return max(one, other, key=lambda model: model.penalised_log_likelihood)
 

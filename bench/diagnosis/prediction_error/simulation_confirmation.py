@@ -50,16 +50,16 @@ class Confirmation(Inquiry):
         Raises:
             SearchStoppedError: the search had to end early.
         """
-        search, watch = self._robot, self._watch
+        search, search_control = self._robot, self._search_control
         unfit = self.classify_unfit_base()
         if unfit is not None:
             return unfit
         base = search.base_model
-        watch.begin_question("search")
+        search_control.begin_question("search")
         self._model = search.run()
         if search.identified is not None:
             return self._build_filter_result(search.identified)
-        watch.begin_question("rivals")
+        search_control.begin_question("rivals")
         self._model = search.fit_competing_models(self._model)
         size = len(self._model.effects)
         self._evaluate_on_held_out_runs()
@@ -68,14 +68,14 @@ class Confirmation(Inquiry):
             # ones, so fit them again.
             self._model = search.fit_competing_models(self._model)
             self._evaluate_on_held_out_runs()
-        watch.begin_question("structure")
+        search_control.begin_question("structure")
         self._model = search.fit_to_convergence(self._model)
         lack_of_fit = assess_lack_of_fit(search, self._model)
-        watch.begin_question("alternatives")
+        search_control.begin_question("alternatives")
         causes = _RobotAlternatives(
             search, self._trial, lack_of_fit.has_structure
         ).collect_evidence(self._model)
-        watch.check_not_stopped()
+        search_control.check_not_stopped()
         model, trial = self._model, self._trial
         state = DiagnosisState(
             causes=len(causes),
@@ -94,14 +94,19 @@ class Confirmation(Inquiry):
 
     def _build_filter_result(self, identified: IdentifiedSet) -> DiagnosisResult:
         """Return the result for a set that filters identified in a model that stays incomplete."""
-        search, watch, model, trial = self._robot, self._watch, identified.model, None
+        search, search_control, model, trial = (
+            self._robot,
+            self._search_control,
+            identified.model,
+            None,
+        )
         if self._held_out is not None:
-            watch.begin_question("held_out")
+            search_control.begin_question("held_out")
             trial = self._trial = HeldOutValidation(self._held_out)
             trial.evaluate_models([search.base_model, model])
-        watch.begin_question("structure")
+        search_control.begin_question("structure")
         lack_of_fit = assess_lack_of_fit(search, model)
-        watch.check_not_stopped()
+        search_control.check_not_stopped()
         state = DiagnosisState(
             causes=len(model.effects),
             closed=compute_gap_closed(search, model, lack_of_fit),
@@ -127,7 +132,7 @@ class Confirmation(Inquiry):
         if self._held_out is None or self._model is None:
             return
         search, model = self._robot, self._model
-        self._watch.begin_question("held_out")
+        self._search_control.begin_question("held_out")
         names = set(model.effects)
         if len(names) > 1:
             for name in model.effects:
@@ -144,7 +149,7 @@ class Confirmation(Inquiry):
         ]
         trial = HeldOutValidation(self._held_out)
         trial.evaluate_models([search.base_model, model, *smaller_models, *competing_models])
-        self._watch.check_not_stopped()
+        self._search_control.check_not_stopped()
         self._trial = trial
         self._model = trial.drop_unhelpful_effects(search, model)
 

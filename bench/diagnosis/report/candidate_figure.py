@@ -214,7 +214,7 @@ def _draw_scores(
     for row, candidate in enumerate(candidates):
         size = max(candidate.score, 0.0)
         bar_style = dict(_BARS[get_candidate_status(report, candidate.effect)])
-        if _is_chance(report, candidate):
+        if _is_insignificant(report, candidate):
             bar_style["facecolor"] = "white"
         axis.barh(row, size, height=thickness, edgecolor=NEUTRAL_MARK, linewidth=0.6, **bar_style)
         other_scores = [max(member.score, 0.0) for member in other_places.get(candidate.effect, ())]
@@ -245,7 +245,7 @@ def _draw_scores(
     axis.set_title("Evidence on the fitted runs", fontsize=9.5, loc="left")
 
 
-def _is_chance(report: DiagnosisReportData, candidate: Candidate) -> bool:
+def _is_insignificant(report: DiagnosisReportData, candidate: Candidate) -> bool:
     """Return whether the score of a candidate that is not a cause is insignificant."""
     return (
         candidate.p_value > SIGNIFICANCE_LEVEL
@@ -268,7 +268,7 @@ def _format_notes(report: DiagnosisReportData, candidates: Sequence[Candidate]) 
     notes = [f"{counts}."]
     p_value_note = "p: p-value of the score"
     certain_p_values = [c.p_value for c in candidates if c.p_value <= MAX_UNPRINTED_P_VALUE]
-    chance_p_values = [c.p_value for c in candidates if _is_chance(report, c)]
+    chance_p_values = [c.p_value for c in candidates if _is_insignificant(report, c)]
     if certain_p_values:
         bars = (
             "for all shown"

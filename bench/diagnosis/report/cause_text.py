@@ -98,7 +98,7 @@ def _format_effect_group(group: Sequence[str], conjunction: str) -> str:
     )
 
 
-def format_lacking(causes: Sequence[Cause]) -> str:
+def format_missing_causes(causes: Sequence[Cause]) -> str:
     """Format what a simulation lacks and has wrong; causes with alternatives come last.
 
     For example ``lacks wind, and linear drag or Coulomb friction``.

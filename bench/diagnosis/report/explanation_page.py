@@ -154,7 +154,7 @@ def render_report(
         closed_interval=format_interval(held_out) if held_out else "",
         bars=list(_make_bars(report)),
         motion=motion,
-        stills={name: _make_still(report, rendered_figures, name) for name in _FIGURES},
+        stills={name: _make_printed_figure(report, rendered_figures, name) for name in _FIGURES},
         joint_positions=rendered_figures["robot"].joint_positions
         if "robot" in rendered_figures
         else (),
@@ -258,7 +258,7 @@ def _make_bars(report: DiagnosisReportData) -> Iterator[Bar]:
 _FIGURES = ("robot", "overview", "where", "candidates")
 
 
-def _make_still(
+def _make_printed_figure(
     report: DiagnosisReportData, rendered_figures: Mapping[str, RenderedFigure], name: str
 ) -> PrintedFigure | None:
     """Return a figure of the page with its text alternative; None if it was not drawn.

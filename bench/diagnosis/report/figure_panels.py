@@ -11,9 +11,9 @@ from bench.diagnosis.report.report_data import DiagnosisReportData, GapLocation,
 from bench.diagnosis.report.wording import format_label, sanitise
 from bench.figures.style import (
     BLUE,
-    CHANCE_LEVEL_GREY,
     CONNECTOR_GREY,
     NEUTRAL_MARK,
+    NULL_LEVEL_GREY,
     VERMILION,
     ZERO_LINE_GREY,
 )
@@ -118,7 +118,7 @@ def draw_gap_location_panel(
         rows,
         xerr=noise,
         fmt="none",
-        ecolor=CHANCE_LEVEL_GREY,
+        ecolor=NULL_LEVEL_GREY,
         elinewidth=7,
         label=_WHITE_NOISE,
     )

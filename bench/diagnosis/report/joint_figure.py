@@ -51,7 +51,7 @@ others.
 """
 _HEIGHTS = {1: 2.6, 2: 1.9, 3: 1.5, 4: 1.25, 5: 1.1}
 """Height of a row in inches, by the number of rows."""
-_LEAST_HEIGHT = 1.0
+_MIN_ROW_HEIGHT = 1.0
 NAMED_JOINT_MARKER = "▸"
 """Marker before the name of a diagnosed joint, visible in print without colour too."""
 LONGEST_NAME = 64
@@ -60,7 +60,7 @@ _NAME_LINE = 18
 """Maximum number of characters per line of the name of a joint or sensor."""
 _NAME_SIZE = 9.5
 """Font size of the names of joints and sensors, in points."""
-_BESIDE_NAME = 0.85
+_NAME_MARGIN = 0.85
 """Space between names and panels in inches, for ticks and units."""
 _HEAD, _FOOT = 0.75, 0.95
 """Space above and below the rows, in inches."""
@@ -123,10 +123,10 @@ def draw_joint_figure(report: DiagnosisReportData, view: RunView) -> Figure:
     """
     rows = _select_worst_rows(report, view)
     quantities = _list_quantities(report) or ["q"]
-    height = _HEIGHTS.get(len(rows), _LEAST_HEIGHT)
+    height = _HEIGHTS.get(len(rows), _MIN_ROW_HEIGHT)
     named_joints = {mark.name for mark in list_place_marks(report)} | _list_marked_joints(report)
     names = [_format_row_name(row, row.name in named_joints) for row in rows]
-    names_width = max(1.95, 0.12 + measure_text_width(names, _NAME_SIZE, "bold") + _BESIDE_NAME)
+    names_width = max(1.95, 0.12 + measure_text_width(names, _NAME_SIZE, "bold") + _NAME_MARGIN)
     width = names_width + 5.15 + 2.6 * len(quantities)
     size = (width, _HEAD + _FOOT + height * len(rows))
     ratios = (4.2, *[3.0] * len(quantities))

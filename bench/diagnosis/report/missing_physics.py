@@ -24,11 +24,11 @@ LAW_PREFIXES: Mapping[str, tuple[str, ...]] = {
 """Prefixes of parameter names by law; the first law with a matching prefix applies."""
 _WARMS = "friction that changes with time, as surfaces warm or wear,"
 _LOAD = "friction that depends on the load (friction.load)"
-_WAY = "friction that differs by direction (friction.direction)"
+_DIRECTION = "friction that differs by direction (friction.direction)"
 _PLACE = "friction that depends on position"
 _FASTER = "friction that grows faster than the speed (drag.quadratic)"
-_RUBS: Mapping[CovariateKind, str] = {
-    "time": _WARMS, "load": _LOAD, "command": _LOAD, "direction": _WAY, "position": _PLACE,
+_FRICTION_BY_COVARIATE: Mapping[CovariateKind, str] = {
+    "time": _WARMS, "load": _LOAD, "command": _LOAD, "direction": _DIRECTION, "position": _PLACE,
 }  # fmt: skip
 LAW_NAMES: Mapping[str, str] = {
     "viscous": "friction", "dry": "friction", "resistance": "a resistance",
@@ -40,7 +40,7 @@ MISSING_PHYSICS_NAMES: Mapping[tuple[str, CovariateKind], str | tuple[str, str]]
     **{
         (law, kind): text
         for law in ("viscous", "dry", "resistance")
-        for kind, text in _RUBS.items()
+        for kind, text in _FRICTION_BY_COVARIATE.items()
     },
     ("viscous", "speed"): (_FASTER, "friction that does not grow with speed (friction.coulomb)"),
     ("viscous", "amplitude"): (
@@ -55,7 +55,7 @@ MISSING_PHYSICS_NAMES: Mapping[tuple[str, CovariateKind], str | tuple[str, str]]
     ("delay", "command"): ("a limit of the rate (input.rate)", "play (backlash)"),
     ("delay", "amplitude"): ("a limit of the rate (input.rate)", "play (backlash)"),
     ("delay", "time"): "clocks that drift apart (clock.skew)",
-    ("push", "direction"): _WAY,
+    ("push", "direction"): _DIRECTION,
     ("push", "load"): "a weight (gravity.scale)",
     ("push", "position"): "a force that depends on position (spring.linear)",
     ("push", "time"): "a force that drifts",

@@ -14,7 +14,7 @@ from bench.diagnosis.report.candidate_ranking import rank_candidates
 from bench.diagnosis.report.cause_text import (
     format_causes,
     format_effect_set,
-    format_lacking,
+    format_missing_causes,
     format_number_error,
     format_values,
     has_placed_causes,
@@ -149,35 +149,35 @@ def format_headline(report: DiagnosisReportData) -> str:
         conclusion += " at any place" if has_placed_causes(report) else ""
         return f"Something is missing from the simulation, and {conclusion}."
     if verdict == "ambiguous":
-        return f"The simulation {format_lacking(causes)}: these data do not show which."
+        return f"The simulation {format_missing_causes(causes)}: these data do not show which."
     if verdict == "partial" and (open_causes := [c for c in causes if c.open_numbers]):
         reason = _format_unconfirmed_reason(open_causes)
-        return f"The simulation {format_lacking(causes)}, but {reason}."
+        return f"The simulation {format_missing_causes(causes)}, but {reason}."
     if parameters_at_bounds := report.verdict.bordering:
         (name, first), *_ = parameters_at_bounds.items()
         end = f"the {END[first.at_bound or 'high']} bound of its range"
         value = append_unit(format_number(first.value), first.unit)
         bound_text = f"parameter {sanitise(name, 60)} ends at {end}, {value}"
         return (
-            f"The simulation {format_lacking(causes)}, but {bound_text}: "
+            f"The simulation {format_missing_causes(causes)}, but {bound_text}: "
             "the cause may compensate for a value beyond it."
         )
     if verdict == "partial":
         remainder = "something else that no known cause explains"
         if len(causes) == 1 and (number_error := format_number_error(causes[0])):
             return format_sentence(f"{number_error}, and the simulation lacks {remainder}")
-        return (
-            f"The simulation {format_lacking(causes)}, and {_get_linking_verb(causes)}{remainder}."
-        )
+        verb = _get_linking_verb(causes)
+        return f"The simulation {format_missing_causes(causes)}, and {verb}{remainder}."
     if len(causes) > 1:
         # With several causes the sentence would be too long; their descriptions follow it.
-        return f"The simulation {format_lacking([replace(c, alternatives=()) for c in causes])}."
+        causes = tuple(replace(cause, alternatives=()) for cause in causes)
+        return f"The simulation {format_missing_causes(causes)}."
     (cause,) = causes
     if number_error := format_number_error(cause):
         return format_sentence(number_error)
     if is_overstated(cause):
         return f"The simulation has too much {format_effect(cause.effect)}."
-    lacking_text = format_lacking([replace(cause, alternatives=())])
+    lacking_text = format_missing_causes([replace(cause, alternatives=())])
     return f"The simulation {lacking_text}: {_describe_within_sentence(cause)}."
 
 
@@ -231,7 +231,7 @@ def _get_linking_verb(causes: Sequence[Cause]) -> str:
 def _format_early_stop_headline(verdict: Verdict) -> str:
     """Format the headline of a search that was stopped early, with its preliminary result."""
     if verdict.verdict == "partial":
-        lacking_text = format_lacking(verdict.causes)
+        lacking_text = format_missing_causes(verdict.causes)
         return (
             f"The simulation {lacking_text}; the search stopped before testing for further causes."
         )
@@ -305,9 +305,9 @@ def format_gain_and_caveats(report: DiagnosisReportData) -> Iterator[str]:
         yield "To distinguish them: " + (format_next_run(report) or "no experiment is proposed.")
 
 
-def _format_unit_errors(faults: Sequence[RecordingFault]) -> Iterator[str]:
+def _format_unit_errors(errors: Sequence[RecordingFault]) -> Iterator[str]:
     """Yield sentences on a wrong unit or sign: evidence, alternatives, and what to do."""
-    first, *further_faults = faults
+    first, *further_faults = errors
     if first.error_after is not None:
         before = (
             f"from {format_number(first.error_before)} " if first.error_before is not None else ""

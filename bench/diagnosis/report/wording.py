@@ -170,7 +170,7 @@ def format_fitted_value(fitted: FittedValue) -> str:
     text = append_unit(format_estimate(fitted.value, fitted.low, fitted.high), fitted.unit)
     if fitted.at_bound is not None:
         text = at_bound(fitted.value, fitted.unit, fitted.at_bound)
-    return text + format_file_change(fitted) + format_usual_range(fitted)
+    return text + format_file_change(fitted) + format_plausible_range(fitted)
 
 
 def format_file_change(fitted: FittedValue) -> str:
@@ -181,7 +181,7 @@ def format_file_change(fitted: FittedValue) -> str:
     return f", in the model file {format_number(fitted.stated)} → {total}"
 
 
-def format_usual_range(fitted: FittedValue) -> str:
+def format_plausible_range(fitted: FittedValue) -> str:
     """Format the usual range of a value outside it: ``, beyond the usual range of 0 to 0.6 N``."""
     if fitted.usual_range is None:
         return ""

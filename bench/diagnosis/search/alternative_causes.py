@@ -202,7 +202,7 @@ class AlternativeFinder:
                     )
                 )
             return convert_excess_ratio(ratios)
-        distance = self._compute_comparable_merit(model) - self._compute_comparable_merit(
+        distance = self._compute_comparable_likelihood(model) - self._compute_comparable_likelihood(
             other_model
         )
         # Held-out runs are further data, so their log-likelihoods are added.
@@ -214,7 +214,7 @@ class AlternativeFinder:
             )
         return distance
 
-    def _compute_comparable_merit(self, model: FittedModel) -> float:
+    def _compute_comparable_likelihood(self, model: FittedModel) -> float:
         """Return the merit; for robots without the null-hypothesis penalty of single-shape effects.
 
         Two such effects differ, for example, only in a sign constraint: if all commands have the

@@ -101,7 +101,7 @@ class Inquiry:
         """
         self._search = search
         self._held_out = held_out
-        self._watch = search.evaluator.search_control
+        self._search_control = search.evaluator.search_control
         self._trial: HeldOutValidation | None = None
         self._model: FittedModel | None = None
 
@@ -115,25 +115,25 @@ class Inquiry:
         if early_result is not None:
             return early_result
         search, base = self._search, self._search.base_model
-        self._watch.begin_question("search")
+        self._search_control.begin_question("search")
         self._model = search_with_subsampling(search)
-        self._watch.begin_question("rivals")
+        self._search_control.begin_question("rivals")
         self._model = search.simplify_laws(refine_best_model(search, self._model))
         self._model = search.fit_to_convergence(self._model)
         validated_effects = self._model.effects
         self._evaluate_on_held_out_runs()
-        self._watch.begin_question("structure")
+        self._search_control.begin_question("structure")
         lack_of_fit = assess_lack_of_fit(search, self._model)
         if search.thorough and self._accept_larger_model(lack_of_fit):
             lack_of_fit = assess_lack_of_fit(search, self._model)
-        self._watch.begin_question("alternatives")
+        self._search_control.begin_question("alternatives")
         model, causes = _select_preferred_model(search, self._trial, self._model, lack_of_fit)
         validation = self._trial
         if model.effects != validated_effects:
             model = search.fit_to_convergence(model)
             if validation is not None:
                 validation.evaluate_models([model])
-        self._watch.check_not_stopped()
+        self._search_control.check_not_stopped()
         state = DiagnosisState(
             causes=len(causes),
             alternatives=any(cause.alternatives for cause in causes),
@@ -154,7 +154,7 @@ class Inquiry:
         """
         search = self._search
         # An unfinished base fit gives no information, not even about motion.
-        if self._watch.has_abandoned_fits():
+        if self._search_control.has_abandoned_fits():
             raise SearchStoppedError
         # Without motion, residual tests would only test rounding.
         if is_motionless(search):
@@ -181,10 +181,10 @@ class Inquiry:
         """
         if self._held_out is None or self._model is None:
             return
-        self._watch.begin_question("held_out")
+        self._search_control.begin_question("held_out")
         validation = _validate_on_held_out(self._search, self._model, self._held_out)
         # Unfinished fits of initial states would be held against their model.
-        self._watch.check_not_stopped()
+        self._search_control.check_not_stopped()
         self._trial = validation
         # The effects that remain after dropping an idle one may have simpler forms.
         self._model = self._search.simplify_laws(
@@ -218,7 +218,7 @@ class Inquiry:
         Only existing fits and scores are used; nothing is simulated here.
         """
         search = self._search
-        early_stop = self._watch.make_early_stop(self._held_out is not None)
+        early_stop = self._search_control.make_early_stop(self._held_out is not None)
         model = self._model or search.get_best_so_far()
         # The residual was not tested, so it is counted as structure and not as noise.
         lack_of_fit = replace(assess_residual_size(search, model), p_value=0.0)

@@ -133,7 +133,7 @@ class EffectSearch(ModelMoves):
             if m.penalised_log_likelihood
             > model.penalised_log_likelihood - STEP_CORRECTION_REFIT_DISTANCE
         ]
-        self.refit_models([m.fit.make_start() for m in close_models], race=False)
+        self.refit_models([m.fit.make_start() for m in close_models], is_racing=False)
         return select_by_size(self, size)[0]
 
     def get_best_so_far(self) -> FittedModel:

@@ -206,7 +206,9 @@ class ScoredModelSet(ModelSet):
             scores = self.scores_by_effects.get(key, scans[number].scores)
             # Scores that were kept when the directions were removed remain valid.
             self._store_scores(key, scans[number]._replace(scores=scores))
-        self._make_room([*keys, *(frozenset(model.effects) for model in other_kept_models)])
+        self._evict_oldest_directions(
+            [*keys, *(frozenset(model.effects) for model in other_kept_models)]
+        )
 
     def _report_scoring(self, model: FittedModel) -> None:
         """Report to the user that a model is scored now, and stop if the search has to end."""
@@ -215,7 +217,7 @@ class ScoredModelSet(ModelSet):
             f"scores of the effect library at {model_text}"
         )
 
-    def _make_room(self, kept_keys: Sequence[frozenset[str]]) -> None:
+    def _evict_oldest_directions(self, kept_keys: Sequence[frozenset[str]]) -> None:
         """Remove the oldest stored directions until `DIRECTION_CACHE_BYTES` is not exceeded.
 
         Those of the base model and of the models `kept_keys` are kept.

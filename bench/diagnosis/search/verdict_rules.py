@@ -169,19 +169,19 @@ def is_unexplained(structure: bool, p_value: float) -> bool:
     return structure or p_value < EFFECT_P_VALUE_THRESHOLD
 
 
-def improves_held_out(merits: tuple[float, float], excesses: tuple[float, float]) -> bool:
+def improves_held_out(likelihoods: tuple[float, float], excesses: tuple[float, float]) -> bool:
     """Return whether an effect improves the prediction of held-out runs.
 
     Far from the noise, the excess must decrease clearly, because a small gain in merit may only
     mimic another missing effect.
 
     Args:
-        merits: merit without the effect, and with it.
+        likelihoods: merit without the effect, and with it.
         excesses: excess without the effect, and with it.
     """
     # Near the noise only the merit decides, because 10 % of a very small excess is meaningless.
     before, after = excesses
-    return merits[1] > merits[0] and (
+    return likelihoods[1] > likelihoods[0] and (
         before < HELD_OUT_EXCESS_THRESHOLD or after < (1.0 - MIN_HELD_OUT_IMPROVEMENT) * before
     )
 

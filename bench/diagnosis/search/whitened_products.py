@@ -65,14 +65,14 @@ class RunSegment(NamedTuple):
         begin: first sample.
         end: end of the samples (exclusive).
         edge: (m,) indices of the samples that lack a neighbour, all channels in one row.
-        lacking: (m,) number of missing neighbours of each of these samples.
+        missing_neighbours: (m,) number of missing neighbours of each of these samples.
     """
 
     run: int
     begin: int
     end: int
     edge: Indices
-    lacking: Array
+    missing_neighbours: Array
 
 
 class SegmentColumns(NamedTuple):
@@ -121,7 +121,7 @@ def add_cross_products(
     parts.whole[...] += first.now @ np.swapaxes(second.now, -1, -2)
     # Summed over a run, it does not matter to which of the two columns the neighbours belong.
     parts.mixed[...] += first.now @ np.swapaxes(second.near, -1, -2)
-    parts.ends[...] += (first.edge * place.lacking) @ np.swapaxes(second.edge, -1, -2)
+    parts.ends[...] += (first.edge * place.missing_neighbours) @ np.swapaxes(second.edge, -1, -2)
 
 
 def add_self_products(parts: LaggedSums, columns: SegmentColumns, place: RunSegment) -> None:
@@ -134,7 +134,7 @@ def add_self_products(parts: LaggedSums, columns: SegmentColumns, place: RunSegm
     """
     parts.whole[...] += np.einsum("kn,kn->k", columns.now, columns.now)
     parts.mixed[...] += np.einsum("kn,kn->k", columns.near, columns.now)
-    parts.ends[...] += np.einsum("km,km,m->k", columns.edge, columns.edge, place.lacking)
+    parts.ends[...] += np.einsum("km,km,m->k", columns.edge, columns.edge, place.missing_neighbours)
 
 
 MIN_RESIDUAL_SHARE = 1e-12
@@ -198,15 +198,16 @@ class WhiteningDesign:
         The sums have the three parts of eq. (1) and are combined for a given phi later. `_normal`
         has the products of the q parameters and s initial states with each other (R, q + s, q + s),
         `_mixed` those with the K directions (R, q + s, K), `_powers` (K,) the squares of the
-        directions, and `_grams` the products of directions that act together. `_lacking` counts the
-        missing neighbours of each sample, and `_known` caches the projected design of each phi.
+        directions, and `_grams` the products of directions that act together. `_missing_neighbours`
+        counts the missing neighbours of each sample, and `_known` caches the projected design of
+        each phi.
         """
         self.blocks = list(blocks)
         self._own = fit.free_indices.size
         self._jacobian = np.moveaxis(fit.jacobian, 3, 0)
         self._directions = np.moveaxis(directions, 3, 0)
         self._weights = observed_mask / sigma
-        self._lacking = count_missing_neighbours(observed_mask)
+        self._missing_neighbours = count_missing_neighbours(observed_mask)
         size, runs, *_ = self._jacobian.shape
         count = len(self._directions)
         self._normal = LaggedSums.zeros(runs, size, size)
@@ -224,7 +225,7 @@ class WhiteningDesign:
         for run in range(runs):
             for begin in range(0, length, step):
                 end = min(begin + step, length)
-                missing_neighbours = self._lacking[run, begin:end].ravel()
+                missing_neighbours = self._missing_neighbours[run, begin:end].ravel()
                 edge = np.flatnonzero(missing_neighbours)
                 yield RunSegment(run, begin, end, edge, missing_neighbours[edge])
 

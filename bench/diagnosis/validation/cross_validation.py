@@ -18,7 +18,11 @@ from bench.diagnosis.evaluation.noise_model import Mask, NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import Indices, RunEvaluator
 from bench.diagnosis.fitting.fit_state import FitStart, KnownJacobian, TrajectoryFit
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
-from bench.diagnosis.validation.held_out_runs import HeldOutFit, HeldOutRuns, compute_merit
+from bench.diagnosis.validation.held_out_runs import (
+    HeldOutFit,
+    HeldOutRuns,
+    compute_penalised_likelihood,
+)
 from sims.core.simulator import Array
 
 MAX_STEPS = 8
@@ -109,7 +113,9 @@ class CrossValidation:
         """
         if not np.isfinite(simulated[self.seen]).all():
             return HeldOutFit(np.full_like(simulated, np.nan), -np.inf, states)
-        penalised_likelihood = compute_merit(self.evaluator.observed, simulated, free)
+        penalised_likelihood = compute_penalised_likelihood(
+            self.evaluator.observed, simulated, free
+        )
         return HeldOutFit(simulated, penalised_likelihood, states, free)
 
     @cached_property

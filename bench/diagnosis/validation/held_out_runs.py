@@ -171,16 +171,16 @@ class HeldOutRuns:
         fits: list[TrajectoryFit] = []
         if not starts:
             return fits
-        watch = self.evaluator.search_control
+        search_control = self.evaluator.search_control
         models = "one model" if len(starts) == 1 else f"{len(starts)} models"
-        watch.begin_stage(f"simulating held-out runs with {models}", len(stages))
+        search_control.begin_stage(f"simulating held-out runs with {models}", len(stages))
         for share, iterations in stages:
             fitter = TrajectoryFitter(
                 self.evaluator, self.noise, share=share, fits_parameters=False
             )
             fits = fitter.fit_models(starts, iterations)
             starts = [fit.make_start() for fit in fits]
-            watch.advance()
+            search_control.advance()
         return fits
 
     def _leaves_linear_range(self, fit: TrajectoryFit) -> bool:
@@ -254,11 +254,13 @@ class HeldOutRuns:
             return HeldOutFit(no_prediction, -np.inf, fit.initial_states)
         # Only initial states were fitted here, so only they count as free.
         free = count_identified_states(self.evaluator, fit, self.noise)
-        penalised_likelihood = compute_merit(self.evaluator.observed, fit.simulated, free)
+        penalised_likelihood = compute_penalised_likelihood(
+            self.evaluator.observed, fit.simulated, free
+        )
         return HeldOutFit(fit.simulated, penalised_likelihood, fit.initial_states, free)
 
 
-def compute_merit(observed: Array, simulated: Array, free: float) -> float:
+def compute_penalised_likelihood(observed: Array, simulated: Array, free: float) -> float:
     """Compute the penalised log-likelihood of predictions, eq. (1) of the module docstring.
 
     Args:

@@ -417,7 +417,7 @@ def write_case(case: BenchmarkCase, folder: str | Path, truth: bool = True) -> P
         Recording(path, case.system, "", constants, noise, runs),
         system,
         digits=9,
-        beside=other_files,
+        extra_files=other_files,
     )
     return path
 

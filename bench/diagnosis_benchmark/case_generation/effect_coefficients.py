@@ -71,7 +71,10 @@ def get_max_strength(name: str) -> float:
 
 
 def _draw_direction(
-    coefficient_scale: float, setting: RecordingConditions, rng: np.random.Generator, *behind: float
+    coefficient_scale: float,
+    setting: RecordingConditions,
+    rng: np.random.Generator,
+    *further_coefficients: float,
 ) -> CoefficientFunction:
     """Draw the direction of an effect with two components, such as a horizontal or a phase angle.
 
@@ -79,18 +82,19 @@ def _draw_direction(
         coefficient_scale: magnitude at strength 1.
         setting: recording conditions; unused here.
         rng: random generator.
-        *behind: further coefficients that do not depend on the strength, such as a period.
+        *further_coefficients: coefficients that do not depend on the strength, such as a
+            period.
 
     Returns:
-        Function from the strength s to the coefficients: far s cos(angle), far s sin(angle),
-        behind.
+        Function from the strength s to the coefficients: s times the scale times cosine and sine of
+        the angle, then the further coefficients.
     """
     angle = rng.uniform(0, 2 * np.pi)
     cosine_part, sine_part = (
         coefficient_scale * float(np.cos(angle)),
         coefficient_scale * float(np.sin(angle)),
     )
-    return lambda s: (cosine_part * s, sine_part * s, *behind)
+    return lambda s: (cosine_part * s, sine_part * s, *further_coefficients)
 
 
 def _draw_horizontal_direction(
@@ -222,7 +226,7 @@ def _draw_saturation(
     return lambda s: (float(peak * (1 - s)),)
 
 
-def _draw_one_way_friction(
+def _draw_direction_dependent_friction(
     coefficient_scale: float, setting: RecordingConditions, rng: np.random.Generator
 ) -> CoefficientFunction:
     """Draw friction that is several times larger in one direction.
@@ -452,8 +456,8 @@ SHAPE_SAMPLERS: dict[str, Callable[..., CoefficientFunction]] = {
     "friction.hysteresis": _draw_hysteresis,
     "joint.backlash": _draw_backlash,
     "joint.flexibility": _draw_flexible_load,
-    "friction.direction": _draw_one_way_friction,
-    "friction.load_direction": _draw_one_way_friction,
+    "friction.direction": _draw_direction_dependent_friction,
+    "friction.load_direction": _draw_direction_dependent_friction,
     "friction.load_quadratic": _draw_quadratic_friction,
     "friction.position": _draw_position_friction,
     "friction.warming": _draw_warm_up_friction,

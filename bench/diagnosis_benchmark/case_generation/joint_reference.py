@@ -46,7 +46,7 @@ class JointDynamics:
         weight: gravity force as a function of position.
         forces: laws of the acting forces.
         limits: laws of the dry friction limits.
-        behind: hidden-state effects: driven loads and hysteresis.
+        hidden_effects: hidden-state effects: driven loads and hysteresis.
     """
 
     def __init__(self, true_system: TrueSystem, number: int) -> None:
@@ -98,22 +98,22 @@ class JointDynamics:
             {"force.periodic", "input.lag", "friction.warming"} & set(active_effects)
         )
         total_inertia, gravity_of_all = self.inertia, self.weight
-        self.behind: list[Any] = [
+        self.hidden_effects: list[Any] = [
             HIDDEN_STATE_EFFECTS[name](total_inertia, gravity_of_all, *c)
             for name, c in active_effects.items()
             if name in HIDDEN_STATE_EFFECTS
         ]
-        self.inertia = total_inertia - sum(part.inertia for part in self.behind)
+        self.inertia = total_inertia - sum(part.inertia for part in self.hidden_effects)
 
-    def set_input_segment(self, piece: InputSegment) -> None:
+    def set_input_segment(self, segment: InputSegment) -> None:
         """Set the input interval in which the motion is integrated, before the integration starts.
 
         A gust acts in the whole interval or not at all, which the time in its middle decides.
 
         Args:
-            piece: part of an input interval that contains no begin or end of a gust.
+            segment: part of an input interval that contains no begin or end of a gust.
         """
-        self.piece, self.middle = piece, 0.5 * (piece.begin + piece.end)
+        self.segment, self.middle = segment, 0.5 * (segment.begin + segment.end)
 
     def compute_force(self, t: float, x: float, v: float, *z: float) -> float:
         """Compute the force on the coordinate, without dry friction.
@@ -124,10 +124,10 @@ class JointDynamics:
             v: velocity.
             *z: states of the hidden-state effects.
         """
-        total = self.piece.evaluate(t) + self.weight(x)
+        total = self.segment.evaluate(t) + self.weight(x)
         for force in self.forces:
             total += force(t, x, v)
-        for part, part_states in zip(self.behind, pair_up(z), strict=True):
+        for part, part_states in zip(self.hidden_effects, pair_up(z), strict=True):
             total += part.force(x, v, *part_states)
         return total
 
@@ -139,7 +139,7 @@ class JointDynamics:
             v: velocity.
             *z: states of the hidden-state effects.
         """
-        parts = zip(self.behind, pair_up(z), strict=True)
+        parts = zip(self.hidden_effects, pair_up(z), strict=True)
         return [rate for part, part_states in parts for rate in part.rates(x, v, *part_states)]
 
     def compute_friction_limit(self, t: float, x: float, v: float) -> float:
@@ -293,7 +293,7 @@ class DahlReferenceFriction:
             limit: largest friction force.
             deflection: distance, m or rad.
         """
-        self.most, self.deflection = limit, deflection
+        self.limit, self.deflection = limit, deflection
 
     def get_initial_state(self, x: float, v: float) -> tuple[float, float]:
         """Return the initial state, without strain."""
@@ -307,7 +307,7 @@ class DahlReferenceFriction:
             v: velocity.
             strain: friction force as a fraction of its limit.
         """
-        return -self.most * strain
+        return -self.limit * strain
 
     def rates(self, x: float, v: float, _: float, strain: float) -> tuple[float, float]:
         """Compute the time derivatives of the two states by Dahl's law.
@@ -344,10 +344,10 @@ FORCE_EFFECTS: dict[str, Callable[[JointDynamics, list[float]], ResistanceLaw]] 
     "gravity.scale": lambda j, c: lambda t, x, v: c[0] * j.weight(x),
     "gravity.tilt": lambda j, c: lambda t, x, v: c[0] * j.gravity * j.sideways(x),
     "supply.sag": lambda j, c: (
-        lambda t, x, v: j.piece.evaluate(t) * (1 / (1 + c[0] * abs(j.piece.evaluate(t))) - 1)
+        lambda t, x, v: j.segment.evaluate(t) * (1 / (1 + c[0] * abs(j.segment.evaluate(t))) - 1)
     ),
     "supply.braking": lambda j, c: (
-        lambda t, x, v: -c[0] * j.piece.evaluate(t) * (j.piece.evaluate(t) * v < 0)
+        lambda t, x, v: -c[0] * j.segment.evaluate(t) * (j.segment.evaluate(t) * v < 0)
     ),
     "spring.linear": lambda j, c: lambda t, x, v: -c[0] * x,
     "spring.cubic": lambda j, c: lambda t, x, v: -c[0] * x**3,
@@ -365,14 +365,14 @@ FORCE_EFFECTS: dict[str, Callable[[JointDynamics, list[float]], ResistanceLaw]] 
 DRY_FRICTION_EFFECTS: dict[str, Callable[[JointDynamics, list[float]], ResistanceLaw]] = {
     "friction.coulomb": lambda j, c: lambda t, x, v: c[0],
     "friction.stribeck": lambda j, c: lambda t, x, v: c[0] + c[1] * exp(-((v / c[2]) ** 2)),
-    "friction.load": lambda j, c: lambda t, x, v: c[0] * abs(j.piece.evaluate(t) - j.weight(x)),
+    "friction.load": lambda j, c: lambda t, x, v: c[0] * abs(j.segment.evaluate(t) - j.weight(x)),
     "friction.load_direction": lambda j, c: (
-        lambda t, x, v: abs(c[0] * j.piece.evaluate(t) - c[1] * j.weight(x))
+        lambda t, x, v: abs(c[0] * j.segment.evaluate(t) - c[1] * j.weight(x))
     ),
     "friction.load_quadratic": lambda j, c: (
         lambda t, x, v: (
-            c[0] * abs(j.piece.evaluate(t) - j.weight(x))
-            + c[1] * compute_transmitted_force(j.piece.evaluate(t), -j.weight(x)) ** 2
+            c[0] * abs(j.segment.evaluate(t) - j.weight(x))
+            + c[1] * compute_transmitted_force(j.segment.evaluate(t), -j.weight(x)) ** 2
         )
     ),
     "friction.position": lambda j, c: (
@@ -444,7 +444,7 @@ def simulate_joint(
     joint, end_time = JointDynamics(true_system, number), float(instants[-1])
     names = ("q", "qd") if true_system.system == "pendulum" else ("x", "v")
     state = np.array([scenario.initial[name] for name in names])
-    hidden = [value for load in joint.behind for value in load.get_initial_state(*state)]
+    hidden = [value for load in joint.hidden_effects for value in load.get_initial_state(*state)]
     state = np.concatenate([state, hidden])
     states = np.empty((instants.size, 2))
     states[instants <= 0] = state[:2]
@@ -472,7 +472,7 @@ def _integrate_segment(joint: JointDynamics, state: Array, instants: Array, stat
     Returns:
         State at the end.
     """
-    time, end = joint.piece.begin, joint.piece.end
+    time, end = joint.segment.begin, joint.segment.end
     for _ in range(10_000):
         if time >= end:
             return state
@@ -500,7 +500,7 @@ def _integrate_until_stop(joint: JointDynamics, start: float, state: Array) -> S
     Returns:
         End time, state at that time, and the dense solution (None without motion).
     """
-    (x, v, *z), end = state, joint.piece.end
+    (x, v, *z), end = state, joint.segment.end
     direction = copysign(1.0, v) if v else 0.0
     if joint.limits and v == 0.0:
         force = joint.compute_force(start, x, 0.0, *z)
@@ -560,7 +560,7 @@ def _integrate_stuck(joint: JointDynamics, start: float, state: Array) -> Segmen
     Returns:
         End time, state at that time, and the dense solution.
     """
-    end = joint.piece.end
+    end = joint.segment.end
 
     def rate(t: float, y: Array) -> list[float]:
         return [0.0, 0.0, *joint.compute_hidden_rates(*y)]
@@ -585,7 +585,7 @@ def _find_break_away(joint: JointDynamics, start: float, x: float) -> float:
     Within an input interval only time-dependent forces and limits change while the coordinate
     rests.
     """
-    end = joint.piece.end
+    end = joint.segment.end
     if not joint.restless:
         return end
 

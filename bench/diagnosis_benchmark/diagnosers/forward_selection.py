@@ -319,7 +319,7 @@ def _refit_with_one_more_effect(
     if not starts:
         return []
     fits = TrajectoryFitter(evaluator, evidence.noise, evidence.base.fixed_parameters).fit_models(
-        starts, MAX_FIT_ITERATIONS, race=True
+        starts, MAX_FIT_ITERATIONS, is_racing=True
     )
     by_name: dict[str, TrajectoryFit] = {}
     for fit in fits:

@@ -70,7 +70,7 @@ class NeuralClassifier(Diagnoser):
             else ""
         )
 
-    def train(self, lesson: DiagnoserTrainingTask) -> Mapping[str, Array]:
+    def train(self, task: DiagnoserTrainingTask) -> Mapping[str, Array]:
         """Simulate recordings until the budget is used up, and train the network.
 
         Class 0 is "no effect", the others are the effects of the library in alphabetical order.
@@ -78,16 +78,14 @@ class NeuralClassifier(Diagnoser):
         Returns:
             Weights of the network; empty if there are too few examples.
         """
-        classes = ["", *sorted(lesson.library)]
+        classes = ["", *sorted(task.library)]
         images, labels = [], []
         for number in count():
             name = (
-                ""
-                if lesson.rng.random() < CLEAN_EXAMPLE_SHARE
-                else str(lesson.rng.choice(classes[1:]))
+                "" if task.rng.random() < CLEAN_EXAMPLE_SHARE else str(task.rng.choice(classes[1:]))
             )
             try:
-                image = _simulate_example(lesson, name, number)
+                image = _simulate_example(task, name, number)
             except SimulationBudgetExceededError:
                 break
             except InputError:
@@ -98,7 +96,7 @@ class NeuralClassifier(Diagnoser):
         if len(labels) < MIN_EXAMPLES:
             return {}
         return _train_network(
-            images, np.array(labels), len(classes), int(lesson.rng.integers(1 << 31))
+            images, np.array(labels), len(classes), int(task.rng.integers(1 << 31))
         )
 
     def diagnose(self, case: DiagnosisCase) -> Answer:

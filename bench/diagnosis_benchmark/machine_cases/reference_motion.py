@@ -86,7 +86,7 @@ class _MachineIntegrator:
         q: positions, (L, N).
         v: velocities, (L, N).
         dry: whether any joint has dry friction.
-        way: direction of motion of joints with dry friction: -1, 0 or 1, (L, N).
+        sliding_direction: direction of motion of joints with dry friction: -1, 0 or 1, (L, N).
         held: whether each joint is stuck, (L, N).
     """
 
@@ -99,9 +99,9 @@ class _MachineIntegrator:
             v: initial velocities, (L, N).
         """
         self.plant, self.q, self.v = plant, q.copy(), v.copy()
-        self.rubs = plant.has_dry_friction
-        self.dry = bool(self.rubs.any())
-        self.way = np.zeros_like(q)
+        self.has_friction = plant.has_dry_friction
+        self.dry = bool(self.has_friction.any())
+        self.sliding_direction = np.zeros_like(q)
         self.held = np.zeros(q.shape, dtype=bool)
 
     def step(self, t: float, h: float, u: Array) -> None:
@@ -141,7 +141,7 @@ class _MachineIntegrator:
         """
         force = self.plant.compute_force(t, q, v, u)
         if self.dry:
-            force = force - self.way * self.plant.compute_friction_limit(q, v)
+            force = force - self.sliding_direction * self.plant.compute_friction_limit(q, v)
         return self._solve_accelerations(q, force)
 
     def _solve_accelerations(self, q: Array, force: Array) -> Array:
@@ -174,20 +174,20 @@ class _MachineIntegrator:
             t: time, s.
             u: applied input, (L, N).
         """
-        resting = self.rubs & (self.v == 0.0)
-        self.way = np.where(self.rubs & ~resting, np.sign(self.v), 0.0)
+        resting = self.has_friction & (self.v == 0.0)
+        self.sliding_direction = np.where(self.has_friction & ~resting, np.sign(self.v), 0.0)
         self.held = resting
         if not resting.any():
             return
         limit = self.plant.compute_friction_limit(self.q, self.v)
-        force = self.plant.compute_force(t, self.q, self.v, u) - self.way * limit
+        force = self.plant.compute_force(t, self.q, self.v, u) - self.sliding_direction * limit
         accelerations = self._solve_accelerations(self.q, force)
         # Force needed to hold a joint still while the others move.
         holding_force = force - np.einsum(
             "lij,lj->li", self.plant.compute_mass_matrix(self.q), accelerations
         )
         loose = resting & (np.abs(holding_force) > limit * (1 + _BREAK_AWAY_TOLERANCE))
-        self.way = np.where(loose, np.sign(holding_force), self.way)
+        self.sliding_direction = np.where(loose, np.sign(holding_force), self.sliding_direction)
         self.held = resting & ~loose
 
     def _recompute_stopped_joints(
@@ -204,7 +204,9 @@ class _MachineIntegrator:
             u: applied input, (L, N).
             velocity_before: velocities at the begin of the step, (L, N).
         """
-        has_stopped = (self.way * self.v < 0.0) & (self.way * velocity_before >= 0.0)
+        has_stopped = (self.sliding_direction * self.v < 0.0) & (
+            self.sliding_direction * velocity_before >= 0.0
+        )
         if not has_stopped.any():
             return
         with np.errstate(divide="ignore", invalid="ignore"):

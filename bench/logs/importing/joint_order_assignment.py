@@ -153,7 +153,8 @@ def _prefer_model(
     result.checks.append(
         "order of joints: the log does not name those of its columns; they are taken in the "
         f"order {', '.join(columns)}, in which the model explains the motion best (a residual of "
-        f"{preferred.residual:.2g} of the drives' forces, {preferred.usual:.2g} in the model's "
+        f"{preferred.residual:.2g} of the drives' forces, "
+        f"{preferred.model_order_residual:.2g} in the model's "
         f"order, {', '.join(joints)}); it is a guess: compare it with the logger's order"
     )
     return {joint: joints[place] for joint, place in zip(joints, preferred.order, strict=True)}

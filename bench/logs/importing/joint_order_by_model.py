@@ -43,16 +43,16 @@ class PreferredOrder(NamedTuple):
     Attributes:
         order: For each joint the index of its column.
         residual: R of equation (1) for this order.
-        usual: R of equation (1) for the model's own order.
+        model_order_residual: R of equation (1) for the model's own order.
     """
 
     order: tuple[int, ...]
     residual: float
-    usual: float
+    model_order_residual: float
 
     def is_certain(self) -> bool:
         """Return whether the order explains much, and far more than the model's own order."""
-        return self.residual < min(MAX_UNEXPLAINED, MAX_PREFERRED_RATIO * self.usual)
+        return self.residual < min(MAX_UNEXPLAINED, MAX_PREFERRED_RATIO * self.model_order_residual)
 
 
 def find_order_by_model(

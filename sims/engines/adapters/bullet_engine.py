@@ -40,7 +40,7 @@ _ZERO_VECTOR = (0.0, 0.0, 0.0)
 """Zero vector: the origin, or zero velocity."""
 _IMPACT_STEP_SECONDS = 1e-4
 """Length of the time step of an impact, in seconds."""
-_CONTACT_REACH = 0.02 * math.sqrt(3)
+_CONTACT_HEIGHT_RADII = 0.02 * math.sqrt(3)
 """Height above the ground, in radii of the ball, at which Bullet's contact begins."""
 
 
@@ -286,12 +286,12 @@ class BulletNativeBall(_BulletMover):
         super().__init__(world)
         self.damping = settings["linear_damping"]
         self._lateral_friction = settings["lateral_friction"]
-        self._reach = math.nan
+        self._contact_height = math.nan
 
     def reset_world(self, constants: dict[str, float]) -> None:
         """Prepare a world for these constants."""
         super().reset_world(constants)
-        self._reach = _CONTACT_REACH * constants["radius"]
+        self._contact_height = _CONTACT_HEIGHT_RADII * constants["radius"]
 
     def set_contact_parameters(self, restitution: float, friction: float) -> None:
         """Set the ball's restitution and the friction of the contact.
@@ -318,4 +318,4 @@ class BulletNativeBall(_BulletMover):
 
     def is_near_contact(self, gap: float) -> bool:
         """Return whether the gap is within Bullet's contact distance."""
-        return gap <= self._reach
+        return gap <= self._contact_height

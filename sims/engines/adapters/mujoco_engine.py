@@ -37,7 +37,7 @@ from sims.engines.external.world_interface import (
 
 REQUIRED_PACKAGES = ("mujoco",)
 
-_STIFFNESS = 1e5
+_CONTACT_STIFFNESS = 1e5
 """Default stiffness of the native contact in 1/s^2: contacts then last 10 ms."""
 _MAX_THREADS = 1024
 _DEFAULT_STEP = 2e-3
@@ -91,7 +91,7 @@ def make_engine(
         raise InputError(f"system {system.name} does not bounce: leave native_contact out")
     if stiffness is not None and not 0 < stiffness < math.inf:
         raise InputError(f"stiffness must be a positive number, found {stiffness}")
-    return MujocoEngine(system, step, stiffness or _STIFFNESS, threads)
+    return MujocoEngine(system, step, stiffness or _CONTACT_STIFFNESS, threads)
 
 
 class MujocoEngine:

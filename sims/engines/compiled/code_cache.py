@@ -14,7 +14,7 @@ from pathlib import Path
 
 from sims.core.file_lock import lock_file
 
-_DIGEST = hashlib.sha256().digest_size
+_DIGEST_BYTES = hashlib.sha256().digest_size
 
 
 def get_cache_folder() -> Path:
@@ -30,8 +30,8 @@ def read_cached(path: Path) -> bytes | None:
         data = path.read_bytes()
     except OSError:
         return None
-    content = data[_DIGEST:]
-    return content if hashlib.sha256(content).digest() == data[:_DIGEST] else None
+    content = data[_DIGEST_BYTES:]
+    return content if hashlib.sha256(content).digest() == data[:_DIGEST_BYTES] else None
 
 
 def make_cached(path: Path, make: Callable[[], bytes], report_wait: Callable[[], None]) -> bytes:

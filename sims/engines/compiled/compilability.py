@@ -31,7 +31,7 @@ from sims.engines.compiled.node_arrays import NotTraceableError
 _tracers: dict[tuple[type[System], InputNames], SystemTracer | None] = {}
 _effects: dict[tuple[type[System], InputNames, type[Effect]], bool] = {}
 _lock = Lock()
-_TOLERANCE = 1e-9
+_MAX_RELATIVE_DIFFERENCE = 1e-9
 """Largest relative difference between a program and the functions from which it was traced."""
 _TEST_RESTITUTION, _TEST_FRICTION = 0.6, 0.2
 """Restitution and friction of the ground with which effects are tested."""
@@ -151,8 +151,10 @@ def _check_program(
         _evaluate_program(program, parameters, states) for program in programs
     )
     for value, expected in zip(values, expected_values, strict=True):
-        size = _TOLERANCE * np.abs(expected).max()
-        if not np.allclose(value, expected, rtol=_TOLERANCE, atol=size, equal_nan=True):
+        size = _MAX_RELATIVE_DIFFERENCE * np.abs(expected).max()
+        if not np.allclose(
+            value, expected, rtol=_MAX_RELATIVE_DIFFERENCE, atol=size, equal_nan=True
+        ):
             raise NotTraceableError("its compiled form gives other numbers")
 
 

@@ -99,15 +99,15 @@ def nan_minimum(a: float, b: float) -> float:
     return a if a <= b or a != a else b
 
 
-def evaluate_sine(r: FloatArray, o: int, a: int, w: int, ahead: float) -> None:
-    """Compute row o = sin(row a + `ahead` quarter turns).
+def evaluate_sine(r: FloatArray, o: int, a: int, w: int, quarter_turns: float) -> None:
+    """Compute row o = sin(row a + `quarter_turns` quarter turns).
 
     Args:
         r: registers.
         o: row of the result.
         a: row of the argument in radians.
         w: number of slots in use.
-        ahead: number of quarter turns: 0 for sine, 1 for cosine.
+        quarter_turns: number of quarter turns: 0 for sine, 1 for cosine.
     """
     is_large = False
     for i in range(w):
@@ -123,7 +123,7 @@ def evaluate_sine(r: FloatArray, o: int, a: int, w: int, ahead: float) -> None:
         c = 2.48015872894767294178e-05 + z * (-2.75573143513906633035e-07 + z * c)
         c = 4.16666666666666019037e-02 + z * (-1.38888888888741095749e-03 + z * c)
         cosine = 1.0 - (0.5 * z - z * z * c)  # (1)
-        k = k + ahead
+        k = k + quarter_turns
         half_quarters = 0.5 * k
         is_odd = half_quarters != (half_quarters + ROUNDING_OFFSET) - ROUNDING_OFFSET
         quarter = k - 4.0 * ((0.25 * k + ROUNDING_OFFSET) - ROUNDING_OFFSET)  # -2 to 2
@@ -134,7 +134,7 @@ def evaluate_sine(r: FloatArray, o: int, a: int, w: int, ahead: float) -> None:
     if is_large:
         for i in range(w):
             if not abs(r[a, i]) <= MAX_REDUCED_ANGLE:
-                r[o, i] = np.sin(r[a, i]) if ahead == 0.0 else np.cos(r[a, i])
+                r[o, i] = np.sin(r[a, i]) if quarter_turns == 0.0 else np.cos(r[a, i])
 
 
 def evaluate_exponential(r: FloatArray, o: int, a: int, w: int) -> None:

@@ -43,7 +43,7 @@ KERNEL_MODULES: tuple[ModuleType, ...] = (
     step_size,
 )
 """Modules that contain the compiled functions."""
-_INLINED = frozenset(
+_INLINED_FUNCTIONS = frozenset(
     {
         *(
             "evaluate_forces",
@@ -159,7 +159,7 @@ def _compile_functions(numba: Any, modules: Sequence[ModuleType]) -> dict[str, A
     for name in TopologicalSorter(callees).static_order():
         parameters = inspect.signature(functions[name]).parameters.values()
         compiled = numba.njit(
-            forceinline=name in _INLINED,
+            forceinline=name in _INLINED_FUNCTIONS,
             error_model="numpy",
             # Without reference counting: an atomic counter for each used array takes ten times as
             # long as the computation. Wrappers for calls from Python are not needed.

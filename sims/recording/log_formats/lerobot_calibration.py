@@ -24,7 +24,7 @@ from sims.core.simulator import InputError
 
 COUNTS_PER_TURN = 4096
 """Encoder counts per turn of a Feetech or Dynamixel servo."""
-LARGEST_FILE = 1_000_000
+MAX_FILE_BYTES = 1_000_000
 """Maximum size of a file that is read as a possible calibration, in bytes."""
 _KEYS = ("range_min", "range_max")
 
@@ -84,7 +84,7 @@ def find_calibration(folders: Iterable[Path]) -> Path | None:
             continue
         for path in sorted(folder.glob("*.json")):
             try:
-                small = path.stat().st_size <= LARGEST_FILE
+                small = path.stat().st_size <= MAX_FILE_BYTES
                 document = json.loads(path.read_text(encoding="utf-8-sig")) if small else None
             except (OSError, ValueError, RecursionError):
                 continue

@@ -63,7 +63,7 @@ class _Other(NamedTuple):
     name: str
 
 
-_MARK = _Other("mark")
+_STACK_MARK = _Other("mark")
 
 
 def read_tensors(path: Path) -> tuple[dict[str, Array], dict[str, list[str]]]:
@@ -193,7 +193,7 @@ def _run_pickle_program(program: bytes) -> Any:
         if opcode == "STOP":
             return stack[-1]
         if opcode == "MARK":
-            stack.append(_MARK)
+            stack.append(_STACK_MARK)
         elif opcode in ("BINPUT", "LONG_BINPUT", "PUT"):
             memo[int(str(argument))] = stack[-1]
         elif opcode == "MEMOIZE":
@@ -233,7 +233,7 @@ def _build_object(opcode: str, stack: list[Any]) -> None:
     Only containers and tensors are built; nothing is imported or called.
     """
     if opcode in ("TUPLE", "LIST", "DICT", "APPENDS", "SETITEMS"):
-        mark_index = max(i for i, value in enumerate(stack) if value is _MARK)
+        mark_index = max(i for i, value in enumerate(stack) if value is _STACK_MARK)
         values = stack[mark_index + 1 :]
         del stack[mark_index:]
         if opcode == "TUPLE":
@@ -270,9 +270,9 @@ def _build_object(opcode: str, stack: list[Any]) -> None:
         raise ValueError(f"unknown step {opcode}")
 
 
-def _evaluate_call(made_by: Any, arguments: Any) -> Any:
+def _evaluate_call(function: Any, arguments: Any) -> Any:
     """Return the result of a call in the program: a tensor, a dictionary, or a placeholder."""
-    name = made_by.text if isinstance(made_by, _Name) else ""
+    name = function.text if isinstance(function, _Name) else ""
     if name == "torch._utils._rebuild_tensor_v2":
         storage, offset, size, stride, *_ = arguments
         return _Tensor(storage, int(offset), tuple(map(int, size)), tuple(map(int, stride)))

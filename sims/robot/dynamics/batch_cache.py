@@ -92,7 +92,7 @@ class BatchCache:
             variant = self._get_variant(added)
             if key not in variant.batches:
                 variant.batches[key] = MujocoBatch(variant.robot, derived, settings, count)
-                self._drop_least_recent()
+                self._evict_unused_variants()
             return variant.batches[key]
         except ValueError as error:
             if not added:
@@ -116,7 +116,7 @@ class BatchCache:
         self._extended[added] = variant
         return variant
 
-    def _drop_least_recent(self) -> None:
+    def _evict_unused_variants(self) -> None:
         """Drop the least recently used variants, except the last one, until the limit is met."""
         sizes = {added: variant.nbytes for added, variant in self._extended.items()}
         for added in list(sizes)[:-1]:

@@ -50,7 +50,7 @@ class RobotMotion:
         forces: (S, nv) precomputed generalised forces.
         inputs: (S,) applied inputs by name.
         carried: (2, S, D) forces on both sides of the transmissions.
-        afloat: (S + 1, P) poses and (S + 1, F) velocities of floating bodies.
+        floating_state: (S + 1, P) poses and (S + 1, F) velocities of floating bodies.
         step: step length in seconds.
         off: (S, K) whether each actuator is switched off.
     """
@@ -63,14 +63,14 @@ class RobotMotion:
     forces: Array
     inputs: Mapping[str, Array]
     carried: Array
-    afloat: FloatingState
+    floating_state: FloatingState
     step: float
     off: Mask
 
     @property
     def velocities(self) -> Array:
         """All velocities (S + 1, D + F)."""
-        return np.concatenate([self.v, self.afloat.rate], axis=1)
+        return np.concatenate([self.v, self.floating_state.rate], axis=1)
 
 
 class LinearisationPoints:
@@ -181,7 +181,9 @@ class LinearisationPoints:
                 parts.append(bind("act")[:n])
             parts += [state.v for state in self._next_hidden_states.values()]
             if floating:
-                unperturbed = self.motion.afloat.pose[self.point_steps[begin : begin + n] + 1]
+                unperturbed = self.motion.floating_state.pose[
+                    self.point_steps[begin : begin + n] + 1
+                ]
                 parts.append(
                     floating.compute_displacement(bind("qpos")[:n, floating.positions], unperturbed)
                 )
@@ -272,15 +274,15 @@ class LinearisationPoints:
             batch.state[:] = self._reset_state
             qpos[:n, joints.positions] = motion.x[steps]
             qvel[:n, joints.velocities] = motion.v[steps]
-            qpos[:n, floating.positions] = motion.afloat.pose[steps]
-            qvel[:n, floating.velocities] = motion.afloat.rate[steps]
+            qpos[:n, floating.positions] = motion.floating_state.pose[steps]
+            qvel[:n, floating.velocities] = motion.floating_state.rate[steps]
             ctrl[:n] = motion.controls[steps]
             applied[:n] = motion.forces[steps]
             if na:
                 bind("act")[:n] = motion.act[steps]
             for name, (k, size) in moved.items():
                 if name == "p":
-                    poses = floating.displace(motion.afloat.pose[steps], k, size)
+                    poses = floating.displace(motion.floating_state.pose[steps], k, size)
                     qpos[:n, floating.positions] = poses
                 elif name != "w":
                     columns[name](k)[:n] += size
@@ -408,7 +410,7 @@ class LinearisationPoints:
         joints = self._joints
         full_matrix = np.zeros((model.nv, model.nv))
         matrices = []
-        poses = self.motion.afloat.pose[self.point_steps]
+        poses = self.motion.floating_state.pose[self.point_steps]
         for x, pose in zip(self.motion.x[self.point_steps], poses, strict=True):
             data.qpos[joints.positions] = x
             data.qpos[self._floating.positions] = pose

@@ -69,12 +69,12 @@ class Trajectory(NamedTuple):
     Attributes:
         x: (S + 1, D) positions of the joints.
         v: (S + 1, D) velocities of the joints.
-        afloat: (S + 1, P) poses and (S + 1, F) velocities of floating joints.
+        floating_state: (S + 1, P) poses and (S + 1, F) velocities of floating joints.
     """
 
     x: Array
     v: Array
-    afloat: FloatingState
+    floating_state: FloatingState
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ class MeasuredLinear(RunLinearisation):
         measured: alternative to `trajectory`: (T, 3) position, velocity and acceleration at the
             samples, by joint number; all other joints follow the simulation.
         nearby: linear model of a similar motion, whose commands and readings are reused.
-        is_alike: whether its Jacobians are reused as well.
+        reuses_jacobians: whether its Jacobians are reused as well.
     """
 
     def __init__(
@@ -128,7 +128,7 @@ class MeasuredLinear(RunLinearisation):
         trajectory: Trajectory | None = None,
         measured: Mapping[int, Array] | None = None,
         nearby: MeasuredLinear | None = None,
-        is_alike: bool = True,
+        reuses_jacobians: bool = True,
     ) -> None:
         """Linearise about the given motion, and compute its readings and the step of each sample.
 
@@ -137,7 +137,7 @@ class MeasuredLinear(RunLinearisation):
         numbers of the steps at the samples.
         """
         self._trajectory, self._measured, self._nearby = trajectory, measured or {}, nearby
-        if nearby is not None and is_alike:
+        if nearby is not None and reuses_jacobians:
             self.quotients = nearby._tangent.quotients
         spacing = float(np.median(np.diff(scenario.times))) if scenario.times.size > 1 else 0.0
         self.held = float(np.clip(spacing, LINEARISATION_INTERVAL_SECONDS, MAX_JACOBIAN_SECONDS))
@@ -169,7 +169,7 @@ class MeasuredLinear(RunLinearisation):
     @property
     def trajectory(self) -> Trajectory:
         """The motion about which the model is linearised."""
-        return Trajectory(self._motion.x, self._motion.v, self._motion.afloat)
+        return Trajectory(self._motion.x, self._motion.v, self._motion.floating_state)
 
     def _simulate_nominal_motion(self) -> RobotMotion:
         """Return the given motion with the commands of the run, in place of a simulated motion.
@@ -183,7 +183,9 @@ class MeasuredLinear(RunLinearisation):
         joints = trajectory.x.shape[1]
         x, v = motion.x.copy(), motion.v.copy()
         x[:, :joints], v[:, :joints] = trajectory.x, trajectory.v
-        return self._add_transmission_loads(replace(motion, x=x, v=v, afloat=trajectory.afloat))
+        return self._add_transmission_loads(
+            replace(motion, x=x, v=v, floating_state=trajectory.floating_state)
+        )
 
     def _get_nearby_motion(self) -> RobotMotion | None:
         """Return the motion of `nearby` with the commands of this model, which saves a simulation.
@@ -195,7 +197,9 @@ class MeasuredLinear(RunLinearisation):
         motion, steps = self._nearby._motion, self._steps + 1
         joints = len(self._simulator.addresses.positions)
         only_file_joints = (
-            motion.x.shape[1] == joints and not motion.act.size and not motion.afloat.pose.size
+            motion.x.shape[1] == joints
+            and not motion.act.size
+            and not motion.floating_state.pose.size
         )
         if not only_file_joints or any(is_series_effect(effect) for effect, _ in self._work.acting):
             return None
@@ -215,7 +219,7 @@ class MeasuredLinear(RunLinearisation):
         for joint, samples in self._measured.items():
             x[:, joint], v[:, joint] = interpolate_quintic(self._times, samples, steps)
         joints = len(self._simulator.addresses.positions)
-        return Trajectory(x[:, :joints], v[:, :joints], motion.afloat)
+        return Trajectory(x[:, :joints], v[:, :joints], motion.floating_state)
 
     def _add_transmission_loads(self, motion: RobotMotion) -> RobotMotion:
         """Return the motion with the loads of the transmissions, if any effect depends on them."""
@@ -436,7 +440,9 @@ class MeasuredLinear(RunLinearisation):
         if has_sensor_effect.any():
             forces = self._tangent.quotients.forces.shape[2]
             unforced = np.zeros((self.knots.size - 1, forces))
-            states[np.append(has_sensor_effect, True)] = self.propagated(predicted, unforced)
+            states[np.append(has_sensor_effect, True)] = self.propagate_deviations(
+                predicted, unforced
+            )
         changes = np.concatenate(
             [np.moveaxis(read[:, :, changing], 2, 0), np.zeros((1, *read.shape[:2]))]
         )
@@ -449,13 +455,13 @@ class MeasuredLinear(RunLinearisation):
         result[:, :, changing] = np.moveaxis(observations[:-1] - without_effects, 0, 2)
         return result
 
-    def propagated(self, begun: Array, forces: Array) -> Array:
+    def propagate_deviations(self, deviations: Array, forces: Array) -> Array:
         """Propagate deviations at samples to all steps, (S + 1, Z), by the linear model (2).
 
         In each step a deviation δ becomes A δ - d + B f, with the defect d of the step.
 
         Args:
-            begun: δ (T, Z) at the samples.
+            deviations: δ (T, Z) at the samples.
             forces: f (T - 1, E), constant between samples.
         """
         tangent = self._tangent
@@ -463,14 +469,14 @@ class MeasuredLinear(RunLinearisation):
         with np.errstate(all="ignore"), capture_mujoco_warnings():
             defects = tangent.defects
         result = np.zeros((self._motion.x.shape[0], tangent.state_size))
-        state = begun[:-1].copy()
+        state = deviations[:-1].copy()
         with np.errstate(all="ignore"):
             for steps, active in self._list_active_intervals():
                 result[steps] = state[active]
                 ahead = np.einsum("izy,iy->iz", quotients.states[points[steps]], state[active])
                 forced = np.einsum("ize,ie->iz", quotients.forces[points[steps]], forces[active])
                 state[active] = ahead - defects[steps] + forced
-        result[self.knots[-1] :] = begun[-1]
+        result[self.knots[-1] :] = deviations[-1]
         return result
 
     def moved(self, deviations: Array) -> Trajectory:
@@ -481,14 +487,14 @@ class MeasuredLinear(RunLinearisation):
         size, na = motion.x.shape[1], motion.act.shape[1]
         floating = self._simulator.make_linearisation_batch(self._work.acting).floating
         first_floating = 2 * size + na + len(self._tangent.hidden_state_effects)
-        floating_count = motion.afloat.rate.shape[1]
-        pose = motion.afloat.pose
+        floating_count = motion.floating_state.rate.shape[1]
+        pose = motion.floating_state.pose
         if floating_count:
             pose = floating.displaced(
                 pose, deviations[:, first_floating : first_floating + floating_count]
             )
         rate = (
-            motion.afloat.rate
+            motion.floating_state.rate
             + deviations[:, first_floating + floating_count : first_floating + 2 * floating_count]
         )
         return Trajectory(

@@ -283,7 +283,7 @@ class MujocoBatch:
         )
 
     def set_initial_state(
-        self, positions: Array, velocities: Array, afloat: FloatingState
+        self, positions: Array, velocities: Array, floating_state: FloatingState
     ) -> tuple[Array, Array]:
         """Set the initial states of the first n batch elements.
 
@@ -293,7 +293,7 @@ class MujocoBatch:
         Args:
             positions: (n, D) positions of the joints of the file.
             velocities: (n, D) velocities of the joints of the file.
-            afloat: poses and velocities of floating bodies.
+            floating_state: poses and velocities of floating bodies.
 
         Returns:
             Initial positions and velocities (n, H) of joints in series: the equilibrium of the
@@ -304,8 +304,8 @@ class MujocoBatch:
         n = len(positions)
         qpos[:n, self.file_joints.positions] = positions
         qvel[:n, self.file_joints.velocities] = velocities
-        qpos[:n, self.floating.positions] = afloat.pose
-        qvel[:n, self.floating.velocities] = afloat.rate
+        qpos[:n, self.floating.positions] = floating_state.pose
+        qvel[:n, self.floating.velocities] = floating_state.rate
         series = self.series_joints
         series_positions = np.zeros((n, series.positions.size))
         if series_positions.size:

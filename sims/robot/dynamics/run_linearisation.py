@@ -130,7 +130,7 @@ class RunLinearisation:
             v=np.concatenate([simulated.v[0], simulated.series[1][0]], axis=1),
             act=np.concatenate([first, act[:-1]]),
             carried=carried,
-            afloat=self._get_floating_states(simulated.fields),
+            floating_state=self._get_floating_states(simulated.fields),
             step=simulator.time_step,
             **self._compute_command_fields(inputs),
         )

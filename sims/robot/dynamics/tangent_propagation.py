@@ -395,11 +395,11 @@ class TangentModel:
         result = np.zeros_like(base)
         result[:, :joints] = motion.x[1:] - base[:, :joints]
         result[:, joints : 2 * joints] = motion.v[1:] - base[:, joints : 2 * joints]
-        moves = motion.afloat.rate.shape[1]
+        moves = motion.floating_state.rate.shape[1]
         if moves:
             # Displacements are relative to the motion itself.
             result[:, -2 * moves : -moves] = -base[:, -2 * moves : -moves]
-            result[:, -moves:] = motion.afloat.rate[1:] - base[:, -moves:]
+            result[:, -moves:] = motion.floating_state.rate[1:] - base[:, -moves:]
         return result
 
     @property

@@ -81,7 +81,7 @@ _NOTES = {
     "solimpfriction), so that the joint does not creep",
 }
 """Notes about effects that a file contains."""
-_SOFT = (
+_SOFT_FRICTION_NOTE = (
     "friction.coulomb: dry friction has MuJoCo's soft form, since solreffriction and "
     "solimpfriction are left as they were; a joint under load creeps"
 )
@@ -187,7 +187,7 @@ def apply_causes(
 def _find_note(robot: RobotModel, cause: FittedCause) -> str | None:
     """Return the note about an effect that the file contains; None if there is none."""
     if cause.effect == COULOMB and (robot.friction_form == "soft" or cause.coefficients[0] < 0):
-        return _SOFT
+        return _SOFT_FRICTION_NOTE
     return _NOTES.get(cause.effect)
 
 

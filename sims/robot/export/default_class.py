@@ -23,7 +23,7 @@ _MUJOCO_DEFAULTS: Mapping[str, Values] = {
     "solimpfriction": (0.9, 0.95, 0.001, 0.5, 2.0),
 }
 """MuJoCo's default values of attributes; all other attributes default to zero."""
-_OF_THE_POSE = frozenset({"axis", "ref", "springref"})
+_POSE_ATTRIBUTES = frozenset({"axis", "ref", "springref"})
 """Attributes that stay with a joint since they depend on its pose."""
 _NONE, _FIXED, _AFFINE = 0.0, 0.0, 1.0
 """MuJoCo's enumeration values of a position servo: no dynamics, fixed gain, affine bias."""
@@ -62,7 +62,7 @@ def _format_default_element(
     class_values = {
         name: value
         for name, value in values.items()
-        if name not in _OF_THE_POSE and not _is_usual(name, value)
+        if name not in _POSE_ATTRIBUTES and not _is_default(name, value)
     }
     if element.kind == "joint":
         if not values["frictionloss"][0]:
@@ -84,7 +84,7 @@ def _format_default_element(
     )
 
 
-def _is_usual(name: str, values: Values) -> bool:
+def _is_default(name: str, values: Values) -> bool:
     return values == _MUJOCO_DEFAULTS[name] if name in _MUJOCO_DEFAULTS else not any(values)
 
 
@@ -120,7 +120,7 @@ def render_model_using_class(
     tags = document.map_to_compiled_ids(applied.model)
     tag = tags[ModelElement("joint", joint)]
     tag.new["class"] = name
-    tag.removed |= {a.name for a in ATTRIBUTES_BY_KIND["joint"]} - _OF_THE_POSE
+    tag.removed |= {a.name for a in ATTRIBUTES_BY_KIND["joint"]} - _POSE_ATTRIBUTES
     if actuator is not None:
         element = ModelElement("actuator", actuator)
         tag = tags[element]

@@ -18,7 +18,7 @@ _UNSUPPORTED_ELEMENTS = ("replicate", "attach", "composite", "flexcomp", "model"
 FILE_ELEMENTS = ("mesh", "texture", "hfield", "skin")
 """Elements that refer to a file."""
 
-_DIRECTORIES = ("assetdir", "meshdir", "texturedir")
+_DIRECTORY_ATTRIBUTES = ("assetdir", "meshdir", "texturedir")
 
 
 class MjcfDocument:
@@ -169,7 +169,9 @@ class MjcfDocument:
         compilers = self.find_elements("compiler")
         for compiler in compilers:
             stated_folders |= {
-                key: compiler.attributes[key] for key in _DIRECTORIES if key in compiler.attributes
+                key: compiler.attributes[key]
+                for key in _DIRECTORY_ATTRIBUTES
+                if key in compiler.attributes
             }
         asset_folder = stated_folders.get("assetdir", "")
         absolute_folders = {

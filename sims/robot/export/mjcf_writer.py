@@ -23,7 +23,7 @@ from sims.robot.export.mjcf_attributes import (
 from sims.robot.export.mjcf_document import MjcfDocument
 from sims.robot.export.xml_editing import XmlElement, format_number, format_numbers
 
-_ORIENTATIONS = ("axisangle", "euler", "xyaxes", "zaxis", "fullinertia")
+_ORIENTATION_ATTRIBUTES = ("axisangle", "euler", "xyaxes", "zaxis", "fullinertia")
 """Attributes that are alternatives to ``quat`` and ``diaginertia``."""
 
 SHORTCUT_ATTRIBUTES = ("kp", "kv", "ki", "dampratio", "timeconst", "inheritrange")
@@ -34,7 +34,7 @@ _INPUT_BY_SHORTCUT = {"position": "pos", "velocity": "vel"}
 
 _GAIN_ATTRIBUTES = {"gainprm", "biasprm"}
 
-_LISTS = {"damping", "stiffness", "dynprm", "gainprm", "biasprm"}
+_LIST_ATTRIBUTES = {"damping", "stiffness", "dynprm", "gainprm", "biasprm"}
 
 
 class MjcfWriter:
@@ -133,7 +133,7 @@ class MjcfWriter:
                     changed = set(values)
                 if "diaginertia" in changed:
                     changed |= {"quat"}
-                    child.removed |= set(_ORIENTATIONS)
+                    child.removed |= set(_ORIENTATION_ATTRIBUTES)
                 child.new |= {name: values[name] for name in values if name in changed}
                 return
         if not values:
@@ -253,7 +253,7 @@ def _format_values(name: str, values: tuple[float, ...]) -> str:
         return "true" if values[0] else "false"
     if name in INTEGER_ATTRIBUTES:
         return str(int(values[0]))
-    if name in _LISTS:
+    if name in _LIST_ATTRIBUTES:
         # Trailing zeros are omitted, since numbers missing in a list are zero.
         last_nonzero = max((i for i, value in enumerate(values) if value), default=0)
         return format_numbers(values[: last_nonzero + 1])

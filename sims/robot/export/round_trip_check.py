@@ -32,10 +32,10 @@ COMPARED_SECONDS = 1.0
 MAX_COMPARED_STEPS = 2000
 """Maximum number of steps of the compared motion."""
 
-_OF_URDF = ("body_mass", "body_ipos", "dof_damping", "dof_frictionloss")
+_URDF_FIELDS = ("body_mass", "body_ipos", "dof_damping", "dof_frictionloss")
 """Model fields that a URDF specifies, in addition to the inertia tensors."""
 
-_NOT_OF_URDF = (
+_UNCOMPARED_FIELDS = (
     *("dof_solref", "dof_solimp", "body_inertia", "body_iquat"),
     *("dof_invweight0", "body_invweight0"),
 )
@@ -95,7 +95,7 @@ def _check_urdf(robot: RobotModel, causes: CauseCoefficients, path: Path) -> Non
     target_model = apply_causes(read_robot(robot.path), urdf_causes).model
     release_free_memory()
     reloaded_model = read_robot(path).compiled
-    for name in _OF_URDF:
+    for name in _URDF_FIELDS:
         reloaded_values, target_values = getattr(reloaded_model, name), getattr(target_model, name)
         if reloaded_values.shape != target_values.shape or not np.allclose(
             reloaded_values,
@@ -120,7 +120,7 @@ def _check_urdf(robot: RobotModel, causes: CauseCoefficients, path: Path) -> Non
         # A URDF does not specify the stiffness of friction, and colliding shapes may be meshes
         # elsewhere.
         _disable_contacts(model)
-        for name in _NOT_OF_URDF:
+        for name in _UNCOMPARED_FIELDS:
             getattr(model, name)[:] = getattr(reloaded_model, name)
     _compare_motion(reloaded_model, target_model, "extended.urdf")
 

@@ -44,7 +44,7 @@ CauseCoefficients = Mapping[str, Mapping[str, FittedValue]]
 EQUAL_NUMBERS_TOLERANCE = 1e-12
 """Relative difference between numbers of a compiled model that counts as rounding."""
 
-_SOFT_IN_URDF = (
+_SOFT_FRICTION_URDF_NOTE = (
     "friction.coulomb: a URDF cannot state that dry friction is stiff, and MuJoCo reads it in its "
     "soft form; extended.xml has the stiff form"
 )
@@ -232,7 +232,7 @@ def _render_urdf(
         if reason:
             lines.append(f"{cause.format(recording)}: not in the URDF: {reason}")
         elif cause.effect == COULOMB and robot.friction_form == "stiff":
-            lines.append(_SOFT_IN_URDF)
+            lines.append(_SOFT_FRICTION_URDF_NOTE)
     lines = list(dict.fromkeys(lines))
     notes += lines
     return writer.to_text(lines)

@@ -28,7 +28,7 @@ VISUAL_ELEMENTS = ("material", "visual")
 ONE_DOF_JOINT_TYPES = ("revolute", "continuous", "prismatic")
 MOVING_JOINT_TYPES = (*ONE_DOF_JOINT_TYPES, "floating", "planar", "spherical")
 JOINT_TYPES = ("fixed", *MOVING_JOINT_TYPES)
-WORLD = "world"
+WORLD_LINK = "world"
 """Name of the link that is the fixed world by a convention of many files."""
 RIGID_SOLREF = (1e-4, 1.0)
 """Parameter `solref` of a rigid mimic relation.
@@ -121,12 +121,12 @@ def _add_world_link(
 
     Simulators with a link of this name read such a file in this way.
     """
-    if WORLD in links or not any(
-        _get_link_name(files, joint, "parent") == WORLD for joint in joints
+    if WORLD_LINK in links or not any(
+        _get_link_name(files, joint, "parent") == WORLD_LINK for joint in joints
     ):
         return []
-    links[WORLD] = SubElement(root, "link", {"name": WORLD})
-    return [f"the link {WORLD}, which the file does not state, is the fixed world"]
+    links[WORLD_LINK] = SubElement(root, "link", {"name": WORLD_LINK})
+    return [f"the link {WORLD_LINK}, which the file does not state, is the fixed world"]
 
 
 def _make_joint_names_unique(files: ModelFileReader, joints: Sequence[Element]) -> list[str]:

@@ -19,7 +19,7 @@ COMPARE = """
 run = simgap.compare("pendulum-swing", tuners=[Careless, "random"], targets=1, budget=4, jobs=0)
 run.statuses.set_index("tuner").loc["careless", "reason"].iloc[0]
 """
-MENDED = TUNER.replace("task.dim - 2", "task.dim + 2")
+REPAIRED_TUNER = TUNER.replace("task.dim - 2", "task.dim + 2")
 AGAIN = """
 run = simgap.compare("pendulum-swing", tuners=[Careless], targets=1, budget=4, jobs=0)
 print(set(run.statuses["status"]))
@@ -40,7 +40,9 @@ def test_a_cells_tuner_is_compared_its_fault_shows_its_line_and_figures_are_inli
 ):
     """A real kernel provides `__main__`, the source text of cells and the display."""
     monkeypatch.setenv("IPYTHONDIR", str(tmp_path / "ipython"))
-    cells = [nbformat.v4.new_code_cell(text) for text in (TUNER, COMPARE, MENDED, AGAIN, WORKERS)]
+    cells = [
+        nbformat.v4.new_code_cell(text) for text in (TUNER, COMPARE, REPAIRED_TUNER, AGAIN, WORKERS)
+    ]
     notebook = nbformat.v4.new_notebook(cells=cells)
     nbclient.NotebookClient(
         notebook, timeout=120, resources={"metadata": {"path": tmp_path}}

@@ -400,7 +400,7 @@ def test_a_damaged_shot_is_one_line_whoever_reads_it(crashing, tmp_path, capsys)
     path = out / "shots" / "golf-000.json"
     sound = path.read_text()
 
-    def spoilt(where, row, key, value):
+    def change_stored_value(where, row, key, value):
         held = json.loads(sound)
         held[where][row][key] = value
         return json.dumps(held)
@@ -409,13 +409,31 @@ def test_a_damaged_shot_is_one_line_whoever_reads_it(crashing, tmp_path, capsys)
         ("[]", "damaged; delete it"),
         ('{"models": [], "rows": 3}', "damaged; delete it"),
         (sound.replace('"hit"', '"hot"', 1), ", 1: columns: expected one named hit"),
-        (spoilt("models", 1, "status", "perfect"), ", 2: status: expected one of done, conv"),
-        (spoilt("models", 0, "height", "high"), ", 1: height: expected a number of at least 0"),
-        (spoilt("models", 0, "effects", {"drag": ["x"]}), ", 1: effects: expected a number, fo"),
-        (spoilt("rows", 2, "simulations", -1), ", 3: simulations: expected a whole number of at"),
-        (spoilt("rows", 0, "seen", 1.5), ", 1: seen: expected a number from 0 to 1, found 1.5"),
-        (spoilt("rows", 0, "hit", 1), ", 1: hit: expected True or False, found 1"),
-        (spoilt("rows", 0, "shot", "golf-001"), "expected a row of golf-000 for each model"),
+        (
+            change_stored_value("models", 1, "status", "perfect"),
+            ", 2: status: expected one of done, conv",
+        ),
+        (
+            change_stored_value("models", 0, "height", "high"),
+            ", 1: height: expected a number of at least 0",
+        ),
+        (
+            change_stored_value("models", 0, "effects", {"drag": ["x"]}),
+            ", 1: effects: expected a number, fo",
+        ),
+        (
+            change_stored_value("rows", 2, "simulations", -1),
+            ", 3: simulations: expected a whole number of at",
+        ),
+        (
+            change_stored_value("rows", 0, "seen", 1.5),
+            ", 1: seen: expected a number from 0 to 1, found 1.5",
+        ),
+        (change_stored_value("rows", 0, "hit", 1), ", 1: hit: expected True or False, found 1"),
+        (
+            change_stored_value("rows", 0, "shot", "golf-001"),
+            "expected a row of golf-000 for each model",
+        ),
     ):
         path.write_text(text)
         capsys.readouterr()
@@ -487,16 +505,16 @@ def test_what_is_lost_on_the_way_is_said_and_no_untrained_tuner_is_shot_with(
     """A lost pool leaves a folder to resume; a failed training ends the study."""
 
     class Gone:
-        def __init__(self, fault):
-            self._fault = fault
+        def __init__(self, error):
+            self._error = error
 
         def load_plugins(self, plugins):
             pass
 
         def iterate_results(self, calls, seconds):
-            if isinstance(self._fault, PoolLostError):
-                raise self._fault
-            yield 0, self._fault
+            if isinstance(self._error, PoolLostError):
+                raise self._error
+            yield 0, self._error
 
         def __enter__(self):
             return self

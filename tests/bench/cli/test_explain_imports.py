@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from tests.simulation_arguments import Wish, write
+from tests.simulation_arguments import simulation_spec, write
 
 HEAVY = {
     "IPython",
@@ -47,7 +47,7 @@ sys.exit(code)
 @pytest.fixture(scope="module")
 def swing(tmp_path_factory):
     path = tmp_path_factory.mktemp("swing") / "swing.csv"
-    wish = Wish(
+    spec = simulation_spec(
         "pendulum",
         runs=3,
         seconds=2.0,
@@ -55,7 +55,7 @@ def swing(tmp_path_factory):
         noise=["q=0.01", "qd=0.05"],
         engine="batch",
     )
-    write(wish, path)
+    write(spec, path)
     return path
 
 

@@ -343,7 +343,7 @@ def test_schemas_are_sound_and_refuse_what_is_damaged_deep_inside(run, capsys):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "kind", "says"),
+    ("arguments", "kind", "message"),
     [
         (["status", "nowhere"], "input", "expected the folder of a comparison"),
         (["status", "--runz"], "usage", "unknown option '--runz'; did you mean --runs"),
@@ -353,14 +353,14 @@ def test_schemas_are_sound_and_refuse_what_is_damaged_deep_inside(run, capsys):
         (["list"], None, ""),
     ],
 )
-def test_a_fault_has_one_form_and_exit_code_2(arguments, kind, says, capsys):
+def test_a_fault_has_one_form_and_exit_code_2(arguments, kind, message, capsys):
     found = answered(capsys, *arguments, code=2 if kind else 0)
     if kind is None:
         assert "error" not in found
         return
     assert find_violations(found, "error") == []
     assert (found["error"]["kind"], found["error"]["code"]) == (kind, 2)
-    assert says in found["error"]["message"]
+    assert message in found["error"]["message"]
 
 
 def test_an_internal_fault_is_a_document_too_and_keeps_its_traceback(capsys, monkeypatch):
@@ -377,7 +377,7 @@ def test_an_internal_fault_is_a_document_too_and_keeps_its_traceback(capsys, mon
     }  # fmt: skip
 
 
-LOUD = """import ctypes
+PRINTING_TUNER = """import ctypes
 import os
 from methods.tuner import Tuner
 
@@ -393,7 +393,7 @@ class Loud(Tuner):
 
 @pytest.mark.slow
 def test_what_a_tuner_prints_does_not_come_to_stand_in_the_document(place):
-    (place / "loud.py").write_text(LOUD)
+    (place / "loud.py").write_text(PRINTING_TUNER)
     command = ["compare", place / "spring-small.toml", *PLUGIN, "--plugin", place / "loud.py"]
     command += ["--tuners", "loud", "--jobs", "0", "--out", place / "loud", "--json"]
     done = subprocess.run(

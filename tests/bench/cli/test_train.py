@@ -49,7 +49,7 @@ def experiment(tmp_path):
     return path
 
 
-def ahead(experiment, *more):
+def train_spring(experiment, *more):
     return main(
         [
             "train",
@@ -66,7 +66,7 @@ def ahead(experiment, *more):
 
 @pytest.mark.slow
 def test_trains_what_compare_then_finds(experiment, tmp_path, cache, capsys):
-    assert ahead(experiment, "--out", tmp_path / "out") == 0
+    assert train_spring(experiment, "--out", tmp_path / "out") == 0
     files = sorted(cache.iterdir())
     assert [file.suffix for file in files] == [".npz", ".npz"]
     stamps = [file.stat().st_mtime_ns for file in files]
@@ -97,7 +97,7 @@ def test_trains_what_compare_then_finds(experiment, tmp_path, cache, capsys):
     )
     assert sorted(cache.iterdir()) == files
     assert [file.stat().st_mtime_ns for file in files] == stamps
-    assert ahead(experiment) == 0
+    assert train_spring(experiment) == 0
     assert "trained earlier with 56 simulations" in capsys.readouterr().out
 
 
@@ -142,7 +142,7 @@ def test_looking_on_changes_nothing(experiment):
 
 
 def test_budget_and_seeds(experiment, cache, capsys):
-    assert ahead(experiment, "--budget", 40, "--seeds", 1) == 0
+    assert train_spring(experiment, "--budget", 40, "--seeds", 1) == 0
     assert len(list(cache.iterdir())) == 1
     said = capsys.readouterr().out
     assert "trained with 40 simulations" in said
@@ -199,12 +199,12 @@ BREAKS = [truncated, emptied, flipped, pickled, foreign, another, reshaped, not_
 @pytest.mark.slow
 @pytest.mark.parametrize("spoil", BREAKS, ids=lambda spoil: spoil.__name__)
 def test_broken_weights_are_refused_with_one_line(experiment, cache, capsys, spoil):
-    assert ahead(experiment) == 0
+    assert train_spring(experiment) == 0
     entry = TunerEntry("small", "tunenet", TUNER["options"])
     path = cache / f"{compute_training_key(load_experiment(str(experiment)), entry, 0)}.npz"
     spoil(path)
     capsys.readouterr()
-    assert ahead(experiment) == 2
+    assert train_spring(experiment) == 2
     said = capsys.readouterr().err.strip()
     assert said.startswith(f"simgap: {path}: ")
     assert len(said.splitlines()) == 1
@@ -218,11 +218,11 @@ def test_broken_weights_are_refused_with_one_line(experiment, cache, capsys, spo
             == 2
         )
         assert capsys.readouterr().err.strip().splitlines()[-1] == said
-        assert ahead(experiment, "--again") == 0
+        assert train_spring(experiment, "--again") == 0
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         (["cma_es", "slider"], "tuner cma_es does not learn: there is nothing to train"),
         (["tunenet", "slyder"], "unknown simulator 'slyder'"),
@@ -237,10 +237,10 @@ def test_broken_weights_are_refused_with_one_line(experiment, cache, capsys, spo
         ),
     ],
 )
-def test_faults_are_one_line(arguments, said, capsys):
+def test_faults_are_one_line(arguments, message, capsys):
     assert main(["train", *arguments]) == 2
     error = capsys.readouterr().err
-    assert said in error
+    assert message in error
     assert len(error.strip().splitlines()) == 1
 
 

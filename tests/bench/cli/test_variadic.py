@@ -57,7 +57,7 @@ def test_several_such_options_may_stand_before_it():
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         # The positional argument is given, so no word is taken from the option.
         (["pendulum", "--effect", "wind=1", "drag"], "--effect drag: expected NAME=VALUE"),
@@ -68,9 +68,9 @@ def test_several_such_options_may_stand_before_it():
         (["--effect", "drag.linear=1", "pendulun"], "unknown simulator 'pendulun'"),
     ],
 )
-def test_faults_name_the_word_that_is_wrong(words, said, tmp_path, capsys):
+def test_faults_name_the_word_that_is_wrong(words, message, tmp_path, capsys):
     assert main(["simulate", *words, "--out", str(tmp_path / "a.csv")]) == 2
-    assert said in capsys.readouterr().err
+    assert message in capsys.readouterr().err
 
 
 def test_simulate_runs_with_the_option_first(tmp_path, capsys):

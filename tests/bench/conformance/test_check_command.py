@@ -11,7 +11,7 @@ from tests.conftest import PLUGINS
 
 CHAOS = ["--plugin", str(PLUGINS / "chaos.py")]
 SPRING = ["--plugin", str(PLUGINS / "spring.py")]
-SOUND = """import numpy as np
+VALID_TUNER = """import numpy as np
 
 from methods.tuner import Tuner
 
@@ -36,7 +36,7 @@ def checked(capsys, *arguments):
 @pytest.mark.slow
 def test_sound_plugin_tuner_passes_every_check(tmp_path, capsys):
     plugin = tmp_path / "shrinking.py"
-    plugin.write_text(SOUND)
+    plugin.write_text(VALID_TUNER)
     code, said = checked(capsys, "shrinking", "--plugin", str(plugin))
     assert code == 0, said
     assert said.count("ok    ") == 14

@@ -89,13 +89,13 @@ def test_every_registered_name_is_the_name_its_class_says():
             continue
 
 
-def cell(says):
+def cell(description):
     """Define a class as a notebook cell does: each call gives a new class of the same name."""
 
     class FromACell(Tuner):
         pass
 
-    FromACell.says = says
+    FromACell.description = description
     return FromACell
 
 

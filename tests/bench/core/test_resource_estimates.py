@@ -146,7 +146,7 @@ def test_experiments_beyond_all_measure_are_refused(tmp_path, capsys, place):
 
 
 @pytest.mark.parametrize(
-    ("options", "says"),
+    ("options", "message"),
     [
         (["--budget", 10**18], "lower budget"),
         (["--budget", "1" + "0" * 400], "--budget: expected a whole number"),
@@ -160,16 +160,16 @@ def test_experiments_beyond_all_measure_are_refused(tmp_path, capsys, place):
         (["--memory", 10**20], "--memory"),
     ],
 )
-def test_options_of_compare_beyond_all_measure(tmp_path, capsys, options, says):
+def test_options_of_compare_beyond_all_measure(tmp_path, capsys, options, message):
     path = tmp_path / "e.toml"
     path.write_text(tomli_w.dumps(BASE))
     line = refused(capsys, ["compare", path, "--out", tmp_path / "out", *options])
-    assert says in line
+    assert message in line
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(
-    ("options", "says"),
+    ("options", "message"),
     [
         (["--runs", 10**9], "of memory"),
         (["--runs", 10**18, "--seconds", 0.1], "of memory"),
@@ -200,9 +200,9 @@ def test_options_of_compare_beyond_all_measure(tmp_path, capsys, options, says):
         (["--observe", ",".join(["q"] * 10**5)], "different channels"),
     ],
 )
-def test_simulations_beyond_all_measure(tmp_path, capsys, options, says):
+def test_simulations_beyond_all_measure(tmp_path, capsys, options, message):
     line = refused(capsys, ["simulate", "pendulum", "--out", tmp_path / "s.csv", *options])
-    assert says in line
+    assert message in line
     assert not list(tmp_path.iterdir())
 
 
@@ -236,7 +236,7 @@ high = 0.0034
 
 
 @pytest.mark.parametrize(
-    ("made", "says"),
+    ("size_options", "message"),
     [
         ({"factor": 1e3}, "are the stamps milliseconds? then divide t by 1000"),
         ({"factor": 1e6}, "are the stamps microseconds? then divide t by 1e+06"),
@@ -261,13 +261,13 @@ high = 0.0034
     ],
 )
 @pytest.mark.parametrize("command", ["explain", "score"])
-def test_recordings_beyond_all_measure(tmp_path, capsys, made, says, command):
-    path = swing(tmp_path, **made)
+def test_recordings_beyond_all_measure(tmp_path, capsys, size_options, message, command):
+    path = swing(tmp_path, **size_options)
     arguments = ["explain", path, "--out", tmp_path / "out"]
     if command == "score":
         (tmp_path / "model.toml").write_text(MODEL)
         arguments = ["score", tmp_path / "model.toml", path]
-    assert says in refused(capsys, arguments)
+    assert message in refused(capsys, arguments)
     assert not (tmp_path / "out").exists()
 
 
@@ -292,7 +292,7 @@ def test_other_commands_refuse_what_is_beyond_all_measure(tmp_path, capsys, monk
 
 
 @pytest.mark.parametrize(
-    ("need", "says"),
+    ("need", "message"),
     [
         (
             ResourceNeed("it", "less", memory=2e9),
@@ -305,11 +305,11 @@ def test_other_commands_refuse_what_is_beyond_all_measure(tmp_path, capsys, monk
         (ResourceNeed("it", "less", seconds=1e18), "3.17e+10 years"),
     ],
 )
-def test_what_is_needed_and_not_there_is_said(need, says):
+def test_what_is_needed_and_not_there_is_said(need, message):
     there = MachineResources(memory=1e9, disk=2e12, files=10)
     with pytest.raises(InputError, match="or insist with --force") as caught:
         check_feasible("x", need, there)
-    assert says in str(caught.value)
+    assert message in str(caught.value)
     check_feasible("x", need, there, force=True)
 
 

@@ -24,20 +24,20 @@ from sims.systems.pendulum import Pendulum
 
 MAT = "ParameterEstimation/SinglePendulum/SinglePendulumDataForParameterEstimation.mat"
 LICENCE = b"Anybody may use this.\n"
-PIECES = (2600, 2600, 2600, 2601)
+RECORD_LENGTHS = (2600, 2600, 2600, 2601)
 """Number of 1 ms samples in each piece of the synthetic swing: two runs of 5 s and a remainder."""
 
 
-def made_swing():
+def swing_samples():
     """Return (2, T) angles and rates at 1 ms; the pendulum hangs down at an angle of pi."""
-    t = np.arange(sum(PIECES)) * 1e-3
+    t = np.arange(sum(RECORD_LENGTHS)) * 1e-3
     return np.stack([np.pi + 0.8 * np.cos(8.0 * t), -6.4 * np.sin(8.0 * t)])
 
 
-def cells(pieces):
+def cells(records):
     """Return a MATLAB cell array of shape (n, 1)."""
-    array = np.empty((len(pieces), 1), object)
-    array[:, 0] = pieces
+    array = np.empty((len(records), 1), object)
+    array[:, 0] = records
     return array
 
 
@@ -46,7 +46,7 @@ def repository(tmp_path, monkeypatch):
     """Create a clone of the pendulum repository with a short synthetic swing, declared in the
     catalogue as the published file; data sets of this machine are not found.
     """
-    parts = np.split(made_swing(), np.cumsum(PIECES)[:-1], axis=1)
+    parts = np.split(swing_samples(), np.cumsum(RECORD_LENGTHS)[:-1], axis=1)
     content = io.BytesIO()
     savemat(content, {"Y_id": cells(parts[:2]), "Y_vad": cells(parts[2:]), "dt": 1e-3})
     folder = tmp_path / "clone"
@@ -145,7 +145,7 @@ def test_a_download_is_a_recording_with_its_licence_and_source(served, tmp_path,
     recording = read_recording(folder / "recording.csv", Pendulum)
     assert len(recording.runs) == 2
     for number, run in enumerate(recording.runs):
-        swing = made_swing()[:, number * 5000 : (number + 1) * 5000 : 5]
+        swing = swing_samples()[:, number * 5000 : (number + 1) * 5000 : 5]
         np.testing.assert_allclose(run.times, np.arange(1000) * 0.005, atol=1e-12)
         np.testing.assert_allclose(run.channels["q"], swing[0] - np.pi, atol=1.1e-6)
         np.testing.assert_allclose(run.channels["qd"], swing[1], atol=1.1e-6)
@@ -244,11 +244,11 @@ def test_a_file_that_was_changed(repository, capsys):
     assert "nothing is written" in said
 
 
-@pytest.mark.parametrize(("kept", "said"), [(0, "found 0"), (50, "found 50")])
-def test_a_file_that_is_not_whole(repository, capsys, kept, said):
+@pytest.mark.parametrize(("kept", "message"), [(0, "found 0"), (50, "found 50")])
+def test_a_file_that_is_not_whole(repository, capsys, kept, message):
     content = (repository / MAT).read_bytes()[:kept]
     (repository / MAT).write_bytes(content)
-    assert said in refused(capsys, "--from", repository)
+    assert message in refused(capsys, "--from", repository)
 
 
 def test_a_licence_that_was_changed(repository, capsys):
@@ -257,15 +257,15 @@ def test_a_licence_that_was_changed(repository, capsys):
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         (["--from", "nowhere"], "--from nowhere: no such folder"),
         (["--from", "ftp://x"], "expected a folder, or an http or https address"),
         (["--from", "."], f"expected {MAT} of commit e99a7e1"),
     ],
 )
-def test_a_source_that_cannot_be(repository, capsys, words, said):
-    assert said in refused(capsys, *words)
+def test_a_source_that_cannot_be(repository, capsys, words, message):
+    assert message in refused(capsys, *words)
 
 
 def test_an_unknown_name_names_those_that_there_are(capsys):

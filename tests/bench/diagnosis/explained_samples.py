@@ -14,12 +14,12 @@ from bench.diagnosis.search.effect_search import EffectSearch
 from bench.logs.synthetic_recording import simulate_recording
 from sims.core.simulator import Scenario
 from sims.recording.recording import Recording, Run
-from tests.simulation_arguments import Wish
+from tests.simulation_arguments import simulation_spec
 
 
-def recording(system="pendulum", **wish):
+def recording(system="pendulum", **options):
     """Simulate a recording without writing a file."""
-    return simulate_recording(Wish(system, **wish)).recording
+    return simulate_recording(simulation_spec(system, **options)).recording
 
 
 def recorded(simulator, theta, starts, times, noise=0.0, seed=0, stated=True):

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from bench.diagnosis.report.report_data import ChannelInfo, DataSplit, GapLocation, ModelFileChange
-from tests.bench.diagnosis.sample_report_data import HELD_OUT, story
+from tests.bench.diagnosis.sample_report_data import HELD_OUT, make_report
 from tests.bench.figures.figure_robots import ARM6, POSE6, arm2, arm6
 
 NOISE = {"q": 0.001, "tau": 0.05}
@@ -25,18 +25,18 @@ def number(value, unit="N*m"):
     return {"value": value, "unit": unit, "low": value - 0.02, "high": value + 0.02}
 
 
-def cause(effect, coefficients=None, alternatives=(), says=None):
+def cause(effect, coefficients=None, alternatives=(), description=None):
     place = effect.partition("@")[2]
     return {
         "effect": effect,
         "alternatives": list(alternatives),
-        "says": says or f"a constant friction opposes motion (at joint {place})",
+        "says": description or f"a constant friction opposes motion (at joint {place})",
         "coefficients": coefficients or {"coefficient": number(0.31)},
         "p_value": 1e-9,
     }
 
 
-RUB = cause("friction.coulomb@elbow")
+COULOMB = cause("friction.coulomb@elbow")
 WRISTS = cause(
     "friction.coulomb@wrist_1",
     alternatives=["friction.coulomb@wrist_2", "friction.coulomb@wrist_3"],
@@ -44,7 +44,7 @@ WRISTS = cause(
 HEAVY = cause(
     "mass.scale@elbow_link",
     {"coefficient": number(0.12, "1")},
-    says="the body is heavier or lighter than the model file states (at body elbow_link)",
+    description="the body is heavier or lighter than the model file states (at body elbow_link)",
 )
 EVERYWHERE = cause("friction.coulomb@*", {f"coefficient@{joint}": number(0.3) for joint in ARM6})
 
@@ -92,7 +92,7 @@ def motion(joints, runs, seed, at):
     return tuple(str(i + 1) for i in range(runs)), (t,) * runs, observed, after - gap, after
 
 
-def robot_story(verdict="named", causes=(RUB,), joints=ARM6, at="elbow", **changes):
+def make_robot_report(verdict="named", causes=(COULOMB,), joints=ARM6, at="elbow", **changes):
     """Return report data of an arm; `changes` replace entries of the verdict or of the data."""
     robot = arm6() if len(joints) == 6 else arm2()
     fitting = DataSplit(*motion(joints, 3, 1, at))
@@ -128,5 +128,5 @@ def robot_story(verdict="named", causes=(RUB,), joints=ARM6, at="elbow", **chang
         "robot": robot,
         "why": (),
     }
-    told = story(verdict, **{**entries, **fields, **changes})
+    told = make_report(verdict, **{**entries, **fields, **changes})
     return replace(told, parameters=())

@@ -155,7 +155,7 @@ def answer(verdict="named", **changes):
     return {**found, **changes}
 
 
-def story(verdict="named", **changes):
+def make_report(verdict="named", **changes):
     """Return report data with this verdict; `changes` replace entries of the verdict or data."""
     gap = verdict not in ("adequate", "unidentifiable")
     fitting, held_out = sides(gap)
@@ -206,7 +206,7 @@ def evil():
         "alternatives": [EVIL],
         "coefficients": {EVIL: {**DRAG["coefficients"]["coefficient"], "unit": EVIL}},
     }
-    base = story("ambiguous")
+    base = make_report("ambiguous")
     document = base.verdict.to_document()
     bad = {
         "system": EVIL,

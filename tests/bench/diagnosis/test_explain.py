@@ -20,7 +20,7 @@ from sims.systems.pendulum import Pendulum
 from tests.bench.diagnosis import verdict_schema
 from tests.bench.diagnosis.report_tables import swing, table
 from tests.conftest import PLUGINS
-from tests.simulation_arguments import Wish, write
+from tests.simulation_arguments import simulation_spec, write
 
 EXAMPLES = PLUGINS.parents[1] / "examples"
 TIMES = np.arange(90) / 60
@@ -210,7 +210,7 @@ def test_other_engines_explain_too(tmp_path):
 
 
 def test_what_takes_no_effects_is_refused(tmp_path, spring):
-    write(Wish("spring", runs=2, seconds=1), tmp_path / "spring.csv")
+    write(simulation_spec("spring", runs=2, seconds=1), tmp_path / "spring.csv")
     with pytest.raises(
         InputError, match="simulator spring takes no effects, so nothing can be missing from it"
     ):
@@ -221,7 +221,7 @@ def test_what_takes_no_effects_is_refused(tmp_path, spring):
 def test_a_plugins_simulator_without_forces_is_explained(tmp_path):
     pytest.importorskip("mujoco")
     load_plugins([EXAMPLES / "bob.py"])
-    truth = Wish(
+    truth = simulation_spec(
         "bob",
         ["damping=0.3"],
         ["input.gain=0.3"],
@@ -248,7 +248,9 @@ def test_a_plugins_simulator_with_forces_is_explained(tmp_path):
     pytest.importorskip("pybullet")
     load_plugins([EXAMPLES / "puck.py"])
     path = tmp_path / "puck.csv"
-    truth = Wish("puck", ["0.3"], ["drag.linear=0.15"], noise=["0.002"], initial=["v=0.2:1"])
+    truth = simulation_spec(
+        "puck", ["0.3"], ["drag.linear=0.15"], noise=["0.002"], initial=["v=0.2:1"]
+    )
     write(replace(truth, runs=2, seconds=0.6, rate=25), path)
     found = explained(path)
     cause = found.causes[0]
@@ -277,7 +279,9 @@ def test_an_extended_simulator_is_scored_and_explained_as_its_system(tmp_path):
         found.extended.simulator().simulate(theta, scenario), by_hand.simulate(theta, scenario)
     )
     made = simulate_recording(
-        Wish("pendulum_extended", noise=["q=0.003", "qd=0.02"], runs=3, seconds=1.5, rate=60)
+        simulation_spec(
+            "pendulum_extended", noise=["q=0.003", "qd=0.02"], runs=3, seconds=1.5, rate=60
+        )
     ).recording
     columns = [(run.times, run.channels["q"], run.channels["qd"]) for run in made.runs]
     path = table(tmp_path, columns, system="pendulum_extended", noise=NOISE)

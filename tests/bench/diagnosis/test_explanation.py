@@ -15,7 +15,7 @@ from bench.diagnosis.explanation import Explanation
 from bench.diagnosis.report.explanation_figures import DPI
 from sims.core.simulator import InputError
 from sims.extended_simulator import ExtendedSimulator, FittedValue
-from tests.bench.diagnosis.sample_report_data import DRAG, EVIL, TILT, evil, story
+from tests.bench.diagnosis.sample_report_data import DRAG, EVIL, TILT, evil, make_report
 
 EXTENDED = ExtendedSimulator(
     name="pendulum_extended",
@@ -29,13 +29,13 @@ EXTENDED = ExtendedSimulator(
 )
 
 
-def explanation_of(story):
-    return Explanation(story.verdict, story, EXTENDED)
+def explanation_of(report):
+    return Explanation(report.verdict, report, EXTENDED)
 
 
 @pytest.fixture
 def named():
-    return explanation_of(story())
+    return explanation_of(make_report())
 
 
 def test_its_parts_can_be_asked_for(named):
@@ -50,17 +50,17 @@ def test_shown_as_text_it_is_three_lines(named):
         "drag.linear: coefficient 2.20×10⁻⁴ (2.00×10⁻⁴ to 2.40×10⁻⁴) N·m·s/rad",
         "90 % of the gap closed (85 to 94 %) on held-out runs",
     ]
-    adequate = explanation_of(story("adequate", title="quiet"))
+    adequate = explanation_of(make_report("adequate", title="quiet"))
     assert repr(adequate) == "adequate: quiet"
 
 
 def test_what_cannot_be_distinguished_is_shown_together():
-    shown = repr(explanation_of(story("ambiguous")))
+    shown = repr(explanation_of(make_report("ambiguous")))
     assert "drag.linear or friction.coulomb: coefficient" in shown
 
 
 def test_shown_as_text_it_stays_short_whatever_it_holds():
-    many = explanation_of(story(causes=[DRAG, TILT] * 20, title="a" * 9000))
+    many = explanation_of(make_report(causes=[DRAG, TILT] * 20, title="a" * 9000))
     assert len(repr(many)) < 500
     shown = repr(explanation_of(evil()))
     assert len(shown) < 500
@@ -101,7 +101,7 @@ def test_each_figure_can_be_had_by_name(named):
         assert len(figure.axes) >= 2
     words = [text.get_text() for text in named.figure("where").texts]
     assert "Where the gap is" in words
-    bare = explanation_of(story("adequate", candidates=[], places=()))
+    bare = explanation_of(make_report("adequate", candidates=[], places=()))
     assert bare.figures == ("overview",)
 
 

@@ -21,7 +21,7 @@ from sims.robot.export import round_trip_check
 from sims.robot.integrator_settings import IntegratorSettings
 from sims.robot.robot_model import RobotModel
 from sims.robot.robot_simulator import make_robot_simulator as robot_simulator
-from tests.bench.diagnosis.sample_report_data import story
+from tests.bench.diagnosis.sample_report_data import make_report
 
 EXAMPLE = Path(__file__).parents[3] / "examples" / "robot"
 FRICTION = {
@@ -51,7 +51,7 @@ def arm():
 
 
 def test_it_is_written_with_the_rest(arm, tmp_path):
-    shown = story()
+    shown = make_report()
     explanation = Explanation(shown.verdict, shown, extended_of(arm, effects=FRICTION))
     paths = explanation.write(tmp_path)
     assert [path.name for path in paths[:3]] == ["verdict.json", "extended.toml", "extended.xml"]
@@ -68,21 +68,21 @@ def test_it_is_written_with_the_rest(arm, tmp_path):
 
 def test_the_report_shows_the_lines_to_change(arm, tmp_path, monkeypatch):
     monkeypatch.setattr(explanation_figures, "render_figures", lambda _: {})
-    shown = replace(story(), robot=arm.robot)
+    shown = replace(make_report(), robot=arm.robot)
     explanation = Explanation(shown.verdict, shown, extended_of(arm, effects=FRICTION))
     html = (explanation.write(tmp_path)[0].parent / "report.html").read_text()
     before = '<joint name="elbow" type="hinge" axis="0 1 0" damping="0.1" armature="0.005"/>'
     assert f"− {before}</del>" in unescape(html)
     assert 'armature="0.005" frictionloss="0.03"' in unescape(html)
     assert "dry friction is stiff in the file" in html
-    nothing = Explanation(shown.verdict, replace(shown, verdict=story("adequate").verdict),
+    nothing = Explanation(shown.verdict, replace(shown, verdict=make_report("adequate").verdict),
                           extended_of(arm))  # fmt: skip
     assert "Changes of the model file" not in nothing._repr_html_()
 
 
 @pytest.mark.slow
 def test_it_errs_by_the_noise_where_its_cause_is_true(arm, tmp_path):
-    shown = story()
+    shown = make_report()
     explanation = Explanation(shown.verdict, shown, extended_of(arm, effects=FRICTION))
     paths = {path.name: path for path in explanation.write(tmp_path / "out")}
     log = EXAMPLE / "log.csv"

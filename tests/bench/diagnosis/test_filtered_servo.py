@@ -50,17 +50,17 @@ SHARED = Path(os.environ.get("SIMGAP_SHARED", Path(__file__).parents[4] / "share
 CASE = SHARED / "cases" / "filtered_servo" / "log.csv"
 
 
-def recorded(folder, begun, seconds=2.5):
+def recorded(folder, initial_activation, seconds=2.5):
     """Write a log of three runs; return its path.
 
     Args:
         folder: folder of the log and of the known model file.
-        begun: ``zero`` for activations as MuJoCo resets them; ``moving`` for a log that is cut out
-            of a motion.
+        initial_activation: ``zero`` for activations as MuJoCo resets them; ``moving`` for a log
+            that is cut out of a motion.
     """
     rng = np.random.default_rng(5)
     model = mujoco.MjModel.from_xml_string(ARM.format(damping=PLANTED, actuators=SERVOS))
-    before = 0.7 if begun == "moving" else 0.0
+    before = 0.7 if initial_activation == "moving" else 0.0
     count = round((seconds + before) / 0.01) + 1
     times = 0.01 * np.arange(count)
     rows = ["run,t,u.s1,u.s2,q.shoulder,q.elbow"]
@@ -82,9 +82,9 @@ def recorded(folder, begun, seconds=2.5):
     return folder / "log.csv"
 
 
-@pytest.mark.parametrize("begun", ["zero", "moving"])
-def test_a_planted_damping_is_found_behind_filtered_servos(tmp_path, begun):
-    path = recorded(tmp_path, begun)
+@pytest.mark.parametrize("initial_activation", ["zero", "moving"])
+def test_a_planted_damping_is_found_behind_filtered_servos(tmp_path, initial_activation):
+    path = recorded(tmp_path, initial_activation)
     lines = []
     found = explaining.explain(path, say=lines.append)
     (cause,) = found.causes

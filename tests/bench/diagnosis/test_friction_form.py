@@ -86,7 +86,9 @@ def fitted(path, name):
     base = fit_base_model(stiff, noise)
     rng = np.random.default_rng(0)
     models = ModelSet(stiff, noise, base.fixed_parameters, rng, np.ones(2, dtype=bool))
-    models.refit_models([FitStart((name,), base.fit.theta, base.fit.initial_states)], race=False)
+    models.refit_models(
+        [FitStart((name,), base.fit.theta, base.fit.initial_states)], is_racing=False
+    )
     return models, models.models[frozenset([name])], evaluator(make_soft_kind(kind))
 
 
@@ -126,7 +128,7 @@ def names_friction_alone(search, held_out):
     """Replace the search: return the planted effect without the time of a search."""
     effect = "friction.coulomb@elbow"
     base = search.base_model
-    search.refit_models([replace(base.fit.make_start(), effects=(effect,))], race=False)
+    search.refit_models([replace(base.fit.make_start(), effects=(effect,))], is_racing=False)
     model = search.models[frozenset([effect])]
     thetas = [base.fit.theta, model.fit.theta]
     measured = dict(zip([(), (effect,)], held_out.fit_initial_states(thetas), strict=True))

@@ -12,7 +12,7 @@ from bench.diagnosis.evaluation.noise_floor import (
     compute_noise_floor,
     compute_value_range,
 )
-from bench.diagnosis.evaluation.noise_free_runs import add_least_noise
+from bench.diagnosis.evaluation.noise_free_runs import add_minimal_noise
 from bench.diagnosis.explain import explain
 from bench.diagnosis.search.diagnose import DiagnosisResult
 from bench.diagnosis.search.lack_of_fit import LackOfFitResult
@@ -38,7 +38,7 @@ def test_a_cause_in_noise_free_data_is_named_with_its_number():
 
 def test_noise_is_added_where_there_is_none_and_nowhere_else():
     made = recording(runs=2, seconds=2, noise=["q=0.002"])
-    again, names = add_least_noise(made, ["q", "qd"])
+    again, names = add_minimal_noise(made, ["q", "qd"])
     assert names == ["qd"]
     for before, after in zip(made.runs, again.runs, strict=True):
         np.testing.assert_array_equal(before.channels["q"], after.channels["q"])
@@ -51,7 +51,7 @@ def test_noise_is_added_where_there_is_none_and_nowhere_else():
 
 def test_the_added_noise_is_the_same_each_time():
     made = recording(runs=2, seconds=1)
-    once, twice = (add_least_noise(made, ["q"])[0] for _ in range(2))
+    once, twice = (add_minimal_noise(made, ["q"])[0] for _ in range(2))
     np.testing.assert_array_equal(once.runs[1].channels["q"], twice.runs[1].channels["q"])
     assert not np.array_equal(once.runs[0].channels["q"], once.runs[1].channels["q"])
 
@@ -60,14 +60,14 @@ def test_the_added_noise_is_the_same_each_time():
 def test_rounding_of_a_file_is_not_noise(digits):
     made = recording(runs=2, seconds=2)
     rounded = [changed(run, q=lambda v: np.round(v, digits)) for run in made.runs]
-    assert add_least_noise(replace(made, runs=tuple(rounded)), ["q"])[1] == ["q"]
+    assert add_minimal_noise(replace(made, runs=tuple(rounded)), ["q"])[1] == ["q"]
 
 
 def test_a_channel_that_never_changes_has_the_noise_of_what_no_sample_tells_of():
     made = recording(runs=2, seconds=1, noise=["0.001"])
     still = [changed(run, qd=lambda v: np.zeros_like(v)) for run in made.runs]
     made = replace(made, runs=tuple(still), noise={})
-    assert add_least_noise(made, ["qd"])[1] == []
+    assert add_minimal_noise(made, ["qd"])[1] == []
     assert compute_noise_floor(evaluator(made, candidates=[]), made).sigma[1] == pytest.approx(
         1e-3 * 10.0
     )

@@ -6,7 +6,7 @@ Two external simulators explain data that the batch engine of the system did not
 import pytest
 
 from bench.diagnosis.explain import explain
-from tests.simulation_arguments import Wish, write
+from tests.simulation_arguments import simulation_spec, write
 
 CASES = {
     "pendulum": ("drag.linear=6e-4", "mujoco", ("q",), 1.0, 30.0),
@@ -20,7 +20,7 @@ CASES = {
 @pytest.mark.parametrize("system", CASES)
 def test_the_same_cause_is_named(system, engine, tmp_path):
     effect, source, observe, seconds, rate = CASES[system]
-    wish = Wish(
+    wish = simulation_spec(
         system,
         effects=[effect],
         noise=["0.004"],

@@ -27,7 +27,7 @@ from bench.diagnosis.search.verdict_rules import verdict_of_numbers
 from sims.core.simulator import Parameter
 from sims.extended_simulator import FittedValue
 from tests.bench.diagnosis.explained_samples import evaluator, recording
-from tests.bench.diagnosis.sample_report_data import DRAG, story
+from tests.bench.diagnosis.sample_report_data import DRAG, make_report
 from tests.conftest import PLUGINS
 
 TANKS = PLUGINS.parents[1] / "examples" / "tanks.py"
@@ -194,7 +194,7 @@ def test_the_bound_is_said_wherever_the_number_is(bounded):
 def test_a_partial_verdict_for_a_bound_says_which():
     number = {"value": 4.0, "unit": "s", "low": None, "high": None, "at_bound": "high"}
     lag = {**DRAG, "effect": "sensor.lag", "coefficients": {"coefficient": number}}
-    told = story("partial", causes=[lag])
+    told = make_report("partial", causes=[lag])
     assert format_headline(told) == (
         "The simulation lacks a sensor lag, but the fit ends at the upper bound of its range, 4 s."
     )
@@ -206,7 +206,7 @@ def test_a_partial_verdict_for_a_bound_says_which():
 
 def test_a_parameter_at_its_bound_is_said_to_be_there():
     p = ParameterChange("mass", "kg", (1.0, 0.9, 1.1), (10.0, np.nan, np.nan), True, (None, "high"))
-    assert "10 kg (upper bound of its range) after" in format_parameter_shift(story(), p)
+    assert "10 kg (upper bound of its range) after" in format_parameter_shift(make_report(), p)
 
 
 def test_nothing_of_a_number_at_a_bound_is_written_into_a_model_file():
@@ -229,7 +229,7 @@ def test_nothing_of_a_number_at_a_bound_is_written_into_a_model_file():
 
 
 @pytest.mark.parametrize(
-    ("before", "after", "bent"),
+    ("before", "after", "absorbed"),
     [
         # The change is below 0.1 %, although it is far outside both intervals.
         ((3.3e-3, 3.29999e-3, 3.30001e-3), (3.3005e-3, 3.30049e-3, 3.30051e-3), False),
@@ -238,11 +238,11 @@ def test_nothing_of_a_number_at_a_bound_is_written_into_a_model_file():
         ((1.0, 0.99, 1.01), (1.08, 1.07, 1.09), True),
     ],
 )
-def test_a_parameter_absorbs_what_is_significant(before, after, bent):
+def test_a_parameter_absorbs_what_is_significant(before, after, absorbed):
     p = ParameterChange("inertia", "kg*m^2", before, after, True)
-    said = format_parameter_shift(story(), p)
-    assert has_absorbed_gap(p) is bent
-    assert ("absorbed part of the gap" in said) is bent
+    said = format_parameter_shift(make_report(), p)
+    assert has_absorbed_gap(p) is absorbed
+    assert ("absorbed part of the gap" in said) is absorbed
     assert "(0.0 %)" not in said
     assert format_shift(replace(p, after=before)) == "unchanged"
 

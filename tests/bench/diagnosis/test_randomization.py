@@ -22,13 +22,13 @@ from bench.diagnosis.verdict import Verdict
 from bench.schemas import load_schema
 from sims.core.toml_validation import tomllib
 from sims.extended_simulator import ExtendedSimulator, FittedValue, get_robot_reference
-from tests.bench.diagnosis.sample_report_data import answer, story
+from tests.bench.diagnosis.sample_report_data import answer, make_report
 from tests.sims.robot.sample_arms import ARM
 
 EXAMPLE = Path(__file__).parents[3] / "examples" / "robot"
 NAMES = ("ranges.toml", "ranges.csv", "ranges_isaac_lab.py", "ranges_mujoco_playground.py")
 RANGES_SCHEMA = load_schema("explain")["anyOf"][0]["properties"]["ranges"]
-RUBS = "friction.coulomb@*"
+ALL_FRICTION = "friction.coulomb@*"
 
 
 def number(value, half=None, unit="1", **changes):
@@ -43,7 +43,7 @@ def one(value, half):
 
 
 EFFECTS = {
-    RUBS: {
+    ALL_FRICTION: {
         "coefficient@shoulder": number(0.1, 0.02, "N*m"),
         "coefficient@elbow": number(-0.03, 0.01, "N*m"),
     },
@@ -89,7 +89,7 @@ def explanation_of(kind, effects, free=None, verdict="named", alternatives=(), t
         for k, (name, own) in enumerate(effects.items())
     ]  # fmt: skip
     found = Verdict.from_document({**answer(verdict), "causes": causes})
-    return Explanation(found, replace(story(), verdict=found), extended)
+    return Explanation(found, replace(make_report(), verdict=found), extended)
 
 
 def by_name(explanation):
@@ -358,7 +358,7 @@ def events(code):
     stubs["isaaclab.envs.mdp"].__getattr__ = lambda name: name
     stubs["isaaclab.managers"].EventTermCfg = lambda **given: given
     stubs["isaaclab.managers"].SceneEntityCfg = lambda name, **given: (name, given)
-    stubs["isaaclab.utils"].configclass = lambda made: made
+    stubs["isaaclab.utils"].configclass = lambda decorated: decorated
     sys.modules.update(stubs)
     try:
         space = {}

@@ -55,7 +55,7 @@ def test_a_link_without_inertia_does_not_make_the_stamps_milliseconds(tmp_path):
     assert check_recording_plausible(*load_recording(table_of(tmp_path, model=light))) == []
 
 
-SAID = {
+ERROR_MESSAGES = {
     "degrees": (
         scaled(1, 1, 57.3, 57.3),
         r"column q.shoulder: expected within -2.6 to 2.6 rad, the joint's range, found "
@@ -70,9 +70,9 @@ SAID = {
 }
 
 
-@pytest.mark.parametrize("name", SAID)
+@pytest.mark.parametrize("name", ERROR_MESSAGES)
 def test_positions_that_cannot_be_are_refused_in_one_line(name, tmp_path):
-    change, message = SAID[name]
+    change, message = ERROR_MESSAGES[name]
     table = table_of(tmp_path, change)
     with pytest.raises(InputError, match=r"log\.csv: (run 1, )?" + message) as error:
         explain(table)

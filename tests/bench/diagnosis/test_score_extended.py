@@ -6,7 +6,7 @@ import pytest
 from bench.diagnosis.score_extended import score_model
 from sims.core.simulator import InputError
 from sims.extended_simulator import ExtendedSimulator, FittedValue, write_extended
-from tests.simulation_arguments import Wish
+from tests.simulation_arguments import simulation_spec
 from tests.simulation_arguments import write as simulate
 
 MODEL = ExtendedSimulator(
@@ -14,7 +14,7 @@ MODEL = ExtendedSimulator(
     {"drag.linear": {"coefficient": FittedValue(6e-4, "N*m*s/rad", None, None)}},
     {"mass": 0.15, "length": 0.15, "gravity": 9.81}, ["q", "qd"],
 )  # fmt: skip
-WISH = Wish(
+SIMULATION = simulation_spec(
     "pendulum",
     ["4e-3"],
     ["drag.linear=6e-4"],
@@ -33,7 +33,7 @@ WISH = Wish(
 
 @pytest.fixture
 def files(tmp_path):
-    simulate(WISH, tmp_path / "swing.csv")
+    simulate(SIMULATION, tmp_path / "swing.csv")
     write_extended(MODEL, tmp_path / "extended.toml")
     return tmp_path / "extended.toml", tmp_path / "swing.csv"
 
@@ -102,8 +102,8 @@ def test_the_error_of_a_channel_is_that_of_its_samples(files):
 
 def test_what_cannot_be_scored_is_one_line(files, tmp_path):
     model, recording = files
-    simulate(Wish("slider", runs=1, seconds=0.5), tmp_path / "other.csv")
-    simulate(replace(WISH, observe=["q"], noise=0.003), tmp_path / "angle.csv")
+    simulate(simulation_spec("slider", runs=1, seconds=0.5), tmp_path / "other.csv")
+    simulate(replace(SIMULATION, observe=["q"], noise=0.003), tmp_path / "angle.csv")
     for other, message in [
         ("other.csv", "other.csv|other.toml"),
         ("angle.csv", "unknown channel of .*angle.csv 'qd'; there are: q"),
@@ -125,7 +125,7 @@ def test_what_cannot_be_scored_is_one_line(files, tmp_path):
 
 def test_another_system_is_refused(files, tmp_path):
     model, _ = files
-    simulate(Wish("servo", runs=1, seconds=0.5), tmp_path / "arm.csv")
+    simulate(simulation_spec("servo", runs=1, seconds=0.5), tmp_path / "arm.csv")
     with pytest.raises(
         InputError, match=r"arm.csv: expected a recording of pendulum, as .* is; found one of servo"
     ):

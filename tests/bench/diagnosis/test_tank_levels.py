@@ -21,7 +21,7 @@ pytestmark = pytest.mark.usefixtures("fresh_registries")
 
 
 @pytest.fixture
-def made():
+def log_script():
     """Load the script that makes the recording, and register the example's simulator."""
     spec = importlib.util.spec_from_file_location("tanks_log", EXAMPLES / "tanks" / "make_log.py")
     script = importlib.util.module_from_spec(spec)
@@ -30,8 +30,8 @@ def made():
     return script
 
 
-def test_the_recording_is_what_the_script_makes(made, tmp_path):
-    made.write(tmp_path / "again.csv")
+def test_the_recording_is_what_the_script_makes(log_script, tmp_path):
+    log_script.write(tmp_path / "again.csv")
     again, shipped = (
         np.loadtxt(path, delimiter=",", skiprows=1) for path in (tmp_path / "again.csv", RECORDING)
     )
@@ -40,32 +40,34 @@ def test_the_recording_is_what_the_script_makes(made, tmp_path):
 
 
 @pytest.mark.parametrize("rim", [0.2, 1.0])
-def test_the_simulator_follows_the_solver_to_a_third_of_the_noise(made, rim):
-    volts, start = made.RUNS[0], made.STARTS[0]
-    exact = made.solved(volts, start, rim)
+def test_the_simulator_follows_the_solver_to_a_third_of_the_noise(log_script, rim):
+    volts, start = log_script.RUNS[0], log_script.STARTS[0]
+    exact = log_script.solved(volts, start, rim)
     tanks = simulators.get("tanks")(fixed={"state.overflow@upper": rim})
-    inputs = {"volts": np.repeat(volts, made.HOLD)}
+    inputs = {"volts": np.repeat(volts, log_script.HOLD)}
     initial = dict(zip(("upper", "lower"), start, strict=True))
-    scenario = Scenario(made.STEP * np.arange(made.SAMPLES), initial, inputs)
-    seen = tanks.simulate(np.array([[made.PUMP, made.UPPER, made.LOWER]]), scenario)[0]
-    assert np.abs(seen - exact).max() < made.NOISE / 3
-    assert (exact[:, 0].max() == rim) == (rim == made.RIM)
+    scenario = Scenario(log_script.STEP * np.arange(log_script.SAMPLES), initial, inputs)
+    seen = tanks.simulate(
+        np.array([[log_script.PUMP, log_script.UPPER, log_script.LOWER]]), scenario
+    )[0]
+    assert np.abs(seen - exact).max() < log_script.NOISE / 3
+    assert (exact[:, 0].max() == rim) == (rim == log_script.RIM)
 
 
 @pytest.mark.slow
-def test_the_rim_is_named_with_its_height(made):
+def test_the_rim_is_named_with_its_height(log_script):
     answer = explain(RECORDING).answer
     (cause,) = answer.causes
     assert (answer.verdict, cause.effect) == ("named", "state.overflow@upper")
     height = cause.coefficients["coefficient"]
-    assert height.low < made.RIM < height.high
+    assert height.low < log_script.RIM < height.high
     assert height.high - height.low < 1e-3
     pump = answer.parameters["pump"]
-    assert pump.low < made.PUMP < pump.high
+    assert pump.low < log_script.PUMP < pump.high
     assert answer.heldout.gap_closed > 0.95
 
 
-def test_tanks_that_do_not_spill_over_lack_nothing(made, tmp_path):
-    made.write(tmp_path / "clean.csv", rim=1.0)
+def test_tanks_that_do_not_spill_over_lack_nothing(log_script, tmp_path):
+    log_script.write(tmp_path / "clean.csv", rim=1.0)
     answer = explain(tmp_path / "clean.csv").answer
     assert (answer.verdict, answer.causes) == ("adequate", ())

@@ -23,7 +23,7 @@ def test_answers_may_be_strings_dictionaries_or_answers():
 
 
 @pytest.mark.parametrize(
-    ("given", "says"),
+    ("given", "message"),
     [
         (None, "expected an Answer"),
         ("perhaps", "verdict: expected one of adequate"),
@@ -33,8 +33,8 @@ def test_answers_may_be_strings_dictionaries_or_answers():
         ({"verdict": "adequate", "parameters": {"mass": (1.0,)}}, r"expected \(low, high\)"),
     ],
 )
-def test_an_invalid_answer_is_one_message(given, says):
-    with pytest.raises(InputError, match=says) as error:
+def test_an_invalid_answer_is_one_message(given, message):
+    with pytest.raises(InputError, match=message) as error:
         Answer.of(given)
     assert "\n" not in str(error.value)
 

@@ -70,7 +70,7 @@ def items(folder):
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory):
+def finished_study(tmp_path_factory):
     folder = tmp_path_factory.mktemp("diagnosis")
     path = written(folder, "fifteen", *MISBEHAVING)
     out = folder / "out"
@@ -81,8 +81,8 @@ def made(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_a_diagnoser_of_a_plugin_file_is_in_the_table(made):
-    _, out = made
+def test_a_diagnoser_of_a_plugin_file_is_in_the_table(finished_study):
+    _, out = finished_study
     own = [row for row in items(out) if row["diagnoser"] == "fifteen"]
     assert [row["status"] for row in own] == ["done", "done"]
     assert all(0 < int(row["simulations"]) <= 6 for row in own)
@@ -92,15 +92,15 @@ def test_a_diagnoser_of_a_plugin_file_is_in_the_table(made):
     assert lines["fifteen", "named, alone"]["of"] == "1"
 
 
-def test_a_diagnoser_cannot_read_the_hidden_causes(made):
-    _, out = made
+def test_a_diagnoser_cannot_read_the_hidden_causes(finished_study):
+    _, out = finished_study
     peeks = [row for row in items(out) if row["diagnoser"] == "peeks"]
     assert {(row["status"], row["verdict"]) for row in peeks} == {("done", "adequate")}
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_a_trusted_diagnoser_could_read_the_hidden_causes(made, tmp_path):
-    _, out = made
+def test_a_trusted_diagnoser_could_read_the_hidden_causes(finished_study, tmp_path):
+    _, out = finished_study
     path, knowing = written(tmp_path, "peeks"), out.parent / "knowing.py"
     given = ["--plugin", str(knowing), "--out", str(tmp_path / "out"), "--jobs", "0"]
     assert main(["compare", str(path), *given]) == 0
@@ -108,8 +108,8 @@ def test_a_trusted_diagnoser_could_read_the_hidden_causes(made, tmp_path):
     assert {(row["verdict"], row["trusted"]) for row in rows} == {("unknown", "True")}
 
 
-def test_failed_answers_stay_in_the_table_and_stop_no_other(made):
-    code, out = made
+def test_failed_answers_stay_in_the_table_and_stop_no_other(finished_study):
+    code, out = finished_study
     assert code == 1
     rows = {row["diagnoser"]: row for row in items(out) if row["kind"] == "single"}
     assert rows["hangs"]["status"] == "timeout"
@@ -122,8 +122,8 @@ def test_failed_answers_stay_in_the_table_and_stop_no_other(made):
     assert clean["hangs"]["alarm"] == "True"  # a missing answer is not reliable
 
 
-def test_python_reads_the_folder_of_the_command(made):
-    _, out = made
+def test_python_reads_the_folder_of_the_command(finished_study):
+    _, out = finished_study
     run = simgap.ComparisonResult(out)
     assert len(run.runs) == 2 * (1 + len(MISBEHAVING))
     assert run.runs["alarm"].dtype == bool
@@ -142,8 +142,8 @@ def test_python_reads_the_folder_of_the_command(made):
     assert str(out) in page
 
 
-def test_a_damaged_table_is_one_line(made, tmp_path):
-    _, out = made
+def test_a_damaged_table_is_one_line(finished_study, tmp_path):
+    _, out = finished_study
     folder = tmp_path / "copy"
     shutil.copytree(out, folder)
     table = folder / "items.csv"
@@ -173,7 +173,7 @@ def test_cases_a_diagnoser_does_not_support_count_nowhere(tmp_path, capsys):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
-def test_a_study_resumes(made, tmp_path, capsys):
+def test_a_study_resumes(finished_study, tmp_path, capsys):
     path = written(tmp_path, "fifteen")
     out = tmp_path / "out"
     given = ["--plugin", str(PLUGIN), "--jobs", "1"]
@@ -228,7 +228,7 @@ def test_recording_conditions_are_as_requested():
 
 
 @pytest.mark.parametrize(
-    ("more", "says"),
+    ("more", "message"),
     [
         ('[[diagnosis.questions]]\nkind = "strange"', "unknown kind 'strange'"),
         ('[[diagnosis.questions]]\nkind = "clean"\nsystems = ["boat"]', "unknown system 'boat'"),
@@ -238,11 +238,11 @@ def test_recording_conditions_are_as_requested():
         ('[[diagnosis.questions]]\nkind = "clean"\ncount = 0', "count: expected 1 to"),
     ],
 )
-def test_a_fault_in_the_table_is_one_line(tmp_path, capsys, more, says):
+def test_a_fault_in_the_table_is_one_line(tmp_path, capsys, more, message):
     path = written(tmp_path, "simgap", more=more)
     assert main(["compare", str(path), "--out", str(tmp_path / "out")]) == 2
     error = capsys.readouterr().err
-    assert says in error
+    assert message in error
     assert error.count("\n") == 1
     assert not (tmp_path / "out").exists()
 

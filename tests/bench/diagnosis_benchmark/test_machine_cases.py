@@ -98,7 +98,7 @@ def by_simgap(system, effects, arm):
     return made.simulate(theta, Scenario(TIMES, begun, inputs))[0]
 
 
-ASKED = [
+DRAWN_CASES = [
     (system, name)
     for system, effects in EFFECTS_BY_MACHINE.items()
     for effect in effects
@@ -107,7 +107,7 @@ ASKED = [
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("system", "name"), ASKED)
+@pytest.mark.parametrize(("system", "name"), DRAWN_CASES)
 def test_each_effect_agrees_with_the_library(system, name, arm):
     c = SOMEWHERE[name.partition("@")[0]]
     if name == "gravity.tilt" and system == "servo":
@@ -187,10 +187,10 @@ def test_files_do_not_reveal_the_hidden_effect():
     clean = draw_case("clean", "arm2", 3)
     item = replace(clean, kind="single", effects={"mass.scale@forearm": (0.1,)})
     texts = render_recording(item)
-    assert set(texts.beside) == {MODEL_FILE_NAME}
+    assert set(texts.extra_files) == {MODEL_FILE_NAME}
     stated = restore_conditions(item.name, "arm2", item.asked).numbers
-    assert f'mass="{stated["mass1"]!r}"' in texts.beside[MODEL_FILE_NAME]
-    whole = "".join([texts.description, *texts.beside.values()])
+    assert f'mass="{stated["mass1"]!r}"' in texts.extra_files[MODEL_FILE_NAME]
+    whole = "".join([texts.description, *texts.extra_files.values()])
     assert "scale" not in whole
     assert item.name not in whole
 

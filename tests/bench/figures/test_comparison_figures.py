@@ -55,7 +55,7 @@ def test_what_a_comparison_lacks_is_not_drawn(missing, changes):
 
 
 @pytest.mark.parametrize(
-    ("name", "axes", "says"),
+    ("name", "axes", "text"),
     [
         ("error", 2, "absolute error of restitution, median"),
         ("misfit", 2, "RMSE of z [m], median"),
@@ -67,11 +67,11 @@ def test_what_a_comparison_lacks_is_not_drawn(missing, changes):
         ("directions", 6, "RMSE of z [m], unseen scenarios, median"),
     ],
 )
-def test_each_figure_can_be_had_without_a_file(name, axes, says):
+def test_each_figure_can_be_had_without_a_file(name, axes, text):
     drawn = draw_figure(stored(), LABELS, name)
     assert isinstance(drawn, Figure)
     assert len(drawn.axes) == axes
-    assert says in words(drawn)
+    assert text in words(drawn)
 
 
 def test_a_figure_draws_the_numbers_of_the_runs():

@@ -17,9 +17,9 @@ SLIDE_AND_TURN = """
 """
 
 
-def seen(made, positions=None):
-    data = make_posed_data(made, positions or {})
-    return choose_projection(made, data), data
+def seen(robot, positions=None):
+    data = make_posed_data(robot, positions or {})
+    return choose_projection(robot, data), data
 
 
 def test_a_planar_robot_is_seen_along_the_common_axis_of_its_joints():

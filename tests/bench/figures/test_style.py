@@ -26,7 +26,7 @@ from bench.logs.recording_loading import load_recording
 from sims.core.simulator import InputError
 from sims.vision.ball_tracker import BallTrack
 from tests.bench.diagnosis.report_tables import swing, table
-from tests.bench.diagnosis.sample_report_data import story
+from tests.bench.diagnosis.sample_report_data import make_report
 from tests.bench.figures.sample_comparisons import LABELS, stored
 
 ROOT = Path(bench.__file__).parents[1]
@@ -87,14 +87,14 @@ def test_drawing_leaves_backend_settings_and_open_figures_alone(notebook, tmp_pa
     assert before[2] == [7]
     drawn = [draw_figure(stored(), LABELS, name) for name in list_figure_names(stored())]
     drawn += [
-        explanation_figures.draw_figure(story(), name)
-        for name in explanation_figures.list_figure_names(story())
+        explanation_figures.draw_figure(make_report(), name)
+        for name in explanation_figures.list_figure_names(make_report())
     ]
     drawn += [rank(), loss(), tracked(), draw_recording_figure(*load_recording(swinging(tmp_path)))]
     for i, one in enumerate(drawn):
         assert isinstance(one, Figure)
         write_figure(one, tmp_path / str(i), dpi=40)
-    explanation_figures.render_figures(story())
+    explanation_figures.render_figures(make_report())
     assert notebook() == before
 
 

@@ -17,7 +17,7 @@ from tests.sample_experiments import spring_experiment
 PROBE = str(PLUGINS / "probe.py")
 
 
-def told(code, files=(), memory=0):
+def run_isolated(code, files=(), memory=0):
     """Run code in an isolated process and return its result as text."""
     tuned = TunerSpec("probe", "", PROBE, {"code": code})
     house = sandboxed_tuner.get_fork_server()
@@ -60,10 +60,10 @@ def held():
     return child.seals
 
 
-def need(seal):
+def need(layer):
     """Skip a test, visibly, if an isolation layer is not available."""
-    if seal not in held():
-        pytest.skip(f"no seal {seal} on this machine: {ISOLATION_LAYERS[seal]}")
+    if layer not in held():
+        pytest.skip(f"no seal {layer} on this machine: {ISOLATION_LAYERS[layer]}")
 
 
 def experiment(name, **changes):
@@ -74,15 +74,15 @@ def experiment(name, **changes):
     return made
 
 
-def outcome(made, seed=0, target=0):
+def outcome(experiment, seed=0, target=0):
     """Execute one run of the experiment."""
-    (entry,) = made.tuners
-    sealed = get_problem(made).draw_targets()[target].blinded
-    order = RunRequest("run", entry, seed, sealed, made.budget)
-    return execute_run(made, replace(order, tuned=sandboxed_tuner.make_tuner_spec(entry)))
+    (entry,) = experiment.tuners
+    target_data = get_problem(experiment).draw_targets()[target].blinded
+    order = RunRequest("run", entry, seed, target_data, experiment.budget)
+    return execute_run(experiment, replace(order, tuned=sandboxed_tuner.make_tuner_spec(entry)))
 
 
-def lesson(name, **options):
+def make_training_request(name, **options):
     """Return a training request for a registered tuner."""
     entry = TunerEntry(name, name, options)
     return TrainingRequest(entry, 0, sandboxed_tuner.make_tuner_spec(entry))

@@ -5,7 +5,7 @@ import os
 
 import pytest
 
-from tests.bench.isolation.isolated_process import PROBE, held, need, told
+from tests.bench.isolation.isolated_process import PROBE, held, need, run_isolated
 
 LIBC = "import ctypes, os\nlibc = ctypes.CDLL(None, use_errno=True)\n"
 CALL = LIBC + "result = libc.{}\n(result, ctypes.get_errno())"
@@ -19,7 +19,7 @@ def test_no_file_outside_is_opened(tmp_path, mode):
     path = tmp_path / "secret"
     path.write_text("0.25")
     code = f"open({str(path)!r}, {mode!r}).read()"
-    assert told(code).startswith(("PermissionError", "OSError: [Errno 30]"))
+    assert run_isolated(code).startswith(("PermissionError", "OSError: [Errno 30]"))
     assert path.read_text() == "0.25"
 
 
@@ -28,7 +28,7 @@ def test_a_file_that_is_given_is_read_and_not_written(mode, tmp_path):
     need("files")
     path = tmp_path / "given"
     path.write_text("0.25")
-    said = told(f"open({str(path)!r}, {mode!r}).read()", [path])
+    said = run_isolated(f"open({str(path)!r}, {mode!r}).read()", [path])
     assert said == "'0.25'" if mode == "r" else said.startswith(("Permission", "OSError"))
 
 
@@ -37,16 +37,16 @@ def test_a_file_that_is_given_is_read_and_not_written(mode, tmp_path):
 def test_no_folder_outside_is_listed(what, place, tmp_path):
     need("files")
     folder = tmp_path if place == "given" else os.path.expanduser(place)
-    assert told(f"import os\nos.{what}({str(folder)!r})").startswith("PermissionError")
+    assert run_isolated(f"import os\nos.{what}({str(folder)!r})").startswith("PermissionError")
 
 
 def test_it_has_an_empty_folder_that_it_fills_no_further_than_allowed():
     need("disk")
-    assert told("import os\nos.listdir()") == "[]"
-    assert told("open('x', 'w').write('abc')") == "3"
+    assert run_isolated("import os\nos.listdir()") == "[]"
+    assert run_isolated("open('x', 'w').write('abc')") == "3"
     full = "for i in range(20):\n    open(str(i), 'wb').write(bytes(8 << 20))\nNone"
-    assert told(full).startswith("OSError: [Errno 28]")
-    assert told("import os\nos.listdir()") == "[]", "and the next one has another"
+    assert run_isolated(full).startswith("OSError: [Errno 28]")
+    assert run_isolated("import os\nos.listdir()") == "[]", "and the next one has another"
 
 
 def test_reading_a_file_leaves_no_trace(tmp_path):
@@ -54,7 +54,7 @@ def test_reading_a_file_leaves_no_trace(tmp_path):
     path = tmp_path / "given"
     path.write_text("0.25")
     os.utime(path, (1e9, 1e9))
-    assert told(f"open({str(path)!r}).read()", [path]) == "'0.25'"
+    assert run_isolated(f"open({str(path)!r}).read()", [path]) == "'0.25'"
     assert os.stat(path).st_atime == 1e9
 
 
@@ -66,7 +66,9 @@ def test_it_changes_nothing_about_a_file_that_it_reads(tmp_path, code):
     path = tmp_path / "given"
     path.write_text("0.25")
     before = os.stat(path)
-    assert told(f"import os\nPATH = {str(path)!r}\nos.{code}", [path]).startswith("PermissionError")
+    assert run_isolated(f"import os\nPATH = {str(path)!r}\nos.{code}", [path]).startswith(
+        "PermissionError"
+    )
     assert os.stat(path) == before
 
 
@@ -77,7 +79,9 @@ def test_its_locks_lock_nothing(tmp_path):
     lock = f"import fcntl\nfile = open({str(path)!r})\nfcntl.flock(file, fcntl.LOCK_EX)"
     with path.open("r+") as file:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        assert told(lock, [path]) == "None", "it neither waits nor hears of who has locked it"
+        assert run_isolated(lock, [path]) == "None", (
+            "it neither waits nor hears of who has locked it"
+        )
 
 
 @pytest.mark.parametrize(
@@ -110,7 +114,7 @@ def test_its_locks_lock_nothing(tmp_path):
 )
 def test_what_it_may_not_ask_of_the_kernel(call, error):
     need("calls")
-    said = told(CALL.format(call))
+    said = run_isolated(CALL.format(call))
     assert said == error if error else said.startswith("(-1, ")
 
 
@@ -130,23 +134,23 @@ def test_what_it_may_not_ask_of_the_kernel(call, error):
     ],
 )  # fmt: skip
 def test_what_an_honest_tuner_does_goes_on_working(code, result):
-    assert told(code) == result
+    assert run_isolated(code) == result
 
 
 def test_it_sees_no_other_process():
     need("processes")
     listed = "import os\n(os.getpid(), [p for p in os.listdir('/proc/self/task')])"
-    assert told(listed) == "(1, ['1'])"
-    assert told("import os\nos.getppid()") == "0"
+    assert run_isolated(listed) == "(1, ['1'])"
+    assert run_isolated("import os\nos.getppid()") == "0"
 
 
 def test_it_has_no_additional_rights():
-    assert "CapEff:\\t0000000000000000\\n" in told("open('/proc/self/status').read()")
-    assert "NoNewPrivs:\\t1\\n" in told("open('/proc/self/status').read()")
+    assert "CapEff:\\t0000000000000000\\n" in run_isolated("open('/proc/self/status').read()")
+    assert "NoNewPrivs:\\t1\\n" in run_isolated("open('/proc/self/status').read()")
 
 
 def test_nothing_is_open_but_its_pipes():
-    said = told("import os\nsorted(int(n) for n in os.listdir('/proc/self/fd'))")
+    said = run_isolated("import os\nsorted(int(n) for n in os.listdir('/proc/self/fd'))")
     assert set(eval(said)) - {3} == {0, 1, 2, 100, 101}
 
 
@@ -156,7 +160,7 @@ def test_its_environment_tells_of_nothing_but_the_machine(monkeypatch):
     sandboxed_tuner.close_isolated_processes()
     monkeypatch.setenv("SECRET_TRUTH", "0.25")
     monkeypatch.setenv("SIMGAP_DATA", "/data")
-    names = set(eval(told("import os\nsorted(os.environ)")))
+    names = set(eval(run_isolated("import os\nsorted(os.environ)")))
     sandboxed_tuner.close_isolated_processes()
     known = {"PATH", "LANG", "LC_ALL", "LC_CTYPE", "LD_LIBRARY_PATH", "HOME", "TMPDIR"}
     # SIMGAP_COMPILED is the folder of compiled integration steps.
@@ -167,7 +171,7 @@ def test_its_environment_tells_of_nothing_but_the_machine(monkeypatch):
 
 
 def test_short_of_memory_it_ends_before_the_harness():
-    assert told("open('/proc/self/oom_score_adj').read()") == "'1000\\n'"
+    assert run_isolated("open('/proc/self/oom_score_adj').read()") == "'1000\\n'"
 
 
 @pytest.mark.parametrize(
@@ -181,9 +185,9 @@ def test_short_of_memory_it_ends_before_the_harness():
 )
 def test_its_memory_is_counted_whatever_it_is_of(code):
     need("calls")
-    said = told(code, memory=64)
+    said = run_isolated(code, memory=64)
     assert "Error" in said
-    assert "Error" not in told(code)
+    assert "Error" not in run_isolated(code)
 
 
 def test_the_active_isolation_layers_are_listed_in_order():
@@ -195,4 +199,4 @@ def test_the_active_isolation_layers_are_listed_in_order():
 
 
 def test_its_own_file_is_read():
-    assert told(f"len(open({PROBE!r}).read()) > 0") == "True"
+    assert run_isolated(f"len(open({PROBE!r}).read()) > 0") == "True"

@@ -44,7 +44,7 @@ class Ends:
             if descriptor is not None:
                 os.close(descriptor)
 
-    def say(self, whole):
+    def write_bytes(self, whole):
         os.write(self.writing, whole)
 
     def hang_up(self):
@@ -89,18 +89,18 @@ def test_what_is_cut_off_waits_until_its_time_is_over_or_the_other_side_is_gone(
     whole = HEAD.pack(b"A", 0, 1, 8) + bytes(8)
     for length in (0, 1, HEAD.size - 1, HEAD.size, len(whole) - 1):
         with Ends() as other:
-            other.say(whole[:length])
+            other.write_bytes(whole[:length])
             with pytest.raises(TimeoutError):
                 other.channel.receive(deadline=soon())
             with Ends() as gone:
-                gone.say(whole[:length])
+                gone.write_bytes(whole[:length])
                 gone.hang_up()
                 with pytest.raises(PeerClosedError):
                     gone.channel.receive()
 
 
 def test_a_length_beyond_the_limit_is_foul_before_anything_is_allocated(ends):
-    ends.say(HEAD.pack(b"A", 0, 1, 1 << 62))
+    ends.write_bytes(HEAD.pack(b"A", 0, 1, 1 << 62))
     with pytest.raises(ProtocolError, match="bytes at once"):
         ends.channel.receive(1 << 31)
 
@@ -108,7 +108,7 @@ def test_a_length_beyond_the_limit_is_foul_before_anything_is_allocated(ends):
 def test_a_length_within_it_takes_no_memory_before_the_bytes_are_there(ends):
     import tracemalloc
 
-    ends.say(HEAD.pack(b"L", 0, 1, 1 << 30))
+    ends.write_bytes(HEAD.pack(b"L", 0, 1, 1 << 30))
     tracemalloc.start()
     with pytest.raises(TimeoutError):
         ends.channel.receive(1 << 31, soon())
@@ -118,7 +118,7 @@ def test_a_length_within_it_takes_no_memory_before_the_bytes_are_there(ends):
 
 
 def test_two_messages_at_once_are_foul(ends):
-    ends.say(HEAD.pack(b"A", 0, 1, 0) * 2)
+    ends.write_bytes(HEAD.pack(b"A", 0, 1, 0) * 2)
     with pytest.raises(ProtocolError, match="without a request"):
         ends.channel.receive()
 
@@ -135,7 +135,7 @@ def test_an_answer_before_the_question_ends_the_run(ends):
     control, supervisor = socket.socketpair()
     child = IsolatedProcess(Server(), control, MessageChannel(*copies))
     child.send(b"E", deadline=soon())
-    ends.say(HEAD.pack(b"A", 0, 1, 8) + bytes(8))
+    ends.write_bytes(HEAD.pack(b"A", 0, 1, 8) + bytes(8))
     supervisor.send(EXIT_CODE.pack(-9))
     with pytest.raises(RunEndedError, match="without a request"):
         child.send(b"E", deadline=soon())
@@ -159,7 +159,7 @@ def test_whatever_comes_is_a_message_or_said_to_be_none(noise, front):
         "arrays": HEAD.pack(b"L", 0, 1, len(noise) + 20) + b'[["a", "<f8", [2]]]\n',
     }
     with Ends() as both:
-        both.say(heads[front] + noise)
+        both.write_bytes(heads[front] + noise)
         both.hang_up()
         try:
             message = both.channel.receive(1 << 16, perf_counter() + 5.0)
@@ -175,7 +175,7 @@ def test_whatever_comes_is_a_message_or_said_to_be_none(noise, front):
 
 kinds = st.sampled_from(["<f8", "<f4", "<i8", "|u1", "|b1", "|O", "<U3", ">f8", "<M8", 3, None])
 sizes = st.lists(st.one_of(st.integers(-2, 5), st.sampled_from([1 << 39, 1 << 62, 1.5, "2", None])))
-told = st.one_of(
+array_descriptions = st.one_of(
     st.lists(
         st.tuples(st.one_of(st.text(max_size=5), st.none(), st.lists(st.text())), kinds, sizes)
     ),
@@ -184,15 +184,15 @@ told = st.one_of(
 
 
 @settings(max_examples=200, deadline=None, derandomize=True)
-@given(told, st.binary(max_size=64))
-def test_any_description_of_arrays_gives_arrays_or_an_error(says, rest):
+@given(array_descriptions, st.binary(max_size=64))
+def test_any_description_of_arrays_gives_arrays_or_an_error(description, rest):
     import json
 
     try:
-        arrays = unpack_arrays(body(json.dumps(says).encode(), b"\n", rest))
+        arrays = unpack_arrays(body(json.dumps(description).encode(), b"\n", rest))
     except ProtocolError:
         return
-    assert len(arrays) == len(says)
+    assert len(arrays) == len(description)
     assert sum(array.nbytes for array in arrays.values()) == len(rest)
     assert all(name.isprintable() for name in arrays)
 
@@ -215,7 +215,7 @@ def test_arrays_come_out_as_they_went_in(data):
 
 
 @pytest.mark.parametrize(
-    "says",
+    "description",
     [
         b'[["a", "<f8", [1]], ["a", "<f8", [1]]]\n',
         b'[["", "<f8", [2]]]\n',
@@ -227,9 +227,9 @@ def test_arrays_come_out_as_they_went_in(data):
         b'{"a": 1}\n',
     ],
 )
-def test_invalid_arrays_are_an_error(says):
+def test_invalid_arrays_are_an_error(description):
     with pytest.raises(ProtocolError):
-        unpack_arrays(body(says, bytes(16)))
+        unpack_arrays(body(description, bytes(16)))
 
 
 def test_json_is_bounded_whatever_else_a_message_may_have():

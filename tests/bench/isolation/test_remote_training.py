@@ -9,11 +9,11 @@ from bench.benchmark.runner.plugin_discovery import load_plugins_for_experiment
 from bench.benchmark.runner.tuner_training import TrainingRequest, read_weights, train_or_load
 from bench.core.plugin_registries import tuners
 from methods.tuner import Tuner
-from tests.bench.isolation.isolated_process import lesson
+from tests.bench.isolation.isolated_process import make_training_request
 from tests.hostile_tuners.attack_arena import HERE
 from tests.sample_experiments import spring_experiment
 
-SCHOOL = str(HERE / "school.py")
+ATTACKING_LEARNERS = str(HERE / "school.py")
 pytestmark = pytest.mark.usefixtures("spring", "fresh_registries")
 
 
@@ -27,7 +27,7 @@ def cache(tmp_path, monkeypatch):
 @pytest.fixture
 def experiment():
     made = spring_experiment(tuners={"school": {}}, training_budget=20)
-    load_plugins_for_experiment([SCHOOL], made)
+    load_plugins_for_experiment([ATTACKING_LEARNERS], made)
     return made
 
 
@@ -47,9 +47,9 @@ class Learned(Tuner):
 
 
 def test_an_isolated_training_gives_the_weights_of_a_trusted_one_bit_for_bit(experiment):
-    sealed = train_or_load(experiment, lesson("school"))
+    sealed = train_or_load(experiment, make_training_request("school"))
     tuners.register(Learned)
-    entry = lesson("school").entry
+    entry = make_training_request("school").entry
     entry = type(entry)("learned", "learned")
     trusted = train_or_load(experiment, TrainingRequest(entry, 0))
     one, other = read_weights(sealed.path)["mean"], read_weights(trusted.path)["mean"]
@@ -58,19 +58,19 @@ def test_an_isolated_training_gives_the_weights_of_a_trusted_one_bit_for_bit(exp
     assert 0.0 < sealed.seconds < 30.0
 
 
-class Watch:
+class RecordingCallback:
     """Training observer that records the calls made to it."""
 
     def __init__(self, problem):
-        self.problem, self.told, self.asked = problem, [], 0
+        self.problem, self.epochs, self.ground_reads = problem, [], 0
 
     @property
     def ground(self):
-        self.asked += 1
+        self.ground_reads += 1
         return self.problem.make_training_simulator(10)
 
-    def epoch(self, *told):
-        self.told.append(told)
+    def epoch(self, *epochs):
+        self.epochs.append(epochs)
 
 
 def test_a_callback_is_informed_and_changes_nothing(experiment, tmp_path, monkeypatch):
@@ -79,9 +79,9 @@ def test_a_callback_is_informed_and_changes_nothing(experiment, tmp_path, monkey
     path = tmp_path / "watched.py"
     path.write_text(WATCHED)
     load_plugins_for_experiment([str(path)], spring_experiment(tuners={"telling": {}}))
-    plain = read_weights(train_or_load(experiment, lesson("telling")).path)
-    watch = Watch(TuningProblem(experiment))
-    made = train_or_load(experiment, lesson("telling"), watch, anew=True)
+    plain = read_weights(train_or_load(experiment, make_training_request("telling")).path)
+    watch = RecordingCallback(TuningProblem(experiment))
+    made = train_or_load(experiment, make_training_request("telling"), watch, anew=True)
     assert [told[:3] for told in watch.told] == [("first", 1, 2), ("sec\ufffdond", 2, 2)]
     assert np.isnan(watch.told[1][4])
     assert watch.asked == 1
@@ -129,12 +129,12 @@ def test_what_the_stand_in_says_of_itself(experiment, tmp_path):
     path = tmp_path / "watched.py"
     path.write_text(WATCHED)
     load_plugins_for_experiment([str(path)], spring_experiment(tuners={"telling": {}}))
-    facts = read_weights(train_or_load(experiment, lesson("telling")).path)["facts"]
+    facts = read_weights(train_or_load(experiment, make_training_request("telling")).path)["facts"]
     assert facts.tolist() == [20, 20, 2, 60]
 
 
 @pytest.mark.parametrize(
-    ("name", "says"),
+    ("name", "reason"),
     [
         ("counter", "40 training simulations requested, 20 allowed"),
         ("fence", "inside the training range"),
@@ -147,16 +147,16 @@ def test_what_the_stand_in_says_of_itself(experiment, tmp_path):
         ("watched", "a message of an unexpected kind"),
     ],
 )
-def test_a_training_that_cheats_fails_and_leaves_no_weights(name, says, experiment, cache):
-    with pytest.raises(RunEndedError, match=says):
-        train_or_load(experiment, lesson(name))
+def test_a_training_that_cheats_fails_and_leaves_no_weights(name, reason, experiment, cache):
+    with pytest.raises(RunEndedError, match=reason):
+        train_or_load(experiment, make_training_request(name))
     assert not list(cache.glob("*")) if cache.exists() else True
 
 
 def test_weights_of_a_trusted_tuner_are_not_those_of_an_isolated_one(experiment):
     from bench.benchmark.runner.tuner_training import compute_training_key
 
-    entry = lesson("school").entry
+    entry = make_training_request("school").entry
     assert compute_training_key(experiment, entry, 0) != compute_training_key(
         experiment.chosen(trusted=True), entry, 0
     )
@@ -176,7 +176,7 @@ def test_a_training_that_is_made_again_after_a_kill_must_ask_for_the_same(experi
 
     simulate = CountedTrainingSimulator.simulate
     monkeypatch.setattr(CountedTrainingSimulator, "simulate", killed_once)
-    assert train_or_load(experiment, lesson("school")).simulations == 20
+    assert train_or_load(experiment, make_training_request("school")).simulations == 20
     np.testing.assert_array_equal(*asked)
     asked.clear()
     drawn = iter(range(10))
@@ -184,7 +184,7 @@ def test_a_training_that_is_made_again_after_a_kill_must_ask_for_the_same(experi
         "bench.benchmark.runner.tuner_training.compute_digest", lambda *_, **__: str(next(drawn))
     )
     with pytest.raises(RunEndedError, match="requested other simulations"):
-        train_or_load(experiment, lesson("school"), anew=True)
+        train_or_load(experiment, make_training_request("school"), anew=True)
 
 
 def test_an_installed_tuner_of_another_package_is_isolated_too(tmp_path, monkeypatch):

@@ -45,16 +45,16 @@ class Learned(Tuner):
         yield self.numbers
 
 
-class TrainedAlike(Learned):
+class SharedTraining(Learned):
     name = source_digest = "trained_alike"
     trains_as = "learned"
 
 
-class TrainedApart(Learned):
+class SeparateTraining(Learned):
     name = source_digest = "trained_apart"
 
 
-def made(*kinds, **changes):
+def run_trusted(*kinds, **changes):
     """Run an experiment in this process; return statuses and rates by (label, target, seed)."""
     for kind in kinds:
         tuners.register(kind)
@@ -74,7 +74,7 @@ def made(*kinds, **changes):
 def proposals(spring):
     """Proposed rates (12,) in rad/s by (label, target, seed); two labels belong to one tuner."""
     tuners = {"random": {}, "again": {"tuner": "random"}, "cma_es": {}}
-    return made(tuners=tuners, targets=2, seeds=3)[1]
+    return run_trusted(tuners=tuners, targets=2, seeds=3)[1]
 
 
 def shared(first, second):
@@ -108,7 +108,7 @@ def test_the_label_of_an_entry_changes_no_number_of_its_runs(proposals):
 
 def test_two_tuners_that_draw_alike_draw_other_numbers():
     names = ["drawing", "also_drawing"]
-    _, rates = made(Drawing, AlsoDrawing, tuners=names, targets=1, seeds=2)
+    _, rates = run_trusted(Drawing, AlsoDrawing, tuners=names, targets=1, seeds=2)
     for target, seed in itertools.product(("in-000", "wide-000"), range(2)):
         pair = [rates[name, target, seed] for name in names]
         assert len(pair[0]) == 12
@@ -118,8 +118,8 @@ def test_two_tuners_that_draw_alike_draw_other_numbers():
 def test_a_training_draws_by_its_seed_and_by_whom_the_tuner_trains_as(tmp_path, monkeypatch):
     monkeypatch.setenv("SIMGAP_CACHE", str(tmp_path))
     names = ["learned", "trained_alike", "trained_apart"]
-    kinds = Learned, TrainedAlike, TrainedApart
-    statuses, rates = made(*kinds, tuners=names, targets=1, ranges=["in"], seeds=3)
+    kinds = Learned, SharedTraining, SeparateTraining
+    statuses, rates = run_trusted(*kinds, tuners=names, targets=1, ranges=["in"], seeds=3)
     assert [(s.tuner, s.seed) for s in statuses] == list(itertools.product(names, range(3)))
     drawn = {
         (name, seed): rates[name, "in-000", seed].item() for name in names for seed in range(3)
@@ -133,14 +133,14 @@ def test_a_training_draws_by_its_seed_and_by_whom_the_tuner_trains_as(tmp_path, 
 def test_weights_of_another_seed_are_not_taken_for_ones_own(tmp_path, monkeypatch):
     monkeypatch.setenv("SIMGAP_CACHE", str(tmp_path))
     asked = {"tuners": ["learned"], "targets": 1, "ranges": ["in"], "seeds": 2}
-    _, before = made(Learned, **asked)
+    _, before = run_trusted(Learned, **asked)
     first, second = sorted(tmp_path.glob("learned-spring-*.npz"))
     own = first.read_bytes()
     first.write_bytes(second.read_bytes())
     with pytest.raises(WeightsError, match=r"expected the weights of learned-spring-0-.*-spring-1"):
-        made(Learned, **asked)
+        run_trusted(Learned, **asked)
     first.write_bytes(own)
-    _, after = made(Learned, **asked)
+    _, after = run_trusted(Learned, **asked)
     assert before == after
 
 
@@ -149,7 +149,7 @@ def test_an_entry_has_its_own_number_of_seeds_and_of_simulations():
         "random": {}, "few": {"tuner": "random", "seeds": 1},
         "short": {"tuner": "random", "budget": 5}, "nelder_mead": {},
     }  # fmt: skip
-    statuses, rates = made(tuners=entries, targets=1, ranges=["in"], seeds=2)
+    statuses, rates = run_trusted(tuners=entries, targets=1, ranges=["in"], seeds=2)
     made_of = {name: [s.simulations for s in statuses if s.tuner == name] for name in entries}
     # Nelder-Mead is deterministic, so one seed is enough.
     assert made_of == {"random": [12, 12], "few": [12], "short": [5, 5], "nelder_mead": [12]}

@@ -10,7 +10,7 @@ from bench.logs.recording_summary import format_summary
 from sims.core.simulator import InputError
 from sims.recording.recording import read_recording
 from sims.systems.servo import Servo
-from tests.simulation_arguments import Wish, write
+from tests.simulation_arguments import simulation_spec, write
 
 RNG = np.random.default_rng(3)
 
@@ -65,7 +65,7 @@ def test_summary_says_what_is_there(odd):
 
 
 def test_a_single_run_is_one_although_its_end_is_held_out(tmp_path):
-    write(Wish("pendulum", runs=1), tmp_path / "a.csv")
+    write(simulation_spec("pendulum", runs=1), tmp_path / "a.csv")
     said = lines(tmp_path / "a.csv")
     assert said[1].endswith(
         "system pendulum, 1 run (its last third is held out), 400 samples, 3.98 s"
@@ -111,7 +111,10 @@ def test_noise_is_found_under_motion_and_uneven_sampling():
 
 
 def test_simulated_noise_is_found(tmp_path):
-    write(Wish("ball", ["restitution=0.9"], noise=["z=0.004"], observe=["z"]), tmp_path / "a.csv")
+    write(
+        simulation_spec("ball", ["restitution=0.9"], noise=["z=0.004"], observe=["z"]),
+        tmp_path / "a.csv",
+    )
     (z,) = (line.split() for line in lines(tmp_path / "a.csv") if line.startswith("z "))
     assert float(z[6]) == 0.004
     assert float(z[7]) == pytest.approx(0.004, rel=0.1)

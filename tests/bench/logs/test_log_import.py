@@ -118,7 +118,7 @@ def test_what_cannot_be_is_left_out_and_said(arm, tmp_path):
     assert "qd." not in made.text
 
 
-FAULTS = {
+INVALID_INPUTS = {
     "nothing": ({"a.csv": "t,heat\n0,20\n0.1,21\n0.2,20\n"}, r"no column is a joint's position"),
     "no stamps": ({"a.csv": "q1,q2\n0,0\n1,1\n0,0\n"}, r"no column increases from row to row"),
     "no rate": ({"a.csv": "t,q1\n0,0\n0.00001,1\n0.00002,0\n"}, r"stamps 1e-05 apart are not "
@@ -131,9 +131,9 @@ FAULTS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", FAULTS)
+@pytest.mark.parametrize("name", INVALID_INPUTS)
 def test_a_fault_is_one_line_and_nothing_is_written(name, arm, tmp_path):
-    files, message = FAULTS[name]
+    files, message = INVALID_INPUTS[name]
     for file, text in files.items():
         (tmp_path / file).write_text(text)
     out = tmp_path / "new" / "log.toml"

@@ -393,11 +393,11 @@ def test_a_table_without_a_header_is_refused_and_nothing_written(arm, tmp_path, 
     assert not out.exists()
 
 
-@pytest.mark.parametrize("spoilt", ["0.5,1\n", "0.5,1,2,3,4,5,6,7,8\n", '0.5,"1,2,3,4,5,6\n'])
-def test_a_broken_row_is_one_line_and_nothing_is_written(spoilt, arm, tmp_path, capsys):
+@pytest.mark.parametrize("bad_row", ["0.5,1\n", "0.5,1,2,3,4,5,6,7,8\n", '0.5,"1,2,3,4,5,6\n'])
+def test_a_broken_row_is_one_line_and_nothing_is_written(bad_row, arm, tmp_path, capsys):
     log = logged(tmp_path / "run")
     lines = log.read_text().splitlines(keepends=True)
-    log.write_text("# a note\n" + "".join([*lines[:50], spoilt, *lines[50:]]))
+    log.write_text("# a note\n" + "".join([*lines[:50], bad_row, *lines[50:]]))
     out = tmp_path / "log.toml"
     assert main(["import", str(log), "--model", str(arm), "--out", str(out)]) == 2
     (line,) = capsys.readouterr().err.splitlines()

@@ -193,11 +193,11 @@ def test_commands_beyond_their_range(kind):
 
 
 def test_stillness(kind):
-    def still(y):
+    def stop_moving(y):
         noise = NOISE * np.random.default_rng(1).normal(size=y.size)
         return np.where(np.arange(y.size) < 0.7 * y.size, y[0] + noise, y)
 
-    run = changed(run_of(8), q_hip=still, qd_hip=lambda y: np.nan * y)
+    run = changed(run_of(8), q_hip=stop_moving, qd_hip=lambda y: np.nan * y)
     texts = [f.text for f in found(kind, run) if f.about == "stillness"]
     assert texts == ["q.hip (70%) of the samples are at rest"]
 

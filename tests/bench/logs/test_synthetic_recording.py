@@ -11,7 +11,7 @@ from sims.core.simulator import InputError
 from sims.core.toml_validation import read_toml
 from sims.recording.recording import read_recording
 from tests.conftest import PLUGINS
-from tests.simulation_arguments import Wish, write
+from tests.simulation_arguments import simulation_spec, write
 
 RNG = np.random.default_rng(0)
 TIMES = np.arange(400) / 100
@@ -59,7 +59,10 @@ def test_the_command_of_the_readme_just_works(tmp_path, capsys, monkeypatch):
 
 
 def test_the_recording_does_not_contain_its_parameters(tmp_path):
-    write(Wish("ball", ["restitution=0.7654"], ["drag.quadratic=0.0123"]), tmp_path / "a.csv")
+    write(
+        simulation_spec("ball", ["restitution=0.7654"], ["drag.quadratic=0.0123"]),
+        tmp_path / "a.csv",
+    )
     description = (tmp_path / "a.toml").read_text()
     assert not any(
         secret in description
@@ -71,20 +74,22 @@ def test_the_recording_does_not_contain_its_parameters(tmp_path):
 def test_the_same_seed_gives_the_same_bytes_and_another_does_not(tmp_path):
     wish = {"system": "servo", "noise": ["0.01"], "runs": 2, "seconds": 0.5}
     for name, seed in (("a", 1), ("b", 1), ("c", 2)):
-        write(Wish(**wish, seed=seed), tmp_path / f"{name}.csv")
+        write(simulation_spec(**wish, seed=seed), tmp_path / f"{name}.csv")
     read = {name: (tmp_path / f"{name}.csv").read_bytes() for name in "abc"}
     assert read["a"] == read["b"] != read["c"]
 
 
 def test_draws_do_not_depend_on_further_requests():
-    few = simulate_recording(Wish("ball", runs=2, noise=["0.01"], seconds=0.3)).recording
+    few = simulate_recording(simulation_spec("ball", runs=2, noise=["0.01"], seconds=0.3)).recording
     many = simulate_recording(
-        Wish("ball", runs=3, noise=["0.01"], seconds=0.3, effects=["drag.linear=0"])
+        simulation_spec("ball", runs=3, noise=["0.01"], seconds=0.3, effects=["drag.linear=0"])
     ).recording
     for a, b in zip(few.runs, many.runs[:2], strict=True):
         np.testing.assert_array_equal(a.channels["z"], b.channels["z"])
-    louder = simulate_recording(Wish("ball", runs=2, noise=["z=0.02"], seconds=0.3)).recording
-    quiet = simulate_recording(Wish("ball", runs=2, seconds=0.3)).recording
+    louder = simulate_recording(
+        simulation_spec("ball", runs=2, noise=["z=0.02"], seconds=0.3)
+    ).recording
+    quiet = simulate_recording(simulation_spec("ball", runs=2, seconds=0.3)).recording
     noise = few.runs[0].channels["z"] - quiet.runs[0].channels["z"]
     np.testing.assert_allclose(
         louder.runs[0].channels["z"] - quiet.runs[0].channels["z"], 2 * noise, atol=1e-12
@@ -94,7 +99,7 @@ def test_draws_do_not_depend_on_further_requests():
 
 def test_what_is_recorded_is_what_the_closed_form_says():
     made = simulate_recording(
-        Wish(
+        simulation_spec(
             "ball",
             initial=["z=100", "vx=2"],
             constants=["gravity=1.62"],
@@ -109,7 +114,7 @@ def test_what_is_recorded_is_what_the_closed_form_says():
     assert made.recording.constants["gravity"] == 1.62
     assert not made.recording.held_out()
     made = simulate_recording(
-        Wish("slider", ["2"], inputs=["u=3"], observe=["v"], runs=1, seconds=1)
+        simulation_spec("slider", ["2"], inputs=["u=3"], observe=["v"], runs=1, seconds=1)
     )
     np.testing.assert_allclose(
         made.recording.runs[0].channels["v"], 1.5 * made.recording.runs[0].times, atol=1e-9
@@ -119,7 +124,7 @@ def test_what_is_recorded_is_what_the_closed_form_says():
 
 @pytest.mark.parametrize("system", ["ball", "pendulum", "slider", "servo"])
 def test_every_system_has_defaults_under_which_it_moves(system, tmp_path):
-    write(Wish(system, runs=2), tmp_path / "a.csv")
+    write(simulation_spec(system, runs=2), tmp_path / "a.csv")
     recording = read(tmp_path / "a.csv")
     first = next(iter(recording.runs[0].channels.values()))
     assert np.ptp(first) > 0.05
@@ -128,13 +133,15 @@ def test_every_system_has_defaults_under_which_it_moves(system, tmp_path):
 
 def test_a_simulator_without_engines_is_a_system_too(tmp_path, spring):
     load_plugins([PLUGINS / "spring.py"])
-    made = simulate_recording(Wish("spring", ["3.5,0.2"], runs=1, seconds=1, observe=["x"]))
+    made = simulate_recording(
+        simulation_spec("spring", ["3.5,0.2"], runs=1, seconds=1, observe=["x"])
+    )
     t = made.recording.runs[0].times
     np.testing.assert_allclose(
         made.recording.runs[0].channels["x"], np.exp(-0.2 * t) * np.cos(3.5 * t), rtol=1e-12
     )
     with pytest.raises(InputError, match="simulator spring supports neither effects nor engines"):
-        simulate_recording(Wish("spring", effects=["drag.linear=1"]))
+        simulate_recording(simulation_spec("spring", effects=["drag.linear=1"]))
 
 
 @pytest.mark.parametrize(
@@ -172,7 +179,7 @@ def test_a_simulator_without_engines_is_a_system_too(tmp_path, spring):
 )
 def test_faults_are_one_line_and_leave_nothing(changes, message, tmp_path):
     with pytest.raises(InputError, match=message) as caught:
-        write(Wish(**{"system": "ball", **changes}), tmp_path / "a.csv")
+        write(simulation_spec(**{"system": "ball", **changes}), tmp_path / "a.csv")
     assert str(caught.value).isprintable()
     assert list(tmp_path.iterdir()) == []
 
@@ -181,11 +188,11 @@ def test_nothing_is_written_over(tmp_path):
     for name in ("a.csv", "a.toml", "a.truth.toml"):
         (tmp_path / name).write_text("mine")
         with pytest.raises(InputError, match=f"{name}: exists already"):
-            write(Wish("ball"), tmp_path / "a.csv")
+            write(simulation_spec("ball"), tmp_path / "a.csv")
         assert [p.name for p in tmp_path.iterdir()] == [name]
         (tmp_path / name).unlink()
     with pytest.raises(InputError, match=r"expected a name that ends in \.csv"):
-        write(Wish("ball"), tmp_path / "a.txt")
+        write(simulation_spec("ball"), tmp_path / "a.txt")
 
 
 def test_signals():

@@ -50,7 +50,7 @@ def notes():
     return pd.DataFrame({"says": says, "value": values})
 
 
-def still():
+def make_printed_figure():
     figure, axes = style.make_panel_grid(1, 1, (5.5, 4.6))
     axes[0, 0].plot(STEPS, np.sqrt(STEPS), color=style.BLUE)
     return PrintedFigure(
@@ -78,7 +78,7 @@ def error_chart():
         )
 
     panels = tuple(panel(kind, title) for kind, title in RANGES.items())
-    return Chart("error", "Error <i>now</i>", panels, still(), "targets")
+    return Chart("error", "Error <i>now</i>", panels, make_printed_figure(), "targets")
 
 
 def bins_chart():
@@ -134,5 +134,5 @@ def page():
         error_chart=error_chart(),
         bins_chart=bins_chart(),
         motion_chart=motion_chart(),
-        still=still(),
+        make_printed_figure=make_printed_figure(),
     )

@@ -47,10 +47,10 @@ def arm(tmp_path):
     """Return a function that builds the arm experiment with changes, next to its model file."""
     written(tmp_path)
 
-    def made(**changes):
+    def parse_arm(**changes):
         return parse_experiment("arm", {**ARM, **changes}, tmp_path / "arm.toml")
 
-    return made
+    return parse_arm
 
 
 def test_a_model_file_stands_instead_of_a_simulator(arm, tmp_path):

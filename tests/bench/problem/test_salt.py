@@ -20,7 +20,7 @@ from tests.sample_experiments import spring_experiment
 pytestmark = pytest.mark.usefixtures("spring")
 
 
-def truths(salt, **changes):
+def true_parameters(salt, **changes):
     return [
         t.truth for t in TuningProblem(spring_experiment(salt="", **changes), salt).draw_targets()
     ]
@@ -45,11 +45,11 @@ def test_fresh_salts_have_128_bits_and_are_never_the_same():
 
 
 def test_targets_follow_from_the_salt():
-    np.testing.assert_array_equal(truths("a"), truths("a"))
-    assert not np.isclose(truths("a"), truths("b")).any()
-    assert not np.isclose(truths("a"), truths("public")).any()
-    np.testing.assert_array_equal(truths("public"), truths(""))
-    np.testing.assert_array_equal(truths("a"), truths("a", seeds=5, budget=99))
+    np.testing.assert_array_equal(true_parameters("a"), true_parameters("a"))
+    assert not np.isclose(true_parameters("a"), true_parameters("b")).any()
+    assert not np.isclose(true_parameters("a"), true_parameters("public")).any()
+    np.testing.assert_array_equal(true_parameters("public"), true_parameters(""))
+    np.testing.assert_array_equal(true_parameters("a"), true_parameters("a", seeds=5, budget=99))
 
 
 def test_a_salt_draws_each_thing_from_a_stream_of_its_own():

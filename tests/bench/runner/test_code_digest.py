@@ -298,7 +298,7 @@ def test_class_of_a_notebook_that_has_no_file_takes_the_text_of_its_cell(monkeyp
     assert cell(11, 1) == cell(12, 1) != cell(13, 2)
 
 
-def made(number):
+def define_tuner(number):
     class Local(Tuner):
         step = number
 
@@ -306,7 +306,8 @@ def made(number):
 
 
 @pytest.mark.parametrize(
-    "kind", [made(1), type("Nobody", (Tuner,), {}), type("Random", (tuners.get("random"),), {})]
+    "kind",
+    [define_tuner(1), type("Nobody", (Tuner,), {}), type("Random", (tuners.get("random"),), {})],
 )
 def test_class_whose_source_cannot_be_found_is_refused_with_one_line(kind, monkeypatch):
     monkeypatch.setattr(kind, "name", "nobody", raising=False)

@@ -60,7 +60,7 @@ def finished_folder(tmp_path_factory):
     return folder
 
 
-def begun(folder, experiment, enough):
+def start_and_kill(folder, experiment, enough):
     """Start a comparison, kill it once `enough` runs are finished, and return its folder."""
     command = [
         *COMMAND,
@@ -88,7 +88,7 @@ def begun(folder, experiment, enough):
 def test_killed_without_warning_and_resumed_the_result_is_the_undisturbed_one(
     finished_folder, tmp_path, capsys
 ):
-    folder = begun(tmp_path / "out", finished_folder / "e.toml", 5)
+    folder = start_and_kill(tmp_path / "out", finished_folder / "e.toml", 5)
     before = read_finished_statuses(folder)
     assert 5 <= len(before) < 48
     assert main(["status", str(folder)]) == 1
@@ -114,7 +114,7 @@ def test_killed_without_warning_and_resumed_the_result_is_the_undisturbed_one(
 
 @pytest.mark.slow
 def test_what_changed_is_refused_by_name(finished_folder, tmp_path, capsys, monkeypatch):
-    folder = begun(tmp_path / "out", finished_folder / "e.toml", 2)
+    folder = start_and_kill(tmp_path / "out", finished_folder / "e.toml", 2)
     text = (folder / "experiment.toml").read_text()
     for change in (
         text.replace("budget = 12", "budget = 13"),
@@ -299,8 +299,8 @@ def test_one_function_tells_which_study_an_experiment_or_a_folder_is(tmp_path, s
 
     assert get_study_class(load_experiment("bounce-shot")) is BounceShotStudy
     assert get_study_class(load_experiment("ball-drop")) is Comparison
-    (begun,) = begin_studies(spring_experiment(), [SPRING_PLUGIN], tmp_path / "out")
-    begun.results.run_sink.close()
+    (start_and_kill,) = begin_studies(spring_experiment(), [SPRING_PLUGIN], tmp_path / "out")
+    start_and_kill.results.run_sink.close()
     there = open_study(tmp_path / "out")
     assert isinstance(there, Comparison)
     standing = there.status()

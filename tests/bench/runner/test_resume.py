@@ -59,7 +59,7 @@ class Interrupting(simgap.Tuner):
         yield task.start
 
 
-def begun(experiment, plugins, folder):
+def run_interrupted(experiment, plugins, folder):
     """Run a comparison whose first run is finished and whose second is interrupted."""
     Interrupting.left = 1
     made = Comparison.begin(prepare_study(experiment, plugins, folder, jobs=0)).run(jobs=0)
@@ -101,7 +101,7 @@ def test_a_changed_plugin_is_refused_and_the_same_one_goes_on(name, tmp_path):
     experiment = spring_experiment(
         simulator="hung", targets=1, seeds=1, ranges=["in"], tuners=["random", "interrupting"]
     )
-    folder = begun(experiment, plugins, tmp_path / "out")
+    folder = run_interrupted(experiment, plugins, tmp_path / "out")
     text = (tmp_path / name).read_text()
     (tmp_path / name).write_text(text + "\n# another word\n")
     refused(folder, "plugins")
@@ -131,7 +131,7 @@ def test_a_changed_recording_is_refused_and_the_same_one_goes_on(name, old, new,
         "tuners": ["random", "interrupting"],
     }  # fmt: skip
     experiment = parse_experiment("swing", document, tmp_path / "swing-experiment.toml")
-    folder = begun(experiment, [], tmp_path / "out")
+    folder = run_interrupted(experiment, [], tmp_path / "out")
     text = (tmp_path / name).read_text()
     assert text.count(old) == 1
     (tmp_path / name).write_text(text.replace(old, new))
@@ -148,7 +148,7 @@ def folder(tmp_path, spring):
     experiment = spring_experiment(
         targets=1, seeds=1, ranges=["in"], tuners=["random", "interrupting"]
     )
-    return begun(experiment, [], tmp_path / "out")
+    return run_interrupted(experiment, [], tmp_path / "out")
 
 
 @pytest.mark.parametrize(

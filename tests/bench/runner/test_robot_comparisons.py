@@ -8,7 +8,7 @@ import pytest
 from bench.cli.main import main
 from tests.bench.diagnosis.pendulum_recordings import SWINGING, written
 
-TRUTH = {"drag.linear@elbow": 0.13, "mass.scale@fore": 0.2}
+TRUE_PARAMETERS = {"drag.linear@elbow": 0.13, "mass.scale@fore": 0.2}
 
 
 @pytest.fixture(scope="module")
@@ -16,7 +16,7 @@ def log(tmp_path_factory):
     """Log of the arm with a damping and a mass that differ from its model file."""
     folder = tmp_path_factory.mktemp("log")
     model = written(folder)
-    given = [f"{name}={value}" for name, value in TRUTH.items()]
+    given = [f"{name}={value}" for name, value in TRUE_PARAMETERS.items()]
     size = ["--runs", "3", "--seconds", "1.6", "--rate", "50"]
     arguments = ["simulate", "--model", str(model), "--effect", *given, "--noise", "1e-4", *size]
     assert main([*arguments, "--out", str(folder / "log.csv")]) == 0
@@ -40,7 +40,7 @@ def compared(log, tmp_path_factory):
 def test_the_true_parameters_are_recovered_from_the_log(compared):
     runs = pd.read_parquet(compared / "runs.parquet")
     ends = runs.sort_values("k").groupby("tuner").last()
-    for name, value in TRUTH.items():
+    for name, value in TRUE_PARAMETERS.items():
         found = ends.loc["least_squares", f"recommendation_{name}"]
         assert found == pytest.approx(value, rel=0.01)
     held_out = ends["heldout_error_q.elbow"]

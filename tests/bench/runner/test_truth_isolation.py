@@ -103,7 +103,7 @@ def test_files_count_once_where_a_process_serves_several_runs():
 
 
 @pytest.mark.parametrize(
-    ("says", "files", "names"),
+    ("message", "files", "names"),
     [
         ('{"count": 1e999, "names": []}', 0, ()),
         ('{"count": -3, "names": ["a"]}', 0, ()),
@@ -113,9 +113,9 @@ def test_files_count_once_where_a_process_serves_several_runs():
         ("[", 0, ()),
     ],
 )
-def test_what_a_process_says_of_its_files_is_no_more_than_a_line(says, files, names):
+def test_what_a_process_says_of_its_files_is_no_more_than_a_line(message, files, names):
     made = experiment("boasting").chosen(
-        tuners=(TunerEntry("boasting", "boasting", {"says": says}),)
+        tuners=(TunerEntry("boasting", "boasting", {"says": message}),)
     )
     ended = outcome(made)
     assert ended.trace.status == "converged"

@@ -4,7 +4,7 @@ import pytest
 from bench.benchmark.runner.tuner_loop import drive_tuner
 from methods.tuner import Proposal, Task, Tuner
 
-TRUTH = np.array([0.3, 0.6])
+TRUE_PARAMETERS = np.array([0.3, 0.6])
 
 
 def task(budget, dim=2):
@@ -28,7 +28,7 @@ class Counted:
 
     def __call__(self, points):
         self.simulated += len(points)
-        losses = np.linalg.norm(points - TRUTH[: points.shape[1]], axis=1)
+        losses = np.linalg.norm(points - TRUE_PARAMETERS[: points.shape[1]], axis=1)
         return np.repeat(losses, 5).reshape(-1, 5, 1), losses
 
 

@@ -54,7 +54,7 @@ def shout():
     return sys.stdout.isatty()
 
 
-def made(calls, seconds=60.0, jobs=2, plugins=()):
+def run_calls(calls, seconds=60.0, jobs=2, plugins=()):
     with LocalPool(jobs) as pool:
         pool.load_plugins([Plugin(path) for path in plugins])
         return dict(pool.iterate_results(calls, seconds))
@@ -69,7 +69,7 @@ def test_a_death_costs_its_own_call_and_no_other(monkeypatch):
         (os.abort, ()),
         (double, ()),
     )
-    results = made(calls)
+    results = run_calls(calls)
     odd = {i: results[i] for i in (3, 11, 12, 20)}
     assert all(isinstance(odd[i], WorkerDiedError) for i in (3, 11, 12))
     assert [str(odd[i]) for i in (3, 11, 12)] == [
@@ -88,7 +88,7 @@ def test_hanging_call_is_killed_at_its_limit_even_if_it_ignores_the_polite_signa
 ):
     monkeypatch.setattr("bench.benchmark.runner.worker_pools.HARD_LIMIT_GRACE_SECONDS", 0.3)
     started = time.monotonic()
-    results = made([(hang, (str(tmp_path / "pid"),)), (double, (1,))], seconds=1.0)
+    results = run_calls([(hang, (str(tmp_path / "pid"),)), (double, (1,))], seconds=1.0)
     assert isinstance(results[0], TimeoutError)
     assert results[1] == 2
     assert time.monotonic() - started < 30
@@ -101,7 +101,7 @@ def test_hanging_call_is_killed_at_its_limit_even_if_it_ignores_the_polite_signa
 def test_call_whose_worker_is_killed_from_outside_is_made_again_but_not_for_ever(
     tmp_path, times, expected
 ):
-    result = made([(killed_until, (str(tmp_path / "count"), times)), (double, (1,))])[0]
+    result = run_calls([(killed_until, (str(tmp_path / "count"), times)), (double, (1,))])[0]
     if expected is WorkerDiedError:
         assert isinstance(result, WorkerDiedError)
         assert "SIGKILL (out of memory?)" in str(result)
@@ -112,13 +112,13 @@ def test_call_whose_worker_is_killed_from_outside_is_made_again_but_not_for_ever
 
 @pytest.mark.slow
 def test_worker_killed_in_the_middle_of_its_answer_stops_nobody():
-    results = made([(half_a_message, ()), *[(double, (i,)) for i in range(5)]])
+    results = run_calls([(half_a_message, ()), *[(double, (i,)) for i in range(5)]])
     assert [results[i] for i in range(1, 6)] == [0, 2, 4, 6, 8]
     assert isinstance(results[0], WorkerDiedError | np.ndarray)
 
 
 def test_what_is_printed_goes_nowhere(capfd):
-    assert made([(shout, ())], jobs=1) == {0: False}
+    assert run_calls([(shout, ())], jobs=1) == {0: False}
     captured = capfd.readouterr()
     assert "x" not in captured.out
     assert "yyyy" not in captured.err
@@ -129,7 +129,7 @@ def test_workers_that_die_at_once_are_an_error_and_no_endless_loop(tmp_path, mon
     plugin = tmp_path / "fatal.py"
     plugin.write_text("import os\nos._exit(9)\n")
     with pytest.raises(InputError, match="die as soon as they start"):
-        made([(double, (1,))], jobs=1, plugins=[str(plugin)])
+        run_calls([(double, (1,))], jobs=1, plugins=[str(plugin)])
 
 
 def test_no_worker_outlives_its_parent(tmp_path):
@@ -189,14 +189,14 @@ def test_memory_beyond_the_limit_is_refused_and_the_limit_ends_with_the_block():
 
 def interrupted_at_birth(context):
     """Return the exit code of a process that receives Ctrl-C as soon as it exists."""
-    process = context.Process(target=leave_when_told)
+    process = context.Process(target=exit_on_interrupt)
     process.start()
     os.kill(process.pid, signal.SIGINT)
     process.join(60.0)
     return process.exitcode
 
 
-def leave_when_told():
+def exit_on_interrupt():
     ignore_interrupts()
     os.kill(os.getpid(), signal.SIGINT)
     os._exit(7)

@@ -247,19 +247,19 @@ def statuses(change):
     return "segments/000001.parquet", damage
 
 
-def said(**changes):
+def change_status(**changes):
     return statuses(lambda held: [[held[0][0], {**held[0][1], **changes}], *held[1:]])
 
 
 HALF |= {
-    "foreign status": said(status="perfect"),
-    "foreign run": said(run="random/in-000/0/0000000000"),
-    "foreign tuner": said(tuner="annealing"),
-    "status of numbers": said(status=3),
-    "seconds in words": said(seconds="long"),
-    "negative time in a part": said(seconds=-1.0),
-    "infinite time in a part": said(seconds=float("inf")),
-    "too many simulations": said(simulations=99),
+    "foreign status": change_status(status="perfect"),
+    "foreign run": change_status(run="random/in-000/0/0000000000"),
+    "foreign tuner": change_status(tuner="annealing"),
+    "status of numbers": change_status(status=3),
+    "seconds in words": change_status(seconds="long"),
+    "negative time in a part": change_status(seconds=-1.0),
+    "infinite time in a part": change_status(seconds=float("inf")),
+    "too many simulations": change_status(simulations=99),
     "no place": statuses(lambda held: [["x", held[0][1]], *held[1:]]),
     "beyond the plan": statuses(lambda held: [[99, held[0][1]], *held[1:]]),
     "statuses no list": statuses(lambda _: {"a": 1}),

@@ -101,12 +101,12 @@ def damaged(folders, kind, damage, tmp_path):
     return tmp_path / kind
 
 
-def is_one_line(code, told, folder, name):
-    assert code == 2, told
-    assert told.count("\n") == 1
-    assert told[:-1].isprintable(), told
-    assert 20 < len(told) < 900, told
-    assert str(folder / name) in told, told
+def is_one_line(code, message, folder, name):
+    assert code == 2, message
+    assert message.count("\n") == 1
+    assert message[:-1].isprintable(), message
+    assert 20 < len(message) < 900, message
+    assert str(folder / name) in message, message
     assert not (folder / "figures").exists()
     assert not (folder / "all").exists()
 
@@ -141,7 +141,7 @@ def test_rows_of_a_part_are_checked_before_more_are_made(damage, folders, tmp_pa
 
 
 def test_what_is_said_names_file_row_expected_found_and_remedy(folders, tmp_path):
-    def told(act):
+    def read_damaged(act):
         folder = damaged(folders, "done", act, tmp_path)
         with pytest.raises(InputError) as caught:
             read_comparison(folder)
@@ -149,21 +149,23 @@ def test_what_is_said_names_file_row_expected_found_and_remedy(folders, tmp_path
         return str(caught.value).removeprefix(str(folder))
 
     remedy = "; restore the file, or start a new comparison"
-    assert told(cell("loss", 1, -2.0)) == (
+    assert read_damaged(cell("loss", 1, -2.0)) == (
         f"/runs.parquet, row 1: loss: expected a number of at least 0, found -2.0{remedy}"
     )
-    assert told(cell("k", 5, 3)).startswith("/runs.parquet, row 5: k: expected 1, the next of ran")
-    assert told(rows(lambda f: f.drop(columns="loss"))).startswith(
+    assert read_damaged(cell("k", 5, 3)).startswith(
+        "/runs.parquet, row 5: k: expected 1, the next of ran"
+    )
+    assert read_damaged(rows(lambda f: f.drop(columns="loss"))).startswith(
         "/runs.parquet: columns: expected one named loss, found 'run, experiment, tuner,"
     )
     quoted = lines(STATUS_CSV, lambda ls: [ls[0], ls[1].replace("done,", 'done,"a\n\nb"'), *ls[2:]])
-    assert told(both(quoted, text(STATUS_CSV, "done,,", "over,,"))) == (
+    assert read_damaged(both(quoted, text(STATUS_CSV, "done,,", "over,,"))) == (
         "/status.csv, line 5: status: expected one of done, converged, crashed, timeout, diverged, "
         f"skipped, found 'over'{remedy}"
     )
     short = both(quoted, lines(STATUS_CSV, lambda ls: [*ls[:-1], "random"]))
-    assert told(short) == f"/status.csv, line 15: expected 10 cells, found 1{remedy}"
-    assert told(lines(STATUS_CSV, lambda ls: ls[:-1])) == (
+    assert read_damaged(short) == f"/status.csv, line 15: expected 10 cells, found 1{remedy}"
+    assert read_damaged(lines(STATUS_CSV, lambda ls: ls[:-1])) == (
         f"/status.csv: expected a run of nelder_mead on wide-001 with seed 0, found none{remedy}"
     )
 
@@ -174,9 +176,9 @@ def test_results_of_one_that_is_under_way_are_written_again_by_resuming(folders,
         shutil.copy(folders / "done" / name, folder / name)
     assert len(read_comparison(folder).statuses) == 12
     (folder / STATUS_CSV).write_bytes(b"\xff")
-    code, told = COMMANDS["plot"](folder)
-    assert (code, told.count("\n")) == (2, 1)
-    assert f"write it again with simgap compare --resume {folder}" in told
+    code, read_damaged = COMMANDS["plot"](folder)
+    assert (code, read_damaged.count("\n")) == (2, 1)
+    assert f"write it again with simgap compare --resume {folder}" in read_damaged
     assert main(["status", str(folder)]) == 1, "its results are not written"
     assert "12 of 12 runs finished\n" in capsys.readouterr().out
     comparison = Comparison.resume(folder)

@@ -44,7 +44,7 @@ def compared(place):
 
 
 @pytest.fixture(scope="module")
-def told(place):
+def explanation_archive(place):
     """Archive of the explanation with its recording."""
     command = ["bundle", str(place / "told"), "--with", str(place / "swing.csv")]
     assert main([*command, "--out", str(place / "told.zip")]) == 0
@@ -110,13 +110,13 @@ def test_it_is_never_written_over_and_an_unfinished_comparison_is_refused(
     assert not (tmp_path / "a.zip").exists()
 
 
-def test_what_was_made_follows(compared, told, capsys):
+def test_what_was_made_follows(compared, explanation_archive, capsys):
     code, found = verified(compared, capsys)
     assert (code, found["follows"], found["archive"]["doubts"]) == (0, True, [])
     checked = found["comparisons"][0]["checked"]
     assert any("the salt has the SHA-256 that was committed" in line for line in checked)
     assert any("16 of 16 rows simulated again" in line for line in checked)
-    code, found = verified(told, capsys)
+    code, found = verified(explanation_archive, capsys)
     assert (code, found["explanation"]["unchecked"]) == (0, [])
     assert any("is reproduced" in line for line in found["explanation"]["checked"])
 
@@ -189,8 +189,8 @@ def word(verdict):
     ("change", "says"),
     [(coefficient, "drag.linear coefficient"), (held_out, "recomputed"), (word, "proven")],
 )
-def test_an_improved_verdict_is_detected(told, tmp_path, capsys, change, says):
-    files = content(told)
+def test_an_improved_verdict_is_detected(explanation_archive, tmp_path, capsys, change, says):
+    files = content(explanation_archive)
     verdict = json.loads(files["told/verdict.json"])
     change(verdict)
     files["told/verdict.json"] = json.dumps(verdict).encode()
@@ -199,8 +199,10 @@ def test_an_improved_verdict_is_detected(told, tmp_path, capsys, change, says):
     assert any(says in doubt["says"] for doubt in found["explanation"]["doubts"])
 
 
-def test_another_recording_than_the_explained_one_is_detected(told, tmp_path, capsys):
-    files = content(told)
+def test_another_recording_than_the_explained_one_is_detected(
+    explanation_archive, tmp_path, capsys
+):
+    files = content(explanation_archive)
     rows = files["told/recordings/swing.csv"].decode()
     files["told/recordings/swing.csv"] = rows.replace("0.0", "0.1", 1).encode()
     code, found = verified(packed(tmp_path / "a.zip", listed_again(files, "told")), capsys)

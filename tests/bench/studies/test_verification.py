@@ -22,7 +22,7 @@ PLUGIN = ["--plugin", str(PLUGINS / "spring.py")]
 
 
 @pytest.fixture(scope="module")
-def sound(tmp_path_factory):
+def finished_folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("verify")
     document = {
         **SPRING, "salt": "", "targets": 2, "seeds": 1, "budget": 5, "noise": {"x": 0.01},
@@ -36,8 +36,8 @@ def sound(tmp_path_factory):
 
 
 @pytest.fixture
-def folder(sound, tmp_path):
-    shutil.copytree(sound, tmp_path / "copy")
+def folder(finished_folder, tmp_path):
+    shutil.copytree(finished_folder, tmp_path / "copy")
     return tmp_path / "copy"
 
 
@@ -48,17 +48,17 @@ def verified(folder, capsys, *options):
     return code, said.out + said.err
 
 
-def test_what_was_made_follows(sound, capsys):
-    code, said = verified(sound, capsys)
+def test_what_was_made_follows(finished_folder, capsys):
+    code, said = verified(finished_folder, capsys)
     assert code == 0
     assert "the salt has the SHA-256 that was committed" in said
     assert "4 targets drawn again, 48 rows compared" in said
     assert "48 of 48 rows simulated again" in said
     assert said.endswith("all results are reproducible\n")
-    held = read_configuration(sound).experiment
+    held = read_configuration(finished_folder).experiment
     assert (held.salt, held.trusted) == (SECRET, False)
-    assert set(pd.read_csv(sound / "table.csv")["salt"]) == {"secret"}
-    assert "process" in json.loads((sound / "environment.json").read_text())["seals"]
+    assert set(pd.read_csv(finished_folder / "table.csv")["salt"]) == {"secret"}
+    assert "process" in json.loads((finished_folder / "environment.json").read_text())["seals"]
 
 
 def changed_rows(folder, column, change, where=slice(None)):
@@ -118,12 +118,12 @@ def test_another_salt_is_refused(folder, capsys, old):
 
 @pytest.mark.usefixtures("undrawn")
 def test_the_salt_is_for_the_owner_alone_until_the_end_and_a_resumed_folder_goes_on_with_it(
-    sound, tmp_path, capsys, monkeypatch
+    finished_folder, tmp_path, capsys, monkeypatch
 ):
     from bench.benchmark.comparison import Comparison
     from bench.benchmark.runner.plugin_discovery import load_plugins_for_experiment
 
-    held = read_configuration(sound)
+    held = read_configuration(finished_folder)
     experiment = held.experiment.chosen(salt="", salt_sha256="")
     load_plugins_for_experiment(held.plugins, experiment)
     begun = Comparison.begin(prepare_study(experiment, held.plugins, tmp_path / "out", 1, SECRET))
@@ -139,15 +139,15 @@ def test_the_salt_is_for_the_owner_alone_until_the_end_and_a_resumed_folder_goes
     assert not kept.exists()
     columns = [f"true_{name}" for name in ("rate", "decay")]
     pd.testing.assert_frame_equal(
-        *(pd.read_parquet(f / "runs.parquet")[columns] for f in (sound, tmp_path / "out"))
+        *(pd.read_parquet(f / "runs.parquet")[columns] for f in (finished_folder, tmp_path / "out"))
     )
 
 
-def test_a_folder_whose_salt_is_gone_is_not_resumed(sound, tmp_path, capsys):
+def test_a_folder_whose_salt_is_gone_is_not_resumed(finished_folder, tmp_path, capsys):
     from bench.benchmark.comparison import Comparison
     from bench.benchmark.runner.plugin_discovery import load_plugins_for_experiment
 
-    held = read_configuration(sound)
+    held = read_configuration(finished_folder)
     load_plugins_for_experiment(held.plugins, held.experiment)
     begun = Comparison.begin(
         prepare_study(
@@ -177,11 +177,11 @@ def test_a_salt_in_addition_to_the_experiments_own_is_refused(tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
-def test_isolation_of_this_machine_and_of_a_folder_is_printed(sound, capsys):
+def test_isolation_of_this_machine_and_of_a_folder_is_printed(finished_folder, capsys):
     assert main(["status"]) == 0
     said = capsys.readouterr().out
     assert "process    active" in said
-    assert main(["status", str(sound)]) == 0
+    assert main(["status", str(finished_folder)]) == 0
     said = capsys.readouterr().out
     assert "isolated: a process for each run" in said
     assert "revealed" in said

@@ -30,10 +30,10 @@ def fall(top=3.8, rebound=0.8):
     return np.where(later < 0, top - 4.905 * TIMES**2, 0.5 + speed * later - 4.905 * later**2)
 
 
-def stage(seed, pixels=100, **look):
+def stage(seed, pixels=100, **appearance):
     rng = np.random.default_rng(seed)
     camera = PinholeCamera.draw_published(rng, pixels)
-    return camera, BallScene(camera, replace(SceneAppearance.draw(rng), **look), 0.5, rng)
+    return camera, BallScene(camera, replace(SceneAppearance.draw(rng), **appearance), 0.5, rng)
 
 
 def upright(z):
@@ -44,7 +44,7 @@ def upright(z):
 def test_centres_are_within_half_a_pixel_of_the_true_centre_after_compression(seed, tmp_path):
     camera, scene = stage(seed)
     points = upright(fall())
-    write_video(tmp_path / "drop.mp4", scene.render_frames(points), TIMES, scene.look.crf)
+    write_video(tmp_path / "drop.mp4", scene.render_frames(points), TIMES, scene.appearance.crf)
     found = track_ball(VideoFile(tmp_path / "drop.mp4"))
     apart = np.linalg.norm(np.stack([found.u, found.v], axis=1) - camera.project(points), axis=1)
     assert np.isfinite(apart).mean() > 0.9
@@ -75,7 +75,7 @@ def test_a_ball_that_comes_to_rest_is_seen_to_the_end(seed, tmp_path):
     times = np.arange(240) / 60
     camera, scene = stage(seed)
     points = upright(bouncing(times))
-    write_video(tmp_path / "rest.mp4", scene.render_frames(points), times, scene.look.crf)
+    write_video(tmp_path / "rest.mp4", scene.render_frames(points), times, scene.appearance.crf)
     found = track_ball(VideoFile(tmp_path / "rest.mp4"))
     true = camera.project_sphere(points, 0.5)[0]
     apart = np.linalg.norm(np.stack([found.u, found.v], axis=1) - true, axis=1)
@@ -94,7 +94,7 @@ def test_the_same_frames_make_the_same_file(tmp_path):
     rng = np.random.default_rng(0)
     for i in range(25):
         junk = [np.ones(rng.integers(1, 20_000)) for _ in range(4)]
-        write_video(tmp_path / f"{i}.mp4", iter(frames), TIMES, scene.look.crf)
+        write_video(tmp_path / f"{i}.mp4", iter(frames), TIMES, scene.appearance.crf)
         made.add((tmp_path / f"{i}.mp4").read_bytes())
         del junk
     assert len(made) == 1

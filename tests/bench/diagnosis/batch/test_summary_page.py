@@ -31,7 +31,7 @@ def cause(value, effect="friction.coulomb@elbow", alternatives=("joint.backlash@
     }
 
 
-def made(tmp_path, count=4, left=2):
+def summary_input(tmp_path, count=4, left=2):
     """Return results of `count` logs with a cause, one without and one failed, and the page input.
 
     The page input has the folders of the explained logs.
@@ -55,7 +55,7 @@ def made(tmp_path, count=4, left=2):
 
 
 def written(tmp_path, count=4, left=2):
-    rows, asked = made(tmp_path, count, left)
+    rows, asked = summary_input(tmp_path, count, left)
     file = tmp_path / "report.html"
     file.write_text(render_summary_page(rows, asked), encoding="utf-8")
     return file, rows
@@ -125,7 +125,7 @@ def test_logs_beyond_what_an_axis_holds_have_numbers(browser, tmp_path):
 
 
 def test_nothing_explained_yet_is_a_page_too(tmp_path):
-    _, asked = made(tmp_path)
+    _, asked = summary_input(tmp_path)
     html = render_summary_page([], asked)
     assert "0 logs, each explained separately" in html
     assert "<strong>none yet</strong>" in html
@@ -136,7 +136,7 @@ def test_no_number_next_to_a_chart_is_cut_off(browser, tmp_path):
     small = [
         LogResult(f"day{k}", "d", "named", (cause(-1.2345e-6 * (1 + 0.01 * k)),)) for k in range(3)
     ]
-    _, asked = made(tmp_path)
+    _, asked = summary_input(tmp_path)
     folders = {row.log: tmp_path / row.log for row in small}
     asked = replace(asked, folders=folders, recordings=folders)
     file = tmp_path / "small.html"

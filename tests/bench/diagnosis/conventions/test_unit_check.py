@@ -28,11 +28,11 @@ from bench.logs.synthetic_recording import simulate_recording
 from sims.extended_simulator import FittedValue
 from sims.recording.unit_conversion import compute_unit_scale
 from tests.conftest import PLUGINS
-from tests.simulation_arguments import Wish
+from tests.simulation_arguments import simulation_spec
 
 ARM = PLUGINS.parents[1] / "examples" / "robot" / "log.csv"
 DEGREE = pi / 180.0
-WISHES = {
+SIMULATED_SYSTEMS = {
     "pendulum": {
         "noise": ["q=0.002", "qd=0.02"],
         "inputs": ["u=multisine:0.05:0.2:2"],
@@ -54,7 +54,7 @@ def swing(folder, stated=None, factors=None):
         stated: wrong unit of each of these signals in the description.
         factors: factor by which the values of each of these signals are multiplied.
     """
-    simulated = simulate_recording(Wish("pendulum", **WISHES["pendulum"]))
+    simulated = simulate_recording(simulation_spec("pendulum", **SIMULATED_SYSTEMS["pendulum"]))
     path = folder / "swing.csv"
     simulated.write(path)
     text = path.with_suffix(".toml").read_text()
@@ -72,7 +72,7 @@ def swing(folder, stated=None, factors=None):
     return path
 
 
-def fault_of(path=None, recording=None, kind=None):
+def find_unit_error(path=None, recording=None, kind=None):
     """Return the wrong unit or sign that the check finds, or None."""
     if recording is None:
         recording, kind = load_joined([path], None, None, ())
@@ -101,7 +101,7 @@ def fault_of(path=None, recording=None, kind=None):
 def test_what_is_stated_wrongly_is_named_with_the_line_that_corrects_it(
     stated, factors, signals, line, tmp_path
 ):
-    found = fault_of(swing(tmp_path, stated, factors))
+    found = find_unit_error(swing(tmp_path, stated, factors))
     assert found is not None
     assert found.signals == signals
     assert found.lines[0] == line
@@ -113,10 +113,10 @@ def test_what_is_stated_wrongly_is_named_with_the_line_that_corrects_it(
 
 
 def test_a_sign_that_does_not_matter_is_not_questioned():
-    wish = {"noise": ["q=0.002"], "observe": ["q"], "initial": ["q=-1:1"]}
-    recording = simulate_recording(Wish("pendulum", **wish)).recording
+    options = {"noise": ["q=0.002"], "observe": ["q"], "initial": ["q=-1:1"]}
+    recording = simulate_recording(simulation_spec("pendulum", **options)).recording
     subject = Subject(simulators.get("pendulum"), recording, "batch")
-    found = fault_of(recording=subject.rescale({"q": 1 / DEGREE}))
+    found = find_unit_error(recording=subject.rescale({"q": 1 / DEGREE}))
     assert found.lines == ('[channels.q] unit = "deg"',)
     assert found.alternatives == ()
 
@@ -150,7 +150,7 @@ def test_a_scale_is_applied_to_the_column_and_its_noise(tmp_path):
     path = swing(tmp_path, {}, {"q": -1})
     about = path.with_suffix(".toml")
     about.write_text(about.read_text().replace("[channels.q]\n", "[channels.q]\nscale = -1\n"))
-    assert fault_of(path) is None
+    assert find_unit_error(path) is None
     recording, _ = load_joined([path], None, None, ())
     assert recording.noise["q"] == 0.002
     about.write_text(about.read_text().replace("scale = -1", "scale = 0"))
@@ -173,15 +173,15 @@ def test_a_scale_is_applied_to_the_column_and_its_noise(tmp_path):
 def test_a_wrong_unit_is_reported_although_a_friction_is_missing_too(factors, line):
     recording, kind = load_joined([ARM], None, None, ())
     subject = Subject(kind, recording, None)
-    found = fault_of(recording=subject.rescale(factors), kind=kind)
+    found = find_unit_error(recording=subject.rescale(factors), kind=kind)
     assert found is not None
     assert found.signals == tuple(sorted(factors, reverse=True))
     assert found.lines[0] == line
-    assert fault_of(recording=recording, kind=kind) is None
+    assert find_unit_error(recording=recording, kind=kind) is None
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("system", WISHES)
+@pytest.mark.parametrize("system", SIMULATED_SYSTEMS)
 def test_neither_clean_recordings_nor_gains_nor_causes_are_called_wrong_units(system):
     """Check 14 clean recordings and true errors of 5 % and more for each system."""
     effects = {
@@ -191,16 +191,20 @@ def test_neither_clean_recordings_nor_gains_nor_causes_are_called_wrong_units(sy
     }  # fmt: skip
     clean = [{"seed": seed} for seed in range(14)]
     wrong = [{"seed": seed, "effects": [e]} for e in effects[system] for seed in (1, 2)]
-    for wish in (*clean, *wrong):
-        recording = simulate_recording(Wish(system, **WISHES[system], **wish)).recording
-        assert fault_of(recording=recording) is None, wish
+    for options in (*clean, *wrong):
+        recording = simulate_recording(
+            simulation_spec(system, **SIMULATED_SYSTEMS[system], **options)
+        ).recording
+        assert find_unit_error(recording=recording) is None, options
 
 
 def test_a_true_gain_near_a_conversion_is_not_a_unit():
-    recording = simulate_recording(Wish("pendulum", **WISHES["pendulum"])).recording
+    recording = simulate_recording(
+        simulation_spec("pendulum", **SIMULATED_SYSTEMS["pendulum"])
+    ).recording
     subject = Subject(simulators.get("pendulum"), recording, "batch")
     # A turn is 2 pi rad, 4.5 % more than 6: its factor reduces the misfit by 95 %.
-    assert fault_of(recording=subject.rescale({"q": 1 / 6.0})) is None
+    assert find_unit_error(recording=subject.rescale({"q": 1 / 6.0})) is None
 
 
 @pytest.mark.parametrize(
@@ -230,7 +234,9 @@ def test_a_plausible_gain_is_a_gain(effect, value):
 
 
 def recognised_of(effect, value):
-    recording = simulate_recording(Wish("pendulum", **WISHES["pendulum"])).recording
+    recording = simulate_recording(
+        simulation_spec("pendulum", **SIMULATED_SYSTEMS["pendulum"])
+    ).recording
     subject = Subject(simulators.get("pendulum"), recording, "batch")
     evaluator = RunEvaluator(subject.kind, recording, recording.training(), candidates=[effect])
     number = FittedValue(value, "1", value - 1e-3, value + 1e-3)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-TRUTH = {"torque_constant": 0.4, "resistance": 5.0, "armature": 0.002}
+TRUE_PARAMETERS = {"torque_constant": 0.4, "resistance": 5.0, "armature": 0.002}
 FRICTION = 0.06
 """Dry friction in N m."""
 CONSTANTS = {
@@ -29,7 +29,7 @@ HELD = 5000
 
 def swings(rng: np.random.Generator) -> list[tuple[float, float, float]]:
     """Return (time, command, noisy angle) of one run from the equations of a DC motor."""
-    k, c = TRUTH, CONSTANTS
+    k, c = TRUE_PARAMETERS, CONSTANTS
     inertia = k["armature"] + c["mass"] * c["length"] ** 2
     goals = rng.uniform(-1.5, 1.5, 1 + EVERY * SAMPLES // HELD)
     angle = rate = 0.0

@@ -23,7 +23,7 @@ from tests.bench.diagnosis.datasheet.drive_recordings import (
     FRICTION,
     NOISE,
     SAMPLES,
-    TRUTH,
+    TRUE_PARAMETERS,
 )
 
 
@@ -32,14 +32,14 @@ def row(sheet: DataSheet, name: str) -> SheetRow:
 
 
 def test_what_was_put_in_lies_within_the_intervals(sheet: DataSheet) -> None:
-    stall = TRUTH["torque_constant"] / TRUTH["resistance"]
+    stall = TRUE_PARAMETERS["torque_constant"] / TRUE_PARAMETERS["resistance"]
     truth = {
-        **TRUTH,
+        **TRUE_PARAMETERS,
         "friction.coulomb": FRICTION,
         "torque constant over resistance": stall,
-        "back-EMF damping": stall * TRUTH["torque_constant"],
+        "back-EMF damping": stall * TRUE_PARAMETERS["torque_constant"],
         "stall torque": stall * CONSTANTS["voltage"],
-        "free speed": CONSTANTS["voltage"] / TRUTH["torque_constant"],
+        "free speed": CONSTANTS["voltage"] / TRUE_PARAMETERS["torque_constant"],
     }
     assert sheet.verdict.verdict == "named"
     shown = {row.name: row.number for row in sheet.rows if row.number is not None}
@@ -106,7 +106,7 @@ def test_drag_cannot_be_distinguished_from_that_of_the_motor(sheet: DataSheet) -
     assert reach is not None
     assert {"torque_constant", "resistance"} <= set(reach.confounded_with)
     assert reach.size > 0.05
-    assert reach.vague
+    assert reach.is_unbounded
 
 
 def test_gaps_show_from_a_size_on_and_limits_up_to_one(sheet: DataSheet) -> None:
@@ -134,7 +134,7 @@ def test_gaps_show_from_a_size_on_and_limits_up_to_one(sheet: DataSheet) -> None
 
 
 def test_what_another_run_may_say_is_no_less_than_what_these_say(sheet: DataSheet) -> None:
-    for name in (*TRUTH, "friction.coulomb"):
+    for name in (*TRUE_PARAMETERS, "friction.coulomb"):
         found = row(sheet, name)
         assert found.number is not None
         assert found.number.low is not None

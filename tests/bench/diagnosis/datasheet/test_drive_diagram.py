@@ -67,7 +67,7 @@ def test_what_pulls_at_rest_shifts_it() -> None:
 def test_it_reaches_as_far_as_the_drive(sheet: DataSheet) -> None:
     stall = next(row.number for row in sheet.rows if row.name == "stall torque")
     assert stall is not None
-    assert sheet.diagram.reach == stall.value
+    assert sheet.diagram.axis_limit == stall.value
     assert sheet.diagram.breakaway == pytest.approx(FRICTION, rel=0.05)
     assert sheet.document()["diagram"]["laws"] == ["friction.coulomb"]
 

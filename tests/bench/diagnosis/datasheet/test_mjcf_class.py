@@ -16,7 +16,7 @@ from bench.diagnosis.datasheet.mjcf_class import build_mjcf, make_class_name
 from bench.diagnosis.datasheet.subject import make_subject
 from bench.diagnosis.score_extended import score_model
 from sims.extended_simulator import FittedValue
-from tests.bench.diagnosis.datasheet.drive_recordings import CONSTANTS, FRICTION, TRUTH
+from tests.bench.diagnosis.datasheet.drive_recordings import CONSTANTS, FRICTION, TRUE_PARAMETERS
 from tests.bench.diagnosis.test_extended_robot_files import EXAMPLE, extended_of
 
 ELBOW = {"friction.coulomb@elbow": {"coefficient": FittedValue(0.03, "N*m", 0.029, 0.031)}}
@@ -32,10 +32,12 @@ def test_a_users_file_takes_the_numbers_from_the_class(files: Path, tmp_path: Pa
     (tmp_path / "class.xml").write_bytes((files / "class.xml").read_bytes())
     (tmp_path / "leg.xml").write_text(USER)
     model = mujoco.MjModel.from_xml_path(str(tmp_path / "leg.xml"))
-    stall = TRUTH["torque_constant"] * CONSTANTS["voltage"] / TRUTH["resistance"]
-    damping = TRUTH["torque_constant"] ** 2 / TRUTH["resistance"]
+    stall = (
+        TRUE_PARAMETERS["torque_constant"] * CONSTANTS["voltage"] / TRUE_PARAMETERS["resistance"]
+    )
+    damping = TRUE_PARAMETERS["torque_constant"] ** 2 / TRUE_PARAMETERS["resistance"]
     assert model.dof_frictionloss[0] == pytest.approx(FRICTION, rel=0.02)
-    assert model.dof_armature[0] == pytest.approx(TRUTH["armature"], rel=0.03)
+    assert model.dof_armature[0] == pytest.approx(TRUE_PARAMETERS["armature"], rel=0.03)
     assert model.dof_damping[0] == pytest.approx(damping, rel=0.03)
     assert model.actuator_forcerange[0] == pytest.approx([-stall, stall], rel=0.01)
     gain = stall * CONSTANTS["kp"] * CONSTANTS["error_gain"]

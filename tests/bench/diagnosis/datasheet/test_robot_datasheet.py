@@ -15,7 +15,7 @@ from bench.diagnosis.datasheet.wording import format_name, format_short_name
 from bench.logs.joined_recordings import load_joined
 from sims.core.simulator import InputError
 from sims.extended_simulator import FittedValue
-from tests.bench.diagnosis.sample_report_data import story
+from tests.bench.diagnosis.sample_report_data import make_report
 from tests.bench.diagnosis.test_extended_robot_files import EXAMPLE, extended_of
 
 FOUND = {
@@ -39,38 +39,40 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "log.csv"
 
 
-def made(log: Path, joint: str) -> SheetContent:
+def build_sheet(log: Path, joint: str) -> SheetContent:
     recording, kind = load_joined([log])
-    return build_datasheet(recording, extended_of(kind, effects=FOUND), story().verdict, joint)
+    return build_datasheet(
+        recording, extended_of(kind, effects=FOUND), make_report().verdict, joint
+    )
 
 
-def row(facts: SheetContent, name: str) -> SheetRow:
-    return next(row for row in facts.rows if row.name == name)
+def row(sheet: SheetContent, name: str) -> SheetRow:
+    return next(row for row in sheet.rows if row.name == name)
 
 
 def test_what_was_found_is_added_to_what_the_file_states(log: Path) -> None:
-    facts = made(log, "elbow")
-    drag = row(facts, "drag.linear@elbow")
+    sheet = build_sheet(log, "elbow")
+    drag = row(sheet, "drag.linear@elbow")
     assert drag.stated == pytest.approx(0.1)
     assert drag.number is not None
     assert (drag.number.value, drag.number.low) == pytest.approx((0.12, 0.115))
     assert format_name(drag) == "linear drag"
-    armature = row(facts, "inertia.armature@elbow")
+    armature = row(sheet, "inertia.armature@elbow")
     assert format_name(armature) == "armature"
-    assert format_short_name(row(facts, "sensor.bias@q.elbow")) == "sensor.bias q"
-    assert format_short_name(row(facts, "force.ripple@elbow sine")) == "force.ripple sine"
+    assert format_short_name(row(sheet, "sensor.bias@q.elbow")) == "sensor.bias q"
+    assert format_short_name(row(sheet, "force.ripple@elbow sine")) == "force.ripple sine"
     assert armature.state == "not shown"
     assert armature.stated == pytest.approx(0.005)
-    assert row(facts, "friction.coulomb@elbow").state == "found"
-    assert facts.diagram.breakaway == pytest.approx(0.03)
-    places = {row.name.partition("@")[2].partition(" ")[0] for row in facts.rows}
+    assert row(sheet, "friction.coulomb@elbow").state == "found"
+    assert sheet.diagram.breakaway == pytest.approx(0.03)
+    places = {row.name.partition("@")[2].partition(" ")[0] for row in sheet.rows}
     assert {"elbow", "q.elbow"} <= places
     assert not any("shoulder" in place for place in places)
-    assert list(facts.elsewhere()) == ["gravity.scale"]
+    assert list(sheet.elsewhere()) == ["gravity.scale"]
 
 
 def test_what_may_be_nothing_at_a_joint_of_a_family_is_not_shown_there(log: Path) -> None:
-    friction = row(made(log, "shoulder"), "friction.coulomb@shoulder")
+    friction = row(build_sheet(log, "shoulder"), "friction.coulomb@shoulder")
     assert friction.state == "not shown"
     assert friction.detection_limit is not None
     assert friction.detection_limit.size == pytest.approx(0.004)

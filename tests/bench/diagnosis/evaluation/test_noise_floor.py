@@ -7,8 +7,8 @@ from bench.diagnosis.evaluation.noise_floor import compute_noise_floor
 from tests.bench.diagnosis.explained_samples import changed, evaluator, recording
 
 
-def floor_of(made):
-    return compute_noise_floor(evaluator(made, candidates=[]), made)
+def floor_of(simulated):
+    return compute_noise_floor(evaluator(simulated, candidates=[]), simulated)
 
 
 def test_stated_noise_is_believed_and_the_rest_estimated():

@@ -1,6 +1,6 @@
 import numpy as np
 
-from bench.diagnosis.evaluation.simulation_cache import LaneCache
+from bench.diagnosis.evaluation.simulation_cache import SimulationCache
 
 ROW = np.zeros((2, 1)).nbytes
 
@@ -9,37 +9,40 @@ def rows(*values):
     return np.array([np.full((2, 1), value) for value in values])
 
 
-def asked(cache, keys, made):
+def fill_cache(cache, keys, rows_by_key):
     """Fill the cache as a run evaluator does; return the results and the simulated keys."""
     new = cache.missing(keys)
     out = np.full((len(keys), 2, 1), np.nan)
-    cache.fill(keys, new, rows(*(made[keys[place]] for place in new)), out)
+    cache.fill(keys, new, rows(*(rows_by_key[keys[place]] for place in new)), out)
     return out[:, 0, 0].tolist(), [keys[place] for place in new]
 
 
 def test_an_element_is_simulated_once_and_then_cached():
-    cache = LaneCache()
-    assert asked(cache, [b"a", b"b", b"a"], {b"a": 1.0, b"b": 2.0}) == ([1, 2, 1], [b"a", b"b"])
+    cache = SimulationCache()
+    assert fill_cache(cache, [b"a", b"b", b"a"], {b"a": 1.0, b"b": 2.0}) == (
+        [1, 2, 1],
+        [b"a", b"b"],
+    )
     # The other value of "a" shows that it is not simulated again.
-    assert asked(cache, [b"c", b"a"], {b"c": 3.0, b"a": 9.0}) == ([3, 1], [b"c"])
-    found, new = asked(cache, [b"a", b"b"], {})
+    assert fill_cache(cache, [b"c", b"a"], {b"c": 3.0, b"a": 9.0}) == ([3, 1], [b"c"])
+    found, new = fill_cache(cache, [b"a", b"b"], {})
     assert (found, new) == ([1, 2], [])
 
 
 def test_what_it_holds_is_its_own():
-    cache = LaneCache()
+    cache = SimulationCache()
     results, out = rows(1.0), np.empty((1, 2, 1))
     cache.fill([b"a"], cache.missing([b"a"]), results, out)
     results[:] = out[:] = 7.0
-    assert asked(cache, [b"a"], {}) == ([1], [])
+    assert fill_cache(cache, [b"a"], {}) == ([1], [])
 
 
 def test_beyond_its_limit_the_oldest_are_dropped():
-    cache = LaneCache(limit=2 * ROW)
+    cache = SimulationCache(limit=2 * ROW)
     made = {key: float(place) for place, key in enumerate([b"a", b"b", b"c", b"d"])}
     # One call may request more results than the cache can hold.
-    assert asked(cache, [b"a", b"b", b"c"], made) == ([0, 1, 2], [b"a", b"b", b"c"])
-    assert asked(cache, [b"b", b"c"], made) == ([1, 2], [])
+    assert fill_cache(cache, [b"a", b"b", b"c"], made) == ([0, 1, 2], [b"a", b"b", b"c"])
+    assert fill_cache(cache, [b"b", b"c"], made) == ([1, 2], [])
     # Results needed by this call are returned although they are dropped at its end.
-    assert asked(cache, [b"b", b"d", b"c", b"a"], made) == ([1, 3, 2, 0], [b"d", b"a"])
-    assert asked(cache, [b"d", b"a"], {}) == ([3, 0], [])
+    assert fill_cache(cache, [b"b", b"d", b"c", b"a"], made) == ([1, 3, 2, 0], [b"d", b"a"])
+    assert fill_cache(cache, [b"d", b"a"], {}) == ([3, 0], [])

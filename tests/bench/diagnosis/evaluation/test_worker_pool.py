@@ -25,10 +25,13 @@ from bench.diagnosis.evaluation.worker_pool import (
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="workers are forked on Linux alone")
 
 
-def evaluator(**watch):
+def evaluator(**control_options):
     """Return the attributes of a run evaluator that a worker pool needs."""
     return SimpleNamespace(
-        simulation_count=0, search_control=SearchControl(**watch), worker_pool=None, factor=3
+        simulation_count=0,
+        search_control=SearchControl(**control_options),
+        worker_pool=None,
+        factor=3,
     )
 
 

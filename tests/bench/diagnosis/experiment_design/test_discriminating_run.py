@@ -16,9 +16,9 @@ from sims.systems.pendulum import Pendulum
 from tests.bench.diagnosis.explained_samples import evaluator, marked, recording, white
 
 
-def rivals(made, sigma, effects, **options):
+def fit_each_effect(simulated, sigma, effects, **options):
     """Return a search and one fitted model per effect."""
-    there = evaluator(made, candidates=list(effects), **options)
+    there = evaluator(simulated, candidates=list(effects), **options)
     noise = white(there, sigma)
     base = fit_base_model(there, noise)
     search = EffectSearch(
@@ -40,7 +40,7 @@ def small_swing(**changes):
 def test_the_run_that_differs_most_is_proposed_and_does_tell_them_apart(free):
     effects = ("drag.linear", "drag.quadratic")
     made = small_swing(effects=["drag.quadratic=2e-4"])
-    search, model, rival = rivals(made, [0.003, 0.02], effects, free=free)
+    search, model, rival = fit_each_effect(made, [0.003, 0.02], effects, free=free)
     found = propose_discriminating_run(search, model, rival)
     assert found.apart > MIN_DISCRIMINATION_SIGMAS
     assert found.change
@@ -73,7 +73,7 @@ def test_the_run_that_differs_most_is_proposed_and_does_tell_them_apart(free):
 
 def test_equal_models_are_not_distinguished_by_any_run():
     made = small_swing()
-    search, model, _ = rivals(made, [0.003, 0.02], ("drag.linear", "drag.quadratic"))
+    search, model, _ = fit_each_effect(made, [0.003, 0.02], ("drag.linear", "drag.quadratic"))
     found = propose_discriminating_run(search, model, model)
     assert found.apart == 0
     assert found.change == {}
@@ -82,7 +82,7 @@ def test_equal_models_are_not_distinguished_by_any_run():
 
 
 def test_what_is_not_recorded_is_proposed_where_no_run_would_do():
-    search, model, _ = rivals(
+    search, model, _ = fit_each_effect(
         small_swing(observe=["q"], noise=["0.003"]), 0.003, ("drag.linear", "drag.quadratic")
     )
     assert propose_discriminating_run(search, model, model).says.endswith("also record qd")
@@ -91,7 +91,7 @@ def test_what_is_not_recorded_is_proposed_where_no_run_would_do():
 def test_an_input_is_made_smaller_or_larger():
     made = recording("slider", runs=1, seconds=1, rate=50, inputs=["u=square:1:1"], noise=["0.003"],
                      effects=["input.gain=0.2"])  # fmt: skip
-    search, model, rival = rivals(made, 0.003, ("input.deadband", "friction.coulomb"))
+    search, model, rival = fit_each_effect(made, 0.003, ("input.deadband", "friction.coulomb"))
     before = search.evaluator.simulation_count
     found = propose_discriminating_run(search, model, rival)
     assert np.isfinite(found.apart)

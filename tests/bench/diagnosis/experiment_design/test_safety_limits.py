@@ -35,7 +35,7 @@ def arm(tmp_path_factory):
     """
     folder = tmp_path_factory.mktemp("arm")
 
-    def made(speed):
+    def make_arm(speed):
         path = folder / f"arm{speed:g}.urdf"
         path.write_text(URDF.replace("SPEED", f"{speed:g}"))
         actuators = {"m": {"joint": "hip", "kind": "motor"}}
@@ -53,7 +53,7 @@ def arm(tmp_path_factory):
         )
         return evaluator, SimpleNamespace(fit=fit, effects=())
 
-    return made
+    return make_arm
 
 
 def pushes(rig, size):

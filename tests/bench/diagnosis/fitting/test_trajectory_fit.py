@@ -22,7 +22,7 @@ from tests.bench.diagnosis.explained_samples import (
     with_runs,
 )
 
-TRUTH = 2.7e-3
+TRUE_RATE = 2.7e-3
 
 
 def swings():
@@ -30,7 +30,7 @@ def swings():
     made = []
     for q, rate, samples in ((0.7, 50, 60), (-1.2, 80, 130), (2.2, 100, 90)):
         times = np.arange(samples) / rate
-        made.append(recorded(Pendulum(), [TRUTH], [{"q": q}], times))
+        made.append(recorded(Pendulum(), [TRUE_RATE], [{"q": q}], times))
     return with_runs(made[0], [part.runs[0] for part in made])
 
 
@@ -46,7 +46,7 @@ def test_parameters_and_initial_states_of_noiseless_runs_come_back():
     there = evaluator(swings())
     fit = fitted(there)
     assert there.observed.shape == (3, 130, 2)
-    assert fit.theta[0] == pytest.approx(TRUTH, rel=2e-5)
+    assert fit.theta[0] == pytest.approx(TRUE_RATE, rel=2e-5)
     released = [[0.7, 0], [-1.2, 0], [2.2, 0]]
     np.testing.assert_allclose(fit.initial_states, released, atol=1e-3)
     seen = np.isfinite(there.observed)
@@ -78,7 +78,7 @@ def test_an_effect_is_fitted_with_the_parameters():
     there = evaluator(made, candidates=["drag.linear", "friction.coulomb"])
     fit = fitted(there, effects=("drag.linear",))
     assert list(fit.free_indices) == [0, 1]
-    assert fit.theta[0] == pytest.approx(TRUTH, rel=1e-4)
+    assert fit.theta[0] == pytest.approx(TRUE_RATE, rel=1e-4)
     assert fit.theta[1] == pytest.approx(8e-4, rel=1e-3)
     assert fit.theta[2] == 0
 
@@ -133,26 +133,28 @@ def test_missing_samples_change_nothing_but_what_is_known():
     there = evaluator(replace(swings(), runs=tuple(runs)))
     fit = fitted(there)
     assert np.isnan(there.observed).sum() > 200
-    assert fit.theta[0] == pytest.approx(TRUTH, rel=2e-5)
+    assert fit.theta[0] == pytest.approx(TRUE_RATE, rel=2e-5)
     np.testing.assert_allclose(fit.initial_states[:, 0], [0.7, -1.2, 2.2], atol=1.5e-4)
 
 
 def test_only_the_first_share_counts():
-    def spoilt(values):
+    def corrupt_second_half(values):
         values[values.size // 2 :] = 50.0
         return values
 
-    runs = tuple(changed(run, q=spoilt, qd=spoilt) for run in swings().runs)
+    runs = tuple(
+        changed(run, q=corrupt_second_half, qd=corrupt_second_half) for run in swings().runs
+    )
     there = evaluator(replace(swings(), runs=runs))
-    assert fitted(there, share=0.45).theta[0] == pytest.approx(TRUTH, rel=1e-4)
-    assert abs(fitted(there).theta[0] / TRUTH - 1) > 0.05
+    assert fitted(there, share=0.45).theta[0] == pytest.approx(TRUE_RATE, rel=1e-4)
+    assert abs(fitted(there).theta[0] / TRUE_RATE - 1) > 0.05
 
 
 def test_bounds_are_kept():
     starts, times = [{"q": 0.8}, {"q": 1.3}], np.arange(80) / 60
     # Negative drag makes the motion grow.
     runaway = Pendulum(fixed={"drag.linear": -5e-4})
-    made = recorded(runaway, [TRUTH], starts, times)
+    made = recorded(runaway, [TRUE_RATE], starts, times)
     there = evaluator(made, candidates=["drag.linear"])
     theta = there.get_nominal_theta()
     theta[1] = 1e-4
@@ -220,7 +222,7 @@ def test_least_squares_with_coloured_noise_is_generalised():
     times, errors = np.arange(150) / 100, []
     rng = np.random.default_rng(11)
     for _ in range(12):
-        clean = recorded(Pendulum(observe=["q"]), [TRUTH], [{"q": 1.0}], times)
+        clean = recorded(Pendulum(observe=["q"]), [TRUE_RATE], [{"q": 1.0}], times)
         noise = rng.standard_normal(150)
         for t in range(1, 150):
             noise[t] = 0.95 * noise[t - 1] + np.sqrt(1 - 0.95**2) * noise[t]
@@ -233,7 +235,7 @@ def test_least_squares_with_coloured_noise_is_generalised():
             for noise in (white(there, 0.02), autoregressive(there, 0.02, 0.95))
         ]
         fits = [fitter.fit_models([start], 20)[0] for fitter in fitters]
-        errors.append([fit.theta[0] / TRUTH - 1 for fit in fits])
+        errors.append([fit.theta[0] / TRUE_RATE - 1 for fit in fits])
     ordinary, generalised = np.sqrt(np.square(errors).mean(axis=0))
     assert generalised < 0.85 * ordinary
     assert generalised < 0.01

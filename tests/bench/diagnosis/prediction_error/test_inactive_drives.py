@@ -37,7 +37,7 @@ ARM = """
   </actuator>
 </mujoco>
 """
-USUAL = {"damping": 0.2, "shoulder": "", "kp": 60, "servo": ""}
+DEFAULTS = {"damping": 0.2, "shoulder": "", "kp": 60, "servo": ""}
 TIMES = 0.01 * np.arange(301)
 LOG = "".join(
     ['model = "arm.xml"\n']
@@ -70,7 +70,7 @@ class Rig:
 def recorded(folder, rig):
     """Write a log of three runs; return its path."""
     rng = np.random.default_rng(3)
-    model = mujoco.MjModel.from_xml_string(ARM.format(**{**USUAL, **rig.model}))
+    model = mujoco.MjModel.from_xml_string(ARM.format(**{**DEFAULTS, **rig.model}))
     gains, biases = model.actuator_gainprm.copy(), model.actuator_biasprm.copy()
     rows = ["run,t,u.s1,u.s2,q.shoulder,q.elbow" + (f",{rig.column[0]}" if rig.column else "")]
     for run in (1, 2, 3):
@@ -95,7 +95,7 @@ def recorded(folder, rig):
                     data.qvel[:] = 0.0
                 else:
                     mujoco.mj_step(model, data)
-    (folder / "arm.xml").write_text(ARM.format(**USUAL))
+    (folder / "arm.xml").write_text(ARM.format(**DEFAULTS))
     (folder / "log.csv").write_text("\n".join(rows) + "\n")
     extra = f'[extra.{rig.column[0]}]\nunit = "1"\n' if rig.column else ""
     (folder / "log.toml").write_text(LOG + extra)

@@ -10,8 +10,8 @@ from bench.diagnosis.report.candidate_figure import draw_candidates_figure
 from bench.diagnosis.report.explanation_figures import draw_figure
 from bench.diagnosis.report.wording import format_p_value
 from tests.bench.diagnosis.explained_samples import recording
-from tests.bench.diagnosis.robot_report_data import candidates, robot_story
-from tests.bench.diagnosis.sample_report_data import story
+from tests.bench.diagnosis.robot_report_data import candidates, make_robot_report
+from tests.bench.diagnosis.sample_report_data import make_report
 from tests.bench.figures.figure_readability import unreadable
 
 LONG = (
@@ -28,8 +28,8 @@ def row(effect, score, p_value=1e-30, share=None):
     return {"effect": effect, "score": score, "p_value": p_value, "heldout_gain": share}
 
 
-def told(*rows, intervals=None, **changes):
-    made = story(candidates=list(rows), **changes)
+def report_of(*rows, intervals=None, **changes):
+    made = make_report(candidates=list(rows), **changes)
     return replace(made, share_intervals=intervals or {})
 
 
@@ -51,15 +51,15 @@ def labels(drawn):
 
 FRICTION = ("friction.load_quadratic", "friction.load_direction", "friction.warming")
 CASES = {
-    "one candidate": told(row("drag.linear", 300.0, share=0.93), intervals=DRAG),
-    "long names": told(*(row(name, 200.0, share=0.9) for name in FRICTION)),
-    "a robot": robot_story(),
-    "a robot with long names": robot_story(candidates=candidates(LONG)),
-    "worse than nothing": told(
+    "one candidate": report_of(row("drag.linear", 300.0, share=0.93), intervals=DRAG),
+    "long names": report_of(*(row(name, 200.0, share=0.9) for name in FRICTION)),
+    "a robot": make_robot_report(),
+    "a robot with long names": make_robot_report(candidates=candidates(LONG)),
+    "worse than nothing": report_of(
         row("drag.linear", 9.0, share=-4.0), intervals={"drag.linear": (-9.0, -1.0)}
     ),
-    "no held-out runs": told(row("drag.linear", 300.0), held_out=None, heldout=None),
-    "nothing found": story("adequate"),
+    "no held-out runs": report_of(row("drag.linear", 300.0), held_out=None, heldout=None),
+    "nothing found": make_report("adequate"),
 }
 
 
@@ -70,7 +70,7 @@ def test_no_text_is_shortened_cut_or_covered(case):
 
 def test_a_place_stands_in_full_with_its_effect():
     one = "friction.load_quadratic@left_arm_shoulder_lift_joint_of_the_upper_body"
-    drawn = draw_candidates_figure(robot_story(causes=(), candidates=[row(one, 300.0)]))
+    drawn = draw_candidates_figure(make_robot_report(causes=(), candidates=[row(one, 300.0)]))
     (name,) = labels(drawn)
     assert name.replace("\n", " ").replace("_ ", "_") == (
         "friction that increases with load and its square "
@@ -80,7 +80,7 @@ def test_a_place_stands_in_full_with_its_effect():
 
 def test_a_p_value_is_printed_once_where_it_distinguishes_nothing():
     rows = [row(f"my.effect_{i}", 400.0 - i, p_value=10.0 ** -(20 + i)) for i in range(12)]
-    texts = words(draw_candidates_figure(told(*rows)))
+    texts = words(draw_candidates_figure(report_of(*rows)))
     assert sum(text.count("p <") for text in texts) == 1
     assert any("p < 10⁻¹² for all shown" in text for text in texts)
     most = Counter(texts).most_common(1)
@@ -93,7 +93,7 @@ def test_p_values_near_the_threshold_are_next_to_their_bars_and_others_are_white
         row("drag.quadratic", 20.0, p_value=0.012),
         row("wind", 3.0, p_value=0.7),
     )
-    drawn = draw_candidates_figure(told(*rows))
+    drawn = draw_candidates_figure(report_of(*rows))
     assert f"20  ({format_p_value(0.012)})" in words(drawn)
     assert any("p ≥ 0.7 for white bars" in text for text in words(drawn))
     colours = [bar.get_facecolor() for bar in drawn.axes[-1].patches]
@@ -103,7 +103,9 @@ def test_p_values_near_the_threshold_are_next_to_their_bars_and_others_are_white
 
 def test_each_candidate_says_how_much_it_closes_with_the_interval():
     drawn = draw_candidates_figure(
-        told(row("drag.linear", 300.0, share=0.93), row("wind", 3.0, share=0.2), intervals=DRAG)
+        report_of(
+            row("drag.linear", 300.0, share=0.93), row("wind", 3.0, share=0.2), intervals=DRAG
+        )
     )
     texts = words(drawn)
     assert "93 % (85 to 97)" in texts
@@ -114,7 +116,7 @@ def test_each_candidate_says_how_much_it_closes_with_the_interval():
 
 
 def test_a_cause_stands_out_without_colour():
-    drawn = draw_candidates_figure(told(row("drag.linear", 300.0), row("wind", 3.0)))
+    drawn = draw_candidates_figure(report_of(row("drag.linear", 300.0), row("wind", 3.0)))
     cause, other = drawn.axes[0].get_yticklabels()
     assert (cause.get_text(), cause.get_fontweight()) == ("▸ linear drag", "bold")
     assert (other.get_text(), other.get_fontweight()) == ("wind", "normal")

@@ -21,7 +21,7 @@ from bench.diagnosis.report.figure_panels import (
 from bench.diagnosis.report.report_data import GapLocation
 from bench.diagnosis.report.run_selection import decimate, select_worst_run
 from bench.figures.figure_files import pdf_figures
-from tests.bench.diagnosis.sample_report_data import evil, story
+from tests.bench.diagnosis.sample_report_data import evil, make_report
 
 NAMES = ["overview", "where", "candidates"]
 
@@ -33,7 +33,7 @@ def pixels(png):
 @pytest.fixture(scope="module")
 def named():
     with pdf_figures():
-        return render_figures(story())
+        return render_figures(make_report())
 
 
 def test_each_figure_is_there_in_every_format_and_shows_something(named):
@@ -56,24 +56,24 @@ def test_before_and_after_are_both_drawn_where_there_is_an_after(named):
 
     blue = (0x00, 0x72, 0xB2)
     assert share(named["overview"].png, *blue) > 5e-3
-    adequate = render_figures(story("adequate"))["overview"].png
+    adequate = render_figures(make_report("adequate"))["overview"].png
     assert share(adequate, *blue) == 0.0
     assert share(adequate, 0xD5, 0x5E, 0x00) > 1e-3
 
 
 def test_without_being_asked_there_are_no_vector_graphics():
-    for png, pdf, svg, _ in render_figures(story()).values():
+    for png, pdf, svg, _ in render_figures(make_report()).values():
         assert png.startswith(b"\x89PNG")
         assert pdf is svg is None
 
 
 def test_figures_are_the_same_again(named):
     with pdf_figures():
-        assert render_figures(story()) == named
+        assert render_figures(make_report()) == named
 
 
 def test_a_page_with_its_figures_stays_small(named):
-    assert 100_000 < len(render_report(story(), named).encode()) < 2_000_000
+    assert 100_000 < len(render_report(make_report(), named).encode()) < 2_000_000
 
 
 def test_any_text_can_be_a_label():
@@ -83,14 +83,14 @@ def test_any_text_can_be_a_label():
 
 
 def test_what_is_not_there_is_not_drawn():
-    bare = story(
+    bare = make_report(
         "unidentifiable", candidates=[], places=(), profiles=(), held_out=None, heldout=None
     )
     assert list(render_figures(bare)) == NAMES[:1]
 
 
 def test_the_run_shown_has_the_largest_gap_of_the_held_out_ones():
-    told = story()
+    told = make_report()
     shot = select_worst_run(told)
     assert shot.held_out
     assert shot.side.names[shot.row] == "held 2"
@@ -100,7 +100,7 @@ def test_the_run_shown_has_the_largest_gap_of_the_held_out_ones():
 
 
 def test_a_run_without_samples_is_never_the_worst():
-    told = story()
+    told = make_report()
     observed = told.held_out.observed.copy()
     observed[1] = np.nan
     shot = select_worst_run(replace(told, held_out=replace(told.held_out, observed=observed)))
@@ -108,7 +108,7 @@ def test_a_run_without_samples_is_never_the_worst():
 
 
 def test_of_many_channels_the_worst_three_are_shown():
-    told = story()
+    told = make_report()
     side, tiles = told.held_out, (1, 1, 3)
     wide = replace(
         side,
@@ -132,7 +132,7 @@ def test_long_runs_are_thinned_without_losing_peaks():
 
 
 def test_profiles_are_chosen_by_how_much_they_stand_out_one_a_variable_first():
-    chosen = select_informative_profiles(story().profiles)
+    chosen = select_informative_profiles(make_report().profiles)
     assert [p.variable for p in chosen] == ["speed", "position", "time", "speed"]
     empty = replace(chosen[0], before=np.full(12, np.nan))
     assert select_informative_profiles([empty, chosen[1]]) == [chosen[1]]
@@ -142,7 +142,7 @@ def test_bars_of_a_profile_are_two_standard_errors_long():
     from matplotlib.figure import Figure
 
     axis = Figure().subplots()
-    profile = story().profiles[0]
+    profile = make_report().profiles[0]
     draw_profile_panel(axis, profile, "rad", extended=False)
     (lines,) = axis.containers[0].lines[2]
     lengths = [segment[1, 1] - segment[0, 1] for segment in lines.get_segments()]
@@ -159,7 +159,7 @@ def test_the_worst_places_are_shown_in_their_order():
 
 def test_what_is_found_is_among_the_candidates_shown_although_it_scores_low():
     names = [f"e{i}" for i in range(40)] + ["drag.linear"]
-    told = story(
+    told = make_report(
         candidates=[
             {"effect": n, "score": 100.0 - i, "p_value": 0.5, "heldout_gain": None}
             for i, n in enumerate(names)
@@ -172,11 +172,13 @@ def test_what_is_found_is_among_the_candidates_shown_although_it_scores_low():
 
 
 def test_the_standing_of_a_candidate():
-    assert [get_candidate_status(story(), n) for n in ("drag.linear", "friction.coulomb")] == [
+    assert [
+        get_candidate_status(make_report(), n) for n in ("drag.linear", "friction.coulomb")
+    ] == [
         "found",
         "not needed",
     ]
-    told = story("ambiguous")
+    told = make_report("ambiguous")
     assert {get_candidate_status(told, n) for n in ("drag.linear", "friction.coulomb")} == {
         "found, but not distinguishable"
     }

@@ -17,13 +17,13 @@ from bench.diagnosis.report_data_builder import DiagnosisReportDataBuilder
 from bench.pages.data_grid import INITIAL_ROWS
 from bench.pages.html_page import make_iframe
 from tests.bench.diagnosis.report.test_summary_text import VERDICTS
-from tests.bench.diagnosis.sample_report_data import DRAG, EVIL, HELD_OUT, TILT, evil, story
+from tests.bench.diagnosis.sample_report_data import DRAG, EVIL, HELD_OUT, TILT, evil, make_report
 
 VOID = {"meta", "img", "br", "link", "input", "line", "circle"}
 SVG = b'<svg xmlns="http://www.w3.org/2000/svg"/>'
 
 
-def still(name):
+def make_rendered_figure(name):
     """Return placeholder bytes for a rendered figure."""
     return RenderedFigure(b"\x89PNG\r\n\x1a\n", b"%PDF-" + name.encode(), SVG + name.encode())
 
@@ -62,7 +62,7 @@ class Reader(HTMLParser):
 
 @pytest.fixture
 def figures():
-    return {name: still(name) for name in ("overview", "where", "candidates")}
+    return {name: make_rendered_figure(name) for name in ("overview", "where", "candidates")}
 
 
 def cells(text, first):
@@ -80,7 +80,7 @@ def cells(text, first):
 def test_every_verdict_makes_a_sound_page_that_begins_with_its_headline(verdict, figures):
     from bench.diagnosis.report.summary_text import format_headline
 
-    told = story(verdict)
+    told = make_report(verdict)
     html = render_report(told, figures)
     reader = Reader(html)
     assert html.startswith("<!DOCTYPE html>\n<html lang=")
@@ -96,7 +96,7 @@ def test_every_verdict_makes_a_sound_page_that_begins_with_its_headline(verdict,
 
 
 def test_it_needs_no_network(figures):
-    html = render_report(story(), figures)
+    html = render_report(make_report(), figures)
     reader = Reader(html)
     assert not set(reader.tags) & {"link", "iframe", "object", "base", "form"}
     assert reader.tags.count("script") == 2
@@ -121,7 +121,7 @@ def test_texts_from_files_and_plugins_are_escaped(figures):
 
 def test_attributes_cannot_be_escaped_from(figures):
     quote = '" onerror="alert(1)'
-    told = story()
+    told = make_report()
     named = replace(
         told, parameters=tuple(replace(p, name=quote) for p in told.parameters), title=quote
     )
@@ -132,20 +132,22 @@ def test_attributes_cannot_be_escaped_from(figures):
 
 
 def test_figures_are_embedded_with_alternatives_that_say_what_they_show(figures):
-    html = render_report(story(), figures)
+    html = render_report(make_report(), figures)
     pattern = r'src="data:image/svg.xml;base64,([^"]+)" data-file="(\w+)" alt="([^"]+)"'
     found = re.findall(pattern, html)
     data = [(name, b64decode(part)) for part, name, _ in found]
     names = ("overview", "where", "candidates")
-    assert data == [(name, still(name).svg) for name in names]
+    assert data == [(name, make_rendered_figure(name).svg) for name in names]
     papers = re.findall(r'href="data:application/pdf;base64,([^"]+)"', html)
-    assert [b64decode(paper) for paper in papers] == [still(name).pdf for name in names]
+    assert [b64decode(paper) for paper in papers] == [
+        make_rendered_figure(name).pdf for name in names
+    ]
     without = {name: figure._replace(pdf=None, svg=None) for name, figure in figures.items()}
-    html = render_report(story(), without)
+    html = render_report(make_report(), without)
     assert not re.search("data:(application/pdf|image/svg.xml);", html)
     shown = re.findall(r'src="data:image/png;base64,([^"]+)" data-file="(\w+)"', html)
     assert [(b64decode(data), name) for data, name in shown] == [
-        (still(name).png, name) for name in names
+        (make_rendered_figure(name).png, name) for name in names
     ]
     overview, where, candidates = (alt for _, _, alt in found)
     assert "q and qd" in overview
@@ -155,7 +157,7 @@ def test_figures_are_embedded_with_alternatives_that_say_what_they_show(figures)
 
 
 def test_numbers_are_those_of_the_report_data(figures):
-    told = story(causes=[DRAG, TILT])
+    told = make_report(causes=[DRAG, TILT])
     html = render_report(told, figures)
     text = Reader(html).text
     assert "Together they close 90 % of the gap (85 to 94 %)" in text
@@ -179,7 +181,7 @@ def test_numbers_are_those_of_the_report_data(figures):
 
 
 def test_errors_of_channels_are_recomputed_from_the_runs(figures):
-    told = story()
+    told = make_report()
     row = cells(render_report(told, figures), "qd")
     assert row[:3] == ["qd", "0.05 rad/s", "estimated, steps of 0.002"]
     for column, side in ((3, told.fitting), (5, told.held_out)):
@@ -191,20 +193,20 @@ def test_errors_of_channels_are_recomputed_from_the_runs(figures):
 
 
 def test_sets_that_cannot_be_distinguished_come_with_reason_and_experiment(figures):
-    text = Reader(render_report(story("ambiguous"), figures)).text
+    text = Reader(render_report(make_report("ambiguous"), figures)).text
     assert (
         "linear drag (score 812, held-out gain 0.9) and Coulomb friction "
         "(score 807, held-out gain 0.89)" in text
     )
     assert text.count("Release it from 1.5 rad instead of 0.5 rad") >= 2
     assert text.index("What to do next") < text.rindex("Release it from 1.5 rad")
-    drag = cells(render_report(story("ambiguous"), figures), "linear drag")
+    drag = cells(render_report(make_report("ambiguous"), figures), "linear drag")
     assert drag[5:7] == ["found, but not distinguishable", "linear drag or Coulomb friction"]
 
 
 def test_after_is_not_shown_where_nothing_was_found(figures):
     for verdict in ("adequate", "unknown", "unidentifiable"):
-        html = render_report(story(verdict), figures)
+        html = render_report(make_report(verdict), figures)
         assert "RMS after" not in html
         assert 'class="bar after"' not in html
 
@@ -212,26 +214,26 @@ def test_after_is_not_shown_where_nothing_was_found(figures):
 def test_it_says_what_remains(figures):
     assert (
         "The noise of qd is estimated from the data, not stated."
-        in Reader(render_report(story(), figures)).text
+        in Reader(render_report(make_report(), figures)).text
     )
-    text = Reader(render_report(story(lack_of_fit=()), figures)).text
+    text = Reader(render_report(make_report(lack_of_fit=()), figures)).text
     assert re.search(r"the residual of the held-out runs is 1 times the noise", text)
 
 
 def test_what_is_open_is_not_called_settled(figures):
     assert (
         "Structure that no known cause explains: the residual"
-        in Reader(render_report(story("unknown"), figures)).text
+        in Reader(render_report(make_report("unknown"), figures)).text
     )
     assert (
         "Structure that no known cause"
-        in Reader(render_report(story("partial", lack_of_fit=()), figures)).text
+        in Reader(render_report(make_report("partial", lack_of_fit=()), figures)).text
     )
-    assert "Nothing significant" in Reader(render_report(story("adequate"), figures)).text
+    assert "Nothing significant" in Reader(render_report(make_report("adequate"), figures)).text
 
 
 def test_gaps_in_what_is_known_do_not_break_the_page():
-    bare = story(
+    bare = make_report(
         "unidentifiable",
         heldout=None,
         held_out=None,
@@ -252,11 +254,11 @@ def test_gaps_in_what_is_known_do_not_break_the_page():
         "low": None,
         "high": None,
     }
-    assert "tuned simulation – rad" in Reader(render_report(story(heldout=nothing), {})).text
+    assert "tuned simulation – rad" in Reader(render_report(make_report(heldout=nothing), {})).text
 
 
 def test_many_runs_are_cut_to_the_worst():
-    told = story()
+    told = make_report()
     many = replace(
         told,
         places=tuple(
@@ -271,7 +273,7 @@ def test_many_runs_are_cut_to_the_worst():
 
 
 def test_commands_name_the_recording_and_the_folder_as_a_shell_takes_them(figures):
-    told = replace(story("ambiguous"), path=Path("my logs/it's <b>.csv"))
+    told = replace(make_report("ambiguous"), path=Path("my logs/it's <b>.csv"))
     html = render_report(told, figures, Path("out dir"))
     said = [unescape(text) for text in re.findall(r'<pre class="copied"[^>]*>([^<]*)', html)]
     assert [shlex.split(text) for text in said] == [
@@ -281,11 +283,11 @@ def test_commands_name_the_recording_and_the_folder_as_a_shell_takes_them(figure
     ]
     # A page without a folder has no extended.toml to refer to.
     assert "extended.toml" not in render_report(told, figures)
-    unknown = Reader(render_report(story("unknown"), figures)).text
+    unknown = Reader(render_report(make_report("unknown"), figures)).text
     assert "--plugin my_effect.py" in unknown
-    assert "--check" in Reader(render_report(story("unidentifiable"), figures)).text
+    assert "--check" in Reader(render_report(make_report("unidentifiable"), figures)).text
     assert "--thorough" not in unknown, "nothing stands that could be added to"
-    partial = story("partial")
+    partial = make_report("partial")
     assert partial.held_out is not None
     assert "explain swing.csv --thorough" in Reader(render_report(partial, figures)).text.replace(
         str(partial.path), "swing.csv"
@@ -318,7 +320,7 @@ def test_what_the_recording_can_fix_comes_before_any_verdict(figures):
             "sensor.drift", False, "1", np.inf, 0.0, 1.0, "not identifiable", ()
         ),
     )
-    text = render_report(story("named", identifiability=numbers), figures)
+    text = render_report(make_report("named", identifiability=numbers), figures)
     said = Reader(text).text.partition(" Terms ")[2]
     assert (
         "Of 3 causes, each considered alone, this recording can identify 1 well, 1 roughly and"
@@ -341,7 +343,7 @@ def test_what_can_be_fixed_does_not_contradict_the_headline(figures, verdict):
         ParameterIdentifiability(n, False, "1", np.inf, 0.0, 1.0, "not identifiable", ())
         for n in names
     ]
-    told = story(verdict, identifiability=tuple(numbers))
+    told = make_report(verdict, identifiability=tuple(numbers))
     text = render_report(told, figures)
     said = Reader(text).text.partition("Of 3 causes, ")[2].partition("Where the gap is")[0]
     lost = "not visible in these data"
@@ -364,7 +366,7 @@ def test_causes_at_places_are_a_matrix_of_effects_by_places(figures):
         ParameterIdentifiability(n, False, "N", 0.1, 0.0, 1.0, word, ()) for n, word in pairs
     )
     cause = {**DRAG, "effect": "friction.coulomb@b"}
-    text = render_report(story("named", identifiability=numbers, causes=[cause]), figures)
+    text = render_report(make_report("named", identifiability=numbers, causes=[cause]), figures)
     signs = {
         row[0]: [re.sub("<[^>]*>", "", cell) for cell in row[1:]]
         for row in (
@@ -379,16 +381,17 @@ def test_causes_at_places_are_a_matrix_of_effects_by_places(figures):
 
 def test_where_nobody_knows_there_is_no_word_of_it(figures):
     assert (
-        "What the recording identifies" not in Reader(render_report(story("named"), figures)).text
+        "What the recording identifies"
+        not in Reader(render_report(make_report("named"), figures)).text
     )
 
 
 def test_the_track_of_a_film_is_drawn_next_to_the_curves(figures, tmp_path):
     png = b"\x89PNG\r\n\x1a\n-a track"
-    html = render_report(story(track=png), figures)
+    html = render_report(make_report(track=png), figures)
     found = re.search(r'src="data:image/png;base64,([^"]+)" alt="The scene of the film', html)
     assert b64decode(found[1]) == png
-    assert "data:image/png" not in render_report(story(), figures)
+    assert "data:image/png" not in render_report(make_report(), figures)
 
     def track(extra):
         recording = SimpleNamespace(path=tmp_path / "drop.csv", extra=dict.fromkeys(extra, "px"))

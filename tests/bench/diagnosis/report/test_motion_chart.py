@@ -15,7 +15,7 @@ from bench.diagnosis.report.motion_chart import (
     select_extreme_samples,
 )
 from bench.diagnosis.report.report_data import ChannelInfo, DataSplit
-from tests.bench.diagnosis.sample_report_data import story
+from tests.bench.diagnosis.sample_report_data import make_report
 
 
 def lost(kept, signals, peaks):
@@ -38,7 +38,7 @@ def test_the_extremes_of_every_stretch_are_kept_and_every_tenth_sample_would_los
     assert list(select_extreme_samples([np.full(5, np.nan)], 2)) == [0, 2, 4]
 
 
-def long_story(channels=6, runs=4, size=25_000):
+def make_long_report(channels=6, runs=4, size=25_000):
     """Return report data with runs of 25 s at 1 kHz."""
     rng = np.random.default_rng(4)
     t = np.arange(size) / 1000.0
@@ -49,12 +49,12 @@ def long_story(channels=6, runs=4, size=25_000):
     held = DataSplit(("late",), (t,), observed[:1], before[:1], after[:1])
     shown = tuple(ChannelInfo(f"channel_{i}", "rad", 0.01, True, 0.0) for i in range(channels))
     side = DataSplit(names, (t,) * runs, observed, before, after)
-    return replace(story(), fitting=side, held_out=held, channels=shown)
+    return replace(make_report(), fitting=side, held_out=held, channels=shown)
 
 
 def test_long_recordings_are_thinned_said_so_and_stay_below_3_mb():
     channels, runs = 6, 4
-    told = long_story(channels, runs)
+    told = make_long_report(channels, runs)
     found = build_motion_table(told)
     assert len(found.frame) <= 1.1 * max(MAX_ROWS, MIN_ROWS_PER_CHANNEL * channels * (runs + 1))
     page = render_report(told, {})
@@ -73,7 +73,7 @@ def test_long_recordings_are_thinned_said_so_and_stay_below_3_mb():
 
 
 def test_of_very_many_runs_the_worst_are_shown_and_the_rest_is_counted():
-    told = story()
+    told = make_report()
     many = replace(
         told.fitting,
         names=tuple(f"r{i}" for i in range(80)),
@@ -92,7 +92,7 @@ def test_of_very_many_runs_the_worst_are_shown_and_the_rest_is_counted():
 
 
 def test_runs_of_one_sample_and_runs_without_any_are_no_trouble():
-    told = story()
+    told = make_report()
     side = told.held_out
     observed = side.observed.copy()
     observed[0] = np.nan
@@ -109,7 +109,7 @@ def test_dots_of_a_long_run_are_pixels_in_vector_files_too():
         next(
             line for line in draw_figure(told, "overview").axes[0].lines if line.get_marker() == "o"
         )
-        for told in (long_story(1, 1), story())
+        for told in (make_long_report(1, 1), make_report())
     )
     assert dots.get_rasterized()
     assert not outlines.get_rasterized()

@@ -20,9 +20,9 @@ from bench.figures import robot_figure as drawing
 from bench.figures.figure_files import pdf_figures
 from bench.pages.html_page import make_iframe
 from bench.pages.text_format import format_number
-from tests.bench.diagnosis.report.test_explanation_page import still
-from tests.bench.diagnosis.robot_report_data import CHANGE, WRISTS, robot_story
-from tests.bench.diagnosis.sample_report_data import EVIL, evil, story
+from tests.bench.diagnosis.report.test_explanation_page import make_rendered_figure
+from tests.bench.diagnosis.robot_report_data import CHANGE, WRISTS, make_robot_report
+from tests.bench.diagnosis.sample_report_data import EVIL, evil, make_report
 from tests.browser import WIDTHS, Opened
 
 
@@ -35,8 +35,8 @@ def written(tmp_path_factory):
         # Draw the robot as links, since rendering has its own tests.
         patch.setattr(drawing, "render_robot", lambda *_: None)
         for name, told in (
-            ("simple", story("ambiguous")),
-            ("robot", robot_story("ambiguous", [WRISTS], changes=(CHANGE,))),
+            ("simple", make_report("ambiguous")),
+            ("robot", make_robot_report("ambiguous", [WRISTS], changes=(CHANGE,))),
         ):
             with pdf_figures(name == "robot"):
                 figures = render_figures(told)
@@ -303,7 +303,8 @@ def test_texts_from_files_stay_texts(browser, tmp_path):
     told = replace(evil(), title=EVIL)
     path = tmp_path / "evil.html"
     path.write_text(
-        render_report(told, {"overview": still("overview")}, tmp_path / EVIL), encoding="utf-8"
+        render_report(told, {"overview": make_rendered_figure("overview")}, tmp_path / EVIL),
+        encoding="utf-8",
     )
     with Opened(browser, path) as one:
         one.page.on("dialog", lambda _: one.complaints.append("a dialog"))

@@ -12,7 +12,7 @@ from bench.diagnosis.report.candidate_ranking import (
 )
 from bench.diagnosis.report.cause_text import (
     format_effect_set,
-    format_lacking,
+    format_missing_causes,
     list_place_marks,
     strip_place,
 )
@@ -26,20 +26,20 @@ from bench.diagnosis.report.summary_text import (
 from bench.diagnosis.report.wording import format_effect, format_effect_name, is_parameter_error
 from bench.diagnosis.verdict import Cause
 from tests.bench.diagnosis.robot_report_data import (
+    COULOMB,
     EVERYWHERE,
     HEAVY,
-    RUB,
     WRISTS,
     cause,
+    make_robot_report,
     number,
-    robot_story,
 )
-from tests.bench.diagnosis.sample_report_data import story
+from tests.bench.diagnosis.sample_report_data import make_report
 from tests.bench.figures.figure_robots import ARM6
 
 
 @pytest.mark.parametrize(
-    ("effect", "said"),
+    ("effect", "text"),
     [
         ("friction.coulomb@elbow", "Coulomb friction at joint elbow"),
         ("input.delay@m_elbow", "an input delay at actuator m_elbow"),
@@ -55,8 +55,8 @@ from tests.bench.figures.figure_robots import ARM6
         ("my.plugin@elbow", "my.plugin@elbow"),
     ],
 )  # fmt: skip
-def test_a_cause_is_said_with_its_place(effect, said):
-    assert format_effect(effect) == said
+def test_a_cause_is_said_with_its_place(effect, text):
+    assert format_effect(effect) == text
 
 
 def test_in_lists_a_place_stands_without_its_kind():
@@ -73,7 +73,7 @@ WRIST = [f"friction.coulomb@wrist_{i}" for i in (1, 2, 3)]
 
 
 @pytest.mark.parametrize(
-    ("names", "said"),
+    ("names", "text"),
     [
         (WRIST, "Coulomb friction at any of the joints wrist_1, wrist_2 or wrist_3"),
         (WRIST[:2], "Coulomb friction at joint wrist_1 or wrist_2"),
@@ -90,13 +90,13 @@ WRIST = [f"friction.coulomb@wrist_{i}" for i in (1, 2, 3)]
         (["drag.linear", "friction.coulomb"], "linear drag or Coulomb friction"),
     ],
 )  # fmt: skip
-def test_sets_are_said_as_people_say_them(names, said):
-    assert format_effect_set(names) == said
+def test_sets_are_said_as_people_say_them(names, text):
+    assert format_effect_set(names) == text
 
 
 def test_all_of_a_set_are_joined_by_and():
-    said = "Coulomb friction at each of the joints wrist_1, wrist_2 and wrist_3"
-    assert format_effect_set(WRIST, "and") == said
+    text = "Coulomb friction at each of the joints wrist_1, wrist_2 and wrist_3"
+    assert format_effect_set(WRIST, "and") == text
 
 
 def test_a_long_set_says_how_many_more_there_are():
@@ -107,12 +107,12 @@ def test_a_long_set_says_how_many_more_there_are():
 
 
 @pytest.mark.parametrize(
-    ("causes", "said"),
+    ("causes", "text"),
     [
-        ([RUB], "The simulation lacks Coulomb friction at joint elbow: a constant friction "
+        ([COULOMB], "The simulation lacks Coulomb friction at joint elbow: a constant friction "
                 "opposes motion."),
         ([HEAVY], "The mass of body elbow_link is 12 % larger than the model file states."),
-        ([RUB, HEAVY], "The simulation lacks Coulomb friction at joint elbow, and has a wrong "
+        ([COULOMB, HEAVY], "The simulation lacks Coulomb friction at joint elbow, and has a wrong "
                        "mass of body elbow_link."),
         ([EVERYWHERE], "The simulation lacks Coulomb friction at every joint: "
                        "a constant friction opposes motion."),
@@ -125,34 +125,35 @@ def test_a_long_set_says_how_many_more_there_are():
          "The centre of mass of body forearm is 0.05 m from where the model file has it."),
         ([cause("actuator.stiffness@m_elbow", {"coefficient": number(-0.25, "1")})],
          "The stiffness of actuator m_elbow is 25 % smaller than the model file states."),
-        ([cause("mass.scale@*", {"coefficient@a": number(0.1, "1")}, says="it weighs otherwise")],
+        ([cause("mass.scale@*", {"coefficient@a": number(0.1, "1")},
+                description="it weighs otherwise")],
          "The simulation has a wrong mass of every body: it weighs otherwise."),
     ],
 )  # fmt: skip
-def test_a_headline_says_what_is_lacking_or_wrong_and_where(causes, said):
-    assert format_headline(robot_story(causes=causes)) == said
+def test_a_headline_says_what_is_lacking_or_wrong_and_where(causes, text):
+    assert format_headline(make_robot_report(causes=causes)) == text
 
 
 def test_a_headline_of_a_set_names_all_of_it():
-    assert format_headline(robot_story("ambiguous", [WRISTS])) == (
+    assert format_headline(make_robot_report("ambiguous", [WRISTS])) == (
         "The simulation lacks Coulomb friction at any of the joints wrist_1, wrist_2 or wrist_3: "
         "these data do not show which."
     )
     mixed = cause("friction.coulomb@elbow", alternatives=["mass.scale@elbow_link"])
-    assert format_headline(robot_story("ambiguous", [mixed])) == (
+    assert format_headline(make_robot_report("ambiguous", [mixed])) == (
         "The simulation either lacks Coulomb friction at joint elbow or has a wrong mass of "
         "body elbow_link: these data do not show which."
     )
 
 
 def test_a_further_effect_is_missing_although_a_number_is_wrong():
-    said = format_headline(robot_story("partial", [HEAVY]))
-    assert said.startswith(
+    text = format_headline(make_robot_report("partial", [HEAVY]))
+    assert text.startswith(
         "The mass of body elbow_link is 12 % larger than the model file states, "
     )
-    assert said.endswith("and the simulation lacks something else that no known cause explains.")
-    both = format_headline(robot_story("partial", [RUB, HEAVY]))
-    told = " ".join(format_gain_and_caveats(robot_story("partial", [RUB, HEAVY])))
+    assert text.endswith("and the simulation lacks something else that no known cause explains.")
+    both = format_headline(make_robot_report("partial", [COULOMB, HEAVY]))
+    told = " ".join(format_gain_and_caveats(make_robot_report("partial", [COULOMB, HEAVY])))
     assert "opposes motion; the mass of body elbow_link is 12 % larger than" in told
     assert both.endswith("elbow_link, and lacks something else that no known cause explains.")
 
@@ -160,24 +161,24 @@ def test_a_further_effect_is_missing_although_a_number_is_wrong():
 SHORTER = cause(
     "numerics.step",
     {"coefficient": {"value": 0.0005, "unit": "s", "low": None, "high": None}},
-    says="a time step of 0.0005 s follows the robot's motion",
+    description="a time step of 0.0005 s follows the robot's motion",
 )
 OTHER = cause(
     "numerics.integrator",
     {"coefficient": {"value": 1.0, "unit": "1", "low": None, "high": None}},
-    says="integrator = RK4 follows the robot's motion",
+    description="integrator = RK4 follows the robot's motion",
 )
 
 
 def test_a_wrong_step_of_a_robot_is_reported_with_its_correction():
-    told = robot_story(causes=[SHORTER])
+    told = make_robot_report(causes=[SHORTER])
     assert format_headline(told) == (
         "The time step of the model file is too long: a time step of 0.0005 s follows the "
         "robot's motion."
     )
     text = " ".join(format_summary(told))
     assert "Too long a time step (numerics.step): time step 5×10⁻⁴ s; p" in text
-    both = robot_story(causes=[OTHER, RUB])
+    both = make_robot_report(causes=[OTHER, COULOMB])
     assert format_headline(both) == (
         "The simulation lacks Coulomb friction at joint elbow, and has an inaccurate integrator."
     )
@@ -186,9 +187,9 @@ def test_a_wrong_step_of_a_robot_is_reported_with_its_correction():
 
 
 def test_unknown_and_adequate_count_causes_and_not_their_places():
-    unknown = format_headline(robot_story("unknown", causes=()))
+    unknown = format_headline(make_robot_report("unknown", causes=()))
     assert "none of the 16 known causes explains it at any place" in unknown
-    clean = " ".join(format_gain_and_caveats(robot_story("adequate", causes=())))
+    clean = " ".join(format_gain_and_caveats(make_robot_report("adequate", causes=())))
     assert "16 possible causes were tested at every place and none is significant" in clean
 
 
@@ -200,16 +201,16 @@ def test_what_is_wrong_and_what_is_lacking():
 
 
 def test_causes_without_places_are_listed_as_ever():
-    told = story("ambiguous").verdict.causes
-    assert format_lacking(told) == "lacks linear drag or Coulomb friction"
+    told = make_report("ambiguous").verdict.causes
+    assert format_missing_causes(told) == "lacks linear drag or Coulomb friction"
     sure = replace(told[0], effect="wind", alternatives=())
-    assert format_lacking([sure, *told]) == "lacks wind, and linear drag or Coulomb friction"
+    assert format_missing_causes([sure, *told]) == "lacks wind, and linear drag or Coulomb friction"
 
 
 def test_the_account_says_numbers_at_their_places():
-    text = " ".join(" ".join(format_summary(robot_story(causes=[EVERYWHERE]))).split())
+    text = " ".join(" ".join(format_summary(make_robot_report(causes=[EVERYWHERE]))).split())
     assert "0.300 (0.280 to 0.320) N·m at shoulder_pan, " in text
-    text = " ".join(" ".join(format_summary(robot_story("ambiguous", [WRISTS]))).split())
+    text = " ".join(" ".join(format_summary(make_robot_report("ambiguous", [WRISTS]))).split())
     assert "Each closes 90 % of the gap" in text
     assert (
         "Coulomb friction at joint wrist_2 or wrist_3 would explain the data equally well" in text
@@ -224,43 +225,47 @@ def test_what_an_effect_does_is_said_without_its_place():
 
 
 def test_of_many_channels_the_worst_of_each_kind_is_said():
-    told = robot_story("adequate", causes=())
+    told = make_robot_report("adequate", causes=())
     assert format_detectable_gap(told).count(" of its noise") == 2
     few = replace(
         told,
         channels=(
-            *story().channels,
+            *make_report().channels,
             *(ChannelInfo(f"x{i}", "m", 1.0, True, 0.0) for i in range(10)),
         ),
     )
     assert format_detectable_gap(few).count("in x") == 10
-    assert "Correcting it closes" in " ".join(format_gain_and_caveats(robot_story(causes=[HEAVY])))
+    assert "Correcting it closes" in " ".join(
+        format_gain_and_caveats(make_robot_report(causes=[HEAVY]))
+    )
 
 
 def test_marks_are_the_places_that_the_verdict_names():
-    (mark,) = list_place_marks(robot_story())
+    (mark,) = list_place_marks(make_robot_report())
     assert (mark.kind, mark.name, mark.says) == ("joint", "elbow", "Coulomb friction: 0.31 N·m")
     assert mark.is_certain
-    wrists = list_place_marks(robot_story("ambiguous", [WRISTS]))
+    wrists = list_place_marks(make_robot_report("ambiguous", [WRISTS]))
     assert [mark.name for mark in wrists] == ["wrist_1", "wrist_2", "wrist_3"]
     assert not any(mark.is_certain for mark in wrists)
-    (heavy,) = list_place_marks(robot_story(causes=[HEAVY]))
+    (heavy,) = list_place_marks(make_robot_report(causes=[HEAVY]))
     assert (heavy.kind, heavy.says) == ("body", "wrong mass: +12 %")
 
 
 def test_a_family_marks_each_of_its_places():
-    assert [mark.name for mark in list_place_marks(robot_story(causes=[EVERYWHERE]))] == list(ARM6)
+    assert [mark.name for mark in list_place_marks(make_robot_report(causes=[EVERYWHERE]))] == list(
+        ARM6
+    )
     late = cause("input.delay@*", {"coefficient": number(0.05, "s")})
-    found = list_place_marks(robot_story(causes=[late]))
+    found = list_place_marks(make_robot_report(causes=[late]))
     assert [mark.name for mark in found] == [f"m_{joint}" for joint in ARM6]
-    assert not list_place_marks(story())
+    assert not list_place_marks(make_report())
     either = cause("friction.coulomb@elbow", alternatives=["friction.coulomb@*"])
-    there = list_place_marks(robot_story("ambiguous", [either]))
+    there = list_place_marks(make_robot_report("ambiguous", [either]))
     assert [mark.says for mark in there if mark.name == "elbow"] == ["Coulomb friction: 0.31 N·m"]
 
 
 def test_candidates_of_one_effect_are_one_entry_where_it_explains_most():
-    told = robot_story()
+    told = make_robot_report()
     there = rank_candidates(told)
     effects = [entry.best.effect for entry in there]
     assert effects[0] == "friction.coulomb@elbow"
@@ -274,29 +279,31 @@ def test_candidates_of_one_effect_are_one_entry_where_it_explains_most():
 
 
 def test_a_family_stands_for_its_effect_only_where_it_explains_much_more():
-    told = robot_story(causes=())
+    told = make_robot_report(causes=())
     scores = {"drag.linear@*": 100.0, "drag.linear@elbow": 95.0, "gravity.tilt": 1.0}
     rows = [{**told.verdict.candidates[0].to_document(), "effect": n, "score": s}
             for n, s in scores.items()]  # fmt: skip
     heads = [
-        entry.best.effect for entry in rank_candidates(robot_story(causes=(), candidates=rows))
+        entry.best.effect
+        for entry in rank_candidates(make_robot_report(causes=(), candidates=rows))
     ]
     assert heads == ["drag.linear@elbow", "gravity.tilt"]
     rows[0]["score"] = 300.0
     heads = [
-        entry.best.effect for entry in rank_candidates(robot_story(causes=(), candidates=rows))
+        entry.best.effect
+        for entry in rank_candidates(make_robot_report(causes=(), candidates=rows))
     ]
     assert heads == ["drag.linear@*", "gravity.tilt"]
 
 
 def test_every_cause_stands_for_itself_among_the_candidates():
-    both = [RUB, cause("friction.coulomb@wrist_3")]
-    shown = [c.effect for c in select_shown_candidates(robot_story(causes=both))]
+    both = [COULOMB, cause("friction.coulomb@wrist_3")]
+    shown = [c.effect for c in select_shown_candidates(make_robot_report(causes=both))]
     assert {"friction.coulomb@elbow", "friction.coulomb@wrist_3"} <= set(shown)
     assert len(shown) == MAX_SHOWN_CANDIDATES
 
 
 def test_without_places_each_candidate_is_an_entry():
-    told = story()
+    told = make_report()
     assert [entry.best for entry in rank_candidates(told)] == list(told.verdict.candidates)
     assert isinstance(told.verdict.causes[0], Cause)

@@ -6,8 +6,8 @@ import pytest
 
 from bench.diagnosis.report.explanation_figures import draw_figure, list_figure_names
 from bench.figures.text_layout import break_name, count_max_lines, measure_text_width, shorten_name
-from tests.bench.diagnosis.robot_report_data import cause, robot_story
-from tests.bench.diagnosis.sample_report_data import evil, story
+from tests.bench.diagnosis.robot_report_data import cause, make_robot_report
+from tests.bench.diagnosis.sample_report_data import evil, make_report
 from tests.bench.figures.figure_readability import unreadable
 
 LONG = (
@@ -22,22 +22,24 @@ LONG = (
 
 def long_robot():
     """Return a six-joint robot with long names and a residual that follows one velocity."""
-    told = robot_story(joints=LONG, at="elbow")
+    told = make_robot_report(joints=LONG, at="elbow")
     profiles = tuple(
         replace(p, channel=f"q.{LONG[0]}", variable=f"velocity of {LONG[0]}") for p in told.profiles
     )
     return replace(told, profiles=profiles)
 
 
-@pytest.mark.parametrize("make", [story, robot_story, long_robot])
+@pytest.mark.parametrize("make", [make_report, make_robot_report, long_robot])
 @pytest.mark.parametrize("name", ["overview", "where"])
 def test_no_text_is_shortened_cut_or_covered(make, name):
     assert unreadable(draw_figure(make(), name)) == []
 
 
 def test_the_labels_of_a_robot_say_what_is_there_in_full():
-    warms = cause("friction.warming@elbow", says="a joint that is cold rubs more (at joint elbow)")
-    drawn = draw_figure(robot_story(causes=(warms,)), "robot")
+    warms = cause(
+        "friction.warming@elbow", description="a cold joint has more friction (at joint elbow)"
+    )
+    drawn = draw_figure(make_robot_report(causes=(warms,)), "robot")
     assert unreadable(drawn) == []
     words = " ".join(text.get_text() for axes in drawn.axes for text in axes.texts)
     assert "friction that decreases as the joint warms" in words.replace("\n", " ")

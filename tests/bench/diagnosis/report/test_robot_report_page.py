@@ -18,21 +18,21 @@ from bench.diagnosis.report.joint_figure import list_joint_rows
 from bench.diagnosis.report.run_selection import select_worst_run
 from bench.figures import robot_figure as drawing
 from bench.pages.data_grid import INITIAL_ROWS
-from tests.bench.diagnosis.report.test_explanation_page import Reader, cells, still
+from tests.bench.diagnosis.report.test_explanation_page import Reader, cells, make_rendered_figure
 from tests.bench.diagnosis.robot_report_data import (
     CHANGE,
     EVERYWHERE,
     HEAVY,
     WRISTS,
     cause,
+    make_robot_report,
     number,
-    robot_story,
 )
-from tests.bench.diagnosis.sample_report_data import EVIL, story
+from tests.bench.diagnosis.sample_report_data import EVIL, make_report
 from tests.bench.figures.figure_robots import ARM6
 
 ALL = ("robot", "overview", "where", "candidates")
-FIGURES = {name: still(name) for name in ALL}
+FIGURES = {name: make_rendered_figure(name) for name in ALL}
 
 
 @pytest.fixture(autouse=True)
@@ -43,7 +43,7 @@ def schematic(monkeypatch):
 
 @pytest.fixture(scope="module")
 def overview():
-    return draw_figure(robot_story(), "overview")
+    return draw_figure(make_robot_report(), "overview")
 
 
 def image(drawn):
@@ -56,13 +56,13 @@ def image(drawn):
 
 
 def test_a_robot_has_a_picture_of_itself_and_others_have_none():
-    assert list_figure_names(robot_story()) == ALL
-    assert "robot" not in list_figure_names(story())
+    assert list_figure_names(make_robot_report()) == ALL
+    assert "robot" not in list_figure_names(make_report())
 
 
 def test_each_joint_has_a_row_and_each_quantity_a_column(overview):
     assert len(overview.axes) == 3 * 6
-    drawn = draw_figure(robot_story(joints=("shoulder", "elbow")), "overview")
+    drawn = draw_figure(make_robot_report(joints=("shoulder", "elbow")), "overview")
     assert len(drawn.axes) == 3 * 2
     edge = image(drawn)
     assert np.concatenate([edge[0], edge[-1], edge[:, 0], edge[:, -1]]).min() == 1.0
@@ -90,7 +90,7 @@ def named(drawn):
 def test_the_joint_that_the_verdict_names_stands_out(overview):
     assert named(overview) == ["elbow"]
     late = cause("input.delay@m_wrist_2", {"coefficient": number(0.05, "s")})
-    drawn = draw_figure(robot_story(causes=[HEAVY, late]), "overview")
+    drawn = draw_figure(make_robot_report(causes=[HEAVY, late]), "overview")
     assert named(drawn) == ["elbow", "wrist_2"]
 
 
@@ -98,7 +98,7 @@ def test_of_very_many_joints_the_worst_are_shown(monkeypatch):
     from bench.diagnosis.report import joint_figure
 
     monkeypatch.setattr(joint_figure, "MAX_JOINTS", 3)
-    drawn = draw_figure(robot_story(), "overview")
+    drawn = draw_figure(make_robot_report(), "overview")
     shown = {text.get_text().lstrip("▸ ") for axis in drawn.axes[::3] for text in axis.texts} & set(
         ARM6
     )
@@ -107,7 +107,7 @@ def test_of_very_many_joints_the_worst_are_shown(monkeypatch):
 
 
 def test_a_channel_that_is_no_joint_has_a_row_of_its_own():
-    told = robot_story()
+    told = make_robot_report()
     channels = (*told.channels[:-1], replace(told.channels[-1], name="s.shake.x"))
     rows = list_joint_rows(replace(told, channels=channels))
     assert [row.name for row in rows] == [*ARM6, "s.shake.x"]
@@ -116,7 +116,7 @@ def test_a_channel_that_is_no_joint_has_a_row_of_its_own():
 
 
 def test_the_robot_stands_as_far_from_the_beginning_as_the_run_goes():
-    told = robot_story()
+    told = make_robot_report()
     stands = get_extreme_pose(told, select_worst_run(told))
     assert set(stands) == set(ARM6)
     seen = told.held_out.observed[0, :, :6]
@@ -128,12 +128,12 @@ def test_the_robot_stands_as_far_from_the_beginning_as_the_run_goes():
 
 
 def test_nothing_is_marked_where_nothing_is_found():
-    drawn = draw_figure(robot_story("adequate", causes=()), "robot")
+    drawn = draw_figure(make_robot_report("adequate", causes=()), "robot")
     assert not drawn.axes[0].collections
 
 
 def test_many_candidates_are_one_row_an_effect_at_first():
-    told = robot_story()
+    told = make_robot_report()
     html = render_report(told, FIGURES)
     at_first = [entry.best for entry in rank_candidates(told)]
     assert len(at_first) < len(told.verdict.candidates) / 3
@@ -153,25 +153,26 @@ def test_many_candidates_are_one_row_an_effect_at_first():
 
 def test_the_lines_of_the_model_file_to_change():
     html = render_report(
-        robot_story(changes=(CHANGE,), unwritable_causes=("a delay has no place in MJCF",)), {}
+        make_robot_report(changes=(CHANGE,), unwritable_causes=("a delay has no place in MJCF",)),
+        {},
     )
     reader = Reader(html)
     assert "Changes of the model file (already made in extended.xml)" in reader.text
     assert '− <joint name="elbow" axis="0 1 0"/>' in reader.text
     assert '+ <joint name="elbow" axis="0 1 0" frictionloss="0.31"/>' in reader.text
     assert "A delay has no place in MJCF." in reader.text
-    assert "Changes of the model file" not in render_report(robot_story(), {})
+    assert "Changes of the model file" not in render_report(make_robot_report(), {})
 
 
 def test_texts_of_the_model_file_are_escaped():
     evil = replace(CHANGE, element=EVIL, before=EVIL, after=EVIL, comment=EVIL)
-    html = render_report(robot_story(changes=(evil,), unwritable_causes=(EVIL,)), {})
+    html = render_report(make_robot_report(changes=(evil,), unwritable_causes=(EVIL,)), {})
     assert html.count("<script") == 2
     assert html.count("&lt;script&gt;") == 5
 
 
 def test_a_set_of_places_is_one_sentence():
-    text = Reader(render_report(robot_story("ambiguous", [WRISTS]), FIGURES)).text
+    text = Reader(render_report(make_robot_report("ambiguous", [WRISTS]), FIGURES)).text
     assert (
         "These data cannot distinguish: Coulomb friction at each of the joints wrist_1, wrist_2 "
         "and wrist_3. Each of them explains these runs equally well." in text
@@ -179,7 +180,7 @@ def test_a_set_of_places_is_one_sentence():
 
 
 def test_the_robot_comes_first_and_has_an_alternative_text():
-    html = render_report(robot_story(causes=[EVERYWHERE]), FIGURES)
+    html = render_report(make_robot_report(causes=[EVERYWHERE]), FIGURES)
     first = html.index("<img")
     alternative = html[first : html.index(">", first)]
     assert "The robot; marked: joint shoulder_pan (Coulomb friction: 0.3 N·m)" in alternative

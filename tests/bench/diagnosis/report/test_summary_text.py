@@ -26,17 +26,25 @@ from bench.diagnosis.report.wording import (
     format_unit,
     joined,
 )
-from tests.bench.diagnosis.sample_report_data import DRAG, EITHER, HELD_OUT, NEXT, TILT, evil, story
+from tests.bench.diagnosis.sample_report_data import (
+    DRAG,
+    EITHER,
+    HELD_OUT,
+    NEXT,
+    TILT,
+    evil,
+    make_report,
+)
 
 VERDICTS = ("adequate", "named", "ambiguous", "partial", "unknown", "unidentifiable")
 
 
-def text(told):
-    return " ".join(" ".join(format_summary(told)).split())
+def text(report):
+    return " ".join(" ".join(format_summary(report)).split())
 
 
 @pytest.mark.parametrize(
-    ("verdict", "said"),
+    ("verdict", "headline"),
     [
         ("adequate", "These data show no effect that the simulation lacks."),
         ("named", "The simulation lacks linear drag: motion is resisted in proportion to speed."),
@@ -58,26 +66,26 @@ def text(told):
         ),
     ],
 )
-def test_each_verdict_has_its_headline(verdict, said):
-    told = story(verdict)
-    assert format_headline(told) == said
-    assert said in text(told)
+def test_each_verdict_has_its_headline(verdict, headline):
+    told = make_report(verdict)
+    assert format_headline(told) == headline
+    assert headline in text(told)
 
 
 def test_only_found_causes_are_said_to_be_lacking():
     for verdict in ("adequate", "unknown", "unidentifiable"):
-        assert "lacks linear drag" not in text(story(verdict))
+        assert "lacks linear drag" not in text(make_report(verdict))
 
 
 def test_several_causes_are_named_together():
-    told = story(causes=[DRAG, TILT])
+    told = make_report(causes=[DRAG, TILT])
     assert format_headline(told) == "The simulation lacks linear drag and a tilt of gravity."
     assert "Together they close 90 % of the gap" in format_gain(told)
     assert "gravity has a horizontal component" in text(told)
 
 
 def test_an_ambiguous_cause_with_a_certain_one():
-    told = story("ambiguous", causes=[EITHER, TILT])
+    told = make_report("ambiguous", causes=[EITHER, TILT])
     expected = (
         "The simulation lacks a tilt of gravity, and linear drag or Coulomb friction: "
         "these data do not show which."
@@ -87,29 +95,29 @@ def test_an_ambiguous_cause_with_a_certain_one():
 
 def test_a_partial_verdict_keeps_what_cannot_be_distinguished():
     assert "linear drag or Coulomb friction, and something else" in format_headline(
-        story("partial", causes=[EITHER])
+        make_report("partial", causes=[EITHER])
     )
 
 
 def test_the_gain_of_a_partial_verdict_is_that_of_the_named_cause():
-    assert format_gain(story("partial")).startswith("Linear drag closes 90 % of the gap")
+    assert format_gain(make_report("partial")).startswith("Linear drag closes 90 % of the gap")
 
 
 def test_unidentifiable_names_the_unidentified_parameters():
     assert format_headline(
-        story("unidentifiable", unidentified_parameters=("mass", "inertia"))
+        make_report("unidentifiable", unidentified_parameters=("mass", "inertia"))
     ).startswith("These data do not identify mass and inertia:")
 
 
 def test_the_gain_is_reported_with_its_interval_and_units():
-    said = format_gain(story())
+    said = format_gain(make_report())
     assert "closes 90 % of the gap (85 to 94 %)" in said
     assert "0.37 rad before and 0.045 rad after" in said
     assert said.endswith("the sensor noise alone would give 0.01 rad.")
 
 
 def test_without_held_out_runs_the_gain_is_not_claimed():
-    told = story(heldout=None, held_out=None)
+    told = make_report(heldout=None, held_out=None)
     side = told.fitting
     before = np.sqrt(np.nanmean(((side.observed - side.before) / [0.01, 0.05]) ** 2))
     assert "No run is held out" in format_gain(told)
@@ -119,12 +127,12 @@ def test_without_held_out_runs_the_gain_is_not_claimed():
 
 def test_nothing_is_called_closed_where_no_share_is_known():
     found = {**HELD_OUT, "gap_closed": None, "low": None, "high": None}
-    assert "of the gap" not in format_gain(story(heldout=found))
-    assert "0.045 rad after" in format_gain(story(heldout=found))
+    assert "of the gap" not in format_gain(make_report(heldout=found))
+    assert "0.045 rad after" in format_gain(make_report(heldout=found))
 
 
 def test_a_weak_cause_under_unknown_is_not_sold_as_the_answer():
-    told = story(
+    told = make_report(
         "unknown", causes=[DRAG], heldout={**HELD_OUT, "gap_closed": 0.3, "low": 0.1, "high": 0.5}
     )
     assert format_headline(told).startswith("Something is missing")
@@ -134,7 +142,7 @@ def test_a_weak_cause_under_unknown_is_not_sold_as_the_answer():
 
 
 def test_adequate_says_what_was_looked_for_and_what_could_hide():
-    said = " ".join(format_gain_and_caveats(story("adequate")))
+    said = " ".join(format_gain_and_caveats(make_report("adequate")))
     assert "6 possible causes were tested" in said
     assert "p = 0.4" in said
     assert re.search(
@@ -156,7 +164,7 @@ def test_a_gap_that_hides_is_smaller_with_more_samples_and_larger_than_a_true_on
             ("1",), (times,), residual, np.zeros_like(residual), np.zeros_like(residual)
         )
         return compute_detectable_gap(
-            story(
+            make_report(
                 fitting=side, held_out=None, channels=(ChannelInfo("q", "rad", 1.0, stated, 0.0),)
             )
         )[0]
@@ -168,20 +176,22 @@ def test_a_gap_that_hides_is_smaller_with_more_samples_and_larger_than_a_true_on
 
 
 def test_ambiguous_proposes_the_experiment_and_says_so_if_there_is_none():
-    assert "To distinguish them: Release it from 1.5 rad" in text(story("ambiguous"))
-    assert "no experiment is proposed" in text(story("ambiguous", next_experiment=None))
-    assert "Next experiment: Release it" in text(story("unidentifiable", next_experiment=NEXT))
+    assert "To distinguish them: Release it from 1.5 rad" in text(make_report("ambiguous"))
+    assert "no experiment is proposed" in text(make_report("ambiguous", next_experiment=None))
+    assert "Next experiment: Release it" in text(
+        make_report("unidentifiable", next_experiment=NEXT)
+    )
 
 
 def test_the_unit_of_the_gain_is_that_of_the_channels_whose_noise_is_its_floor():
-    assert get_held_out_unit(story()) == "rad"
-    assert get_held_out_unit(story(heldout={**HELD_OUT, "noise_floor": 0.05})) == "rad/s"
-    assert get_held_out_unit(story(heldout={**HELD_OUT, "noise_floor": 1.0})) == "1"
-    assert get_held_out_unit(story(heldout={**HELD_OUT, "unit": "m"})) == "m"
+    assert get_held_out_unit(make_report()) == "rad"
+    assert get_held_out_unit(make_report(heldout={**HELD_OUT, "noise_floor": 0.05})) == "rad/s"
+    assert get_held_out_unit(make_report(heldout={**HELD_OUT, "noise_floor": 1.0})) == "1"
+    assert get_held_out_unit(make_report(heldout={**HELD_OUT, "unit": "m"})) == "m"
 
 
 def test_parameters_tell_what_they_had_absorbed():
-    said = text(story())
+    said = text(make_report())
     assert (
         "inertia 0.00333 (0.00325 to 0.00341) kg·m² before, "
         "0.00351 (0.00345 to 0.00357) kg·m² after (+5.4 %)" in said
@@ -202,21 +212,21 @@ def test_a_move_within_both_intervals_is_no_absorption():
 
 
 def test_the_largest_gap_is_located():
-    said = text(story())
+    said = text(make_report())
     assert (
         "run 4 (13 before, 1.1 after); channel qd (11 before, 1.1 after); "
         "phase last third (16 before, 1.2 after)" in said
     )
-    assert "gap is largest" not in text(story("adequate"))
+    assert "gap is largest" not in text(make_report("adequate"))
 
 
 @pytest.mark.parametrize("verdict", VERDICTS)
 def test_the_account_is_short_and_fits_a_terminal(verdict):
-    lines = format_summary(story(verdict))
+    lines = format_summary(make_report(verdict))
     assert len(lines) <= 32
     assert max(len(line) for line in lines) <= 100
-    assert "nan" not in text(story(verdict)).lower()
-    assert "None" not in text(story(verdict))
+    assert "nan" not in text(make_report(verdict)).lower()
+    assert "None" not in text(make_report(verdict))
 
 
 def test_a_terminal_obeys_nothing_in_the_data():
@@ -303,19 +313,19 @@ CUT = {"by": "budget", "during": "refit of drag.linear and 3 more", "not_asked":
 
 
 def test_an_early_end_is_reported_before_anything_else():
-    told = text(story("unknown", cut=CUT, causes=[DRAG]))
+    told = text(make_report("unknown", cut=CUT, causes=[DRAG]))
     assert "The search stopped before it identified what the simulation lacks; best" in told
     assert "by its time budget; last step: refit of drag.linear and 3 more. Not" in told
     assert "none of the 6 known causes" not in told, "they were not all asked"
-    told = text(story("unknown", cut={**CUT, "by": "interrupt"}))
+    told = text(make_report("unknown", cut={**CUT, "by": "interrupt"}))
     assert "before it identified what the simulation lacks. The search was stopped by an in" in told
-    told = text(story("partial", cut={**CUT, "not_asked": ["structure"]}))
+    told = text(make_report("partial", cut={**CUT, "not_asked": ["structure"]}))
     assert "lacks linear drag; the search stopped before testing for further causes." in told
     assert "something else that no known cause explains" not in told
 
 
 def test_held_out_runs_that_were_not_asked_are_not_said_to_be_missing():
     cut = {**CUT, "not_asked": ["held_out", "structure"]}
-    told = text(story("unknown", cut=cut, heldout=None))
+    told = text(make_report("unknown", cut=cut, heldout=None))
     assert "The gain was not measured on held-out runs" in told
     assert "No run is held out" not in told

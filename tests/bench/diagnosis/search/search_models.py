@@ -10,11 +10,11 @@ from bench.diagnosis.validation.held_out_runs import HeldOutFit
 from tests.bench.diagnosis.explained_samples import linear_fit
 
 
-def model(*names, merit=0.0):
+def model(*names, likelihood=0.0):
     """Return a model with these effects; its log-likelihood is its penalised log-likelihood."""
     fit = linear_fit(np.zeros((1, 1, 1, 1)), 1)
     fit = type(fit)(names, *list(vars(fit).values())[1:])
-    return FittedModel(fit, Likelihood(merit, np.ones(1), np.zeros(1)), merit)
+    return FittedModel(fit, Likelihood(likelihood, np.ones(1), np.zeros(1)), likelihood)
 
 
 def search_of(*models, excess=None):

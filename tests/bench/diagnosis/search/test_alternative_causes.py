@@ -8,9 +8,9 @@ from bench.diagnosis.search.held_out_validation import HeldOutValidation
 from bench.diagnosis.search.verdict_rules import INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
 from tests.bench.diagnosis.search.search_models import held_out, model, search_of
 
-BEST = model("a", merit=100.0)
-ALIKE = model("b", merit=100.0 - 0.5 * INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO)
-BEHIND = model("c", merit=100.0 - 2.0 * INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO)
+BEST = model("a", likelihood=100.0)
+INDISTINGUISHABLE = model("b", likelihood=100.0 - 0.5 * INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO)
+DISTINGUISHABLE = model("c", likelihood=100.0 - 2.0 * INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO)
 
 
 def placed(place="", contains=()):
@@ -24,7 +24,13 @@ def evidence(
     scores = SimpleNamespace(
         effects=("a", "b", "c"), null_quantiles=np.full(3, luck), null_scores=np.zeros((3, 40))
     )
-    search = search_of(model(), BEST, ALIKE, BEHIND, excess={(n,): e for n, e in excess.items()})
+    search = search_of(
+        model(),
+        BEST,
+        INDISTINGUISHABLE,
+        DISTINGUISHABLE,
+        excess={(n,): e for n, e in excess.items()},
+    )
     search.scores_by_effects = {frozenset(): scores}
     search.best_p_values = {frozenset(): best}
     slots = {name: slice(0, size) for name, size in zip("abc", sizes, strict=True)}
@@ -98,7 +104,7 @@ def test_what_contains_a_place_or_law_that_does_as_well_is_no_answer(
     monkeypatch, family, contains, kept, place
 ):
     """The simpler effect is preferred; a family whose place scores far lower stays in the set."""
-    search = search_of(model(), BEST, ALIKE, BEHIND)
+    search = search_of(model(), BEST, INDISTINGUISHABLE, DISTINGUISHABLE)
     effects = {name: placed() for name in "abc"} | {family: placed(place, contains)}
     search.evaluator = SimpleNamespace(available_effects=effects, has_linearisation=False)
     monkeypatch.setattr(AlternativeFinder, "_is_plausible", lambda self, effect: True)
@@ -108,18 +114,18 @@ def test_what_contains_a_place_or_law_that_does_as_well_is_no_answer(
     assert found.preferred == ("b" if family == "a" else "a")
 
 
-@pytest.mark.parametrize(("least", "alternatives"), [(-1.0, ("b",)), (0.1, ())])
+@pytest.mark.parametrize(("lower_bound", "alternatives"), [(-1.0, ("b",)), (0.1, ())])
 def test_the_null_gain_of_one_of_two_signs_does_not_count_for_a_robot(
-    least, alternatives, monkeypatch
+    lower_bound, alternatives, monkeypatch
 ):
     """Only an effect with shape parameters keeps its penalty."""
     search = search_of(
-        model(), BEST, model("b", merit=100.0 - 3.0 * INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO)
+        model(), BEST, model("b", likelihood=100.0 - 3.0 * INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO)
     )
     search.evaluator = SimpleNamespace(
         available_effects={"a": placed(), "b": placed()},
         has_linearisation=True,
-        parameters=[SimpleNamespace(bounds=(least, 1.0))] * 2,
+        parameters=[SimpleNamespace(bounds=(lower_bound, 1.0))] * 2,
         coefficient_slices={"a": slice(0, 1), "b": slice(1, 2)},
     )
     search.get_effect_penalty = {"a": 0.0, "b": 3.0 * INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO}.get

@@ -10,7 +10,7 @@ from bench.diagnosis.search.effect_search import EffectSearch, is_hopeless
 from tests.bench.diagnosis.explained_samples import recording, searched
 from tests.bench.diagnosis.search.search_models import model, search_of
 
-BASE, LARGER = model(merit=10.0), model("a", merit=30.0)
+BASE, LARGER = model(likelihood=10.0), model("a", likelihood=30.0)
 
 
 def search(monkeypatch, **answers):
@@ -24,14 +24,16 @@ def search(monkeypatch, **answers):
 
 
 @pytest.mark.parametrize(
-    ("merit", "chance", "taken"),
+    ("likelihood", "p_value", "taken"),
     [(30.0, 0.0029, True), (30.0, 0.0031, False), (9.9, 0.0, False), (10.1, 0.0, True)],
 )
-def test_an_effect_is_taken_that_has_merit_and_is_no_chance(monkeypatch, merit, chance, taken):
-    larger = model("a", merit=merit)
+def test_an_effect_is_taken_that_has_merit_and_is_no_chance(
+    monkeypatch, likelihood, p_value, taken
+):
+    larger = model("a", likelihood=likelihood)
     made = search(
-        monkeypatch, is_complete=lambda self, best, doubt: best is not BASE,
-        compute_missing_effect_p_value=chance,
+        monkeypatch, is_complete=lambda self, best, p_value: best is not BASE,
+        compute_missing_effect_p_value=p_value,
         _search_size=lambda self, best, size: larger, compute_excess_residual=0.1,
         is_noise_like=False,
         correct_step_errors=lambda self, model: model,
@@ -40,10 +42,10 @@ def test_an_effect_is_taken_that_has_merit_and_is_no_chance(monkeypatch, merit, 
 
 
 def test_where_nothing_suggests_an_effect_none_is_tried(monkeypatch):
-    doubts, sizes = [], []
+    p_values, sizes = [], []
 
-    def plain(self, best, doubt):
-        doubts.append(doubt)
+    def plain(self, best, p_value):
+        p_values.append(p_value)
         return best is LARGER
 
     def grown(self, best, size):
@@ -56,7 +58,7 @@ def test_where_nothing_suggests_an_effect_none_is_tried(monkeypatch):
     }  # fmt: skip
     asked["correct_step_errors"] = lambda self, model: model
     assert search(monkeypatch, **asked).run() is LARGER
-    assert (doubts, sizes) == ([0.1, 0.015], [1]), "a second effect needs stronger evidence"
+    assert (p_values, sizes) == ([0.1, 0.015], [1]), "a second effect needs stronger evidence"
 
 
 @pytest.mark.parametrize(
@@ -101,7 +103,7 @@ def test_a_gain_counts_less_what_luck_gives_its_effects(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("sigma", "stated", "chance", "quiet"),
+    ("sigma", "stated", "p_value", "quiet"),
     [
         (1.29, True, 0.0, True),
         (1.31, True, 1.0, False),
@@ -112,10 +114,10 @@ def test_a_gain_counts_less_what_luck_gives_its_effects(monkeypatch):
     ],
 )
 def test_the_residual_may_be_noise_up_to_the_floor_or_if_its_correlation_decays(
-    monkeypatch, sigma, stated, chance, quiet
+    monkeypatch, sigma, stated, p_value, quiet
 ):
     monkeypatch.setattr(
-        "bench.diagnosis.search.scored_models.compute_portmanteau_p_value", lambda *_: chance
+        "bench.diagnosis.search.scored_models.compute_portmanteau_p_value", lambda *_: p_value
     )
     made = search(monkeypatch, compute_residual=np.zeros((1, 1, 1)))
     made.evaluator = SimpleNamespace(observed=np.zeros((1, 1, 1)))

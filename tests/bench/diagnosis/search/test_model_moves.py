@@ -24,17 +24,17 @@ def search(effects, seed=0):
     return made
 
 
-def fitted(made, names, values):
+def fitted(search, names, values):
     """Return the model with these effects, fitted from these coefficients."""
-    theta = made.evaluator.get_nominal_theta()
+    theta = search.evaluator.get_nominal_theta()
     for name in names:
-        theta[made.evaluator.coefficient_slices[name]] = values[name]
-    made.refit_models([FitStart(names, theta, made.evaluator.initial_state_guesses)])
-    return made.models[frozenset(names)]
+        theta[search.evaluator.coefficient_slices[name]] = values[name]
+    search.refit_models([FitStart(names, theta, search.evaluator.initial_state_guesses)])
+    return search.models[frozenset(names)]
 
 
 @pytest.mark.parametrize(
-    ("truth", "richer", "kept"),
+    ("true_effects", "richer", "kept"),
     [
         ({"friction.coulomb": 0.7}, "friction.stribeck", "friction.coulomb"),
         ({"friction.stribeck": (0.5, 0.9, 0.3)}, "friction.stribeck", "friction.stribeck"),
@@ -42,34 +42,36 @@ def fitted(made, names, values):
         ({"friction.direction": (0.2, 0.9)}, "friction.direction", "friction.direction"),
     ],
 )
-def test_the_richer_law_stands_where_it_comes_nearer(truth, richer, kept):
-    made = search({**truth, "force.bias": 0.4})
+def test_the_richer_law_stands_where_it_comes_nearer(true_effects, richer, kept):
+    made = search({**true_effects, "force.bias": 0.4})
     values = {"friction.stribeck": (0.5, 0.5, 0.2), "friction.direction": (0.5, 0.4)}
     model = fitted(made, ("force.bias", richer), {**values, "force.bias": 0.3})
     plainer = made.simplify_laws(model)
     assert set(plainer.effects) == {"force.bias", kept}
     if kept != richer:
         place = made.evaluator.coefficient_slices[kept].start
-        assert plainer.fit.theta[place] == pytest.approx(truth[kept], rel=0.05)
+        assert plainer.fit.theta[place] == pytest.approx(true_effects[kept], rel=0.05)
 
 
 @pytest.mark.parametrize(
-    ("truth", "kept"),
+    ("true_effects", "kept"),
     [
         ({"friction.coulomb": 0.7, "drag.linear": 0.6}, {"friction.coulomb", "drag.linear"}),
         ({"friction.warming": (0.7, 0.6, 2.0)}, {"friction.warming"}),
     ],
     ids=["far longer than the run", "within it"],
 )
-def test_a_law_whose_time_the_data_do_not_show_gives_way_to_the_sum_of_its_parts(truth, kept):
+def test_a_law_whose_time_the_data_do_not_show_gives_way_to_the_sum_of_its_parts(
+    true_effects, kept
+):
     """Over 4 s, friction with a time constant of 300 s equals dry plus viscous friction."""
-    made = search({**truth, "force.bias": 0.4})
+    made = search({**true_effects, "force.bias": 0.4})
     values = {"friction.warming": (0.7, 0.6, 2.0 if len(kept) == 1 else 300.0), "force.bias": 0.3}
     plainer = made.simplify_laws(fitted(made, ("force.bias", "friction.warming"), values))
     assert set(plainer.effects) == {"force.bias", *kept}
-    for name in truth:
+    for name in true_effects:
         c = plainer.fit.theta[made.evaluator.coefficient_slices[name]]
-        np.testing.assert_allclose(c, truth[name], rtol=0.05)
+        np.testing.assert_allclose(c, true_effects[name], rtol=0.05)
 
 
 def test_data_far_from_the_model_are_explained_by_the_smaller_model(monkeypatch):

@@ -16,10 +16,10 @@ from tests.bench.diagnosis.search.search_models import model, search_of
 
 
 def test_competitors_are_near_by_likelihood_or_by_their_residual():
-    best = model("a", merit=100.0)
-    by_merit = model("b", merit=100.0 - 0.9 * MAX_COMPETITOR_DISTANCE)
+    best = model("a", likelihood=100.0)
+    by_merit = model("b", likelihood=100.0 - 0.9 * MAX_COMPETITOR_DISTANCE)
     by_excess, far = model("c"), model("d")
-    larger = model("a", "b", merit=100.0)
+    larger = model("a", "b", likelihood=100.0)
     excess = {
         ("a",): 1.0,
         ("b",): 9.0,
@@ -34,16 +34,16 @@ def test_competitors_are_near_by_likelihood_or_by_their_residual():
 def test_a_competitor_that_is_better_after_convergence_stays_unless_structure_remains(
     monkeypatch, structure, stands
 ):
-    base, best = model(), model("a", merit=100.0)
-    search = search_of(base, best, model("b", merit=90.0))
+    base, best = model(), model("a", likelihood=100.0)
+    search = search_of(base, best, model("b", likelihood=90.0))
     search.evaluator = SimpleNamespace(library=["a", "b"])
     refits = []
 
     def refit(starts, noise):
         refits.append(([start.effects for start in starts], noise))
-        search.models[frozenset("b")] = model("b", merit=110.0)
+        search.models[frozenset("b")] = model("b", likelihood=110.0)
 
-    search.refit_models, search.refit_extensions = refit, lambda models, most: None
+    search.refit_models, search.refit_extensions = refit, lambda models, max_effects: None
     monkeypatch.setattr(settling, "generate_frequency_neighbours", lambda evaluator, fit: [])
     monkeypatch.setattr(
         settling,
@@ -66,7 +66,7 @@ def test_a_competitor_of_a_pair_also_starts_from_the_shared_effects(monkeypatch)
     A difference of 10.4 in twice the log-likelihood once hid that a command bias and a force bias
     are equivalent.
     """
-    best, rival = model("a", "b", merit=100.0), model("a", "c", merit=90.0)
+    best, rival = model("a", "b", likelihood=100.0), model("a", "c", likelihood=90.0)
     best = replace(best, fit=replace(best.fit, theta=np.array([1.0, 2.0, 3.0, 0.0])))
     rival = replace(rival, fit=replace(rival.fit, theta=np.array([1.1, 2.2, 0.0, 4.0])))
     search = search_of(best, rival, model("a"), model("b"))
@@ -75,7 +75,7 @@ def test_a_competitor_of_a_pair_also_starts_from_the_shared_effects(monkeypatch)
     begun = []
     search.refit_models, search.refit_extensions = (
         lambda s, noise: begun.extend(s),
-        lambda models, most: None,
+        lambda models, max_effects: None,
     )
     monkeypatch.setattr(settling, "generate_frequency_neighbours", lambda evaluator, fit: [])
     left = SimpleNamespace(has_structure=False)

@@ -12,7 +12,7 @@ from bench.diagnosis.search.subsampled_search import search_with_subsampling
 from tests.bench.diagnosis.explained_samples import recording, searched
 
 SIGMA = [0.003]
-RUBBED = {"effects": ["friction.coulomb=0.3"], "observe": ["x"], "noise": ["x=0.003"]}
+WITH_FRICTION = {"effects": ["friction.coulomb=0.3"], "observe": ["x"], "noise": ["x=0.003"]}
 
 
 @pytest.fixture(autouse=True)
@@ -24,7 +24,7 @@ def _short(monkeypatch):
 
 @pytest.fixture(scope="module")
 def log():
-    return recording("slider", runs=2, seconds=1.5, rate=400.0, seed=3, **RUBBED)
+    return recording("slider", runs=2, seconds=1.5, rate=400.0, seed=3, **WITH_FRICTION)
 
 
 @pytest.fixture

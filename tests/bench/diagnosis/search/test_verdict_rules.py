@@ -23,10 +23,13 @@ def test_every_verdict_has_one_sentence_and_is_in_the_form_of_verdict_json():
         assert meaning[0].islower()
 
 
-def rests(ranges=(5.9, 5.9), left=(2.9, 2.9), touched=False):
+def rests(ranges=(5.9, 5.9), left=(2.9, 2.9), is_model_sensitive=False):
     """Evaluate `is_motionless` for ranges and residuals in units of the noise."""
     return verdict_rules.is_motionless(
-        np.array(ranges) * SIGMA, np.array(left) * SIGMA, SIGMA, is_model_sensitive=touched
+        np.array(ranges) * SIGMA,
+        np.array(left) * SIGMA,
+        SIGMA,
+        is_model_sensitive=is_model_sensitive,
     )
 
 
@@ -34,12 +37,12 @@ def test_a_recording_shows_nothing_where_every_channel_rests_as_its_model_does()
     assert rests()
     assert not rests(ranges=(5.9, 6.1)), "one channel moves"
     assert not rests(left=(3.1, 2.9)), "it ought to move and does not"
-    assert not rests(touched=True), "its model moves"
+    assert not rests(is_model_sensitive=True), "its model moves"
 
 
 def test_one_constant_shows_nothing_whatever_its_model_does():
-    assert rests(ranges=(0, 0), left=(99, 99), touched=True)
-    assert not rests(ranges=(1e-9, 0), left=(99, 99), touched=True)
+    assert rests(ranges=(0, 0), left=(99, 99), is_model_sensitive=True)
+    assert not rests(ranges=(1e-9, 0), left=(99, 99), is_model_sensitive=True)
 
 
 def test_a_parameter_is_fixed_by_an_error_of_less_than_half_its_bounds():
@@ -60,11 +63,11 @@ def test_estimated_noise_is_exceeded_sevenfold_whatever_the_error():
     assert verdict_rules.exceeds_noise(7.01, 1.0, is_noise_stated=False)
 
 
-@pytest.mark.parametrize(("stated", "chance"), [(True, 1e-3), (False, 1e-4)])
-def test_an_unmodelled_force_is_structure_below_a_p_value(stated, chance):
+@pytest.mark.parametrize(("stated", "p_value"), [(True, 1e-3), (False, 1e-4)])
+def test_an_unmodelled_force_is_structure_below_a_p_value(stated, p_value):
     level = verdict_rules.get_structure_threshold(stated)
-    assert verdict_rules.has_structure(0.99 * chance, level, ())
-    assert not verdict_rules.has_structure(1.01 * chance, level, ())
+    assert verdict_rules.has_structure(0.99 * p_value, level, ())
+    assert not verdict_rules.has_structure(1.01 * p_value, level, ())
 
 
 def test_a_channel_above_the_noise_is_structure_although_no_force_explains_it():

@@ -155,10 +155,10 @@ def test_intervals_cover_the_true_parameters(phi):
     assert (np.mean(held, axis=0) >= 0.85).all()
 
 
-@pytest.mark.parametrize("told", [{}, {"qd": 0.0}])
-def test_the_covariance_is_that_of_all_unknowns_at_once(told):
+@pytest.mark.parametrize("initial", [{}, {"qd": 0.0}])
+def test_the_covariance_is_that_of_all_unknowns_at_once(initial):
     made = recording(runs=2, seconds=0.8, rate=50, noise=["q=0.003", "qd=0.02"], seed=3)
-    made = with_runs(made, [replace(made.runs[0], initial=told), made.runs[1]])
+    made = with_runs(made, [replace(made.runs[0], initial=initial), made.runs[1]])
     search, model = searched(made, [0.003, 0.02], candidates=[])
     sigma = model.likelihood.sigma
     assert np.allclose(model.likelihood.phi, 0, atol=0.3)
@@ -183,7 +183,7 @@ def test_the_covariance_is_that_of_all_unknowns_at_once(told):
     # Values in kg^2 m^4 are far below absolute tolerances, so they are scaled.
     known = compute_covariance(search, model)[0, 0]
     assert known * 1e12 == pytest.approx(inverse[0, 0] * 1e12, rel=1e-6)
-    least = 1.0 if told else 3.0
+    least = 1.0 if initial else 3.0
     assert known > least / normal[0, 0], "initial states take most of what is known of it"
     value, low, high = compute_intervals(search, model)[0]
     assert value == model.fit.theta[0]
