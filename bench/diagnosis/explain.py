@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import replace
 from itertools import combinations
@@ -225,6 +225,7 @@ class _ExplainRun:
         self.seed = options.seed
         self.tuner = options.tuner
         self.say = say = options.say
+        self.notes: tuple[str, ...] = ()
         self.force = force = options.force
         self.thorough = options.thorough
         self.search_control = options.make_search_control()
@@ -250,32 +251,18 @@ class _ExplainRun:
         self.free = () if kind.has_model else tuple(options.free)
         kind = self._add_contact_effects(kind)
         # This check precedes the run evaluators, which plan every step of every run.
-        for odd in check_recording_plausible(self.recording, kind, force):
-            say(f"{self.path}: {odd}")
-        self.recording, thinned = thin_recording(self.recording, kind)
-        self.recording, settled = leave_out_settling(self.recording, kind)
-        self.recording, note = segment_recording(
-            self.recording, kind, options.pieces, options.whole
-        )
-        recorded = self.recording.runs[0].channels
-        names = [channel.name for channel in kind.channels if channel.name in recorded]
-        self.recording, quiet = add_minimal_noise(self.recording, names)
-        said = thinned, settled, note, _format_added_noise(quiet)
-        self.notes = tuple(text for text in said if text)
-        for note in self.notes:
-            say(note)
+        for anomaly in check_recording_plausible(self.recording, kind, force):
+            say(f"{self.path}: {anomaly}")
+        self._prepare_recording(kind, options)
         check_recording_size(self.recording, kind(engine=self.engine), force)
         # By name, the declared range of a base parameter and the wider range that replaced it.
         self.wider: dict[str, tuple[Bounds, Bounds]] = {}
         # Base parameters of a robot, identified by prediction errors; starting values of the fit.
         self.identified: Array | None = None
         self._set_up(kind)
-        left_out = [
-            f"{effect} is not tested: {why}" for effect, why in kind.system.left_out.items()
-        ]
-        for line in left_out:
-            say(line)
-        self.notes = (*self.notes, *left_out)
+        self._add_notes(
+            f"{effect} is not tested: {reason}" for effect, reason in kind.system.left_out.items()
+        )
         self.coarse: CoarseStepFinding | None = None
         self._filtered: FollowedRuns | None = None
         # Finer steps than the file's, and the run evaluators with the file's step if one is used.
@@ -284,6 +271,30 @@ class _ExplainRun:
         self.found: tuple[EffectSearch, DiagnosisResult] | None = None
         self.unit_errors: tuple[RecordingFault, ...] = ()
         self._check_recording()
+
+    def _prepare_recording(self, kind: type[SystemSimulator], options: ExplainOptions) -> None:
+        """Thin and split the runs, leave out their settling, and add noise where there is none.
+
+        The recording is replaced, and each change is noted.
+        """
+        self.recording, thinning_note = thin_recording(self.recording, kind)
+        self.recording, settling_note = leave_out_settling(self.recording, kind)
+        self.recording, segment_note = segment_recording(
+            self.recording, kind, options.pieces, options.whole
+        )
+        recorded = self.recording.runs[0].channels
+        names = [channel.name for channel in kind.channels if channel.name in recorded]
+        self.recording, noise_free_channels = add_minimal_noise(self.recording, names)
+        noise_note = _format_added_noise(noise_free_channels)
+        notes = thinning_note, settling_note, segment_note, noise_note
+        self._add_notes(note for note in notes if note)
+
+    def _add_notes(self, notes: Iterable[str]) -> None:
+        """Report notes to the user, and keep them for the report."""
+        added_notes = tuple(notes)
+        for note in added_notes:
+            self.say(note)
+        self.notes = (*self.notes, *added_notes)
 
     def _add_contact_effects(self, kind: type[SystemSimulator]) -> type[SystemSimulator]:
         """Return the simulator of a robot with effects at the contacts of the recording."""
@@ -407,9 +418,9 @@ class _ExplainRun:
         base = self._fit_base()
         if not np.isfinite(base.fit.simulated[np.isfinite(self.fitting.observed)]).all():
             raise self._make_simulation_error()
-        found = self._search_with_friction_forms(base)
-        found = self._search_with_better_step(found.search, found.finding) or found
-        base, search, finding, rng = found
+        result = self._search_with_friction_forms(base)
+        result = self._search_with_better_step(result.search, result.finding) or result
+        base, search, finding, rng = result
         self.search_control.begin_stage("measuring the gain")
         verdict = self.assessor.build_verdict(search, finding, rng, self.started)
         verdict = replace(
@@ -422,10 +433,10 @@ class _ExplainRun:
             *describe_unusual_values(self.fitting, finding.model.fit.theta, self.wider),
             *self.notes,
         )
-        story = DiagnosisReportDataBuilder(
+        report_data = DiagnosisReportDataBuilder(
             self.assessor, search, base, finding, notes
         ).build_report_data(verdict)
-        return Explanation(verdict, story, self._build_extended_simulator(search, finding))
+        return Explanation(verdict, report_data, self._build_extended_simulator(search, finding))
 
     def _search_with_friction_forms(self, base: BaseFit) -> _SearchResult:
         """Search for causes; repeat with MuJoCo's soft dry friction if the data support that form.
@@ -442,33 +453,38 @@ class _ExplainRun:
         from bench.diagnosis.prediction_error.prediction_error_search import PredictionErrorSearch
         from bench.diagnosis.prediction_error.selection_fits import SoftFrictionError
 
-        stiff = _RunEvaluators(self.kind, self.fitting, self.validation)
+        stiff_evaluators = _RunEvaluators(self.kind, self.fitting, self.validation)
         try:
-            found = _SearchResult(base, search, self._find_causes(search), rng)
-            # A search does not select dry friction that is a free number.
-            is_free = has_dry_friction(self.fitting, ())
-            done = self.search_control.has_abandoned_fits() or bool(self.unit_errors) or not is_free
-            if done or not is_likelier_soft(
-                search, found.finding.model, INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
+            result = _SearchResult(base, search, self._find_causes(search), rng)
+            # The search itself compares the forms of friction that it selects, but not of friction
+            # that is a free number.
+            is_comparison_needed = (
+                has_dry_friction(self.fitting, ())
+                and not self.unit_errors
+                and not self.search_control.has_abandoned_fits()
+            )
+            if not is_comparison_needed or not is_likelier_soft(
+                search, result.finding.model, INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
             ):
-                return found
+                return result
             return self._search_with_soft_friction(base, search)
         except SoftFrictionError as error:
-            soft = self._search_with_soft_friction(base, search, error.start)
+            soft_result = self._search_with_soft_friction(base, search, error.start)
             if (
                 not error.is_preliminary
-                or self._is_explained(soft)
+                or self._is_explained(soft_result)
                 or self.search_control.has_abandoned_fits()
             ):
-                return soft
+                return soft_result
         self.say(STIFF_FRICTION)
-        before = self.assessor.before
-        self._restore_evaluators(stiff, before)
-        again = self._create_search(base, rng, is_form_given=True)
-        if isinstance(search, PredictionErrorSearch) and isinstance(again, PredictionErrorSearch):
-            again.take_over(search)
+        self._restore_evaluators(stiff_evaluators, self.assessor.before)
+        stiff_search = self._create_search(base, rng, is_form_given=True)
+        if isinstance(search, PredictionErrorSearch) and isinstance(
+            stiff_search, PredictionErrorSearch
+        ):
+            stiff_search.take_over(search)
         try:
-            return _SearchResult(base, again, self._find_causes(again), rng)
+            return _SearchResult(base, stiff_search, self._find_causes(stiff_search), rng)
         except SoftFrictionError as error:
             return self._search_with_soft_friction(base, search, error.start)
 
@@ -499,9 +515,9 @@ class _ExplainRun:
                 "or write a corrected description: "
                 f"simgap inspect {self.path.name} --fix NAME.toml"
             )
-        what = "; ".join(one.description for one in differences)
+        description = "; ".join(difference.description for difference in differences)
         raise InputError(
-            f"{self.path}: {what}; expected the conventions of the model file: {remedy} "
+            f"{self.path}: {description}; expected the conventions of the model file: {remedy} "
             "(--force explains the log as it is)"
         )
 
@@ -511,33 +527,35 @@ class _ExplainRun:
         return found.finding.verdict in EXPLAINED_VERDICTS
 
     def _search_with_soft_friction(
-        self, base: BaseFit, before: EffectSearch, likely: FitStart | None = None
+        self, base: BaseFit, stiff_search: EffectSearch, likely: FitStart | None = None
     ) -> _SearchResult:
-        """Search and judge with MuJoCo's soft dry friction.
+        """Refit the base model with MuJoCo's soft dry friction, and search for causes again.
 
         Args:
-            base: Base model.
-            before: Search with stiff friction.
+            base: Base model, fitted with stiff friction.
+            stiff_search: Search with stiff friction; its results are reused where they are valid.
             likely: Model that may explain the runs.
         """
         # This import is needed for robots only.
         from bench.diagnosis.prediction_error.prediction_error_search import PredictionErrorSearch
 
         self.say(SOFT_FRICTION)
-        held_out = self.assessor.before
+        base_prediction = self.assessor.before
         self._set_up(make_soft_kind(self.kind))
-        self.assessor = replace(self.assessor, before=held_out)
+        self.assessor = replace(self.assessor, before=base_prediction)
         fitter = TrajectoryFitter(self.fitting, self.noise, base.fixed_parameters)
         start = replace(base.fit.make_start(), initial_states=self.fitting.initial_state_guesses)
         (fit,) = fitter.fit_models([start], FINAL_ITERATIONS)
         base = self._correct_step_errors(replace(base, fit=fit))
         rng = self._make_rng()
         search = self._create_search(base, rng)
-        if isinstance(search, PredictionErrorSearch) and isinstance(before, PredictionErrorSearch):
+        if isinstance(search, PredictionErrorSearch) and isinstance(
+            stiff_search, PredictionErrorSearch
+        ):
             search.likely = likely
             # Friction of the file keeps its form unless it is a free number.
             if not has_dry_friction(self.fitting, ()):
-                search.take_over(before)
+                search.take_over(stiff_search)
         return _SearchResult(base, search, self._find_causes(search), rng)
 
     def _finish_base_and_search(self, base: BaseFit) -> _SearchResult:
@@ -583,14 +601,13 @@ class _ExplainRun:
 
         For a robot, units are usually tested only if no effect has explained the gap before.
         """
-        explained = finding.verdict in EXPLAINED_VERDICTS
-        if not self._checks_units_late or explained or self.search_control.has_abandoned_fits():
+        is_explained = finding.verdict in EXPLAINED_VERDICTS
+        if not self._checks_units_late or is_explained or self.search_control.has_abandoned_fits():
             return ()
-        left, before = (
-            search.compute_excess_residual(model) for model in (finding.model, search.base_model)
-        )
+        remaining_excess = search.compute_excess_residual(finding.model)
+        base_excess = search.compute_excess_residual(search.base_model)
         # With a wrong unit or sign, effects would leave more of the discrepancy.
-        if left < MAX_EXCESS_SHARE_WITH_RIGHT_UNITS * before:
+        if remaining_excess < MAX_EXCESS_SHARE_WITH_RIGHT_UNITS * base_excess:
             return ()
         base = BaseFit(search.base_model.fit, frozenset(search.fixed_parameters))
         fault = find_wrong_units(self._unit_check_subject, self.fitting, self.noise, base)
@@ -600,11 +617,11 @@ class _ExplainRun:
         self, search: EffectSearch, finding: DiagnosisResult
     ) -> tuple[RecordingFault, ...]:
         """Return wrong units and signs that the diagnosed causes imitate."""
-        found = [
+        faults = [
             find_imitated_unit(self._unit_check_subject, self.fitting, cause, search.base_model.fit)
             for cause in self.assessor.causes(search, finding)
         ]
-        return tuple(fault for fault in found if fault is not None)
+        return tuple(fault for fault in faults if fault is not None)
 
     @property
     def _unit_check_subject(self) -> Subject:
@@ -631,8 +648,8 @@ class _ExplainRun:
             return None
         search, finding = self.found
         for cause in finding.causes:
-            rest = {name for name in finding.model.effects if name != cause.effect}
-            keys = [frozenset({*rest, other}) for other in cause.alternatives]
+            other_causes = {name for name in finding.model.effects if name != cause.effect}
+            keys = [frozenset({*other_causes, effect}) for effect in cause.alternatives]
             competing_models = [search.models[key] for key in keys if key in search.models]
             if competing_models:
                 return design_next_run(search, finding.model, competing_models, seconds, longest)
@@ -687,12 +704,12 @@ class _ExplainRun:
 
         This is so for a robot's recording, unless its free numbers could not be identified.
         """
-        lost = (
+        has_unidentified_base = (
             self.has_base_parameters
             and self.identified is None
             and self.fitting.filtered_runs is not None
         )
-        return self.kind.has_model and not lost
+        return self.kind.has_model and not has_unidentified_base
 
     @property
     def has_base_parameters(self) -> bool:
@@ -710,10 +727,10 @@ class _ExplainRun:
 
         self.search_control.begin_stage("computing prediction errors")
         evaluator, *held_out = self._list_run_evaluators()
-        followed = self._get_filter()
+        filtered_runs = self._get_filter()
         # Where the linear model diverges, causes are searched by simulation.
-        if not followed.has_expected_innovations or self._is_linear_model_wrong_at_contacts(
-            followed
+        if not filtered_runs.has_expected_innovations or self._is_linear_model_wrong_at_contacts(
+            filtered_runs
         ):
             if self._has_contacts:
                 # This import is needed for robots only.
@@ -723,25 +740,27 @@ class _ExplainRun:
                 set_first_states_in_contact(self._list_run_evaluators(), theta, self.noise.sigma)
             return
         if self.has_base_parameters and self.tuner is None:
-            followed = self._filter_with_fitted_parameters(followed)
-        evaluator.follow(followed)
+            filtered_runs = self._filter_with_fitted_parameters(filtered_runs)
+        evaluator.follow(filtered_runs)
         for evaluator in held_out:
             # Held-out runs are only simulated; without a filter they begin at their measured
             # values.
             theta = evaluator.get_nominal_theta()
-            found = FollowedRuns.follow(evaluator, theta, self.noise, max_linearisations=1)
-            if found.has_expected_innovations:
-                evaluator.follow(found)
+            filtered_held_out = FollowedRuns.follow(
+                evaluator, theta, self.noise, max_linearisations=1
+            )
+            if filtered_held_out.has_expected_innovations:
+                evaluator.follow(filtered_held_out)
 
-    def _is_linear_model_wrong_at_contacts(self, followed: FollowedRuns) -> bool:
+    def _is_linear_model_wrong_at_contacts(self, filtered_runs: FollowedRuns) -> bool:
         """Return whether the linear model of a robot fails at the contacts of the recording.
 
         The depth of a contact is smaller than the noise of most encoders, so that a model that is
         linearised about the readings has wrong contact forces. The filter then needs a missing
         force that is larger than all typical forces.
         """
-        share = float((followed.force / followed.typical).max())
-        return self._has_contacts and not share <= MAX_FORCE_SHARE_AT_CONTACTS
+        force_share = float((filtered_runs.force / filtered_runs.typical).max())
+        return self._has_contacts and not force_share <= MAX_FORCE_SHARE_AT_CONTACTS
 
     @property
     def _has_contacts(self) -> bool:
@@ -761,28 +780,37 @@ class _ExplainRun:
             )
         return self._filtered
 
-    def _filter_with_fitted_parameters(self, followed: FollowedRuns) -> FollowedRuns:
+    def _filter_with_fitted_parameters(self, filtered_runs: FollowedRuns) -> FollowedRuns:
         """Return the runs, filtered with base parameters from a prediction-error fit."""
         # These imports are needed for robots only.
         from bench.diagnosis.kalman.likelihood_fit import identify_base
         from bench.diagnosis.prediction_error.incomplete_model import is_long
 
         evaluator = self.fitting
-        declared = {p.name: p.bounds for p in evaluator.parameters}
+        declared_bounds = {p.name: p.bounds for p in evaluator.parameters}
         # The joints of a real robot have friction, and long recordings are those of real robots.
-        found, wider = identify_base(evaluator, self.noise, followed, is_long(evaluator))
-        if found is not followed:
-            self.identified = evaluator.identified_base = found.theta[evaluator.base_indices]
-        self._widen_ranges(wider, declared)
-        return found
+        refiltered_runs, wider_bounds = identify_base(
+            evaluator, self.noise, filtered_runs, is_long(evaluator)
+        )
+        if refiltered_runs is not filtered_runs:
+            self.identified = evaluator.identified_base = refiltered_runs.theta[
+                evaluator.base_indices
+            ]
+        self._widen_ranges(wider_bounds, declared_bounds)
+        return refiltered_runs
 
-    def _widen_ranges(self, found: Mapping[str, Bounds], declared: Mapping[str, Bounds]) -> None:
+    def _widen_ranges(
+        self, wider_bounds: Mapping[str, Bounds], declared_bounds: Mapping[str, Bounds]
+    ) -> None:
         """Report the wider ranges of base parameters, and use them for all runs."""
         for evaluator in self._list_run_evaluators()[1:]:
-            use_bounds(evaluator, found)
-        for parameter, (low, high) in found.items():
-            self.say(f"{parameter} ends at a bound of its range: widened to {low:g} to {high:g}")
-        self.wider |= {one: (declared[one], bounds) for one, bounds in found.items()}
+            use_bounds(evaluator, wider_bounds)
+        for name, (low, high) in wider_bounds.items():
+            self.say(f"{name} ends at a bound of its range: widened to {low:g} to {high:g}")
+        self.wider |= {
+            parameter: (declared_bounds[parameter], bounds)
+            for parameter, bounds in wider_bounds.items()
+        }
 
     def _prepare_robot_base(self, base: BaseFit) -> BaseFit:
         """Return the base model of a robot with the step that the data support.
@@ -795,8 +823,8 @@ class _ExplainRun:
 
     def _shows_step_errors(self, base: BaseFit) -> bool:
         """Return whether the recording shows the discretisation error of the engine's steps."""
-        lost = self.fitting.filtered_runs is None or not np.isfinite(base.fit.cost)
-        if self.search_control.has_abandoned_fits() or lost:
+        has_no_filter = self.fitting.filtered_runs is None or not np.isfinite(base.fit.cost)
+        if self.search_control.has_abandoned_fits() or has_no_filter:
             return True
         # These imports are needed for robots only.
         from bench.diagnosis.kalman.candidate_responses import FollowedRuns
@@ -814,8 +842,8 @@ class _ExplainRun:
         # This import is needed for robots only.
         from bench.diagnosis.prediction_error.effect_selection import shows_step_errors
 
-        followed = self.fitting.filtered_runs
-        if followed is not None and not shows_step_errors(followed):
+        filtered_runs = self.fitting.filtered_runs
+        if filtered_runs is not None and not shows_step_errors(filtered_runs):
             return base
         return correct_discretisation(self.fitting, self.noise, base)
 
@@ -827,10 +855,10 @@ class _ExplainRun:
 
     def _widen_bounds_at_fit(self, base: BaseFit) -> BaseFit:
         """Widen the ranges of base parameters that the fit leaves at a bound."""
-        declared = {p.name: p.bounds for p in self.fitting.parameters}
-        declared |= {name: bounds for name, (bounds, _) in self.wider.items()}
-        base, found = fit_wider(self.fitting, self.noise, base)
-        self._widen_ranges(found, declared)
+        declared_bounds = {p.name: p.bounds for p in self.fitting.parameters}
+        declared_bounds |= {name: bounds for name, (bounds, _) in self.wider.items()}
+        base, wider_bounds = fit_wider(self.fitting, self.noise, base)
+        self._widen_ranges(wider_bounds, declared_bounds)
         return base
 
     def _freeze_unidentified(self, base: BaseFit) -> BaseFit:
@@ -841,18 +869,19 @@ class _ExplainRun:
         """
         if self.search_control.has_abandoned_fits() or not np.isfinite(base.fit.cost):
             return base
-        kept = freeze_unidentified_parameters(
+        reduced_base = freeze_unidentified_parameters(
             self.fitting, self.noise, base, lambda base: self._create_search(base, self._make_rng())
         )
-        if kept.unidentified_parameters:
+        if reduced_base.unidentified_parameters:
             names = ", ".join(
-                self.fitting.parameters[i].name for i in sorted(kept.unidentified_parameters)
+                self.fitting.parameters[i].name
+                for i in sorted(reduced_base.unidentified_parameters)
             )
             self.say(
                 "kept at the nominal value, because the recording does not identify it "
                 f"together with the others: {names}"
             )
-        return kept
+        return reduced_base
 
     def _choose_base_step(self, base: BaseFit) -> BaseFit:
         """Choose the step of the base model: the file's own, or a finer one.
@@ -864,41 +893,49 @@ class _ExplainRun:
         from bench.diagnosis.evaluation.integrator_check import find_step_refinements
 
         self.finer = Reusable(find_step_refinements(self.fitting, self.noise))
-        file = _RunEvaluators(self.kind, self.fitting, self.validation)
-        value, left = self._rate_base(base)
-        gap = left - 1.0
-        for fine in self.finer:
+        file_evaluators = _RunEvaluators(self.kind, self.fitting, self.validation)
+        file_log_likelihood, residual = self._rate_base(base)
+        gap = residual - 1.0
+        for refinement in self.finer:
             # A finer step leaves a smaller residual; a step that is too coarse for it is not tried.
-            if not fine.is_accurate_enough(left):
+            if not refinement.is_accurate_enough(residual):
                 continue
-            self._set_up(fine.kind)
+            self._set_up(refinement.kind)
             if self.fitting.filtered_runs is None:
                 # A model that diverges with the file's step may be filtered with a finer one.
                 self._filter_runs()
-            other = fit_base_model(self.fitting, self.noise, self._get_nearby_starts(base))
-            reached, left = self._rate_base(other)
-            if not is_finer_step_better(reached - value, gap, left - 1.0):
+            finer_base = fit_base_model(self.fitting, self.noise, self._get_nearby_starts(base))
+            finer_log_likelihood, residual = self._rate_base(finer_base)
+            if not is_finer_step_better(
+                finer_log_likelihood - file_log_likelihood, gap, residual - 1.0
+            ):
                 # Another missing effect may affect both models: they are compared again with it.
-                if fine.is_accurate_enough(0.0):
+                if refinement.is_accurate_enough(0.0):
                     break
-                left = 0.0
-            elif fine.is_accurate_enough(left):
-                self._use_finer(fine, reached - value, base, file)
-                return other
-        self._restore_evaluators(file)
+                residual = 0.0
+            elif refinement.is_accurate_enough(residual):
+                self._use_finer(
+                    refinement, finer_log_likelihood - file_log_likelihood, base, file_evaluators
+                )
+                return finer_base
+        self._restore_evaluators(file_evaluators)
         return base
 
     def _use_finer(
-        self, fine: StepRefinement, gain: float, base: BaseFit, file: _RunEvaluators
+        self,
+        refinement: StepRefinement,
+        gain: float,
+        base: BaseFit,
+        file_evaluators: _RunEvaluators,
     ) -> None:
         """Record that the file's own step is too coarse; the finer step is in use already."""
-        numerics = fine.numerics
+        numerics = refinement.numerics
         self.say(
             f"simulated with a smaller time step: {numerics.integrator}, {numerics.timestep:g} s"
         )
-        self.coarse, self.file = CoarseStepFinding(fine, gain), file
+        self.coarse, self.file = CoarseStepFinding(refinement, gain), file_evaluators
         self.assessor = replace(
-            self.assessor, before=self._predict_with_file_step(base, file.validation)
+            self.assessor, before=self._predict_with_file_step(base, file_evaluators.validation)
         )
 
     def _search_with_better_step(
@@ -922,15 +959,15 @@ class _ExplainRun:
             return None
         if not finding.causes and (self.coarse is not None or finding.verdict == "adequate"):
             return None
-        found = (
+        present_merit = (
             finding.model.penalised_log_likelihood,
             search.compute_excess_residual(finding.model),
         )
-        here = _RunEvaluators(self.kind, self.fitting, self.validation)
+        present_evaluators = _RunEvaluators(self.kind, self.fitting, self.validation)
         if self.coarse is not None:
             before = self.assessor.before
             self._restore_evaluators(self.file)
-            if not is_finer_model_better(self._rate_best_subset(search, finding), found):
+            if not is_finer_model_better(self._rate_best_subset(search, finding), present_merit):
                 self.say(
                     "the time step of the model file explains the data equally well: it is used"
                 )
@@ -939,20 +976,20 @@ class _ExplainRun:
                 return self._finish_base_and_search(
                     fit_base_model(self.fitting, self.noise, self._get_nearby_starts(base))
                 )
-            self._restore_evaluators(here, before)
+            self._restore_evaluators(present_evaluators, before)
             return None
-        fine = next((one for one in self.finer or () if one.is_accurate_enough(0.0)), None)
-        if fine is None:
+        refinement = next((one for one in self.finer or () if one.is_accurate_enough(0.0)), None)
+        if refinement is None:
             return None
-        self._set_up(fine.kind)
-        best = self._rate_best_subset(search, finding)
-        if not is_finer_model_better(found, best):
-            self._restore_evaluators(here)
+        self._set_up(refinement.kind)
+        finer_merit = self._rate_best_subset(search, finding)
+        if not is_finer_model_better(present_merit, finer_merit):
+            self._restore_evaluators(present_evaluators)
             return None
         base = BaseFit(search.base_model.fit, search.fixed_parameters)
-        other = fit_base_model(self.fitting, self.noise, self._get_nearby_starts(base))
-        self._use_finer(fine, best[0] - found[0], base, here)
-        return self._finish_base_and_search(other)
+        finer_base = fit_base_model(self.fitting, self.noise, self._get_nearby_starts(base))
+        self._use_finer(refinement, finer_merit[0] - present_merit[0], base, present_evaluators)
+        return self._finish_base_and_search(finer_base)
 
     def _rate_best_subset(
         self, search: EffectSearch, finding: DiagnosisResult
@@ -963,14 +1000,16 @@ class _ExplainRun:
             Penalised log-likelihood and excess RMS residual of the best model.
         """
         names, fit = finding.model.effects, finding.model.fit
-        slots = self.fitting.coefficient_slices
+        coefficient_slices = self.fitting.coefficient_slices
         starts = []
         for count in range(len(names) + 1):
-            for some in combinations(names, count):
+            for subset in combinations(names, count):
                 theta = fit.theta.copy()
-                for left_out in set(names) - set(some):
-                    theta[slots[left_out]] = self.fitting.get_nominal_theta()[slots[left_out]]
-                starts.append(FitStart(some, theta, fit.initial_states))
+                for omitted in set(names) - set(subset):
+                    theta[coefficient_slices[omitted]] = self.fitting.get_nominal_theta()[
+                        coefficient_slices[omitted]
+                    ]
+                starts.append(FitStart(subset, theta, fit.initial_states))
         fits = TrajectoryFitter(self.fitting, self.noise, search.fixed_parameters).fit_models(
             starts, MAX_ITERATIONS
         )
@@ -978,7 +1017,8 @@ class _ExplainRun:
             BaseFit(search.base_model.fit, search.fixed_parameters), self._make_rng()
         )
         best = max(
-            (models.add_fit(one) for one in fits), key=lambda model: model.penalised_log_likelihood
+            (models.add_fit(subset_fit) for subset_fit in fits),
+            key=lambda model: model.penalised_log_likelihood,
         )
         return best.penalised_log_likelihood, models.compute_excess_residual(best)
 
@@ -1006,9 +1046,9 @@ class _ExplainRun:
 
     def _rate_base(self, base: BaseFit) -> tuple[float, float]:
         """Return twice the log-likelihood and the RMS residual, in noise units, of a base model."""
-        found = self._create_search(base, self._make_rng())
-        return float(found.base_model.likelihood.value), 1.0 + found.compute_excess_residual(
-            found.base_model
+        search = self._create_search(base, self._make_rng())
+        return float(search.base_model.likelihood.value), 1.0 + search.compute_excess_residual(
+            search.base_model
         )
 
     def _make_rng(self) -> np.random.Generator:
@@ -1045,41 +1085,41 @@ class _ExplainRun:
     ) -> ExtendedSimulator:
         """Build the extended simulator: the base simulator with fitted values and found effects.
 
-        `own` has the fitted base parameters, `freed` the constants fitted like parameters, and
-        `added` the coefficients of each found effect, all by name.
+        `base_values` has the fitted base parameters, `freed_constants` the constants fitted like
+        parameters, and `added_effects` the coefficients of each found effect, all by name.
         """
         evaluator, numbers = (
             self.fitting,
             self.assessor.collect_parameter_estimates(search, finding.model),
         )
-        own = {
+        base_values = {
             p.name: numbers[i]
             for i, p in enumerate(evaluator.parameters[: evaluator.system_parameter_count])
         }
         # A freed constant becomes a constant of the extended simulator, with its fitted value.
-        freed = {
+        freed_constants = {
             p.name: numbers[evaluator.system_parameter_count + i].value
             for i, p in enumerate(evaluator.freed_constants)
         }
-        added = {}
+        added_effects = {}
         # The simulator's order keeps the file independent of the order of the search.
-        for effect, slot in evaluator.coefficient_slices.items():
+        for effect, coefficient_slice in evaluator.coefficient_slices.items():
             if effect not in finding.model.effects:
                 continue
             coefficients = evaluator.available_effects[effect].on(evaluator.simulator.system)
-            places = range(*slot.indices(len(evaluator.parameters)))
-            added[effect] = {
-                coefficient.name: numbers[place]
-                for coefficient, place in zip(coefficients, places, strict=True)
+            indices = range(*coefficient_slice.indices(len(evaluator.parameters)))
+            added_effects[effect] = {
+                coefficient.name: numbers[index]
+                for coefficient, index in zip(coefficients, indices, strict=True)
             }
         return ExtendedSimulator(
             extend.make_extended_name(self.recording.system),
             self.recording.system,
             self.engine,
             self.recording.title,
-            own,
-            added,
-            {**self.recording.constants, **freed},
+            base_values,
+            added_effects,
+            {**self.recording.constants, **freed_constants},
             evaluator.channels,
             self.kind,
             extend.get_robot_reference(self.kind),

@@ -20,7 +20,7 @@ from sims.core.effect import Effect, Friction, members_of
 from sims.core.simulator import Array
 from sims.system_simulator import SystemSimulator
 
-_HOLDS = ", and smaller forces do not start motion"
+_STICTION_TEXT = ", and smaller forces do not start motion"
 """Part of the description of Coulomb friction that does not hold for the soft form, which creeps.
 """
 
@@ -81,12 +81,12 @@ def add_solver_parameters(evaluator: RunEvaluator, name: str, description: str) 
     effect = type(evaluator.available_effects[name])
     members = members_of(effect)
     joints = [joint for joint in robot.robot.joints if joint.has_one_coordinate]
-    places = [member.coordinate for member in members if member.coordinate is not None]
-    dofs = [joints[place].velocity for place in places]
+    coordinate_indices = [member.coordinate for member in members if member.coordinate is not None]
+    dofs = [joints[place].velocity for place in coordinate_indices]
     parameters = {tuple(robot.robot.compiled.dof_solref[dof].tolist()) for dof in dofs}
     text = " or ".join(" ".join(f"{value:g}" for value in pair) for pair in sorted(parameters))
     sentence, bracket, place = description.partition(" (at ")
-    sentence = sentence.removesuffix(_HOLDS)
+    sentence = sentence.removesuffix(_STICTION_TEXT)
     return f"{sentence}, in MuJoCo's soft form (solreffriction {text}){bracket}{place}"
 
 
@@ -102,15 +102,15 @@ def is_likelier_soft(models: ModelSet, model: FittedModel, margin: float) -> boo
     """
     if not has_dry_friction(models.evaluator, model.effects) or has_soft_form(models.evaluator):
         return False
-    soft_world = models.evaluator.with_kind(make_soft_kind(models.evaluator.kind))
+    soft_evaluator = models.evaluator.with_kind(make_soft_kind(models.evaluator.kind))
     try:
-        return choose_friction_form(models, model, soft_world, margin) is not None
+        return choose_friction_form(models, model, soft_evaluator, margin) is not None
     finally:
-        soft_world.close()
+        soft_evaluator.close()
 
 
 def choose_friction_form(
-    models: ModelSet, model: FittedModel, other_world: RunEvaluator, margin: float
+    models: ModelSet, model: FittedModel, other_evaluator: RunEvaluator, margin: float
 ) -> FittedModel | None:
     """Refit a model with the other form of dry friction, and return it if it is likelier.
 
@@ -121,19 +121,21 @@ def choose_friction_form(
     Args:
         models: Models of the present form, with their noise and frozen parameters.
         model: One of these models, for which `has_dry_friction` is true.
-        other_world: Run evaluator of the same runs and parameters, with a simulator of the other
-            form.
+        other_evaluator: Run evaluator of the same runs and parameters, with a simulator of the
+            other form.
         margin: Minimum gain in twice the log-likelihood.
 
     Returns:
         The model in the other form; None if the present form is kept.
     """
-    refitted_model = _refit_in(other_world, models, model)
+    refitted_model = _refit_with_other_form(other_evaluator, models, model)
     gain = refitted_model.likelihood.value - model.likelihood.value
     return refitted_model if gain >= margin else None
 
 
-def _refit_in(evaluator: RunEvaluator, models: ModelSet, model: FittedModel) -> FittedModel:
+def _refit_with_other_form(
+    evaluator: RunEvaluator, models: ModelSet, model: FittedModel
+) -> FittedModel:
     """Fit the effects of a model with `evaluator`, which has the other form of dry friction.
 
     Both forms can then be compared by their likelihoods.
@@ -194,14 +196,14 @@ def replace_by_stateless_friction(
     Returns:
         Names of the effects and parameters of the model without these states.
     """
-    theta, plain_names = theta.copy(), dict[str, None]()
+    theta, stateless_names = theta.copy(), dict[str, None]()
     for name in names:
         friction = get_stateless_friction(evaluator, name)
-        plain_names[friction] = None
+        stateless_names[friction] = None
         if friction != name:
             # The first coefficient of both effects is the limit of the friction force.
             theta[evaluator.get_coefficient_indices(friction)[0]] += theta[
                 evaluator.get_coefficient_indices(name)[0]
             ]
             theta[evaluator.get_coefficient_indices(name)] = 0.0
-    return tuple(plain_names), theta
+    return tuple(stateless_names), theta

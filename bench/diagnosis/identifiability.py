@@ -37,7 +37,7 @@ from sims.core.unit_text import format_unit
 
 IdentifiabilityLevel = Literal["identifiable", "weak", "not identifiable"]
 
-NARROW, WIDE = 0.1, 1.0
+MAX_IDENTIFIABLE_WIDTH, MAX_WEAK_WIDTH = 0.1, 1.0
 """Maximum width of a 95 % interval, as a fraction of a parameter's range, for identifiable and for
 weak parameters.
 """
@@ -100,10 +100,10 @@ def assess_identifiability(
             if evaluator.available_effects[name].place != ALL_PLACES
         ]
         direction_set = compute_directions(evaluator, fit, names)
-    return _Identified(evaluator, noise, fit, direction_set).numbers()
+    return _IdentifiabilityAssessment(evaluator, noise, fit, direction_set).numbers()
 
 
-class _Identified:
+class _IdentifiabilityAssessment:
     """Linearised runs at a fit, from which the identifiability of each number follows."""
 
     def __init__(
@@ -138,11 +138,13 @@ class _Identified:
 
     def _project_out_states(self, columns: Array) -> Array:
         """Project the initial states of each run out of columns (R, n, k); return (N, k)."""
-        b = self.states
+        state_jacobian = self.states
         precision = np.diag(compute_state_prior(self.evaluator) ** -2.0)
-        normal = np.matmul(b.transpose(0, 2, 1), b) + precision
-        inner = np.linalg.solve(normal, np.matmul(b.transpose(0, 2, 1), columns))
-        projected: Array = columns - np.matmul(b, inner)
+        normal = np.matmul(state_jacobian.transpose(0, 2, 1), state_jacobian) + precision
+        coefficients = np.linalg.solve(
+            normal, np.matmul(state_jacobian.transpose(0, 2, 1), columns)
+        )
+        projected: Array = columns - np.matmul(state_jacobian, coefficients)
         runs, samples, count = projected.shape
         return projected.reshape(runs * samples, count)
 
@@ -152,35 +154,44 @@ class _Identified:
         scale = np.sqrt(np.einsum("nk,nk->k", columns, columns))
         is_sensitive = scale > 0
         covariance = np.full((scale.size, scale.size), np.inf)
-        unit = columns[:, is_sensitive] / scale[is_sensitive]
-        inverse = np.linalg.pinv(unit.T @ unit, rcond=1e-13, hermitian=True)
-        values, vectors = np.linalg.eigh(unit.T @ unit)
+        unit_columns = columns[:, is_sensitive] / scale[is_sensitive]
+        correlation_inverse = np.linalg.pinv(
+            unit_columns.T @ unit_columns, rcond=1e-13, hermitian=True
+        )
+        values, vectors = np.linalg.eigh(unit_columns.T @ unit_columns)
         unidentified = vectors[:, values < 1e-12]
-        inverse = inverse + 1e12 * unidentified @ unidentified.T
-        places = np.ix_(is_sensitive, is_sensitive)
-        covariance[places] = inverse / np.outer(scale[is_sensitive], scale[is_sensitive])
+        correlation_inverse = correlation_inverse + 1e12 * unidentified @ unidentified.T
+        sensitive_block = np.ix_(is_sensitive, is_sensitive)
+        covariance[sensitive_block] = correlation_inverse / np.outer(
+            scale[is_sensitive], scale[is_sensitive]
+        )
         numbers = []
-        for i, place in enumerate(self.fit.free_indices.tolist()):
-            parameter = self.evaluator.parameters[place]
-            sd = np.sqrt(max(float(covariance[i, i]), 0.0))
+        for i, index in enumerate(self.fit.free_indices.tolist()):
+            parameter = self.evaluator.parameters[index]
+            standard_error = np.sqrt(max(float(covariance[i, i]), 0.0))
             confounders = []
-            for j, other_place in enumerate(self.fit.free_indices.tolist()):
+            for j, other_index in enumerate(self.fit.free_indices.tolist()):
                 if i != j and np.isfinite(covariance[i, j]) and is_sensitive[i] and is_sensitive[j]:
                     corr = covariance[i, j] / np.sqrt(covariance[i, i] * covariance[j, j])
                     confounders.append(
-                        (self.evaluator.parameters[other_place].name, float(abs(corr)))
+                        (self.evaluator.parameters[other_index].name, float(abs(corr)))
                     )
             low, high = parameter.bounds
             numbers.append(
                 _classify_parameter(
-                    parameter.name, True, parameter.unit, Z95 * sd, (low, high), confounders
+                    parameter.name,
+                    True,
+                    parameter.unit,
+                    Z95 * standard_error,
+                    (low, high),
+                    confounders,
                 )
             )
         # The fit has frozen parameters to which the runs are insensitive.
-        for place in sorted(
+        for index in sorted(
             set(self.evaluator.base_indices.tolist()) - set(self.fit.free_indices.tolist())
         ):
-            parameter = self.evaluator.parameters[place]
+            parameter = self.evaluator.parameters[index]
             numbers.append(
                 _classify_parameter(
                     parameter.name, True, parameter.unit, np.inf, parameter.bounds, ()
@@ -191,7 +202,7 @@ class _Identified:
     def _assess_causes(self) -> list[ParameterIdentifiability]:
         """Assess the coefficient of each possible cause, fitted with the free parameters.
 
-        Effects that act at all places are represented by their members at single places. `powers`
+        Effects that act at all places are represented by their members at single places. `norms`
         (k,) has the norm of each direction, in units of the noise, after the part that the
         parameters can reproduce is projected out.
         """
@@ -204,49 +215,55 @@ class _Identified:
         is_at_one_place = [
             evaluator.available_effects[p.effect].place != ALL_PLACES for p in self.found.candidates
         ]
-        values = self.found.responses[..., is_at_one_place]
-        scaled_responses = np.where(self.seen[..., None], values, 0.0)
+        responses = self.found.responses[..., is_at_one_place]
+        scaled_responses = np.where(self.seen[..., None], responses, 0.0)
         scaled_responses /= self.noise.sigma[:, None]
         runs, _, _, count = scaled_responses.shape
         columns = self._project_out_states(scaled_responses.reshape(runs, -1, count))
         if self.parameters.shape[1]:
             basis, _ = np.linalg.qr(self.parameters)
             columns -= basis @ (basis.T @ columns)
-        powers = np.sqrt(np.einsum("nk,nk->k", columns, columns))
+        norms = np.sqrt(np.einsum("nk,nk->k", columns, columns))
         # A coefficient with several shapes is represented by the most sensitive one.
-        best: dict[tuple[str, int], int] = {}
-        limits = {probe.effect for probe in probes if probe.is_single_size}
+        most_sensitive: dict[tuple[str, int], int] = {}
+        switching_effects = {probe.effect for probe in probes if probe.is_single_size}
         for k, probe in enumerate(probes):
-            if probe.effect in limits and not probe.is_single_size:
+            if probe.effect in switching_effects and not probe.is_single_size:
                 continue
             key = probe.effect, probe.coefficient_index
-            if key not in best or powers[k] > powers[best[key]]:
-                best[key] = k
-        selected_columns = list(best.values())
-        units = columns[:, selected_columns] / np.maximum(powers[selected_columns], 1e-300)
-        correlations = np.abs(units.T @ units)
+            if key not in most_sensitive or norms[k] > norms[most_sensitive[key]]:
+                most_sensitive[key] = k
+        selected_columns = list(most_sensitive.values())
+        unit_columns = columns[:, selected_columns] / np.maximum(norms[selected_columns], 1e-300)
+        correlations = np.abs(unit_columns.T @ unit_columns)
         numbers = []
-        for row, ((name, place), k) in zip(correlations, best.items(), strict=True):
-            parameter = evaluator.parameters[evaluator.get_coefficient_indices(name)[place]]
+        for row, ((name, coefficient_index), k) in zip(
+            correlations, most_sensitive.items(), strict=True
+        ):
+            parameter = evaluator.parameters[
+                evaluator.get_coefficient_indices(name)[coefficient_index]
+            ]
             probe = probes[k]
-            half_width = Z95 / powers[k] if powers[k] > 0 else np.inf
+            half_width = Z95 / norms[k] if norms[k] > 0 else np.inf
             confounders = [
                 (other_effect, float(correlation))
                 for (other_effect, _), j, correlation in zip(
-                    best, selected_columns, row, strict=True
+                    most_sensitive, selected_columns, row, strict=True
                 )
-                if other_effect != name and powers[j] > 0
+                if other_effect != name and norms[j] > 0
             ]
-            is_single_coefficient = sum(1 for effect, _ in best if effect == name) == 1
+            is_single_coefficient = sum(1 for effect, _ in most_sensitive if effect == name) == 1
             label = name if is_single_coefficient else f"{name} {parameter.name.rpartition('.')[2]}"
             if probe.is_single_size:
                 # The effect of a limit or backlash is not proportional to it; it shows if it is
                 # reached.
-                limit = _classify_parameter(
+                identifiability = _classify_parameter(
                     label, False, parameter.unit, 0.0, parameter.bounds, confounders
                 )
                 numbers.append(
-                    replace(limit, half=np.nan, word=_rate_switching_effect(float(powers[k])))
+                    replace(
+                        identifiability, half=np.nan, word=_rate_switching_effect(float(norms[k]))
+                    )
                 )
                 continue
             numbers.append(
@@ -261,7 +278,9 @@ def _rate_switching_effect(noises: float) -> IdentifiabilityLevel:
     """Return the level of a limit or backlash that changes the samples by this norm."""
     if noises < MIN_DETECTABLE_LIMIT_SIGMAS:
         return "not identifiable"
-    return "weak" if noises < MIN_DETECTABLE_LIMIT_SIGMAS / NARROW else "identifiable"
+    return (
+        "weak" if noises < MIN_DETECTABLE_LIMIT_SIGMAS / MAX_IDENTIFIABLE_WIDTH else "identifiable"
+    )
 
 
 def _classify_parameter(
@@ -286,8 +305,8 @@ def _classify_parameter(
     low, high = bounds
     share = 2.0 * half_width / max(high - low, 1e-300)
     level: IdentifiabilityLevel = "not identifiable"
-    if share <= WIDE:
-        level = "identifiable" if share <= NARROW else "weak"
+    if share <= MAX_WEAK_WIDTH:
+        level = "identifiable" if share <= MAX_IDENTIFIABLE_WIDTH else "weak"
     strong_confounders = sorted(
         (m for m in confounders if m[1] > CONFOUNDING_CORRELATION), key=lambda m: -m[1]
     )

@@ -30,7 +30,10 @@ MIN_CLOSED_SHARE = 0.5
 search. With a smaller share, another missing effect decides which step looks better.
 """
 STEP, INTEGRATOR = "numerics.step", "numerics.integrator"
-_WITH: dict[VerdictName, VerdictName] = {"adequate": "named", "unknown": "partial"}
+_VERDICT_WITH_COARSE_STEP: dict[VerdictName, VerdictName] = {
+    "adequate": "named",
+    "unknown": "partial",
+}
 """Verdict on the whole if the step was too coarse, by the verdict on the remaining causes."""
 
 
@@ -38,18 +41,18 @@ class Reusable(Generic[Item]):
     """Iterable that computes each item once, when it is first needed."""
 
     def __init__(self, items: Iterator[Item]) -> None:
-        self._rest, self._known = items, list[Item]()
+        self._remaining_items, self._computed_items = items, list[Item]()
 
     def __iter__(self) -> Iterator[Item]:
         """Yield all items from the first; none is computed a second time."""
         number = 0
         while True:
-            if number == len(self._known):
+            if number == len(self._computed_items):
                 try:
-                    self._known.append(next(self._rest))
+                    self._computed_items.append(next(self._remaining_items))
                 except StopIteration:
                     return
-            yield self._known[number]
+            yield self._computed_items[number]
             number += 1
 
 
@@ -99,7 +102,11 @@ def add_numerics_cause(verdict: Verdict, coarse: CoarseStepFinding) -> Verdict:
         coarse: Finding that the file's step is too coarse.
     """
     causes = (*_list_numerics_causes(coarse), *verdict.causes)
-    return replace(verdict, verdict=_WITH.get(verdict.verdict, verdict.verdict), causes=causes)
+    return replace(
+        verdict,
+        verdict=_VERDICT_WITH_COARSE_STEP.get(verdict.verdict, verdict.verdict),
+        causes=causes,
+    )
 
 
 def _list_numerics_causes(coarse: CoarseStepFinding) -> list[Cause]:

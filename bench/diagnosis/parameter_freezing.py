@@ -41,20 +41,24 @@ def freeze_unidentified_parameters(
     for iteration in range(MAX_REFITS):
         search = searching(base)
         unidentified = find_unidentified_parameters(search, search.base_model)
-        places = [
+        unidentified_indices = [
             i
             for i in evaluator.base_indices.tolist()
             if evaluator.parameters[i].name in unidentified
         ]
-        if not places:
+        if not unidentified_indices:
             break
         # `unidentified` is sorted by the width of the intervals.
-        places.sort(key=lambda i: unidentified.index(evaluator.parameters[i].name))
-        frozen_places = places if iteration == MAX_REFITS - 1 else places[: (len(places) + 1) // 2]
+        unidentified_indices.sort(key=lambda i: unidentified.index(evaluator.parameters[i].name))
+        frozen_indices = (
+            unidentified_indices
+            if iteration == MAX_REFITS - 1
+            else unidentified_indices[: (len(unidentified_indices) + 1) // 2]
+        )
         theta = base.fit.theta.copy()
-        theta[frozen_places] = evaluator.get_nominal_theta()[frozen_places]
+        theta[frozen_indices] = evaluator.get_nominal_theta()[frozen_indices]
         base = replace(
-            base, unidentified_parameters=base.unidentified_parameters | frozenset(frozen_places)
+            base, unidentified_parameters=base.unidentified_parameters | frozenset(frozen_indices)
         )
         start = replace(base.fit.make_start(), theta=theta)
         base = replace(

@@ -66,7 +66,7 @@ class DiagnosisReportDataBuilder:
         after = self.finding.model.fit.simulated
         # The noise is that of the finding, because a good model estimates it better.
         sigma = self.assessor.estimate_noise_sigma(self.finding)
-        held_out, held_out_places = self._summarise_held_out(sigma)
+        held_out, held_out_locations = self._summarise_held_out(sigma)
         return DiagnosisReportData(
             # A recording without a title is identified by its file name.
             recording.title or recording.path.stem,
@@ -77,7 +77,7 @@ class DiagnosisReportDataBuilder:
             held_out,
             (
                 *residual_analysis.compute_gap_locations(evaluator, before, after, sigma),
-                *held_out_places,
+                *held_out_locations,
             ),
             tuple(residual_analysis.compute_residual_profiles(evaluator, before, after, sigma)),
             tuple(self._list_parameter_changes()),
@@ -187,11 +187,11 @@ class DiagnosisReportDataBuilder:
             return None, []
         before = held_out_fits[()].simulated
         after = held_out_fits[names].simulated
-        places = residual_analysis.compute_gap_locations(
+        locations = residual_analysis.compute_gap_locations(
             evaluator, before, after, sigma, f" ({self._how_validated})"
         )
         # Channels and phases are reported for the fitted runs only; held-out gaps by run.
-        runs = [place for place in places if place.kind == "run"]
+        runs = [location for location in locations if location.kind == "run"]
         return residual_analysis.build_data_split(evaluator, before, after), runs
 
     def _list_channels(self, sigma: Array) -> tuple[ChannelInfo, ...]:
@@ -294,9 +294,9 @@ class DiagnosisReportDataBuilder:
         for cause in finding.causes:
             if cause.alternatives:
                 names = [cause.effect, *cause.alternatives]
-                has_places = any("@" in name for name in names)
+                names_joints = any("@" in name for name in names)
                 effects_text = (
-                    format_effect_set(names, "and") if has_places else _join_effect_names(names)
+                    format_effect_set(names, "and") if names_joints else _join_effect_names(names)
                 )
                 yield (
                     f"{effects_text} have the same influence on these runs, "

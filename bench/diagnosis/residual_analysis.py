@@ -219,28 +219,30 @@ def compute_residual_profiles(
     if get_robot(evaluator) is not None:
         name = _find_largest_residual_channel(evaluator, before, sigma)
         variables = _iterate_joint_variables(evaluator, after, name)
-    c = evaluator.channels.index(name)
+    channel_index = evaluator.channels.index(name)
     profiles = []
     for variable, unit, values in variables:
-        is_finite = np.isfinite(evaluator.observed[:, :, c]) & np.isfinite(values)
+        is_finite = np.isfinite(evaluator.observed[:, :, channel_index]) & np.isfinite(values)
         variable_values = values[is_finite]
         edges = _compute_bin_edges(variable_values)
         if edges is None:
             continue
         # Values outside the edges count in the outermost bins.
-        places = np.searchsorted(edges, variable_values, side="right") - 1
-        bins = np.clip(places, 0, PROFILE_BIN_COUNT - 1)
+        bin_indices = np.searchsorted(edges, variable_values, side="right") - 1
+        bins = np.clip(bin_indices, 0, PROFILE_BIN_COUNT - 1)
         counts = np.bincount(bins, minlength=PROFILE_BIN_COUNT).astype(np.float64)
         # The mean of an empty bin is NaN and is not drawn.
         with np.errstate(invalid="ignore", divide="ignore"):
             means = []
             for simulated in (before, after):
-                residual = (evaluator.observed - simulated)[:, :, c][is_finite]
+                residual = (evaluator.observed - simulated)[:, :, channel_index][is_finite]
                 means.append(np.bincount(bins, residual, PROFILE_BIN_COUNT) / counts)
-            error = sigma[c] / np.sqrt(counts)
-        error[counts == 0] = np.nan
+            standard_error = sigma[channel_index] / np.sqrt(counts)
+        standard_error[counts == 0] = np.nan
         centres = (edges[1:] + edges[:-1]) / 2.0
-        profiles.append(ResidualProfile(name, variable, unit, centres, means[0], means[1], error))
+        profiles.append(
+            ResidualProfile(name, variable, unit, centres, means[0], means[1], standard_error)
+        )
     return profiles
 
 

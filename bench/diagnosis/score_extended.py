@@ -49,21 +49,28 @@ def score_model(
     Raises:
         InputError: A file cannot be read, or the recording is of another system.
     """
-    memory = recording if isinstance(recording, Recording) else None
+    recording_in_memory = recording if isinstance(recording, Recording) else None
     path = recording.path if isinstance(recording, Recording) else Path(recording)
     if model.suffix not in MODEL_FILES:
         _check_plugin(model)
     # The description names the system of the recording before the table is read.
-    of_robot = memory.model if memory is not None else read_model_reference(path)
+    model_reference = (
+        recording_in_memory.model if recording_in_memory is not None else read_model_reference(path)
+    )
     if model.suffix in MODEL_FILES:
-        extended, kind = _load_robot(model, of_robot)
+        extended, kind = _load_robot(model, model_reference)
     else:
         extended, kind, _ = open_extended(model, simulators.get)
         # A recording of another robot is recognised by its channels.
-        if of_robot is None or extended.robot is None:
-            _check_system(path, _get_system_name(memory or path, of_robot), extended, model)
+        if model_reference is None or extended.robot is None:
+            _check_system(
+                path,
+                _get_system_name(recording_in_memory or path, model_reference),
+                extended,
+                model,
+            )
     # All runs count by default, because only initial states are fitted here.
-    data = memory or read_recording(path, kind, whole=True)
+    data = recording_in_memory or read_recording(path, kind, whole=True)
     # Constants of the recording take precedence over those that the model was fitted with.
     data = replace(data, constants={**extended.constants, **data.constants})
     data, _ = leave_out_settling(data, kind)
@@ -133,10 +140,12 @@ def _load_robot(
     return ExtendedSimulator(kind.name, kind.name, None, "", {}, {}, {}, (), kind), kind
 
 
-def _get_system_name(recording: Path | Recording, of_robot: ModelFileReference | None) -> str:
+def _get_system_name(
+    recording: Path | Recording, model_reference: ModelFileReference | None
+) -> str:
     """Return the system of a recording: the name of a robot's model file, or of a system."""
-    if of_robot is not None:
-        return of_robot.path.name
+    if model_reference is not None:
+        return model_reference.path.name
     return recording.system if isinstance(recording, Recording) else read_system_name(recording)
 
 
@@ -169,23 +178,23 @@ def build_theta(evaluator: RunEvaluator, extended: ExtendedSimulator) -> Array:
     # Missing parameters are nominal, and missing coefficients are off.
     theta = evaluator.get_nominal_theta()
     base_parameters = evaluator.parameters[: evaluator.system_parameter_count]
-    for place, parameter in enumerate(base_parameters):
+    for index, parameter in enumerate(base_parameters):
         if parameter.name in extended.parameters:
             number = extended.parameters[parameter.name]
-            theta[place] = number.value
+            theta[index] = number.value
     for name, numbers in extended.effects.items():
         coefficients = evaluator.available_effects[name].on(evaluator.simulator.system)
-        places = evaluator.get_coefficient_indices(name)
-        for place, coefficient in zip(places, coefficients, strict=True):
+        indices = evaluator.get_coefficient_indices(name)
+        for index, coefficient in zip(indices, coefficients, strict=True):
             if coefficient.name in numbers:
-                theta[place] = numbers[coefficient.name].value
+                theta[index] = numbers[coefficient.name].value
     return theta
 
 
 def _simulate_runs(evaluator: RunEvaluator, extended: ExtendedSimulator, sigma: Array) -> Array:
     """Simulate the runs (R, T, C) with the model's numbers, from fitted initial states."""
-    white = np.zeros(len(sigma))
-    runs = HeldOutRuns(evaluator, NoiseModel(sigma, white))
+    no_autocorrelation = np.zeros(len(sigma))
+    runs = HeldOutRuns(evaluator, NoiseModel(sigma, no_autocorrelation))
     (prediction,) = runs.fit_initial_states([build_theta(evaluator, extended)])
     return prediction.simulated
 

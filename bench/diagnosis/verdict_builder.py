@@ -73,7 +73,7 @@ class VerdictBuilder:
         return None if self.validation is None else self.validation.evaluator
 
     @property
-    def _by_stretches(self) -> bool:
+    def _resamples_segments(self) -> bool:
         """Return whether gains are resampled by segments, because cross-validated runs are few."""
         return self.validation is not None and self.validation.is_cross_validation
 
@@ -143,23 +143,23 @@ class VerdictBuilder:
         """
         intervals = compute_intervals(search, model)
         ranges = self._get_bounds(model)
-        result = {}
-        for place, parameter in enumerate(self.fitting_evaluator.parameters):
+        estimates = {}
+        for index, parameter in enumerate(self.fitting_evaluator.parameters):
             # Insensitive parameters stay nominal; effects that are not in the model are zero.
-            unfitted_estimate = float(model.fit.theta[place]), np.nan, np.nan
-            value, low, high = intervals.get(place, unfitted_estimate)
+            unfitted_estimate = float(model.fit.theta[index]), np.nan, np.nan
+            value, low, high = intervals.get(index, unfitted_estimate)
             if is_instant(parameter):
                 # The time of an event is only known to one sample spacing.
                 low, high = (
                     low - self.fitting_evaluator.sample_interval / 2,
                     high + self.fitting_evaluator.sample_interval / 2,
                 )
-            at_bound = bound_of(value, *ranges[place]) if place in intervals else None
+            at_bound = bound_of(value, *ranges[index]) if index in intervals else None
             # JSON has no number for an unknown bound; at a bound the curvature gives no interval.
             is_bounded = np.isfinite(low) and np.isfinite(high) and at_bound is None
-            ends = (low, high) if is_bounded else (None, None)
+            interval = (low, high) if is_bounded else (None, None)
             plausible_range = (
-                self._get_plausible_range(place) if place in intervals else parameter.bounds
+                self._get_plausible_range(index) if index in intervals else parameter.bounds
             )
             exceeded_range = (
                 plausible_range
@@ -167,19 +167,19 @@ class VerdictBuilder:
                 else None
             )
             unit = parameter.unit
-            low_end, high_end = ends
-            result[place] = FittedValue(
+            low_end, high_end = interval
+            estimates[index] = FittedValue(
                 value, unit, low_end, high_end, at_bound, usual_range=exceeded_range
             )
-        return self._add_totals(model, result)
+        return self._add_totals(model, estimates)
 
-    def _get_plausible_range(self, place: int) -> tuple[float, float]:
+    def _get_plausible_range(self, index: int) -> tuple[float, float]:
         """Return the plausible range, narrower than the bounds for a robot's free numbers."""
-        parameter = self.fitting_evaluator.parameters[place]
-        free = (
-            self.fitting_evaluator.kind.has_model and place in self.fitting_evaluator.base_indices
+        parameter = self.fitting_evaluator.parameters[index]
+        is_free = (
+            self.fitting_evaluator.kind.has_model and index in self.fitting_evaluator.base_indices
         )
-        return parameter.training or parameter.bounds if free else parameter.bounds
+        return parameter.training or parameter.bounds if is_free else parameter.bounds
 
     def _add_totals(
         self, model: FittedModel, numbers: dict[int, FittedValue]
@@ -197,16 +197,16 @@ class VerdictBuilder:
 
         placed_effects = list(self._iterate_fitted_effects(model))
         fitted_effects = [
-            (effect, [numbers[i].value for i in places]) for effect, places in placed_effects
+            (effect, [numbers[i].value for i in indices]) for effect, indices in placed_effects
         ]
-        for (effect, places), effect_totals in zip(
+        for (effect, indices), effect_totals in zip(
             placed_effects, compute_file_totals(kind.robot, fitted_effects), strict=True
         ):
             # The model file keeps its gravity if the bodies are gravity-compensated.
-            is_compensated = is_gravity_compensated(effect.name, {"": numbers[places[0]]})
-            if is_compensated or not any(numbers[i].value for i in places):
+            is_compensated = is_gravity_compensated(effect.name, {"": numbers[indices[0]]})
+            if is_compensated or not any(numbers[i].value for i in indices):
                 continue
-            for i, number_total in zip(places, effect_totals, strict=True):
+            for i, number_total in zip(indices, effect_totals, strict=True):
                 if number_total is not None:
                     unit = number_total.unit if number_total.unit != numbers[i].unit else ""
                     file_value, total = number_total.stated, number_total.total
@@ -224,19 +224,19 @@ class VerdictBuilder:
         """
         evaluator, kind = self.fitting_evaluator, cast(Any, self.fitting_evaluator.kind)
         # The free numbers of the user come first, in the order of their effects.
-        places = iter(range(evaluator.system_parameter_count))
+        indices = iter(range(evaluator.system_parameter_count))
         for effect in kind.system.freed_effects:
-            yield effect, [next(places) for _ in effect.coefficients]
+            yield effect, [next(indices) for _ in effect.coefficients]
         for name in model.effects:
             effect = evaluator.available_effects[name]
             members = members_of(effect)
-            places = iter(evaluator.get_coefficient_indices(name))
+            indices = iter(evaluator.get_coefficient_indices(name))
             # A family with one coefficient for all places changes no number of the file.
             if sum(len(member.coefficients) for member in members) == len(
                 evaluator.get_coefficient_indices(name)
             ):
                 for member in members:
-                    yield type(member), [next(places) for _ in member.coefficients]
+                    yield type(member), [next(indices) for _ in member.coefficients]
 
     def _get_bounds(self, model: FittedModel) -> dict[int, tuple[float, float]]:
         """Return the bounds of each fitted number, by index in the parameter vector."""
@@ -255,13 +255,17 @@ class VerdictBuilder:
             return replace(finding, verdict="adequate")
         numbers = self.collect_parameter_estimates(search, finding.model)
         unambiguous_causes = [cause for cause in finding.causes if not cause.alternatives]
-        places = [
+        coefficient_indices = [
             i
             for cause in unambiguous_causes
             for i in self.fitting_evaluator.get_coefficient_indices(cause.effect)
         ]
-        results = all(numbers[i].is_result for i in places) and not self._is_at_bound(numbers)
-        return replace(finding, verdict=verdict_rules.verdict_of_numbers(finding.verdict, results))
+        are_results = all(
+            numbers[i].is_result for i in coefficient_indices
+        ) and not self._is_at_bound(numbers)
+        return replace(
+            finding, verdict=verdict_rules.verdict_of_numbers(finding.verdict, are_results)
+        )
 
     def _is_refuted(self, search: EffectSearch, finding: DiagnosisResult) -> bool:
         """Return whether fitted models refute a missing effect that only the linear score suggests.
@@ -329,30 +333,37 @@ class VerdictBuilder:
     def _build_cause(self, evidence: CauseEvidence, numbers: dict[int, FittedValue]) -> Cause:
         """Build a cause of the verdict from an effect found by the search.
 
-        `numbers` has the fitted values by their index in the parameter vector.
+        Its description names the soft form of dry friction (MuJoCo's `frictionloss`) with the
+        solver parameters if the friction has it. `numbers` has the fitted values by their index in
+        the parameter vector.
         """
         evaluator = self.fitting_evaluator
         # The coefficients of an effect are contiguous in the parameter vector, in the effect's
         # order.
         effect = evaluator.available_effects[evidence.effect]
         coefficients = effect.on(evaluator.simulator.system)
-        places = range(
+        indices = range(
             *evaluator.coefficient_slices[evidence.effect].indices(len(evaluator.parameters))
         )
         # A coefficient that cannot be observed is fixed at zero and is not a result.
-        by_name = {
+        fitted_values = {
             c.name: numbers[i]
-            for c, i in zip(coefficients, places, strict=True)
+            for c, i in zip(coefficients, indices, strict=True)
             if c.least is None or c.least != c.most
         }
-        form = get_friction_form(evaluator, evidence.effect)
+        friction_form = get_friction_form(evaluator, evidence.effect)
         description = effect.says
-        if form is not None:
+        if friction_form is not None:
             description = add_solver_parameters(evaluator, evidence.effect, description)
-        if evaluator.kind.has_model and is_gravity_compensated(evidence.effect, by_name):
+        if evaluator.kind.has_model and is_gravity_compensated(evidence.effect, fitted_values):
             description = GRAVITY_COMPENSATED
         return Cause(
-            evidence.effect, evidence.alternatives, description, by_name, evidence.p_value, form
+            evidence.effect,
+            evidence.alternatives,
+            description,
+            fitted_values,
+            evidence.p_value,
+            friction_form,
         )
 
     def _list_counted_channels(self) -> list[int]:
@@ -397,7 +408,7 @@ class VerdictBuilder:
             counted_channels,
             self._compute_noise_floor(finding),
             rng,
-            self._by_stretches,
+            self._resamples_segments,
         )
         result = compute_held_out_gain(runs, before, after, *gain_arguments)
         return _build_held_out_result(
@@ -416,7 +427,7 @@ class VerdictBuilder:
         if scores is None:
             return ()
         base = search.base_model.likelihood.value
-        rows = []
+        candidates = []
         for i, effect in enumerate(scores.effects):
             score = float(scores.score[i])
             # A fit may gain more than the linear score predicts, in particular far from the data.
@@ -428,10 +439,12 @@ class VerdictBuilder:
                 np.clip(estimate_tail_p_value(scores.null_scores, beyond_chance), 0.0, 1.0)
             )
             share = self._get_closed_share(finding, (effect,))
-            slot = search.evaluator.coefficient_slices[effect]
-            score -= search.parameter_penalty * (slot.stop - slot.start - 1)
-            rows.append(Candidate(effect, max(score, 0.0), p_value, share))
-        return tuple(sorted(rows, key=lambda row: -row.score))
+            coefficient_slice = search.evaluator.coefficient_slices[effect]
+            score -= search.parameter_penalty * (
+                coefficient_slice.stop - coefficient_slice.start - 1
+            )
+            candidates.append(Candidate(effect, max(score, 0.0), p_value, share))
+        return tuple(sorted(candidates, key=lambda row: -row.score))
 
     def _get_closed_share(self, finding: DiagnosisResult, names: EffectNames) -> float | None:
         """Return the share of the held-out gap that a model closes; None if it is not measured."""
@@ -474,7 +487,7 @@ class VerdictBuilder:
                 self._list_counted_channels(),
                 self._compute_noise_floor(finding),
                 rng,
-                self._by_stretches,
+                self._resamples_segments,
             )
             result = compute_held_out_gain(runs, before, simulated.simulated, *gain_arguments)
             if np.isfinite(result.low) and np.isfinite(result.high):

@@ -190,28 +190,49 @@ class ConventionComparison:
                 break
             differences.append(best)
             corrected = best.hypothesis.applied(corrected)
-        if not differences:
-            return []
         hypotheses = [difference.hypothesis for difference in differences]
-        parts = self._select_parts(corrected)
-        explained = _get_log_likelihood(self._filter_runs(parts)) + _compute_log_scales(
-            hypotheses, parts
-        )
-        causes = self._compute_log_likelihood_of_causes(corrected)
-        if explained < causes + CAUSES_MARGIN:
+        if not differences or not self._is_confirmed(described, corrected, hypotheses):
             return []
+        return differences
+
+    def _is_confirmed(
+        self,
+        described: Recording,
+        corrected: Recording,
+        hypotheses: Sequence[ConventionHypothesis],
+    ) -> bool:
+        """Return whether the conventions explain the log better than any set of causes.
+
+        They must also remove most of the missing force, and increase the log-likelihood of all
+        samples.
+
+        Args:
+            described: Recording as it is described.
+            corrected: Recording with its conventions corrected.
+            hypotheses: Differences of the conventions that were corrected.
+        """
+        parts = self._select_parts(corrected)
+        with_conventions = _get_log_likelihood(
+            self._filter_runs(parts)
+        ) + _compute_log_scale_correction(hypotheses, parts)
+        with_causes = self._compute_log_likelihood_of_causes(corrected)
+        if with_conventions < with_causes + CAUSES_MARGIN:
+            return False
         # If the filter diverges on the log as described, causes cannot be compared: only a
         # correction that leaves nothing unexplained is certain.
-        if np.isinf(causes) and self._compute_largest_missing_force(corrected) > MIN_MISSING_FORCE:
-            return []
+        if (
+            np.isinf(with_causes)
+            and self._compute_largest_missing_force(corrected) > MIN_MISSING_FORCE
+        ):
+            return False
         if not self._removes_missing_force(described, corrected):
-            return []
+            return False
         before, after = (
-            _get_log_likelihood(self._filter_runs(difference))
-            for difference in _cut_to_common_samples(described, corrected)
+            _get_log_likelihood(self._filter_runs(recording))
+            for recording in _cut_to_common_samples(described, corrected)
         )
-        after += _compute_log_scales(hypotheses, corrected)
-        return differences if after > before + LOG_LIKELIHOOD_MARGIN else []
+        after += _compute_log_scale_correction(hypotheses, corrected)
+        return after > before + LOG_LIKELIHOOD_MARGIN
 
     def _removes_missing_force(self, described: Recording, corrected: Recording) -> bool:
         """Return whether the corrections leave only a small part of the largest missing force."""
@@ -230,17 +251,18 @@ class ConventionComparison:
             else np.inf
         )
 
-    def _list_suspect_joints(self, followed: FollowedRuns) -> list[JointSignals]:
+    def _list_suspect_joints(self, filtered_runs: FollowedRuns) -> list[JointSignals]:
         """Return the joints at which the filter needs a large missing force.
 
-        A wrong sign, unit or joint order shows as such a force. If the filter diverges, all joints
-        are suspects.
+        The missing force is the standard deviation of the force noise (process noise) with which
+        the filter follows the readings. A wrong sign, unit or joint order shows as such a force. If
+        the filter diverges, all joints are suspects.
         """
-        if not followed.has_expected_innovations:
+        if not filtered_runs.has_expected_innovations:
             return self._generator.joints
         coordinates = self.subject.kind.system.coordinates
-        shares = (followed.force / followed.typical)[: len(coordinates)]
-        is_missing = followed.missing_forces.any() or shares.max() > ABSURD_MISSING_FORCE
+        shares = (filtered_runs.force / filtered_runs.typical)[: len(coordinates)]
+        is_missing = filtered_runs.missing_forces.any() or shares.max() > ABSURD_MISSING_FORCE
         if not is_missing or shares.max() <= MIN_MISSING_FORCE:
             return []
         limit = min(SUSPECT_SHARE * max(1.0, float(shares.max())), MAX_SUSPECT_LIMIT)
@@ -260,20 +282,22 @@ class ConventionComparison:
         described = ConventionHypothesis("")
         limit = self._compute_log_likelihood(described, recording) + LOG_LIKELIHOOD_MARGIN
         # Most hypotheses already fail on the run that the log as described explains worst.
-        by_run = [
+        log_likelihood_by_run = [
             self._compute_log_likelihood(described, recording, run)
             for run in range(len(self._part_slices))
         ]
-        worst_run = int(np.argmin(by_run))
-        min_log_likelihood = by_run[worst_run] + MIN_WORST_RUN_SHARE * LOG_LIKELIHOOD_MARGIN
+        worst_run = int(np.argmin(log_likelihood_by_run))
+        min_log_likelihood = (
+            log_likelihood_by_run[worst_run] + MIN_WORST_RUN_SHARE * LOG_LIKELIHOOD_MARGIN
+        )
         force_error = self._compute_log_force_error(described, recording, worst_run)
-        scored: dict[str, tuple[float, ConventionHypothesis]] = {}
-        evaluated: list[object] = []
+        best_by_description: dict[str, tuple[float, ConventionHypothesis]] = {}
+        evaluated_changes: list[object] = []
         for hypothesis in self._generator.generate(recording, suspects):
             key = dict(hypothesis.changes), hypothesis.late
-            if key in evaluated:
+            if key in evaluated_changes:
                 continue
-            evaluated.append(key)
+            evaluated_changes.append(key)
             growth = self._compute_log_force_error(hypothesis, recording, worst_run) - force_error
             if growth > MAX_FORCE_ERROR_GROWTH:
                 continue
@@ -284,21 +308,21 @@ class ConventionComparison:
                 continue
             score = self._compute_log_likelihood(hypothesis, recording)
             # For several offsets of one signal, the best one is refined.
-            known = scored.get(hypothesis.description, (limit, hypothesis))
-            if score > known[0]:
-                scored[hypothesis.description] = score, hypothesis
-        ahead = sorted(scored.values(), key=lambda pair: -pair[0])
-        refined = [self._refine_offset(*pair, recording) for pair in ahead[:MAX_REFINED]]
-        clear = [
+            best_known = best_by_description.get(hypothesis.description, (limit, hypothesis))
+            if score > best_known[0]:
+                best_by_description[hypothesis.description] = score, hypothesis
+        ranked = sorted(best_by_description.values(), key=lambda pair: -pair[0])
+        refined = [self._refine_offset(*pair, recording) for pair in ranked[:MAX_REFINED]]
+        accepted = [
             (score, one)
-            for score, one in (*refined, *ahead[MAX_REFINED:])
+            for score, one in (*refined, *ranked[MAX_REFINED:])
             if score > limit and self._uses_inputs(score, one, recording)
         ]
-        if not clear:
+        if not accepted:
             return None
-        best = max(score for score, _ in clear)
-        equal = [one for score, one in clear if score > best - EQUAL_LOG_LIKELIHOOD]
-        first, *others = sorted(equal, key=lambda one: one.size)
+        best = max(score for score, _ in accepted)
+        equally_likely = [one for score, one in accepted if score > best - EQUAL_LOG_LIKELIHOOD]
+        first, *others = sorted(equally_likely, key=lambda one: one.size)
         gain = best - limit + LOG_LIKELIHOOD_MARGIN
         return ConventionDifference(first, gain, tuple(others[: MAX_NAMED - 1]))
 
@@ -335,9 +359,11 @@ class ConventionComparison:
         scales_inputs = all(name in inputs and abs(c.scale) != 1.0 for name, c in changes.items())
         if not changes or not scales_inputs:
             return True
-        off = {name: replace(c, scale=OFF_FACTOR * c.scale) for name, c in changes.items()}
-        without = self._compute_log_likelihood(replace(hypothesis, changes=off), recording)
-        return score > without + LOG_LIKELIHOOD_MARGIN
+        switched_off = {name: replace(c, scale=OFF_FACTOR * c.scale) for name, c in changes.items()}
+        score_without_inputs = self._compute_log_likelihood(
+            replace(hypothesis, changes=switched_off), recording
+        )
+        return score > score_without_inputs + LOG_LIKELIHOOD_MARGIN
 
     def _refine_offset(
         self, score: float, hypothesis: ConventionHypothesis, recording: Recording
@@ -351,11 +377,11 @@ class ConventionComparison:
             return score, hypothesis
         step = FIRST_OFFSET_STEP
         while step > OFFSET_ACCURACY:
-            for signed in (step, -step):
-                moved = hypothesis.add_offset_step(signed)
-                moved_score = self._compute_log_likelihood(moved, recording)
-                if moved_score > score + MIN_REFINEMENT_GAIN:
-                    score, hypothesis = moved_score, moved
+            for signed_step in (step, -step):
+                shifted = hypothesis.add_offset_step(signed_step)
+                shifted_score = self._compute_log_likelihood(shifted, recording)
+                if shifted_score > score + MIN_REFINEMENT_GAIN:
+                    score, hypothesis = shifted_score, shifted
                     break
             else:
                 step /= 2.0
@@ -365,7 +391,10 @@ class ConventionComparison:
     def _compute_log_likelihood(
         self, hypothesis: ConventionHypothesis, recording: Recording, run: int | None = None
     ) -> float:
-        """Return the log-likelihood (1) on the short parts of a recording.
+        """Return the log-likelihood of the recorded values under a hypothesis, on the short parts.
+
+        It is that of the filter's innovations for the converted signals, corrected for the change
+        of units: eq. (1) of the module docstring.
 
         Args:
             hypothesis: Difference between the conventions.
@@ -375,7 +404,7 @@ class ConventionComparison:
         self.evaluations += 1
         parts = self._select_parts(hypothesis.applied(recording), run)
         followed = self._filter_runs(parts, max_linearisations=1)
-        return _get_log_likelihood(followed) + _compute_log_scales([hypothesis], parts)
+        return _get_log_likelihood(followed) + _compute_log_scale_correction([hypothesis], parts)
 
     def _filter_runs(
         self, recording: Recording, max_linearisations: int = MAX_LINEARISATIONS
@@ -408,30 +437,34 @@ class ConventionComparison:
         evaluator = RunEvaluator(
             subject.kind, parts, parts.training(), subject.engine, list_hat_effects(subject.kind)
         )
-        followed = FollowedRuns.follow(
+        filtered = FollowedRuns.follow(
             evaluator, evaluator.get_nominal_theta(), _estimate_white_noise(evaluator, parts), None
         )
-        if not followed.has_expected_innovations:
+        if not filtered.has_expected_innovations:
             evaluator.close()
             return -np.inf
-        left_out = MANY_SHAPES | CONVENTION_EFFECTS
-        names = [name for name in evaluator.library if name.partition("@")[0] not in left_out]
+        excluded_effects = MANY_SHAPES | CONVENTION_EFFECTS
+        names = [
+            name for name in evaluator.library if name.partition("@")[0] not in excluded_effects
+        ]
         base = _make_unfitted_start(evaluator)
         probes = [probe for name in names for probe in iterate_first_probes(evaluator, base, name)]
-        selected = identify(followed, followed.columns(probes))
-        samples = int(followed.runs.recorded.sum())
-        best, penalty = followed.log_likelihood, 0.0
+        selected = identify(filtered, filtered.columns(probes))
+        samples = int(filtered.runs.recorded.sum())
+        best, penalty = filtered.log_likelihood, 0.0
         for count, group in enumerate(selected.groups, start=1):
             penalty += 0.5 * len(group.column_indices) * math.log(samples) + math.log(len(names))
             groups = selected.groups[:count]
             theta = evaluator.get_nominal_theta()
-            for one, numbers in zip(groups, selected.regression.solve(groups)[1], strict=True):
-                theta[evaluator.coefficient_slices[one.effect]] = group_coefficients(
-                    evaluator, probes, one, numbers
+            for effect_group, coefficients in zip(
+                groups, selected.regression.solve(groups)[1], strict=True
+            ):
+                theta[evaluator.coefficient_slices[effect_group.effect]] = group_coefficients(
+                    evaluator, probes, effect_group, coefficients
                 )
-            fitted = _fit_coefficients(followed.with_parameters(theta), groups)
+            fitted = _fit_coefficients(filtered.with_parameters(theta), groups)
             best = max(best, fitted.log_likelihood - penalty)
-        best = max(best, _compute_log_likelihood_of_soft_friction(followed))
+        best = max(best, _compute_log_likelihood_of_soft_friction(filtered))
         evaluator.close()
         if self._compute_largest_missing_force(corrected) < LARGE_MISSING_FORCE:
             return best
@@ -463,16 +496,16 @@ class ConventionComparison:
         return [_select_liveliest_part(run) for run in runs]
 
 
-def _cut_to_common_samples(one: Recording, other: Recording) -> tuple[Recording, Recording]:
+def _cut_to_common_samples(first: Recording, second: Recording) -> tuple[Recording, Recording]:
     """Cut the runs of two versions of a recording to the samples that both have."""
-    pairs = list(zip(one.runs, other.runs, strict=True))
+    pairs = list(zip(first.runs, second.runs, strict=True))
     counts = [min(a.times.size, b.times.size) for a, b in pairs]
 
     def cut(recording: Recording) -> Recording:
         runs = zip(recording.runs, counts, strict=True)
         return replace(recording, runs=tuple(run.part(slice(0, count)) for run, count in runs))
 
-    return cut(one), cut(other)
+    return cut(first), cut(second)
 
 
 def _get_log_likelihood(followed: FollowedRuns) -> float:
@@ -481,8 +514,14 @@ def _get_log_likelihood(followed: FollowedRuns) -> float:
     return likelihood if np.isfinite(likelihood) and followed.has_expected_innovations else -np.inf
 
 
-def _compute_log_scales(hypotheses: Sequence[ConventionHypothesis], recording: Recording) -> float:
-    """Return the last term of (1) for the training runs of a recording."""
+def _compute_log_scale_correction(
+    hypotheses: Sequence[ConventionHypothesis], recording: Recording
+) -> float:
+    """Return the sum of log |factor| over all converted samples of the training runs.
+
+    Added to the log-likelihood of converted signals, it gives that of the recorded values;
+    otherwise a small factor would seem to fit better.
+    """
     result = 0.0
     for name, change in (item for one in hypotheses for item in one.changes.items()):
         samples = [run.channels[name] for run in recording.training() if name in run.channels]

@@ -22,7 +22,9 @@ from sims.recording.angle_unwrapping import unwrapped
 from sims.recording.log_formats.lerobot_calibration import range_scale
 from sims.recording.recording import Recording, Run
 
-ANGLES = np.array([-120.0, -70.0, -35.0, -15.0, 15.0, 35.0, 70.0, 120.0, 180.0]) * math.pi / 180.0
+TRIED_ZERO_OFFSETS = (
+    np.array([-120.0, -70.0, -35.0, -15.0, 15.0, 35.0, 70.0, 120.0, 180.0]) * math.pi / 180.0
+)
 """Offsets of a zero position that are tried, in rad; the best one is refined."""
 MIN_OFFSET = 0.1
 """Minimum offset of a zero position that counts as a convention, in rad. Smaller offsets are errors
@@ -113,21 +115,21 @@ class ConventionHypothesis:
         signals = {**run.inputs, **run.channels}
         earlier = {name: values[1] for name, values in run.before.items()}
 
-        def changed(values: Mapping[str, Array], source: Mapping[str, Array]) -> dict[str, Array]:
-            """Return signals by name; a signal with a change is computed from `source`."""
+        def convert(values: Mapping[str, Array], source: Mapping[str, Array]) -> dict[str, Array]:
+            """Return signals by name; a signal that differs is computed from `source`."""
             return {
-                name: self.changes[name].applied(source) if name in self.changes else old
-                for name, old in values.items()
+                name: self.changes[name].applied(source) if name in self.changes else unchanged
+                for name, unchanged in values.items()
             }
 
         before = {
             name: np.stack([run.before[name][0], values])
-            for name, values in changed(earlier, earlier).items()
+            for name, values in convert(earlier, earlier).items()
         }
         result = replace(
             run,
-            channels=changed(run.channels, signals),
-            inputs=changed(run.inputs, signals),
+            channels=convert(run.channels, signals),
+            inputs=convert(run.inputs, signals),
             before=before,
             initial={} if self.changes else run.initial,
         )
@@ -142,24 +144,24 @@ class ConventionHypothesis:
         return replace(self, changes=changes)
 
 
-def _advance_inputs(run: Run, late: float) -> Run:
+def _advance_inputs(run: Run, delay: float) -> Run:
     """Return a run with its inputs earlier by a delay in s; without its end, whose inputs are lost.
 
     Samples are moved instead of the offset of the time stamps, because a part of a run contains no
     inputs after its end.
     """
-    stamps = run.times + late
-    count = int(np.searchsorted(stamps, run.times[-1] + 0.5 * late, side="right"))
+    stamps = run.times + delay
+    count = int(np.searchsorted(stamps, run.times[-1] + 0.5 * delay, side="right"))
     count = min(max(count, 2), run.times.size)
     inputs = {}
     for name, values in run.inputs.items():
         if name in run.linear:
-            moved = np.interp(stamps, run.times, values)
+            advanced = np.interp(stamps, run.times, values)
         else:
             # The tolerance is for stamps that differ by rounding.
-            places = np.searchsorted(run.times, stamps + 1e-6 * late, side="right") - 1
-            moved = values[places]
-        inputs[name] = moved
+            last_indices = np.searchsorted(run.times, stamps + 1e-6 * delay, side="right") - 1
+            advanced = values[last_indices]
+        inputs[name] = advanced
     return replace(run, inputs=inputs).part(slice(0, count))
 
 
@@ -235,14 +237,14 @@ class HypothesisGenerator:
         suspects = [joint for joint in suspects if joint.channels]
         for joint in suspects:
             yield from _generate_signs(joint)
-            yield from _generate_zeros(joint, recording)
+            yield from _generate_zero_offsets(joint, recording)
             for name in dict.fromkeys((*joint.channels.values(), *joint.inputs)):
                 yield from _generate_units([self._signals[name]], recording)
-        yield from _generate_wraps(suspects, recording)
-        yield from _generate_orders(self.joints, recording, suspects)
+        yield from _generate_wrapped_angles(suspects, recording)
+        yield from _generate_joint_orders(self.joints, recording, suspects)
         if 2 * len(suspects) >= len(self.joints):
             yield from self._generate_common_units(recording)
-            yield from self._generate_normalised()
+            yield from self._generate_normalised_positions()
         yield from _generate_late_commands(recording)
 
     def _generate_common_units(self, recording: Recording) -> Iterator[ConventionHypothesis]:
@@ -261,7 +263,7 @@ class HypothesisGenerator:
     def _list_channels(self, quantity: str) -> list[str]:
         return [joint.channels[quantity] for joint in self.joints if quantity in joint.channels]
 
-    def _generate_normalised(self) -> Iterator[ConventionHypothesis]:
+    def _generate_normalised_positions(self) -> Iterator[ConventionHypothesis]:
         """Yield hypotheses that positions and commands are shares of the range of each joint.
 
         The shares are in percent, from 0 or from -100 to 100, as LeRobot records them.
@@ -303,33 +305,37 @@ def _generate_signs(joint: JointSignals) -> Iterator[ConventionHypothesis]:
         yield ConventionHypothesis(text, {name: SignalChange(name, -1.0) for name in names})
 
 
-def _generate_zeros(joint: JointSignals, recording: Recording) -> Iterator[ConventionHypothesis]:
-    """Yield hypotheses that a hinge is counted from another zero, in position or also in command.
+def _generate_zero_offsets(
+    joint: JointSignals, recording: Recording
+) -> Iterator[ConventionHypothesis]:
+    """Yield hypotheses that the angle of a hinge is measured from another zero position.
 
-    With a servo, the mean difference of command and position is the likely offset of the position.
+    Either the position and the command of its servo have the same offset, or the position alone. An
+    offset is a free angle in rad: several are tried, and the best one is refined later. If the
+    hinge has a servo, the offset of the position alone is estimated as the mean difference of
+    command and position.
     """
     position = joint.channels.get("q")
     if position is None or not joint.is_hinge:
         return
-    offsets = ANGLES.tolist()
+    tried_offsets = position_offsets = TRIED_ZERO_OFFSETS.tolist()
     if joint.servo_inputs:
-        command = joint.servo_inputs[0]
-        runs = recording.training()
-        differences = [run.inputs[command] - run.channels[position] for run in runs]
-        offsets = [float(np.mean([np.nanmean(values) for values in differences]))]
         text = f"joint {joint.name} looks counted from another zero, command and position"
-        for offset in ANGLES.tolist():
+        for offset in tried_offsets:
             names = (position, *joint.servo_inputs)
             changes = {name: SignalChange(name, 1.0, offset) for name in names}
             yield ConventionHypothesis(text, changes, has_free_offset=True)
+        command = joint.servo_inputs[0]
+        differences = [run.inputs[command] - run.channels[position] for run in recording.training()]
+        position_offsets = [float(np.mean([np.nanmean(values) for values in differences]))]
     text = f"position {position} looks counted from another zero"
-    for offset in offsets:
+    for offset in position_offsets:
         if abs(offset) > MIN_OFFSET:
             changes = {position: SignalChange(position, 1.0, offset)}
             yield ConventionHypothesis(text, changes, has_free_offset=True)
 
 
-def _generate_wraps(
+def _generate_wrapped_angles(
     joints: Sequence[JointSignals], recording: Recording
 ) -> Iterator[ConventionHypothesis]:
     """Yield hypotheses that recorded angles jump by whole turns, which have to be added again."""
@@ -351,35 +357,36 @@ def _compute_largest_jump(values: Array) -> float:
     return float(np.abs(np.diff(values[np.isfinite(values)])).max(initial=0.0))
 
 
-def _generate_orders(
+def _generate_joint_orders(
     joints: Sequence[JointSignals], recording: Recording, suspects: Sequence[JointSignals]
 ) -> Iterator[ConventionHypothesis]:
     """Yield other orders of the joints: of channels, of commands, and of both.
 
-    Pairs of suspects are exchanged. Whole orders are the alphabetical one, the reversed one, and
-    the one in which positions follow commands best.
+    Pairs of suspects are exchanged. Orders of all joints are the alphabetical one, the reversed
+    one, and the one in which positions follow commands best. An order maps the index of a joint to
+    the index of the joint whose columns it has.
     """
-    numbers = range(len(joints))
+    indices = range(len(joints))
     has_commands = all(len(joint.inputs) == 1 for joint in joints)
     quantities = [q for q in QUANTITIES if all(q in joint.channels for joint in joints)]
-    places = [i for i in numbers if joints[i] in suspects]
-    orders = [{a: b, b: a} for a, b in combinations(places, 2)]
-    alphabetical = sorted(numbers, key=lambda i: joints[i].name)
+    suspect_indices = [i for i in indices if joints[i] in suspects]
+    orders = [{a: b, b: a} for a, b in combinations(suspect_indices, 2)]
+    alphabetical = sorted(indices, key=lambda i: joints[i].name)
     orders += [
-        {i: alphabetical.index(i) for i in numbers},
+        {i: alphabetical.index(i) for i in indices},
         dict(enumerate(alphabetical)),
-        {i: len(joints) - 1 - i for i in numbers},
+        {i: len(joints) - 1 - i for i in indices},
     ]
     if has_commands and "q" in quantities:
         orders.append(_find_order_of_commands(joints, recording))
     for order in orders:
-        moved = {a: b for a, b in order.items() if a != b}
-        if not moved:
+        exchanged = {a: b for a, b in order.items() if a != b}
+        if not exchanged:
             continue
-        names = join_first_names([joints[a].name for a in sorted(moved)], MAX_NAMED)
+        names = join_first_names([joints[a].name for a in sorted(exchanged)], MAX_NAMED)
         channels = {
             joints[a].channels[q]: SignalChange(joints[b].channels[q])
-            for a, b in moved.items()
+            for a, b in exchanged.items()
             for q in quantities
         }
         if channels:
@@ -387,7 +394,7 @@ def _generate_orders(
         if not has_commands:
             continue
         commands = {
-            joints[a].inputs[0]: SignalChange(joints[b].inputs[0]) for a, b in moved.items()
+            joints[a].inputs[0]: SignalChange(joints[b].inputs[0]) for a, b in exchanged.items()
         }
         yield ConventionHypothesis(f"the commands of {names} look exchanged", commands)
         if channels:
@@ -419,9 +426,11 @@ def _generate_units(
     for unit, gain in UNITS.get(first.si, {}).items():
         scale = first.scale * gain / first.gain
         if not math.isclose(scale, 1.0, rel_tol=1e-6):
-            words, stated = (UNITS_IN_WORDS.get(one, one) for one in (unit, first.specified_unit))
+            unit_words, stated_words = (
+                UNITS_IN_WORDS.get(one, one) for one in (unit, first.specified_unit)
+            )
             yield ConventionHypothesis(
-                f"the numbers of {text} look like {words}, stated as {stated}",
+                f"the numbers of {text} look like {unit_words}, stated as {stated_words}",
                 {name: SignalChange(name, scale) for name in names},
                 unit=unit,
             )

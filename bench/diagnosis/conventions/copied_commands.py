@@ -49,11 +49,13 @@ def find_copied_commands(
         runs = [run for run in recording.runs if command in run.inputs and channel in run.channels]
         if not runs:
             continue
-        u = np.concatenate([run.inputs[command] for run in runs])
-        y = np.concatenate([run.channels[channel] for run in runs])
-        measured = np.isfinite(y)
-        u, y = u[measured], y[measured]
-        if len(np.unique(y)) >= MIN_SAMPLES and np.array_equal(u, y):
+        command_values = np.concatenate([run.inputs[command] for run in runs])
+        measured_values = np.concatenate([run.channels[channel] for run in runs])
+        is_recorded = np.isfinite(measured_values)
+        command_values, measured_values = command_values[is_recorded], measured_values[is_recorded]
+        if len(np.unique(measured_values)) >= MIN_SAMPLES and np.array_equal(
+            command_values, measured_values
+        ):
             yield command, channel, _find_likely_column(recording, channel)
 
 
@@ -68,20 +70,20 @@ def _find_likely_column(recording: Recording, channel: str) -> str:
     except InputError:  # A recording in memory has no description.
         return UNKNOWN_COLUMN
     tables = [table for kind in ("channels", "inputs") for table in meta.get(kind, {}).values()]
-    used = [
+    used_columns = [
         column for table in tables if isinstance(table, dict) for column in _list_columns(table)
     ]
-    own = meta.get("channels", {}).get(channel, {})
-    name = (_list_columns(own) or [channel])[0]
+    channel_table = meta.get("channels", {}).get(channel, {})
+    position_column = (_list_columns(channel_table) or [channel])[0]
     best, best_correlation = UNKNOWN_COLUMN, MIN_CORRELATION
     for log in _iterate_logs(description):
-        if name not in log.list_columns():
+        if position_column not in log.list_columns():
             continue
-        y = log.get_column(name)
+        position = log.get_column(position_column)
         for column in log.list_columns():
-            if column in (*used, name):
+            if column in (*used_columns, position_column):
                 continue
-            correlation = _compute_correlation(log.get_column(column), y)
+            correlation = _compute_correlation(log.get_column(column), position)
             if correlation > best_correlation:
                 best, best_correlation = column, correlation
         break
@@ -107,8 +109,8 @@ def _compute_correlation(u: Array, y: Array) -> float:
     """Return the correlation of two columns; 0 if they are equal, or one does not change."""
     if u.shape != y.shape or np.array_equal(u, y, equal_nan=True):
         return 0.0
-    known = np.isfinite(u) & np.isfinite(y)
-    u, y = u[known], y[known]
+    is_recorded = np.isfinite(u) & np.isfinite(y)
+    u, y = u[is_recorded], y[is_recorded]
     if u.size < MIN_SAMPLES or np.ptp(u) == 0 or np.ptp(y) == 0:
         return 0.0
     return float(np.corrcoef(u, y)[0, 1])

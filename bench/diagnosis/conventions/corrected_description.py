@@ -46,12 +46,14 @@ def correct_description(
             before = copy.deepcopy(result[kind])
             for name, change in hypothesis.changes.items():
                 if name in before:
-                    own = _move_to_column(before, name, change)
-                    result[kind][name] = _change_scale(own, units[kind][name], change, hypothesis)
+                    table = _move_to_column(before, name, change)
+                    result[kind][name] = _change_scale(table, units[kind][name], change, hypothesis)
         if hypothesis.late:
-            time = dict(result.get("time", {}))
-            time["offset"] = _round_value(float(time.get("offset", 0.0)) - hypothesis.late)
-            result["time"] = time
+            time_table = dict(result.get("time", {}))
+            time_table["offset"] = _round_value(
+                float(time_table.get("offset", 0.0)) - hypothesis.late
+            )
+            result["time"] = time_table
     return result
 
 
@@ -78,19 +80,20 @@ def _change_scale(
 ) -> dict[str, Any]:
     """Return the table of a signal with another unit, scale or offset.
 
-    With the gain g of the specified unit, recorded values r are g (k r + b) in SI units. The change
-    converts them to c (g (k r + b)) + d, with d in SI units.
+    With the gain g of the specified unit and the old scale k and offset b of the table, recorded
+    values r are g (k r + b) in SI units. The change converts them to c (g (k r + b)) + d, with its
+    factor c and its offset d in SI units.
     """
     gain = compute_unit_scale(table["unit"], si).gain
     factor, offset = change.scale, change.offset
     if hypothesis.unit is not None:
         table["unit"] = hypothesis.unit
         return table
-    k, b = float(table.get("scale", 1.0)), float(table.get("offset", 0.0))
+    old_scale, old_offset = float(table.get("scale", 1.0)), float(table.get("offset", 0.0))
     if factor != 1.0:
-        table["scale"] = _round_value(factor * k)
-    if offset or b:
-        table["offset"] = _round_value(factor * b + offset / gain)
+        table["scale"] = _round_value(factor * old_scale)
+    if offset or old_offset:
+        table["offset"] = _round_value(factor * old_offset + offset / gain)
     if change.unwrap:
         table["unwrap"] = change.command or True
     return table
@@ -110,22 +113,27 @@ def list_changed_tables(
         declared: Simulator of the robot, with the units of its signals.
         differences: Differences to correct.
     """
-    after, before = (
+    corrected, unchanged = (
         correct_description(meta, declared, differences),
         correct_description(meta, declared, ()),
     )
     for kind in KINDS:
         names = [
-            name for one in differences for name in one.hypothesis.changes if name in after[kind]
+            name
+            for difference in differences
+            for name in difference.hypothesis.changes
+            if name in corrected[kind]
         ]
         for name in dict.fromkeys(names):
-            table = after[kind][name]
-            was = before[kind][name]
-            own = [key for key in CORRECTED_KEYS if key in table and table[key] != was.get(key)]
-            keys = [f"{key} = {_format_value(table[key])}" for key in own]
-            yield f"[{kind}.{toml_key(name)}] {', '.join(keys)}"
-    if any(one.hypothesis.late for one in differences):
-        yield f"[time] offset = {after['time']['offset']:.9g}"
+            table = corrected[kind][name]
+            old_table = unchanged[kind][name]
+            changed_keys = [
+                key for key in CORRECTED_KEYS if key in table and table[key] != old_table.get(key)
+            ]
+            assignments = [f"{key} = {_format_value(table[key])}" for key in changed_keys]
+            yield f"[{kind}.{toml_key(name)}] {', '.join(assignments)}"
+    if any(difference.hypothesis.late for difference in differences):
+        yield f"[time] offset = {corrected['time']['offset']:.9g}"
 
 
 def _format_value(value: Any) -> str:

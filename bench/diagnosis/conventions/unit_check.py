@@ -94,31 +94,31 @@ it is the lower bound of the gain's range.
 
 SCREENING_SHARE = FIT_HORIZONS[0].share
 """First fraction of each run, by which hypotheses are screened."""
-_NAMED = 4
+MAX_NAMED_SIGNALS = 4
 """Maximum number of signals that a sentence names."""
-_BEYOND = "parameter {} lies beyond the bounds of its range"
+PARAMETER_AT_BOUND_TEXT = "parameter {} lies beyond the bounds of its range"
 """Alternative explanation for a recording whose base fit ends at a bound."""
-_DEGREE = math.pi / 180.0
-_GRAVITY = 9.80665
+DEGREE_RAD = math.pi / 180.0
+STANDARD_GRAVITY = 9.80665
 UNITS: Mapping[str, Mapping[str, float]] = {
-    "rad": {"rad": 1.0, "deg": _DEGREE, "mrad": 1e-3, "turn": 2.0 * math.pi},
+    "rad": {"rad": 1.0, "deg": DEGREE_RAD, "mrad": 1e-3, "turn": 2.0 * math.pi},
     "rad/s": {
         "rad/s": 1.0,
-        "deg/s": _DEGREE,
+        "deg/s": DEGREE_RAD,
         "rpm": math.pi / 30.0,
         "turn/s": 2.0 * math.pi,
     },
-    "rad/s^2": {"rad/s^2": 1.0, "deg/s^2": _DEGREE},
+    "rad/s^2": {"rad/s^2": 1.0, "deg/s^2": DEGREE_RAD},
     "m": {"m": 1.0, "cm": 1e-2, "mm": 1e-3},
     "m/s": {"m/s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3},
-    "m/s^2": {"m/s^2": 1.0, "g_0": _GRAVITY, "mm/s^2": 1e-3},
-    "N": {"N": 1.0, "kgf": _GRAVITY, "mN": 1e-3, "kN": 1e3},
-    "N*m": {"N*m": 1.0, "kgf*m": _GRAVITY, "N*cm": 1e-2, "mN*m": 1e-3, "kN*m": 1e3},
+    "m/s^2": {"m/s^2": 1.0, "g_0": STANDARD_GRAVITY, "mm/s^2": 1e-3},
+    "N": {"N": 1.0, "kgf": STANDARD_GRAVITY, "mN": 1e-3, "kN": 1e3},
+    "N*m": {"N*m": 1.0, "kgf*m": STANDARD_GRAVITY, "N*cm": 1e-2, "mN*m": 1e-3, "kN*m": 1e3},
     "V": {"V": 1.0, "mV": 1e-3, "kV": 1e3},
     "A": {"A": 1.0, "mA": 1e-3, "kA": 1e3},
 }
 """Factors to the SI unit, by SI unit and by unit in which signals are often recorded."""
-_TOGETHER = (
+UNIT_SYSTEMS = (
     {"rad": "deg", "rad/s": "deg/s", "rad/s^2": "deg/s^2"},
     {"rad": "turn", "rad/s": "turn/s"},
     {"m": "mm", "m/s": "mm/s", "m/s^2": "mm/s^2"},
@@ -198,10 +198,11 @@ class Hypothesis:
         factors = self.factors()
         lines = []
         for signal, unit in zip(self.signals, self.units, strict=True):
-            keys = [f'unit = "{unit}"'] * (unit != signal.specified_unit)
-            keys += [f"scale = {self._get_corrected_scale(signal):.9g}"] * (
-                self._get_corrected_scale(signal) != 1.0
-            )
+            keys = []
+            if unit != signal.specified_unit:
+                keys.append(f'unit = "{unit}"')
+            if self._get_corrected_scale(signal) != 1.0:
+                keys.append(f"scale = {self._get_corrected_scale(signal):.9g}")
             lines.append(f"[{signal.kind}.{toml_key(signal.name)}] {', '.join(keys)}")
         return RecordingFault(
             tuple(signal.name for signal in self.signals),
@@ -224,20 +225,22 @@ class Hypothesis:
         which the recorded values have to be multiplied; it is shown for a wrong unit.
         """
         first, unit = self.signals[0], self.units[0]
-        names = join_first_names([signal.signal_text for signal in self.signals], _NAMED)
+        names = join_first_names([signal.signal_text for signal in self.signals], MAX_NAMED_SIGNALS)
         table = f"[{first.kind}.{first.name}]" if len(self.signals) == 1 else "the tables of each"
         scale = f"set scale = {self._get_corrected_scale(first):.9g} in {table} of {file}"
         if unit == first.specified_unit and self.scale == -1.0:
             return f"The sign of {names} looks reversed: {scale}"
         if unit == first.specified_unit:
             return f"The recorded numbers of {names} look converted twice: {scale}"
-        turned = f"; the sign is reversed too: {scale}" if self.scale < 0 else ""
-        words, stated = (UNITS_IN_WORDS.get(one, one) for one in (unit, first.specified_unit))
-        wanted = dict.fromkeys(f'unit = "{one}"' for one in self.units)
+        sign_text = f"; the sign is reversed too: {scale}" if self.scale < 0 else ""
+        unit_words, stated_words = (
+            UNITS_IN_WORDS.get(one, one) for one in (unit, first.specified_unit)
+        )
+        unit_keys = dict.fromkeys(f'unit = "{one}"' for one in self.units)
         return (
-            f"The recorded numbers of {names} look like {words}, stated as {stated} "
-            f"(factor {abs(factors[first.name]):.4g}): set {' and '.join(wanted)} in {table} of "
-            f"{file}{turned}"
+            f"The recorded numbers of {names} look like {unit_words}, stated as {stated_words} "
+            f"(factor {abs(factors[first.name]):.4g}): set {' and '.join(unit_keys)} in {table} of "
+            f"{file}{sign_text}"
         )
 
 
@@ -313,23 +316,24 @@ def find_wrong_units(
     if not (shares > MIN_BASE_RESIDUAL_SHARE).any():
         return None
     before = _compute_residual_rms(residual, is_recorded, noise)
-    known = before if np.isfinite(before) else None
+    known_before = before if np.isfinite(before) else None
     signals = subject.signals(evaluator.channels)
     hypotheses = list(_generate_hypotheses(signals, _list_suspected_parts(evaluator, shares)))
     excess = MAX_REMAINING_SHARE * (before - 1.0)
     accepted: list[tuple[Hypothesis, float]] = []
-    others: list[str] = []
+    alternative_texts: list[str] = []
     for hypothesis in _select_promising(subject, hypotheses):
-        after, missed = _fit_rescaled(subject, hypothesis.factors())
-        if after - 1.0 > excess or missed > MAX_RESIDUAL_SHARE:
+        after, residual_share = _fit_rescaled(subject, hypothesis.factors())
+        if after - 1.0 > excess or residual_share > MAX_RESIDUAL_SHARE:
             continue
         distinction = _test_distinctness(subject, hypothesis, after, int(is_recorded.sum()))
         if distinction == "sharp":
             accepted.append((hypothesis, after))
         elif distinction == "absorbed":
             accepted.append((hypothesis, after))
-            others += [
-                _BEYOND.format(name) for name in _list_parameters_at_bounds(evaluator, base.fit)
+            alternative_texts += [
+                PARAMETER_AT_BOUND_TEXT.format(name)
+                for name in _list_parameters_at_bounds(evaluator, base.fit)
             ]
     if not accepted:
         return None
@@ -337,16 +341,19 @@ def find_wrong_units(
     lowest_misfit = min(after for _, after in accepted)
     equally_good = [pair for pair in accepted if pair[1] <= MAX_EQUAL_RATIO * lowest_misfit]
     equally_good.sort(key=lambda pair: (len(pair[0].signals), pair[0].scale != 1.0))
-    (best, after), *others_alike = equally_good
+    (best, after), *equal_others = equally_good
     # Hypotheses that differ only in the sign are not alternatives.
     same = best.signals, best.units
-    rest = [pair for pair in others_alike if (pair[0].signals, pair[0].units) != same]
-    others = [
-        *(hypothesis.make_error(subject.file, None, None).says for hypothesis, _ in rest),
-        *others,
+    other_hypotheses = [pair for pair in equal_others if (pair[0].signals, pair[0].units) != same]
+    alternative_texts = [
+        *(
+            hypothesis.make_error(subject.file, None, None).says
+            for hypothesis, _ in other_hypotheses
+        ),
+        *alternative_texts,
     ]
-    alternatives = tuple(dict.fromkeys(others))
-    return replace(best.make_error(subject.file, known, after), alternatives=alternatives)
+    alternatives = tuple(dict.fromkeys(alternative_texts))
+    return replace(best.make_error(subject.file, known_before, after), alternatives=alternatives)
 
 
 def find_imitated_unit(
@@ -388,7 +395,8 @@ def find_imitated_unit(
         wanted = hypothesis.factors()[signal.name]
         if wanted * factor > 0 and abs(math.log(wanted / factor)) < GAIN_TOLERANCE:
             alternatives = tuple(
-                _BEYOND.format(name) for name in _list_parameters_at_bounds(evaluator, base)
+                PARAMETER_AT_BOUND_TEXT.format(name)
+                for name in _list_parameters_at_bounds(evaluator, base)
             )
             return replace(
                 hypothesis.make_error(subject.file, None, None), alternatives=alternatives
@@ -400,7 +408,8 @@ def find_imitated_unit(
             f"check the unit, the column and the sign of {signal.signal_text} in {subject.file}"
         )
         alternatives = tuple(
-            _BEYOND.format(name) for name in _list_parameters_at_bounds(evaluator, base)
+            PARAMETER_AT_BOUND_TEXT.format(name)
+            for name in _list_parameters_at_bounds(evaluator, base)
         )
         return RecordingFault((signal.name,), factor, None, message, (), None, None, alternatives)
     return None
@@ -488,19 +497,23 @@ def _generate_hypotheses(
     by_unit: dict[tuple[str, str, str], list[Signal]] = {}
     for signal in signals:
         by_unit.setdefault((signal.kind, signal.si, signal.specified_unit), []).append(signal)
-    for alike in by_unit.values():
-        if len(alike) > 1:
-            yield from _generate_unit_hypotheses(tuple(alike))
-    for units in _TOGETHER:
-        either = [s for s in signals if s.si in units]
-        for wanted in (units, {si: si for si in units}):
-            those = tuple(s for s in either if s.specified_unit != wanted[s.si])
-            if len({s.si for s in those}) > 1:
-                yield Hypothesis(those, tuple(wanted[s.si] for s in those))
-        if len({s.si for s in either}) > 1:
-            si = either[0].si
-            stated = tuple(s.specified_unit for s in either)
-            yield Hypothesis(tuple(either), stated, 1.0 / UNITS[si][units[si]])
+    for same_unit_signals in by_unit.values():
+        if len(same_unit_signals) > 1:
+            yield from _generate_unit_hypotheses(tuple(same_unit_signals))
+    for units in UNIT_SYSTEMS:
+        related_signals = [s for s in signals if s.si in units]
+        for actual_units in (units, {si: si for si in units}):
+            changed_signals = tuple(
+                s for s in related_signals if s.specified_unit != actual_units[s.si]
+            )
+            if len({s.si for s in changed_signals}) > 1:
+                yield Hypothesis(
+                    changed_signals, tuple(actual_units[s.si] for s in changed_signals)
+                )
+        if len({s.si for s in related_signals}) > 1:
+            si = related_signals[0].si
+            specified_units = tuple(s.specified_unit for s in related_signals)
+            yield Hypothesis(tuple(related_signals), specified_units, 1.0 / UNITS[si][units[si]])
     yield from _generate_reversed_joints(signals, suspects)
 
 

@@ -23,6 +23,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -93,6 +94,25 @@ class DetectionLimit:
         """Return whether its estimate would differ from zero if it were fitted."""
         return abs(self.estimate_if_fitted) > self.size
 
+    def to_document(self) -> dict[str, Any]:
+        """Return the keys of the limit in the row of a data sheet, as TOML data.
+
+        `resolved` is the detectable size of a proportional effect; `none_above` and `none_below`
+        exclude a backlash above, or a limit below, a size. The size is omitted if the data are
+        insensitive to the effect.
+        """
+        document: dict[str, Any] = {}
+        if np.isfinite(self.size):
+            size_key = {"": "resolved", "above": "none_above", "below": "none_below"}[self.limit]
+            document[size_key] = self.size
+            if self.is_unbounded:
+                document["vague"] = True
+            if self.is_nonzero_if_fitted:
+                document["leans_to"] = self.estimate_if_fitted
+        if self.confounded_with:
+            document["mixed_with"] = list(self.confounded_with)
+        return document
+
 
 @dataclass(frozen=True)
 class DetectionLimits:
@@ -125,26 +145,26 @@ def compute_detection_limits(
     Raises:
         InputError: The simulation fails on the runs.
     """
-    floor = compute_noise_floor(evaluator, evaluator.recording)
-    white = NoiseModel(floor.sigma, np.zeros(len(floor.sigma)))
-    fit = _linearise_extended(evaluator, extended, white)
+    noise_floor = compute_noise_floor(evaluator, evaluator.recording)
+    white_noise = NoiseModel(noise_floor.sigma, np.zeros(len(noise_floor.sigma)))
+    fit = _linearise_extended(evaluator, extended, white_noise)
     if not np.isfinite(fit.simulated[np.isfinite(evaluator.observed)]).all():
         raise InputError(f"{evaluator.recording.path}: the simulation of it fails")
     # The random stream is not used, because there is no search.
-    models = ModelSet(evaluator, white, frozenset(), make_rng("sheet"), floor.is_stated)
+    models = ModelSet(evaluator, white_noise, frozenset(), make_rng("sheet"), noise_floor.is_stated)
     model = models.add_fit(fit)
     likelihood = model.likelihood
     # The residual of the model is taken as the noise, whatever the recording specifies.
     noise = NoiseModel(np.maximum(likelihood.sigma, 1e-300), likelihood.phi)
     directions = _add_small_gaps(evaluator, fit, compute_directions(evaluator, fit, names))
-    information = _DetectionLimitCalculator(
+    calculator = _DetectionLimitCalculator(
         evaluator,
         noise,
         get_central_jacobian(models, fit),
         directions,
         models.compute_residual(fit),
     )
-    return information.compute_limits(
+    return calculator.compute_limits(
         _compute_prediction_half_widths(assess_consistency(models, model))
     )
 
@@ -217,11 +237,13 @@ def _linearise_extended(
         for p in evaluator.parameters[: evaluator.system_parameter_count]
     ]
     # A parameter without an interval was not fitted.
-    frozen = {i for i, number in enumerate(known_values) if number is None or number.low is None}
+    unfitted_parameters = {
+        i for i, number in enumerate(known_values) if number is None or number.low is None
+    }
     start = FitStart(tuple(extended.effects), theta, prediction.states)
-    return TrajectoryFitter(evaluator, noise, frozenset(frozen)).fit_models([start], iterations=0)[
-        0
-    ]
+    return TrajectoryFitter(evaluator, noise, frozenset(unfitted_parameters)).fit_models(
+        [start], iterations=0
+    )[0]
 
 
 class _DetectionLimitCalculator:
@@ -246,9 +268,9 @@ class _DetectionLimitCalculator:
         """
         self.evaluator, self.direction_set = evaluator, direction_set
         self.q = fit.free_indices.size
-        self.places = fit.free_indices.tolist()
+        self.free_indices = fit.free_indices.tolist()
         self.free = tuple(evaluator.parameters[i].name for i in fit.free_indices.tolist())
-        parameter_columns, state_columns = fit.jacobian[..., : self.q], fit.jacobian[..., self.q :]
+        parameter_columns, state_columns = fit.parameter_jacobian, fit.state_jacobian
         columns = np.concatenate(
             [parameter_columns, direction_set.responses, residual[..., None], state_columns], axis=3
         )
@@ -272,34 +294,40 @@ class _DetectionLimitCalculator:
 
     def compute_limits(self, prediction_half_widths: Mapping[str, float]) -> DetectionLimits:
         """Compute the detection limit of each coefficient, at the shape that is detected best."""
-        shapes: dict[tuple[str, int], list[int]] = {}
+        shapes_by_coefficient: dict[tuple[str, int], list[int]] = {}
         for k in np.argsort(-self.powers, kind="stable").tolist():
             probe = self.direction_set.candidates[k]
-            if not probe.fixed:
-                shapes.setdefault((probe.effect, probe.place), []).append(k)
-        best = {key: probe_indices[0] for key, probe_indices in shapes.items()}
-        limits = dict.fromkeys(
+            if not probe.is_single_size:
+                shapes_by_coefficient.setdefault(
+                    (probe.effect, probe.coefficient_index), []
+                ).append(k)
+        best_shape = {key: probe_indices[0] for key, probe_indices in shapes_by_coefficient.items()}
+        switching_effects = dict.fromkeys(
             probe.effect for probe in self.direction_set.candidates if probe.is_single_size
         )
         detection_limits = {}
-        for (name, place), probe_indices in shapes.items():
+        for (name, coefficient_index), probe_indices in shapes_by_coefficient.items():
             # At that shape a richer law may be equivalent to a simpler one that it contains.
             new_shapes = [
-                k for k in probe_indices if not self._is_covered_by_simpler_effect(name, k, best)
+                k
+                for k in probe_indices
+                if not self._is_covered_by_simpler_effect(name, k, best_shape)
             ]
-            if name not in limits and new_shapes:
-                detection_limits[name, self._get_coefficient_name(name, place)] = (
+            if name not in switching_effects and new_shapes:
+                detection_limits[name, self._get_coefficient_name(name, coefficient_index)] = (
                     self._compute_proportional_limit(new_shapes[0])
                 )
-        for name in limits:
+        for name in switching_effects:
             detection_limits[name, self._get_coefficient_name(name, 0)] = (
                 self._compute_switching_limit(name)
             )
         return DetectionLimits(self.free, self.covariance, detection_limits, prediction_half_widths)
 
-    def _get_coefficient_name(self, effect: str, place: int) -> str:
+    def _get_coefficient_name(self, effect: str, coefficient_index: int) -> str:
         return (
-            self.evaluator.available_effects[effect].on(self.evaluator.simulator.system)[place].name
+            self.evaluator.available_effects[effect]
+            .on(self.evaluator.simulator.system)[coefficient_index]
+            .name
         )
 
     def _compute_proportional_limit(self, k: int) -> DetectionLimit:
@@ -350,7 +378,9 @@ class _DetectionLimitCalculator:
         other_columns = [self.q + j for (effect, _), j in best.items() if effect in simpler_effects]
         for effect in simpler_effects & set(self.evaluator.coefficient_slices):
             effect_places = self.evaluator.get_coefficient_indices(effect)
-            other_columns += [j for j, place in enumerate(self.places) if place in effect_places]
+            other_columns += [
+                j for j, place in enumerate(self.free_indices) if place in effect_places
+            ]
         i = self.q + k
         for j in other_columns:
             scale = np.sqrt(self.products[i, i] * self.products[j, j])

@@ -9,29 +9,22 @@ from __future__ import annotations
 
 import re
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from os.path import relpath
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-
+from bench.diagnosis.datasheet.constants_groups import ConstantsGroup, group_runs_by_constants
+from bench.diagnosis.datasheet.exported_log_description import describe_log_for_model
+from bench.diagnosis.datasheet.mean_friction_limit import compute_mean_friction_limit
 from bench.diagnosis.datasheet.sheet_content import SheetContent
 from bench.diagnosis.extended_robot_files import collect_causes
 from sims import effects as library
 from sims.core.effect import Friction
-from sims.core.simulator import Array
-from sims.core.system import RenderedModelFile, StateSnapshot
-from sims.core.toml_validation import read_toml
+from sims.core.system import RenderedModelFile
 from sims.extended_simulator import FittedValue
-from sims.recording.recording import Run
-from sims.recording.recording_description import get_description_path
 
 CLASS_FILE = "class.xml"
 """File name of the classes."""
-MOTOR_ON_THRESHOLD = 0.5
-"""Value of a switching input above which the motor is on."""
 
 
 class MjcfFiles(NamedTuple):
@@ -88,35 +81,35 @@ def _build_system_files(sheet: SheetContent, folder: Path) -> MjcfFiles:
 
     classes: list[_DefaultClass] = []
     files: dict[str, str] = {}
-    for setting in group_runs_by_constants(sheet):
-        model = _model_file(sheet, setting)
+    for group in group_runs_by_constants(sheet):
+        model = _render_model_file(sheet, group)
         if model is None:
             return MjcfFiles({}, (f"{sheet.subject.kind.name} has no form in MJCF",))
-        name = make_class_name("_".join([sheet.name, setting.name]) if setting.name else sheet.name)
-        with tempfile.TemporaryDirectory() as place:
-            path = Path(place) / f"{sheet.subject.kind.name}.xml"
+        name = make_class_name("_".join([sheet.name, group.name]) if group.name else sheet.name)
+        with tempfile.TemporaryDirectory() as folder_name:
+            path = Path(folder_name) / f"{sheet.subject.kind.name}.xml"
             path.write_text(model.text)
             robot = read_robot(path)
-        causes, notes = _map_effects_to_model(sheet, setting, model)
+        causes, notes = _map_effects_to_model(sheet, group, model)
         rendered = _render_class(
             robot, causes, model.joint, model.actuator, name, sheet, (*model.notes, *notes)
         )
         classes.append(rendered)
-        stem = f"model_{setting.name}" if setting.name else "model"
+        stem = f"model_{group.name}" if group.name else "model"
         if rendered.model:
             files[f"{stem}.xml"] = rendered.model
-            files |= _describe_log_for_model(sheet, setting, model, stem, folder)
+            files |= describe_log_for_model(sheet, group, model, stem, folder)
     lines = dict.fromkeys(line for rendered in classes for line in rendered.notes)
     return MjcfFiles({CLASS_FILE: _format_file(sheet, classes), **files}, tuple(lines))
 
 
-def _model_file(sheet: SheetContent, setting: ConstantsGroup) -> RenderedModelFile | None:
+def _render_model_file(sheet: SheetContent, group: ConstantsGroup) -> RenderedModelFile | None:
     """Render the system with the constants of one group of runs as an MJCF model.
 
     Return None if the constants give no valid model, or if the system has no form in MJCF.
     """
     try:
-        return sheet.subject.kind.system.model_file(setting.numbers)
+        return sheet.subject.kind.system.model_file(group.numbers)
     except ZeroDivisionError:
         # The file may contain a value that was edited by hand.
         return None
@@ -147,12 +140,12 @@ def _render_class(
     from sims.robot.export.xml_editing import NotEditableError
 
     applied = apply_causes(robot, causes, sheet.extended.title)
-    places = robot.joint(joint).id, robot.actuator(actuator).id if actuator else None
+    ids = robot.joint(joint).id, robot.actuator(actuator).id if actuator else None
     class_notes = [*notes, *applied.notes]
-    text = render_default_class(applied, *places, name, class_notes)
+    text = render_default_class(applied, *ids, name, class_notes)
     try:
         return _DefaultClass(
-            text, class_notes, render_model_using_class(robot, applied, *places, name, text)
+            text, class_notes, render_model_using_class(robot, applied, *ids, name, text)
         )
     except NotEditableError as unfit:
         return _DefaultClass(
@@ -178,45 +171,8 @@ def _format_file(sheet: SheetContent, classes: Sequence[_DefaultClass]) -> str:
     )
 
 
-@dataclass(frozen=True)
-class ConstantsGroup:
-    """Runs of a recording with equal constants.
-
-    Attributes:
-        name: Short name from the constants; empty if there are none.
-        numbers: Parameters and constants.
-        runs: Runs of the recording.
-    """
-
-    name: str
-    numbers: Mapping[str, float]
-    runs: tuple[Run, ...]
-
-
-def group_runs_by_constants(sheet: SheetContent) -> list[ConstantsGroup]:
-    """Group the runs with equal constants, such as one load, in the order of the recording.
-
-    An MJCF model has fixed numbers, so each group needs its own model.
-    """
-    by_constants: dict[tuple[tuple[str, float], ...], list[Run]] = {}
-    for run in sheet.recording.runs:
-        by_constants.setdefault(tuple(sorted(run.constants.items())), []).append(run)
-    defaults = {c.name: c.value for c in sheet.subject.kind.constants}
-    defaults |= {p.name: p.nominal for p in sheet.subject.kind.parameters}
-    fitted_values = {name: number.value for name, number in sheet.extended.parameters.items()}
-    numbers = {**defaults, **sheet.recording.constants, **sheet.extended.constants, **fitted_values}
-    return [
-        ConstantsGroup(
-            "_".join(f"{name}{value:g}" for name, value in constants) if by_constants else "",
-            {**numbers, **dict(constants)},
-            tuple(runs),
-        )
-        for constants, runs in by_constants.items()
-    ]
-
-
 def _map_effects_to_model(
-    sheet: SheetContent, setting: ConstantsGroup, model: RenderedModelFile
+    sheet: SheetContent, group: ConstantsGroup, model: RenderedModelFile
 ) -> tuple[dict[str, Mapping[str, FittedValue]], list[str]]:
     """Map the fitted effects of a system to the joint, actuator and channel of its MJCF model.
 
@@ -225,20 +181,24 @@ def _map_effects_to_model(
     """
     from sims.robot.model_field_effects import MODEL_FIELD_EFFECTS
 
-    places = {"joint": model.joint, "actuator": model.actuator, "channel": model.signals["q"]}
+    place_by_kind = {
+        "joint": model.joint,
+        "actuator": model.actuator,
+        "channel": model.signals["q"],
+    }
     causes: dict[str, Mapping[str, FittedValue]] = {}
     dry_friction, notes = 0.0, []
     for name, numbers in sheet.extended.effects.items():
         effect = library.get_effect(name)
         if issubclass(effect, Friction) and name not in MODEL_FIELD_EFFECTS:
-            mean_limit = _compute_mean_friction_limit(sheet, setting, effect, numbers)
+            mean_limit = compute_mean_friction_limit(sheet, group, effect, numbers)
             dry_friction += mean_limit
             notes.append(
                 f"{name}: MuJoCo has no such law; frictionloss is its mean over these runs, "
                 f"{mean_limit:.4g} N·m"
             )
             continue
-        place = places.get(effect.at, "")
+        place = place_by_kind.get(effect.at, "")
         zero_value = FittedValue(0.0, "1", None, None)
         coefficients = {
             c.name: numbers.get(c.name, zero_value) for c in effect.on(sheet.subject.kind.system)
@@ -250,86 +210,3 @@ def _map_effects_to_model(
         total = dry_friction + (fitted_friction.value if fitted_friction else 0.0)
         causes[key] = {"coefficient": FittedValue(total, "N*m", None, None)}
     return causes, notes
-
-
-def _compute_mean_friction_limit(
-    sheet: SheetContent,
-    setting: ConstantsGroup,
-    effect: type[Friction],
-    numbers: Mapping[str, FittedValue],
-) -> float:
-    """Compute the mean limit of a friction law over the samples of some runs."""
-    limits = [
-        _compute_friction_limits(sheet, setting, run, effect, numbers) for run in setting.runs
-    ]
-    values = np.concatenate(limits)
-    return float(values[np.isfinite(values)].mean())
-
-
-def _compute_friction_limits(
-    sheet: SheetContent,
-    setting: ConstantsGroup,
-    run: Run,
-    effect: type[Friction],
-    numbers: Mapping[str, FittedValue],
-) -> Array:
-    """Compute the limit (T,) of a friction law at each sample of a run, as one batch."""
-    kind = sheet.subject.kind
-    system = kind.system()
-    (coordinate,) = system.coordinates
-    position = run.channels[coordinate]
-    rate = np.gradient(position, run.times)
-    shape = (len(position), 1)
-    theta = np.array([[setting.numbers[p.name] for p in kind.parameters]])
-    effect_coefficients = effect.on(system)
-    coefficients = [
-        numbers[c.name].value if c.name in numbers else 0.0 for c in effect_coefficients
-    ]
-    moment = StateSnapshot(
-        system,
-        np.repeat(theta, len(position), axis=0),
-        {c.name: np.full(shape, setting.numbers[c.name]) for c in kind.constants},
-        (run.times - run.times[0])[:, None],
-        position[:, None],
-        rate[:, None],
-        {name: values[:, None] for name, values in run.inputs.items()},
-    )
-    c = np.array(coefficients)[:, None, None]
-    limit: Array = effect().limit(np.broadcast_to(c, (len(c), *shape)), moment)[:, 0]
-    return limit
-
-
-def _describe_log_for_model(
-    sheet: SheetContent, setting: ConstantsGroup, model: RenderedModelFile, stem: str, folder: Path
-) -> Iterator[tuple[str, str]]:
-    """Yield a description of the log for the model, in which its runs are marked held out.
-
-    Nothing is yielded for a log of several files.
-    """
-    import tomli_w
-
-    path = sheet.recording.path
-    if path.suffix != ".csv" or any(run.log for run in sheet.recording.runs):
-        return
-    log_description = read_toml(get_description_path(path))
-    file = relpath(path.resolve(), folder.resolve())
-    document: dict[str, Any] = {
-        "model": f"{stem}.xml",
-        "title": f"{sheet.name} as {stem}.xml",
-        "channels": {},
-        "inputs": {},
-        "runs": {
-            run.name: {"held_out": True} for run in setting.runs if _is_motor_always_on(run, model)
-        },
-    }
-    for kind in ("channels", "inputs"):
-        for name, description in log_description.get(kind, {}).items():
-            if name in model.signals:
-                document[kind][model.signals[name]] = {"file": file, "column": name, **description}
-    yield f"{stem}.toml", tomli_w.dumps(document)
-
-
-def _is_motor_always_on(run: Run, model: RenderedModelFile) -> bool:
-    """Return whether the inputs that switch the motor are on all the time."""
-    switches = [values for name, values in run.inputs.items() if name not in model.signals]
-    return all(bool((values > MOTOR_ON_THRESHOLD).all()) for values in switches)

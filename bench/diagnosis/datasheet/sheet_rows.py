@@ -69,7 +69,7 @@ class SheetRow:
         if self.stated is not None:
             row["stated"] = self.stated
         if self.detection_limit is not None:
-            row |= _make_limit_keys(self.detection_limit)
+            row |= self.detection_limit.to_document()
         if self.p_value is not None:
             row["p_value"] = self.p_value
         if self.share is not None:
@@ -77,27 +77,6 @@ class SheetRow:
         if self.alternatives:
             row["alternatives"] = list(self.alternatives)
         return row
-
-
-def _make_limit_keys(detection_limit: DetectionLimit) -> dict[str, Any]:
-    """Return the TOML keys of a detection limit in the row of a data sheet.
-
-    `resolved` is the detectable size of a proportional effect; `none_above` and `none_below`
-    exclude a backlash above, or a limit below, a size. The size is omitted if the data are
-    insensitive to the effect.
-    """
-    row: dict[str, Any] = {}
-    if np.isfinite(detection_limit.size):
-        row[
-            {"": "resolved", "above": "none_above", "below": "none_below"}[detection_limit.limit]
-        ] = detection_limit.size
-        if detection_limit.is_unbounded:
-            row["vague"] = True
-        if detection_limit.is_nonzero_if_fitted:
-            row["leans_to"] = detection_limit.estimate_if_fitted
-    if detection_limit.confounded_with:
-        row["mixed_with"] = list(detection_limit.confounded_with)
-    return row
 
 
 def build_sheet_rows(
@@ -148,8 +127,8 @@ class _Rows:
                     (derived.of({**values_by_name, name: values_by_name[name] + step}) - value)
                     / step
                 )
-            spread = np.array(slopes)
-            half_width = Z95 * float(np.sqrt(max(spread @ covariance @ spread, 0.0)))
+            gradient = np.array(slopes)
+            half_width = Z95 * float(np.sqrt(max(gradient @ covariance @ gradient, 0.0)))
             number = FittedValue(value, derived.unit, value - half_width, value + half_width)
             row = SheetRow(derived.name, derived.says, "system", "derived", derived.unit, number)
             yield replace(row, strongest=derived.strongest)
@@ -174,12 +153,13 @@ class _Rows:
             return
         for name, number in self.extended.parameters.items():
             # The coefficient of an effect with several has its name after a point.
-            effect, _, place = name.partition("@")
+            effect, _, place_and_coefficient = name.partition("@")
             local_place = next(
                 (
-                    p
-                    for p in self.subject.places
-                    if place in (p, f"{p}.{_get_coefficient_part(place)}")
+                    own_place
+                    for own_place in self.subject.places
+                    if place_and_coefficient
+                    in (own_place, f"{own_place}.{_get_coefficient_part(place_and_coefficient)}")
                 ),
                 "",
             )
@@ -201,13 +181,13 @@ class _Rows:
                 )
                 label = f"{effect} {coefficient}" if has_several else effect
                 row = self._make_effect_row(effect, label, number, "found", self._find_cause(name))
-                if _is_nothing(number):
+                if _may_be_zero(number):
                     yield self._make_hidden_row(row, effect, number)
                     continue
-                place = (
+                place_suffix = (
                     "" if name.partition("@")[2] != ALL_PLACES else f"@{effect.partition('@')[2]}"
                 )
-                parameter = name if len(numbers) == 1 else f"{name}.{coefficient}{place}"
+                parameter = name if len(numbers) == 1 else f"{name}.{coefficient}{place_suffix}"
                 yield self._add_prediction_interval(row, effect, parameter)
 
     def _add_prediction_interval(self, row: SheetRow, effect: str, parameter: str) -> SheetRow:
@@ -226,7 +206,9 @@ class _Rows:
 
     def _make_hidden_row(self, row: SheetRow, effect: str, number: FittedValue) -> SheetRow:
         """Build the row of a cause at other places that is not shown here."""
-        detection_limit = _make_number_limit(number, self.subject.get_model_file_value(effect))
+        detection_limit = _make_limit_from_interval(
+            number, self.subject.get_model_file_value(effect)
+        )
         return SheetRow(
             row.name,
             row.says,
@@ -337,14 +319,16 @@ def _get_coefficient_part(place: str) -> str:
     return place.rpartition(".")[2]
 
 
-def _is_nothing(number: FittedValue) -> bool:
-    """Return whether the coefficient of a cause at other places may be zero here."""
+def _may_be_zero(number: FittedValue) -> bool:
+    """Return whether zero lies in the 95 % interval of a coefficient; False without an interval."""
     if number.low is None or number.high is None:
         return False
     return number.low <= 0 <= number.high
 
 
-def _make_number_limit(number: FittedValue, file_value: ModelFileValue | None) -> DetectionLimit:
+def _make_limit_from_interval(
+    number: FittedValue, file_value: ModelFileValue | None
+) -> DetectionLimit:
     low, high = number.low or 0.0, number.high or 0.0
     size = max(abs(low), abs(high))
     return DetectionLimit(size if file_value is None else file_value.compute_half_width(size))

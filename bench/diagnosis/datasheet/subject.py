@@ -15,7 +15,10 @@ from sims.system_simulator import SystemSimulator
 
 PLACE_KIND_TITLES = {"joint": "Joint", "actuator": "Actuator", "channel": "Sensor"}
 """Titles of the kinds of places that belong to a joint, in the order of the sheet."""
-_SHARES = {"actuator.stiffness": "{force}/{length}", "actuator.damping": "{force}*s/{length}"}
+RELATIVE_VALUE_UNITS = {
+    "actuator.stiffness": "{force}/{length}",
+    "actuator.damping": "{force}*s/{length}",
+}
 """Units of numbers of the model file, for effects that are relative changes of these numbers."""
 
 
@@ -71,7 +74,7 @@ class SheetSubject:
         """Names of the actuators that drive the joint."""
         return tuple(
             effect_place.name
-            for effect_place in self._get_places().get("actuator", ())
+            for effect_place in self._get_effect_places().get("actuator", ())
             if self._is_on_joint(effect_place)
         )
 
@@ -80,7 +83,7 @@ class SheetSubject:
         """Return whether the joint is prismatic, not rotary."""
         if not self.joint:
             return self.kind.system.kind != "rotary"
-        (joint,) = (s for s in self._get_places()["joint"] if s.name == self.joint)
+        (joint,) = (s for s in self._get_effect_places()["joint"] if s.name == self.joint)
         return bool(joint.kind == "slide")
 
     def is_driven(self, recording: Recording) -> bool:
@@ -140,7 +143,7 @@ class SheetSubject:
         """Return the value in the model file that an effect changes; None if there is none."""
         base, _, place = effect.partition("@")
         for kind in ("joint", "actuator"):
-            for effect_place in self._get_places().get(kind, ()):
+            for effect_place in self._get_effect_places().get(kind, ()):
                 if effect_place.name == place and base in effect_place.stated:
                     return self._get_file_value(base, effect_place)
         return None
@@ -153,19 +156,19 @@ class SheetSubject:
         others the value has the unit of the effect's coefficient.
         """
         length, force = ("m", "N") if effect_place.kind == "slide" else ("rad", "N*m")
-        share = base in _SHARES
+        share = base in RELATIVE_VALUE_UNITS
         effect = library.find_effect(f"{base}@{effect_place.name}", self.kind.system)
-        unit = _SHARES[base] if share else effect.coefficients[0].units[0] or "1"
+        unit = RELATIVE_VALUE_UNITS[base] if share else effect.coefficients[0].units[0] or "1"
         # A servo has a negative bias, but its gain is positive.
         value = abs(effect_place.stated[base])
         return ModelFileValue(value, unit.format(force=force, length=length), share)
 
-    def _get_places(self) -> Mapping[str, Any]:
-        places: Mapping[str, Any] = getattr(self.kind.system, "places", {})
-        return places
+    def _get_effect_places(self) -> Mapping[str, Any]:
+        effect_places: Mapping[str, Any] = getattr(self.kind.system, "places", {})
+        return effect_places
 
     def _is_on_joint(self, effect_place: Any) -> bool:
-        (joint,) = (s for s in self._get_places()["joint"] if s.name == self.joint)
+        (joint,) = (s for s in self._get_effect_places()["joint"] if s.name == self.joint)
         return bool(effect_place.coordinate == joint.coordinate)
 
 
@@ -183,8 +186,8 @@ def make_subject(kind: type[SystemSimulator], joint: str | None) -> SheetSubject
         if joint is not None:
             raise InputError(f"--joint: expected none, as {kind.name} is no robot; found {joint}")
         return SheetSubject(kind, "", frozenset())
-    places: Mapping[str, Any] = vars(kind.system)["places"]
-    joints = [effect_place.name for effect_place in places["joint"]]
+    effect_places: Mapping[str, Any] = vars(kind.system)["places"]
+    joints = [effect_place.name for effect_place in effect_places["joint"]]
     if joint is None and len(joints) > 1:
         raise InputError(f"robot {kind.name}: expected --joint, one of {', '.join(joints)}")
     joint = joints[0] if joint is None else joint

@@ -279,8 +279,8 @@ class RunEvaluator:
         """Return the coordinate that an effect acts on; empty if there are no coordinates."""
         system = self.simulator.system
         coordinate = self.available_effects[effect].coordinate
-        place = system.primary if coordinate is None else coordinate
-        return system.coordinates[place] if system.coordinates else ""
+        index = system.primary if coordinate is None else coordinate
+        return system.coordinates[index] if system.coordinates else ""
 
     def _get_channel_range(self, name: str) -> float:
         """Return the largest range of a channel within one run, cached; 0 if not recorded."""
@@ -311,15 +311,15 @@ class RunEvaluator:
             fine steps.
         """
         shifting_indices: list[int] = []
-        filtering: list[int] = []
+        fine_step_indices: list[int] = []
         for effect in self.simulator.effects:
-            places = self.get_coefficient_indices(effect.name)
+            indices = self.get_coefficient_indices(effect.name)
             if _shifts_sample_times(effect):
-                shifting_indices.extend(places)
+                shifting_indices.extend(indices)
             if effect.sharp or (isinstance(effect, Sensor) and effect.filters):
-                filtering.extend(places)
+                fine_step_indices.extend(indices)
         # The type must be given, because an empty list would become an array of floats.
-        return np.array(shifting_indices, dtype=np.intp), np.array(filtering, dtype=np.intp)
+        return np.array(shifting_indices, dtype=np.intp), np.array(fine_step_indices, dtype=np.intp)
 
     def _scale_coefficient_ranges(self) -> tuple[Parameter, ...]:
         """Return the parameters with coefficient ranges for the time scale of the runs."""
@@ -360,10 +360,10 @@ class RunEvaluator:
 
     def get_sample_mask(self, share: float) -> Mask:
         """Return the mask (R, T, C) of available samples within the first share of each run."""
-        numbers = np.arange(self.observed.shape[1])
+        sample_numbers = np.arange(self.observed.shape[1])
         sample_counts = np.ceil(share * self.lengths)
-        first = numbers < sample_counts[:, None]
-        sample_mask: Mask = np.isfinite(self.observed) & first[:, :, None]
+        is_in_share = sample_numbers < sample_counts[:, None]
+        sample_mask: Mask = np.isfinite(self.observed) & is_in_share[:, :, None]
         return sample_mask
 
     def simulate(
@@ -387,10 +387,12 @@ class RunEvaluator:
         """
         result = np.empty((len(theta), *self.observed.shape[1:]))
         if self.has_linearisation:
-            lanes = zip(theta, runs.tolist(), states, strict=True)
+            elements = zip(theta, runs.tolist(), states, strict=True)
             keys = [
-                b"".join((repr((share, run)).encode(), element_theta.tobytes(), begin.tobytes()))
-                for element_theta, run, begin in lanes
+                b"".join(
+                    (repr((share, run)).encode(), element_theta.tobytes(), initial_state.tobytes())
+                )
+                for element_theta, run, initial_state in elements
             ]
             missing_indices = self._cache.missing(keys)
             new_results = self._simulate_batch(
@@ -419,18 +421,18 @@ class RunEvaluator:
 
         # The slowest element of a call sets its steps, so elements that need many steps are
         # simulated separately.
-        kinds = self.group_compatible(theta)
+        groups = self.group_compatible(theta)
         max_batch_size = max(MIN_BATCH_SIZE, MAX_BATCH_SAMPLES // length)
         if self.is_cheap_to_split:
             max_batch_size = min(
                 max_batch_size, max(MIN_CHUNK_SIZE, int(MAX_CHUNK_SAMPLES / (share * length)))
             )
         parts, calls = [], []
-        for kind in np.unique(kinds):
-            lanes = np.flatnonzero(kinds == kind)
-            for part in np.array_split(lanes, -(-lanes.size // max_batch_size)):
+        for group in np.unique(groups):
+            elements = np.flatnonzero(groups == group)
+            for part in np.array_split(elements, -(-elements.size // max_batch_size)):
                 parts.append(part)
-                calls.append((bool(kind >= 2), theta[part], runs[part], states[part], share))
+                calls.append((bool(group >= 2), theta[part], runs[part], states[part], share))
         for number, simulated in self.worker_pool.map_unordered(self, _simulate_engine_call, calls):
             sample_count = simulated.shape[1]
             result[parts[number], :sample_count] = simulated
@@ -502,14 +504,17 @@ class RunEvaluator:
     def group_compatible(self, theta: Array) -> Indices:
         """Return group numbers (L,); batch elements of one group can share an engine call.
 
+        Groups 1 and 3 have effects that read signals at other times; groups 2 and 3 need fine
+        steps.
+
         Args:
             theta: (L, P) parameters.
         """
-        active = theta != 0
-        is_shifting = active[:, self._shifting_coefficients].any(axis=1)
-        filtering = active[:, self._fine_step_coefficients].any(axis=1)
-        kinds: Indices = is_shifting + 2 * filtering
-        return kinds
+        is_active = theta != 0
+        is_shifting = is_active[:, self._shifting_coefficients].any(axis=1)
+        needs_fine_steps = is_active[:, self._fine_step_coefficients].any(axis=1)
+        groups: Indices = is_shifting + 2 * needs_fine_steps
+        return groups
 
     @property
     def is_cheap_to_split(self) -> bool:
@@ -555,9 +560,9 @@ class RunEvaluator:
         scenarios = self._make_scenarios(theta, runs, share)
         # The simulator does not treat freed constants as parameters.
         freed_indices = np.arange(self.system_parameter_count, self.base_indices.size)
-        lanes = np.delete(theta, freed_indices, axis=1)
+        system_theta = np.delete(theta, freed_indices, axis=1)
         initial = dict(zip(self.state_names, states.T, strict=True))
-        return simulator.simulate_batch(lanes, scenarios, initial)
+        return simulator.simulate_batch(system_theta, scenarios, initial)
 
     def simulate_scenarios(
         self, theta: Array, scenarios: Sequence[Scenario], states: Array
@@ -577,11 +582,11 @@ class RunEvaluator:
         result = np.full((len(theta), length, len(self.channels)), np.nan)
         max_batch_size = max(MIN_CHUNK_SIZE, MAX_BATCH_SAMPLES // length)
         freed_indices = np.arange(self.system_parameter_count, self.base_indices.size)
-        kinds = self.group_compatible(theta)
-        for kind in np.unique(kinds):
-            simulator = self._fine_step_simulator if kind >= 2 else self.simulator
-            lanes = np.flatnonzero(kinds == kind)
-            for part in np.array_split(lanes, -(-lanes.size // max_batch_size)):
+        groups = self.group_compatible(theta)
+        for group in np.unique(groups):
+            simulator = self._fine_step_simulator if group >= 2 else self.simulator
+            elements = np.flatnonzero(groups == group)
+            for part in np.array_split(elements, -(-elements.size // max_batch_size)):
                 part_scenarios = [self._set_freed_constants(scenarios[i], theta[i]) for i in part]
                 initial = dict(zip(self.state_names, states[part].T, strict=True))
                 observations = simulator.simulate_batch(
@@ -706,13 +711,13 @@ def _make_freed_parameter(name: str, simulator: SystemSimulator, recording: Reco
 
 def _allocate_coefficients(simulator: SystemSimulator, first: int) -> dict[str, slice]:
     """Return the slice of theta of each effect, starting at index `first`."""
-    slots = {}
+    slices = {}
     # Use the order of the simulator, which is the order of its parameters.
     for effect in simulator.effects:
         end = first + len(effect.on(simulator.system))
-        slots[effect.name] = slice(first, end)
+        slices[effect.name] = slice(first, end)
         first = end
-    return slots
+    return slices
 
 
 def _shifts_sample_times(effect: Effect) -> bool:

@@ -118,12 +118,12 @@ def fit_base_model(
 
     # An insensitive parameter is set to nominal, because the value that the search reached means
     # nothing.
-    places = evaluator.base_indices.tolist()
-    insensitive = frozenset(i for i in places if not _is_sensitive(evaluator, best, i, noise))
+    base_indices = evaluator.base_indices.tolist()
+    insensitive = frozenset(i for i in base_indices if not _is_sensitive(evaluator, best, i, noise))
     if insensitive:
-        insensitive_places = list(insensitive)
+        insensitive_indices = list(insensitive)
         theta = best.theta.copy()
-        theta[insensitive_places] = evaluator.get_nominal_theta()[insensitive_places]
+        theta[insensitive_indices] = evaluator.get_nominal_theta()[insensitive_indices]
         start = replace(best.make_start(), theta=theta)
         best = TrajectoryFitter(evaluator, noise, insensitive).fit_models(
             [start], FINAL_ITERATIONS
@@ -168,8 +168,8 @@ def _list_starts(evaluator: RunEvaluator, initial_base: Array | None) -> list[Ar
         return starts
     for shares in spread_start_points(GRID_STARTS, len(parameters)):
         theta = nominal.copy()
-        for place, parameter, share in zip(evaluator.base_indices, parameters, shares, strict=True):
-            theta[place] = _interpolate_bounds(parameter, share)
+        for index, parameter, share in zip(evaluator.base_indices, parameters, shares, strict=True):
+            theta[index] = _interpolate_bounds(parameter, share)
         starts.append(theta)
     return starts
 
@@ -219,13 +219,13 @@ def compute_start_costs(
         share: initial share of each run that counts.
         failed_residual: residual of a sample that could not be simulated.
     """
-    count, runs = len(starts), len(evaluator.prepared_runs)
+    start_count, run_count = len(starts), len(evaluator.prepared_runs)
     thetas = [s.theta for s in starts]
-    theta = np.repeat(thetas, runs, axis=0)
+    theta = np.repeat(thetas, run_count, axis=0)
     states = np.concatenate([s.initial_states for s in starts])
-    lanes = np.tile(np.arange(runs), count)
-    simulated = evaluator.simulate(theta, lanes, states, share)
-    simulated = simulated.reshape(count, runs, *simulated.shape[1:])
+    run_indices = np.tile(np.arange(run_count), start_count)
+    simulated = evaluator.simulate(theta, run_indices, states, share)
+    simulated = simulated.reshape(start_count, run_count, *simulated.shape[1:])
 
     # An abandoned start has no samples, and must not seem to fit them.
     unmasked_residuals = np.nan_to_num(evaluator.observed - simulated, nan=failed_residual)
@@ -235,18 +235,18 @@ def compute_start_costs(
 
 
 def _is_sensitive(
-    evaluator: RunEvaluator, fit: TrajectoryFit, place: int, noise: NoiseModel
+    evaluator: RunEvaluator, fit: TrajectoryFit, index: int, noise: NoiseModel
 ) -> bool:
     """Return whether the simulated runs depend on a parameter enough to estimate it.
 
     The test is the norm of the change of all samples, in units of the noise, if the parameter moves
-    over its whole range. `place` is the index of the parameter in theta.
+    over its whole range. `index` is the index of the parameter in theta.
     """
     # A fixed parameter has no column.
-    columns = np.flatnonzero(fit.free_indices == place)
+    columns = np.flatnonzero(fit.free_indices == index)
     if not columns.size:
         return False
-    low, high = evaluator.parameters[place].bounds
+    low, high = evaluator.parameters[index].bounds
     change = fit.jacobian[..., columns[0]] * (high - low) / noise.sigma
     # Count only available samples.
     available_change = change[np.isfinite(evaluator.observed)]

@@ -98,24 +98,24 @@ class KnownJacobian(NamedTuple):
     free_indices: Indices
     jacobian: Array
 
-    def drop_parameters(self, places: Collection[int]) -> KnownJacobian:
-        """Return the derivatives without the columns of the parameters `places` (indices in theta).
+    def drop_parameters(self, indices: Collection[int]) -> KnownJacobian:
+        """Return the derivatives without the columns of some parameters (indices in theta).
 
         It is used for a model with fewer effects than the one whose derivatives are known.
         """
         kept_columns = [
-            j for j, place in enumerate(self.free_indices.tolist()) if place not in places
+            j for j, index in enumerate(self.free_indices.tolist()) if index not in indices
         ]
         return KnownJacobian(self.free_indices[kept_columns], self.jacobian[..., kept_columns])
 
-    def add_parameters(self, places: Sequence[int], jacobian: Array) -> KnownJacobian:
+    def add_parameters(self, indices: Sequence[int], jacobian: Array) -> KnownJacobian:
         """Return the derivatives together with those by further parameters.
 
         Args:
-            places: (k,) indices of the further parameters in theta.
+            indices: (k,) indices of the further parameters in theta.
             jacobian: (R, T, C, k) derivatives by them.
         """
-        free = np.concatenate([self.free_indices, np.array(places, dtype=np.intp)])
+        free = np.concatenate([self.free_indices, np.array(indices, dtype=np.intp)])
         return KnownJacobian(free, np.concatenate([self.jacobian, jacobian], axis=3))
 
 
@@ -163,9 +163,19 @@ class TrajectoryFit:
     cost: float
     is_own_jacobian: bool = True
 
+    @property
+    def parameter_jacobian(self) -> Array:
+        """Derivatives (R, T, C, q) of the simulated observations by the fitted parameters."""
+        return self.jacobian[..., : self.free_indices.size]
+
+    @property
+    def state_jacobian(self) -> Array:
+        """Derivatives (R, T, C, s) of the simulated observations by the initial states."""
+        return self.jacobian[..., self.free_indices.size :]
+
     def get_known_jacobian(self) -> KnownJacobian:
         """Return the derivatives by the parameters, for reuse in fits that start nearby."""
-        return KnownJacobian(self.free_indices, self.jacobian[..., : self.free_indices.size])
+        return KnownJacobian(self.free_indices, self.parameter_jacobian)
 
     def make_start(self) -> FitStart:
         """Return a start with which another fit continues from this one."""

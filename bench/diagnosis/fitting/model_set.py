@@ -45,7 +45,7 @@ A fit that grows more was distorted by structure that is not noise.
 """
 MAX_SEED = 2**62
 """Upper limit of the integer that identifies the random number streams of a search."""
-_SIZES = {
+MODEL_SIZE_TEXTS = {
     0: ("the base model", "the base model"),
     1: ("one effect", "single effects"),
     2: ("one pair of effects", "pairs of effects"),
@@ -101,10 +101,10 @@ class ModelSet:
     models: dict[frozenset[str], FittedModel] = field(default_factory=dict)
     null_gains: dict[str, float] = field(default_factory=dict)
     refined_jacobians: dict[int, tuple[TrajectoryFit, TrajectoryFit]] = field(default_factory=dict)
-    _drawn: int = field(init=False, repr=False)
+    _stream_seed: int = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        self._drawn = int(self.rng.integers(MAX_SEED))
+        self._stream_seed = int(self.rng.integers(MAX_SEED))
 
     def make_rng(self, question: str, names: Iterable[str] = ()) -> np.random.Generator:
         """Return the random generator of a question about a model with the given effects.
@@ -115,7 +115,7 @@ class ModelSet:
             question: name of the question.
             names: effects of the model.
         """
-        return make_rng(self._drawn, question, *sorted(names))
+        return make_rng(self._stream_seed, question, *sorted(names))
 
     @property
     def observed_mask(self) -> Mask:
@@ -154,7 +154,7 @@ class ModelSet:
         """Return a fit with its likelihood and its penalised log-likelihood, eq. (1)."""
         freedom = fit.free_indices.size + count_identified_states(self.evaluator, fit, self.noise)
         # A model that could not be simulated is stored, too, so that it is not tried again.
-        likelihood = _LOST
+        likelihood = FAILED_LIKELIHOOD
         if np.isfinite(fit.cost):
             likelihood = maximise_likelihood(
                 self.compute_residual(fit), self.observed_mask, freedom
@@ -198,10 +198,10 @@ class ModelSet:
         An effect with many shapes gains likelihood from noise alone. The part of this gain that the
         penalty of its coefficients does not cover is subtracted.
         """
-        slot = self.evaluator.coefficient_slices[name]
+        coefficients = self.evaluator.coefficient_slices[name]
         # If there are few shapes, the coefficients alone pay for the gain under the null
         # hypothesis.
-        parameter_penalties = (slot.stop - slot.start) * self.parameter_penalty
+        parameter_penalties = (coefficients.stop - coefficients.start) * self.parameter_penalty
         return float(max(self.null_gains.get(name, 0.0) - parameter_penalties, 0.0))
 
     def refit_models(
@@ -222,8 +222,8 @@ class ModelSet:
             is_racing: whether to stop fits that fall far behind.
             iterations: maximum number of steps of each fit.
         """
-        watch = self.evaluator.search_control
-        watch.report_and_check(f"refit of {_format_starts(starts)}")
+        control = self.evaluator.search_control
+        control.report_and_check(f"refit of {_format_starts(starts)}")
         noise = noise or self.noise
         starts = [self.with_sensitivities(start) for start in starts]
         if is_staged:
@@ -232,13 +232,13 @@ class ModelSet:
         is_race = is_racing and noise is self.noise
         lowest_cost = self._find_lowest_cost(starts) if is_race else np.inf
         fitter = TrajectoryFitter(self.evaluator, noise, self.fixed_parameters)
-        watch.begin_stage(_name_stage(starts), len(starts))
+        control.begin_stage(_name_stage(starts), len(starts))
         for fit in fitter.fit_models(
-            starts, iterations, is_racing=is_racing, lowest_cost=lowest_cost, finished=watch.advance
+            starts, iterations, is_racing=is_race, lowest_cost=lowest_cost, finished=control.advance
         ):
             self.add_fit(fit)
         # A fit that was stopped early is stored, but not evaluated.
-        watch.check_not_stopped()
+        control.check_not_stopped()
         self._report_best()
 
     def fit_all(
@@ -305,7 +305,8 @@ class ModelSet:
         this method prefers smooth residuals to small ones.
         """
         self.evaluator.search_control.begin_stage("refining the model")
-        squares = TrajectoryFitter(self.evaluator, self.noise).compute_cost
+        # Costs of fits with different noise weights are compared by those of the present noise.
+        compute_cost = TrajectoryFitter(self.evaluator, self.noise).compute_cost
         for _ in range(MAX_REWEIGHTED_FITS):
             likelihood = model.likelihood
             if not np.isfinite(model.fit.cost):
@@ -322,13 +323,14 @@ class ModelSet:
             (fit,) = fitter.fit_models([self.make_final_start(model)], MAX_ITERATIONS)
             if self.evaluator.search_control.has_abandoned_fits():
                 break
-            refitted = self._rate_fit(replace(fit, cost=squares(fit)))
-            if refitted.fit.cost > MAX_REWEIGHTED_SQUARES_RATIO * squares(model.fit):
+            refitted = self._rate_fit(replace(fit, cost=compute_cost(fit)))
+            if refitted.fit.cost > MAX_REWEIGHTED_SQUARES_RATIO * compute_cost(model.fit):
                 break
             gain = refitted.penalised_log_likelihood - model.penalised_log_likelihood
             if gain < MIN_GAIN_FOR_REWEIGHTING:
                 if gain > 0:
-                    # The fits are so close that scores about the old one remain valid.
+                    # Stored directly, because `_store_if_better` would discard the scores about the
+                    # old fit, which remain valid for a fit that is so close.
                     model = self.models[frozenset(refitted.effects)] = refitted
                 break
             model = self._store_if_better(refitted)
@@ -398,7 +400,9 @@ def _format_starts(starts: Sequence[FitStart]) -> str:
 def _name_stage(starts: Sequence[FitStart]) -> str:
     """Return the name of the stage that fits these models, for the progress display."""
     size = max((len(start.effects) for start in starts), default=0)
-    singular, plural = _SIZES.get(size, (f"set of {size} effects", f"sets of {size} effects"))
+    singular, plural = MODEL_SIZE_TEXTS.get(
+        size, (f"set of {size} effects", f"sets of {size} effects")
+    )
     return f"fitting {singular if len(starts) == 1 else plural}"
 
 
@@ -420,9 +424,8 @@ def count_identified_states(
         noise: noise of each channel.
     """
     observed_mask = np.isfinite(evaluator.observed)
-    states = fit.jacobian[..., fit.free_indices.size :]
-    observed_states = np.where(observed_mask[..., None], states, 0.0)
-    scaled = observed_states / noise.sigma[:, None]
+    state_jacobian = np.where(observed_mask[..., None], fit.state_jacobian, 0.0)
+    scaled = state_jacobian / noise.sigma[:, None]
     # The shape is written out, because -1 is ambiguous if there are no states.
     runs, length, channels, size = scaled.shape
     columns = scaled.reshape(runs, length * channels, size) * compute_state_prior(evaluator)
@@ -435,5 +438,5 @@ def count_identified_states(
     return float(freedoms.clip(0.0, 1.0).sum())
 
 
-_LOST = Likelihood(-np.inf, np.zeros(0), np.zeros(0))
+FAILED_LIKELIHOOD = Likelihood(-np.inf, np.zeros(0), np.zeros(0))
 """Likelihood of a model that could not be simulated."""

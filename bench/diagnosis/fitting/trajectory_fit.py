@@ -80,16 +80,16 @@ def iterate_rounds(iterations: int, is_racing: bool) -> Iterator[RacingRound]:
 
 
 def eliminate_losing_fits(problems: Sequence[FitState], lowest_cost: float) -> None:
-    """Mark fits as done if several more steps would not bring them close to the best cost.
+    """Mark fits as finished if several more steps would not bring them close to the best cost.
 
     Args:
-        problems: states of the fits; `done` is set in place.
+        problems: states of the fits; `is_finished` is set in place.
         lowest_cost: lowest cost of other fits.
     """
-    best = min(lowest_cost, *(p.point.cost for p in problems))
-    for p in problems:
-        p.is_finished |= (
-            p.point.cost - PREDICTED_DECREASE_FACTOR * p.predicted_decrease
+    best = min(lowest_cost, *(problem.point.cost for problem in problems))
+    for problem in problems:
+        problem.is_finished |= (
+            problem.point.cost - PREDICTED_DECREASE_FACTOR * problem.predicted_decrease
             > best + ELIMINATION_MARGIN
         )
 
@@ -168,7 +168,13 @@ class TrajectoryFitter:
             best = min(lowest_cost, *(problem.point.cost for problem in problems))
             groups = self._group_fits(problems, unfinished)
             calls = [
-                (self._list_terms(), [problems[i] for i in g], racing_round, is_racing, best)
+                (
+                    self._list_worker_arguments(),
+                    [problems[i] for i in g],
+                    racing_round,
+                    is_racing,
+                    best,
+                )
                 for g in groups
             ]
             for number, members in self.evaluator.worker_pool.map_unordered(
@@ -180,7 +186,7 @@ class TrajectoryFitter:
                         finished()
         return [p.make_fit() for p in problems]
 
-    def _list_terms(self) -> tuple[Any, ...]:
+    def _list_worker_arguments(self) -> tuple[Any, ...]:
         """Return all fields except the run evaluator, which workers have already.
 
         A worker creates its own fitter from them; see `_advance_group`.
@@ -206,14 +212,16 @@ class TrajectoryFitter:
             return [list(unfinished)]
         runs, length, _ = evaluator.observed.shape
         state_count = self._list_displaced_states().size
-        lanes = sum(1 + problems[i].free_indices.size + state_count for i in unfinished) * runs
-        cost = lanes * length * self.share + ALGEBRA_COST_SAMPLES * len(unfinished)
+        element_count = (
+            sum(1 + problems[i].free_indices.size + state_count for i in unfinished) * runs
+        )
+        cost = element_count * length * self.share + ALGEBRA_COST_SAMPLES * len(unfinished)
         # Compiled batch elements are stepped in parallel, however long they are.
-        count = int(np.ceil(min(cost / GROUP_COST_SAMPLES, lanes / MIN_CHUNK_SIZE)))
-        kinds = evaluator.group_compatible(
+        count = int(np.ceil(min(cost / GROUP_COST_SAMPLES, element_count / MIN_CHUNK_SIZE)))
+        element_kinds = evaluator.group_compatible(
             np.stack([problems[i].point.start.theta for i in unfinished])
         )
-        order = [unfinished[i] for i in np.argsort(kinds, kind="stable")]
+        order = [unfinished[i] for i in np.argsort(element_kinds, kind="stable")]
         parts = np.array_split(order, min(count, len(order)))
         return [part.tolist() for part in parts]
 
@@ -263,7 +271,7 @@ class TrajectoryFitter:
                 else self._simulate_points
             )
             for (problem, _), point in zip(trials, make_points(trials, sample_mask), strict=True):
-                self._accept_or_reject(problem, point)
+                self._accept_or_reject_trial(problem, point)
         return list(problems)
 
     def _simulate_starts(self, problems: Sequence[FitState], sample_mask: Mask) -> None:
@@ -425,7 +433,7 @@ class TrajectoryFitter:
     ) -> list[FitPoint]:
         """Simulate trial points, and give each the derivatives of its fit's present point.
 
-        `_accept_or_reject` updates these derivatives if the point is accepted.
+        `_accept_or_reject_trial` updates these derivatives if the point is accepted.
         """
         runs = len(self.evaluator.initial_state_guesses)
         simulated = self.evaluator.simulate(
@@ -471,13 +479,13 @@ class TrajectoryFitter:
         masked_derivatives: Array = derivatives * ~evaluator.known_state_mask[:, None, None, :]
         return masked_derivatives
 
-    def _compute_derivatives(self, part: Array, steps: Array, state_indices: Indices) -> Array:
+    def _compute_derivatives(self, simulated: Array, steps: Array, state_indices: Indices) -> Array:
         """Compute finite-difference derivatives (R, T, C, q + s).
 
         They are zero for known initial states, which therefore absorb nothing of the residual.
 
         Args:
-            part: (1 + q + n, R, T, C) simulation without and with each unknown displaced.
+            simulated: (1 + q + n, R, T, C) simulation without and with each unknown displaced.
             steps: (q + s,) displacements.
             state_indices: (n,) indices of the initial states that are displaced.
         """
@@ -486,11 +494,11 @@ class TrajectoryFitter:
         columns = np.concatenate([np.arange(q), q + state_indices])
         # An abandoned batch element is NaN, so the effect of its unknown is not known.
         with np.errstate(all="ignore"):
-            quotients = np.moveaxis(part[1:] - part[0], 0, -1) / steps[columns]
+            quotients = np.moveaxis(simulated[1:] - simulated[0], 0, -1) / steps[columns]
         jacobian: Array = np.where(is_finite_response(quotients), quotients, 0.0)
         if columns.size == steps.size:
             return jacobian
-        quotients, jacobian = jacobian, np.zeros((*part.shape[1:], steps.size))
+        quotients, jacobian = jacobian, np.zeros((*simulated.shape[1:], steps.size))
         jacobian[..., columns] = quotients
         jacobian[..., q:] *= ~known_mask[:, None, None, :]
         return jacobian
@@ -507,14 +515,14 @@ class TrajectoryFitter:
         return residual
 
     def _compute_state_deviation(self, states: Array) -> Array:
-        """Return d (R, s) of eq. (1) of `gauss_newton`: initial states minus their guesses.
+        """Return initial states minus their guesses (R, s), in prior standard deviations.
 
-        They are in units of the prior standard deviation.
+        Their squares are a term of the cost, eq. (1) of `gauss_newton`.
         """
-        drift: Array = (states - self.evaluator.initial_state_guesses) / compute_state_prior(
+        deviation: Array = (states - self.evaluator.initial_state_guesses) / compute_state_prior(
             self.evaluator
         )
-        return drift
+        return deviation
 
     def compute_cost(self, fit: TrajectoryFit) -> float:
         """Return the cost that a fit has with the noise weights of this fitter.
@@ -526,17 +534,17 @@ class TrajectoryFitter:
         )
 
     def _compute_cost(self, simulated: Array, states: Array, sample_mask: Mask) -> float:
-        """Return the cost, eq. (1) of `gauss_newton`: the whitened residual and the prior, squared.
+        """Return the sum of squares of the whitened residual and of the state deviations.
 
-        It is infinite if the simulation was abandoned.
+        It is the cost, eq. (1) of `gauss_newton`, and infinite if the simulation was abandoned.
         """
         residual = self._compute_residual(simulated, sample_mask)
         # An abandoned batch element is NaN, which cannot be compared.
         if not np.isfinite(residual).all():
             return np.inf
-        w = whiten(residual, sample_mask, self.noise)
-        drift = self._compute_state_deviation(states)
-        return float((w * w).sum() + (drift * drift).sum())
+        whitened = whiten(residual, sample_mask, self.noise)
+        deviation = self._compute_state_deviation(states)
+        return float((whitened * whitened).sum() + (deviation * deviation).sum())
 
     def _propose_trials(
         self, problems: Sequence[FitState], sample_mask: Mask
@@ -597,7 +605,7 @@ class TrajectoryFitter:
             point.start, theta=theta, initial_states=point.start.initial_states + step.state_steps
         )
 
-    def _accept_or_reject(self, problem: FitState, point: FitPoint) -> None:
+    def _accept_or_reject_trial(self, problem: FitState, point: FitPoint) -> None:
         """Accept a trial point if its cost is lower, else reject it, and update the damping.
 
         Derivatives are updated by Broyden's method if the trial was simulated without them.

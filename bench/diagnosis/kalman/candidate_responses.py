@@ -82,7 +82,8 @@ class Columns:
 
     Attributes:
         probes: the K candidates.
-        places: (K,) column of each candidate; candidates with the same effect share a column.
+        places: (K,) index of the column of each candidate; candidates with the same effect share a
+            column.
         sizes: (K,) scaling coefficient of each probe.
         pushed: (R, T - 1, E + nu, M) mean forces and controls of M columns between samples.
         readings: ψ (R, T, C, M).
@@ -172,7 +173,7 @@ class FollowedRuns:
         )
         best: FollowedRuns | None = None
         linear: list[MeasuredLinear] = []
-        for number in range(max_linearisations if trajectories is None else 1):
+        for iteration in range(max_linearisations if trajectories is None else 1):
             # Near the data, Jacobians change little from one motion to another.
             neighbours: Sequence[MeasuredLinear | None] = linear or [None] * len(
                 evaluator.prepared_runs
@@ -189,7 +190,7 @@ class FollowedRuns:
             force, noise, trajectories = followed.force, followed.noise, followed.trajectories
             gain = np.inf if best is None else followed.log_likelihood - best.log_likelihood
             # The first linearisation is about the readings alone, which are not a possible motion.
-            best = followed if number < 2 or gain > 0.0 else best
+            best = followed if iteration < 2 or gain > 0.0 else best
             if not gain > LINEARISED_GAIN:
                 break
         assert best is not None
@@ -223,8 +224,8 @@ class FollowedRuns:
                 zip(self.trajectories, (similar or self).linear, strict=True)
             )
         ]
-        given = self.noise, linear, self.force, self.typical
-        return self._filter_linear(self.evaluator, theta, *given)
+        filter_arguments = self.noise, linear, self.force, self.typical
+        return self._filter_linear(self.evaluator, theta, *filter_arguments)
 
     def _has_jacobians_of(self, theta: Array) -> bool:
         """Return whether a model has the Jacobians of this one.
@@ -343,8 +344,8 @@ class FollowedRuns:
     @property
     def missing_forces(self) -> Mask:
         """True if the model lacks a force (E,), so that the filter needs process noise there."""
-        mask: Mask = self.losses_without_force > MIN_LOSS_WITHOUT_FORCE
-        return mask
+        is_missing: Mask = self.losses_without_force > MIN_LOSS_WITHOUT_FORCE
+        return is_missing
 
     @property
     def has_missing_force(self) -> bool:
@@ -382,23 +383,23 @@ class FollowedRuns:
             probes: the candidates.
         """
         effects: list[tuple[Effect, Array]] = []
-        numbers: dict[tuple[str, bytes], int] = {}
-        places = []
+        column_by_key: dict[tuple[str, bytes], int] = {}
+        column_indices = []
         for probe in probes:
             effect, c = self.evaluator.available_effects[probe.effect], probe.coefficients
-            parts = [(one, k) for one, k in effect.parts(c[:, None, None]) if k.any()]
+            parts = [(part, k) for part, k in effect.parts(c[:, None, None]) if k.any()]
             # A member of a family has the same response as the single effect.
             if len(parts) == 1:
                 effect, c = parts[0][0], parts[0][1][:, 0, 0]
             key = effect.name, c.tobytes()
-            if key not in numbers:
-                numbers[key] = len(effects)
+            if key not in column_by_key:
+                column_by_key[key] = len(effects)
                 effects.append((effect, c))
-            places.append(numbers[key])
-        number, samples, channels = self.runs.residuals.shape
+            column_indices.append(column_by_key[key])
+        run_count, samples, channels = self.runs.residuals.shape
         inputs = self.runs.inputs.shape[3]
-        pushed = np.zeros((number, samples - 1, inputs, len(effects)), dtype=np.float32)
-        readings = np.zeros((number, samples, channels, len(effects)), dtype=np.float32)
+        pushed = np.zeros((run_count, samples - 1, inputs, len(effects)), dtype=np.float32)
+        readings = np.zeros((run_count, samples, channels, len(effects)), dtype=np.float32)
         changes = compute_control_changes(self.linear, effects)
         for run, (linear, driven) in enumerate(zip(self.linear, changes, strict=True)):
             predicted = self.filtered.predicted[run, : linear.knots.size, : self.runs.prior.size]
@@ -413,7 +414,9 @@ class FollowedRuns:
         sizes = np.array(
             [1.0 if p.is_single_size else p.coefficients[p.coefficient_index] for p in probes]
         )
-        return Columns(tuple(probes), np.array(places, dtype=np.intp), sizes, pushed, readings)
+        return Columns(
+            tuple(probes), np.array(column_indices, dtype=np.intp), sizes, pushed, readings
+        )
 
     def step_error_response(self) -> Array:
         """Return the whitened response (R, T, C) to the errors of the integrator's steps."""
@@ -425,7 +428,10 @@ class FollowedRuns:
         return response
 
     def responses(self, columns: Columns) -> SingleArray:
-        """Propagate columns through the filter by (1).
+        """Return how a unit of each candidate changes the whitened innovations of the filter.
+
+        The forces, controls and readings that a candidate adds are propagated through the recursion
+        of the filter, eq. (1) of the module docstring, with its gains.
 
         Args:
             columns: inputs of the candidates.
@@ -460,7 +466,8 @@ class FollowedRuns:
     def sensitivities(self, columns: Columns) -> Array:
         """Return the changes of the readings of simulated runs (R, T, C, K) by candidates.
 
-        They follow from (1) without gain, in units of the probes' coefficients.
+        Unlike in the filter, the readings are not fed back (gain zero): the changes are those of a
+        simulation. They are in units of the probes' coefficients.
         """
         number, _, _, count = columns.readings.shape
         changes = self._propagate_without_gain(
@@ -470,7 +477,10 @@ class FollowedRuns:
             return changes[..., columns.places] / columns.sizes
 
     def _propagate_without_gain(self, s: Array, columns: Columns | None = None) -> Array:
-        """Propagate first states and optional columns by (1) without gain.
+        """Propagate changes of the first states, and optional columns, through the linear model.
+
+        The recursion is s[i+1] = A s[i] + b[i] with readings H s + ψ, eq. (1) of the module
+        docstring with gain zero.
 
         Args:
             s: (R, Z, K) changes of the first states.
@@ -543,7 +553,11 @@ class FollowedRuns:
     def _propagate_through_filter(
         self, pushed: SingleArray, readings: SingleArray, inputs: SingleArray | None = None
     ) -> SingleArray:
-        """Propagate columns through (1).
+        """Propagate columns through the filter, and return the whitened responses (R, T, C, M).
+
+        The recursion is s[i+1] = A (s[i] - K u[i]) + b[i] with u = H s + ψ, where K is the gain of
+        the filter; the whitened response is W u. It is eq. (1) of the module docstring, for all M
+        columns at once in single precision.
 
         Args:
             pushed: (R, T - 1, E + nu, M) forces and controls, or states if `inputs` is None.
@@ -604,8 +618,8 @@ def _fit_noise(runs: LinearRuns, noise: NoiseModel, force: Array, typical: Array
         typical: (E,) typical forces.
     """
     best: _NoiseFit | None = None
-    lowest = float(noise.phi.max(initial=0.0))
-    for phi in (None, *(phi for phi in CORRELATIONS if phi > lowest)):
+    present_phi = float(noise.phi.max(initial=0.0))
+    for phi in (None, *(phi for phi in CORRELATIONS if phi > present_phi)):
         tried_noise = (
             noise if phi is None else NoiseModel(noise.sigma, np.full_like(noise.phi, phi))
         )
@@ -659,7 +673,7 @@ def _compute_prior_deviations(
     coordinates = evaluator.simulator.system.coordinates
     prior = np.full(size, 1e-9)
     joints, positions = len(coordinates), linear[0].positions
-    speeds = np.max([np.abs(one.trajectory.v).max(axis=0) for one in linear], axis=0)
+    speeds = np.max([np.abs(run_model.trajectory.v).max(axis=0) for run_model in linear], axis=0)
     for joint, name in enumerate(coordinates[:joints]):
         if name in evaluator.channels:
             prior[joint] = POSITION_PRIOR

@@ -139,7 +139,7 @@ class LinearRuns:
         runs, samples, _ = observed.shape
         stacked: dict[str, Array] = {}
         for name in STACKED:
-            parts = [getattr(own, name) for own in maps]
+            parts = [getattr(run_maps, name) for run_maps in maps]
             length = samples if name == "readings" else samples - 1
             values = np.zeros((runs, length, *parts[0].shape[1:]))
             if name == "states":
@@ -150,9 +150,9 @@ class LinearRuns:
             values[~(np.abs(values) < MAX_MAGNITUDE)] = 0.0
             stacked[name] = values
         residuals = np.zeros(observed.shape)
-        for run, own in enumerate(maps):
-            count = len(own.predicted)
-            residuals[run, :count] = observed[run, :count] - own.predicted
+        for run, run_maps in enumerate(maps):
+            count = len(run_maps.predicted)
+            residuals[run, :count] = observed[run, :count] - run_maps.predicted
         recorded = np.isfinite(residuals) & np.isfinite(observed)
         residuals[~recorded] = 0.0
         stacked["readings"][~recorded] = 0.0
@@ -216,31 +216,37 @@ def add_noise_states(runs: LinearRuns, noise: NoiseModel) -> tuple[LinearRuns, A
         The models with one more state for each channel with correlated noise, and R (C,), the
         variances of the remaining white noise.
     """
-    coloured = np.flatnonzero(noise.phi > 0)
+    coloured_channels = np.flatnonzero(noise.phi > 0)
     white = np.square(noise.sigma)
-    if not coloured.size:
+    if not coloured_channels.size:
         return runs, white
     white = white.copy()
-    white[coloured] *= AR_FLOOR
-    (number, samples, channels), size = runs.residuals.shape, runs.prior.size
-    more = coloured.size
-    states = np.zeros((number, samples - 1, size + more, size + more))
+    white[coloured_channels] *= AR_FLOOR
+    (run_count, samples, channels), size = runs.residuals.shape, runs.prior.size
+    noise_count = coloured_channels.size
+    states = np.zeros((run_count, samples - 1, size + noise_count, size + noise_count))
     states[:, :, :size, :size] = runs.states
-    own = size + np.arange(more)
-    states[:, :, own, own] = noise.phi[coloured]
-    nothing = np.zeros((number, samples - 1, more))
-    defects = np.concatenate([runs.defects, nothing], axis=2)
-    jumps = np.concatenate([runs.jumps, nothing], axis=2)
+    noise_states = size + np.arange(noise_count)
+    states[:, :, noise_states, noise_states] = noise.phi[coloured_channels]
+    zeros = np.zeros((run_count, samples - 1, noise_count))
+    defects = np.concatenate([runs.defects, zeros], axis=2)
+    jumps = np.concatenate([runs.jumps, zeros], axis=2)
     # The innovations of the noise act like forces of known variance.
-    forces = np.zeros((number, samples - 1, size + more, runs.forces.shape[3] + more))
+    forces = np.zeros(
+        (run_count, samples - 1, size + noise_count, runs.forces.shape[3] + noise_count)
+    )
     forces[:, :, :size, : runs.forces.shape[3]] = runs.forces
-    sizes = noise.sigma[coloured] * np.sqrt(1.0 - np.square(noise.phi[coloured]))
-    forces[:, :, own, runs.forces.shape[3] + np.arange(more)] = sizes
-    readings = np.concatenate([runs.readings, np.zeros((number, samples, channels, more))], axis=3)
-    readings[:, :, coloured, own] = 1.0
+    innovation_sigmas = noise.sigma[coloured_channels] * np.sqrt(
+        1.0 - np.square(noise.phi[coloured_channels])
+    )
+    forces[:, :, noise_states, runs.forces.shape[3] + np.arange(noise_count)] = innovation_sigmas
+    readings = np.concatenate(
+        [runs.readings, np.zeros((run_count, samples, channels, noise_count))], axis=3
+    )
+    readings[:, :, coloured_channels, noise_states] = 1.0
     readings[~runs.recorded] = 0.0
-    prior = np.concatenate([runs.prior, noise.sigma[coloured]])
-    found = replace(
+    prior = np.concatenate([runs.prior, noise.sigma[coloured_channels]])
+    runs_with_noise = replace(
         runs,
         states=states,
         defects=defects,
@@ -249,11 +255,11 @@ def add_noise_states(runs: LinearRuns, noise: NoiseModel) -> tuple[LinearRuns, A
         prior=prior,
         jumps=jumps,
     )
-    return found, white
+    return runs_with_noise, white
 
 
 def filter_runs(runs: LinearRuns, force: Array, white: Array) -> Filtered:
-    """Filter all runs by (1) to (4).
+    """Follow all runs with a Kalman filter, eqs. (1) to (4) of the module docstring.
 
     Args:
         runs: the linear models.
@@ -261,16 +267,16 @@ def filter_runs(runs: LinearRuns, force: Array, white: Array) -> Filtered:
             columns of G, those of coloured noise, have 1.
         white: R (C,) variances of white noise.
     """
-    number, samples, channels = runs.residuals.shape
+    run_count, samples, channels = runs.residuals.shape
     size = runs.prior.size
     # A missing sample is replaced by a reading of zero with variance one.
     variances = np.where(runs.recorded, white, 1.0)
-    predicted = np.zeros((number, samples, size))
-    covariances = np.zeros((number, samples, size, size))
-    innovations = np.zeros((number, samples, channels))
-    gains = np.zeros((number, samples, size, channels))
-    whiteners = np.zeros((number, samples, channels, channels))
-    likelihood = np.zeros(number)
+    predicted = np.zeros((run_count, samples, size))
+    covariances = np.zeros((run_count, samples, size, size))
+    innovations = np.zeros((run_count, samples, channels))
+    gains = np.zeros((run_count, samples, size, channels))
+    whiteners = np.zeros((run_count, samples, channels, channels))
+    likelihood = np.zeros(run_count)
     filter_recursion(
         *_make_contiguous(runs.states, runs.defects, runs.forces, runs.readings, runs.residuals),
         *(np.square(runs.jumps), variances, runs.prior),
@@ -283,17 +289,17 @@ def filter_runs(runs: LinearRuns, force: Array, white: Array) -> Filtered:
 
 
 def smooth_runs(runs: LinearRuns, filtered: Filtered, force: Array) -> Smoothed:
-    """Smooth all runs by (5) and (6).
+    """Smooth all runs backward, eqs. (5) and (6) of the module docstring (Bryson and Frazier).
 
     Args:
         runs: the linear models.
         filtered: results of the filter.
         force: standard deviations of the missing forces, as for `filter_runs`.
     """
-    number, samples, _ = runs.residuals.shape
+    run_count, samples, _ = runs.residuals.shape
     count = runs.forces.shape[3]
-    states = np.zeros((number, samples, runs.prior.size))
-    forces = np.zeros((number, samples - 1, count))
+    states = np.zeros((run_count, samples, runs.prior.size))
+    forces = np.zeros((run_count, samples - 1, count))
     measured, expected = np.zeros(count), np.zeros(count)
     smoother_recursion(
         *_make_contiguous(runs.states, runs.forces, runs.readings),
@@ -310,7 +316,10 @@ def smooth_runs(runs: LinearRuns, filtered: Filtered, force: Array) -> Smoothed:
 def fit_process_noise(
     runs: LinearRuns, force: Array, white: Array, typical: Array
 ) -> tuple[Array, Filtered, Smoothed]:
-    """Fit the standard deviations of the missing forces by maximum likelihood, (7).
+    """Fit the standard deviations of the missing forces (process noise) by maximum likelihood.
+
+    Each iteration filters and smooths the runs, and multiplies each variance by the ratio of its
+    smoothed to its expected square, eq. (7) of the module docstring.
 
     Args:
         runs: the linear models.
@@ -323,18 +332,18 @@ def fit_process_noise(
     """
     count = force.size
     # Short segments in parallel need fewer steps, and show the same process noise.
-    long = runs.residuals.shape[1] > 2 * SEGMENT_SAMPLES
-    short = runs.segments(SEGMENT_SAMPLES) if long else runs
+    is_long = runs.residuals.shape[1] > 2 * SEGMENT_SAMPLES
+    fitted_runs = runs.segments(SEGMENT_SAMPLES) if is_long else runs
     for _ in range(MAX_ITERATIONS):
-        filtered = filter_runs(short, force, white)
-        smoothed = smooth_runs(short, filtered, force)
+        filtered = filter_runs(fitted_runs, force, white)
+        smoothed = smooth_runs(fitted_runs, filtered, force)
         ratio = np.clip(np.sqrt(smoothed.score[:count]), 1.0 / LARGEST_CHANGE, LARGEST_CHANGE)
-        changed = np.maximum(force * ratio, SMALLEST_FORCE * typical)
-        done = bool((np.abs(changed / force - 1.0) < CONVERGENCE_TOLERANCE).all())
-        if done:
+        new_force = np.maximum(force * ratio, SMALLEST_FORCE * typical)
+        has_converged = bool((np.abs(new_force / force - 1.0) < CONVERGENCE_TOLERANCE).all())
+        if has_converged:
             break
-        force = changed
-    if long:
+        force = new_force
+    if is_long:
         filtered = filter_runs(runs, force, white)
         smoothed = smooth_runs(runs, filtered, force)
     return force, filtered, smoothed
@@ -347,7 +356,7 @@ def _make_contiguous(*arrays: Array) -> tuple[Array, ...]:
 
 def _complete_deviations(force: Array, runs: LinearRuns) -> Array:
     """Return the deviations of all columns of G for each run (B, E), including coloured noise."""
-    number, columns = len(runs.residuals), runs.forces.shape[3]
-    result = np.ones((number, columns))
+    run_count, columns = len(runs.residuals), runs.forces.shape[3]
+    result = np.ones((run_count, columns))
     result[:, : force.shape[-1]] = force
     return result

@@ -80,12 +80,12 @@ def estimate_first_states(
     states, variances = [], []
     for number in range(len(evaluator.prepared_runs)):
         run = _CubatureFilter(evaluator, simulator, theta, sigma, number)
-        tried = [run.smooth(share * typical) for share in FORCE_SHARES]
-        best = max(tried, key=lambda one: one.log_likelihood)
+        smoothed_runs = [run.smooth(share * typical) for share in FORCE_SHARES]
+        best = max(smoothed_runs, key=lambda smoothed: smoothed.log_likelihood)
         states.append(best.mean)
         variances.append(np.diag(best.covariance))
-    found = FirstStates(np.array(states), np.sqrt(np.mean(variances, axis=0)))
-    return found if all(np.isfinite(part).all() for part in found) else None
+    first_states = FirstStates(np.array(states), np.sqrt(np.mean(variances, axis=0)))
+    return first_states if all(np.isfinite(part).all() for part in first_states) else None
 
 
 class _Smoothed(NamedTuple):
@@ -152,43 +152,59 @@ class _CubatureFilter:
         with np.errstate(all="ignore"), capture_mujoco_warnings():
             self._mujoco_batch.write_effects(self._acting)
             for i, (begin, end) in enumerate(zip(self._knots, self._knots[1:], strict=False)):
-                gained, mean, covariance = self._update(i, mean, covariance)
-                log_likelihood += gained
+                log_likelihood_gain, mean, covariance = self._update(i, mean, covariance)
+                log_likelihood += log_likelihood_gain
                 root = np.linalg.cholesky(covariance + ADDED_VARIANCE * np.eye(size))
-                moved = points[:, :size] @ root.T  # (1)
-                ends = self._propagate(mean + moved, points[:, size:] * force, int(begin), int(end))
+                displacements = points[:, :size] @ root.T  # (1)
+                ends = self._propagate(
+                    mean + displacements, points[:, size:] * force, int(begin), int(end)
+                )
                 if not np.isfinite(ends).all():
                     return _Smoothed(-np.inf, self._start, covariance)
                 predicted = ends.mean(axis=0)
-                spread = (ends - predicted).T @ (ends - predicted) / len(ends)
-                spread += ADDED_VARIANCE * np.eye(size)
-                crossed = moved.T @ (ends - predicted) / len(ends)
-                intervals.append((mean, covariance, predicted, spread, crossed))
-                mean, covariance = predicted, spread
-            gained, mean, covariance = self._update(self._knots.size - 1, mean, covariance)
-        for before, own, predicted, spread, crossed in reversed(intervals):
-            gain = np.linalg.solve(spread, crossed.T).T  # (2)
-            mean = before + gain @ (mean - predicted)
-            covariance = own + gain @ (covariance - spread) @ gain.T
-        return _Smoothed(log_likelihood + gained, mean, covariance)
+                predicted_covariance = (ends - predicted).T @ (ends - predicted) / len(ends)
+                predicted_covariance += ADDED_VARIANCE * np.eye(size)
+                cross_covariance = displacements.T @ (ends - predicted) / len(ends)
+                intervals.append(
+                    (mean, covariance, predicted, predicted_covariance, cross_covariance)
+                )
+                mean, covariance = predicted, predicted_covariance
+            log_likelihood_gain, mean, covariance = self._update(
+                self._knots.size - 1, mean, covariance
+            )
+        for (
+            filtered_mean,
+            filtered_covariance,
+            predicted,
+            predicted_covariance,
+            cross_covariance,
+        ) in reversed(intervals):
+            gain = np.linalg.solve(predicted_covariance, cross_covariance.T).T  # (2)
+            mean = filtered_mean + gain @ (mean - predicted)
+            covariance = filtered_covariance + gain @ (covariance - predicted_covariance) @ gain.T
+        return _Smoothed(log_likelihood + log_likelihood_gain, mean, covariance)
 
     def _update(self, i: int, mean: Array, covariance: Array) -> tuple[float, Array, Array]:
-        """Update mean and covariance by the readings of sample i (Kalman).
+        """Update mean and covariance of the state by the readings of sample i (Kalman filter).
 
         Returns:
             Log-likelihood of the readings, mean, and covariance.
         """
-        there = np.isfinite(self._observed[i])
-        rows = np.array(self._rows)[there]
+        is_recorded = np.isfinite(self._observed[i])
+        rows = np.array(self._rows)[is_recorded]
         if not rows.size:
             return 0.0, mean, covariance
-        residual = self._observed[i][there] - mean[rows]
-        spread = covariance[np.ix_(rows, rows)] + np.diag(self._variances[there])
-        gain = np.linalg.solve(spread, covariance[rows]).T
-        _, size = np.linalg.slogdet(spread)
-        log_likelihood = -0.5 * float(residual @ np.linalg.solve(spread, residual) + size)
-        after = covariance - gain @ covariance[rows]
-        return log_likelihood, mean + gain @ residual, 0.5 * (after + after.T)
+        residual = self._observed[i][is_recorded] - mean[rows]
+        innovation_covariance = covariance[np.ix_(rows, rows)] + np.diag(
+            self._variances[is_recorded]
+        )
+        gain = np.linalg.solve(innovation_covariance, covariance[rows]).T
+        _, log_determinant = np.linalg.slogdet(innovation_covariance)
+        log_likelihood = -0.5 * float(
+            residual @ np.linalg.solve(innovation_covariance, residual) + log_determinant
+        )
+        new_covariance = covariance - gain @ covariance[rows]
+        return log_likelihood, mean + gain @ residual, 0.5 * (new_covariance + new_covariance.T)
 
     def _propagate(self, states: Array, forces: Array, begin: int, end: int) -> Array:
         """Step states (n, 2 D) with additional forces (n, D) through the engine.
@@ -200,18 +216,21 @@ class _CubatureFilter:
         result = states.copy()
         if end == begin:
             return result
-        places, dofs = mujoco_batch.file_joints.positions, mujoco_batch.file_joints.velocities
+        position_columns, velocity_columns = (
+            mujoco_batch.file_joints.positions,
+            mujoco_batch.file_joints.velocities,
+        )
         for first in range(0, len(states), LINEARISATION_BATCH_SIZE):
             part = slice(first, first + LINEARISATION_BATCH_SIZE)
-            own = states[part]
-            n = len(own)
-            floating_state = FloatingState(np.zeros((n, 0)), np.zeros((n, 0)))
-            mujoco_batch.set_initial_state(own[:, :joints], own[:, joints:], floating_state)
-            pushed = np.repeat(self._given.forces[:, begin:end], n, axis=0)
-            pushed[:, :, dofs] += forces[part, None]
-            controls = np.repeat(self._given.controls[:, begin:end], n, axis=0)
-            done = mujoco_batch.step(controls, pushed, ["qpos", "qvel"])
-            result[part, :joints] = done["qpos"][:, -1, places]
-            result[part, joints:] = done["qvel"][:, -1, dofs]
+            part_states = states[part]
+            count = len(part_states)
+            afloat = FloatingState(np.zeros((count, 0)), np.zeros((count, 0)))
+            mujoco_batch.set_initial_state(part_states[:, :joints], part_states[:, joints:], afloat)
+            applied_forces = np.repeat(self._given.forces[:, begin:end], count, axis=0)
+            applied_forces[:, :, velocity_columns] += forces[part, None]
+            controls = np.repeat(self._given.controls[:, begin:end], count, axis=0)
+            motion = mujoco_batch.step(controls, applied_forces, ["qpos", "qvel"])
+            result[part, :joints] = motion["qpos"][:, -1, position_columns]
+            result[part, joints:] = motion["qvel"][:, -1, velocity_columns]
             result[part][mujoco_batch.failed] = np.nan
         return result

@@ -30,7 +30,7 @@ from bench.diagnosis.prediction_error.joint_effects import (
 from bench.diagnosis.prediction_error.library_columns import LibraryColumns, build_regression_about
 from bench.diagnosis.prediction_error.model_filters import FilteredSet, ModelFilters
 from bench.diagnosis.search.effect_search import EffectSearch
-from bench.diagnosis.search.refit_starts import with_effect
+from bench.diagnosis.search.refit_starts import add_effect_to_start
 from sims.core.simulator import Array
 from sims.robot.places.typical_forces import compute_joint_scales
 from sims.robot.robot_simulator import RobotSimulator
@@ -80,7 +80,7 @@ class EffectProposals:
             current.names, current.followed.theta, evaluator.initial_state_guesses
         )
         return [
-            with_effect(evaluator, present_model, name, c)
+            add_effect_to_start(evaluator, present_model, name, c)
             for name, c in by_regression + joint_model[:max_joint_proposals]
         ]
 

@@ -115,15 +115,15 @@ class InactiveDrive:
         Args:
             masks: (T,) samples of each run.
         """
-        more, changes = 0.0, 0
-        for costs, mask, own in zip(self.costs, masks, self.masks, strict=True):
-            given = np.where(mask[:: self.every], costs[1], costs[0])
-            likeliest = np.where(own[:: self.every], costs[1], costs[0])
-            more += float((given - likeliest).sum())
+        extra_cost, changes = 0.0, 0
+        for costs, mask, likeliest_mask in zip(self.costs, masks, self.masks, strict=True):
+            given_costs = np.where(mask[:: self.every], costs[1], costs[0])
+            lowest_costs = np.where(likeliest_mask[:: self.every], costs[1], costs[0])
+            extra_cost += float((given_costs - lowest_costs).sum())
             if len(spans(mask)) > MAX_STRETCHES:
                 return False
             changes += int((mask[1:] != mask[:-1]).sum())
-        return more <= MAX_EXTRA_COST * CHANGE_COST * max(changes, 1)
+        return extra_cost <= MAX_EXTRA_COST * CHANGE_COST * max(changes, 1)
 
 
 def remove_inactive_drives(recording: Recording, kind: type[Simulator]) -> Recording:
@@ -141,32 +141,34 @@ def remove_inactive_drives(recording: Recording, kind: type[Simulator]) -> Recor
         return recording
     notes = list(recording.notes)
     runs = recording.runs
-    left_out = [np.zeros(run.times.size, dtype=bool) for run in runs]
+    inactive_masks = [np.zeros(run.times.size, dtype=bool) for run in runs]
     unexplained: list[InactiveDrive] = []
     for drive in drives:
         switches = [] if drive.is_held else _find_switches(recording, drive)
         if not switches:
             unexplained.append(drive)
-            left_out = [a | _widen_mask(b) for a, b in zip(left_out, drive.masks, strict=True)]
+            inactive_masks = [
+                a | _widen_mask(b) for a, b in zip(inactive_masks, drive.masks, strict=True)
+            ]
             continue
-        runs, said = apply_drive_switches(recording.path, runs, switches)
-        lines = " and ".join(switch.line for switch in switches)
+        runs, texts = apply_drive_switches(recording.path, runs, switches)
+        switch_lines = " and ".join(switch.line for switch in switches)
         description = recording.path.with_suffix(".toml").name
         notes += [
             f"{text}, and the motion shows no force of it: the drive is assumed to be off; state "
-            f"it in {description}: {lines}"
-            for text in said
+            f"it in {description}: {switch_lines}"
+            for text in texts
         ]
-    pairs = zip(runs, left_out, strict=True)
-    kept = [part for run, mask in pairs for part in split_without_masked(run, mask)]
-    if unexplained and any(not run.held_out for run in kept):
-        notes += [_format_message(recording, unexplained, left_out)]
-        runs = tuple(kept)
+    pairs = zip(runs, inactive_masks, strict=True)
+    remaining_runs = [part for run, mask in pairs for part in split_without_masked(run, mask)]
+    if unexplained and any(not run.held_out for run in remaining_runs):
+        notes += [_format_message(recording, unexplained, inactive_masks)]
+        runs = tuple(remaining_runs)
     return replace(recording, runs=tuple(runs), notes=tuple(notes))
 
 
 def _format_message(
-    recording: Recording, drives: Sequence[InactiveDrive], left_out: Sequence[Mask]
+    recording: Recording, drives: Sequence[InactiveDrive], inactive_masks: Sequence[Mask]
 ) -> str:
     """Write the note on samples with inactive drives that were left out.
 
@@ -174,18 +176,20 @@ def _format_message(
     stated that does.
     """
     joints = ", ".join(drive.joint for drive in drives)
-    where = spans_of_runs(recording.runs, left_out)
+    sample_text = spans_of_runs(recording.runs, inactive_masks)
     noun = "joint" if len(drives) == 1 else "joints"
-    does = "the joints stand still" if drives[0].is_held else "the motion shows no force of them"
+    symptom_text = (
+        "the joints stand still" if drives[0].is_held else "the motion shows no force of them"
+    )
     column = _find_changing_column(recording, drives)
-    near = f"; column {column} changes there" if column else ""
+    column_text = f"; column {column} changes there" if column else ""
     name = drives[0].actuators[0]
     line = DriveSwitch(name, "COLUMN", True).line
     return (
         f"the drives of {noun} {joints} exert no force in some samples, which are excluded "
-        f"({where}): "
-        f"{does}, whatever the command is{near}; if a column shows when a drive is on, state it: "
-        f"{line}"
+        f"({sample_text}): "
+        f"{symptom_text}, whatever the command is{column_text}; "
+        f"if a column shows when a drive is on, state it: {line}"
     )
 
 
@@ -193,9 +197,9 @@ def _find_switches(recording: Recording, drive: InactiveDrive) -> list[DriveSwit
     """Return switches of a drive's actuators from the first column that shows when it is off."""
     for column in recording.runs[0].extra:
         for zero_is_off in (True, False):
-            found = [DriveSwitch(name, column, zero_is_off) for name in drive.actuators]
-            if drive.is_likely([found[0].off(run) for run in recording.runs]):
-                return found
+            switches = [DriveSwitch(name, column, zero_is_off) for name in drive.actuators]
+            if drive.is_likely([switches[0].off(run) for run in recording.runs]):
+                return switches
     return []
 
 
@@ -205,15 +209,15 @@ def _find_changing_column(recording: Recording, drives: Sequence[InactiveDrive])
     The result is empty if there is no such column.
     """
     for column in recording.runs[0].extra:
-        hits, others = 0, 0
+        changes_near, other_changes = 0, 0
         for number, run in enumerate(recording.runs):
             values = run.extra[column]
             changes = np.flatnonzero(np.diff(values) != 0) + 1
-            found = np.any([drive.masks[number] for drive in drives], axis=0)
-            near = _widen_mask(found) & _widen_mask(~found)
-            hits += int(near[changes].sum())
-            others += int((~near[changes]).sum())
-        if hits and not others:
+            inactive_mask = np.any([drive.masks[number] for drive in drives], axis=0)
+            is_near_change = _widen_mask(inactive_mask) & _widen_mask(~inactive_mask)
+            changes_near += int(is_near_change[changes].sum())
+            other_changes += int((~is_near_change[changes]).sum())
+        if changes_near and not other_changes:
             return column
     return ""
 
@@ -241,38 +245,39 @@ def find_inactive_drives(recording: Recording, kind: type[Simulator]) -> list[In
     if any(run.times.size <= 3 * MIN_SAMPLES for run in recording.runs):
         return []
     total = sum(run.times.size for run in recording.runs)
-    every = -(-total // MAX_SAMPLES)
+    sample_stride = -(-total // MAX_SAMPLES)
     with np.errstate(all="ignore"):
         forces = [
-            compute_joint_forces(robot, recording, run) for run in _thin_runs(recording, every)
+            compute_joint_forces(robot, recording, run)
+            for run in _thin_runs(recording, sample_stride)
         ]
     driven = [a for a in robot.actuators if a.joint is not None and a.kind != "other"]
     actuators = {
-        number: tuple(a.name for a in driven if a.joint == joint.name)
-        for number, joint in enumerate(robot.joints)
+        joint_index: tuple(a.name for a in driven if a.joint == joint.name)
+        for joint_index, joint in enumerate(robot.joints)
     }
-    joints = [number for number, names in actuators.items() if names]
+    joints = [joint_index for joint_index, names in actuators.items() if names]
     drives = []
     for joint in joints:
-        stretches = _Intervals(forces, [joint], OFF)
-        if stretches.any():
-            drives.append((joint, stretches))
+        intervals = _Intervals(forces, [joint], OFF)
+        if intervals.any():
+            drives.append((joint, intervals))
     if not drives and joints:
-        stretches = _Intervals(forces, joints, HELD)
-        drives = [(joint, stretches) for joint in joints] if stretches.any() else []
+        intervals = _Intervals(forces, joints, HELD)
+        drives = [(joint, intervals) for joint in joints] if intervals.any() else []
     return [
         InactiveDrive(
             robot.joints[joint].name,
             actuators[joint],
-            stretches.state == HELD,
+            intervals.state == HELD,
             tuple(
-                np.repeat(mask, every)[: run.times.size]
-                for mask, run in zip(stretches.masks, recording.runs, strict=True)
+                np.repeat(mask, sample_stride)[: run.times.size]
+                for mask, run in zip(intervals.masks, recording.runs, strict=True)
             ),
-            tuple(stretches.costs),
-            every,
+            tuple(intervals.costs),
+            sample_stride,
         )
-        for joint, stretches in drives
+        for joint, intervals in drives
     ]
 
 
@@ -323,41 +328,52 @@ class _Intervals:
 
         Single intervals that do not fulfil them are removed.
         """
-        nothing = [np.zeros_like(mask) for mask in masks]
-        working = [~_widen_mask(mask) for mask in masks]
-        inner = [_remove_edges(mask) for mask in masks]
+        empty_masks = [np.zeros_like(mask) for mask in masks]
+        active_masks = [~_widen_mask(mask) for mask in masks]
+        interior_masks = [_remove_edges(mask) for mask in masks]
         if (
-            min(sum(int(m.sum()) for m in of_runs) for of_runs in (working, inner))
+            min(sum(int(m.sum()) for m in of_runs) for of_runs in (active_masks, interior_masks))
             < MIN_SAMPLES // 2
         ):
-            return nothing
-        missed = self._compute_residual_magnitudes(ON, working)
-        usual = self._compute_residual_magnitudes(self.state, working)
-        driven = self._compute_residual_magnitudes(ON, inner)
-        left = self._compute_residual_magnitudes(self.state, inner)
-        is_worse = any(d >= MIN_MISSED_RATIO * m for d, m in zip(driven, missed, strict=True))
-        is_small = all(e <= MAX_RESIDUAL_SHARE * u for e, u in zip(left, usual, strict=True))
-        if not (is_worse and is_small and sum(left) <= MAX_RESIDUAL_SHARE * sum(driven)):
-            return nothing
-        fast = [
+            return empty_masks
+        drive_error_outside = self._compute_residual_magnitudes(ON, active_masks)
+        hypothesis_error_outside = self._compute_residual_magnitudes(self.state, active_masks)
+        drive_error_inside = self._compute_residual_magnitudes(ON, interior_masks)
+        hypothesis_error_inside = self._compute_residual_magnitudes(self.state, interior_masks)
+        is_worse = any(
+            d >= MIN_MISSED_RATIO * m
+            for d, m in zip(drive_error_inside, drive_error_outside, strict=True)
+        )
+        is_small = all(
+            e <= MAX_RESIDUAL_SHARE * u
+            for e, u in zip(hypothesis_error_inside, hypothesis_error_outside, strict=True)
+        )
+        if not (
+            is_worse
+            and is_small
+            and sum(hypothesis_error_inside) <= MAX_RESIDUAL_SHARE * sum(drive_error_inside)
+        ):
+            return empty_masks
+        typical_speeds = [
             _compute_magnitude(
-                np.concatenate([f.velocity[m, j] for f, m in self._pair_with_forces(working)])
+                np.concatenate([f.velocity[m, j] for f, m in self._pair_with_forces(active_masks)])
             )
             for j in self._joints
         ]
         result = []
-        for run, (mask, within) in enumerate(zip(masks, inner, strict=True)):
-            standing = np.zeros_like(mask)
+        for run, (mask, interior_mask) in enumerate(zip(masks, interior_masks, strict=True)):
+            accepted_mask = np.zeros_like(mask)
             for first, end in spans(mask):
-                own = [np.zeros_like(m) for m in masks]
-                own[run][first:end] = within[first:end]
-                better = sum(
-                    self._compute_residual_magnitudes(self.state, own)
-                ) <= MAX_STRETCH_SHARE * sum(self._compute_residual_magnitudes(ON, own))
-                standing[first:end] = better and (
-                    self.state == OFF or self._is_at_rest(run, own[run], (first, end), fast)
+                interval_masks = [np.zeros_like(m) for m in masks]
+                interval_masks[run][first:end] = interior_mask[first:end]
+                is_explained = sum(
+                    self._compute_residual_magnitudes(self.state, interval_masks)
+                ) <= MAX_STRETCH_SHARE * sum(self._compute_residual_magnitudes(ON, interval_masks))
+                accepted_mask[first:end] = is_explained and (
+                    self.state == OFF
+                    or self._is_at_rest(run, interval_masks[run], (first, end), typical_speeds)
                 )
-            result.append(standing)
+            result.append(accepted_mask)
         return result
 
     def _pair_with_forces(self, masks: Sequence[Mask]) -> zip[tuple[JointForces, Mask]]:
@@ -374,16 +390,16 @@ class _Intervals:
         ]
 
     def _is_at_rest(
-        self, run: int, mask: Mask, ends: tuple[int, int], fast: Sequence[float]
+        self, run: int, mask: Mask, ends: tuple[int, int], typical_speeds: Sequence[float]
     ) -> bool:
         """Return whether all joints are at rest in an interval at an end of the run."""
         velocity = self._forces[run].velocity
         at_end = ends[0] <= EDGE_SAMPLES or ends[1] >= mask.size - EDGE_SAMPLES
-        still = [
-            _compute_magnitude(velocity[mask, j]) <= MAX_REST_SPEED * f
-            for j, f in zip(self._joints, fast, strict=True)
+        is_joint_at_rest = [
+            _compute_magnitude(velocity[mask, j]) <= MAX_REST_SPEED * typical_speed
+            for j, typical_speed in zip(self._joints, typical_speeds, strict=True)
         ]
-        return at_end and all(still)
+        return at_end and all(is_joint_at_rest)
 
 
 def _remove_edges(mask: Mask) -> Mask:
@@ -396,20 +412,21 @@ def _remove_edges(mask: Mask) -> Mask:
 
 def _compute_costs(residuals: Sequence[Array], state: int) -> list[Array]:
     """Return costs (2, T) in each run, of an active drive and of a hypothesis about one joint."""
-    chosen = [ON, state]
-    pooled = np.concatenate(residuals, axis=1)[chosen]
-    pooled = pooled[:, np.isfinite(pooled).all(axis=0)]
-    if not pooled.size:
-        return [np.zeros((2, r.shape[1])) for r in residuals]
-    scale = float(np.median(np.abs(pooled).min(axis=0)))
-    scale = max(scale, MIN_SCALE_SHARE * _compute_magnitude(pooled[1]))
+    hypotheses = [ON, state]
+    pooled_residuals = np.concatenate(residuals, axis=1)[hypotheses]
+    pooled_residuals = pooled_residuals[:, np.isfinite(pooled_residuals).all(axis=0)]
+    if not pooled_residuals.size:
+        return [np.zeros((2, run_residuals.shape[1])) for run_residuals in residuals]
+    scale = float(np.median(np.abs(pooled_residuals).min(axis=0)))
+    scale = max(scale, MIN_SCALE_SHARE * _compute_magnitude(pooled_residuals[1]))
     if not scale > 0:
-        return [np.zeros((2, r.shape[1])) for r in residuals]
+        return [np.zeros((2, run_residuals.shape[1])) for run_residuals in residuals]
     return [
         np.minimum(
-            np.abs(np.nan_to_num(r[chosen], nan=MAX_SAMPLE_COST * scale)) / scale, MAX_SAMPLE_COST
+            np.abs(np.nan_to_num(run_residuals[hypotheses], nan=MAX_SAMPLE_COST * scale)) / scale,
+            MAX_SAMPLE_COST,
         )
-        for r in residuals
+        for run_residuals in residuals
     ]
 
 
@@ -420,17 +437,17 @@ def _choose_second_hypothesis(costs: Array) -> Mask:
     """
     count = costs.shape[1]
     from_other = np.zeros((2, count), dtype=bool)
-    best = costs[:, 0].copy()
-    for k in range(1, count):
-        changed = best[::-1] + CHANGE_COST
-        from_other[:, k] = changed < best
-        best = np.minimum(best, changed) + costs[:, k]
+    lowest_costs = costs[:, 0].copy()
+    for i in range(1, count):
+        cost_with_change = lowest_costs[::-1] + CHANGE_COST
+        from_other[:, i] = cost_with_change < lowest_costs
+        lowest_costs = np.minimum(lowest_costs, cost_with_change) + costs[:, i]
     result = np.zeros(count, dtype=bool)
-    now = int(np.argmin(best))
-    for k in range(count - 1, -1, -1):
-        result[k] = now == 1
-        if from_other[now, k]:
-            now = 1 - now
+    hypothesis = int(np.argmin(lowest_costs))
+    for i in range(count - 1, -1, -1):
+        result[i] = hypothesis == 1
+        if from_other[hypothesis, i]:
+            hypothesis = 1 - hypothesis
     return result
 
 

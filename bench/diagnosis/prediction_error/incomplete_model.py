@@ -47,7 +47,7 @@ from bench.diagnosis.prediction_error.selection_fits import (
     MIN_FURTHER_GAIN_SHARE,
 )
 from bench.diagnosis.search.candidate_directions import CandidateDirection
-from bench.diagnosis.search.refit_starts import with_effect
+from bench.diagnosis.search.refit_starts import add_effect_to_start
 from sims.core.simulator import Array
 
 MIN_SECONDS = 8.0
@@ -274,7 +274,7 @@ def _add_next_effect(
     name, (solution,) = best.effect, regression.solve([best])[1]
     c = group_coefficients(evaluator, columns.probes, best, solution)
     present = FitStart(current.names, current.followed.theta, evaluator.initial_state_guesses)
-    start = with_effect(evaluator, present, name, c)
+    start = add_effect_to_start(evaluator, present, name, c)
     larger = _fit_set(context, current.followed.with_parameters(start.theta), start.effects)
     gain = 2.0 * (larger.followed.log_likelihood - current.followed.log_likelihood)
     return larger if gain > _compute_min_gain(context, larger, name) else None

@@ -62,7 +62,7 @@ from bench.diagnosis.prediction_error.selection_fits import (
     select_with_shapes,
 )
 from bench.diagnosis.prediction_error.simulated_fits import (
-    fit,
+    fit_by_simulation,
     is_explained,
     is_nearly_explained,
     remove_idle_effects,
@@ -70,7 +70,7 @@ from bench.diagnosis.prediction_error.simulated_fits import (
 )
 from bench.diagnosis.search.candidate_directions import DirectionSet
 from bench.diagnosis.search.effect_search import EffectSearch
-from bench.diagnosis.search.refit_starts import with_effect
+from bench.diagnosis.search.refit_starts import add_effect_to_start
 from bench.diagnosis.search.score_test import CandidateScores
 from bench.diagnosis.search.verdict_rules import EFFECT_P_VALUE_THRESHOLD
 from sims.core.simulator import Array
@@ -106,7 +106,7 @@ class PredictionErrorSearch(EffectSearch):
         """
         context, self.best_supported_model, best = self._search_context, self.base_model, None
         if self.likely is not None:
-            best = remove_idle_effects(context, fit(context, self.likely))
+            best = remove_idle_effects(context, fit_by_simulation(context, self.likely))
         else:
             self.identified = identify_incomplete(context)
         if self.identified is not None:
@@ -151,9 +151,9 @@ class PredictionErrorSearch(EffectSearch):
         This is the case if a force is missing, the best model does not explain the runs, and there
         is time left.
         """
-        lacks = self._search_context.filters.base.has_missing_force
+        is_force_missing = self._search_context.filters.base.has_missing_force
         return (
-            lacks
+            is_force_missing
             and not is_explained(self._search_context, best)
             and not self.evaluator.search_control.has_abandoned_fits()
         )
@@ -211,33 +211,36 @@ class PredictionErrorSearch(EffectSearch):
             self._search_context.columns,
             scores.effects[0],
         )
-        c = columns.coefficients(*scores.peaks[0][0])
-        start = with_effect(self.evaluator, model.fit.make_start(), name, c)
-        places, count = self.evaluator.get_coefficient_indices(name), len(self.evaluator.library)
+        coefficients = columns.coefficients(*scores.peaks[0][0])
+        start = add_effect_to_start(self.evaluator, model.fit.make_start(), name, coefficients)
+        indices, library_size = (
+            self.evaluator.get_coefficient_indices(name),
+            len(self.evaluator.library),
+        )
         # A filter with the effect in the model is faster than a fit, and not linear in the effect.
         log_likelihood = filters.get_filter(model).log_likelihood
         gains = []
         for share in TRIED_SHARES:
             theta = start.theta.copy()
-            theta[places] *= share
+            theta[indices] *= share
             gains.append(2.0 * (filters.log_likelihood(theta) - log_likelihood))
-        by_filter = compute_p_value_of_gain(max(gains), len(places), count)
-        if by_filter > EFFECT_P_VALUE_THRESHOLD:
-            return by_filter
+        p_value_by_filter = compute_p_value_of_gain(max(gains), len(indices), library_size)
+        if p_value_by_filter > EFFECT_P_VALUE_THRESHOLD:
+            return p_value_by_filter
         larger = self.fit_one(start)
         gain = larger.likelihood.value - model.likelihood.value
-        return compute_p_value_of_gain(gain, len(places), count)
+        return compute_p_value_of_gain(gain, len(indices), library_size)
 
     def score_missing_effects(
         self,
         model: FittedModel,
-        against: Array | None = None,  # noqa: ARG002
+        noise_residual: Array | None = None,  # noqa: ARG002
     ) -> CandidateScores:
         """Score every effect that the model lacks by the innovations.
 
         Args:
             model: the model.
-            against: not used.
+            noise_residual: not used.
         """
         key = frozenset(model.effects)
         if key not in self.scores_by_effects:
@@ -251,8 +254,8 @@ class PredictionErrorSearch(EffectSearch):
             return replace(self.score_missing_effects(self.base_model), p_value=1.0)
         self._report_scoring(model)
         regression, _ = self._search_context.columns.regression(model)
-        stream = self.make_rng("library", model.effects)
-        return score_by_regression(regression, set(self._list_addable_effects(model)), stream)
+        rng = self.make_rng("library", model.effects)
+        return score_by_regression(regression, set(self._list_addable_effects(model)), rng)
 
     def score_unmodelled_force(self, model: FittedModel) -> tuple[float, str] | None:
         """Return the p-value of the best additional force and the signal it depends on."""
@@ -285,9 +288,11 @@ class PredictionErrorSearch(EffectSearch):
 
     def with_sensitivities(self, start: FitStart) -> FitStart:
         """Return a start with derivatives by its coefficients about the measured motion."""
-        free = set(self.evaluator.base_indices.tolist()) - self.fixed_parameters
-        has_jacobian = start.known_jacobian is not None or not start.effects
-        if has_jacobian or free or has_series(self.evaluator, start.effects):
+        has_free_base = set(self.evaluator.base_indices.tolist()) - self.fixed_parameters
+        needs_jacobian = start.known_jacobian is None and start.effects
+        # The derivatives are those by coefficients of effects alone, and linear without states of
+        # elastic joints.
+        if not needs_jacobian or has_free_base or has_series(self.evaluator, start.effects):
             return start
         return replace(start, known_jacobian=self._search_context.columns.sensitivities(start))
 

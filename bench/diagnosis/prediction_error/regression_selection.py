@@ -201,7 +201,7 @@ class Regression:
                 blocks, cross[batch.columns][..., None], batch.positive
             )
             left = np.maximum(rss - own[:, 0], SMALLEST_RSS * self.total)
-            result[batch.places] = self.count * np.log(rss / left)
+            result[batch.group_indices] = self.count * np.log(rss / left)
         for i, group in enumerate(self.groups):
             if group.effect in held:
                 result[i] = 0.0

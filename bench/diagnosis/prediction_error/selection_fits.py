@@ -29,7 +29,7 @@ from bench.diagnosis.prediction_error.joint_effects import (
     has_many_shapes,
 )
 from bench.diagnosis.prediction_error.simulated_fits import (
-    fit,
+    fit_by_simulation,
     fit_nearby,
     is_at_noise,
     is_explained,
@@ -67,6 +67,8 @@ The model of a real robot is never complete, and long recordings show this with 
 def fit_quick_selection(context: SearchContext, selected: Selected) -> FittedModel:
     """Fit the selected set by simulation, without effects that gain little.
 
+    It is not fitted if simulation is slow and the filter shows that a force is still missing.
+
     Args:
         context: context of the search.
         selected: the selection.
@@ -74,11 +76,13 @@ def fit_quick_selection(context: SearchContext, selected: Selected) -> FittedMod
     Returns:
         The fitted model, or the base model if simulation is slow and a force is still missing.
     """
-    paying = drop_surplus_effects(context, selected)
-    is_slow = len(paying.groups) > MAX_SLOW_EFFECTS and _is_slow(context, paying.effects)
+    useful_selection = drop_surplus_effects(context, selected)
+    is_slow = len(useful_selection.groups) > MAX_SLOW_EFFECTS and _is_slow(
+        context, useful_selection.effects
+    )
     if is_slow and selected.followed.has_missing_force:
         return context.search.base_model
-    return fit_selection(context, paying)
+    return fit_selection(context, useful_selection)
 
 
 def fit_selection(context: SearchContext, selected: Selected) -> FittedModel:
@@ -93,7 +97,7 @@ def fit_selection(context: SearchContext, selected: Selected) -> FittedModel:
         return base
     start = context.columns.start(selected.groups, selected.coefficients)
     states = context.filters.estimate_first_states(selected.followed)
-    fitted = fit(context, replace(start, initial_states=states))
+    fitted = fit_by_simulation(context, replace(start, initial_states=states))
     if not np.isfinite(fitted.fit.cost):
         return base
     fitted = remove_idle_effects(context, fitted)
@@ -157,15 +161,15 @@ def select_with_shapes(context: SearchContext, selected: Selected) -> Selected:
         selected: the previous selection.
     """
     evaluator, joints = context.evaluator, np.flatnonzero(selected.followed.missing_forces).tolist()
-    many_shaped = [
+    effects_with_shapes = [
         n for n in evaluator.library if has_many_shapes(n) and acts_at_joint(evaluator, n, joints)
     ]
-    if not many_shaped:
+    if not effects_with_shapes:
         return selected
     evaluator.search_control.begin_stage(
-        f"testing {len(many_shaped)} effects with several coefficients", 1
+        f"testing {len(effects_with_shapes)} effects with several coefficients", 1
     )
-    context.columns.add(many_shaped)
+    context.columns.add(effects_with_shapes)
     return context.columns.select()
 
 
@@ -183,7 +187,9 @@ class SoftFrictionError(Exception):
 
 
 def check_selection(context: SearchContext, selected: Selected) -> None:
-    """Compare a selection with soft dry friction, before anything is fitted.
+    """Raise `SoftFrictionError` if soft dry friction explains the runs better than a selection.
+
+    It compares log-likelihoods of filters, before anything but dry friction is fitted.
 
     Args:
         context: context of the search.
@@ -195,25 +201,25 @@ def check_selection(context: SearchContext, selected: Selected) -> None:
     filters = context.filters
     if filters.is_soft or not filters.base.has_missing_force:
         return
-    friction = make_dry_friction_start(context, selected)
+    stiff_friction = make_dry_friction_start(context, selected)
     # Stiff friction that explains the runs needs no comparison.
-    if friction.effects and is_explained(
-        context, context.search.fit_one(friction, FIRST_ITERATIONS)
+    if stiff_friction.effects and is_explained(
+        context, context.search.fit_one(stiff_friction, FIRST_ITERATIONS)
     ):
         return
-    soft = _find_soft_friction(context)
-    if soft is None:
+    soft_start = _find_soft_friction(context)
+    if soft_start is None:
         return
-    softer = filters.log_likelihood(soft.theta, is_soft=True)
-    gain = softer - filters.base.log_likelihood
+    soft_log_likelihood = filters.log_likelihood(soft_start.theta, is_soft=True)
+    gain = soft_log_likelihood - filters.base.log_likelihood
     # Another effect at the joint that promises more is fitted first.
-    if not gain > max(context.proposals.compute_largest_gain_of_others(soft.effects[0]), 0.0):
+    if not gain > max(context.proposals.compute_largest_gain_of_others(soft_start.effects[0]), 0.0):
         return
-    if _is_far_less_likely(context, selected, softer):
-        raise SoftFrictionError(soft, is_preliminary=True)
-    paying = drop_surplus_effects(context, selected)
+    if _is_far_less_likely(context, selected, soft_log_likelihood):
+        raise SoftFrictionError(soft_start, is_preliminary=True)
+    useful_selection = drop_surplus_effects(context, selected)
     log_likelihood = filters.log_likelihood(
-        context.columns.start(paying.groups, paying.coefficients).theta
+        context.columns.start(useful_selection.groups, useful_selection.coefficients).theta
     )
     check_filter(context, log_likelihood, is_preliminary=True)
 
@@ -228,7 +234,7 @@ def _find_soft_friction(context: SearchContext) -> FitStart | None:
     columns, evaluator = context.columns, context.evaluator
     regression = columns.base_regression
     gains, groups = regression.gains([]), regression.groups
-    by_gain = [
+    friction_groups = [
         i
         for i in np.argsort(-gains, kind="stable").tolist()
         if gains[i] > MIN_GAIN_SHARE * gains.max()
@@ -236,11 +242,13 @@ def _find_soft_friction(context: SearchContext) -> FitStart | None:
         and not groups[i].effect.endswith("@*")
         and groups[i].effect in evaluator.library
     ]
-    if not by_gain:
+    if not friction_groups:
         return None
-    best = groups[by_gain[0]]
-    (c,) = columns.coefficients(best, regression.solve([best])[1][0])
-    return context.filters.find_soft_friction(best.effect, float(np.copysign(1.0, c)))
+    best_group = groups[friction_groups[0]]
+    (coefficient,) = columns.coefficients(best_group, regression.solve([best_group])[1][0])
+    return context.filters.find_soft_friction(
+        best_group.effect, float(np.copysign(1.0, coefficient))
+    )
 
 
 def _is_far_less_likely(context: SearchContext, selected: Selected, log_likelihood: float) -> bool:
@@ -265,7 +273,7 @@ def _is_far_less_likely(context: SearchContext, selected: Selected, log_likeliho
 def check_filter(
     context: SearchContext, log_likelihood: float, is_preliminary: bool = False
 ) -> None:
-    """Compare the log-likelihood of a filter with that of soft dry friction.
+    """Raise `SoftFrictionError` if soft dry friction is likelier than a model with its filter.
 
     Args:
         context: context of the search.
@@ -275,16 +283,18 @@ def check_filter(
     Raises:
         SoftFrictionError: soft friction is likelier.
     """
-    soft = _find_soft_friction(context)
-    if soft is None:
+    soft_start = _find_soft_friction(context)
+    if soft_start is None:
         return
-    softer = context.filters.log_likelihood(soft.theta, is_soft=True)
-    if softer > log_likelihood + 0.5 * INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO:
-        raise SoftFrictionError(soft, is_preliminary)
+    soft_log_likelihood = context.filters.log_likelihood(soft_start.theta, is_soft=True)
+    if soft_log_likelihood > log_likelihood + 0.5 * INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO:
+        raise SoftFrictionError(soft_start, is_preliminary)
 
 
 def check_fit(context: SearchContext, model: FittedModel) -> None:
-    """Compare a fitted model with the same effects in the soft form of dry friction.
+    """Raise `SoftFrictionError` if a fitted model is likelier with soft dry friction.
+
+    It is refitted with the same effects in the soft form.
 
     Args:
         context: context of the search.
@@ -316,7 +326,7 @@ def fit_dry_friction(context: SearchContext, selected: Selected) -> FittedModel:
         return remove_idle_effects(context, fitted_before)
     if fitted_before is not None and np.isfinite(fitted_before.fit.cost):
         friction = fitted_before.fit.make_start()
-    fitted = fit(context, friction)
+    fitted = fit_by_simulation(context, friction)
     return remove_idle_effects(context, fitted) if is_explained(context, fitted) else fitted
 
 
@@ -331,14 +341,20 @@ def make_dry_friction_start(context: SearchContext, selected: Selected) -> FitSt
     """
     evaluator, filters = context.evaluator, context.filters
     start = context.columns.start(selected.groups, selected.coefficients)
-    plain_names, plain_theta = replace_by_stateless_friction(evaluator, start.effects, start.theta)
-    native = [name for name in plain_names if name.partition("@")[0] in MODEL_FIELD_EFFECTS]
-    friction = [name for name in native if has_dry_friction(evaluator, [name])]
+    stateless_names, stateless_theta = replace_by_stateless_friction(
+        evaluator, start.effects, start.theta
+    )
+    model_field_effects = [
+        name for name in stateless_names if name.partition("@")[0] in MODEL_FIELD_EFFECTS
+    ]
+    friction = [name for name in model_field_effects if has_dry_friction(evaluator, [name])]
     contained = {part for name in friction for part in evaluator.available_effects[name].contains}
     names = tuple(name for name in friction if name not in contained)
     theta = filters.reference.copy()
     for name in names:
-        theta[evaluator.coefficient_slices[name]] = plain_theta[evaluator.coefficient_slices[name]]
+        theta[evaluator.coefficient_slices[name]] = stateless_theta[
+            evaluator.coefficient_slices[name]
+        ]
     return FitStart(names, theta, filters.estimate_first_states(filters.base))
 
 
@@ -357,18 +373,28 @@ def is_friction_sufficient(
     """
     filters = context.filters
     start = context.columns.start(selected.groups, selected.coefficients)
-    _, plain_theta = replace_by_stateless_friction(context.evaluator, start.effects, start.theta)
-    stiff = filters.log_likelihood(plain_theta)
-    soft = -np.inf if filters.is_soft else filters.log_likelihood(plain_theta, is_soft=True)
+    _, stateless_theta = replace_by_stateless_friction(
+        context.evaluator, start.effects, start.theta
+    )
+    stiff_log_likelihood = filters.log_likelihood(stateless_theta)
+    soft_log_likelihood = (
+        -np.inf if filters.is_soft else filters.log_likelihood(stateless_theta, is_soft=True)
+    )
     selected_log_likelihood = (
-        -np.inf if np.array_equal(plain_theta, start.theta) else filters.log_likelihood(start.theta)
+        -np.inf
+        if np.array_equal(stateless_theta, start.theta)
+        else filters.log_likelihood(start.theta)
     )
     if (
-        not max(stiff, soft)
+        not max(stiff_log_likelihood, soft_log_likelihood)
         > selected_log_likelihood - 0.5 * INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
     ):
         return False
-    if soft > max(stiff, selected_log_likelihood) + 0.5 * INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO:
+    if (
+        soft_log_likelihood
+        > max(stiff_log_likelihood, selected_log_likelihood)
+        + 0.5 * INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
+    ):
         check_fit(context, friction)
     return True
 
@@ -425,7 +451,7 @@ def refine_single_effects(context: SearchContext, fitted: Sequence[FittedModel])
             starts += [model.fit.make_start(), *list_nearby_starts(context, model, name)]
     best = context.search.base_model
     for _, start in select_lowest_of_each(context, starts)[:MAX_REFINED]:
-        refined = fit(context, start)
+        refined = fit_by_simulation(context, start)
         if not is_at_noise(context, refined) and is_nearly_explained(context, refined):
             refined = fit_nearby(context, refined, refined.effects[0])
         best = select_more_likely(best, refined)
@@ -461,6 +487,6 @@ def fit_series_effects(context: SearchContext, selected: Selected) -> FittedMode
         theta = context.filters.make_theta_with(probe.effect, probe.coefficients)
         starts.append(FitStart((probe.effect,), theta, evaluator.initial_state_guesses))
     fitted = search.fit_all([start for _, start in select_lowest_of_each(context, starts)])
-    return fit(
+    return fit_by_simulation(
         context, max(fitted, key=lambda model: model.penalised_log_likelihood).fit.make_start()
     )

@@ -28,15 +28,16 @@ EXPLAINED_EXCESS = 0.03
 """Maximum excess over the noise of a fitted set that explains the data."""
 NEARLY_EXPLAINED_SHARE = 0.1
 """Maximum excess, as a share of that of the base model, at which effects are only added."""
-NEGLIGIBLE, NEGLIGIBLE_SHARE = 0.1, 0.005
+NEGLIGIBLE_EXCESS, NEGLIGIBLE_EXCESS_SHARE = 0.1, 0.005
 """Maximum excess at which the search ends: absolute, and as a share of that of the base model."""
 
 
-def fit(context: SearchContext, start: FitStart) -> FittedModel:
-    """Fit a set by simulation.
+def fit_by_simulation(context: SearchContext, start: FitStart) -> FittedModel:
+    """Fit a set of effects by simulation, with restarts if it does not explain the runs.
 
     If the residual is large, the fit is repeated with derivatives by the first states about the
-    simulated motion, because those about the measured motion may be invalid.
+    simulated motion, because those about the measured motion may be invalid. Dry friction is then
+    fitted again from nearby coefficients.
 
     Args:
         context: context of the search.
@@ -68,7 +69,7 @@ def fit_filtered(context: SearchContext, current: FilteredSet) -> FittedModel:
         current: the set.
     """
     states = context.filters.estimate_first_states(current.followed)
-    return fit(context, FitStart(current.names, current.followed.theta, states))
+    return fit_by_simulation(context, FitStart(current.names, current.followed.theta, states))
 
 
 def fit_nearby(context: SearchContext, model: FittedModel, name: str) -> FittedModel:
@@ -93,15 +94,15 @@ def list_nearby_starts(context: SearchContext, model: FittedModel, name: str) ->
         model: the fitted model.
         name: name of the effect.
     """
-    measured = context.filters.estimate_first_states(context.filters.base)
+    measured_states = context.filters.estimate_first_states(context.filters.base)
     starts = []
-    for place in context.evaluator.get_coefficient_indices(name):
+    for index in context.evaluator.get_coefficient_indices(name):
         for factor in NEARBY_FACTORS:
             theta = model.fit.theta.copy()
-            theta[place] *= factor
+            theta[index] *= factor
             starts += [
-                FitStart(model.effects, theta, states)
-                for states in (model.fit.initial_states, measured)
+                FitStart(model.effects, theta, initial_states)
+                for initial_states in (model.fit.initial_states, measured_states)
             ]
     return starts
 
@@ -123,14 +124,18 @@ def select_lowest_of_each(
     costs = compute_start_costs(
         context.evaluator, context.search.noise, starts, share=1.0, failed_residual=np.inf
     )
-    lowest: dict[tuple[str, ...], tuple[float, FitStart]] = {}
+    best_of_each_set: dict[tuple[str, ...], tuple[float, FitStart]] = {}
     for i in np.argsort(costs, kind="stable").tolist():
-        lowest.setdefault(starts[i].effects, (float(costs[i]), starts[i]))
-    return list(lowest.values())
+        best_of_each_set.setdefault(starts[i].effects, (float(costs[i]), starts[i]))
+    return list(best_of_each_set.values())
 
 
 def is_explained(context: SearchContext, model: FittedModel) -> bool:
-    """Return whether a fitted model leaves only noise, or a negligible share of a large excess.
+    """Return whether a fitted model leaves only noise, or a negligible share of a large residual.
+
+    The excess residual, which is compared, is the RMS residual in units of the noise, minus one. A
+    model with stiff dry friction must leave only noise: a small remaining residual may show that
+    the friction has MuJoCo's soft form (`filters.is_soft` if the simulator has that form already).
 
     Args:
         context: context of the search.
@@ -141,8 +146,10 @@ def is_explained(context: SearchContext, model: FittedModel) -> bool:
     # Friction of the wrong form may leave a small residual.
     if has_dry_friction(context.evaluator, model.effects) and not context.filters.is_soft:
         return False
-    excess = context.search.compute_excess_residual
-    return excess(model) < min(NEGLIGIBLE, NEGLIGIBLE_SHARE * excess(context.search.base_model))
+    compute_excess = context.search.compute_excess_residual
+    return compute_excess(model) < min(
+        NEGLIGIBLE_EXCESS, NEGLIGIBLE_EXCESS_SHARE * compute_excess(context.search.base_model)
+    )
 
 
 def is_at_noise(context: SearchContext, model: FittedModel) -> bool:
@@ -165,8 +172,10 @@ def is_nearly_explained(context: SearchContext, model: FittedModel) -> bool:
         context: context of the search.
         model: the fitted model.
     """
-    excess = context.search.compute_excess_residual
-    return excess(model) < NEARLY_EXPLAINED_SHARE * excess(context.search.base_model)
+    compute_excess = context.search.compute_excess_residual
+    return compute_excess(model) < NEARLY_EXPLAINED_SHARE * compute_excess(
+        context.search.base_model
+    )
 
 
 def select_more_likely(one: FittedModel, other: FittedModel) -> FittedModel:
@@ -214,20 +223,24 @@ def _merge_into_families(context: SearchContext, model: FittedModel) -> FittedMo
 
 
 def make_replacing_start(
-    evaluator: RunEvaluator, model: FittedModel, names: Sequence[str], other: str, c: Array
+    evaluator: RunEvaluator,
+    model: FittedModel,
+    removed_effects: Sequence[str],
+    new_effect: str,
+    coefficients: Array,
 ) -> FitStart:
     """Return a start in which one effect replaces several others.
 
     Args:
         evaluator: the runs.
         model: the fitted model.
-        names: effects that are removed.
-        other: the effect that replaces them.
-        c: (k,) coefficients of the new effect.
+        removed_effects: effects that are removed.
+        new_effect: the effect that replaces them.
+        coefficients: (k,) coefficients of the new effect.
     """
     theta = model.fit.theta.copy()
-    for name in names:
+    for name in removed_effects:
         theta[evaluator.coefficient_slices[name]] = 0.0
-    theta[evaluator.coefficient_slices[other]] = c
-    remaining = (name for name in model.effects if name not in names)
-    return FitStart((*remaining, other), theta, model.fit.initial_states)
+    theta[evaluator.coefficient_slices[new_effect]] = coefficients
+    remaining = (name for name in model.effects if name not in removed_effects)
+    return FitStart((*remaining, new_effect), theta, model.fit.initial_states)

@@ -140,15 +140,19 @@ class AlternativeFinder:
             if added == effect:
                 continue
             distance = self._compute_distance(model, other_model)
-            if is_indistinguishable(distance) and not self._buys_nothing(effect, added, distance):
+            if is_indistinguishable(distance) and not self._wastes_coefficients(
+                effect, added, distance
+            ):
                 competing_effects.append((distance, added))
         return self._remove_richer(competing_effects)
 
-    def _buys_nothing(self, effect: str, other_effect: str, distance: float) -> bool:
-        """Return whether another effect needs more coefficients without reducing the excess enough.
+    def _wastes_coefficients(self, effect: str, other_effect: str, distance: float) -> bool:
+        """Return whether another effect needs more coefficients but hardly fits better.
 
         If the residual has structure, likelihoods do not account for the number of coefficients.
-        Each further coefficient must then reduce the excess as much as a richer law must.
+        Each further coefficient must then reduce the excess residual (RMS residual in units of the
+        noise, minus one) as much as a richer law must. `distance` is how far the other model is
+        behind, in twice the log-likelihood.
         """
         if not self.structure:
             return False

@@ -129,26 +129,33 @@ def compute_directions(
         names: names of effects that the model does not contain.
     """
     probes = [probe for name in names for probe in iterate_first_probes(evaluator, fit, name)]
-    values = _compute_directions(evaluator, fit, probes)
-    acting = _find_observable_probes(evaluator, probes, values)
+    responses = _compute_directions(evaluator, fit, probes)
+    is_acting = _find_observable_probes(evaluator, probes, responses)
     # The first responses show which coefficients only modify, for effects that act at all.
-    modified = list(_make_modifier_probes(evaluator, probes, acting))
-    places = np.flatnonzero(acting)
-    probes = [probes[i] for i in places] + modified
-    # This is the largest array of an explanation, so active rows are moved up in place.
-    for row, place in enumerate(places.tolist()):
-        if row < place:
-            values[row] = values[place]
-    values = values[: places.size]
-    if modified:
-        values = np.concatenate([values, _compute_directions(evaluator, fit, modified)])
-    return DirectionSet(tuple(probes), np.moveaxis(values, 0, -1))
+    modifier_probes = list(_make_modifier_probes(evaluator, probes, is_acting))
+    active_indices = np.flatnonzero(is_acting)
+    probes = [probes[i] for i in active_indices] + modifier_probes
+    # This is the largest array of an explanation, so active rows are moved up within it.
+    for row, index in enumerate(active_indices.tolist()):
+        if row < index:
+            responses[row] = responses[index]
+    responses = responses[: active_indices.size]
+    if modifier_probes:
+        responses = np.concatenate(
+            [responses, _compute_directions(evaluator, fit, modifier_probes)]
+        )
+    return DirectionSet(tuple(probes), np.moveaxis(responses, 0, -1))
 
 
 def iterate_first_probes(
     evaluator: RunEvaluator, fit: TrajectoryFit, name: str
 ) -> Iterator[CandidateDirection]:
-    """Yield a small value of every scaling coefficient of an effect, at every shape.
+    """Yield the coefficients at which the directions of an effect are computed.
+
+    A scaling coefficient is the strength of an effect, and zero switches the effect off; each gets
+    a small value. A shape parameter, such as a frequency, cannot be zero; all its values on a grid
+    are tried. Effects that do not act in proportion to their coefficients, such as limits and end
+    stops, get several full sizes instead.
 
     Args:
         evaluator: the runs.
@@ -159,51 +166,51 @@ def iterate_first_probes(
     # A coefficient that cannot be zero is a shape parameter, and does not scale the effect.
     effect = evaluator.available_effects[name]
     coefficients = effect.coefficients
-    for c in effect.probe_points():
+    for values in effect.probe_points():
         # Changes at several points add up to that at a point between them (`Effect.combine`).
-        yield CandidateDirection(name, 0, 0, c, can_be_negative=True)
-    shaping = [i for i, p in enumerate(parameters) if p.bounds[0] > 0]
-    count = len(parameters)
-    scaling = [i for i in range(count) if i not in shaping]
+        yield CandidateDirection(name, 0, 0, values, can_be_negative=True)
+    shape_indices = [i for i, p in enumerate(parameters) if p.bounds[0] > 0]
+    coefficient_count = len(parameters)
+    scaling_indices = [i for i in range(coefficient_count) if i not in shape_indices]
     travel = evaluator.get_effect_travel(name)
     grids = [
         parameters[i].bounds[:1]
         if coefficients[i].of == "rotor" and _is_contained_in_model(evaluator, fit, name)
         else _make_shape_grid(evaluator, parameters[i], coefficients[i].tried, travel)
-        for i in shaping
+        for i in shape_indices
     ]
     group = 0
-    leading = coefficients[0]
+    first_coefficient = coefficients[0]
     # Scaling coefficients at one grid point act together, such as a sine and a cosine.
     for point in product(*grids):
         # A small limit of a force or a rate would remove all of it.
         has_linear_response = (
-            leading.of not in NONLINEAR_COEFFICIENT_KINDS and not effect.probe_points()
+            first_coefficient.of not in NONLINEAR_COEFFICIENT_KINDS and not effect.probe_points()
         )
-        for place in scaling if has_linear_response else ():
-            low, high = parameters[place].bounds
-            c = np.zeros(count)
-            c[shaping] = point
-            c[place] = INITIAL_PROBE_SHARE * high
+        for index in scaling_indices if has_linear_response else ():
+            low, high = parameters[index].bounds
+            values = np.zeros(coefficient_count)
+            values[shape_indices] = point
+            values[index] = INITIAL_PROBE_SHARE * high
             yield CandidateDirection(
                 effect=name,
                 grid_point=group,
-                coefficient_index=place,
-                coefficients=c,
+                coefficient_index=index,
+                coefficients=values,
                 can_be_negative=low < 0,
             )
         group += 1
-    if leading.of == "stop":
+    if first_coefficient.of == "stop":
         yield from _make_end_stop_probes(evaluator, name, group)
         return
     lowest, _ = parameters[0].bounds
     # A small limit does not act like a large one, so limits are tried at values that the input
     # reaches.
-    if leading.of in NONLINEAR_COEFFICIENT_KINDS or (
-        leading.of in ("input", "error") and lowest == 0
+    if first_coefficient.of in NONLINEAR_COEFFICIENT_KINDS or (
+        first_coefficient.of in ("input", "error") and lowest == 0
     ):
         shapes = np.array(list(product(*grids)))
-        yield from _make_limit_probes(evaluator, name, group, shapes if shaping else None)
+        yield from _make_limit_probes(evaluator, name, group, shapes if shape_indices else None)
 
 
 def _is_contained_in_model(evaluator: RunEvaluator, fit: TrajectoryFit, name: str) -> bool:
@@ -217,11 +224,12 @@ def _is_contained_in_model(evaluator: RunEvaluator, fit: TrajectoryFit, name: st
 
 
 def _make_end_stop_probes(
-    evaluator: RunEvaluator, name: str, first: int
+    evaluator: RunEvaluator, name: str, first_group: int
 ) -> Iterator[CandidateDirection]:
     """Yield end stops of several depths and stiffnesses at both ends of the range of a coordinate.
 
-    Each is one candidate that is valid only at its size. `first` is the number of its first group.
+    Each is one candidate that is valid only at its size. `first_group` is the number of the first
+    grid point.
     """
     end_stops = [
         c
@@ -230,7 +238,7 @@ def _make_end_stop_probes(
             evaluator, name, side, END_STOP_STIFFNESS_SHARES, END_STOP_DEPTH_SHARES
         )
     ]
-    for number, c in enumerate(end_stops, start=first):
+    for number, c in enumerate(end_stops, start=first_group):
         yield CandidateDirection(
             effect=name,
             grid_point=number,
@@ -242,14 +250,14 @@ def _make_end_stop_probes(
 
 
 def _make_limit_probes(
-    evaluator: RunEvaluator, name: str, group: int, shapes: Array | None
+    evaluator: RunEvaluator, name: str, first_group: int, shapes: Array | None
 ) -> Iterator[CandidateDirection]:
     """Yield limits, dead bands and backlash of sizes that the motion or the input reaches.
 
     Args:
         evaluator: the runs.
         name: name of the effect.
-        group: number of the first group.
+        first_group: number of the first grid point.
         shapes: (n, k - 1) shape parameters to combine with each size; None if there are none.
     """
     largest = compute_reachable_levels(evaluator, name)
@@ -264,14 +272,14 @@ def _make_limit_probes(
         "give": COMPLIANCE_SHARES,
     }
     kind = evaluator.available_effects[name].coefficients[0].of
-    levels = shares_by_kind.get(kind, INPUT_LEVEL_SHARES)
+    shares = shares_by_kind.get(kind, INPUT_LEVEL_SHARES)
     if kind == "travel" and evaluator.has_linearisation:
         # Simulating a robot costs a hundred times as much, so fewer sizes are tried.
-        levels = GAP_TRAVEL_SHARES[1:4]
-    sizes = [level * largest for level in levels]
+        shares = GAP_TRAVEL_SHARES[1:4]
+    sizes = [share * largest for share in shares]
     if shapes is not None:
         sizes = [np.append(size, shape) for shape in shapes for size in sizes]
-    for number, c in enumerate(sizes, start=group):
+    for number, c in enumerate(sizes, start=first_group):
         yield CandidateDirection(
             effect=name,
             grid_point=number,
@@ -347,14 +355,14 @@ def generate_frequency_neighbours(
             theta[evaluator.coefficient_slices[name]] = c
             yield FitStart(fit.effects, theta, fit.initial_states)
         bounds = compute_coefficient_bounds(evaluator, name)
-        for number, place in enumerate(evaluator.get_coefficient_indices(name)):
-            parameter = evaluator.parameters[place]
-            value = float(fit.theta[place])
+        for i, index in enumerate(evaluator.get_coefficient_indices(name)):
+            parameter = evaluator.parameters[index]
+            value = float(fit.theta[index])
             for shifted_value in _shift_frequency_or_time(
                 evaluator, parameter, value, evaluator.get_effect_travel(name)
             ):
                 theta = fit.theta.copy()
-                theta[place] = np.clip(shifted_value, *bounds[number])
+                theta[index] = np.clip(shifted_value, *bounds[i])
                 yield FitStart(fit.effects, theta, fit.initial_states)
 
 

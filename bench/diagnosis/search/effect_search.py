@@ -75,7 +75,7 @@ class EffectSearch(ModelMoves):
     settled_effects: frozenset[str] | None = None
     step_corrected_effects: frozenset[str] | None = None
     thorough: bool = False
-    _sketch: EffectSearch | None = None
+    _segment_search: EffectSearch | None = None
 
     def run(self) -> FittedModel:
         """Return the model of all effects that the data show.
@@ -147,16 +147,14 @@ class EffectSearch(ModelMoves):
         scores = self.scores_by_effects.get(frozenset(best.effects))
         if scores is None or not larger:
             return best
-        extension = max(larger, key=lambda model: model.penalised_log_likelihood)
-        gain = extension.likelihood.value - best.likelihood.value
-        is_significant = (
-            self.compute_gain_p_value(scores, extension, gain) <= EFFECT_P_VALUE_THRESHOLD
-        )
-        return (
-            extension
-            if is_significant and extension.penalised_log_likelihood > best.penalised_log_likelihood
-            else best
-        )
+        best_extension = max(larger, key=lambda model: model.penalised_log_likelihood)
+        gain = best_extension.likelihood.value - best.likelihood.value
+        if (
+            self.compute_gain_p_value(scores, best_extension, gain) <= EFFECT_P_VALUE_THRESHOLD
+            and best_extension.penalised_log_likelihood > best.penalised_log_likelihood
+        ):
+            return best_extension
+        return best
 
     def _search_size(self, best: FittedModel, size: int) -> FittedModel | None:
         """Fit models of `size` effects, and return the best one after exchanges and simplification.
@@ -242,54 +240,62 @@ class EffectSearch(ModelMoves):
         if segment_evaluator is None:
             return
         # One search on segments serves every size; it decides nothing, and only provides starts.
-        if self._sketch is None:
-            self._sketch = EffectSearch(
+        if self._segment_search is None:
+            self._segment_search = EffectSearch(
                 segment_evaluator,
                 self.noise,
                 self.fixed_parameters,
                 self.make_rng("pieces"),
                 self.is_noise_stated,
             )
-            self._sketch.refit_models(
+            self._segment_search.refit_models(
                 [FitStart((), self.base_model.fit.theta, segment_evaluator.initial_state_guesses)]
             )
-        segment_models = self._sketch
-        segment_models.refit_extensions(
-            select_beam(segment_models, size - 1), MAX_REFITTED_CANDIDATES
+        segment_search = self._segment_search
+        segment_search.refit_extensions(
+            select_beam(segment_search, size - 1), MAX_REFITTED_CANDIDATES
         )
-        best = select_by_size(segment_models, size)[:SEGMENT_MODELS_KEPT]
-        if best:
-            self.refit_models([join_segment_fits(self.evaluator, model.fit) for model in best])
+        best_models = select_by_size(segment_search, size)[:SEGMENT_MODELS_KEPT]
+        if best_models:
+            self.refit_models(
+                [join_segment_fits(self.evaluator, model.fit) for model in best_models]
+            )
 
     @cached_property
     def _forgets_initial_state(self) -> bool:
-        """True if the motion forgets its initial state quickly, as strongly damped systems do.
+        """True if initial states hardly change the end of the runs, as in strongly damped systems.
 
-        Segments of the runs are then no easier to fit than whole runs.
+        Short segments of the runs are then no easier to fit than whole runs.
         """
-        fit, evaluator = self.base_model.fit, self.evaluator
-        by_states = (
+        evaluator = self.evaluator
+        # Robots have linearised derivatives (R, T, C, s) by the initial states, which all models
+        # share; other systems have those of the base fit.
+        state_jacobian = (
             evaluator.state_derivatives
             if evaluator.has_linearisation
-            else fit.jacobian[..., fit.free_indices.size :]
+            else self.base_model.fit.state_jacobian
         )
-        return by_states is not None and forgets_initial_state(evaluator, self.noise, by_states)
+        return state_jacobian is not None and forgets_initial_state(
+            evaluator, self.noise, state_jacobian
+        )
 
     def _choose_simpler_effect(self, single: FittedModel) -> FittedModel:
-        """Return the effect that a single effect contains if the simpler one is preferable.
+        """Return the model of a simpler effect in place of a single effect, if it is preferable.
 
-        This applies if the residual has structure to which the richer effect may have adapted.
+        A simpler effect is one that the effect contains, as Stribeck friction contains Coulomb
+        friction. It is preferred if the residual has structure to which the richer effect may have
+        adapted. `single` is the model with the one effect; it is returned otherwise.
         """
         if self.is_complete(single, EFFECT_P_VALUE_THRESHOLD):
             return single
         for name in self.evaluator.available_effects[single.effects[0]].contains:
-            part = self.models.get(frozenset([name]))
+            simpler_model = self.models.get(frozenset([name]))
             # The richer effect must reduce the excess clearly, otherwise it mimics a missing
             # effect.
-            if part is not None and self.compute_excess_residual(
+            if simpler_model is not None and self.compute_excess_residual(
                 single
-            ) > MAX_REPLACEMENT_EXCESS_SHARE * self.compute_excess_residual(part):
-                return part
+            ) > MAX_REPLACEMENT_EXCESS_SHARE * self.compute_excess_residual(simpler_model):
+                return simpler_model
         return single
 
 
@@ -321,24 +327,31 @@ def select_beam(search: EffectSearch, size: int) -> list[FittedModel]:
 def is_hopeless(search: EffectSearch, larger: FittedModel) -> bool:
     """Return whether a model of several effects is too far from the data to try another effect.
 
-    In a thorough search, all models of the same size must be too far.
+    Its excess residual (RMS residual in units of the noise, minus one) is compared with those of
+    the base model and of the best single effect. In a thorough search, all models of the same size
+    must be too far.
 
     Args:
         search: the search, with all fitted models.
         larger: the model of several effects.
     """
     # If two effects leave as much as the best single one, a third effect will not help.
-    of_base = MAX_PAIR_EXCESS_SHARE * search.compute_excess_residual(search.base_model)
-    of_single = MAX_PAIR_EXCESS_SHARE_OF_SINGLE * min(_list_excesses(search, 1), default=np.inf)
+    limit_by_base = MAX_PAIR_EXCESS_SHARE * search.compute_excess_residual(search.base_model)
+    limit_by_single = MAX_PAIR_EXCESS_SHARE_OF_SINGLE * min(
+        _list_excess_residuals(search, 1), default=np.inf
+    )
     excess = search.compute_excess_residual(larger)
     if search.thorough:
         # The model to extend need not have the lowest excess, because merit is misleading there.
-        excess = min(excess, *_list_excesses(search, len(larger.effects)))
-    return excess > min(of_base, of_single)
+        excess = min(excess, *_list_excess_residuals(search, len(larger.effects)))
+    return excess > min(limit_by_base, limit_by_single)
 
 
-def _list_excesses(search: EffectSearch, size: int) -> list[float]:
-    """Return the RMS residual minus one, in units of the noise, of models of `size` effects."""
+def _list_excess_residuals(search: EffectSearch, size: int) -> list[float]:
+    """Return the excess residuals of all models with `size` effects.
+
+    The excess residual is the RMS residual in units of the noise, minus one.
+    """
     return [
         search.compute_excess_residual(m) for m in search.models.values() if len(m.effects) == size
     ]

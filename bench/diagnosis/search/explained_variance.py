@@ -42,28 +42,27 @@ class GroupBatch:
     """Groups that are solved together: same number of columns, same sign constraints.
 
     Attributes:
-        places: (n,) indices of the groups.
+        group_indices: (n,) indices of the groups.
         columns: (n, k) indices of their directions.
         positive: (k,) whether each coefficient must be nonnegative.
     """
 
-    places: Indices
+    group_indices: Indices
     columns: Indices
     positive: tuple[bool, ...]
 
 
 def group_directions(directions: DirectionSet) -> list[DirectionGroup]:
     """Group the directions of each effect at each grid point of its shape; they act together."""
-    places: dict[tuple[str, int], list[int]] = {}
+    columns_by_group: dict[tuple[str, int], list[int]] = {}
     for i, probe in enumerate(directions.candidates):
-        key = probe.effect, probe.grid_point
-        places.setdefault(key, []).append(i)
-    members = []
-    for (effect, _), columns in places.items():
+        columns_by_group.setdefault((probe.effect, probe.grid_point), []).append(i)
+    groups = []
+    for (effect, _), columns in columns_by_group.items():
         probes = [directions.candidates[i] for i in columns]
         positive = tuple(not probe.can_be_negative for probe in probes)
-        members.append(DirectionGroup(effect, tuple(columns), positive))
-    return members
+        groups.append(DirectionGroup(effect, tuple(columns), positive))
+    return groups
 
 
 def batch_groups(members: Sequence[DirectionGroup]) -> list[GroupBatch]:
@@ -72,11 +71,11 @@ def batch_groups(members: Sequence[DirectionGroup]) -> list[GroupBatch]:
     for i, group in enumerate(members):
         groups_by_signs.setdefault(group.positive, []).append(i)
     result = []
-    for positive, places in groups_by_signs.items():
-        columns = [members[i].column_indices for i in places]
+    for positive, group_indices in groups_by_signs.items():
+        columns = [members[i].column_indices for i in group_indices]
         result.append(
             GroupBatch(
-                np.array(places, dtype=np.intp),
+                np.array(group_indices, dtype=np.intp),
                 np.array(columns, dtype=np.intp),
                 positive,
             )
@@ -131,7 +130,7 @@ def _solve_best_subset(gram: Array, cross: Array, positive: Sequence[bool]) -> t
     coefficients = np.zeros((number, count))
     for subset in _enumerate_subsets(count):
         solution = _solve_subset(gram, cross, subset)
-        constrained = [place for place, i in enumerate(subset) if positive[i]]
+        constrained = [j for j, column in enumerate(subset) if positive[column]]
         previous_best = best[solution.groups]
         # More columns must explain more than rounding error, otherwise the smaller subset is kept.
         is_better = solution.gain > previous_best * (1.0 + 1e-9)

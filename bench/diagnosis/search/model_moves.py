@@ -36,10 +36,15 @@ EffectStarts = dict[str, Array]
 
 @dataclass
 class ModelMoves(ScoredModelSet):
-    """Scored models, and the moves from one to another."""
+    """Scored models, and the moves from one to another.
 
-    _lessened: set[frozenset[str]] = field(default_factory=set)
-    _simplified: set[tuple[frozenset[str], frozenset[str]]] = field(default_factory=set)
+    `_reduced_effect_sets` has the models (as sets of effects) whose effects were removed one by one
+    already, and `_fitted_simplifications` the pairs of a model and its simplification that were
+    fitted already.
+    """
+
+    _reduced_effect_sets: set[frozenset[str]] = field(default_factory=set)
+    _fitted_simplifications: set[tuple[frozenset[str], frozenset[str]]] = field(default_factory=set)
 
     def remove_effect(self, model: FittedModel, name: str) -> FittedModel:
         """Return the model with one of its effects removed.
@@ -80,8 +85,8 @@ class ModelMoves(ScoredModelSet):
         """
         key = frozenset(model.effects)
         # From here, the smaller model may reach a minimum that was missed when it was built up.
-        if len(model.effects) > 1 and key not in self._lessened:
-            self._lessened.add(key)
+        if len(model.effects) > 1 and key not in self._reduced_effect_sets:
+            self._reduced_effect_sets.add(key)
             self._fit_without(model, model.effects)
         for name in model.effects:
             submodel = self.remove_effect(model, name)
@@ -97,7 +102,7 @@ class ModelMoves(ScoredModelSet):
         excess.
         """
         for name in model.effects:
-            for parts in self._iterate_contained_effects(model, name):
+            for parts in self._iterate_simpler_effects(model, name):
                 simpler_model = self._fit_with_parts(model, name, parts)
                 is_excess_close = (
                     self.compute_excess_residual(model)
@@ -111,45 +116,56 @@ class ModelMoves(ScoredModelSet):
                     return self.simplify_laws(simpler_model)
         return model
 
-    def _iterate_contained_effects(self, model: FittedModel, name: str) -> Iterator[EffectStarts]:
+    def _iterate_simpler_effects(self, model: FittedModel, name: str) -> Iterator[EffectStarts]:
         """Yield simpler effects that may replace an effect, with initial coefficients.
 
-        They are the simpler laws at the same place, one by one and all together, and the most
-        active member of a family.
+        They are the simpler laws that the effect contains at the same joint or body, one by one and
+        all together, and the most active member of a family (one effect at all joints or bodies).
         """
-        effects, slots = self.evaluator.available_effects, self.evaluator.coefficient_slices
-        coefficients = model.fit.theta[slots[name]]
-        part_coefficients, begin = EffectStarts(), 0
-        for part in effects[name].contains:
-            if part in effects and effects[part].place == effects[name].place:
-                # The scaling coefficient of a contained law comes first in the law that contains
-                # it.
-                end = begin + slots[part].stop - slots[part].start
-                part_coefficients[part], begin = coefficients[begin:end], end
-        yield from ({part: c} for part, c in part_coefficients.items())
+        contained_laws = self._split_into_contained_laws(model, name)
+        yield from ({law: c} for law, c in contained_laws.items())
         # If the shape parameter of a law lies outside the range of the data, the law acts as the
         # sum of its parts. One law with a time far longer than the runs replaces two simpler laws,
         # and fits the data immediately.
-        if len(part_coefficients) > 1:
-            yield part_coefficients
-        members = getattr(effects[name], "members", ())
-        coefficient_count = len(members[0].coefficients) if members else 0
-        # A coefficient shared by all places says nothing about a single place.
-        if len(members) > 1 and coefficients.size == coefficient_count * len(members):
-            free = model.fit.free_indices.tolist()
-            columns = [free.index(place) for place in self.evaluator.get_coefficient_indices(name)]
-            responses = np.sqrt(np.square(model.fit.jacobian[..., columns]).sum(axis=(0, 1, 2)))
-            sizes = (
-                (np.abs(coefficients) * responses)
-                .reshape(len(members), coefficient_count)
-                .max(axis=1)
-            )
-            largest_member = int(np.argmax(sizes))
-            yield {
-                members[largest_member].name: coefficients[
-                    coefficient_count * largest_member : coefficient_count * (largest_member + 1)
-                ]
-            }
+        if len(contained_laws) > 1:
+            yield contained_laws
+        yield from self._find_dominant_member(model, name)
+
+    def _split_into_contained_laws(self, model: FittedModel, name: str) -> EffectStarts:
+        """Return the simpler laws that an effect contains, with its fitted coefficients.
+
+        The scaling coefficients of the contained laws come first among the coefficients of the
+        effect, in the order in which it names the laws.
+        """
+        effects = self.evaluator.available_effects
+        coefficient_slices = self.evaluator.coefficient_slices
+        coefficients = model.fit.theta[coefficient_slices[name]]
+        laws, begin = EffectStarts(), 0
+        for law in effects[name].contains:
+            if law in effects and effects[law].place == effects[name].place:
+                end = begin + coefficient_slices[law].stop - coefficient_slices[law].start
+                laws[law], begin = coefficients[begin:end], end
+        return laws
+
+    def _find_dominant_member(self, model: FittedModel, name: str) -> Iterator[EffectStarts]:
+        """Yield the member of a family that changes the runs most, with its coefficients.
+
+        The members are one effect at several joints or bodies. Nothing is yielded for other
+        effects, or if the members share their coefficients.
+        """
+        members = getattr(self.evaluator.available_effects[name], "members", ())
+        indices = self.evaluator.get_coefficient_indices(name)
+        per_member = len(members[0].coefficients) if members else 0
+        if len(members) < 2 or len(indices) != per_member * len(members):
+            return
+        coefficients = model.fit.theta[indices].reshape(len(members), per_member)
+        free_indices = model.fit.free_indices.tolist()
+        columns = [free_indices.index(index) for index in indices]
+        # Change of all samples per unit of each coefficient (root of the sum of squares).
+        responses = np.sqrt(np.square(model.fit.jacobian[..., columns]).sum(axis=(0, 1, 2)))
+        changes = np.abs(coefficients) * responses.reshape(coefficients.shape)
+        largest = int(np.argmax(changes.max(axis=1)))
+        yield {members[largest].name: coefficients[largest]}
 
     def _fit_with_parts(self, model: FittedModel, name: str, parts: EffectStarts) -> FittedModel:
         """Fit the model with the simpler effects `parts` in place of the richer effect `name`.
@@ -157,20 +173,21 @@ class ModelMoves(ScoredModelSet):
         All other parameters start from their present values. A model that was already fitted from
         here is not fitted again.
         """
-        replaced = ([*parts] if n == name else [n] for n in model.effects)
-        names = tuple(dict.fromkeys(chain.from_iterable(replaced)))
-        key, step = frozenset(names), (frozenset(model.effects), frozenset(names))
+        effects_of_each = ([*parts] if n == name else [n] for n in model.effects)
+        names = tuple(dict.fromkeys(chain.from_iterable(effects_of_each)))
+        key = frozenset(names)
+        simplification = frozenset(model.effects), key
         # A known model may be at a poor local minimum, so it is fitted again unless it is better.
         is_fit_needed = (
             key not in self.models
             or self.models[key].penalised_log_likelihood < model.penalised_log_likelihood
         )
-        if is_fit_needed and step not in self._simplified:
-            self._simplified.add(step)
+        if is_fit_needed and simplification not in self._fitted_simplifications:
+            self._fitted_simplifications.add(simplification)
             theta = model.fit.theta.copy()
             theta[self.evaluator.coefficient_slices[name]] = 0.0
-            for part, c in parts.items():
-                theta[self.evaluator.coefficient_slices[part]] += c
+            for part, coefficients in parts.items():
+                theta[self.evaluator.coefficient_slices[part]] += coefficients
             return self.fit_one(FitStart(names, theta, model.fit.initial_states))
         return self.models[key]
 

@@ -100,10 +100,11 @@ def _make_swapped_start(
     (added_effect,), (removed_effect,) = (
         set(m.effects) - set(n.effects) for m, n in ((other_model, model), (model, other_model))
     )
-    slots = search.evaluator.coefficient_slices
+    coefficient_slices = search.evaluator.coefficient_slices
+    added = coefficient_slices[added_effect]
     theta = model.fit.theta.copy()
-    theta[slots[removed_effect]] = 0.0
-    theta[slots[added_effect]] = other_model.fit.theta[slots[added_effect]]
+    theta[coefficient_slices[removed_effect]] = 0.0
+    theta[added] = other_model.fit.theta[added]
     return FitStart(other_model.effects, theta, model.fit.initial_states)
 
 
@@ -123,9 +124,10 @@ def list_competing_models(search: EffectSearch, model: FittedModel) -> list[Fitt
 
 
 def _is_competitive(search: EffectSearch, other_model: FittedModel, model: FittedModel) -> bool:
-    """Return whether two models are close in merit or in excess.
+    """Return whether two models are close in merit or in excess residual.
 
-    Merit is misleading if the residual has structure.
+    Merit is the penalised log-likelihood, and the excess residual the RMS residual in units of the
+    noise, minus one. Merit is misleading if the residual has structure.
     """
     if (
         abs(model.penalised_log_likelihood - other_model.penalised_log_likelihood)

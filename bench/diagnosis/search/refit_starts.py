@@ -70,30 +70,38 @@ def select_refit_starts(
         max_count: maximum number of candidates.
         fits_all: whether to include all candidates, or for robots up to `MAX_REFITS_THOROUGH`.
     """
-    numbered = []
+    numbered_starts = []
     # If scores use derivatives of the simulator, few candidates are better than their score.
-    share = MIN_RELATIVE_SCORE_EXACT if evaluator.has_linearisation else MIN_RELATIVE_SCORE
+    min_relative_score = (
+        MIN_RELATIVE_SCORE_EXACT if evaluator.has_linearisation else MIN_RELATIVE_SCORE
+    )
     if fits_all and evaluator.has_linearisation:
-        max_count, share = MAX_REFITS_THOROUGH, 0.0
-    # If scores are less reliable, they only order the patient fits, and exclude none.
+        max_count, min_relative_score = MAX_REFITS_THOROUGH, 0.0
+    # If scores are less reliable, they only order the fits, and exclude no candidate.
     is_all_wanted = fits_all and not evaluator.has_linearisation
     for i in _rank_candidates(
-        scores, max_count, share, is_all_wanted, _find_simulated_scores(evaluator, scores)
+        scores,
+        max_count,
+        min_relative_score,
+        is_all_wanted,
+        _find_simulated_scores(evaluator, scores),
     ):
         name = scores.effects[i]
         # The score peaks of an effect are fitted separately, because each may lead to its own
         # minimum.
-        for peak, (group, scored) in enumerate(scores.peaks[i]):
+        for peak_number, (group, predicted_coefficients) in enumerate(scores.peaks[i]):
             known_jacobian = _predict_jacobian(evaluator, model, direction_set, group, name)
-            for c in _list_start_sizes(evaluator, direction_set, group, scored, name):
+            for c in _list_start_sizes(
+                evaluator, direction_set, group, predicted_coefficients, name
+            ):
                 start = replace(
-                    with_effect(evaluator, model.fit.make_start(), name, c),
+                    add_effect_to_start(evaluator, model.fit.make_start(), name, c),
                     known_jacobian=known_jacobian,
                 )
-                numbered.append((peak, start))
-    # Patient fits begin with the first part of the runs, so starts are compared there.
-    share = FIT_HORIZONS[0].share if fits_all else 1.0
-    return _select_nearest_start(evaluator, noise, numbered, share)
+                numbered_starts.append((peak_number, start))
+    # Fits of all candidates begin with the first part of the runs, so starts are compared there.
+    run_share = FIT_HORIZONS[0].share if fits_all else 1.0
+    return _select_nearest_start(evaluator, noise, numbered_starts, run_share)
 
 
 def _find_simulated_scores(evaluator: RunEvaluator, scores: CandidateScores) -> frozenset[int]:
@@ -150,7 +158,7 @@ def _rank_candidates(
     return selected + selected_by_simulation
 
 
-def with_effect(evaluator: RunEvaluator, start: FitStart, name: str, c: Array) -> FitStart:
+def add_effect_to_start(evaluator: RunEvaluator, start: FitStart, name: str, c: Array) -> FitStart:
     """Add an effect to a model, in place of the effects that it contains.
 
     Args:
@@ -162,10 +170,10 @@ def with_effect(evaluator: RunEvaluator, start: FitStart, name: str, c: Array) -
     effect = evaluator.available_effects[name]
     contained, theta = effect.contains, start.theta.copy()
     # An effect and one that it contains together would have no unique solution.
-    for part in sorted(set(contained) & set(start.effects)):
-        place = evaluator.coefficient_slices[part]
-        c = effect.taking(c, part, theta[place])
-        theta[place] = 0.0
+    for contained_effect in sorted(set(contained) & set(start.effects)):
+        part_slice = evaluator.coefficient_slices[contained_effect]
+        c = effect.taking(c, contained_effect, theta[part_slice])
+        theta[part_slice] = 0.0
     theta[evaluator.coefficient_slices[name]] = c
     remaining_effects = [n for n in start.effects if n not in contained]
     return FitStart((*remaining_effects, name), theta, start.initial_states)
@@ -253,31 +261,31 @@ def _list_start_sizes(
 def _select_nearest_start(
     evaluator: RunEvaluator,
     noise: NoiseModel,
-    numbered: Sequence[tuple[int, FitStart]],
-    share: float,
+    numbered_starts: Sequence[tuple[int, FitStart]],
+    run_share: float,
 ) -> list[FitStart]:
-    """Return the start with the lowest cost for each peak number and set of effects.
+    """Return the start with the lowest cost for each score peak of each set of effects.
 
     Args:
         evaluator: the runs.
         noise: noise of each channel.
-        numbered: starts with the number of their score peak.
-        share: initial share of the runs on which the cost is computed.
+        numbered_starts: starts with the number of their score peak.
+        run_share: initial share of the runs on which the cost is computed.
     """
-    if not numbered:
+    if not numbered_starts:
         return []
-    starts = [start for _, start in numbered]
+    starts = [start for _, start in numbered_starts]
     runs = len(evaluator.prepared_runs)
     count = len(starts)
     theta = np.repeat([s.theta for s in starts], runs, axis=0)
     states = np.concatenate([s.initial_states for s in starts])
-    lanes = np.tile(np.arange(runs), count)
+    run_indices = np.tile(np.arange(runs), count)
     # All starts are simulated in one engine call, as one batch.
-    predictions = evaluator.simulate(theta, lanes, states, share)
+    predictions = evaluator.simulate(theta, run_indices, states, run_share)
     predictions = predictions.reshape(count, runs, *predictions.shape[1:])
-    sample_mask = evaluator.get_sample_mask(share)
+    sample_mask = evaluator.get_sample_mask(run_share)
     best: dict[tuple[int, EffectNames], tuple[float, FitStart]] = {}
-    for (number, start), simulated in zip(numbered, predictions, strict=True):
+    for (number, start), simulated in zip(numbered_starts, predictions, strict=True):
         residual = evaluator.observed - simulated
         normalised_residual = np.where(sample_mask, residual, 0.0) / noise.sigma
         cost = float(np.square(normalised_residual).sum())

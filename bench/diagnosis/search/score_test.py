@@ -68,6 +68,7 @@ SURROGATE_COUNT_FACTOR = 4
 """Factor by which the number of surrogates is increased for such p-values."""
 
 ScorePeak = tuple[DirectionGroup, Array]
+"""A group of directions with the coefficients of its columns, from which a fit may start."""
 
 
 @dataclass(frozen=True)
@@ -100,9 +101,9 @@ class ScoreTest:
     """Score test of candidate effects against any residuals of one model.
 
     Args:
-        at: the model that the directions refer to.
+        fit: the fitted model that the directions refer to.
         directions: directions of the candidates.
-        seen: (R, T, C) mask of available samples.
+        observed_mask: (R, T, C) mask of available samples.
         noise: its sigma weights the channels; its correlation is not used.
     """
 
@@ -149,13 +150,13 @@ class ScoreTest:
         # The sums of products from one pass over the samples serve every correlation of the grid.
         for phi, determinant in self._determinants.items():
             total, grams, cross = products.project(phi)
-            table.begin(phi, determinant, total)
+            table.begin_correlation(phi, determinant, total)
             for batch, gram in zip(self._batches, grams, strict=True):
-                table.enter(
+                table.add_batch(
                     batch, *compute_explained_squares(gram, cross[batch.columns], batch.positive)
                 )
-            table.end()
-        return table.ranked()
+            table.end_correlation()
+        return table.rank_effects()
 
 
 def compute_calibrated_scores(
@@ -181,55 +182,61 @@ def compute_calibrated_scores(
 
 
 class _BestScores:
-    """Best likelihood of every group and effect over the correlations so far.
+    """Best likelihood of every group of directions and every effect over the correlations so far.
+
+    For each correlation, the caller calls `begin_correlation`, then `add_batch` for all groups, and
+    then `end_correlation`.
 
     Args:
         members: groups of all effects.
-        residuals: number of residuals.
-        count: n of eq. (3).
+        residuals: number S of residuals: the observed one first, then the surrogates.
+        count: number n of samples.
     """
 
     def __init__(self, members: Sequence[DirectionGroup], residuals: int, count: int) -> None:
         """Create an empty table of E effects by S residuals.
 
-        `_rows` has the row of each group's effect. `_best` (E, S) is the largest l(phi) of eq. (3)
-        so far, `_without` (S,) that without any direction, and `_white` (E,) the score without
-        autocorrelation. `_gains` (E, S) has the explained sums of squares at the present
-        correlation `_phi`, and `_total` (S,) the sums of squares before.
+        With l(phi) twice the log-likelihood, eq. (3) of the module docstring, `_effect_rows` has
+        the row of each group's effect, `_best_log_likelihoods` (E, S) the largest l(phi) so far,
+        `_best_without_effects` (S,) that without any direction, and `_white_noise_scores` (E,) the
+        score without autocorrelation. `_explained_squares` (E, S) has the explained sums of squares
+        at the present correlation `_phi`, and `_total_squares` (S,) the sums of squares before.
         """
         self._count = count
         self._groups = members
-        self._names = list(dict.fromkeys(group.effect for group in members))
-        rows = {name: row for row, name in enumerate(self._names)}
-        self._rows = np.array([rows[group.effect] for group in members], dtype=np.intp)
-        effects = len(self._names)
-        self._best = np.full((effects, residuals), -np.inf)
-        self._without = np.full(residuals, -np.inf)
-        self._white = np.zeros(effects)
+        self._effect_names = list(dict.fromkeys(group.effect for group in members))
+        rows = {name: row for row, name in enumerate(self._effect_names)}
+        self._effect_rows = np.array([rows[group.effect] for group in members], dtype=np.intp)
+        effects = len(self._effect_names)
+        self._best_log_likelihoods = np.full((effects, residuals), -np.inf)
+        self._best_without_effects = np.full(residuals, -np.inf)
+        self._white_noise_scores = np.zeros(effects)
         # For each group: twice its log-likelihood, its correlation and its coefficients.
-        self._values = np.full(len(members), -np.inf)
-        self._phis = np.zeros(len(members))
+        self._group_log_likelihoods = np.full(len(members), -np.inf)
+        self._group_phis = np.zeros(len(members))
         max_columns = max((len(group.column_indices) for group in members), default=0)
-        self._coefficients = np.zeros((len(members), max_columns))
-        self._gains = np.zeros((effects, residuals))
+        self._group_coefficients = np.zeros((len(members), max_columns))
+        self._explained_squares = np.zeros((effects, residuals))
         self._phi = self._determinant = 0.0
-        self._total = np.zeros(residuals)
+        self._total_squares = np.zeros(residuals)
 
-    def begin(self, phi: float, determinant: float, total: Array) -> None:
-        """Start a correlation, with log det W'W and <e, e> (S,) of eq. (3).
+    def begin_correlation(self, phi: float, determinant: float, total: Array) -> None:
+        """Start a correlation, and compute the likelihood of each residual without any direction.
 
         Args:
             phi: the correlation.
-            determinant: log det W'W.
-            total: (S,) sums of squares of the residuals.
+            determinant: log-determinant log det W'W of the whitening W.
+            total: (S,) sums of squares of the whitened residuals.
         """
-        self._phi, self._determinant, self._total = phi, determinant, total
-        self._gains[...] = 0.0
+        self._phi, self._determinant, self._total_squares = phi, determinant, total
+        self._explained_squares[...] = 0.0
         value_without_effects = self._compute_log_likelihood(total, total)
-        self._without = np.maximum(self._without, value_without_effects)
+        self._best_without_effects = np.maximum(self._best_without_effects, value_without_effects)
 
     def _compute_log_likelihood(self, remaining_squares: Array, total_squares: Array) -> Array:
-        """Return l(phi) of eq. (3), twice the log-likelihood, at the present correlation.
+        """Return twice the log-likelihood at the present correlation, with the best noise level.
+
+        It is log det W'W - n log(remaining squares), eq. (3) of the module docstring.
 
         Args:
             remaining_squares: sums of squares of the residual after the directions have explained
@@ -242,42 +249,50 @@ class _BestScores:
         result: Array = self._determinant - self._count * logarithms
         return result
 
-    def enter(self, batch: GroupBatch, gain: Array, coefficients: Array) -> None:
-        """Enter what the groups of a batch explain.
+    def add_batch(self, batch: GroupBatch, gain: Array, coefficients: Array) -> None:
+        """Update the table with the sums of squares that the groups of a batch explain.
 
         Args:
             batch: the groups.
             gain: (n, S) explained sums of squares.
             coefficients: (n, k) coefficients for the first residual.
         """
-        rows = self._rows[batch.places]
+        rows = self._effect_rows[batch.group_indices]
         order = np.argsort(rows, kind="stable")
-        present, first = np.unique(rows[order], return_index=True)
-        largest = np.maximum.reduceat(gain[order], first, axis=0)
-        self._gains[present] = np.maximum(self._gains[present], largest)
-        value = self._compute_log_likelihood(self._total[0] - gain[:, 0], self._total[0])
+        present_rows, first = np.unique(rows[order], return_index=True)
+        largest_squares = np.maximum.reduceat(gain[order], first, axis=0)
+        self._explained_squares[present_rows] = np.maximum(
+            self._explained_squares[present_rows], largest_squares
+        )
+        value = self._compute_log_likelihood(
+            self._total_squares[0] - gain[:, 0], self._total_squares[0]
+        )
         # The first residual is the observed one; only its coefficients are used as starts of fits.
-        is_better = value > self._values[batch.places]
-        places = batch.places[is_better]
-        self._values[places] = value[is_better]
-        self._phis[places] = self._phi
-        self._coefficients[places, : coefficients.shape[1]] = coefficients[is_better]
+        is_better = value > self._group_log_likelihoods[batch.group_indices]
+        improved_groups = batch.group_indices[is_better]
+        self._group_log_likelihoods[improved_groups] = value[is_better]
+        self._group_phis[improved_groups] = self._phi
+        self._group_coefficients[improved_groups, : coefficients.shape[1]] = coefficients[is_better]
 
-    def end(self) -> None:
+    def end_correlation(self) -> None:
         """Finish a correlation: update the best likelihood of each effect from its groups."""
-        values = self._compute_log_likelihood(self._total - self._gains, self._total)
-        self._best = np.maximum(self._best, values)
+        values = self._compute_log_likelihood(
+            self._total_squares - self._explained_squares, self._total_squares
+        )
+        self._best_log_likelihoods = np.maximum(self._best_log_likelihoods, values)
         # With phi = 0, whitening leaves sums of squares unchanged.
-        if self._phi == 0 and len(self._names):
-            value_without_effects = self._compute_log_likelihood(self._total[0], self._total[0])
-            self._white = np.maximum(values[:, 0] - value_without_effects, 0.0)
+        if self._phi == 0 and len(self._effect_names):
+            value_without_effects = self._compute_log_likelihood(
+                self._total_squares[0], self._total_squares[0]
+            )
+            self._white_noise_scores = np.maximum(values[:, 0] - value_without_effects, 0.0)
 
-    def ranked(self) -> CandidateScores:
+    def rank_effects(self) -> CandidateScores:
         """Return the scores of eq. (4) in descending order, with the p-value of eq. (5)."""
-        gains = self._best - self._without  # (4)
+        gains = self._best_log_likelihoods - self._best_without_effects  # (4)
         observed = gains[:, 0]
         surrogate_gains = gains[:, 1:]
-        null_quantiles = np.zeros(len(self._names))
+        null_quantiles = np.zeros(len(self._effect_names))
         p_value = 1.0
         if surrogate_gains.shape[1]:
             # An effect with many shapes has higher scores under the null hypothesis, which must not
@@ -290,42 +305,41 @@ class _BestScores:
         order = np.argsort(-observed, kind="stable")
         phi = 0.0
         if order.size:
-            members = np.flatnonzero(self._rows == order[0])
-            phi = float(self._phis[members[np.argmax(self._values[members])]])
+            members = np.flatnonzero(self._effect_rows == order[0])
+            phi = float(self._group_phis[members[np.argmax(self._group_log_likelihoods[members])]])
         return CandidateScores(
-            effects=tuple(self._names[i] for i in order),
+            effects=tuple(self._effect_names[i] for i in order),
             score=observed[order],
             null_quantiles=null_quantiles[order],
-            peaks=tuple(self._get_peaks(np.flatnonzero(self._rows == i)) for i in order),
+            peaks=tuple(self._get_peaks(np.flatnonzero(self._effect_rows == i)) for i in order),
             p_value=p_value,
             phi=phi,
             null_scores=null_scores[order],
-            white_noise_scores=self._white[order],
+            white_noise_scores=self._white_noise_scores[order],
         )
 
-    def _get_peaks(self, places: NDArray[np.intp]) -> tuple[ScorePeak, ...]:
+    def _get_peaks(self, group_indices: NDArray[np.intp]) -> tuple[ScorePeak, ...]:
         """Return the best group of an effect with its coefficients, as start of a fit.
 
         An effect with many shapes, such as frequencies, may have several local maxima of the
-        likelihood; the best of them are returned. `places` has the indices of the groups of the
-        effect.
+        likelihood; the best of them are returned. `group_indices` are the groups of the effect.
         """
-        values = self._values[places]
-        has_many_shapes = len(places) > SHAPE_COUNT_FOR_MULTISTART
-        peaks = values == values.max()
+        values = self._group_log_likelihoods[group_indices]
+        has_many_shapes = len(group_indices) > SHAPE_COUNT_FOR_MULTISTART
+        is_peak = values == values.max()
         if has_many_shapes:
             # Neighbours of the best group give the same result, so only local maxima count.
-            padded_values = np.concatenate([[-np.inf], values, [-np.inf]])
-            above_former = values >= padded_values[:-2]
-            above_latter = values >= padded_values[2:]
-            peaks = above_former & above_latter
+            padded = np.concatenate([[-np.inf], values, [-np.inf]])
+            above_previous = values >= padded[:-2]
+            above_next = values >= padded[2:]
+            is_peak = above_previous & above_next
         order = np.argsort(-values, kind="stable")
         max_peaks = STARTS_PER_EFFECT if has_many_shapes else 1
-        peak_places = [places[i] for i in order if peaks[i]][:max_peaks]
+        peak_groups = [group_indices[i] for i in order if is_peak[i]][:max_peaks]
         result = []
-        for i in peak_places:
+        for i in peak_groups:
             group = self._groups[i]
-            result.append((group, self._coefficients[i, : len(group.column_indices)].copy()))
+            result.append((group, self._group_coefficients[i, : len(group.column_indices)].copy()))
         return tuple(result)
 
 
@@ -341,20 +355,17 @@ def estimate_tail_p_value(null_values: Array, observed: Array) -> float:
     """
     if not observed.size:
         return 1.0
-    largest = np.sort(null_values.max(axis=0))
+    null_maxima = np.sort(null_values.max(axis=0))
     value = float(observed.max())
-    count = largest.size
-    exceedance_count = int((largest >= value).sum())
+    count = null_maxima.size
+    exceedance_count = int((null_maxima >= value).sum())
     # Counting cannot give less than one in the number of surrogates; smaller p-values are
     # extrapolated.
-    first = int(TAIL_QUANTILE * count)
-    extreme = largest[first:]
-    begin = extreme[0]
-    if value <= begin or count < MIN_SURROGATES_FOR_TAIL:
+    tail = null_maxima[int(TAIL_QUANTILE * count) :]
+    tail_begin = tail[0]
+    if value <= tail_begin or count < MIN_SURROGATES_FOR_TAIL:
         # The residual counts as one of the surrogates, so the p-value is never zero.
         return (1.0 + exceedance_count) / (1.0 + count)
     # The scale of an exponential distribution is its mean excess over the threshold.
-    tail_excess = extreme - begin
-    mean_excess = max(float(tail_excess.mean()), 1e-9)
-    p_value = TAIL_SHARE * np.exp(-(value - begin) / mean_excess)
-    return float(p_value)
+    mean_excess = max(float((tail - tail_begin).mean()), 1e-9)
+    return float(TAIL_SHARE * np.exp(-(value - tail_begin) / mean_excess))

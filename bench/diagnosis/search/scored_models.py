@@ -1,6 +1,6 @@
 """Fitted models together with the scores of all effects that they lack.
 
-Each model is scored once against the whole library by a linear test
+Each model is scored once noise_residual the whole library by a linear test
 (`search.score_test`). The score and the size of the residual show whether the model lacks
 something.
 """
@@ -126,34 +126,38 @@ class ScoredModelSet(ModelSet):
             self.superseded_scans[key] = self.cached_scans.pop(key)
 
     def score_missing_effects(
-        self, model: FittedModel, against: Array | None = None
+        self, model: FittedModel, noise_residual: Array | None = None
     ) -> CandidateScores:
         """Score every effect that the model lacks.
 
         Args:
             model: the model.
-            against: (R, T, C) residual whose spectrum the surrogates have; None for that of the
-                model.
+            noise_residual: (R, T, C) residual whose spectrum the surrogates have; None for that of
+                the model.
         """
         key = frozenset(model.effects)
-        if key not in (self.scores_by_effects if against is None else self.cached_scans):
+        if key not in (self.scores_by_effects if noise_residual is None else self.cached_scans):
             self._score_models([model])
-        if against is None:
+        if noise_residual is None:
             return self.scores_by_effects[key]
         stored_scan = self.cached_scans[key]
         self._report_scoring(model)
         # Directions cost one simulation per candidate, and are reused with other surrogates. The
         # spectrum of the noise is best estimated from a model with less structure in its residual.
         residual = self.compute_residual(model.fit)
-        stream = self.make_rng("library", model.effects)
-        scores = _score_residual(stored_scan.test, residual, against, self.observed_mask, stream)
+        rng = self.make_rng("library", model.effects)
+        scores = _score_residual(
+            stored_scan.test, residual, noise_residual, self.observed_mask, rng
+        )
         self._store_scores(key, stored_scan._replace(scores=scores))
         return scores
 
     def _score_models(
         self, models: Sequence[FittedModel], other_kept_models: Sequence[FittedModel] = ()
     ) -> None:
-        """Score the effects that each of the models lacks.
+        """Score the effects that each of the models lacks, in parallel, and store the results.
+
+        If a model was replaced by nearly the same fit, its stored directions are used again.
 
         Args:
             models: models to score.
@@ -164,7 +168,7 @@ class ScoredModelSet(ModelSet):
             self._report_scoring(model)
             model = self.refine_jacobian(model)
             key = frozenset(model.effects)
-            residual, stream = (
+            residual, rng = (
                 self.compute_residual(model.fit),
                 self.make_rng("library", model.effects),
             )
@@ -175,7 +179,7 @@ class ScoredModelSet(ModelSet):
                 and self._compute_fit_distance(previous_scan.fit, model.fit) < UNCHANGED_FIT_SIGMAS
             ):
                 scores = _score_residual(
-                    previous_scan.test, residual, residual, self.observed_mask, stream
+                    previous_scan.test, residual, residual, self.observed_mask, rng
                 )
                 self._store_scores(key, previous_scan._replace(scores=scores))
                 continue
@@ -187,7 +191,7 @@ class ScoredModelSet(ModelSet):
                     self.compute_channel_weights(model),
                     residual,
                     self.observed_mask,
-                    stream,
+                    rng,
                 )
             )
         if calls:
@@ -206,9 +210,7 @@ class ScoredModelSet(ModelSet):
             scores = self.scores_by_effects.get(key, scans[number].scores)
             # Scores that were kept when the directions were removed remain valid.
             self._store_scores(key, scans[number]._replace(scores=scores))
-        self._evict_oldest_directions(
-            [*keys, *(frozenset(model.effects) for model in other_kept_models)]
-        )
+        self._limit_cache_size([*keys, *(frozenset(model.effects) for model in other_kept_models)])
 
     def _report_scoring(self, model: FittedModel) -> None:
         """Report to the user that a model is scored now, and stop if the search has to end."""
@@ -217,7 +219,7 @@ class ScoredModelSet(ModelSet):
             f"scores of the effect library at {model_text}"
         )
 
-    def _evict_oldest_directions(self, kept_keys: Sequence[frozenset[str]]) -> None:
+    def _limit_cache_size(self, kept_keys: Sequence[frozenset[str]]) -> None:
         """Remove the oldest stored directions until `DIRECTION_CACHE_BYTES` is not exceeded.
 
         Those of the base model and of the models `kept_keys` are kept.
@@ -272,12 +274,44 @@ class ScoredModelSet(ModelSet):
     def refit_extensions(
         self, beam: Iterable[FittedModel], max_count: int, fits_all: bool = False
     ) -> None:
-        """Refit the most promising extensions of models; known ones only if patient.
+        """Fit the models with one more effect that have the highest scores.
+
+        For robots, models with simpler laws are fitted first, and those with richer laws only if
+        the simpler ones leave more than noise: laws that are evaluated in every step cost most.
 
         Args:
             beam: models to extend.
             max_count: maximum number of candidates per model.
-            fits_all: whether to include all candidates, and fit the beginnings of the runs first.
+            fits_all: whether to include all candidates, also those that were fitted before, and to
+                fit the beginnings of the runs first.
+        """
+        starts = self._collect_extension_starts(beam, max_count, fits_all)
+        if not self.evaluator.has_linearisation or fits_all:
+            if starts:
+                self.refit_models(starts, is_staged=fits_all)
+            return
+        known_models = {frozenset(start.effects) for start in starts} | set(self.models)
+        simpler_models = {
+            id(start): self._list_simpler_models(start) & known_models for start in starts
+        }
+        simple_starts = [start for start in starts if not simpler_models[id(start)]]
+        if simple_starts:
+            self.refit_models(simple_starts)
+        richer_starts = [
+            start
+            for start in starts
+            if simpler_models[id(start)] and not self._leaves_only_noise(simpler_models[id(start)])
+        ]
+        if richer_starts:
+            self.refit_models(richer_starts)
+
+    def _collect_extension_starts(
+        self, beam: Iterable[FittedModel], max_count: int, fits_all: bool
+    ) -> list[FitStart]:
+        """Return starts of fits of each model of the beam with one more effect.
+
+        Models without stored directions are scored first. Arguments are those of
+        `refit_extensions`.
         """
         starts = []
         models = list(beam)
@@ -301,22 +335,7 @@ class ScoredModelSet(ModelSet):
                 fits_all,
             )
             starts += [s for s in extension_starts if fits_all or self._is_new(s, latest_model)]
-        if not self.evaluator.has_linearisation or fits_all:
-            if starts:
-                self.refit_models(starts, is_staged=fits_all)
-            return
-        # Laws that are evaluated in every step cost most, and the laws that they contain are often
-        # sufficient.
-        names = {frozenset(start.effects) for start in starts} | set(self.models)
-        parts = {id(start): self._list_simpler_models(start) & names for start in starts}
-        simple_starts = [start for start in starts if not parts[id(start)]]
-        if simple_starts:
-            self.refit_models(simple_starts)
-        richer_starts = [
-            s for s in starts if parts[id(s)] and not self._leaves_only_noise(parts[id(s)])
-        ]
-        if richer_starts:
-            self.refit_models(richer_starts)
+        return starts
 
     def _is_new(self, start: FitStart, model: FittedModel) -> bool:
         """Return whether a fit from this start may find something new.
@@ -376,7 +395,8 @@ class ScoredModelSet(ModelSet):
     ) -> float:
         """Return the p-value of a gain in twice the log-likelihood.
 
-        The null-hypothesis level of the larger model's effects is subtracted first.
+        The gain that the larger model's effects reach under the null hypothesis (90 % quantile over
+        the surrogates) is subtracted first.
 
         Args:
             scores: scores about the smaller model.
@@ -433,7 +453,7 @@ def _scan_model(
     weights: NoiseModel,
     residual: Array,
     observed_mask: Mask,
-    stream: np.random.Generator,
+    rng: np.random.Generator,
 ) -> ModelScan:
     """Score all effects that one model lacks; runs in this process or in a worker.
 
@@ -444,32 +464,32 @@ def _scan_model(
         weights: noise that weights the channels.
         residual: (R, T, C) residual of the model.
         observed_mask: (R, T, C) mask of available samples.
-        stream: random generator of the surrogates.
+        rng: random generator of the surrogates.
     """
     candidates = compute_directions(evaluator, fit, missing_effects)
     test = ScoreTest(fit, candidates, observed_mask, weights)
     return ModelScan(
-        fit, candidates, test, _score_residual(test, residual, residual, observed_mask, stream)
+        fit, candidates, test, _score_residual(test, residual, residual, observed_mask, rng)
     )
 
 
 def _score_residual(
     test: ScoreTest,
     residual: Array,
-    against: Array,
+    noise_residual: Array,
     observed_mask: Mask,
-    stream: np.random.Generator,
+    rng: np.random.Generator,
 ) -> CandidateScores:
     """Return the scores of a residual, with a p-value from surrogate residuals.
 
-    The surrogates are random noise with the spectrum of the residual `against` (R, T, C); they show
-    which scores such noise reaches without any effect.
+    The surrogates are random noise with the spectrum of the residual `noise_residual` (R, T, C);
+    they show which scores such noise reaches without any effect.
     """
     return compute_calibrated_scores(
         test,
         residual,
         lambda count: draw_surrogates(
-            against, observed_mask, count, stream, project_out=test.project_out
+            noise_residual, observed_mask, count, rng, project_out=test.project_out
         ),
         SURROGATE_COUNT,
     )

@@ -101,17 +101,18 @@ def _collect_full_fit_starts(
     They are the result, models that explain the data nearly as well, models without one of its
     effects, and the best models of a single effect.
     """
-    competing_models = [
+    selected_models = [
         subsampled_model,
         *list_competing_models(subsampled_search, subsampled_model),
         *list_submodels(subsampled_search, subsampled_model),
     ]
-    competing_models += [
+    selected_models += [
         subsampled_search.remove_effect(subsampled_model, name) for name in subsampled_model.effects
     ]
-    competing_models += select_by_size(subsampled_search, 1)[:MAX_SINGLE_EFFECT_REFITS]
-    chosen = {model.effects: model.fit.make_start() for model in competing_models if model.effects}
-    return list(chosen.values())
+    selected_models += select_by_size(subsampled_search, 1)[:MAX_SINGLE_EFFECT_REFITS]
+    # A dictionary, because the lists overlap and each model is fitted once.
+    starts = {model.effects: model.fit.make_start() for model in selected_models if model.effects}
+    return list(starts.values())
 
 
 def _select_full_model(search: EffectSearch, subsampled_model: FittedModel) -> FittedModel:

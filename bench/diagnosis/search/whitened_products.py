@@ -35,14 +35,14 @@ class LaggedSums(NamedTuple):
     """The three sums of eq. (1), each an array of products.
 
     Attributes:
-        whole: products of equal samples.
-        mixed: products of each sample with its neighbours.
-        ends: products of samples without a neighbour, times the number of missing neighbours.
+        same_samples: products of the samples at equal times, summed over time.
+        neighbours: products of each sample with its two neighbours in time, summed.
+        run_ends: products of samples without a neighbour, times the number of missing neighbours.
     """
 
-    whole: Array
-    mixed: Array
-    ends: Array
+    same_samples: Array
+    neighbours: Array
+    run_ends: Array
 
     @staticmethod
     def zeros(*shape: int) -> LaggedSums:
@@ -52,7 +52,9 @@ class LaggedSums(NamedTuple):
     def combine(self, phi: float) -> Array:
         """Combine the three sums to the whitened inner products (W a)'(W b) of eq. (1)."""
         square = phi * phi
-        scaled_products = (1.0 + square) * self.whole - phi * self.mixed - square * self.ends
+        scaled_products = (
+            (1.0 + square) * self.same_samples - phi * self.neighbours - square * self.run_ends
+        )
         result: Array = scaled_products / (1.0 - square)  # (1)
         return result
 
@@ -64,14 +66,15 @@ class RunSegment(NamedTuple):
         run: index of the run.
         begin: first sample.
         end: end of the samples (exclusive).
-        edge: (m,) indices of the samples that lack a neighbour, all channels in one row.
-        missing_neighbours: (m,) number of missing neighbours of each of these samples.
+        edge_samples: (m,) indices of the samples that lack a neighbour in time, all channels in
+            one row.
+        missing_neighbours: (m,) number of missing neighbours (1 or 2) of each of these samples.
     """
 
     run: int
     begin: int
     end: int
-    edge: Indices
+    edge_samples: Indices
     missing_neighbours: Array
 
 
@@ -79,14 +82,14 @@ class SegmentColumns(NamedTuple):
     """Columns over a section of a run in sigmas, all channels in one row.
 
     Attributes:
-        now: (k, n) the samples.
-        near: (k, n) sum of the previous and the next sample of each sample.
-        edge: (k, m) the samples that lack a neighbour.
+        samples: (k, n) the samples.
+        neighbour_sums: (k, n) sum of the previous and the next sample of each sample.
+        edge_samples: (k, m) the samples that lack a neighbour.
     """
 
-    now: Array
-    near: Array
-    edge: Array
+    samples: Array
+    neighbour_sums: Array
+    edge_samples: Array
 
 
 def count_missing_neighbours(observed_mask: Mask) -> Array:
@@ -108,7 +111,7 @@ def select_run(parts: LaggedSums, run: int) -> LaggedSums:
 
 
 def add_cross_products(
-    parts: LaggedSums, first: SegmentColumns, second: SegmentColumns, place: RunSegment
+    parts: LaggedSums, first: SegmentColumns, second: SegmentColumns, segment: RunSegment
 ) -> None:
     """Add the products of all columns of one set with all columns of another.
 
@@ -116,25 +119,29 @@ def add_cross_products(
         parts: sums to add to, in place.
         first: columns of the first set.
         second: columns of the second set.
-        place: the section of the run.
+        segment: the section of the run.
     """
-    parts.whole[...] += first.now @ np.swapaxes(second.now, -1, -2)
+    parts.same_samples[...] += first.samples @ np.swapaxes(second.samples, -1, -2)
     # Summed over a run, it does not matter to which of the two columns the neighbours belong.
-    parts.mixed[...] += first.now @ np.swapaxes(second.near, -1, -2)
-    parts.ends[...] += (first.edge * place.missing_neighbours) @ np.swapaxes(second.edge, -1, -2)
+    parts.neighbours[...] += first.samples @ np.swapaxes(second.neighbour_sums, -1, -2)
+    parts.run_ends[...] += (first.edge_samples * segment.missing_neighbours) @ np.swapaxes(
+        second.edge_samples, -1, -2
+    )
 
 
-def add_self_products(parts: LaggedSums, columns: SegmentColumns, place: RunSegment) -> None:
+def add_self_products(parts: LaggedSums, columns: SegmentColumns, segment: RunSegment) -> None:
     """Add the products of columns with themselves.
 
     Args:
         parts: sums to add to, in place.
         columns: the columns.
-        place: the section of the run.
+        segment: the section of the run.
     """
-    parts.whole[...] += np.einsum("kn,kn->k", columns.now, columns.now)
-    parts.mixed[...] += np.einsum("kn,kn->k", columns.near, columns.now)
-    parts.ends[...] += np.einsum("km,km,m->k", columns.edge, columns.edge, place.missing_neighbours)
+    parts.same_samples[...] += np.einsum("kn,kn->k", columns.samples, columns.samples)
+    parts.neighbours[...] += np.einsum("kn,kn->k", columns.neighbour_sums, columns.samples)
+    parts.run_ends[...] += np.einsum(
+        "km,km,m->k", columns.edge_samples, columns.edge_samples, segment.missing_neighbours
+    )
 
 
 MIN_RESIDUAL_SHARE = 1e-12
@@ -154,19 +161,19 @@ class _ReducedDesign(NamedTuple):
     """A design after whitening and projection.
 
     Attributes:
-        states: (R, s, s) roots of the inverse normal matrices of the initial states.
-        by_states: (R s, q + K) L'J'a of eq. (2) for the initial states, of parameters and
-            directions.
-        parameter_root: (q, q) root for the parameters.
-        by_parameters: (q, K) L'J'a of eq. (2) for the parameters, of directions.
-        grams: (n, k, k) products of directions in each block.
-        acting: (K,) mask of directions that are not absorbed.
+        state_roots: (R, s, s) roots L of the inverse normal matrices of the initial states.
+        state_projections: (R s, q + K) L'J'a of eq. (2) for the initial states, with the
+            derivatives by the parameters and the directions as columns a.
+        parameter_root: (q, q) root L for the parameters.
+        parameter_projections: (q, K) L'J'a of eq. (2) for the parameters, with the directions as a.
+        grams: for each block, products (n, k, k) of the directions that act together.
+        acting: (K,) mask of directions that parameters and initial states do not absorb.
     """
 
-    states: Array
-    by_states: Array
+    state_roots: Array
+    state_projections: Array
     parameter_root: Array
-    by_parameters: Array
+    parameter_projections: Array
     grams: list[Array]
     acting: Mask
 
@@ -178,9 +185,9 @@ class WhiteningDesign:
         blocks: as given.
 
     Args:
-        at: the model.
+        fit: the fitted model.
         directions: (R, T, C, K) change of the runs by each direction.
-        seen: (R, T, C) mask of available samples.
+        observed_mask: (R, T, C) mask of available samples.
         sigma: (C,) weights of the channels.
         blocks: arrays (n, k) of column indices; the directions in a row act together.
     """
@@ -195,28 +202,31 @@ class WhiteningDesign:
     ) -> None:
         """Sum the products of Jacobian and directions over all samples, for all correlations.
 
-        The sums have the three parts of eq. (1) and are combined for a given phi later. `_normal`
-        has the products of the q parameters and s initial states with each other (R, q + s, q + s),
-        `_mixed` those with the K directions (R, q + s, K), `_powers` (K,) the squares of the
-        directions, and `_grams` the products of directions that act together. `_missing_neighbours`
-        counts the missing neighbours of each sample, and `_known` caches the projected design of
-        each phi.
+        The sums have the three parts of eq. (1) and are combined for a given phi later.
+        `_jacobian_products` has the products of the derivatives by the q parameters and s initial
+        states with each other (R, q + s, q + s), `_direction_products` those with the K directions
+        (R, q + s, K), `_direction_squares` (K,) the squares of the directions, and
+        `_block_products` the products of directions that act together. `_missing_neighbours` (R, T,
+        C) counts the missing neighbours of each sample, and `_reduced_designs` caches the projected
+        design of each phi.
         """
         self.blocks = list(blocks)
-        self._own = fit.free_indices.size
+        self._parameter_count = fit.free_indices.size
         self._jacobian = np.moveaxis(fit.jacobian, 3, 0)
         self._directions = np.moveaxis(directions, 3, 0)
         self._weights = observed_mask / sigma
         self._missing_neighbours = count_missing_neighbours(observed_mask)
         size, runs, *_ = self._jacobian.shape
         count = len(self._directions)
-        self._normal = LaggedSums.zeros(runs, size, size)
-        self._mixed = LaggedSums.zeros(runs, size, count)
-        self._powers = LaggedSums.zeros(count)
-        self._grams = [LaggedSums.zeros(*block.shape, block.shape[1]) for block in self.blocks]
-        self._known: dict[float, _ReducedDesign] = {}
-        for place in self._iterate_sections():
-            self._add_section_products(place)
+        self._jacobian_products = LaggedSums.zeros(runs, size, size)
+        self._direction_products = LaggedSums.zeros(runs, size, count)
+        self._direction_squares = LaggedSums.zeros(count)
+        self._block_products = [
+            LaggedSums.zeros(*block.shape, block.shape[1]) for block in self.blocks
+        ]
+        self._reduced_designs: dict[float, _ReducedDesign] = {}
+        for segment in self._iterate_sections():
+            self._add_section_products(segment)
 
     def _iterate_sections(self) -> Iterator[RunSegment]:
         """Yield sections of the runs that are so short that their columns fit in the CPU cache."""
@@ -230,16 +240,16 @@ class WhiteningDesign:
                 yield RunSegment(run, begin, end, edge, missing_neighbours[edge])
 
     def _weight_columns(
-        self, values: Array, place: RunSegment, has_neighbours: bool = True
+        self, values: Array, segment: RunSegment, has_neighbours: bool = True
     ) -> SegmentColumns:
         """Return weighted samples of one section, and the sums of their two neighbours in time.
 
         Args:
             values: (k, R, T, C) columns: derivatives, directions or residuals.
-            place: the section.
+            segment: the section.
             has_neighbours: whether neighbours are needed; otherwise they are zero.
         """
-        run, begin, end = place.run, place.begin, place.end
+        run, begin, end = segment.run, segment.begin, segment.end
         rows = len(values)
         # Include one more sample on either side, as a neighbour of the outermost samples.
         first, last = (max(begin - 1, 0), end + 1) if has_neighbours else (begin, end)
@@ -254,28 +264,34 @@ class WhiteningDesign:
         # The shape is written out, because -1 is ambiguous if there are no rows.
         size = rows, samples.shape[1] * samples.shape[2]
         flat = samples.reshape(size)
-        return SegmentColumns(flat, neighbour_sums.reshape(size), flat[:, place.edge])
+        return SegmentColumns(flat, neighbour_sums.reshape(size), flat[:, segment.edge_samples])
 
-    def _add_section_products(self, place: RunSegment) -> None:
+    def _add_section_products(self, segment: RunSegment) -> None:
         """Add the products of one section of a run to the sums of eq. (1)."""
-        jacobian_columns = self._weight_columns(self._jacobian, place)
-        direction_columns = self._weight_columns(self._directions, place)
+        jacobian_columns = self._weight_columns(self._jacobian, segment)
+        direction_columns = self._weight_columns(self._directions, segment)
         add_cross_products(
-            select_run(self._normal, place.run), jacobian_columns, jacobian_columns, place
+            select_run(self._jacobian_products, segment.run),
+            jacobian_columns,
+            jacobian_columns,
+            segment,
         )
         add_cross_products(
-            select_run(self._mixed, place.run), jacobian_columns, direction_columns, place
+            select_run(self._direction_products, segment.run),
+            jacobian_columns,
+            direction_columns,
+            segment,
         )
-        add_self_products(self._powers, direction_columns, place)
-        for block, parts in zip(self.blocks, self._grams, strict=True):
+        add_self_products(self._direction_squares, direction_columns, segment)
+        for block, parts in zip(self.blocks, self._block_products, strict=True):
             # The square of a single column is already known.
             if block.shape[1] > 1:
                 members = SegmentColumns(
-                    direction_columns.now[block],
-                    direction_columns.near[block],
-                    direction_columns.edge[block],
+                    direction_columns.samples[block],
+                    direction_columns.neighbour_sums[block],
+                    direction_columns.edge_samples[block],
                 )
-                add_cross_products(parts, members, members, place)
+                add_cross_products(parts, members, members, segment)
 
     def compute_products(self, *residuals: Array) -> tuple[LaggedSums, LaggedSums, LaggedSums]:
         """Compute products of residuals with themselves, with the Jacobian, and with directions.
@@ -292,19 +308,21 @@ class WhiteningDesign:
         squares = LaggedSums.zeros(samples)
         shared = LaggedSums.zeros(runs, size, samples)
         cross = LaggedSums.zeros(len(self._directions), samples)
-        for place in self._iterate_sections():
+        for segment in self._iterate_sections():
             # Concatenate section by section, because whole copies would double the memory.
-            parts = [self._weight_columns(array, place) for array in residuals]
+            parts = [self._weight_columns(array, segment) for array in residuals]
             residual_columns = SegmentColumns(
                 *(np.concatenate(rows) for rows in zip(*parts, strict=True))
             )
-            jacobian_columns = self._weight_columns(self._jacobian, place)
-            direction_columns = self._weight_columns(self._directions, place, has_neighbours=False)
-            add_self_products(squares, residual_columns, place)
-            add_cross_products(
-                select_run(shared, place.run), jacobian_columns, residual_columns, place
+            jacobian_columns = self._weight_columns(self._jacobian, segment)
+            direction_columns = self._weight_columns(
+                self._directions, segment, has_neighbours=False
             )
-            add_cross_products(cross, direction_columns, residual_columns, place)
+            add_self_products(squares, residual_columns, segment)
+            add_cross_products(
+                select_run(shared, segment.run), jacobian_columns, residual_columns, segment
+            )
+            add_cross_products(cross, direction_columns, residual_columns, segment)
         return squares, shared, cross
 
     def project_out(self, residuals: Array) -> Array:
@@ -314,7 +332,7 @@ class WhiteningDesign:
             residuals: (S, R, T, C) residuals before the fit.
         """
         reduced_design = self.reduce(0.0)
-        q = self._own
+        q = self._parameter_count
         weighted = self._jacobian * self._weights
         shared = np.stack(
             [
@@ -326,9 +344,9 @@ class WhiteningDesign:
         # Back substitution: first coefficients of the parameters, then of the initial states of
         # each run.
         parameters = reduced_design.parameter_root @ by_parameters
-        state_products = by_states - reduced_design.by_states[:, :q] @ parameters
-        runs, size, _ = reduced_design.states.shape
-        states = reduced_design.states @ state_products.reshape(runs, size, len(residuals))
+        state_products = by_states - reduced_design.state_projections[:, :q] @ parameters
+        runs, size, _ = reduced_design.state_roots.shape
+        states = reduced_design.state_roots @ state_products.reshape(runs, size, len(residuals))
         result = np.empty_like(residuals)
         for run in range(runs):
             coefficients = np.concatenate([parameters, states[run]])
@@ -343,19 +361,19 @@ class WhiteningDesign:
 
         The result is cached.
         """
-        if phi not in self._known:
-            self._known[phi] = self._whiten_and_project(phi)
-        return self._known[phi]
+        if phi not in self._reduced_designs:
+            self._reduced_designs[phi] = self._whiten_and_project(phi)
+        return self._reduced_designs[phi]
 
     def _whiten_and_project(self, phi: float) -> _ReducedDesign:
         """Whiten the design with the correlation phi, and project it by eq. (2), without a cache.
 
         First the initial states of each run are projected out, then the parameters of all runs.
         """
-        q = self._own
-        normal = self._normal.combine(phi)
-        mixed = self._mixed.combine(phi)
-        powers = self._powers.combine(phi)
+        q = self._parameter_count
+        normal = self._jacobian_products.combine(phi)
+        mixed = self._direction_products.combine(phi)
+        powers = self._direction_squares.combine(phi)
 
         # Eq. (2) for the initial states of each run, then for the parameters.
         states = _compute_matrix_root(normal[:, q:, q:])
@@ -374,7 +392,7 @@ class WhiteningDesign:
         acting = remaining > MIN_RESIDUAL_SHARE * powers
         remaining = np.where(acting, remaining, 0.0)
         grams = []
-        for block, parts in zip(self.blocks, self._grams, strict=True):
+        for block, parts in zip(self.blocks, self._block_products, strict=True):
             if block.shape[1] == 1:
                 grams.append(remaining[block][:, :, None])
                 continue
@@ -415,7 +433,7 @@ class InnerProducts:
         absorbed = np.concatenate([by_states, by_parameters])
         total = self._squares.combine(phi) - np.einsum("as,as->s", absorbed, absorbed)
         direction_products = np.concatenate(
-            [reduced_design.by_states[:, q:], reduced_design.by_parameters]
+            [reduced_design.state_projections[:, q:], reduced_design.parameter_projections]
         )
         cross = self._cross.combine(phi) - direction_products.T @ absorbed
         return (
@@ -439,8 +457,10 @@ def _project_residuals(reduced_design: _ReducedDesign, shared: Array) -> tuple[A
     """
     q = len(reduced_design.parameter_root)
     # First the initial states of each run, then the parameters.
-    by_states = _project_directions(reduced_design.states, shared[:, q:])
-    parameter_products = shared[:, :q].sum(axis=0) - reduced_design.by_states[:, :q].T @ by_states
+    by_states = _project_directions(reduced_design.state_roots, shared[:, q:])
+    parameter_products = (
+        shared[:, :q].sum(axis=0) - reduced_design.state_projections[:, :q].T @ by_states
+    )
     return by_states, reduced_design.parameter_root.T @ parameter_products
 
 
