@@ -34,7 +34,6 @@ DIFFERENCE_EFFECTS = frozenset(
     {"drag.linear", "drag.quadratic", "friction.coulomb", "spring.linear"}
 )
 """Effects whose coefficient is a difference from the value in the model file."""
-_MORE = {True: "larger", False: "smaller"}
 
 
 def format_effect_set(names: Sequence[str], conjunction: str = "or") -> str:
@@ -148,9 +147,9 @@ def format_number_error(cause: Cause) -> str:
     base, place = split_effect_name(cause.effect)
     if cause.says == GRAVITY_COMPENSATED:
         return sanitise(cause.says)
-    if base in _STEPPED:
-        return f"{_STEPPED[base]}: {sanitise(cause.says).rstrip('.')}"
-    format_error = _SIZED.get(base)
+    if base in _STEP_ERROR_TEXTS:
+        return f"{_STEP_ERROR_TEXTS[base]}: {sanitise(cause.says).rstrip('.')}"
+    format_error = _MODEL_FILE_ERROR_FORMATTERS.get(base)
     values = list(cause.coefficients.values())
     if format_error is None or not place or place == ALL_PLACES or not values:
         return ""
@@ -166,6 +165,11 @@ def is_overstated(cause: Cause) -> bool:
     return bool(place) and base in DIFFERENCE_EFFECTS and bool(values) and max(values) < 0
 
 
+def _compare(change: float) -> str:
+    """Return ``larger`` for a positive change and ``smaller`` for others."""
+    return "larger" if change > 0 else "smaller"
+
+
 def _make_percentage_formatter(quantity: str) -> Callable[[str, Sequence[FittedValue]], str]:
     """Return a function that says by which percentage a quantity differs from the model file.
 
@@ -174,9 +178,9 @@ def _make_percentage_formatter(quantity: str) -> Callable[[str, Sequence[FittedV
     """
 
     def say(where: str, values: Sequence[FittedValue]) -> str:
-        c = values[0].value
-        percent = format_percent(abs(c))
-        return f"the {quantity} {where} is {percent} {_MORE[c > 0]} than the model file states"
+        relative_change = values[0].value
+        percent = format_percent(abs(relative_change))
+        return f"the {quantity} {where} is {percent} {_compare(relative_change)} than the model file states"
 
     return say
 
@@ -189,7 +193,7 @@ def _make_difference_formatter(quantity: str) -> Callable[[str, Sequence[FittedV
 
     def say(where: str, values: Sequence[FittedValue]) -> str:
         size = append_unit(format_number(abs(values[0].value), 2), values[0].unit)
-        comparison = _MORE[values[0].value > 0]
+        comparison = _compare(values[0].value)
         return f"the {quantity} {where} is {size} {comparison} than the model file states"
 
     return say
@@ -227,15 +231,15 @@ def _format_link_length(place_text: str, values: Sequence[FittedValue]) -> str:
 
     `values[0]` is the relative change of the length.
     """
-    c = values[0].value
-    percent = format_percent(abs(c))
+    relative_change = values[0].value
+    percent = format_percent(abs(relative_change))
     return (
-        f"the distance {place_text} from its parent is {percent} {_MORE[c > 0]} "
+        f"the distance {place_text} from its parent is {percent} {_compare(relative_change)} "
         "than the model file states"
     )
 
 
-_SIZED: Mapping[str, Callable[[str, Sequence[FittedValue]], str]] = {
+_MODEL_FILE_ERROR_FORMATTERS: Mapping[str, Callable[[str, Sequence[FittedValue]], str]] = {
     "mass.scale": _make_percentage_formatter("mass"),
     "inertia.scale": _make_percentage_formatter("inertia"),
     "actuator.stiffness": _make_percentage_formatter("stiffness"),
@@ -250,7 +254,7 @@ _SIZED: Mapping[str, Callable[[str, Sequence[FittedValue]], str]] = {
     "contact.damping": _make_percentage_formatter("damping ratio"),
 }
 """Functions that format how wrong a value of the model file is, by effect."""
-_STEPPED = {
+_STEP_ERROR_TEXTS = {
     "numerics.step": "the time step of the model file is too long",
     "numerics.integrator": "the integrator of the model file is not accurate enough",
 }
@@ -274,7 +278,11 @@ def list_values(cause: Cause) -> list[tuple[str, str]]:
 
 
 def format_values(cause: Cause) -> str:
-    """Format the coefficients of a cause in one line; those of a family with their places."""
+    """Format the coefficients of a cause in one line.
+
+    If the cause is one effect at all joints or bodies (a family), each coefficient is followed by
+    the joint or body at which it acts.
+    """
     texts = []
     for name, text in list_values(cause):
         coefficient, place = split_effect_name(name)
@@ -340,7 +348,7 @@ def _format_coefficient(cause: Cause, effect: str, place: str) -> str:
     if len(at_place) != 1:
         return ""
     fitted = at_place[0]
-    if split_effect_name(effect)[0] in _SIZED and fitted.unit == "1":
+    if split_effect_name(effect)[0] in _MODEL_FILE_ERROR_FORMATTERS and fitted.unit == "1":
         sign = "+" if fitted.value > 0 else ""
         return f": {sign}{format_percent(fitted.value)}"
     return f": {append_unit(format_number(fitted.value, 2), fitted.unit)}"

@@ -30,7 +30,7 @@ from bench.pages.page_table import Table
 from sims import effects
 from sims.core.simulator import InputError
 
-CANDIDATES, PLACES, FOLLOWS = "candidates", "where", "follows"
+CANDIDATE_TABLE, GAP_LOCATION_TABLE, RESIDUAL_PROFILE_TABLE = "candidates", "where", "follows"
 """Names of the tables."""
 BEST, ELSEWHERE = "the best of each effect", "the same at other places"
 """Labels of the rows of a robot's candidates, for the filter."""
@@ -100,17 +100,17 @@ def _get_effect_description(report: DiagnosisReportData, name: str) -> str:
 def build_gap_location_table(report: DiagnosisReportData) -> Table:
     """Build a table with one row per part of the data: its RMS residual in units of the noise."""
     rows = []
-    for p in report.places:
+    for location in report.gap_locations:
         row = {
-            "kind": p.kind,
-            "part": sanitise(p.label, 80),
-            "samples": p.samples,
-            "before": p.before,
+            "kind": location.kind,
+            "part": sanitise(location.label, 80),
+            "samples": location.samples,
+            "before": location.before,
         }
         if has_extended_model(report):
-            row["after"] = p.after
+            row["after"] = location.after
         if is_robot(report):
-            name = p.label if p.kind == "channel" else ""
+            name = location.label if location.kind == "channel" else ""
             row["joint"] = find_joint(report, "channel", name)
         rows.append(row)
     return Table.from_rows(rows)
@@ -119,15 +119,18 @@ def build_gap_location_table(report: DiagnosisReportData) -> Table:
 def build_residual_profile_table(report: DiagnosisReportData) -> Table:
     """Build the table of residual profiles, with one row per bin."""
     rows = []
-    for p in report.profiles:
-        key = {"channel": sanitise(p.channel, 80), "variable": sanitise(p.variable, 80)}
-        means_by_model = {"before": p.before} | (
-            {"after": p.after} if has_extended_model(report) else {}
+    for profile in report.profiles:
+        profile_columns = {
+            "channel": sanitise(profile.channel, 80),
+            "variable": sanitise(profile.variable, 80),
+        }
+        means_by_model = {"before": profile.before} | (
+            {"after": profile.after} if has_extended_model(report) else {}
         )
         for model, means in means_by_model.items():
-            for centre, mean, error in zip(p.centres, means, p.error, strict=True):
+            for centre, mean, error in zip(profile.centres, means, profile.error, strict=True):
                 values = {"mean": mean, "low": mean - 2 * error, "high": mean + 2 * error}
-                rows.append({**key, "when": model, "at": centre, **values})
+                rows.append({**profile_columns, "when": model, "at": centre, **values})
     return Table.from_rows(rows)
 
 
@@ -163,7 +166,7 @@ def make_residual_profile_panels(report: DiagnosisReportData) -> list[Panel]:
         panels.append(
             Panel(
                 _format_profile_name(profile),
-                FOLLOWS,
+                RESIDUAL_PROFILE_TABLE,
                 "at",
                 tuple(series),
                 Axis(

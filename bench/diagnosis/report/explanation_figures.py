@@ -57,7 +57,7 @@ size.
 """
 _WIDTHS = {1: 8.6, 2: 10.0, 3: 12.5}
 """Width of the overview in inches, by the number of channels."""
-_HEADING = 0.22
+_HEADING_OFFSET = 0.22
 """Distance from the upper edge to the middle of a heading, in inches."""
 _HEADING_SIZE = 11.0
 """Maximum font size of a heading, in points."""
@@ -78,7 +78,7 @@ def list_figure_names(report: DiagnosisReportData) -> tuple[str, ...]:
     is_available = {
         "robot": report.robot is not None,
         "overview": True,
-        "where": bool(select_gap_locations(report.places)),
+        "where": bool(select_gap_locations(report.gap_locations)),
         "candidates": bool(select_shown_candidates(report)),
     }
     return tuple(name for name, available in is_available.items() if available)
@@ -98,7 +98,7 @@ def draw_figure(report: DiagnosisReportData, name: str) -> Figure:
     if name not in figure_names:
         raise make_unknown_name_error("figure", name, figure_names)
     with _apply_style():
-        figure = _MAKERS[name](report)
+        figure = _FIGURE_FUNCTIONS[name](report)
         # Ticks take their style from the settings that are active when they are first drawn.
         figure.draw_without_rendering()
     return figure
@@ -125,7 +125,7 @@ def render_figures(report: DiagnosisReportData) -> dict[str, RenderedFigure]:
     """Draw all figures and render their files, by name."""
     with _apply_style():
         # The settings must stay active, because text is laid out again when a figure is written.
-        figures = {name: _MAKERS[name](report) for name in list_figure_names(report)}
+        figures = {name: _FIGURE_FUNCTIONS[name](report) for name in list_figure_names(report)}
         rendered = {}
         for name, figure in figures.items():
             png, pdf = style.render_png_and_pdf(figure, DPI)
@@ -165,7 +165,7 @@ def get_extreme_pose(report: DiagnosisReportData, view: RunView) -> dict[str, fl
     joints, columns = [], []
     for c, channel in enumerate(report.channels):
         kind, _, joint = channel.name.partition(".")
-        values = view.side.observed[view.row, :, c]
+        values = view.data_split.observed[view.row, :, c]
         if kind == "q" and np.isfinite(values).any():
             joints.append(joint)
             columns.append(np.nan_to_num(values, nan=float(values[np.isfinite(values)][0])))
@@ -199,19 +199,21 @@ def _draw_overview(report: DiagnosisReportData) -> Figure:
     for column, c in enumerate(view.channels):
         _draw_signal(axes[0][column], axes[1][column], report, view, c)
     # A sample time counts once, however many channels were recorded.
-    samples = int(np.isfinite(view.side.observed[view.row]).any(axis=1).sum())
+    samples = int(np.isfinite(view.data_split.observed[view.row]).any(axis=1).sum())
     kind = f"{report.validation_run} run" if view.held_out else "run"
     reason = "that fits worst" if report.verdict.verdict == "adequate" else "with the largest gap"
     selection = (
         f"; {count} of {len(report.channels)} channels" if count < len(report.channels) else ""
     )
-    name = shorten_label(view.side.names[view.row])
+    name = shorten_label(view.data_split.names[view.row])
     title = f"The {kind} {reason}: {name} ({samples} samples{selection})"
     figure.suptitle(title, fontsize=11, y=0.985)
     # The columns differ only in the channel, so they share one legend.
     handles, labels = axes[0][0].get_legend_handles_labels()
-    band, its_label = axes[1][0].get_legend_handles_labels()
-    figure.legend([*handles, *band], [*labels, *its_label], loc="lower center", ncols=4, fontsize=9)
+    band_handles, band_labels = axes[1][0].get_legend_handles_labels()
+    figure.legend(
+        [*handles, *band_handles], [*labels, *band_labels], loc="lower center", ncols=4, fontsize=9
+    )
     left_margin = 0.75 / figure.get_figwidth()
     figure.subplots_adjust(
         left=left_margin, right=0.985, top=0.92, bottom=0.165, hspace=0.1, wspace=0.2
@@ -223,7 +225,7 @@ def _draw_signal(
     signal_axis: Axes, residual_axis: Axes, report: DiagnosisReportData, view: RunView, c: int
 ) -> None:
     """Draw the measured and simulated signal of a channel, and the residual below it."""
-    channel, split = report.channels[c], view.side
+    channel, split = report.channels[c], view.data_split
     times = split.times[view.row]
     # Arrays are padded after the end of a shorter run.
     signals = [a[view.row, : len(times), c] for a in (split.observed, split.before, split.after)]
@@ -298,11 +300,11 @@ class _FigureLayout(NamedTuple):
         # Hinting makes letters wider on the page than their outlines.
         available_width = self.width - inches - 0.3
         size = _HEADING_SIZE * min(1.0, available_width / measure_text_width([text], _HEADING_SIZE))
-        y = 1 - self.up(_HEADING)
+        y = 1 - self.up(_HEADING_OFFSET)
         self.figure.text(self.across(inches), y, text, fontsize=size, va="center")
 
 
-_NAMES = 1.9
+_MIN_NAMES_WIDTH = 1.9
 """Minimum width for the names of places, in inches."""
 _PROFILES_AFTER = 4.1
 """Distance from the end of the names of places to the profiles, in inches."""
@@ -310,27 +312,27 @@ _PROFILES_AFTER = 4.1
 
 def _draw_residual_locations(report: DiagnosisReportData) -> Figure:
     """Draw the gap locations on the left, and the most informative profiles on the right."""
-    places, profiles = (
-        select_gap_locations(report.places),
+    locations, profiles = (
+        select_gap_locations(report.gap_locations),
         select_informative_profiles(report.profiles),
     )
     rows = min(2, len(profiles))
     columns = -(-len(profiles) // 2)
-    names = place_names(places)
-    left_margin = max(_NAMES, 0.25 + measure_text_width(names, _STYLE["font.size"]))
+    names = place_names(locations)
+    left_margin = max(_MIN_NAMES_WIDTH, 0.25 + measure_text_width(names, _STYLE["font.size"]))
     profiles_from = left_margin + _PROFILES_AFTER
     # A single column of profiles is wider than one of several columns.
     width = left_margin + 3.3 + (3.1 * columns if columns != 1 else 4.4)
-    row = 0.27 + 0.13 * (count_max_lines(names) - 1)
+    row_height = 0.27 + 0.13 * (count_max_lines(names) - 1)
     # Variables of robots have long names, which need several lines below the panels.
     label_height = 0.15 * (
         count_max_lines([format_profile_label(profile) for profile in profiles]) - 1
     )
-    height = max(2.6 + row * len(places), 1.5 + (1.9 + label_height) * rows)
+    height = max(2.6 + row_height * len(locations), 1.5 + (1.9 + label_height) * rows)
     figure, axes = make_panel_grid(1, 1, (width, height), layout=None)
     layout, axis = _FigureLayout(figure, width, height), axes[0, 0]
     axis.set_position((left_margin / width, 1.0 / height, 3.1 / width, 1 - 1.4 / height))
-    draw_gap_location_panel(axis, places, report)
+    draw_gap_location_panel(axis, locations, report)
     layout.heading(0.15, "Where the gap is")
     figure.legend(
         *get_legend_entries(axis), loc="lower left", ncols=2, fontsize=8.5, columnspacing=1.0
@@ -365,7 +367,7 @@ def _draw_residual_locations(report: DiagnosisReportData) -> Figure:
     return figure
 
 
-_MAKERS: Mapping[str, Callable[[DiagnosisReportData], Figure]] = {
+_FIGURE_FUNCTIONS: Mapping[str, Callable[[DiagnosisReportData], Figure]] = {
     "robot": _draw_robot,
     "overview": _draw_overview,
     "where": _draw_residual_locations,

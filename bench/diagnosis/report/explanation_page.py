@@ -23,9 +23,9 @@ from bench.diagnosis.report.consistency_section import (
 )
 from bench.diagnosis.report.evidence_tables import (
     BEST,
-    CANDIDATES,
-    FOLLOWS,
-    PLACES,
+    CANDIDATE_TABLE,
+    GAP_LOCATION_TABLE,
+    RESIDUAL_PROFILE_TABLE,
     build_candidate_table,
     build_gap_location_table,
     build_residual_profile_table,
@@ -46,10 +46,10 @@ from bench.diagnosis.report.summary_text import (
     format_next_run,
     format_shift,
     format_simulation_count,
+    format_tuned_value,
     get_held_out_unit,
     has_absorbed_gap,
     has_gap_closed,
-    tuned,
 )
 from bench.diagnosis.report.wording import (
     append_unit,
@@ -79,12 +79,12 @@ _BADGES = {
     "unidentifiable": "unidentifiable: the data do not identify the parameters",
 }
 """Short text of every verdict."""
-_STOPPED_EARLY = {
+_EARLY_STOP_BADGES = {
     "partial": "partial: a cause is found; the search was stopped early",
     "unknown": "unknown: the search was stopped early",
 }
 """Short text of a verdict if the search was stopped early."""
-_RESIDUALS = {
+_RESIDUAL_DESCRIPTIONS = {
     "partial": "Structure that no known cause explains",
     "unknown": "Structure that no known cause explains",
     "unidentifiable": "It is not known what the simulation lacks",
@@ -110,9 +110,9 @@ def render_report(
     """
     page = HtmlPage(_STYLE.read_text(encoding="utf-8"))
     tables = {
-        CANDIDATES: build_candidate_table(report),
-        PLACES: build_gap_location_table(report),
-        FOLLOWS: build_residual_profile_table(report),
+        CANDIDATE_TABLE: build_candidate_table(report),
+        GAP_LOCATION_TABLE: build_gap_location_table(report),
+        RESIDUAL_PROFILE_TABLE: build_residual_profile_table(report),
     }
     for name, table in tables.items():
         if len(table):
@@ -144,7 +144,7 @@ def render_report(
         values_of_causes=[_format_cause(cause) for cause in verdict.causes],
         consistency=format_consistency(report),
         alternative_sets=[_format_set(report, c) for c in verdict.causes if c.alternatives],
-        residual_description=_RESIDUALS.get(open_verdict, "Nothing significant"),
+        residual_description=_RESIDUAL_DESCRIPTIONS.get(open_verdict, "Nothing significant"),
         residual_runs=residual_runs,
         residual_rms=format_number(compute_normalised_rms(report, residual_split, "after"), 2),
         units=_format_units(report),
@@ -189,7 +189,7 @@ def _format_badge(report: DiagnosisReportData) -> str:
     if verdict.recording_faults:
         return "unknown: the recording has a wrong unit or sign"
     if verdict.cut is not None:
-        return _STOPPED_EARLY[verdict.verdict]
+        return _EARLY_STOP_BADGES[verdict.verdict]
     if verdict.has_open_numbers:
         return "partial: a cause is found, but its value is at a bound or has no interval"
     if verdict.bordering:
@@ -285,7 +285,7 @@ def _describe_figure(report: DiagnosisReportData, name: str) -> str:
         return f"{sentence} {format_headline(report)}"
     # A few of the largest values suffice, because the tables contain all of them.
     if name == "where":
-        finite = [place for place in report.places if isfinite(place.before)]
+        finite = [place for place in report.gap_locations if isfinite(place.before)]
         sizes = [
             f"{place.kind} {sanitise(place.label, 30)} {format_number(place.before, 2)}"
             for place in sorted(finite, key=lambda place: -place.before)[:_MAX_LISTED_NAMES]
@@ -386,4 +386,10 @@ def _make_parameter_row(p: ParameterChange) -> ParameterRow:
         return ParameterRow(p.name, text, text, "–", None)
     reason = "had absorbed part of the gap" if has_absorbed_gap(p) else "not significant"
     drawing = draw_intervals([("before", *p.before), ("after", *p.after)])
-    return ParameterRow(p.name, tuned(p, 0), tuned(p, 1), f"{format_shift(p)}, {reason}", drawing)
+    return ParameterRow(
+        p.name,
+        format_tuned_value(p, 0),
+        format_tuned_value(p, 1),
+        f"{format_shift(p)}, {reason}",
+        drawing,
+    )

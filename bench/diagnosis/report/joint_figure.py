@@ -49,20 +49,20 @@ RESIDUAL_AXIS_QUANTILE = 0.999
 """Quantile of the residuals that fits into a panel, so that a single outlier does not flatten the
 others.
 """
-_HEIGHTS = {1: 2.6, 2: 1.9, 3: 1.5, 4: 1.25, 5: 1.1}
+_ROW_HEIGHTS = {1: 2.6, 2: 1.9, 3: 1.5, 4: 1.25, 5: 1.1}
 """Height of a row in inches, by the number of rows."""
 _MIN_ROW_HEIGHT = 1.0
 NAMED_JOINT_MARKER = "▸"
 """Marker before the name of a diagnosed joint, visible in print without colour too."""
 LONGEST_NAME = 64
 """Maximum number of characters of the name of a joint or sensor."""
-_NAME_LINE = 18
+_NAME_LINE_LENGTH = 18
 """Maximum number of characters per line of the name of a joint or sensor."""
 _NAME_SIZE = 9.5
 """Font size of the names of joints and sensors, in points."""
-_NAME_MARGIN = 0.85
+_NAME_GAP_INCHES = 0.85
 """Space between names and panels in inches, for ticks and units."""
-_HEAD, _FOOT = 0.75, 0.95
+_TOP_MARGIN_INCHES, _BOTTOM_MARGIN_INCHES = 0.75, 0.95
 """Space above and below the rows, in inches."""
 
 
@@ -71,12 +71,12 @@ class JointRow(NamedTuple):
 
     Attributes:
         name: Name of the joint or sensor.
-        shown: Index of the channel whose motion is shown.
+        motion_channel: Index of the channel whose motion is shown.
         channels: Indices of its channels, by quantity.
     """
 
     name: str
-    shown: int
+    motion_channel: int
     channels: Mapping[str, int]
 
 
@@ -123,12 +123,12 @@ def draw_joint_figure(report: DiagnosisReportData, view: RunView) -> Figure:
     """
     rows = _select_worst_rows(report, view)
     quantities = _list_quantities(report) or ["q"]
-    height = _HEIGHTS.get(len(rows), _MIN_ROW_HEIGHT)
+    height = _ROW_HEIGHTS.get(len(rows), _MIN_ROW_HEIGHT)
     named_joints = {mark.name for mark in list_place_marks(report)} | _list_marked_joints(report)
     names = [_format_row_name(row, row.name in named_joints) for row in rows]
-    names_width = max(1.95, 0.12 + measure_text_width(names, _NAME_SIZE, "bold") + _NAME_MARGIN)
+    names_width = max(1.95, 0.12 + measure_text_width(names, _NAME_SIZE, "bold") + _NAME_GAP_INCHES)
     width = names_width + 5.15 + 2.6 * len(quantities)
-    size = (width, _HEAD + _FOOT + height * len(rows))
+    size = (width, _TOP_MARGIN_INCHES + _BOTTOM_MARGIN_INCHES + height * len(rows))
     ratios = (4.2, *[3.0] * len(quantities))
     figure, axes = make_panel_grid(
         len(rows), len(ratios), size, layout=None, sharex=True, width_ratios=ratios
@@ -175,9 +175,9 @@ def _compute_scaled_residual(
     report: DiagnosisReportData, view: RunView, c: int, model: str
 ) -> Array:
     """Return the residual (T,) of a channel in units of its noise."""
-    count = len(view.side.times[view.row])
-    simulated = getattr(view.side, model)
-    residual: Array = (view.side.observed - simulated)[view.row, :count, c] / report.channels[
+    count = len(view.data_split.times[view.row])
+    simulated = getattr(view.data_split, model)
+    residual: Array = (view.data_split.observed - simulated)[view.row, :count, c] / report.channels[
         c
     ].sigma
     return residual
@@ -190,10 +190,11 @@ def _draw_motion(
 
     The name is highlighted if the diagnosis names the joint (`is_named`).
     """
-    channel, split = report.channels[row.shown], view.side
+    channel, split = report.channels[row.motion_channel], view.data_split
     times = split.times[view.row]
     signals = [
-        a[view.row, : len(times), row.shown] for a in (split.observed, split.before, split.after)
+        a[view.row, : len(times), row.motion_channel]
+        for a in (split.observed, split.before, split.after)
     ]
     rows = decimate(signals[0])
     measured, before, after = (signal[rows] for signal in signals)
@@ -238,13 +239,13 @@ def _draw_motion(
 
 def _format_row_name(row: JointRow, is_named: bool) -> str:
     """Format the name of a joint or sensor in short lines."""
-    name = break_name(sanitise(row.name, LONGEST_NAME), _NAME_LINE)
+    name = break_name(sanitise(row.name, LONGEST_NAME), _NAME_LINE_LENGTH)
     return f"{NAMED_JOINT_MARKER} {name}" if is_named else name
 
 
 def _draw_residual(panel: Axes, report: DiagnosisReportData, view: RunView, c: int) -> None:
     """Draw the residuals of channel number c in units of its noise, with the RMS above."""
-    times = view.side.times[view.row]
+    times = view.data_split.times[view.row]
     panel.axhspan(
         -2, 2, color=NOISE_BAND_GREY, linewidth=0, label="±2σ: 95 % of the noise", zorder=0
     )
@@ -347,21 +348,21 @@ def _add_title_and_legend(
         f"; the worst {len(rows)} of {total} joints and sensors" if len(rows) < total else ""
     )
     # A sample time counts once, however many channels were recorded.
-    samples = int(np.isfinite(view.side.observed[view.row]).any(axis=1).sum())
+    samples = int(np.isfinite(view.data_split.observed[view.row]).any(axis=1).sum())
     kind = f"{report.validation_run} run" if view.held_out else "run"
     reason = "that fits worst" if report.verdict.verdict == "adequate" else "with the largest gap"
-    title = f"The {kind} {reason}, joint by joint: {shorten_label(view.side.names[view.row])}"
+    title = f"The {kind} {reason}, joint by joint: {shorten_label(view.data_split.names[view.row])}"
     title += f" ({samples} samples{selection})"
     figure.suptitle(title, fontsize=11, x=0.012, ha="left", y=1 - 0.2 / height, va="center")
     handles, labels = axes[0, 0].get_legend_handles_labels()
     with warnings.catch_warnings():
         # A residual column may have no panel in its first row.
         warnings.simplefilter("ignore", UserWarning)
-        bands = [panel.get_legend_handles_labels() for panel in axes[:, 1]]
-    band, its_label = next(((h, name) for h, name in bands if h), ([], []))
+        residual_legends = [panel.get_legend_handles_labels() for panel in axes[:, 1]]
+    band_handles, band_labels = next(((h, name) for h, name in residual_legends if h), ([], []))
     figure.legend(
-        [*handles, *band],
-        [*labels, *its_label],
+        [*handles, *band_handles],
+        [*labels, *band_labels],
         loc="lower center",
         bbox_to_anchor=(0.5, 0.22 / height),
         ncols=4,
@@ -373,8 +374,8 @@ def _add_title_and_legend(
     figure.subplots_adjust(
         left=names_width / width,
         right=1 - 0.12 / width,
-        top=1 - _HEAD / height,
-        bottom=_FOOT / height,
+        top=1 - _TOP_MARGIN_INCHES / height,
+        bottom=_BOTTOM_MARGIN_INCHES / height,
         hspace=0.3,
         wspace=0.19,
     )

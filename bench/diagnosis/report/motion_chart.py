@@ -38,7 +38,7 @@ _MIN_HALF_HEIGHT = 3.0
 """Minimum half-height of a residual panel in noise standard deviations, so that noise does not fill
 the panel.
 """
-_TALL, _LOW, _ROW = 250, 190, 190
+_MOTION_HEIGHT, _RESIDUAL_HEIGHT, _SIDE_BY_SIDE_HEIGHT = 250, 190, 190
 """Heights in pixels: of a motion panel and of a residual panel below it, and of both side by side.
 """
 
@@ -47,13 +47,13 @@ class ShownRun(NamedTuple):
     """Run that the page shows.
 
     Attributes:
-        side: Data split of the run.
+        data_split: Data split of the run.
         row: Index of the run in it.
         says: Name, use and gap of the run, for the selection control.
         gap: RMS residual of the base model, in units of the noise.
     """
 
-    side: DataSplit
+    data_split: DataSplit
     row: int
     says: str
     gap: float
@@ -66,7 +66,7 @@ class MotionTable(NamedTuple):
         frame: Table with one row per sample, as text.
         runs: Runs of the chart, the worst first, but the run of the printed figure before all
             others.
-        stretches: Number of parts of the longest run of which the extremes are shown; 0 if all
+        part_count: Number of parts of the longest run of which the extremes are shown; 0 if all
             samples are shown.
         longest: Number of samples of the longest run.
         absent: Number of runs that are not shown.
@@ -74,7 +74,7 @@ class MotionTable(NamedTuple):
 
     frame: Table
     runs: tuple[ShownRun, ...]
-    stretches: int
+    part_count: int
     longest: int
     absent: int
 
@@ -93,11 +93,12 @@ def build_motion_table(report: DiagnosisReportData, max_rows: int = MAX_ROWS) ->
     parts = [
         _format_rows(report, run, c, samples_per_run) for run in shown_runs for c in range(count)
     ]
-    names = ["run", "channel", "t", "measured", "before"] + ["after"] * has_extended_model(report)
-    names += ["residual_before"] + ["residual_after"] * has_extended_model(report)
+    names = ["run", "channel", "t", "measured", "before", "residual_before"]
+    if has_extended_model(report):
+        names = [*names[:5], "after", "residual_before", "residual_after"]
     columns = [[cell for part in parts for cell in part[i]] for i in range(len(names))]
     frame = Table(dict(zip(names, columns, strict=True)))
-    longest_run = max(len(run.side.times[run.row]) for run in shown_runs)
+    longest_run = max(len(run.data_split.times[run.row]) for run in shown_runs)
     part_count = _count_parts(report, samples_per_run) if longest_run > samples_per_run else 0
     return MotionTable(
         frame, tuple(shown_runs), part_count, longest_run, len(runs) - len(shown_runs)
@@ -107,7 +108,7 @@ def build_motion_table(report: DiagnosisReportData, max_rows: int = MAX_ROWS) ->
 def _sort_runs(report: DiagnosisReportData) -> list[ShownRun]:
     """List all runs by descending RMS residual, but the run of the printed figure first."""
     sigma = np.array([c.sigma for c in report.channels])
-    first = select_worst_run(report)
+    worst_run = select_worst_run(report)
     runs = []
     for split in list_data_splits(report):
         squares = np.square((split.observed - split.before) / sigma)
@@ -119,8 +120,8 @@ def _sort_runs(report: DiagnosisReportData) -> list[ShownRun]:
             gap = float(np.sqrt(finite.mean())) if finite.size else 0.0
             title = f"{sanitise(name, 40)}{split_note}: RMS residual {format_number(gap, 2)} σ"
             runs.append(ShownRun(split, row, title, gap))
-    first_run = (id(first.side), first.row)
-    return sorted(runs, key=lambda run: ((id(run.side), run.row) != first_run, -run.gap))
+    first_run = (id(worst_run.data_split), worst_run.row)
+    return sorted(runs, key=lambda run: ((id(run.data_split), run.row) != first_run, -run.gap))
 
 
 def _count_parts(report: DiagnosisReportData, max_rows: int) -> int:
@@ -128,20 +129,20 @@ def _count_parts(report: DiagnosisReportData, max_rows: int) -> int:
     return max(1, max_rows // (6 if has_extended_model(report) else 4))
 
 
-def select_extreme_samples(signals: Sequence[Array], stretches: int) -> NDArray[np.intp]:
+def select_extreme_samples(signals: Sequence[Array], part_count: int) -> NDArray[np.intp]:
     """Select the samples at which any signal has its minimum or maximum within a part of the run.
 
     The first and the last sample are included.
 
     Args:
         signals: Signals (T,), NaN where missing.
-        stretches: Number of parts, of nearly equal length.
+        part_count: Number of parts, of nearly equal length.
 
     Returns:
         Sorted indices of the samples.
     """
     size = len(signals[0])
-    edges = np.linspace(0, size, stretches + 1).astype(int)[:-1]
+    edges = np.linspace(0, size, part_count + 1).astype(int)[:-1]
     part_length = np.diff([*edges, size]).max()
     # Each row holds one part; shorter parts are padded with values that are never extremes.
     indices = np.minimum(edges[:, None] + np.arange(part_length), size - 1)
@@ -164,7 +165,7 @@ def _format_rows(
 
     If there are more than `max_rows` samples, only the extremes of short parts are kept.
     """
-    split, channel = run.side, report.channels[c]
+    split, channel = run.data_split, report.channels[c]
     times = split.times[run.row]
     models = ("before", "after") if has_extended_model(report) else ("before",)
     observed = split.observed[run.row, : len(times), c]
@@ -257,10 +258,14 @@ def _list_hidden(
         return ()
     gaps: dict[str, float] = {}
     counts: dict[str, int] = {}
-    by_name = {place.label: place.before for place in report.places if place.kind == "channel"}
+    gap_by_channel = {
+        location.label: location.before
+        for location in report.gap_locations
+        if location.kind == "channel"
+    }
     for facets, c in places:
         name = facets[toggle]
-        gaps[name] = max(gaps.get(name, 0.0), by_name.get(report.channels[c].name, 0.0))
+        gaps[name] = max(gaps.get(name, 0.0), gap_by_channel.get(report.channels[c].name, 0.0))
         counts[name] = counts.get(name, 0) + 1
     remaining = MAX_INITIAL_CHANNELS
     visible_names: set[str] = set()
@@ -281,7 +286,7 @@ def _make_panels(
     """
     channel = report.channels[c]
     selection = {
-        "run": sanitise(run.side.names[run.row], 80),
+        "run": sanitise(run.data_split.names[run.row], 80),
         "channel": sanitise(channel.name, 80),
     }
     extended = has_extended_model(report)
@@ -307,7 +312,11 @@ def _make_panels(
     )
     noise_band = (AxisSpan(-2.0, 2.0, "±2σ: 95 % of the noise", along="y"),)
     tooltip_lines = _make_tooltip_lines(format_unit(channel.unit), channel.sigma, extended)
-    heights = (_ROW, _ROW) if is_wide else (_TALL, _LOW)
+    heights = (
+        (_SIDE_BY_SIDE_HEIGHT, _SIDE_BY_SIDE_HEIGHT)
+        if is_wide
+        else (_MOTION_HEIGHT, _RESIDUAL_HEIGHT)
+    )
     motion_panel = Panel(
         name,
         MOTION_TABLE_NAME,
@@ -349,7 +358,8 @@ def _make_tooltip_lines(unit: str, sigma: float, extended: bool) -> tuple[Toolti
         TooltipLine("measured", "measured", unit, MEASURED_STYLE),
         TooltipLine("before", "before", unit, BASE_MODEL_STYLE),
     ]
-    tooltip_lines += [TooltipLine("after", "after", unit, EXTENDED_MODEL_STYLE)] * extended
+    if extended:
+        tooltip_lines.append(TooltipLine("after", "after", unit, EXTENDED_MODEL_STYLE))
     tooltip_lines.append(residual("residual before", "residual_before", BASE_MODEL_STYLE))
     if extended:
         tooltip_lines.append(residual("residual after", "residual_after", EXTENDED_MODEL_STYLE))

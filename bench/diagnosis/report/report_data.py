@@ -150,7 +150,7 @@ class DiagnosisReportData:
         channels: Recorded channels.
         fitting: Runs for fitting.
         held_out: Runs for validation; None if there are none.
-        places: Gap locations, including held-out runs.
+        gap_locations: Gap locations, including held-out runs.
         profiles: Residual against time, position, speed and inputs.
         parameters: Parameters before and after.
         lack_of_fit: Sentences on what the extended model leaves unexplained, and notes; may be
@@ -177,7 +177,7 @@ class DiagnosisReportData:
     channels: tuple[ChannelInfo, ...]
     fitting: DataSplit
     held_out: DataSplit | None
-    places: tuple[GapLocation, ...]
+    gap_locations: tuple[GapLocation, ...]
     profiles: tuple[ResidualProfile, ...]
     parameters: tuple[ParameterChange, ...]
     lack_of_fit: tuple[str, ...]

@@ -25,13 +25,13 @@ class RunView(NamedTuple):
     """Run that a figure shows.
 
     Attributes:
-        side: Data split of the run.
+        data_split: Data split of the run.
         row: Index of the run in it.
         held_out: Whether the run is held out.
         channels: Indices of the channels to show.
     """
 
-    side: DataSplit
+    data_split: DataSplit
     row: int
     held_out: bool
     channels: list[int]

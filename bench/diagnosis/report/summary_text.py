@@ -101,12 +101,12 @@ def format_details(report: DiagnosisReportData) -> Iterator[str]:
     # The most important reasons come first; the page contains all of them.
     if report.why:
         yield "Why: " + " ".join(format_sentence(text) for text in report.why[:2])
-    largest_places = [format_largest_gap(report, kind) for kind in ("run", "channel", "phase")]
-    places = [text for text in largest_places if text]
+    largest_gaps = [format_largest_gap(report, kind) for kind in ("run", "channel", "phase")]
+    gap_texts = [text for text in largest_gaps if text]
     # Without a gap, the largest residual of a part is random.
-    if places and verdict != "adequate":
+    if gap_texts and verdict != "adequate":
         unit = "RMS in units of the noise (1 is the noise floor)"
-        yield f"Where the gap is largest, {unit}: {'; '.join(places)}."
+        yield f"Where the gap is largest, {unit}: {'; '.join(gap_texts)}."
     if report.parameters:
         sentences = [format_parameter_shift(report, p) for p in report.parameters]
         yield "Parameters: " + " ".join(sentences)
@@ -208,8 +208,8 @@ def iterate_undetermined_numbers(report: DiagnosisReportData) -> Iterator[str]:
             f"{END[fitted.at_bound or 'high']} bound of its range"
             for name, fitted in at_bounds
         ]
-        is_time_at_bound = any(fitted.unit == "s" for _, fitted in at_bounds)
-        remedy = "; for a time, record longer runs" * is_time_at_bound
+        has_time_at_bound = any(fitted.unit == "s" for _, fitted in at_bounds)
+        remedy = "; for a time, record longer runs" if has_time_at_bound else ""
         yield (
             f"{'; '.join(parts)}. A value at a bound is not a result and has no interval: the data "
             "suggest a value beyond it, or another cause acts in a similar way. Check units and "
@@ -540,13 +540,17 @@ def format_largest_gap(report: DiagnosisReportData, kind: str) -> str:
         report: Report data.
         kind: ``run``, ``channel`` or ``phase``.
     """
-    of_kind = [place for place in report.places if place.kind == kind and isfinite(place.before)]
+    locations = [
+        location
+        for location in report.gap_locations
+        if location.kind == kind and isfinite(location.before)
+    ]
     # With a single one, its gap is the largest anyway.
-    if len(of_kind) < 2:
+    if len(locations) < 2:
         return ""
-    place: GapLocation = max(of_kind, key=lambda p: p.before)
-    after = f" before, {format_number(place.after, 2)} after" if report.verdict.causes else ""
-    return f"{kind} {sanitise(place.label, 60)} ({format_number(place.before, 2)}{after})"
+    worst: GapLocation = max(locations, key=lambda location: location.before)
+    after = f" before, {format_number(worst.after, 2)} after" if report.verdict.causes else ""
+    return f"{kind} {sanitise(worst.label, 60)} ({format_number(worst.before, 2)}{after})"
 
 
 def format_parameter_shift(report: DiagnosisReportData, p: ParameterChange) -> str:
@@ -565,13 +569,13 @@ def format_parameter_shift(report: DiagnosisReportData, p: ParameterChange) -> s
         return f"{name} does not influence these data and stays at {nominal}."
     if not report.verdict.causes:
         # Without a cause, the last fit is also of the base model, and is the best one.
-        return f"{name} = {tuned(p, 1)}."
-    before, after = tuned(p, 0), tuned(p, 1)
+        return f"{name} = {format_tuned_value(p, 1)}."
+    before, after = format_tuned_value(p, 0), format_tuned_value(p, 1)
     end = ": it had absorbed part of the gap." if has_absorbed_gap(p) else "."
     return f"{name} {before} before, {after} after ({format_shift(p)}){end}"
 
 
-def tuned(p: ParameterChange, model_index: int) -> str:
+def format_tuned_value(p: ParameterChange, model_index: int) -> str:
     """Format a parameter's estimate with its interval, or the bound that it is at.
 
     Args:

@@ -71,7 +71,7 @@ def compute_central_jacobian(
         The fit with the new Jacobian.
     """
     q = fit.free_indices.size
-    runs, size = fit.initial_states.shape
+    runs, state_count = fit.initial_states.shape
     bounds = _widen_bounds(evaluator, fit)
     ranges = bounds[:, 1] - bounds[:, 0]
     steps = compute_difference_steps(fit.jacobian, noise, ranges)
@@ -81,10 +81,10 @@ def compute_central_jacobian(
     theta, states = _displace_both_sides(fit, steps, bounds)
 
     # One call simulates both sides and all runs, because the engine steps a batch at once.
-    vectors = theta.reshape(-1, fit.theta.size)
-    rows = np.repeat(vectors, runs, axis=0)
-    lanes = np.tile(np.arange(runs), len(vectors))
-    simulated = evaluator.simulate(rows, lanes, states.reshape(-1, size))
+    displaced_theta = theta.reshape(-1, fit.theta.size)
+    repeated_theta = np.repeat(displaced_theta, runs, axis=0)
+    run_indices = np.tile(np.arange(runs), len(displaced_theta))
+    simulated = evaluator.simulate(repeated_theta, run_indices, states.reshape(-1, state_count))
     lower_side, upper_side = simulated.reshape(2, steps.size, *fit.simulated.shape)
 
     # Row j has changed parameter j, so the widths are on the diagonal.
@@ -126,10 +126,10 @@ def _displace_both_sides(fit: TrajectoryFit, steps: Array, bounds: Array) -> tup
     states = np.tile(fit.initial_states, (2, len(steps), 1, 1))
     for side, sign in enumerate((-1.0, 1.0)):
         shifts = sign * steps
-        for j, place in enumerate(fit.free_indices):
-            displaced_value = fit.theta[place] + shifts[j]
+        for j, index in enumerate(fit.free_indices):
+            displaced_value = fit.theta[index] + shifts[j]
             # At a bound the step is one-sided, so the actual difference is used as the divisor.
-            theta[side, j, place] = np.clip(displaced_value, *bounds[j])
+            theta[side, j, index] = np.clip(displaced_value, *bounds[j])
         for j, shift in enumerate(shifts[q:]):
             states[side, q + j, :, j] += shift
     return theta, states
@@ -151,7 +151,11 @@ def _widen_bounds(evaluator: RunEvaluator, fit: TrajectoryFit) -> Array:
 
 
 def compute_covariance(models: ModelSet, model: FittedModel) -> Array:
-    """Compute the covariance (q, q) of the fitted parameters with AR(1) noise, by eq. (2)."""
+    """Compute the covariance (q, q) of the fitted parameters with AR(1) noise.
+
+    It is the inverse of the curvature of the whitened sum of squares, from which the initial states
+    of each run are eliminated: eq. (2) of the module docstring.
+    """
     fisher_blocks = compute_fisher_blocks(models, model)
     parameter_curvature = fisher_blocks.parameters.sum(axis=0)
     # The Schur complement that solves a step of the fit also eliminates the initial states here.
@@ -172,8 +176,8 @@ def invert_scaled(parameter_curvature: Array, schur_complement: Array) -> Array:
         schur_complement: (q, q) curvature after elimination of the initial states.
     """
     # Parameters of any unit are scaled alike, so that the cut-off below means the same for each.
-    powers = np.diagonal(parameter_curvature)
-    scale = np.sqrt(np.maximum(powers, MIN_CURVATURE))
+    diagonal = np.diagonal(parameter_curvature)
+    scale = np.sqrt(np.maximum(diagonal, MIN_CURVATURE))
     units = np.outer(scale, scale)
     scaled = schur_complement / units
     inverse = np.linalg.pinv(scaled, rcond=1e-13, hermitian=True)
@@ -181,8 +185,8 @@ def invert_scaled(parameter_curvature: Array, schur_complement: Array) -> Array:
     is_unidentified = values < 1e-12
     # The pseudo-inverse of an unidentified direction is zero, which would look certain.
     if is_unidentified.any():
-        free = vectors[:, is_unidentified]
-        inverse = inverse + (free * 1e12) @ free.T
+        unidentified = vectors[:, is_unidentified]
+        inverse = inverse + (unidentified * 1e12) @ unidentified.T
     result: Array = inverse / units  # (2)
     return result
 
@@ -265,22 +269,24 @@ def compute_intervals(
     """
     variances = np.diagonal(compute_covariance(models, model))
     # Rounding may make a variance negative.
-    spread = np.sqrt(np.maximum(variances, 0.0))
-    places = model.fit.free_indices.tolist()
-    result = {}
-    for place, sd in zip(places, spread.tolist(), strict=True):
-        value = float(model.fit.theta[place])
-        low, high = models.evaluator.parameters[place].bounds
+    standard_errors = np.sqrt(np.maximum(variances, 0.0))
+    indices = model.fit.free_indices.tolist()
+    intervals = {}
+    for index, standard_error in zip(indices, standard_errors.tolist(), strict=True):
+        value = float(model.fit.theta[index])
+        low, high = models.evaluator.parameters[index].bounds
         # A value may be far outside its plausible range, and is then the scale itself.
         size = max(high - low, abs(value))
-        is_bounded = np.isfinite(sd) and 2.0 * Z95 * sd < MAX_INTERVAL_WIDTH * size
-        half_width = Z95 * sd if is_bounded else np.nan
-        result[place] = (
+        is_bounded = (
+            np.isfinite(standard_error) and 2.0 * Z95 * standard_error < MAX_INTERVAL_WIDTH * size
+        )
+        half_width = Z95 * standard_error if is_bounded else np.nan
+        intervals[index] = (
             value,
             value - half_width,
             value + half_width,
         )
-    return result
+    return intervals
 
 
 @dataclass(frozen=True)
@@ -311,7 +317,7 @@ def compute_held_out_gain(
     channels: Sequence[int],
     floor: float,
     rng: np.random.Generator,
-    by_stretches: bool = False,
+    resamples_segments: bool = False,
 ) -> HeldOutGain:
     """Compute the share of the gap closed, eq. (1), with a bootstrap interval over runs.
 
@@ -325,9 +331,10 @@ def compute_held_out_gain(
         channels: Indices of the channels that count; they share a unit.
         floor: RMS of the noise over these channels.
         rng: Random generator of the resampling.
-        by_stretches: Resample segments of the runs; two or three runs are too few to resample.
+        resamples_segments: Resample segments of the runs; two or three runs are too few to
+            resample.
     """
-    sums = _sum_squared_errors(evaluator, before, after, channels, by_stretches)
+    sums = _sum_squared_errors(evaluator, before, after, channels, resamples_segments)
     total_sums = sums.sum(axis=0)
     before_sum, after_sum, count = total_sums
     base = float(np.sqrt(before_sum / count))
@@ -350,36 +357,39 @@ def _sum_squared_errors(
     before: Array,
     after: Array,
     channels: Sequence[int],
-    by_stretches: bool,
+    resamples_segments: bool,
 ) -> Array:
     """Sum up the squared errors of two models over each run or segment, for the bootstrap.
 
-    Each row (n, 3) has the sum of squares before, the one after, and the number of samples.
+    Each row (n, 3) has the sum of squares of the base model, that of the extended model, and the
+    number of samples.
     """
-    rows = []
-    for run, part in _list_resampled_parts(evaluator, by_stretches):
+    part_sums = []
+    for run, part in _list_resampled_parts(evaluator, resamples_segments):
         observed = evaluator.observed[run, part][:, channels]
         observed_mask = np.isfinite(observed)
         # A part without samples would be a row of zeros with an undefined error.
         if not observed_mask.any():
             continue
-        row = []
+        sums = []
         for simulated in (before, after):
             simulated_part = simulated[run, part][:, channels]
             error = (observed - simulated_part)[observed_mask]
-            row.append(float(error @ error))
-        row.append(float(observed_mask.sum()))
-        rows.append(row)
-    return np.array(rows)
+            sums.append(float(error @ error))
+        sums.append(float(observed_mask.sum()))
+        part_sums.append(sums)
+    return np.array(part_sums)
 
 
-def _list_resampled_parts(evaluator: RunEvaluator, by_stretches: bool) -> list[tuple[int, slice]]:
+def _list_resampled_parts(
+    evaluator: RunEvaluator, resamples_segments: bool
+) -> list[tuple[int, slice]]:
     """List the parts that the bootstrap resamples: whole runs, or segments of too few runs.
 
     Each is the index of the run and the slice of its samples.
     """
     count = len(evaluator.prepared_runs)
-    if count > 1 and not by_stretches:
+    if count > 1 and not resamples_segments:
         return [(run, slice(None)) for run in range(count)]
     parts = []
     for run, length in enumerate(evaluator.lengths.tolist()):

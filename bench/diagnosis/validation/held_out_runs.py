@@ -171,16 +171,16 @@ class HeldOutRuns:
         fits: list[TrajectoryFit] = []
         if not starts:
             return fits
-        search_control = self.evaluator.search_control
+        control = self.evaluator.search_control
         models = "one model" if len(starts) == 1 else f"{len(starts)} models"
-        search_control.begin_stage(f"simulating held-out runs with {models}", len(stages))
+        control.begin_stage(f"simulating held-out runs with {models}", len(stages))
         for share, iterations in stages:
             fitter = TrajectoryFitter(
                 self.evaluator, self.noise, share=share, fits_parameters=False
             )
             fits = fitter.fit_models(starts, iterations)
             starts = [fit.make_start() for fit in fits]
-            search_control.advance()
+            control.advance()
         return fits
 
     def _leaves_linear_range(self, fit: TrajectoryFit) -> bool:
@@ -193,9 +193,9 @@ class HeldOutRuns:
         if not evaluator.has_linearisation or not np.isfinite(fit.cost):
             return False
         runs = len(evaluator.initial_state_guesses)
-        lanes = np.tile(fit.theta, (runs, 1))
+        repeated_theta = np.tile(fit.theta, (runs, 1))
         simulated_from_guess = evaluator.simulate(
-            lanes, np.arange(runs), evaluator.initial_state_guesses
+            repeated_theta, np.arange(runs), evaluator.initial_state_guesses
         )
         state_changes = fit.initial_states - evaluator.initial_state_guesses
         # A diverging simulation from the guess is infinite or NaN.
@@ -253,11 +253,11 @@ class HeldOutRuns:
             no_prediction = np.full_like(self.evaluator.observed, np.nan)
             return HeldOutFit(no_prediction, -np.inf, fit.initial_states)
         # Only initial states were fitted here, so only they count as free.
-        free = count_identified_states(self.evaluator, fit, self.noise)
+        free_state_count = count_identified_states(self.evaluator, fit, self.noise)
         penalised_likelihood = compute_penalised_likelihood(
-            self.evaluator.observed, fit.simulated, free
+            self.evaluator.observed, fit.simulated, free_state_count
         )
-        return HeldOutFit(fit.simulated, penalised_likelihood, fit.initial_states, free)
+        return HeldOutFit(fit.simulated, penalised_likelihood, fit.initial_states, free_state_count)
 
 
 def compute_penalised_likelihood(observed: Array, simulated: Array, free: float) -> float:

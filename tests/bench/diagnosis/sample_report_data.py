@@ -224,7 +224,7 @@ def evil():
         channels=tuple(replace(c, name=EVIL, unit=EVIL) for c in base.channels),
         fitting=replace(base.fitting, names=("$x_{$", EVIL, "\x00", "日本")),
         held_out=replace(base.held_out, names=("$\\frac{1}$" + EVIL, "$")),
-        places=tuple(replace(p, label=EVIL + "$\\alpha{$") for p in base.places),
+        gap_locations=tuple(replace(p, label=EVIL + "$\\alpha{$") for p in base.gap_locations),
         profiles=tuple(replace(p, channel=EVIL, variable=EVIL, unit=EVIL) for p in base.profiles),
         parameters=tuple(replace(p, name=EVIL, unit=EVIL) for p in base.parameters),
         lack_of_fit=(EVIL,),

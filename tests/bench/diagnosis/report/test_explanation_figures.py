@@ -93,10 +93,10 @@ def test_the_run_shown_has_the_largest_gap_of_the_held_out_ones():
     told = make_report()
     shot = select_worst_run(told)
     assert shot.held_out
-    assert shot.side.names[shot.row] == "held 2"
+    assert shot.data_split.names[shot.row] == "held 2"
     rest = select_worst_run(replace(told, held_out=None))
     assert not rest.held_out
-    assert rest.side.names[rest.row] == "4"
+    assert rest.data_split.names[rest.row] == "4"
 
 
 def test_a_run_without_samples_is_never_the_worst():

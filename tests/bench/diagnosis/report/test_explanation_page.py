@@ -262,7 +262,7 @@ def test_many_runs_are_cut_to_the_worst():
     many = replace(
         told,
         places=tuple(
-            replace(told.places[0], label=f"r{i}", before=float(i)) for i in range(1, 500)
+            replace(told.gap_locations[0], label=f"r{i}", before=float(i)) for i in range(1, 500)
         ),
     )
     html = render_report(many, {})

@@ -59,7 +59,7 @@ def test_long_recordings_are_thinned_said_so_and_stay_below_3_mb():
     assert len(found.frame) <= 1.1 * max(MAX_ROWS, MIN_ROWS_PER_CHANNEL * channels * (runs + 1))
     page = render_report(told, {})
     assert "Runs of up to 25000 samples are not drawn in full" in page
-    assert f"each of {found.stretches} parts of a run" in page
+    assert f"each of {found.part_count} parts of a run" in page
     # Every row is an original sample, not an average.
     frame = pd.DataFrame(found.frame.rows())
     rows = frame[(frame["run"] == "2") & (frame["channel"] == "channel_3")]
@@ -83,7 +83,7 @@ def test_of_very_many_runs_the_worst_are_shown_and_the_rest_is_counted():
         after=np.tile(told.fitting.after, (20, 1, 1)),
     )
     found = build_motion_table(replace(told, fitting=many))
-    names = [run.side.names[run.row] for run in found.runs]
+    names = [run.data_split.names[run.row] for run in found.runs]
     assert names[:3] == ["held 2", "r79", "r78"]
     assert found.absent == 82 - len(names) > 0
     page = render_report(replace(told, fitting=many), {})

@@ -271,7 +271,7 @@ def test_every_figure_is_saved_with_its_numbers(robot, written):
         assert robot.saved(files.get_by_role("link").click) == (f"{name}.pdf", figure.pdf)
     file, frame = table(robot, "#where-picture .files", "where")
     assert file == "where.csv"
-    told = written["robot"].story.places
+    told = written["robot"].story.gap_locations
     assert list(frame["before"]) == [place.before for place in told]
 
 
