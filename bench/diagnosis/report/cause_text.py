@@ -180,7 +180,8 @@ def _make_percentage_formatter(quantity: str) -> Callable[[str, Sequence[FittedV
     def say(where: str, values: Sequence[FittedValue]) -> str:
         relative_change = values[0].value
         percent = format_percent(abs(relative_change))
-        return f"the {quantity} {where} is {percent} {_compare(relative_change)} than the model file states"
+        comparison = _compare(relative_change)
+        return f"the {quantity} {where} is {percent} {comparison} than the model file states"
 
     return say
 

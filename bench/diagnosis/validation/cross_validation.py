@@ -56,7 +56,7 @@ class CrossValidation:
     @property
     def simulations(self) -> int:
         """Number of simulations made for the folds alone."""
-        if "_folds" not in self.__dict__:
+        if "_run_folds" not in self.__dict__:
             return 0
         return sum(
             fold.fitting.simulation_count + fold.left_out.simulation_count
@@ -65,7 +65,7 @@ class CrossValidation:
 
     def close(self) -> None:
         """Close the simulators of the folds; the run evaluator of all runs stays open."""
-        if "_folds" in self.__dict__:
+        if "_run_folds" in self.__dict__:
             for fold in self._run_folds:
                 fold.fitting.close()
                 fold.left_out.close()

@@ -124,7 +124,7 @@ def make_robot_report(verdict="named", causes=(COULOMB,), joints=ARM6, at="elbow
         "channels": channels,
         "fitting": fitting,
         "held_out": held_out,
-        "places": tuple(places),
+        "gap_locations": tuple(places),
         "robot": robot,
         "why": (),
     }

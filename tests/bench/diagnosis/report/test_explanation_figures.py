@@ -83,8 +83,8 @@ def test_any_text_can_be_a_label():
 
 
 def test_what_is_not_there_is_not_drawn():
-    bare = make_report(
-        "unidentifiable", candidates=[], places=(), profiles=(), held_out=None, heldout=None
+    bare = story(
+        "unidentifiable", candidates=[], gap_locations=(), profiles=(), held_out=None, heldout=None
     )
     assert list(render_figures(bare)) == NAMES[:1]
 

@@ -238,7 +238,7 @@ def test_gaps_in_what_is_known_do_not_break_the_page():
         heldout=None,
         held_out=None,
         candidates=[],
-        places=(),
+        gap_locations=(),
         profiles=(),
         parameters={},
         why=(),
@@ -261,7 +261,7 @@ def test_many_runs_are_cut_to_the_worst():
     told = make_report()
     many = replace(
         told,
-        places=tuple(
+        gap_locations=tuple(
             replace(told.gap_locations[0], label=f"r{i}", before=float(i)) for i in range(1, 500)
         ),
     )

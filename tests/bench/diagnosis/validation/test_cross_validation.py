@@ -68,7 +68,10 @@ def test_each_run_is_predicted_by_a_fit_to_the_other_alone():
     there = evaluator(split_held_out(made, folds=True))
     noise = white(there, SIGMA)
     fit = fit_base_model(there, noise).fit
-    (predicted,) = CrossValidation(there, noise).validate([fit])
+    validation = CrossValidation(there, noise)
+    assert validation.simulations == 0
+    (predicted,) = validation.validate([fit])
+    assert validation.simulations > 2 * len(made.runs), "the folds are fitted and predicted"
     for run in (0, 1):
         other = evaluator(replace(made, runs=made.runs[1 - run : 2 - run]))
         alone = evaluator(replace(made, runs=made.runs[run : run + 1]))
