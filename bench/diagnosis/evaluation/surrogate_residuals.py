@@ -54,7 +54,7 @@ def draw_surrogates(
     observed_mask: Mask,
     count: int,
     rng: np.random.Generator,
-    largest: int = 6,
+    max_order: int = 6,
     project_out: Callable[[Array], Array] | None = None,
 ) -> Array:
     """Draw residuals (count, R, T, C) with the spectrum of a given residual.
@@ -64,13 +64,13 @@ def draw_surrogates(
         observed_mask: (R, T, C) mask of available samples; the surrogates are zero elsewhere.
         count: number of surrogates.
         rng: random numbers for the innovations.
-        largest: maximum order of the autoregression.
+        max_order: maximum order of the autoregression.
         project_out: callback that returns the residual of a fit to noise (count, R, T, C); without
             it the bias is not corrected.
     """
     channels = residual.shape[2]
     weights = [
-        _fit_autoregression(residual[..., c], observed_mask[..., c], largest)
+        _fit_autoregression(residual[..., c], observed_mask[..., c], max_order)
         for c in range(channels)
     ]
     # White noise has no correlation that a fit could reduce.
@@ -169,11 +169,11 @@ def _drive_autoregression(weights: Array, innovations: Array) -> Array:
     return innovations
 
 
-def _fit_autoregression(values: Array, observed_mask: Mask, largest: int) -> Array:
+def _fit_autoregression(values: Array, observed_mask: Mask, max_order: int) -> Array:
     """Fit an autoregression to values (R, T); no weights if it has too few innovations."""
     filled = np.where(observed_mask, values, 0.0)
     covariances = _estimate_autocovariances(
-        filled, observed_mask, min(largest, observed_mask.shape[1] - 1)
+        filled, observed_mask, min(max_order, observed_mask.shape[1] - 1)
     )
     weights = _select_order_by_aic(covariances, int(observed_mask.sum()))
     return (
@@ -193,14 +193,14 @@ def _compute_centred_innovations(filled: Array, observed_mask: Mask, weights: Ar
     return centred
 
 
-def _estimate_autocovariances(filled: Array, observed_mask: Mask, largest: int) -> Array:
-    """Estimate the autocovariances (largest + 1,) of values (R, T) at the lags 0 to `largest`.
+def _estimate_autocovariances(filled: Array, observed_mask: Mask, max_order: int) -> Array:
+    """Estimate the autocovariances (max_order + 1,) of values (R, T) at the lags 0 to `max_order`.
 
     Missing samples are zero in `filled`; only pairs of available samples (`observed_mask`) count.
     """
     length = observed_mask.shape[1]
     covariances = []
-    for lag in range(largest + 1):
+    for lag in range(max_order + 1):
         earlier_samples, later_samples = slice(0, length - lag), slice(lag, length)
         # Missing samples add nothing to the sum, so their pairs are not counted either.
         pairs = observed_mask[:, later_samples] & observed_mask[:, earlier_samples]

@@ -3,7 +3,7 @@
 The result of a task does not depend on the process that runs it. The split into tasks does not
 depend on the number of workers either, so the results are bit-identical with one worker and with
 many. Workers are forked only after enough work has been done to justify their cost. They inherit
-the `World` objects as they were then and receive small messages. They end with the pool, or with
+the run evaluators as they were then and receive small messages. They end with the pool, or with
 their parent (by a kernel signal and by the end of their pipe). They ignore Ctrl-C, which only the
 parent handles.
 """
@@ -47,7 +47,7 @@ Task = Callable[..., Result]
 
 
 class SharedState(Protocol):
-    """Shared state that tasks work on, such as a `World`."""
+    """Shared state that tasks work on, such as a run evaluator."""
 
     simulation_count: int
     search_control: SearchControl
@@ -62,13 +62,21 @@ class _Worker(NamedTuple):
 
 
 class _Answer(NamedTuple):
-    """Reply of a worker: a result or an error with its traceback, and counts for the parent."""
+    """Reply of a worker.
+
+    Attributes:
+        result: result of the task; None after an error.
+        error: error that the task raised, if any.
+        trace: traceback of the error as text.
+        simulation_count: number of simulations that the task made.
+        has_abandoned_fits: whether the task stopped a fit early.
+    """
 
     result: Any
     error: Exception | None
     trace: str
-    simulations: int
-    left: bool
+    simulation_count: int
+    has_abandoned_fits: bool
 
 
 class _WorkerTracebackError(Exception):
@@ -88,16 +96,16 @@ class ForkedWorkerPool:
     def __init__(self, jobs: int = 1) -> None:
         """Create a pool without workers; they are forked when enough work was done to justify them.
 
-        `_spent` is the time, in seconds, that tasks took in this process; workers start when it
-        reaches `PARALLEL_THRESHOLD_SECONDS`.
+        `_task_seconds` is the time, in seconds, that tasks took in this process; workers start when
+        it reaches `PARALLEL_THRESHOLD_SECONDS`.
         """
         self._jobs = jobs
-        self._spent = 0.0
-        # `_worlds` are all registered worlds, `_known` those that the present workers inherited.
-        self._worlds: list[SharedState] = []
-        self._known: list[SharedState] = []
-        self._team: list[_Worker] = []
-        self._ending: mmap.mmap | None = None
+        self._task_seconds = 0.0
+        # Run evaluators that workers inherit when they start, and those that they have now.
+        self._registered_evaluators: list[SharedState] = []
+        self._inherited_evaluators: list[SharedState] = []
+        self._workers: list[_Worker] = []
+        self._stop_flag: mmap.mmap | None = None
 
     def map(
         self, evaluator: SharedState, task: Task[Result], items: Sequence[tuple[Any, ...]]
@@ -129,46 +137,48 @@ class ForkedWorkerPool:
             The number of an item and its result.
         """
         is_parallel = self._jobs > 1 and len(items) > 1
-        if is_parallel and self._spent >= PARALLEL_THRESHOLD_SECONDS:
+        if is_parallel and self._task_seconds >= PARALLEL_THRESHOLD_SECONDS:
             self._ensure_workers(evaluator)
-        if is_parallel and self._team:
+        if is_parallel and self._workers:
             yield from self._distribute(evaluator, task, items)
             return
         for number, item in enumerate(items):
             start_time = time.perf_counter()
             result = task(evaluator, *item)
             if is_parallel:
-                self._spent += time.perf_counter() - start_time
+                self._task_seconds += time.perf_counter() - start_time
             yield number, result
 
     def register(self, evaluator: SharedState) -> None:
         """Register a run evaluator, so that workers inherit it when they start."""
-        self._worlds.append(evaluator)
+        self._registered_evaluators.append(evaluator)
 
     def forget(self, evaluator: SharedState) -> None:
         """Start new workers before the next work on a changed run evaluator."""
-        self._known = [known_world for known_world in self._known if known_world is not evaluator]
+        self._inherited_evaluators = [
+            inherited for inherited in self._inherited_evaluators if inherited is not evaluator
+        ]
 
     def close(self) -> None:
         """Kill all workers, and continue without them."""
-        for worker in list(self._team):
+        for worker in list(self._workers):
             worker.process.kill()
-        for worker in list(self._team):
+        for worker in list(self._workers):
             self._kill_worker(worker.pipe)
         self._jobs = 1
 
     def _ensure_workers(self, evaluator: SharedState) -> None:
         """Ensure that the workers have inherited a run evaluator; otherwise replace them.
 
-        A worker has the data that existed when it was forked, so it does not know later worlds.
+        A worker has the data that existed when it was forked, so it does not know later ones.
         """
-        if _is_same_array(self._known, evaluator):
+        if _contains_object(self._inherited_evaluators, evaluator):
             return
-        for worker in list(self._team):
+        for worker in list(self._workers):
             self._kill_worker(worker.pipe)
-        if not _is_same_array(self._worlds, evaluator):
+        if not _contains_object(self._registered_evaluators, evaluator):
             self.register(evaluator)
-        self._known = list(self._worlds)
+        self._inherited_evaluators = list(self._registered_evaluators)
         # Checked at this moment, because threads may start and end.
         if can_fork():
             self._fork_workers()
@@ -176,11 +186,11 @@ class ForkedWorkerPool:
     def _fork_workers(self) -> None:
         """Fork the workers, each with its own pipe to this process.
 
-        A forked worker inherits the registered worlds without a copy. `worker_arguments` has the
-        arguments of the worker's main function.
+        A forked worker inherits the registered run evaluators without a copy. `worker_arguments`
+        has the arguments of the worker's main function.
         """
-        if self._ending is None:
-            self._ending = mmap.mmap(-1, 1)
+        if self._stop_flag is None:
+            self._stop_flag = mmap.mmap(-1, 1)
         context = multiprocessing.get_context("fork")
         # Frozen objects stay in shared memory pages: garbage collection in a worker does not write
         # to them.
@@ -189,14 +199,20 @@ class ForkedWorkerPool:
             parent_end, worker_end = context.Pipe()
             # A worker that inherits ends of other pipes would keep the workers of these pipes
             # alive.
-            other_pipes = [parent_end, *(worker.pipe for worker in self._team)]
-            worker_arguments = (self._known, worker_end, other_pipes, self._ending, os.getpid())
+            other_pipes = [parent_end, *(worker.pipe for worker in self._workers)]
+            worker_arguments = (
+                self._inherited_evaluators,
+                worker_end,
+                other_pipes,
+                self._stop_flag,
+                os.getpid(),
+            )
             process = context.Process(
                 target=_run_worker, args=worker_arguments, daemon=True, name="explain"
             )
             process.start()
             worker_end.close()
-            self._team.append(_Worker(process, parent_end))
+            self._workers.append(_Worker(process, parent_end))
         gc.unfreeze()
 
     def _distribute(
@@ -209,21 +225,23 @@ class ForkedWorkerPool:
 
         An item is processed again if its worker dies; without any worker, the items are processed
         in this process. `unprocessed` has the numbers of these items, `busy` the item number of
-        each working pipe, and `free` the idle pipes. `place` is the index by which the workers know
-        the run evaluator.
+        each working pipe, and `idle` the idle pipes. `evaluator_index` is the index by which the
+        workers know the run evaluator.
 
         An error in a task is raised after all other items are finished.
         """
         errors: dict[int, tuple[Exception, str]] = {}
         unprocessed = list(range(len(items)))[::-1]
         busy: dict[Connection, int] = {}
-        free = [worker.pipe for worker in self._team]
-        place = next(i for i, known_world in enumerate(self._known) if known_world is evaluator)
+        idle = [worker.pipe for worker in self._workers]
+        evaluator_index = next(
+            i for i, inherited in enumerate(self._inherited_evaluators) if inherited is evaluator
+        )
         while unprocessed or busy:
-            while free and unprocessed:
-                pipe = free.pop()
+            while idle and unprocessed:
+                pipe = idle.pop()
                 number = unprocessed.pop()
-                if _send(pipe, (place, task, items[number])):
+                if _send(pipe, (evaluator_index, task, items[number])):
                     busy[pipe] = number
                 else:
                     self._kill_worker(pipe)
@@ -240,9 +258,9 @@ class ForkedWorkerPool:
                     self._kill_worker(pipe)
                     unprocessed.append(number)
                     continue
-                free.append(pipe)
-                evaluator.simulation_count += reply.simulations
-                evaluator.search_control.record_abandoned_fit(reply.left)
+                idle.append(pipe)
+                evaluator.simulation_count += reply.simulation_count
+                evaluator.search_control.record_abandoned_fit(reply.has_abandoned_fits)
                 if reply.error is not None:
                     errors[number] = reply.error, reply.trace
                 else:
@@ -256,24 +274,24 @@ class ForkedWorkerPool:
         """Wait for replies and return their pipes; tell workers to stop if the search must end."""
         while True:
             ready_pipes = connection.wait(pipes, POLL_INTERVAL_SECONDS)
-            if self._ending is not None and evaluator.search_control.should_stop():
-                self._ending[0] = 1
+            if self._stop_flag is not None and evaluator.search_control.should_stop():
+                self._stop_flag[0] = 1
             if ready_pipes:
                 return ready_pipes
 
     def _kill_worker(self, pipe: Connection) -> None:
         """Kill the worker at the other end of a pipe, and remove it from the pool."""
-        for worker in list(self._team):
+        for worker in list(self._workers):
             if worker.pipe is pipe:
-                self._team.remove(worker)
+                self._workers.remove(worker)
                 worker.process.kill()
                 worker.process.join()
                 pipe.close()
 
 
-def _is_same_array(evaluators: Sequence[SharedState], evaluator: SharedState) -> bool:
+def _contains_object(evaluators: Sequence[SharedState], evaluator: SharedState) -> bool:
     """Return whether a run evaluator is one of the given objects (by identity, not equality)."""
-    return any(other_world is evaluator for other_world in evaluators)
+    return any(other is evaluator for other in evaluators)
 
 
 def can_fork() -> bool:
@@ -339,7 +357,7 @@ def _run_worker(
     evaluators: Sequence[SharedState],
     pipe: Connection,
     other_pipes: list[Connection],
-    ending: mmap.mmap,
+    stop_flag: mmap.mmap,
     parent: int,
 ) -> None:
     """Process the requests of the parent until the pipe ends; main loop of a worker.
@@ -348,7 +366,7 @@ def _run_worker(
         evaluators: objects that the worker inherits; a request names one by its index.
         pipe: connection to the parent.
         other_pipes: inherited ends of other pipes, which the worker closes.
-        ending: one shared byte; a value other than zero asks all workers to stop.
+        stop_flag: one shared byte; a value other than zero asks all workers to stop.
         parent: process id of the parent.
     """
     # Ctrl-C of a terminal reaches every process of the group; only the parent handles it.
@@ -364,19 +382,22 @@ def _run_worker(
         evaluator.worker_pool = ForkedWorkerPool()
     while True:
         try:
-            place, task, item = pickle.loads(pipe.recv_bytes())
+            evaluator_index, task, item = pickle.loads(pipe.recv_bytes())
         except (EOFError, OSError):
             return
-        evaluator, deadline = evaluators[place], evaluators[place].search_control.deadline
-        evaluator.search_control = SearchControl(stop=lambda: ending[0] != 0)
+        evaluator, deadline = (
+            evaluators[evaluator_index],
+            evaluators[evaluator_index].search_control.deadline,
+        )
+        evaluator.search_control = SearchControl(stop=lambda: stop_flag[0] != 0)
         evaluator.search_control.deadline = deadline
-        before = evaluator.simulation_count
+        count_before = evaluator.simulation_count
         result, error, trace = None, None, ""
         try:
             result = task(evaluator, *item)
         except Exception as raised:
             error, trace = raised, traceback.format_exc()
-        count = evaluator.simulation_count - before
+        count = evaluator.simulation_count - count_before
         if not _send(
             pipe,
             _Answer(result, error, trace, count, evaluator.search_control.has_abandoned_fits()),

@@ -82,23 +82,27 @@ class RigModel:
     def __init__(self, evaluator: RunEvaluator, seconds: float) -> None:
         """Measure the usual input levels, command sizes and sampling interval of the present runs.
 
-        `rest` has the median of each input over all runs, in the unit of the input; `largest` its
-        largest deviation from this median. `driven` names the inputs that deviate at all. `step` is
-        the median sampling interval of the first run in seconds, and `begin` the initial state of a
-        candidate run.
+        `median_commands` has the median of each input over all runs, in the unit of the input;
+        `largest_commands` its largest deviation from this median. `driven_inputs` names the inputs
+        that deviate at all. `step` is the median sampling interval of the first run in seconds, and
+        `initial_state` the initial state of a candidate run.
         """
         self.evaluator, self.seconds = evaluator, seconds
-        self.old = evaluator.prepared_runs[0].scenario
-        self.step = float(np.median(np.diff(self.old.times)))
-        self.largest, self.rest = {}, {}
-        for name in self.old.inputs:
+        self.recorded_scenario = evaluator.prepared_runs[0].scenario
+        self.step = float(np.median(np.diff(self.recorded_scenario.times)))
+        self.largest_commands, self.median_commands = {}, {}
+        for name in self.recorded_scenario.inputs:
             signals = [track.scenario.inputs[name] for track in evaluator.prepared_runs]
             middle = float(np.median(np.concatenate(signals)))
-            self.largest[name] = max(float(np.abs(values - middle).max()) for values in signals)
-            self.rest[name] = middle
-        self.driven = tuple(name for name in self.old.inputs if self.largest[name] > 0)
+            self.largest_commands[name] = max(
+                float(np.abs(values - middle).max()) for values in signals
+            )
+            self.median_commands[name] = middle
+        self.driven_inputs = tuple(
+            name for name in self.recorded_scenario.inputs if self.largest_commands[name] > 0
+        )
         self.limits = read_model_file_limits(evaluator)
-        self.begin = self._get_initial_state()
+        self.initial_state = self._get_initial_state()
 
     def _get_initial_state(self) -> Array:
         """Return the initial state of the first run, at rest and within joint ranges.
@@ -124,8 +128,8 @@ class RigModel:
         """
         for state in self._iterate_initial_states():
             yield RunPlan(states=(state,))
-        groups = [(name,) for name in self.driven]
-        for input_groups in [*groups, self.driven] if len(groups) > 1 else groups:
+        groups = [(name,) for name in self.driven_inputs]
+        for input_groups in [*groups, self.driven_inputs] if len(groups) > 1 else groups:
             for size in COMMAND_SIZE_FACTORS:
                 for form in COMMAND_FORMS:
                     yield RunPlan(input_groups, form, size)
@@ -158,7 +162,7 @@ class RigModel:
             evaluator.state_names[i] for i in np.flatnonzero(evaluator.known_state_mask.all(axis=0))
         }
         for name in system.coordinates:
-            usual_value = float(self.begin[evaluator.state_names.index(name)])
+            usual_value = float(self.initial_state[evaluator.state_names.index(name)])
             values = [
                 share * usual_value if abs(usual_value) > REST_STATE else share
                 for share in INITIAL_STATE_FACTORS
@@ -196,22 +200,24 @@ class RigModel:
         """Turn a plan into a run that can be simulated: commands, constants and initial state."""
         times = np.arange(0.0, self.seconds, self.step * plan.hold_factor)
         inputs = {
-            name: self._limit_command(name, np.full(times.size, self.rest[name]))
-            for name in self.old.inputs
+            name: self._limit_command(name, np.full(times.size, self.median_commands[name]))
+            for name in self.recorded_scenario.inputs
         }
-        states = self.begin.copy()
+        states = self.initial_state.copy()
         limited_inputs = []
         for number, name in enumerate(plan.driven_inputs):
             signal = plan.size * _compute_command(
                 plan.form, times, self.step, np.random.default_rng(number)
             )
-            command = self.rest[name] + self.largest[name] * (signal + plan.level)
+            command = self.median_commands[name] + self.largest_commands[name] * (
+                signal + plan.level
+            )
             inputs[name] = self._limit_command(name, command)
             limited_inputs += [name] if (inputs[name] != command).any() else []
         for name, value in plan.states:
             states[self.evaluator.state_names.index(name)] = value
-        constants = {**self.old.constants, **dict(plan.constants)}
-        scenario = replace(self.old, times=times, inputs=inputs, constants=constants)
+        constants = {**self.recorded_scenario.constants, **dict(plan.constants)}
+        scenario = replace(self.recorded_scenario, times=times, inputs=inputs, constants=constants)
         return CandidateRun(
             plan, self._describe_plan(plan, inputs, limited_inputs), scenario, states
         )

@@ -203,21 +203,21 @@ def _get_first_run(evaluator: RunEvaluator, limits: StatedLimits) -> _Run:
     A robot starts at rest, because it cannot be started in motion, and with commands and positions
     within their limits.
     """
-    track = evaluator.prepared_runs[0]
+    run_data = evaluator.prepared_runs[0]
     if not evaluator.kind.has_model:
-        return _Run("", {}, track.scenario, track.initial_state_guess)
+        return _Run("", {}, run_data.scenario, run_data.initial_state_guess)
     rates = set(evaluator.simulator.system.rates)
     states = [
         0.0 if name in rates else _clip(value, limits.states.get(name))
-        for name, value in zip(evaluator.state_names, track.initial_state_guess, strict=True)
+        for name, value in zip(evaluator.state_names, run_data.initial_state_guess, strict=True)
     ]
-    recorded_inputs = track.scenario.inputs
+    recorded_inputs = run_data.scenario.inputs
     inputs = {
         name: _clip(values, limits.commands.get(name)) for name, values in recorded_inputs.items()
     }
     is_limited = any((inputs[name] != values).any() for name, values in recorded_inputs.items())
     limit_note = ", with commands limited as the model file states" if is_limited else ""
-    return _Run(limit_note, {}, replace(track.scenario, inputs=inputs), np.array(states))
+    return _Run(limit_note, {}, replace(run_data.scenario, inputs=inputs), np.array(states))
 
 
 def _clip(values: Any, limits: Interval | None) -> Any:
@@ -248,24 +248,24 @@ def _change_initial_states(
     The initial velocities of a robot are not changed, because it starts at rest.
     """
     system = evaluator.simulator.system
-    height = len(system.coordinates) - 1
+    height_index = len(system.coordinates) - 1
     states_with_units = zip(evaluator.state_names, _list_state_units(evaluator), strict=True)
-    for place, (name, unit) in enumerate(states_with_units):
-        above_ground = system.bounces and place == height
+    for index, (name, unit) in enumerate(states_with_units):
+        above_ground = system.bounces and index == height_index
         if evaluator.kind.has_model and name not in system.coordinates:
             continue
-        for share in INITIAL_STATE_FACTORS:
+        for factor in INITIAL_STATE_FACTORS:
             # A body cannot be released below the ground.
-            if above_ground and share < 0:
+            if above_ground and factor < 0:
                 continue
             states = first.states.copy()
-            value = float(states[place])
+            value = float(states[index])
             is_nonzero = abs(value) > REST_STATE
-            value = share * value if is_nonzero else share
+            value = factor * value if is_nonzero else factor
             if above_ground:
                 value = max(value, MIN_DROP_HEIGHT)
             value = float(_clip(value, limits.states.get(name)))
-            states[place] = value
+            states[index] = value
             description = f"Start with {name} = {value:.3g} {unit}{first.says}"
             yield _Run(description, {name: value}, first.scenario, states)
 
@@ -275,28 +275,30 @@ def _scale_inputs(evaluator: RunEvaluator, first: _Run, limits: StatedLimits) ->
 
     An input is never scaled beyond the limits of its command.
     """
-    shares = ROBOT_INPUTS if evaluator.kind.has_model else INPUT_FACTORS
+    factors = ROBOT_INPUTS if evaluator.kind.has_model else INPUT_FACTORS
     for name, signal in first.scenario.inputs.items():
         if not signal.any():
             continue
         low, high = limits.commands.get(name, UNLIMITED)
-        largest_share = _compute_largest_share(signal, (low, high))
-        for share in dict.fromkeys(min(share, largest_share) for share in shares):
-            scaled_signal = share * signal
+        largest_factor = _compute_largest_factor(signal, (low, high))
+        for factor in dict.fromkeys(min(factor, largest_factor) for factor in factors):
+            scaled_signal = factor * signal
             if (
-                1.0 / MIN_INPUT_FACTOR < share < MIN_INPUT_FACTOR
+                1.0 / MIN_INPUT_FACTOR < factor < MIN_INPUT_FACTOR
                 or scaled_signal.min() < low
                 or scaled_signal.max() > high
             ):
                 continue
             inputs = {**first.scenario.inputs, name: scaled_signal}
-            size = "smaller" if share < 1 else "larger"
-            description = f"Make the input {name} {size}, {share:.3g} times what it was{first.says}"
+            size = "smaller" if factor < 1 else "larger"
+            description = (
+                f"Make the input {name} {size}, {factor:.3g} times what it was{first.says}"
+            )
             scenario = replace(first.scenario, inputs=inputs)
-            yield _Run(description, {name: share}, scenario, first.states)
+            yield _Run(description, {name: factor}, scenario, first.states)
 
 
-def _compute_largest_share(signal: Array, limits: Interval) -> float:
+def _compute_largest_factor(signal: Array, limits: Interval) -> float:
     """Return the largest factor that keeps a signal within its limits, rounded down.
 
     It is infinite if nothing limits the signal.
@@ -333,13 +335,13 @@ def _compute_discrimination(
     """
     model_thetas = [model.fit.theta, competing_model.fit.theta]
     # Freed constants are fitted with the parameters, but passed to the simulator as constants.
-    places = evaluator.base_indices[evaluator.system_parameter_count :]
-    theta = np.delete(np.stack(model_thetas), places, axis=1)
-    names = [parameter.name for parameter in evaluator.freed_constants]
+    freed_indices = evaluator.base_indices[evaluator.system_parameter_count :]
+    theta = np.delete(np.stack(model_thetas), freed_indices, axis=1)
+    freed_names = [parameter.name for parameter in evaluator.freed_constants]
     scenarios = []
     for model_theta in model_thetas:
-        values = model_theta[places].tolist()
-        freed_constants = dict(zip(names, values, strict=True))
+        values = model_theta[freed_indices].tolist()
+        freed_constants = dict(zip(freed_names, values, strict=True))
         constants = {**run.scenario.constants, **freed_constants}
         scenarios.append(replace(run.scenario, constants=constants))
 

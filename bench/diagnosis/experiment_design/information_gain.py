@@ -44,7 +44,7 @@ MAX_EVALUATED_RUNS = 12
 """Maximum number of runs of a robot for which (1) is computed: those with the largest difference of
 the models before a refit.
 """
-MANY, FEWER = 12, 4
+MAX_EXACT_EVALUATIONS, MAX_EXACT_EVALUATIONS_ROBOT = 12, 4
 """Maximum number of exact evaluations of (1) in a row, for a system and for a robot, which is
 slower to simulate.
 """
@@ -59,16 +59,20 @@ MAX_DAMPING = 1e8
 """
 
 
-class _Known(NamedTuple):
+class _ParameterInformation(NamedTuple):
     """Information of the present runs on a model's parameters.
 
     Each parameter is in units of `spread`: its standard error, but at most a tenth of its bounds.
+
+    Attributes:
+        model: Fitted model.
+        spread: (q,) unit of each fitted parameter.
+        inverse: (q, q) inverse of the covariance of the parameters, in these units.
     """
 
     model: FittedModel
     spread: Array
     inverse: Array
-    """Inverse of the covariance matrix of the parameters, in units of `spread`."""
 
 
 class _LinearisedRun(NamedTuple):
@@ -113,22 +117,25 @@ class RunRanker:
     def __init__(self, models: ModelSet, competing_models: Sequence[FittedModel]) -> None:
         """Prepare the noise, the limits of the setup, and the covariances of the parameters.
 
-        `known` has the covariance of the parameters of each model, as C in eq. (1). `pairs` has all
-        ordered pairs (true model, competing model). `max_useful_gain` is the total value above
-        which a run gains nothing more, and `patience` the maximum number of exact evaluations in a
-        row. `free` (s,) marks the initial states that have to be estimated.
+        `information` has the covariance of the parameters of each model, as C in eq. (1). `pairs`
+        has all ordered pairs (true model, competing model). `max_total_value` is the total value
+        above which a run gains nothing more, and `max_exact_evaluations` the maximum number of
+        exact evaluations in a row. `is_free_state` (s,) marks the initial states that have to be
+        estimated.
         """
         self.models, self.evaluator = models, models.evaluator
-        self.known = [_compute_prior_covariance(models, model) for model in competing_models]
+        self.information = [_compute_prior_covariance(models, model) for model in competing_models]
         self.noise: NoiseModel = compute_fisher_blocks(models, competing_models[0]).noise
         self.limits = RigLimits(self.evaluator, competing_models[0])
         count = len(competing_models)
         self.pairs = list(permutations(range(count), 2))
-        self.max_useful_gain = (
+        self.max_total_value = (
             MAX_USEFUL_DISCRIMINATION * len(self.pairs) / 2 if self.pairs else np.inf
         )
-        self.patience = FEWER if self.evaluator.kind.has_model else MANY
-        self.free = ~self.evaluator.known_state_mask.all(axis=0)
+        self.max_exact_evaluations = (
+            MAX_EXACT_EVALUATIONS_ROBOT if self.evaluator.kind.has_model else MAX_EXACT_EVALUATIONS
+        )
+        self.is_free_state = ~self.evaluator.known_state_mask.all(axis=0)
 
     # -- runs
 
@@ -138,7 +145,7 @@ class RunRanker:
         They are ordered by the linearised discrimination T, or with one model by the information
         gain D: eqs. (1) and (2) of the module docstring.
         """
-        diagnosed_model = self.known[0].model
+        diagnosed_model = self.information[0].model
         allowed_runs = [
             run
             for run, is_allowed in zip(runs, self.limits(diagnosed_model, runs), strict=True)
@@ -149,8 +156,8 @@ class RunRanker:
         entries = []
         for run in allowed_runs:
             linearisations = [
-                self._linearise_run(run, known_model, known_model.model.fit.theta)
-                for known_model in self.known
+                self._linearise_run(run, information, information.model.fit.theta)
+                for information in self.information
             ]
             if all(linearisation is not None for linearisation in linearisations):
                 entries.append(
@@ -168,13 +175,13 @@ class RunRanker:
         and a competing model; with one model it is the information gain D of eq. (2).
         """
         if not self.pairs:
-            value = _compute_information_gain(slopes[0], self.known[0])
+            value = _compute_information_gain(slopes[0], self.information[0])
             return RunValue(run, np.array([value]), value)
         values = np.zeros((len(slopes), len(slopes)))
         for true_index, competing_index in self.pairs:
             gap = slopes[true_index].centre - slopes[competing_index].centre
             values[true_index, competing_index] = _compute_remaining_difference(
-                gap, slopes[competing_index], self.known[competing_index]
+                gap, slopes[competing_index], self.information[competing_index]
             )[0]
         return RunValue(run, values, _sum_discrimination(values))
 
@@ -185,11 +192,11 @@ class RunRanker:
         values = entry.values.copy()
         for true_index, competing_index in self.pairs:
             values[true_index, competing_index] = self._compute_discrimination(
-                entry.run, self.known[true_index], self.known[competing_index]
+                entry.run, self.information[true_index], self.information[competing_index]
             )
         # The run must be within the limits, whichever model is true.
-        for known_model in self.known[1:]:
-            if not self.limits(known_model.model, [entry.run])[0]:
+        for information in self.information[1:]:
+            if not self.limits(information.model, [entry.run])[0]:
                 values[:] = 0.0
         return RunValue(entry.run, values, _sum_discrimination(values), is_exact=True)
 
@@ -200,14 +207,14 @@ class RunRanker:
         """
         sizes = []
         for run in runs:
-            thetas = [known_model.model.fit.theta for known_model in self.known]
+            thetas = [information.model.fit.theta for information in self.information]
             whitened = self._whiten(self._simulate_run(run, thetas, [run.states] * len(thetas)))
             gaps = [whitened[b] - whitened[a] for a, b in combinations(range(len(whitened)), 2)]
             gaps = gaps or [whitened[0] - whitened[0].mean()]
             size = float(sum(np.log1p(np.square(gap).sum()) for gap in gaps))
             sizes.append(size if np.isfinite(size) else -np.inf)
         order = np.argsort(-np.array(sizes), kind="stable")
-        return [runs[place] for place in order[:MAX_EVALUATED_RUNS].tolist()]
+        return [runs[index] for index in order[:MAX_EVALUATED_RUNS].tolist()]
 
     # -- one run
 
@@ -221,12 +228,16 @@ class RunRanker:
     def _whiten(self, values: Array) -> Array:
         """Whiten observations, or differences of them, to (L, n)."""
         is_observed = np.ones((1, *values.shape[1:]), dtype=np.bool_)
-        lanes = np.moveaxis(values, 0, -1)[None]
-        result: Array = np.moveaxis(whiten(lanes, is_observed, self.noise)[0], -1, 0)
+        columns = np.moveaxis(values, 0, -1)[None]
+        result: Array = np.moveaxis(whiten(columns, is_observed, self.noise)[0], -1, 0)
         return result.reshape(len(values), -1)
 
     def _linearise_run(
-        self, run: CandidateRun, known_model: _Known, theta: Array, states: Array | None = None
+        self,
+        run: CandidateRun,
+        information: _ParameterInformation,
+        theta: Array,
+        states: Array | None = None,
     ) -> _LinearisedRun | None:
         """Linearise a run at a parameter vector and an initial state.
 
@@ -235,30 +246,38 @@ class RunRanker:
             the initial state so much that its result could not be interpreted.
         """
         begin = run.states if states is None else states
-        free = known_model.model.fit.free_indices.tolist()
-        thetas = [theta] * (1 + len(free) + int(self.free.sum()))
-        for row, place in enumerate(free):
+        free_indices = information.model.fit.free_indices.tolist()
+        thetas = [theta] * (1 + len(free_indices) + int(self.is_free_state.sum()))
+        for row, index in enumerate(free_indices):
             displaced_theta = theta.copy()
-            displaced_theta[place] += known_model.spread[row]
+            displaced_theta[index] += information.spread[row]
             thetas[1 + row] = displaced_theta
-        shifts = STATE_STEP_SHARE * np.eye(begin.size)[self.free]
-        initial_states = [begin] * (1 + len(free)) + [begin + shift for shift in shifts]
+        shifts = STATE_STEP_SHARE * np.eye(begin.size)[self.is_free_state]
+        initial_states = [begin] * (1 + len(free_indices)) + [begin + shift for shift in shifts]
         simulated = self._simulate_run(run, thetas, initial_states)
         if not np.isfinite(simulated).all():
             return None
-        differences = np.abs(simulated[1 + len(free) :] - simulated[0])
+        differences = np.abs(simulated[1 + len(free_indices) :] - simulated[0])
         sizes = np.array([channel.scale for channel in self.evaluator.simulator.channels])
         if (
             differences.size
             and (differences / sizes).max() > MAX_STATE_STEP_GROWTH * STATE_STEP_SHARE
         ):
             return None
-        lanes = self._whiten(np.concatenate([simulated[:1], simulated[1:] - simulated[0]]))
-        parameter_responses, state_responses = lanes[1 : 1 + len(free)], lanes[1 + len(free) :]
-        return _LinearisedRun(lanes[0], parameter_responses.T, state_responses.T / STATE_STEP_SHARE)
+        whitened = self._whiten(np.concatenate([simulated[:1], simulated[1:] - simulated[0]]))
+        parameter_responses, state_responses = (
+            whitened[1 : 1 + len(free_indices)],
+            whitened[1 + len(free_indices) :],
+        )
+        return _LinearisedRun(
+            whitened[0], parameter_responses.T, state_responses.T / STATE_STEP_SHARE
+        )
 
     def _compute_discrimination(
-        self, run: CandidateRun, true_model: _Known, competing_model: _Known
+        self,
+        run: CandidateRun,
+        true_model: _ParameterInformation,
+        competing_model: _ParameterInformation,
     ) -> float:
         """Compute the discrimination T of eq. (1) of a run, to which the competitor is refitted.
 
@@ -286,7 +305,7 @@ class RunRanker:
             )
             trial_theta, trial_states = theta.copy(), states.copy()
             trial_theta[fit.free_indices] += step * competing_model.spread
-            trial_states[self.free] += state_step
+            trial_states[self.is_free_state] += state_step
             trial_linearisation = self._linearise_run(
                 run, competing_model, trial_theta, trial_states
             )
@@ -316,7 +335,7 @@ class RunRanker:
         return lowest_cost
 
 
-def _compute_prior_covariance(models: ModelSet, model: FittedModel) -> _Known:
+def _compute_prior_covariance(models: ModelSet, model: FittedModel) -> _ParameterInformation:
     """Compute the covariance C of a model's parameters from the present runs, for eqs. (1) and (2).
 
     The unit of each parameter, `spread`, is its standard error, but at most a tenth of the width of
@@ -331,7 +350,7 @@ def _compute_prior_covariance(models: ModelSet, model: FittedModel) -> _Known:
     max_spread = 0.1 * (bounds[:, 1] - bounds[:, 0])
     spread = np.minimum(np.sqrt(np.maximum(np.diagonal(covariance), 1e-300)), max_spread)
     inverse = np.asarray(np.linalg.pinv(covariance / np.outer(spread, spread), hermitian=True))
-    return _Known(model, np.asarray(spread), inverse)
+    return _ParameterInformation(model, np.asarray(spread), inverse)
 
 
 def _sum_discrimination(values: Array) -> float:
@@ -347,7 +366,7 @@ def _sum_discrimination(values: Array) -> float:
 def _compute_remaining_difference(
     gap: Array,
     slopes: _LinearisedRun,
-    known_model: _Known,
+    information: _ParameterInformation,
     deviation: Array | None = None,
     damping: float = 1e-9,
 ) -> tuple[float, Array, Array]:
@@ -356,29 +375,29 @@ def _compute_remaining_difference(
     Args:
         gap: (n,) residual of the competing model.
         slopes: Linearisation of the competing model.
-        known_model: Information of the present runs on the competing model.
+        information: Information of the present runs on the competing model.
         deviation: (q,) difference of its parameters from their present estimates, in units of
             `spread`.
         damping: Levenberg-Marquardt damping of the step.
     """
-    q = len(known_model.spread)
+    q = len(information.spread)
     deviation = np.zeros(q) if deviation is None else deviation
     columns = np.concatenate([slopes.numbers, slopes.states], axis=1)
     normal, pull = columns.T @ columns, columns.T @ gap
-    normal[:q, :q] += known_model.inverse
-    pull[:q] -= known_model.inverse @ deviation
+    normal[:q, :q] += information.inverse
+    pull[:q] -= information.inverse @ deviation
     damped = normal + damping * np.diag(np.diagonal(normal)) + 1e-18 * np.eye(len(normal))
     step = np.linalg.solve(damped, pull)
-    initial_cost = float(gap @ gap + deviation @ known_model.inverse @ deviation)
+    initial_cost = float(gap @ gap + deviation @ information.inverse @ deviation)
     minimum_cost = initial_cost - 2.0 * float(pull @ step) + float(step @ normal @ step)
     return max(minimum_cost, 0.0), step[:q], step[q:]
 
 
-def _compute_information_gain(slopes: _LinearisedRun, known_model: _Known) -> float:
+def _compute_information_gain(slopes: _LinearisedRun, information: _ParameterInformation) -> float:
     """Compute the information gain D, eq. (2): the logarithm of the decrease of uncertainty."""
     basis, _ = np.linalg.qr(slopes.states)
     projected_slopes = slopes.numbers - basis @ (basis.T @ slopes.numbers)
-    covariance = np.linalg.pinv(known_model.inverse, hermitian=True)
+    covariance = np.linalg.pinv(information.inverse, hermitian=True)
     _, value = np.linalg.slogdet(
         np.eye(len(covariance)) + covariance @ (projected_slopes.T @ projected_slopes)
     )

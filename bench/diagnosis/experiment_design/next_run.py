@@ -117,7 +117,7 @@ def design_next_run(
         ranked_runs = _evaluate_fully(ranker, ranked_runs)
         if (
             not ranked_runs
-            or ranked_runs[0].value >= ranker.max_useful_gain
+            or ranked_runs[0].value >= ranker.max_total_value
             or models.evaluator.search_control.has_abandoned_fits()
         ):
             break
@@ -145,16 +145,16 @@ def design_next_run(
     )
 
 
-def _may_longer_run_help(best: RunValue, times: float) -> bool:
+def _may_longer_run_help(best: RunValue, length_factor: float) -> bool:
     """Return whether a longer run may distinguish models that the best run does not."""
     discrimination = np.minimum(best.values, best.values.T)
     undistinguished = discrimination[
         (discrimination > 0) & (discrimination <= DISCRIMINATION_THRESHOLD)
     ]
     return (
-        times > 1.0
+        length_factor > 1.0
         and best.values.ndim == 2
-        and bool((undistinguished * 2.0 * times > DISCRIMINATION_THRESHOLD).any())
+        and bool((undistinguished * 2.0 * length_factor > DISCRIMINATION_THRESHOLD).any())
     )
 
 
@@ -164,12 +164,12 @@ def _evaluate_fully(ranker: RunRanker, runs: Sequence[RunValue]) -> list[RunValu
     Linearised values tend to be too high.
     """
     ranked = sorted(runs, key=get_sort_key)
-    for _ in range(ranker.patience):
+    for _ in range(ranker.max_exact_evaluations):
         first = next(
             (k for k, entry in enumerate(ranked[:PLANS_VARIED_PER_ROUND]) if not entry.is_exact),
             None,
         )
-        if first is None or (ranked[0].is_exact and ranked[0].value >= ranker.max_useful_gain):
+        if first is None or (ranked[0].is_exact and ranked[0].value >= ranker.max_total_value):
             break
         ranked[first] = ranker.evaluate_exactly(ranked[first])
         ranked.sort(key=get_sort_key)
@@ -216,7 +216,9 @@ def _describe_best_run(
         times=run.scenario.times,
         inputs=dict(run.scenario.inputs),
         initial=dict(zip(models.evaluator.state_names, run.states.tolist(), strict=True)),
-        constants={k: v for k, v in constants.items() if rig.old.constants.get(k) != v},
+        constants={
+            k: v for k, v in constants.items() if rig.recorded_scenario.constants.get(k) != v
+        },
         groups=groups,
     )
 
@@ -232,13 +234,13 @@ def _iterate_connected_groups(
     """Yield connected groups of names that are linked by pairs that are not distinguished."""
     remaining = list(range(len(names)))
     while remaining:
-        group, added = [], [remaining[0]]
-        while added:
-            group += added
-            remaining = [place for place in remaining if place not in added]
-            added = [
+        group, newly_connected = [], [remaining[0]]
+        while newly_connected:
+            group += newly_connected
+            remaining = [index for index in remaining if index not in newly_connected]
+            newly_connected = [
                 b
                 for b in remaining
-                if any(discrimination[a, b] <= DISCRIMINATION_THRESHOLD for a in added)
+                if any(discrimination[a, b] <= DISCRIMINATION_THRESHOLD for a in newly_connected)
             ]
-        yield tuple(names[place] for place in sorted(group))
+        yield tuple(names[index] for index in sorted(group))

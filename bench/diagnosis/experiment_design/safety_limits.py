@@ -128,8 +128,8 @@ class RigLimits:
         evaluator.simulation_count += len(model_scenarios)
         names = [channel.name for channel in simulator.channels]
         return [
-            dict(zip(names, lane[: scenario.times.size].T, strict=True))
-            for lane, scenario in zip(result, model_scenarios, strict=True)
+            dict(zip(names, channel_values[: scenario.times.size].T, strict=True))
+            for channel_values, scenario in zip(result, model_scenarios, strict=True)
         ]
 
     # -- limits

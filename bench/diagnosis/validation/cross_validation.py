@@ -85,7 +85,7 @@ class CrossValidation:
         shape = self.evaluator.observed.shape
         simulated = np.full((len(fits), *shape), np.nan)
         states = np.stack([fit.initial_states for fit in fits])
-        free = np.zeros(len(fits))
+        free_state_counts = np.zeros(len(fits))
         for number, fold in enumerate(self._run_folds):
             self.evaluator.search_control.begin_stage(
                 f"cross-validation, fold {number + 1} of {len(self._run_folds)}"
@@ -95,13 +95,15 @@ class CrossValidation:
             for i, prediction in enumerate(predicted):
                 simulated[i, fold.rows, : prediction.simulated.shape[1]] = prediction.simulated
                 states[i, fold.rows] = prediction.states
-                free[i] += prediction.freedom
+                free_state_counts[i] += prediction.freedom
         return [
             self._predict_all_runs(*result)
-            for result in zip(simulated, states, free.tolist(), strict=True)
+            for result in zip(simulated, states, free_state_counts.tolist(), strict=True)
         ]
 
-    def _predict_all_runs(self, simulated: Array, states: Array, free: float) -> HeldOutFit:
+    def _predict_all_runs(
+        self, simulated: Array, states: Array, free_state_count: float
+    ) -> HeldOutFit:
         """Return a model's prediction of all runs with its merit, the penalised log-likelihood.
 
         A failed simulation has the merit -infinity, so that any other model is preferred.
@@ -109,14 +111,12 @@ class CrossValidation:
         Args:
             simulated: (R, T, C) prediction of each run by the model refitted without it.
             states: (R, s) initial states.
-            free: Effective number of fitted initial states, for the penalty.
+            free_state_count: Effective number of fitted initial states, for the penalty.
         """
         if not np.isfinite(simulated[self.seen]).all():
             return HeldOutFit(np.full_like(simulated, np.nan), -np.inf, states)
-        penalised_likelihood = compute_penalised_likelihood(
-            self.evaluator.observed, simulated, free
-        )
-        return HeldOutFit(simulated, penalised_likelihood, states, free)
+        penalised_likelihood = compute_penalised_likelihood(self.evaluator.observed, simulated, free_state_count)
+        return HeldOutFit(simulated, penalised_likelihood, states, free_state_count)
 
     @cached_property
     def _run_folds(self) -> list[_Fold]:
@@ -159,18 +159,20 @@ class CrossValidation:
         """
         base = set(self.evaluator.base_indices.tolist())
         # All models of a search keep the same parameters fixed at their nominal values.
-        frozen = frozenset(base - set(fits[0].free_indices.tolist()))
+        fixed_parameters = frozenset(base - set(fits[0].free_indices.tolist()))
         length = fold.fitting.observed.shape[1]
         starts = []
         for fit in fits:
-            jacobian = fit.jacobian[fold.fitted_rows, :length, :, : fit.free_indices.size]
+            jacobian = fit.parameter_jacobian[fold.fitted_rows, :length]
             known_jacobian = KnownJacobian(fit.free_indices, jacobian)
             starts.append(
                 FitStart(
                     fit.effects, fit.theta, fit.initial_states[fold.fitted_rows], known_jacobian
                 )
             )
-        refits = TrajectoryFitter(fold.fitting, self.noise, frozen).fit_models(starts, MAX_STEPS)
+        refits = TrajectoryFitter(fold.fitting, self.noise, fixed_parameters).fit_models(
+            starts, MAX_STEPS
+        )
         return self._remove_unsupported(fold.fitting, refits)
 
     def _remove_unsupported(
@@ -187,11 +189,11 @@ class CrossValidation:
         if not removals:
             return thetas
         runs = len(evaluator.prepared_runs)
-        lanes = np.stack([fits[i].theta for i, _ in removals])
-        for lane, (_, name) in zip(lanes, removals, strict=True):
-            lane[evaluator.get_coefficient_indices(name)] = 0.0
+        thetas_without = np.stack([fits[i].theta for i, _ in removals])
+        for theta_without, (_, name) in zip(thetas_without, removals, strict=True):
+            theta_without[evaluator.get_coefficient_indices(name)] = 0.0
         simulated_without = evaluator.simulate(
-            np.repeat(lanes, runs, axis=0),
+            np.repeat(thetas_without, runs, axis=0),
             np.tile(np.arange(runs), len(removals)),
             np.concatenate([fits[i].initial_states for i, _ in removals]),
         ).reshape(len(removals), *evaluator.observed.shape)

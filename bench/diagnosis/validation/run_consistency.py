@@ -220,11 +220,16 @@ def _find_trend_covariate(
         return TrendCovariate(
             classify_constant(evaluator, grouping.by), grouping.by, consistency.trend
         )
-    places = {name: list(runs) for name, runs in zip(grouping.names, grouping.runs, strict=True)}
+    runs_by_group = {
+        name: list(runs) for name, runs in zip(grouping.names, grouping.runs, strict=True)
+    }
     trends = []
     for covariate in compute_run_covariates(evaluator, model, consistency.number):
         values = np.array(
-            [covariate.values[places[part.group]].mean() for part in consistency.group_estimates]
+            [
+                covariate.values[runs_by_group[part.group]].mean()
+                for part in consistency.group_estimates
+            ]
         )
         trend = (
             _fit_trend(consistency.group_estimates, values)
@@ -254,12 +259,16 @@ def _find_trend_covariate(
     return TrendCovariate(best.kind, best.name, trend, tuple(similar_covariates))
 
 
-def _compute_residual_mean_square(parts: Sequence[GroupEstimate], numbers: Array) -> float:
+def _compute_residual_mean_square(
+    group_estimates: Sequence[GroupEstimate], covariate_values: Array
+) -> float:
     """Compute the weighted mean square about the line of `_fit_trend`; at least 1 (expectation)."""
-    values = np.array([part.value for part in parts])
-    weights = np.array([part.error for part in parts]) ** -2.0
-    residual = values - np.polyval(np.polyfit(numbers, values, 1, w=np.sqrt(weights)), numbers)
-    return max(float(weights @ residual**2) / (len(parts) - 2), 1.0)
+    values = np.array([part.value for part in group_estimates])
+    weights = np.array([part.error for part in group_estimates]) ** -2.0
+    residual = values - np.polyval(
+        np.polyfit(covariate_values, values, 1, w=np.sqrt(weights)), covariate_values
+    )
+    return max(float(weights @ residual**2) / (len(group_estimates) - 2), 1.0)
 
 
 def _assess_parameter(consistency: ParameterConsistency, level: float) -> ParameterConsistency:
@@ -272,20 +281,22 @@ def _list_groupings(runs: Sequence[Run]) -> Iterator[_RunGrouping]:
     """Yield the ways to group the runs: by log, by each differing constant, by single run."""
     logs = tuple(dict.fromkeys(run.log for run in runs))
     if len(logs) > 1:
-        places = tuple(tuple(i for i, run in enumerate(runs) if run.log == log) for log in logs)
-        yield _RunGrouping("log", logs, places, tuple(map(float, range(len(logs)))))
+        run_indices = tuple(
+            tuple(i for i, run in enumerate(runs) if run.log == log) for log in logs
+        )
+        yield _RunGrouping("log", logs, run_indices, tuple(map(float, range(len(logs)))))
     for name in dict.fromkeys(name for run in runs for name in run.constants):
         values = [run.constants.get(name, np.nan) for run in runs]
         unique_values = sorted(set(values))
         if len(unique_values) > 1 and np.isfinite(unique_values).all():
-            places = tuple(
+            run_indices = tuple(
                 tuple(i for i, v in enumerate(values) if v == unique_value)
                 for unique_value in unique_values
             )
             yield _RunGrouping(
                 name,
                 tuple(f"{unique_value:g}" for unique_value in unique_values),
-                places,
+                run_indices,
                 tuple(unique_values),
             )
     if len(runs) > 1:
@@ -295,22 +306,33 @@ def _list_groupings(runs: Sequence[Run]) -> Iterator[_RunGrouping]:
 
 
 def _compute_run_normal_equations(models: ModelSet, model: FittedModel) -> tuple[Array, Array]:
-    """Compute the normal equations of each run: H (R, q, q) and g (R, q) of eq. (1)."""
+    """Compute the normal equations of the q parameters for each run.
+
+    They are the curvatures H (R, q, q) and the gradients g (R, q), after the initial states of the
+    run are eliminated: eq. (1) of the module docstring.
+    """
     evaluator, fit = models.evaluator, model.fit
     q = fit.free_indices.size
     fisher_blocks = compute_fisher_blocks(models, model)
     residual = whiten(models.compute_residual(fit), models.observed_mask, fisher_blocks.noise)
-    pull = np.einsum("rnk,rn->rk", fisher_blocks.jacobian, residual.reshape(len(residual), -1))
-    pull[:, q:] += compute_state_prior(evaluator) ** -2.0 * (
+    gradients_by_unknown = np.einsum(
+        "rnk,rn->rk", fisher_blocks.jacobian, residual.reshape(len(residual), -1)
+    )
+    gradients_by_unknown[:, q:] += compute_state_prior(evaluator) ** -2.0 * (
         evaluator.initial_state_guesses - fit.initial_states
     )
-    pull[:, q:] *= ~evaluator.known_state_mask
+    gradients_by_unknown[:, q:] *= ~evaluator.known_state_mask
     right_hand_sides = np.concatenate(
-        [fisher_blocks.cross.transpose(0, 2, 1), pull[:, q:, None]], 2
+        [fisher_blocks.cross.transpose(0, 2, 1), gradients_by_unknown[:, q:, None]], 2
     )
-    eliminated = np.linalg.solve(fisher_blocks.states, right_hand_sides)
-    curvatures = fisher_blocks.parameters - np.matmul(fisher_blocks.cross, eliminated[..., :-1])
-    gradients = pull[:, :q] - np.matmul(fisher_blocks.cross, eliminated[..., -1:])[..., 0]  # (1)
+    state_solutions = np.linalg.solve(fisher_blocks.states, right_hand_sides)
+    curvatures = fisher_blocks.parameters - np.matmul(
+        fisher_blocks.cross, state_solutions[..., :-1]
+    )
+    gradients = (
+        gradients_by_unknown[:, :q]
+        - np.matmul(fisher_blocks.cross, state_solutions[..., -1:])[..., 0]
+    )  # (1)
     return curvatures, gradients
 
 
@@ -334,33 +356,37 @@ def _test_parameters(
         gradients: (R, q) g_r of eq. (1).
     """
     joint_covariance = _invert_regularised(curvatures.sum(axis=0))
-    steps, errors = [], []
+    steps, group_errors = [], []
     for runs in grouping.runs:
         group_covariance = _invert_regularised(curvatures[list(runs)].sum(axis=0))
         steps.append(group_covariance @ gradients[list(runs)].sum(axis=0))  # (2)
-        errors.append(np.sqrt(np.maximum(np.diagonal(group_covariance), 0.0)))
-    for column, place in enumerate(model.fit.free_indices.tolist()):
-        parameter, value = evaluator.parameters[place], float(model.fit.theta[place])
+        group_errors.append(np.sqrt(np.maximum(np.diagonal(group_covariance), 0.0)))
+    for column, index in enumerate(model.fit.free_indices.tolist()):
+        parameter, value = evaluator.parameters[index], float(model.fit.theta[index])
         low, high = parameter.bounds
         size = max(high - low, abs(value))
-        parts, numbers = [], []
+        group_estimates, covariate_values = [], []
         for group, name in enumerate(grouping.names):
-            error = float(errors[group][column])
+            error = float(group_errors[group][column])
             if error > 0 and 2.0 * Z95 * error < MAX_INTERVAL_WIDTH * size:
-                parts.append(GroupEstimate(name, value + float(steps[group][column]), error))
-                numbers.append(grouping.numbers[group] if grouping.numbers else 0.0)
-        if len(parts) < 2:
+                group_estimates.append(
+                    GroupEstimate(name, value + float(steps[group][column]), error)
+                )
+                covariate_values.append(grouping.numbers[group] if grouping.numbers else 0.0)
+        if len(group_estimates) < 2:
             continue
         error = float(np.sqrt(max(joint_covariance[column, column], 0.0)))
-        scatter, p_value = _estimate_heterogeneity(parts)
-        trend = _fit_trend(parts, np.array(numbers)) if grouping.numbers else None
+        scatter, p_value = _estimate_heterogeneity(group_estimates)
+        trend = (
+            _fit_trend(group_estimates, np.array(covariate_values)) if grouping.numbers else None
+        )
         yield ParameterConsistency(
             parameter.name,
             parameter.unit,
             grouping.by,
             value,
             error,
-            tuple(parts),
+            tuple(group_estimates),
             scatter,
             p_value,
             True,
@@ -376,43 +402,45 @@ def _invert_regularised(curvature: Array) -> Array:
     return result
 
 
-def _estimate_heterogeneity(parts: Sequence[GroupEstimate]) -> tuple[float, float]:
+def _estimate_heterogeneity(group_estimates: Sequence[GroupEstimate]) -> tuple[float, float]:
     """Estimate by how much groups differ beyond their errors: tau of eq. (4), and the p-value.
 
     The method is that of DerSimonian and Laird, with Cochran's Q.
     """
-    values = np.array([part.value for part in parts])
-    weights = np.array([part.error for part in parts]) ** -2.0
+    values = np.array([part.value for part in group_estimates])
+    weights = np.array([part.error for part in group_estimates]) ** -2.0
     weighted_mean = float(weights @ values / weights.sum())
     q = float(weights @ (values - weighted_mean) ** 2)  # (3)
-    freedom = len(parts) - 1
+    degrees_of_freedom = len(group_estimates) - 1
     scale = float(weights.sum() - (weights @ weights) / weights.sum())
-    tau = np.sqrt(max(q - freedom, 0.0) / scale) if scale > 0 else 0.0  # (4)
-    return float(tau), chi_squared_tail(freedom, q)
+    tau = np.sqrt(max(q - degrees_of_freedom, 0.0) / scale) if scale > 0 else 0.0  # (4)
+    return float(tau), chi_squared_tail(degrees_of_freedom, q)
 
 
-def _fit_trend(parts: Sequence[GroupEstimate], numbers: Array) -> Trend | None:
+def _fit_trend(group_estimates: Sequence[GroupEstimate], covariate_values: Array) -> Trend | None:
     """Fit a line to the group estimates over covariate values, weighted by 1 / error².
 
     Return None for fewer than three groups, or if the covariate is the same in all.
     """
-    if len(parts) < 3 or not np.ptp(numbers) > 0:
+    if len(group_estimates) < 3 or not np.ptp(covariate_values) > 0:
         return None
-    values = np.array([part.value for part in parts])
-    weights = np.array([part.error for part in parts]) ** -2.0
-    centred_numbers = numbers - weights @ numbers / weights.sum()
-    power = float(weights @ centred_numbers**2)
-    slope = float(weights @ (centred_numbers * values)) / power
-    residual = values - weights @ values / weights.sum() - slope * centred_numbers
-    freedom = len(parts) - 2
-    ratio = float(weights @ residual**2) / freedom
-    error = float(np.sqrt(max(ratio, 1.0) / power))
+    values = np.array([part.value for part in group_estimates])
+    weights = np.array([part.error for part in group_estimates]) ** -2.0
+    centred = covariate_values - weights @ covariate_values / weights.sum()
+    spread = float(weights @ centred**2)
+    slope = float(weights @ (centred * values)) / spread
+    residual = values - weights @ values / weights.sum() - slope * centred
+    freedom = len(group_estimates) - 2
+    mean_square = float(weights @ residual**2) / freedom
+    error = float(np.sqrt(max(mean_square, 1.0) / spread))
     # If the scatter agrees with the errors, these are known; otherwise they are estimated.
-    size = abs(slope) / error
+    t_statistic = abs(slope) / error
     return Trend(
         slope,
         error,
-        erfc(size / sqrt(2.0)) if ratio <= 1.0 else _compute_student_p_value(size, freedom),
+        erfc(t_statistic / sqrt(2.0))
+        if mean_square <= 1.0
+        else _compute_student_p_value(t_statistic, freedom),
     )
 
 

@@ -28,7 +28,7 @@ def test_the_answer_is_the_same_to_the_last_bit_with_one_two_and_eight(monkeypat
     usual = ForkedWorkerPool._distribute
 
     def counted(self, *given):
-        shared.append(len(self._team))
+        shared.append(len(self._workers))
         return usual(self, *given)
 
     monkeypatch.setattr(ForkedWorkerPool, "_distribute", counted)
