@@ -11,7 +11,7 @@ from bench.core.plugin_registries import make_robot_simulator
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.experiment_design.candidate_runs import RigModel, RunPlan
 from bench.diagnosis.experiment_design.discriminating_run import (
-    _compute_largest_share,
+    _compute_largest_factor,
     _iterate_changed_runs,
 )
 from bench.diagnosis.experiment_design.model_file_limits import UNLIMITED, read_model_file_limits
@@ -192,10 +192,10 @@ def test_every_simple_run_of_a_robot_is_within_the_limits(tmp_path):
 
 def test_a_signal_is_enlarged_up_to_its_limit():
     signal = np.array([-0.5, 0.4])
-    assert _compute_largest_share(signal, (-1.0, 1.0)) == 2.0
-    assert _compute_largest_share(signal, (-2.0, 0.5)) == 1.25
-    assert _compute_largest_share(signal, UNLIMITED) == np.inf
-    assert _compute_largest_share(np.zeros(2), (-1.0, 1.0)) == np.inf
+    assert _compute_largest_factor(signal, (-1.0, 1.0)) == 2.0
+    assert _compute_largest_factor(signal, (-2.0, 0.5)) == 1.25
+    assert _compute_largest_factor(signal, UNLIMITED) == np.inf
+    assert _compute_largest_factor(np.zeros(2), (-1.0, 1.0)) == np.inf
 
 
 def test_what_the_runs_so_far_did_wrongly_is_not_proposed_again(tmp_path):

@@ -125,9 +125,9 @@ def test_loads_that_were_there_can_be_had_again(servo):
 def test_commands_have_their_form_their_level_and_their_rate(servo):
     def goal(plan):
         run = servo.make_run(plan)
-        return run.scenario.times, run.scenario.inputs["goal"] - servo.rest["goal"]
+        return run.scenario.times, run.scenario.inputs["goal"] - servo.median_commands["goal"]
 
-    most = servo.largest["goal"]
+    most = servo.largest_commands["goal"]
     _, ramp = goal(RunPlan(("goal",), "ramps up and down", 2.0))
     assert np.abs(ramp).max() == pytest.approx(2.0 * most, rel=0.02)
     assert np.abs(np.diff(ramp)).max() == pytest.approx(8.0 * most / 199, rel=0.01)
