@@ -115,7 +115,9 @@ class CrossValidation:
         """
         if not np.isfinite(simulated[self.seen]).all():
             return HeldOutFit(np.full_like(simulated, np.nan), -np.inf, states)
-        penalised_likelihood = compute_penalised_likelihood(self.evaluator.observed, simulated, free_state_count)
+        penalised_likelihood = compute_penalised_likelihood(
+            self.evaluator.observed, simulated, free_state_count
+        )
         return HeldOutFit(simulated, penalised_likelihood, states, free_state_count)
 
     @cached_property

@@ -101,7 +101,7 @@ def test_each_figure_can_be_had_by_name(named):
         assert len(figure.axes) >= 2
     words = [text.get_text() for text in named.figure("where").texts]
     assert "Where the gap is" in words
-    bare = explanation_of(story("adequate", candidates=[], gap_locations=()))
+    bare = explanation_of(make_report("adequate", candidates=[], gap_locations=()))
     assert bare.figures == ("overview",)
 
 

@@ -83,7 +83,7 @@ def test_any_text_can_be_a_label():
 
 
 def test_what_is_not_there_is_not_drawn():
-    bare = story(
+    bare = make_report(
         "unidentifiable", candidates=[], gap_locations=(), profiles=(), held_out=None, heldout=None
     )
     assert list(render_figures(bare)) == NAMES[:1]
