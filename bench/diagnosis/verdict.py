@@ -269,7 +269,11 @@ class Verdict:
         if self.verdict != "partial" or not self.causes:
             return {}
         numbers = self.parameters.items()
-        return {k: n for k, n in numbers if n.at_bound is not None and not n.is_result}
+        return {
+            name: number
+            for name, number in numbers
+            if number.at_bound is not None and not number.is_result
+        }
 
     def to_document(self) -> JsonDocument:
         """Return the content of verdict.json."""

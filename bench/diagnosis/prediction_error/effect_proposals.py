@@ -143,7 +143,9 @@ class EffectProposals:
         """
         evaluator, place = self.filters.evaluator, get_joint_name(self.filters.evaluator, joint)
         assert isinstance(evaluator.simulator, RobotSimulator)
-        speed = max(float(np.abs(one.trajectory.v[:, joint]).max()) for one in followed.linear)
+        speed = max(
+            float(np.abs(proposal.trajectory.v[:, joint]).max()) for proposal in followed.linear
+        )
         typical = {
             f"drag.linear@{place}": FIRST_SHARE * float(followed.typical[joint]) / max(speed, 1e-9),
             f"inertia.armature@{place}": float(
@@ -160,7 +162,7 @@ class EffectProposals:
                 if not gain > 0.5 * self.filters.penalty(name):
                     change = typical.get(name, float(np.copysign(FIRST_SHARE, change)))
                 proposals.append((gain, name, np.array([change])))
-        proposals.sort(key=lambda one: -one[0])
+        proposals.sort(key=lambda proposal: -proposal[0])
         return [(name, c) for _, name, c in proposals]
 
     def compute_largest_gain_of_others(self, friction: str) -> float:

@@ -180,15 +180,15 @@ def try_one_more_effect(context: SearchContext, current: FilteredSet) -> list[Fi
         larger_sets.append(filters.follow_with_effects(start.theta, start.effects, 0))
         search_control.advance()
         search_control.check_not_stopped()
-    larger_sets.sort(key=lambda one: _compute_criterion(context, one))
+    larger_sets.sort(key=lambda larger_set: _compute_criterion(context, larger_set))
     # The coefficients of the best are improved before they are compared.
     compared = list[FilteredSet]()
-    for one in larger_sets[:MAX_IMPROVED_TRIALS]:
-        if compared and _is_settled(context, compared[0], one):
-            compared.append(one)
+    for larger_set in larger_sets[:MAX_IMPROVED_TRIALS]:
+        if compared and _is_settled(context, compared[0], larger_set):
+            compared.append(larger_set)
             continue
-        compared.append(filters.follow_with_effects(one.followed.theta, one.names))
-        compared.sort(key=lambda one: _compute_criterion(context, one))
+        compared.append(filters.follow_with_effects(larger_set.followed.theta, larger_set.names))
+        compared.sort(key=lambda larger_set: _compute_criterion(context, larger_set))
     return compared
 
 
@@ -213,7 +213,9 @@ def _select_nearly_as_likely(
         return ()
     error = LINEARISATION_ERROR * context.filters.compute_gain(larger_sets[0].followed)
     limit = _compute_criterion(context, larger_sets[0]) + COMPETING_MODEL_MARGIN + error
-    near_sets = [one for one in larger_sets if _compute_criterion(context, one) <= limit]
+    near_sets = [
+        larger_set for larger_set in larger_sets if _compute_criterion(context, larger_set) <= limit
+    ]
     return [*near_sets, *larger_sets[len(near_sets) : MAX_FIRST_EFFECTS]]
 
 

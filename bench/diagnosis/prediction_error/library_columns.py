@@ -172,16 +172,16 @@ class LibraryColumns:
         tangents = [_make_tangent_probes(evaluator, name, start.theta) for name in start.effects]
         columns = followed.columns([probe for effect_probes in tangents for probe in effect_probes])
         responses = followed.sensitivities(columns)
-        places, derivatives, first_column = list[int](), [], 0
+        indices, derivatives, first_column = list[int](), [], 0
         for name, (whole_change, *displaced) in zip(start.effects, tangents, strict=True):
             for k, probe in enumerate(displaced):
                 # A coefficient without a range has no derivative.
                 step = float(probe.coefficients[k] - whole_change.coefficients[k]) or np.inf
                 change = responses[..., first_column + 1 + k] - responses[..., first_column]
                 derivatives.append(change / step)
-            places += evaluator.get_coefficient_indices(name)
+            indices += evaluator.get_coefficient_indices(name)
             first_column += 1 + len(displaced)
-        return KnownJacobian(np.array(places, dtype=np.intp), np.stack(derivatives, axis=-1))
+        return KnownJacobian(np.array(indices, dtype=np.intp), np.stack(derivatives, axis=-1))
 
 
 def group_coefficients(
@@ -198,20 +198,20 @@ def group_coefficients(
         group: columns of the effect.
         solution: regression coefficients of these columns.
     """
-    own, effect = (
+    group_probes, effect = (
         [probes[i] for i in group.column_indices],
         evaluator.available_effects[group.effect],
     )
     if effect.probe_points():
-        sizes = np.array([probe.coefficients[probe.coefficient_index] for probe in own])
-        points = np.array([probe.coefficients for probe in own])
+        sizes = np.array([probe.coefficients[probe.coefficient_index] for probe in group_probes])
+        points = np.array([probe.coefficients for probe in group_probes])
         return clip_coefficients(evaluator, group.effect, effect.combine(points, solution / sizes))
-    c = own[0].coefficients.copy()
+    coefficients = group_probes[0].coefficients.copy()
     for column, value in zip(group.column_indices, solution, strict=True):
         # A fixed change is valid only at its own size.
         if not probes[column].is_single_size:
-            c[probes[column].coefficient_index] = value
-    return clip_coefficients(evaluator, group.effect, c)
+            coefficients[probes[column].coefficient_index] = value
+    return clip_coefficients(evaluator, group.effect, coefficients)
 
 
 def build_regression_about(
@@ -245,16 +245,18 @@ def _make_tangent_probes(
     The first shows what the effect changes as a whole; the differences of the others from it are
     the derivatives by the coefficients.
     """
-    c = theta[evaluator.coefficient_slices[name]]
-    probes = [CandidateDirection(name, 0, 0, c, can_be_negative=True, is_single_size=True)]
-    for place, (low, high) in enumerate(compute_coefficient_bounds(evaluator, name)):
-        displaced = c.copy()
-        size = max(abs(float(c[place])), RELATIVE_DIFFERENCE * (high - low))
+    coefficients = theta[evaluator.coefficient_slices[name]]
+    probes = [
+        CandidateDirection(name, 0, 0, coefficients, can_be_negative=True, is_single_size=True)
+    ]
+    for index, (low, high) in enumerate(compute_coefficient_bounds(evaluator, name)):
+        displaced = coefficients.copy()
+        size = max(abs(float(coefficients[index])), RELATIVE_DIFFERENCE * (high - low))
         step = RELATIVE_DIFFERENCE * size
-        displaced[place] += step if displaced[place] + step <= high else -step
+        displaced[index] += step if displaced[index] + step <= high else -step
         probes.append(
             CandidateDirection(
-                name, 1 + place, place, displaced, can_be_negative=True, is_single_size=True
+                name, 1 + index, index, displaced, can_be_negative=True, is_single_size=True
             )
         )
     return probes

@@ -92,15 +92,15 @@ class ModelFilters:
             theta[self.evaluator.base_indices[is_free]] = identified[is_free]
         return theta
 
-    def make_theta_with(self, name: str, c: Array) -> Array:
+    def make_theta_with(self, name: str, coefficients: Array) -> Array:
         """Return parameters (P,) with one effect.
 
         Args:
             name: name of the effect.
-            c: (k,) its coefficients.
+            coefficients: (k,) its coefficients.
         """
         theta = self.reference.copy()
-        theta[self.evaluator.coefficient_slices[name]] = c
+        theta[self.evaluator.coefficient_slices[name]] = coefficients
         return theta
 
     @property
@@ -246,8 +246,8 @@ class ModelFilters:
     def _search_soft_friction(self, name: str, sign: float) -> FitStart | None:
         """Search the force of the model that `find_soft_friction` returns."""
         joint = name.partition("@")[2]
-        numbers = {get_joint_name(self.evaluator, j): j for j in range(self.base.force.size)}
-        models = make_soft_friction_models(self.base, self.reference, numbers[joint], sign)
+        joint_indices = {get_joint_name(self.evaluator, j): j for j in range(self.base.force.size)}
+        models = make_soft_friction_models(self.base, self.reference, joint_indices[joint], sign)
         if not models:
             return None
         followed: dict[int, FollowedRuns] = {}

@@ -110,8 +110,8 @@ class Regression:
     def shows_nuisance(self, chosen: Sequence[DirectionGroup]) -> bool:
         """Return whether the data show the first column of `always`, in addition to a set."""
         with_it, parts = self._fit_groups([*chosen, self._nuisance])
-        rest = DirectionGroup("", self.always[1:], (False,) * (len(self.always) - 1))
-        without, _ = self._fit_groups([*chosen, rest])
+        others = DirectionGroup("", self.always[1:], (False,) * (len(self.always) - 1))
+        without, _ = self._fit_groups([*chosen, others])
         return (
             float(parts[-1][0]) > 0.5
             and self.compute_log_ratio(without, with_it) > MIN_VISIBLE_GAIN
@@ -140,11 +140,11 @@ class Regression:
         active = np.ones(columns.size, dtype=bool)
         solution = np.zeros(columns.size)
         while active.any():
-            own = columns[active]
-            normal, scale = _normalise_gram(gram, own)
-            solved = np.linalg.solve(normal, cross[own] / scale)
+            active_columns = columns[active]
+            normal, scale = _normalise_gram(gram, active_columns)
+            scaled_solution = np.linalg.solve(normal, cross[active_columns] / scale)
             solution[:] = 0.0
-            solution[active] = solved / scale
+            solution[active] = scaled_solution / scale
             negative = np.flatnonzero(active & positive & (solution < 0))
             if not negative.size:
                 break
@@ -170,7 +170,11 @@ class Regression:
         return float(self.count * np.log(before / after))
 
     def price(self, group: DirectionGroup) -> float:
-        """Return the minimum gain of an effect, the right side of (2)."""
+        """Return the minimum gain of an effect in twice the log-likelihood.
+
+        It is k log N + 2 log M for k coefficients, N samples and M candidate effects: the right
+        side of eq. (2) of the module docstring.
+        """
         coefficients = len(group.column_indices) * np.log(max(self.count, 2))
         return float(coefficients + 2.0 * np.log(max(len(self.effects), 2)))
 
@@ -190,20 +194,20 @@ class Regression:
             gram = gram - rows.T @ solved[:, :-1]
             cross = cross - rows.T @ solved[:, -1]
             rss, _ = self.solve(chosen)
-        aliased = np.diagonal(gram) <= COLLINEARITY_TOLERANCE * np.diagonal(self.gram)
-        held = set(self._list_contained_effects(chosen))
+        is_collinear = np.diagonal(gram) <= COLLINEARITY_TOLERANCE * np.diagonal(self.gram)
+        contained_effects = set(self._list_contained_effects(chosen))
         result = np.zeros(len(self.groups))
-        gram = np.where(aliased[:, None] | aliased[None], 0.0, gram)
-        cross = np.where(aliased, 0.0, cross)
+        gram = np.where(is_collinear[:, None] | is_collinear[None], 0.0, gram)
+        cross = np.where(is_collinear, 0.0, cross)
         for batch in self._batches:
             blocks = gram[batch.columns[:, :, None], batch.columns[:, None, :]]
-            own, _ = compute_explained_squares(
+            explained, _ = compute_explained_squares(
                 blocks, cross[batch.columns][..., None], batch.positive
             )
-            left = np.maximum(rss - own[:, 0], SMALLEST_RSS * self.total)
-            result[batch.group_indices] = self.count * np.log(rss / left)
+            remaining = np.maximum(rss - explained[:, 0], SMALLEST_RSS * self.total)
+            result[batch.group_indices] = self.count * np.log(rss / remaining)
         for i, group in enumerate(self.groups):
-            if group.effect in held:
+            if group.effect in contained_effects:
                 result[i] = 0.0
         return result
 
@@ -215,11 +219,14 @@ class Regression:
 
     def _list_contained_effects(self, chosen: Sequence[DirectionGroup]) -> list[str]:
         """Return the effects of a set, with all effects that they contain."""
-        held = [group.effect for group in chosen]
-        return held + [name for own in held for name in self.contains.get(own, ())]
+        effects = [group.effect for group in chosen]
+        return effects + [name for effect in effects for name in self.contains.get(effect, ())]
 
     def select(self, max_groups: int, begin: Sequence[DirectionGroup] = ()) -> list[DirectionGroup]:
-        """Select effects by forward and backward steps with (2).
+        """Select effects by forward and backward steps.
+
+        The effect with the largest gain above its price is added if it predicts left-out runs
+        better; then effects that no longer gain their price are removed.
 
         Args:
             max_groups: maximum number of effects.
@@ -259,35 +266,39 @@ class Regression:
 
     def _compute_left_out_rss(self, chosen: Sequence[DirectionGroup]) -> Array:
         """Return the residual sum of squares (R,) of each run, predicted from the other runs."""
-        found = []
+        residual_squares = []
         groups = [*chosen, self._nuisance]
         columns = list_columns(groups)
         for run, total in enumerate(self.totals):
             gram, cross = self.gram - self.grams[run], self.cross - self.crosses[run]
             _, parts = self._fit_groups(groups, gram, cross)
-            own = np.concatenate(parts) if parts else np.zeros(0)
+            coefficients = np.concatenate(parts) if parts else np.zeros(0)
             block = self.grams[run][np.ix_(columns, columns)]
-            found.append(total - 2.0 * own @ self.crosses[run][columns] + own @ block @ own)
-        return np.array(found)
+            residual_squares.append(
+                total
+                - 2.0 * coefficients @ self.crosses[run][columns]
+                + coefficients @ block @ coefficients
+            )
+        return np.array(residual_squares)
 
     def prune(self, chosen: Sequence[DirectionGroup]) -> list[DirectionGroup]:
         """Remove effects one by one whose gain is below their price, the right side of (2).
 
         The effect with the smallest net gain is removed first.
         """
-        left = list(chosen)
-        while left:
-            rss, _ = self.solve(left)
+        remaining = list(chosen)
+        while remaining:
+            rss, _ = self.solve(remaining)
             losses = []
-            for group in left:
-                rest = [other for other in left if other is not group]
-                without = self.solve(rest)[0]
-                losses.append(self.compute_log_ratio(without, rss) - self.price(group))
-            least = int(np.argmin(losses))
-            if losses[least] > 0:
+            for group in remaining:
+                others = [other for other in remaining if other is not group]
+                rss_without = self.solve(others)[0]
+                losses.append(self.compute_log_ratio(rss_without, rss) - self.price(group))
+            weakest = int(np.argmin(losses))
+            if losses[weakest] > 0:
                 break
-            del left[least]
-        return left
+            del remaining[weakest]
+        return remaining
 
 
 def _normalise_gram(gram: Array, columns: IndexArray) -> tuple[Array, Array]:
@@ -308,14 +319,14 @@ def list_columns(groups: Sequence[DirectionGroup]) -> IndexArray:
 
 def group_probes(probes: Sequence[CandidateDirection]) -> list[DirectionGroup]:
     """Group the columns of the probes of one effect at one grid point, which act together."""
-    places: dict[tuple[str, int], list[int]] = {}
+    columns_by_group: dict[tuple[str, int], list[int]] = {}
     for i, probe in enumerate(probes):
-        places.setdefault((probe.effect, probe.grid_point), []).append(i)
+        columns_by_group.setdefault((probe.effect, probe.grid_point), []).append(i)
     return [
         DirectionGroup(
             effect, tuple(columns), tuple(not probes[i].can_be_negative for i in columns)
         )
-        for (effect, _), columns in places.items()
+        for (effect, _), columns in columns_by_group.items()
     ]
 
 
