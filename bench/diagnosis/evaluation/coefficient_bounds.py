@@ -87,8 +87,8 @@ def get_bounds_by_index(
     """
     bounds: dict[int, tuple[float, float]] = {}
     for name in names:
-        places = evaluator.get_coefficient_indices(name)
-        bounds |= zip(places, compute_coefficient_bounds(evaluator, name), strict=True)
+        indices = evaluator.get_coefficient_indices(name)
+        bounds |= zip(indices, compute_coefficient_bounds(evaluator, name), strict=True)
     return bounds
 
 
@@ -100,8 +100,8 @@ def clip_coefficients(evaluator: RunEvaluator, name: str, c: Array) -> Array:
         name: name of the effect.
         c: (k,) its coefficients.
     """
-    limited: Array = np.clip(c, *np.array(compute_coefficient_bounds(evaluator, name)).T)
-    return limited
+    clipped: Array = np.clip(c, *np.array(compute_coefficient_bounds(evaluator, name)).T)
+    return clipped
 
 
 def is_unusual(value: float, low: float, high: float) -> bool:

@@ -133,14 +133,14 @@ class _ReferenceMotions:
         self, evaluator: RunEvaluator, noise: NoiseModel, kind: type[RobotSimulator]
     ) -> None:
         self._evaluator, self._kind, self._noise = evaluator, kind, noise
-        self._tracks = evaluator.prepared_runs[:CHECKED_RUN_COUNT]
-        self._seen: dict[IntegratorSettings, Array] = {}
+        self._checked_runs = evaluator.prepared_runs[:CHECKED_RUN_COUNT]
+        self._motions: dict[IntegratorSettings, Array] = {}
 
     def of(self, numerics: IntegratorSettings) -> Array:
-        """Return the motion (R, T, C), NaN after the end of a shorter run."""
-        if numerics not in self._seen:
-            self._seen[numerics] = self._simulate_with(numerics)
-        return self._seen[numerics]
+        """Return the motion (R, T, C) with a step and integrator, NaN after the end of a run."""
+        if numerics not in self._motions:
+            self._motions[numerics] = self._simulate_with(numerics)
+        return self._motions[numerics]
 
     def _simulate_with(self, numerics: IntegratorSettings) -> Array:
         """Simulate the first runs with a given time step and integrator, at nominal parameters.
@@ -150,14 +150,14 @@ class _ReferenceMotions:
         evaluator = self._evaluator
         kind = self._kind.with_integrator_settings(numerics)
         simulator = kind(evaluator.recording.constants, evaluator.channels)
-        count = len(self._tracks)
+        count = len(self._checked_runs)
         theta = np.tile(
             evaluator.get_nominal_theta()[: evaluator.system_parameter_count], (count, 1)
         )
         states = dict(
             zip(evaluator.state_names, evaluator.initial_state_guesses[:count].T, strict=True)
         )
-        scenarios = [track.scenario for track in self._tracks]
+        scenarios = [track.scenario for track in self._checked_runs]
         evaluator.simulation_count += count
         return simulator.simulate_batch(theta, scenarios, states)
 
@@ -175,15 +175,15 @@ class _ReferenceMotions:
             if self.compute_rms_difference(coarse, refined) < CONVERGENCE_TOLERANCE:
                 return refined
         for parts in (2, 5):
-            pairs = []
+            extrapolated = []
             for n in (parts, 2 * parts):
                 coarse, refined = (
                     self.of(IntegratorSettings(model_settings.timestep / k, STIFF_INTEGRATOR))
                     for k in (n, 2 * n)
                 )
-                pairs.append(2.0 * refined - coarse)  # (1)
-            if self.compute_rms_difference(*pairs) < CONVERGENCE_TOLERANCE:
-                return pairs[1]
+                extrapolated.append(2.0 * refined - coarse)  # (1)
+            if self.compute_rms_difference(*extrapolated) < CONVERGENCE_TOLERANCE:
+                return extrapolated[1]
         return None
 
     def compute_rms_difference(self, first: Array, second: Array) -> float:
@@ -191,7 +191,7 @@ class _ReferenceMotions:
 
         Only available samples of the recording are compared.
         """
-        observed_masks = [np.isfinite(track.observed) for track in self._tracks]
+        observed_masks = [np.isfinite(track.observed) for track in self._checked_runs]
         squares = []
         for run, observed_mask in enumerate(observed_masks):
             samples = slice(len(observed_mask))

@@ -59,7 +59,7 @@ def compute_joint_forces(robot: RobotModel, recording: Recording, run: Run) -> J
     model = robot.compiled
     states = np.stack(track_joints(run.times, _get_readings(robot, recording, run)))
     motion = np.transpose(states, (2, 1, 0))
-    still = np.stack([motion[0], np.zeros_like(motion[0]), np.zeros_like(motion[0])])
+    rest_motion = np.stack([motion[0], np.zeros_like(motion[0]), np.zeros_like(motion[0])])
     controls, activations = _compute_controls(robot, run)
     applied = np.zeros(motion.shape[1:])
     for column, joint in enumerate(robot.joints):
@@ -67,13 +67,13 @@ def compute_joint_forces(robot: RobotModel, recording: Recording, run: Run) -> J
         if name in run.inputs:
             applied[:, column] = _compute_mean_input(run, name)
     needed, driven = motion_forces(model, robot.joints, motion, controls, activations)
-    holding, _ = motion_forces(model, robot.joints, still, controls, activations)
+    holding, _ = motion_forces(model, robot.joints, rest_motion, controls, activations)
     names = [joint.name for joint in robot.joints]
-    for name, off in run.off.items():
-        of = robot.actuator(name).joint
-        if of is not None:
+    for name, off_mask in run.off.items():
+        joint_name = robot.actuator(name).joint
+        if joint_name is not None:
             # Where the drive is known to be off, both hypotheses agree.
-            driven[off, names.index(of)] = 0.0
+            driven[off_mask, names.index(joint_name)] = 0.0
     return JointForces(needed - applied, driven, holding - applied, motion[1])
 
 
@@ -119,10 +119,14 @@ def _compute_controls(robot: RobotModel, run: Run) -> tuple[Array, Array]:
         if name in run.inputs:
             controls[:, actuator.control] = _compute_mean_input(run, name)
     steps = np.diff(run.times)
-    for one in activation_filters(robot):
-        taken = one.clip_controls(controls[:, one.actuator.control])
-        now = float(taken[0])
-        for k, kept in enumerate(np.exp(-np.append(steps, 0.0) / max(one.seconds, 1e-9)).tolist()):
-            activations[k, one.address] = now
-            now = taken[k] + kept * (now - taken[k])
+    for activation_filter in activation_filters(robot):
+        clipped_controls = activation_filter.clip_controls(
+            controls[:, activation_filter.actuator.control]
+        )
+        activation = float(clipped_controls[0])
+        for k, decay in enumerate(
+            np.exp(-np.append(steps, 0.0) / max(activation_filter.seconds, 1e-9)).tolist()
+        ):
+            activations[k, activation_filter.address] = activation
+            activation = clipped_controls[k] + decay * (activation - clipped_controls[k])
     return controls, activations

@@ -66,33 +66,33 @@ def identify_base(
         evaluator.search_control.begin_stage("identifying the base parameters")
         return FollowedRuns.follow(evaluator, theta, noise, force=best.force)
 
-    places = evaluator.base_indices.tolist()
-    limits = {i: compute_range_around(evaluator, i) for i in places}
-    resisting = get_bounds_by_index(evaluator, _list_resisting_effects(followed))
-    found = []
-    for further in [resisting] if is_resisted else [{}, resisting]:
-        tried = maximise_innovation_likelihood(
-            followed, limits | further, MAX_BASE_ITERATIONS, follow
+    base_indices = evaluator.base_indices.tolist()
+    limits = {i: compute_range_around(evaluator, i) for i in base_indices}
+    resisting_bounds = get_bounds_by_index(evaluator, _list_resisting_effects(followed))
+    accepted = []
+    for further_bounds in [resisting_bounds] if is_resisted else [{}, resisting_bounds]:
+        fitted = maximise_innovation_likelihood(
+            followed, limits | further_bounds, MAX_BASE_ITERATIONS, follow
         )
-        ends = [bound_of(float(tried.theta[i]), *bounds) for i, bounds in limits.items()]
-        if tried.has_expected_innovations and not any(ends):
-            found.append(tried)
+        bounds_reached = [bound_of(float(fitted.theta[i]), *bounds) for i, bounds in limits.items()]
+        if fitted.has_expected_innovations and not any(bounds_reached):
+            accepted.append(fitted)
         # The base parameters alone leave no force missing, so friction is not needed.
-        if found and not tried.has_missing_force:
+        if accepted and not fitted.has_missing_force:
             break
-    best = max(found, key=lambda one: one.log_likelihood, default=followed)
+    best = max(accepted, key=lambda one: one.log_likelihood, default=followed)
     if best.log_likelihood - followed.log_likelihood < MIN_BASE_GAIN:
         return followed, {}
-    values = {i: float(best.theta[i]) for i in places}
-    wider = {}
+    values = {i: float(best.theta[i]) for i in base_indices}
+    wider_bounds = {}
     for i, value in values.items():
         low, high = evaluator.parameters[i].bounds
         if not low <= value <= high:
-            wider[evaluator.parameters[i].name] = compute_range_around(evaluator, i, value)
-    use_bounds(evaluator, wider)
+            wider_bounds[evaluator.parameters[i].name] = compute_range_around(evaluator, i, value)
+    use_bounds(evaluator, wider_bounds)
     theta = followed.theta.copy()
-    theta[places] = best.theta[places]
-    return follow(theta, best), wider
+    theta[base_indices] = best.theta[base_indices]
+    return follow(theta, best), wider_bounds
 
 
 def _list_resisting_effects(followed: FollowedRuns) -> list[str]:
@@ -127,18 +127,18 @@ def maximise_innovation_likelihood(
     for _ in range(iterations):
         if best.evaluator.search_control.has_abandoned_fits():
             break
-        step, expected = compute_likelihood_step(best, bounds)
-        if expected < min_gain:
+        step, predicted_gain = compute_likelihood_step(best, bounds)
+        if predicted_gain < min_gain:
             break
-        gained = 0.0
+        gain = 0.0
         for _ in range(1 + MAX_HALVINGS):
-            tried = follow(best.theta + step, best)
-            gained = tried.log_likelihood - best.log_likelihood
-            if gained > 0:
-                best = tried
+            trial = follow(best.theta + step, best)
+            gain = trial.log_likelihood - best.log_likelihood
+            if gain > 0:
+                best = trial
                 break
             step = step / 2.0
-        if gained < min_gain:
+        if gain < min_gain:
             break
     return best
 
@@ -156,16 +156,16 @@ def compute_likelihood_step(
         The change of all parameters (P,), and the predicted gain in log-likelihood for linear
         innovations.
     """
-    places = list(bounds)
-    rows, target = _compute_derivatives(followed, bounds), followed.filtered.whitened
-    gram, cross = rows.T @ rows, rows.T @ target.reshape(-1)
+    indices = list(bounds)
+    derivatives, target = _compute_derivatives(followed, bounds), followed.filtered.whitened
+    gram, cross = derivatives.T @ derivatives, derivatives.T @ target.reshape(-1)
     scale = np.maximum(np.sqrt(np.diagonal(gram)), 1e-300)
-    normal = gram / scale / scale[:, None] + RIDGE * np.eye(len(places))
-    values = followed.theta[places]
+    normal = gram / scale / scale[:, None] + RIDGE * np.eye(len(indices))
+    values = followed.theta[indices]
     low, high = np.array(list(bounds.values())).T
     change = np.clip(values + np.linalg.solve(normal, cross / scale) / scale, low, high) - values
     step = np.zeros_like(followed.theta)
-    step[places] = change
+    step[indices] = change
     return step, float(change @ cross - 0.5 * change @ gram @ change)
 
 
@@ -189,21 +189,21 @@ def _compute_derivatives(followed: FollowedRuns, bounds: Mapping[int, Bounds]) -
 
 
 def _compute_innovation_derivative(
-    followed: FollowedRuns, target: Array, place: int, bounds: Bounds
+    followed: FollowedRuns, target: Array, index: int, bounds: Bounds
 ) -> Array:
     """Return minus the derivative (R, T, C) of the whitened innovations by one parameter.
 
     It is a one-sided difference that stays within the bounds. `target` has the innovations at the
-    present parameters, and `place` is the index of the parameter in theta.
+    present parameters, and `index` is the index of the parameter in theta.
     """
     low, high = bounds
-    first, last = followed.evaluator.parameters[place].bounds
-    step = DIFFERENCE_SHARE * min(last - first, high - low)
+    plausible_low, plausible_high = followed.evaluator.parameters[index].bounds
+    step = DIFFERENCE_SHARE * min(plausible_high - plausible_low, high - low)
     # A parameter without a range has no derivative.
     if not step > 0:
         return np.zeros_like(target)
-    moved = followed.theta.copy()
-    moved[place] += step if moved[place] + step <= high else -step
-    change = target - followed.compute_whitened_innovations(moved)
-    derivative: Array = np.nan_to_num(change / (moved[place] - followed.theta[place]))
+    displaced_theta = followed.theta.copy()
+    displaced_theta[index] += step if displaced_theta[index] + step <= high else -step
+    change = target - followed.compute_whitened_innovations(displaced_theta)
+    derivative: Array = np.nan_to_num(change / (displaced_theta[index] - followed.theta[index]))
     return derivative

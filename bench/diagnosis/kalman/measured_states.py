@@ -49,8 +49,8 @@ def _compute_measured_states(
     Joints with fewer than three recorded positions are left out.
     """
     coordinates, rates = evaluator.simulator.system.coordinates, evaluator.simulator.system.rates
-    track = evaluator.prepared_runs[run]
-    times, observed = track.scenario.times, track.observed
+    run_data = evaluator.prepared_runs[run]
+    times, observed = run_data.scenario.times, run_data.observed
     joints, readings = [], []
     for joint, names in enumerate(zip(coordinates, rates, strict=True)):
         if names[0] not in evaluator.channels:
@@ -64,12 +64,15 @@ def _compute_measured_states(
         readings.append((np.stack(values, axis=1), np.array(noise)))
     if not joints:
         return {}
-    found = track_joints(times, readings)
-    return dict(zip(joints, found, strict=True))
+    states = track_joints(times, readings)
+    return dict(zip(joints, states, strict=True))
 
 
 def track_joints(times: Array, readings: list[tuple[Array, Array]]) -> list[Array]:
-    """Filter and smooth joints by (1), each with the likeliest jerk.
+    """Estimate position, velocity and acceleration of joints with a Kalman filter and smoother.
+
+    Each joint moves with a constant, unknown jerk between two samples, eq. (1) of the module
+    docstring; the size of the jerk with the largest likelihood is used.
 
     Args:
         times: (T,) times of the samples.
@@ -81,10 +84,10 @@ def track_joints(times: Array, readings: list[tuple[Array, Array]]) -> list[Arra
     """
     steps = np.diff(times)
     count, samples = len(readings), times.size
-    a = np.tile(np.eye(3), (samples - 1, 1, 1))
-    a[:, 0, 1] = a[:, 1, 2] = steps
-    a[:, 0, 2] = 0.5 * steps**2
-    g = np.stack([steps**3 / 6.0, 0.5 * steps**2, steps], axis=1)[:, :, None]
+    transitions = np.tile(np.eye(3), (samples - 1, 1, 1))
+    transitions[:, 0, 1] = transitions[:, 1, 2] = steps
+    transitions[:, 0, 2] = 0.5 * steps**2
+    jerk_responses = np.stack([steps**3 / 6.0, 0.5 * steps**2, steps], axis=1)[:, :, None]
     values = np.stack([v for v, _ in readings])
     # Use units of the noise, so that both channels have variance one.
     scale = np.stack([n for _, n in readings])[:, None]
@@ -97,33 +100,33 @@ def track_joints(times: Array, readings: list[tuple[Array, Array]]) -> list[Arra
     reading[..., 0, 0] = 1.0 / scale[..., 0]
     reading[..., 1, 1] = 1.0 / scale[..., 1]
     reading[~recorded] = 0.0
-    sizes = np.array(
+    position_ranges = np.array(
         [max(float(np.nanmax(v[:, 0]) - np.nanmin(v[:, 0])), n[0]) for v, n in readings]
     )
     # The prior of position, velocity and acceleration is so wide that the readings decide. Its
     # scale is the range per second, or per duration of the run if that is shorter.
     span = min(float(times[-1] - times[0]), 1.0)
-    prior = np.array([10.0, 10.0 / span, 100.0 / span**2]) * max(float(sizes.max()), 1e-9)
-    levels = JERKS.size
-    joints, nothing = np.arange(count), np.zeros((count, samples - 1, 3))
+    prior = np.array([10.0, 10.0 / span, 100.0 / span**2]) * max(float(position_ranges.max()), 1e-9)
+    jerk_count = JERKS.size
+    joints, zeros = np.arange(count), np.zeros((count, samples - 1, 3))
     runs = LinearRuns(
-        states=np.tile(a, (count, 1, 1, 1)),
-        defects=nothing,
-        forces=np.tile(g, (count, 1, 1, 1)),
+        states=np.tile(transitions, (count, 1, 1, 1)),
+        defects=zeros,
+        forces=np.tile(jerk_responses, (count, 1, 1, 1)),
         inputs=np.zeros((count, samples - 1, 3, 0)),
         readings=reading,
         residuals=residuals,
         recorded=recorded,
         prior=prior,
-        step_errors=nothing,
-        jumps=nothing,
-    ).subset(np.repeat(joints, levels))
-    force = (sizes[:, None] * JERKS / span**3).reshape(-1, 1)
+        step_errors=zeros,
+        jumps=zeros,
+    ).subset(np.repeat(joints, jerk_count))
+    force = (position_ranges[:, None] * JERKS / span**3).reshape(-1, 1)
     filtered = filter_runs(runs, force, np.ones(2))
-    likely = filtered.log_likelihood.reshape(count, levels)
-    chosen = np.argmax(likely, axis=1) + levels * joints
-    best = runs.subset(chosen)
-    smoothed = smooth_runs(best, filtered.subset(chosen), force[chosen])
-    found = smoothed.states
-    found[:, :, 0] += first[:, None]
-    return list(found)
+    log_likelihoods = filtered.log_likelihood.reshape(count, jerk_count)
+    likeliest = np.argmax(log_likelihoods, axis=1) + jerk_count * joints
+    best = runs.subset(likeliest)
+    smoothed = smooth_runs(best, filtered.subset(likeliest), force[likeliest])
+    states = smoothed.states
+    states[:, :, 0] += first[:, None]
+    return list(states)

@@ -90,7 +90,7 @@ def identify(followed: FollowedRuns, columns: Columns, first: Regression | None 
             followed, columns, selected, new_coefficients, numerics
         )
         likelihood = refitted.log_likelihood
-        done = result is not None and likelihood < result.log_likelihood + 1.0
+        has_converged = result is not None and likelihood < result.log_likelihood + 1.0
         if result is None or likelihood > result.log_likelihood:
             result = Selected(
                 selected,
@@ -101,7 +101,7 @@ def identify(followed: FollowedRuns, columns: Columns, first: Regression | None 
                 numerics,
                 regression.shows_nuisance(selected),
             )
-        if done:
+        if has_converged:
             break
         selected_before, coefficients = selected, new_coefficients
     assert result is not None
@@ -127,13 +127,13 @@ def regress(
         always: indices of probes that are part of every set, and are not candidates.
     """
     responses = followed.responses(columns)
-    number, _, _, count = responses.shape
+    run_count, _, _, count = responses.shape
     nuisance = followed.step_error_response()
     own_columns = list_columns(chosen)
     weights = np.concatenate([*coefficients, np.zeros(0)])
-    grams = np.zeros((number, count + 1, count + 1))
-    crosses, totals = np.zeros((number, count + 1)), np.zeros(number)
-    for run in range(number):
+    grams = np.zeros((run_count, count + 1, count + 1))
+    crosses, totals = np.zeros((run_count, count + 1)), np.zeros(run_count)
+    for run in range(run_count):
         target = followed.filtered.whitened[run].reshape(-1)
         rows = responses[run].reshape(target.size, count).astype(np.float64)
         rows = np.concatenate([rows, nuisance[run].reshape(-1, 1)], axis=1)
