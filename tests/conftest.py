@@ -11,11 +11,11 @@ from tests.data_dependence import find_data_dependent_names
 PLUGINS = Path(__file__).parent / "plugins"
 
 _SHARED = Path(__file__).parents[2] / "shared"
-_BESIDE = _SHARED / "data"
+_DATA_FOLDER = _SHARED / "data"
 """Default folder of the real recordings, on machines that have it."""
 
 # Child processes inherit these values; values set by the user have priority.
-for _name, _folder in (("SIMGAP_DATA", _BESIDE), ("SIMGAP_ROBOTS", _SHARED / "robots")):
+for _name, _folder in (("SIMGAP_DATA", _DATA_FOLDER), ("SIMGAP_ROBOTS", _SHARED / "robots")):
     if _folder.is_dir():
         os.environ.setdefault(_name, str(_folder))
 
@@ -67,7 +67,7 @@ def own_cache(tmp_path_factory, monkeypatch):
 @pytest.fixture(scope="session")
 def recordings():
     """Return the folder of real recordings; skip the test if it does not exist."""
-    folder = Path(os.environ.get("SIMGAP_DATA", _BESIDE))
+    folder = Path(os.environ.get("SIMGAP_DATA", _DATA_FOLDER))
     if not folder.is_dir():
         pytest.skip(f"no recordings: {folder} is missing (set SIMGAP_DATA)")
     return folder

@@ -30,7 +30,7 @@ from bench.benchmark.isolation.scratch_folders import remove_stale_folders
 from bench.benchmark.storage.journal_segments import read_finished_statuses
 from bench.benchmark.storage.result_folder import read_configuration
 from tests.conftest import PLUGINS
-from tests.local_cluster import cluster, said
+from tests.local_cluster import cluster, command_line
 from tests.sample_experiments import SPRING
 from tests.without_drawing import COMMAND
 
@@ -38,7 +38,7 @@ MEASURED = ["tuner_seconds", "simulator_seconds", "fit_seconds", "seconds"]
 TUNERS = {"random": {}, "cma_es": {}, "least_squares": {}, "regressor": {"seeds": 1}}
 
 SALT = "as secret as can be"
-SEALED = ("nursery", "keeper", "tuner")
+ISOLATION_PROCESSES = ("nursery", "keeper", "tuner")
 """Kinds of processes below a worker: fork server, supervisor, isolated tuner (each the parent of
 the next).
 """
@@ -76,7 +76,7 @@ def victims(process, what, running):
     if what == "cluster worker":
         return running.workers()
     if what == "worker":
-        return [c for c in runner.children() if "spawn_main" in said(c)]
+        return [c for c in runner.children() if "spawn_main" in command_line(c)]
     return below([runner, *(running.workers() if running else [])], what)
 
 
@@ -84,13 +84,15 @@ def below(top, what):
     """Return the fork servers, supervisors or tuners that descend from these processes."""
     everyone = [c for one in top for c in one.children(recursive=True)]
     # All three have the same command line, because the fork server forks the others.
-    alike = {c.pid: c for c in everyone if "bench.benchmark.isolation.fork_server" in said(c)}
-    return [c for c in alike.values() if SEALED[_depth(c, alike)] == what]
+    processes = {
+        c.pid: c for c in everyone if "bench.benchmark.isolation.fork_server" in command_line(c)
+    }
+    return [c for c in processes.values() if ISOLATION_PROCESSES[_depth(c, processes)] == what]
 
 
-def _depth(process, alike):
+def _depth(process, processes):
     depth = 0
-    while (process := alike.get(process.ppid())) is not None:
+    while (process := processes.get(process.ppid())) is not None:
         depth += 1
     return min(depth, 2)
 
@@ -111,7 +113,9 @@ def disturbed(folder, experiment, kills, rng, running, environment, isolation):
                 raise AssertionError(ended(process, folder))
             return hits
         before = read_finished_statuses(folder)
-        what = str(rng.choice(["runner", "cluster worker" if running else "worker", *SEALED]))
+        what = str(
+            rng.choice(["runner", "cluster worker" if running else "worker", *ISOLATION_PROCESSES])
+        )
         if not killed(process, what, running, rng):
             continue
         hits[what] += 1
@@ -151,7 +155,7 @@ def killed(process, what, running, rng):
     return False
 
 
-def refuse_remains(place, running):
+def check_nothing_left(place, running):
     """Wait up to 20 s, then raise if orphaned processes or abandoned folders remain."""
     until = time.monotonic() + 20.0
     while orphans(place, running) or deserted(place):
@@ -248,12 +252,12 @@ def chaos(folder, kills, seed, on_cluster, targets=60):
             folder_here = folder / f"round-{on_cluster:d}-{rounds}"
             hits += disturbed(folder_here, experiment, left, rng, running, environment, isolation)
             compare(folder_here, undisturbed)
-            refuse_remains(place, running)
+            check_nothing_left(place, running)
     # The next runner cleans up like this. The cluster itself was killed, on both sides of its
     # pipes.
     with patch("tempfile.tempdir", str(place)):
         remove_stale_folders()
-    refuse_remains(place, None)
+    check_nothing_left(place, None)
     return hits, rounds, len(pd.read_csv(undisturbed / "status.csv"))
 
 

@@ -46,7 +46,7 @@ class Cluster:
             c
             for nanny in self.nannies
             for c in psutil.Process(nanny.pid).children()
-            if "spawn_main" in said(c)
+            if "spawn_main" in command_line(c)
         ]
 
     def stop(self):
@@ -64,7 +64,7 @@ class Cluster:
             process.wait()
 
 
-def said(process):
+def command_line(process):
     try:
         return " ".join(process.cmdline())
     except psutil.Error:

@@ -12,7 +12,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("bench", "methods", "sims")
-ROOMS = {
+BENCH_PACKAGES = {
     "api", "benchmark", "bounce_shot", "cli", "conformance", "core", "datasets", "diagnosis",
     "diagnosis_benchmark", "experiments", "figures", "logs", "misspecification", "pages", "schemas",
     "studies",
@@ -58,7 +58,7 @@ def imports():
 
 def test_the_packages_of_the_harness_are_listed():
     there = {p.stem for p in (ROOT / "bench").iterdir() if p.suffix == ".py" or p.is_dir()}
-    assert there - {"__init__", "__pycache__"} == ROOMS
+    assert there - {"__init__", "__pycache__"} == BENCH_PACKAGES
 
 
 def test_imports_run_downwards_and_never_in_a_circle(imports):

@@ -42,7 +42,8 @@ def halves(errors, covered=COVERED):
 
 
 def rehearsed(problem, randomised, index):
-    """Draw a target from the training distribution, and its truth (dim,) in physical units."""
+    """Draw a target from the training distribution, and its true parameters (dim,) in physical
+    units."""
     rng = make_rng("randomised", problem.experiment.name, index)
     scenarios = problem.draw_scenarios(rng)
     low, high = problem.cube.training

@@ -30,7 +30,7 @@ from sims.systems.slider import SliderSystem
 from tests.bench.diagnosis.explained_samples import linear_fit
 from tests.simulation_arguments import simulation_spec, write
 
-USUAL = simulation_spec(
+DEFAULT_RECORDING = simulation_spec(
     # Record with the engine that explains, so that numerical errors do not grow with the length.
     "slider",
     effects=["friction.coulomb=0.3"],
@@ -122,7 +122,7 @@ def explained(samples=SAMPLES, candidates=None, runs=RUNS):
     try:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "data.csv"
-            write(replace(USUAL, runs=runs, seconds=samples / runs / 100.0), path)
+            write(replace(DEFAULT_RECORDING, runs=runs, seconds=samples / runs / 100.0), path)
             for _ in range(2 if samples < 10 * SAMPLES else 1):
                 begin = time.process_time()
                 explaining.explain(path)

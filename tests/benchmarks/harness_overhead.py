@@ -53,13 +53,13 @@ def bare(points, problem, scenario):
     return perf_counter() - started
 
 
-def harnessed(points, problem, sealed):
+def harnessed(points, problem, is_isolated):
     task = Task(
-        problem.cube.dim, sealed.start, sealed.fitting.observed, problem.scale,
+        problem.cube.dim, is_isolated.start, is_isolated.fitting.observed, problem.scale,
         problem.cube.training,
-        len(points), (len(sealed.fitting.observed),),
+        len(points), (len(is_isolated.fitting.observed),),
     )  # fmt: skip
-    evaluator = ProposalEvaluator(problem, sealed.fitting)
+    evaluator = ProposalEvaluator(problem, is_isolated.fitting)
     started = perf_counter()
     trace = drive_tuner(Drawing(points), task, evaluator, np.random.default_rng(0))
     seconds = perf_counter() - started

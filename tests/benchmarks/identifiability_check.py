@@ -4,9 +4,9 @@
 
 Problems are random: a pendulum, slider, servo or two-joint arm with some unknown numbers, and with
 random strengths of input and noise. For a number that the check calls identifiable, the interval
-must hold the truth in 90 to 98 of 100 problems. Otherwise three tuners fit the number for three
-robots that differ in this number only, and it counts as fixed if every estimate is within a tenth
-of its range.
+must contain the true value in 90 to 98 of 100 problems. Otherwise three tuners fit the number for
+three robots that differ in this number only, and it counts as fixed if every estimate is within a
+tenth of its range.
 """
 
 import argparse
@@ -71,7 +71,7 @@ class Problem:
             self.kind, channel, choices = SYSTEMS[self.system]
             self.channels, self.free = (channel,), choices[rng.integers(len(choices))]
         self.parameters = self.kind.system.parameters
-        self.truth = self.drawn(rng)
+        self.true_parameters = self.drawn(rng)
 
     def drawn(self, rng):
         """Draw values of parameters and of free constants, by name."""
@@ -84,17 +84,17 @@ class Problem:
             values[constant.name] = constant.value * share
         return values
 
-    def recording(self, truth):
+    def recording(self, true_parameters):
         """Return two runs with motion and noise."""
         rng = np.random.default_rng(self.seed)
         names = [p.name for p in self.parameters]
-        constants = {k: v for k, v in truth.items() if k not in names}
+        constants = {k: v for k, v in true_parameters.items() if k not in names}
         simulator = self.kind(constants, self.channels)
         runs = []
         for number in range(2):
             inputs = self.inputs(simulator, rng)
             begin = {next(iter(simulator.states)): self.strength * rng.uniform(-0.5, 0.5)}
-            theta = np.array([[truth[name] for name in names]])
+            theta = np.array([[true_parameters[name] for name in names]])
             seen = simulator.simulate(theta, Scenario(TIMES, begin, inputs))[0]
             seen = seen + self.noise * rng.standard_normal(seen.shape)
             channels = dict(zip(self.channels, seen.T, strict=True))
@@ -116,9 +116,9 @@ class Problem:
             given[name] = wave
         return given
 
-    def world(self, truth):
+    def world(self, true_parameters):
         """Return the evaluator of the recording, as in explain, and its noise model."""
-        recording = self.recording(truth)
+        recording = self.recording(true_parameters)
         free = () if self.system == "arm" else self.free
         engine = self.kind.default_engine if self.kind.own_engine else "batch"
         world = RunEvaluator(self.kind, recording, recording.runs, engine, (), free)
@@ -128,8 +128,9 @@ class Problem:
 
 
 def answered(problem, rng):
-    """Return (level, whether its interval holds the truth or it is fixed) of each free number."""
-    world, noise = problem.world(problem.truth)
+    """Return (level, whether its interval contains the true value or it is fixed) of each free
+    number."""
+    world, noise = problem.world(problem.true_parameters)
     fit = compute_central_jacobian(world, fit_base_model(world, noise).fit, noise)
     places = {world.parameters[i].name: i for i in world.base_indices}
     rows = []
@@ -137,9 +138,9 @@ def answered(problem, rng):
         if not number.free:
             continue
         place = places[number.name]
-        truth = problem.truth[number.name]
+        true_parameters = problem.true_parameters[number.name]
         if number.word == "identifiable" or number.word == "weak":
-            rows.append((number.word, abs(fit.theta[place] - truth) < number.half))
+            rows.append((number.word, abs(fit.theta[place] - true_parameters) < number.half))
         else:
             rows.append((number.word, is_fixed(problem, number, rng)))
     world.close()
@@ -151,12 +152,15 @@ def is_fixed(problem, number, rng):
     name, near = number.name, FIXED * (number.high - number.low)
     for value in range(VALUES):
         # Draw from the whole range: an insensitive number stays near its nominal value.
-        truth = {**problem.truth, name: float(rng.uniform(number.low, number.high))}
-        world, noise = problem.world(truth)
+        true_parameters = {
+            **problem.true_parameters,
+            name: float(rng.uniform(number.low, number.high)),
+        }
+        world, noise = problem.world(true_parameters)
         (place,) = (k for k, i in enumerate(world.base_indices) if world.parameters[i].name == name)
         for tuner in TUNERS:
             found = find_start_with_tuner(tuner, world, noise, value)[place]
-            if abs(found - truth[name]) > near:
+            if abs(found - true_parameters[name]) > near:
                 world.close()
                 return False
         world.close()

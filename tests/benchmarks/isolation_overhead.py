@@ -164,7 +164,7 @@ def steps(tuned):
     return 1e3 * np.diff(times)
 
 
-def said(rows):
+def print_medians(rows):
     """Print the median of each number over several rounds."""
     middle = {
         name: round(median([row[name] for row in rows]), 2) if not isinstance(value, str) else value
@@ -205,7 +205,7 @@ def main():
                 ]
     sandboxed_tuner.close_isolated_processes()
     for rows in zip(*rounds, strict=True):
-        said(rows)
+        print_medians(rows)
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ from tests.simulation_arguments import simulation_spec, write
 
 SLIDER = {"system": "slider", "observe": ["x"], "inputs": ["u=steps:2:0.5"]}
 LONG = {"runs": 3, "seconds": 8.0, "rate": 1000.0}
-MADE = {
+RECORDING_OPTIONS = {
     "clean": SLIDER | {"noise": ["x=0.002"], "seed": 1},
     "weak friction": SLIDER
     | {"noise": ["x=0.002"], "effects": ["friction.coulomb=0.004"], "seed": 2},
@@ -38,7 +38,7 @@ MADE = {
 }
 
 
-def asked(path, long):
+def explain_thinned(path, long):
     """Return processor seconds and the answer, if recordings are thinned from `long` samples."""
     usual = run_thinning.MIN_SAMPLES_TO_THIN
     run_thinning.MIN_SAMPLES_TO_THIN = long
@@ -56,8 +56,8 @@ def asked(path, long):
 
 def row(name, path):
     """Return a row of the table."""
-    whole, said = asked(path, np.inf)
-    few, also = asked(path, run_thinning.MIN_SAMPLES_TO_THIN)
+    whole, said = explain_thinned(path, np.inf)
+    few, also = explain_thinned(path, run_thinning.MIN_SAMPLES_TO_THIN)
     same = "the same" if also == said else also
     return f"| {name} | {whole:.1f} | {few:.1f} | {whole / few:.1f} | {said} | {same} |"
 
@@ -69,7 +69,7 @@ def main():
     print("| recording | all samples, s | fewer, s | ratio | verdict | with fewer |")
     print("|---|---|---|---|---|---|", flush=True)
     with tempfile.TemporaryDirectory() as folder:
-        for number, (name, wish) in enumerate(MADE.items()):
+        for number, (name, wish) in enumerate(RECORDING_OPTIONS.items()):
             path = Path(folder) / f"{number}.csv"
             write(simulation_spec(**wish, **LONG), path)
             # Run once before measuring, so that imports and tracing are not counted.

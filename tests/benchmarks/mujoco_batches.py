@@ -15,7 +15,7 @@ import numpy as np
 from sims.core.simulator import Scenario
 from sims.systems.pendulum import Pendulum
 
-LANES = (1, 16, 256)
+BATCH_SIZES = (1, 16, 256)
 STEPS = 1600
 STEP = 2.5e-3
 FRICTION = 0.01
@@ -29,14 +29,14 @@ Cost = tuple[float, float]
 """Processor and wall time per batch element, ms."""
 
 
-def native(lanes: int, threads: int = 1) -> Callable[[], None]:
+def native(batch_size: int, threads: int = 1) -> Callable[[], None]:
     """Return a function that runs MuJoCo alone, as the reference for costs.
 
     It uses `mujoco.batch.Batch` with dry friction by the joint's `frictionloss`, and reads no
     intermediate results.
 
     Args:
-        lanes: number of pendulums, each with its own initial angle.
+        batch_size: number of pendulums, each with its own initial angle.
         threads: threads of the batch.
 
     Returns:
@@ -52,8 +52,8 @@ def native(lanes: int, threads: int = 1) -> Callable[[], None]:
     pendulum_mujoco_world.load(model, 5e-3, constants)
     model.opt.timestep = STEP
     model.dof_frictionloss[:] = FRICTION
-    many = batch.Batch(model, lanes, threads)
-    angles = np.linspace(0.5, 2.5, lanes)
+    many = batch.Batch(model, batch_size, threads)
+    angles = np.linspace(0.5, 2.5, batch_size)
 
     def work() -> None:
         many.reset(stage=int(mujoco.mjtStage.mjSTAGE_NONE))
@@ -63,7 +63,7 @@ def native(lanes: int, threads: int = 1) -> Callable[[], None]:
     return work
 
 
-def ours(effects: tuple[str, ...], lanes: int, **settings: int) -> Callable[[], None]:
+def ours(effects: tuple[str, ...], batch_size: int, **settings: int) -> Callable[[], None]:
     """Return a function that runs the engine `mujoco` on many pendulums.
 
     Each effect has half of its largest coefficient.
@@ -72,16 +72,22 @@ def ours(effects: tuple[str, ...], lanes: int, **settings: int) -> Callable[[], 
     known = len(Pendulum.system.parameters)
     middle = [p.nominal for p in pendulum.parameters[:known]]
     middle += [0.5 * p.bounds[1] for p in pendulum.parameters[known:]]
-    theta = np.array(middle) * np.random.default_rng(1).uniform(0.95, 1.05, (lanes, len(middle)))
+    theta = np.array(middle) * np.random.default_rng(1).uniform(
+        0.95, 1.05, (batch_size, len(middle))
+    )
     run = Scenario(np.arange(401) / 100, {"q": 1.5})
-    return lambda: np.testing.assert_equal(pendulum.simulate(theta, run).shape[:2], (lanes, 401))
+    return lambda: np.testing.assert_equal(
+        pendulum.simulate(theta, run).shape[:2], (batch_size, 401)
+    )
 
 
-def once(work: Callable[[], None], lanes: int) -> Cost:
+def once(work: Callable[[], None], batch_size: int) -> Cost:
     """Return the cost per batch element."""
     processor, wall = process_time(), perf_counter()
     work()
-    return 1e3 * (process_time() - processor) / lanes, 1e3 * (perf_counter() - wall) / lanes
+    return 1e3 * (process_time() - processor) / batch_size, 1e3 * (
+        perf_counter() - wall
+    ) / batch_size
 
 
 def main() -> None:
@@ -89,11 +95,11 @@ def main() -> None:
     print("| pendulum | elements | engine `mujoco`, ms | `batch.Batch` itself, ms |")
     print("|---|---|---|---|")
     for name, effects in CASES.items():
-        for lanes in LANES:
-            variants = ours(effects, lanes), native(lanes)
-            costs = [[once(work, lanes) for work in variants] for _ in range(3)]
+        for batch_size in BATCH_SIZES:
+            variants = ours(effects, batch_size), native(batch_size)
+            costs = [[once(work, batch_size) for work in variants] for _ in range(3)]
             cells = [f"{cpu:.2f} ({wall:.2f})" for cpu, wall in np.min(costs, axis=0).tolist()]
-            print(f"| {name} | {lanes:,} | {' | '.join(cells)} |", flush=True)
+            print(f"| {name} | {batch_size:,} | {' | '.join(cells)} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -6,14 +6,16 @@ cannot distinguish are drawn by seed; the causes of a set are not all equivalent
 `find_equivalent_effects`. The proposed run is recorded once by the exam's own simulators, with the
 hidden cause and new noise, and everything is explained together. A set is
 
-* settled, if all remaining causes are equivalent in any data to the truth, or, according to the
+* settled, if all remaining causes are equivalent in any data to the true cause, or, according to
+the
   design, cannot be distinguished from it by any run of this kind; one of these causes remains,
-* split, if fewer causes remain than before, the truth among them, but more than in a settled set,
+* split, if fewer causes remain than before, the true cause among them, but more than in a settled
+set,
 * open, if no cause was excluded,
-* lost, if the truth is excluded, or explain gives another verdict.
+* lost, if the true cause is excluded, or explain gives another verdict.
 
 The prediction of the design is kept if no two remaining causes are predicted to be distinguishable,
-and the truth is not lost.
+and the true cause is not lost.
 """
 
 import argparse
@@ -71,7 +73,7 @@ def main(arguments):
     rows = []
     calls = [(asked[place], given.offset, given.longest) for place in order.tolist()]
     with multiprocessing.get_context("spawn").Pool(given.jobs) as pool:
-        for row in pool.imap(_asked, calls):
+        for row in pool.imap(_evaluate_question, calls):
             if row is None:
                 continue
             rows.append(row)
@@ -82,7 +84,7 @@ def main(arguments):
     _summarise(rows, given)
 
 
-def _asked(call):
+def _evaluate_question(call):
     """Return a row about a question; None if it leaves no set open that data could split."""
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
         os.environ[name] = "1"
@@ -140,7 +142,7 @@ def _row(question, item, known, proposed, found):
     answer = found.answer
     left = {name for cause in answer.causes for name in (cause.effect, *cause.alternatives)}
     (truth,) = item.effects
-    # Causes that the design cannot distinguish from the truth, and their equivalents.
+    # Causes that the design cannot distinguish from the true cause, and their equivalents.
     twins = next(set(group) for group in design.groups if truth in group)
     alike = {
         name for twin in twins for name in find_equivalent_effects(item.system, item.driven, twin)
@@ -172,7 +174,10 @@ def _row(question, item, known, proposed, found):
 def _summarise(rows, given):
     told = [row for row in rows if " | " in row["groups"]]
     rest = [row for row in rows if row not in told]
-    for name, some in (("said to be told", told), ("said to be told by no run", rest)):
+    for name, some in (
+        ("predicted distinguishable", told),
+        ("predicted distinguishable by no run", rest),
+    ):
         counts = collections.Counter(row["outcome"] for row in some)
         listed = ", ".join(f"{count} {outcome}" for outcome, count in sorted(counts.items()))
         kept = sum(row["kept"] for row in some)

@@ -36,7 +36,7 @@ def tested(system, runs):
     return ScoreTest(fit, found, seen, NoiseModel(np.full(seen.shape[2], SIGMA), np.zeros(1))), seen
 
 
-def chances(test, seen, memory, count):
+def compute_p_values(test, seen, memory, count):
     """Return p-values (2, count): with the bias of the fit removed, and without."""
     rng = np.random.default_rng(1)
     found = []
@@ -58,7 +58,7 @@ def main():
         for runs in RUNS:
             test, seen = tested(system, runs)
             for memory in MEMORIES:
-                now, before = chances(test, seen, memory, count)
+                now, before = compute_p_values(test, seen, memory, count)
                 shares = [
                     f"{(now < level).mean():.3f} ({(before < level).mean():.3f})"
                     for level in LEVELS

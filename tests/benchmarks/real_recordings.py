@@ -26,7 +26,7 @@ from sims.systems.pendulum import Pendulum
 DATA = Path(os.environ.get("SIMGAP_DATA", Path(__file__).parents[3] / "shared" / "data"))
 PUBLISHED = {
     "pendulum_free_swing/recording": "linear damping",
-    "servo_pendulum/recording": "friction that grows with the load, besides viscous friction",
+    "servo_pendulum/recording": "viscous friction, and friction that grows with the load",
     "servo_pendulum/thorough": "the same",
     "smartphone_fall/fall": "quadratic air drag, and an offset",
     "smartphone_fall/up_down": "quadratic air drag, and an offset that varies by run",

@@ -60,7 +60,7 @@ def main():
     words = table["error_ratio"].map("{:.2g}".format) + table["ahead"].map({True: " +", False: ""})
     table["shown"] = words + table["behind"].map({True: " BEHIND", False: ""})
     print(
-        f"median error of {options.tuner} over the rival's; + significantly ahead, BEHIND "
+        f"median error of {options.tuner} over that of the other; + significantly ahead, BEHIND "
         "significantly behind"
     )
     print(table.pivot(index=["range", "rival"], columns="simulations", values="shown").to_string())

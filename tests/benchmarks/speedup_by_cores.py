@@ -18,21 +18,21 @@ from bench.diagnosis.evaluation.worker_pool import ForkedWorkerPool
 from bench.diagnosis.explain import explain
 from tests.simulation_arguments import simulation_spec, write
 
-USUAL = {"runs": 4, "seconds": 4.0, "rate": 100.0, "engine": "mujoco"}
+DEFAULTS = {"runs": 4, "seconds": 4.0, "rate": 100.0, "engine": "mujoco"}
 PAIRS = {
     "pendulum": simulation_spec(
         "pendulum", effects=["drag.linear=6e-4", "friction.coulomb=2e-3"],
-        noise=["q=0.003", "qd=0.02"], **USUAL,
+        noise=["q=0.003", "qd=0.02"], **DEFAULTS,
     ),
     "slider": simulation_spec(
         "slider", effects=["drag.quadratic=0.4", "friction.coulomb=0.3"],
-        inputs=["u=chirp:3:0.3:2"], noise=["x=0.002", "v=0.01"], **USUAL,
+        inputs=["u=chirp:3:0.3:2"], noise=["x=0.002", "v=0.01"], **DEFAULTS,
     ),
     "servo": simulation_spec(
-        "servo", effects=["friction.coulomb=0.01", "input.delay=0.03"], noise=["0.002"], **USUAL
+        "servo", effects=["friction.coulomb=0.01", "input.delay=0.03"], noise=["0.002"], **DEFAULTS
     ),
     "ball": simulation_spec(
-        "ball", effects=["wind=3,0.004", "sensor.delay=0.03"], noise=["0.005"], **USUAL
+        "ball", effects=["wind=3,0.004", "sensor.delay=0.03"], noise=["0.005"], **DEFAULTS
     ),
 }  # fmt: skip
 
@@ -43,15 +43,17 @@ class Meter:
     def __init__(self):
         self.longest = self.all = 0.0
         self.rounds = 0
-        self.usual = ForkedWorkerPool._distribute
+        self.distribute = ForkedWorkerPool._distribute
 
     def __enter__(self):
         meter = self
 
-        def shared(crew, world, task, items):
+        def shared(worker_pool, world, task, items):
             spent = Counter()
             wrapped = [(task, *item) for item in items]
-            for number, (result, who, seconds) in meter.usual(crew, world, timed, wrapped):
+            for number, (result, who, seconds) in meter.distribute(
+                worker_pool, world, timed, wrapped
+            ):
                 spent[who] += seconds
                 yield number, result
             meter.rounds += 1
@@ -62,7 +64,7 @@ class Meter:
         return self
 
     def __exit__(self, *_):
-        ForkedWorkerPool._distribute = self.usual
+        ForkedWorkerPool._distribute = self.distribute
 
 
 def timed(world, task, *item):

@@ -23,7 +23,7 @@ from sims.systems.servo import Servo
 from sims.systems.slider import Slider
 from tests.benchmarks.mujoco_batches import native, once
 
-LANES = (1, 16, 256, 1024)
+BATCH_SIZES = (1, 16, 256, 1024)
 REPEATS = 4
 CASES = (
     (Pendulum, ()),
@@ -37,7 +37,7 @@ CASES = (
 )
 
 
-def work(cls, effects, lanes):
+def work(cls, effects, batch_size):
     """Return the simulator, parameter vectors and scenarios of a batch on four runs."""
     rng = np.random.default_rng(2)
     t = np.arange(400) / 100
@@ -51,8 +51,8 @@ def work(cls, effects, lanes):
         p.nominal if k < len(cls.system.parameters) else 0.3 * p.bounds[1]
         for k, p in enumerate(simulator.parameters)
     ]
-    theta = np.array(middle) * rng.uniform(0.95, 1.05, (lanes, len(middle)))
-    return simulator, theta, [runs[k % 4] for k in range(lanes)]
+    theta = np.array(middle) * rng.uniform(0.95, 1.05, (batch_size, len(middle)))
+    return simulator, theta, [runs[k % 4] for k in range(batch_size)]
 
 
 class Noted:
@@ -64,16 +64,16 @@ class Noted:
     def __getattr__(self, name):
         return getattr(self.engine, name)
 
-    def integrate(self, lanes):
+    def integrate(self, batch):
         started = process_time()
-        motion = self.engine.integrate(lanes)
+        motion = self.engine.integrate(batch)
         self.seconds += process_time() - started
         return motion
 
 
-def seconds(cls, effects, lanes, repeats=REPEATS):
+def seconds(cls, effects, batch_size, repeats=REPEATS):
     """Return processor seconds (2, 2): evaluated and traced, each for the engine and the call."""
-    simulator, theta, scenarios = work(cls, effects, lanes)
+    simulator, theta, scenarios = work(cls, effects, batch_size)
     simulator.engine = engine = Noted(simulator.engine)
     best = np.full((2, 2), np.inf)
     evaluated = mock.patch.object(compilability, "_get_tracer", return_value=None)
@@ -94,21 +94,22 @@ def table():
     yield "| system and effects | elements | evaluated, ms | traced | ratio | of the whole call |"
     yield "|---|---|---|---|---|---|"
     for cls, effects in CASES:
-        for lanes in LANES:
-            (old, old_call), (new, new_call) = seconds(cls, effects, lanes)
+        for batch_size in BATCH_SIZES:
+            (old, old_call), (new, new_call) = seconds(cls, effects, batch_size)
             name = " + ".join([cls.name, *(f"`{effect}`" for effect in effects)])
+            per_element = 1e3 / batch_size
             yield (
-                f"| {name} | {lanes:,} | {1e3 * old / lanes:.3f} | {1e3 * new / lanes:.4f}"
+                f"| {name} | {batch_size:,} | {per_element * old:.3f} | {per_element * new:.4f}"
                 f" | {old / new:.1f} | {old_call / new_call:.1f} |"
             )
 
 
 def yardsticks():
     """Yield the rows of MuJoCo's own stepping."""
-    for lanes in LANES:
-        work = native(lanes)
-        least = min(once(work, lanes)[0] for _ in range(REPEATS))
-        yield f"| MuJoCo itself: pendulum, dry friction | {lanes:,} | | {least:.2f} | | |"
+    for batch_size in BATCH_SIZES:
+        work = native(batch_size)
+        least = min(once(work, batch_size)[0] for _ in range(REPEATS))
+        yield f"| MuJoCo itself: pendulum, dry friction | {batch_size:,} | | {least:.2f} | | |"
 
 
 def main():

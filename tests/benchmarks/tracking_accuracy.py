@@ -2,9 +2,9 @@
 
 Errors are given by the distance of the camera and by the speed of the ball. Run with
 ``OMP_NUM_THREADS=1 python -m tests.benchmarks.tracking_accuracy --out DIR``; writes table.csv,
-drops.csv and a figure. The truth is the projection of the ball's centre through the camera model.
-Every drop has its own published camera, light, colours, noise and compression, and is read from a
-compressed video file.
+drops.csv and a figure. The reference is the projection of the ball's centre through the camera
+model. Every drop has its own published camera, light, colours, noise and compression, and is read
+from a compressed video file.
 """
 
 from __future__ import annotations
@@ -145,7 +145,7 @@ def draw(table, drops, folder, count):
     axes[0].set_ylabel("distance from the true centre [px]")
     axes[0].legend(frameon=False, fontsize=8)
     told = f"films of {count} frames, 100 × 100 px, compressed; dashed: 0.5 px"
-    figure.suptitle(f"Tracked ball against the renderer's truth; {told}", fontsize=10)
+    figure.suptitle(f"Tracked ball against the renderer's reference; {told}", fontsize=10)
     figure.savefig(folder / "accuracy.png", dpi=140)
     figure.savefig(folder / "accuracy.pdf", metadata={"CreationDate": None})
 

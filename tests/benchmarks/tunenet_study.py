@@ -1,5 +1,5 @@
-"""What limits the published TuneNet, step by step: ``python -m tests.benchmarks.tunenet_study
-[--out DIR]``.
+"""Study of what limits the published TuneNet, step by step: ``python -m
+tests.benchmarks.tunenet_study [--out DIR]``.
 
 On the published bouncing ball (`ball-drop`), the published network and training are changed one
 item at a time until they are this project's, and each item is then removed from this project's
@@ -52,7 +52,7 @@ class Variant(PairTuner):
     """
 
     name = "variant"
-    says: str = ""
+    description: str = ""
     built: PairNetworkDesign = OURS
     reads: FeatureConfig = WEIGHED
     spread: tuple[int, int] = (100, 8)
@@ -154,7 +154,7 @@ class Study:
     def train(self, variant, seed):
         begin = time.perf_counter()
         variant.train_on(
-            self.data(variant.spread, seed), make_rng("tunenet study", variant.says, seed)
+            self.data(variant.spread, seed), make_rng("tunenet study", variant.description, seed)
         )
         return time.perf_counter() - begin
 
@@ -212,8 +212,8 @@ def ablation(study):
     for variant in [*path(), *without()]:
         trained = [replace(variant, members=[]) for _ in range(SEEDS)]
         seconds = np.mean([study.train(tuner, seed) for seed, tuner in enumerate(trained)])
-        kept[variant.says] = trained[0]
-        rows += study.rows(variant.says, trained, seconds=seconds)
+        kept[variant.description] = trained[0]
+        rows += study.rows(variant.description, trained, seconds=seconds)
         print(*(f"{key} {value}" for key, value in rows[-1].items()), sep="  ", flush=True)
     return pd.DataFrame(rows), kept
 
@@ -223,7 +223,7 @@ def noisy(study, kept):
     both = Variant("tunenet, with a second network for noise", OURS, FeatureConfig(noise=0.01))
     study.train(both, 0)
     variants = [kept["published"], kept["+ Broyden's step = tunenet"], both]
-    names = ["published", "tunenet, trained without noise", both.says]
+    names = ["published", "tunenet, trained without noise", both.description]
     return pd.DataFrame(
         [r for n, v in zip(names, variants, strict=True) for r in study.rows(n, [v], noise=NOISE)]
     )
@@ -240,7 +240,7 @@ def ensemble(study):
     together = Variant(
         "mean of the members", members=[m.get_trained_network().clean for m in members]
     )
-    rows += study.rows(f"{together.says} ({MEMBERS})", [together])
+    rows += study.rows(f"{together.description} ({MEMBERS})", [together])
     spread = []
     for target in study.targets:
         side = target.blinded.fitting
@@ -275,7 +275,7 @@ def cost(study):
 
 
 def path_figure(table):
-    names = [v.says for v in path()]
+    names = [v.description for v in path()]
     figure, grid = make_panel_grid(1, 2, (10.0, 4.6), sharey=True)
     axes = grid[0]
     kinds = {"in": "Targets in the training range", "wide": "Targets anywhere"}

@@ -27,7 +27,7 @@ from sims.own_simulator import OwnSimulator
 from tests.conftest import PLUGINS
 
 
-class Sound(Tuner):
+class ValidTuner(Tuner):
     """Shrink a cloud of points around the best point."""
 
     def tune(self, task, rng):
@@ -39,56 +39,56 @@ class Sound(Tuner):
             width *= 0.9
 
 
-class OneDimensional(Sound):
+class OneDimensional(ValidTuner):
     def tune(self, task, rng):
         while True:
             yield np.array([float(np.asarray(task.start).item())])
 
 
-class ChokesOnSmallBudgets(Sound):
+class ChokesOnSmallBudgets(ValidTuner):
     def tune(self, task, rng):
         if task.budget < 5:
             raise ValueError("needs five")
         yield from super().tune(task, rng)
 
 
-class LeavesTheCube(Sound):
+class LeavesTheCube(ValidTuner):
     def tune(self, task, rng):
         yield Proposal(task.start, recommend=task.start + 2.0)
         yield from super().tune(task, rng)
 
 
-class NeedsAnOption(Sound):
+class NeedsAnOption(ValidTuner):
     def __init__(self, width):
         self.width = width
 
 
-class SortsWhatItIsShown(Sound):
+class SortsWhatItIsShown(ValidTuner):
     def tune(self, task, rng):
         while True:
             seen = yield rng.uniform(size=(3, task.dim))
             seen.losses.sort()
 
 
-class DependsOnItsProcess(Sound):
+class DependsOnItsProcess(ValidTuner):
     def tune(self, task, rng):
         while True:
             yield rng.uniform(size=(1, task.dim)) * (os.getpid() % 1000) / 1000
 
 
-class NoBetterThanChance(Sound):
+class NoBetterThanRandom(ValidTuner):
     def tune(self, task, rng):
         while True:
             yield rng.uniform(size=(1, task.dim))
 
 
-class DrawsGlobally(Sound):
+class DrawsGlobally(ValidTuner):
     def tune(self, task, rng):
         while True:
             yield np.random.uniform(size=(1, task.dim))  # noqa: NPY002
 
 
-class Remembers(Sound):
+class KeepsState(ValidTuner):
     def __init__(self):
         self.best = None
 
@@ -98,17 +98,17 @@ class Remembers(Sound):
             yield self.best
 
 
-class SeedsGlobally(Sound):
+class SeedsGlobally(ValidTuner):
     def tune(self, task, rng):
         random.seed(0)
         yield from super().tune(task, rng)
 
 
-class CallsItselfDeterministic(Sound):
+class CallsItselfDeterministic(ValidTuner):
     stochastic = False
 
 
-class ChokesOnFailures(Sound):
+class ChokesOnFailures(ValidTuner):
     def tune(self, task, rng):
         seen = yield task.start
         while True:
@@ -117,13 +117,13 @@ class ChokesOnFailures(Sound):
             )
 
 
-class NeverBetter(Sound):
+class NeverBetter(ValidTuner):
     def tune(self, task, rng):
         while True:
             yield Proposal(rng.uniform(size=(1, task.dim)), recommend=task.start)
 
 
-class ForgetsWhatItLearned(Sound):
+class ForgetsWhatItLearned(ValidTuner):
     learned = True
 
     def fit(self, simulator, rng, budget):
@@ -140,7 +140,7 @@ class ForgetsWhatItLearned(Sound):
             yield np.clip(task.start + self.weights["shift"], 0, 1)
 
 
-class HoldsAFunction(Sound):
+class HoldsAFunction(ValidTuner):
     def __init__(self):
         self.helper = lambda x: x
 
@@ -149,12 +149,12 @@ BROKEN_TUNERS = {
     "check_api_is_complete": NeedsAnOption,
     "check_arguments_are_not_changed": SortsWhatItIsShown,
     "check_same_run_in_other_processes": DependsOnItsProcess,
-    "check_beats_random_search": NoBetterThanChance,
+    "check_beats_random_search": NoBetterThanRandom,
     "check_runs_in_one_and_in_ten_dimensions": OneDimensional,
     "check_budget_is_exact": ChokesOnSmallBudgets,
     "check_proposals_stay_in_the_unit_cube": LeavesTheCube,
     "check_same_seed_gives_the_same_run": DrawsGlobally,
-    "check_runs_do_not_touch_each_other": Remembers,
+    "check_runs_do_not_touch_each_other": KeepsState,
     "check_global_random_state_is_left_alone": SeedsGlobally,
     "check_stochastic_is_declared": CallsItselfDeterministic,
     "check_failed_simulations_are_survived": ChokesOnFailures,
@@ -167,7 +167,7 @@ BROKEN_TUNERS = {
 
 @pytest.mark.parametrize("check", TUNER_CHECKS, ids=lambda check: check.__name__)
 def test_tuner_check_rejects_its_broken_subject_and_no_sound_one(check):
-    check(Sound)
+    check(ValidTuner)
     broken = BROKEN_TUNERS[check.__name__]
     if isinstance(broken, str):
         from bench.core.plugin_registries import load_plugins
@@ -183,13 +183,13 @@ def test_tuner_check_rejects_its_broken_subject_and_no_sound_one(check):
 
 
 def test_a_learned_tuner_without_storage_and_a_tune_that_does_not_yield_are_rejected():
-    class Unfinished(Sound):
+    class Unfinished(ValidTuner):
         learned = True
 
         def fit(self, simulator, rng, budget):
             pass
 
-    class Returns(Sound):
+    class Returns(ValidTuner):
         def tune(self, task, rng):
             return [task.start]
 
@@ -200,7 +200,7 @@ def test_a_learned_tuner_without_storage_and_a_tune_that_does_not_yield_are_reje
 
 
 def test_training_outside_the_training_range_or_beyond_the_budget_is_rejected():
-    class Greedy(Sound):
+    class Greedy(ValidTuner):
         learned = True
 
         def fit(self, simulator, rng, budget):
@@ -446,7 +446,7 @@ def test_simulator_check_rejects_its_broken_subject_and_no_sound_one(check):
 
 
 @pytest.mark.parametrize(
-    ("kind", "failing", "says"),
+    ("kind", "failing", "message"),
     [
         (NoSentence, "check_declaration_is_complete", "a sentence; found none"),
         (
@@ -497,7 +497,7 @@ def test_simulator_check_rejects_its_broken_subject_and_no_sound_one(check):
         ),
     ],
 )
-def test_one_cause_gives_one_failure(kind, failing, says, fresh_registries):
+def test_one_cause_gives_one_failure(kind, failing, message, fresh_registries):
     from bench.core.plugin_registries import simulators as registered
 
     registered.register(kind)
@@ -508,13 +508,13 @@ def test_one_cause_gives_one_failure(kind, failing, says, fresh_registries):
             if line and not line.startswith("not applicable"):
                 failed[check] = line
     assert [check.__name__ for check in failed] == [failing], failed
-    assert re.search(says, *failed.values())
+    assert re.search(message, *failed.values())
 
 
 def test_parametrized_tests_skip_what_means_nothing_without_a_check_that_failed():
-    made = {case.id: case.values[0] for case in parametrize(KeepsHeat).args[1]}
+    instance_count = {case.id: case.values[0] for case in parametrize(KeepsHeat).args[1]}
     ends = {}
-    for name, check in made.items():
+    for name, check in instance_count.items():
         try:
             check()
         except CheckError:
@@ -590,9 +590,9 @@ class Elsewhere(Breeze):
 
     @classmethod
     def misses(cls, system):
-        return "says no, and yes" if cls.asked else ""
+        return "says no, and yes" if cls.is_refusing else ""
 
-    asked = False
+    is_refusing = False
 
 
 def of_robot(moment):
@@ -629,11 +629,11 @@ class NeverOnAtAJoint(Breeze):
 
 class GrowsWithItsNumber(Breeze):
     name = "breeze.grows_with_its_number"
-    made = 0
+    instance_count = 0
 
     def __init__(self):
-        GrowsWithItsNumber.made += 1
-        self.number = GrowsWithItsNumber.made
+        GrowsWithItsNumber.instance_count += 1
+        self.number = GrowsWithItsNumber.instance_count
 
     def force(self, c, moment):
         return c[0] * (1.0 + self.number * of_robot(moment)) + 0.0 * moment.x
@@ -672,7 +672,7 @@ def test_effect_check_rejects_its_broken_subject_and_no_sound_one(
     if broken is Elsewhere:
         from sims.system_simulator import SystemSimulator
 
-        broken.asked = True
+        broken.is_refusing = True
         monkeypatch.setattr(
             SystemSimulator, "_effect", lambda self, name: effects.get_effect(name)()
         )

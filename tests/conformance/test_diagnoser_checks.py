@@ -17,7 +17,7 @@ class Right(Diagnoser):
         return "adequate"
 
 
-class SaysNothing(Right):
+class ReturnsNothing(Right):
     def diagnose(self, case):
         return None
 
@@ -77,12 +77,12 @@ class Stumbles(Right):
 class LearnsTexts(Right):
     learned = True
 
-    def train(self, lesson):
+    def train(self, task):
         return {"words": np.array(["drag"])}
 
 
 REJECTED = [
-    (checks.check_answers, SaysNothing, "found an answer: expected an Answer"),
+    (checks.check_answers, ReturnsNothing, "found an answer: expected an Answer"),
     (checks.check_answers, NamesNothing, "causes where something is named"),
     (checks.check_names_what_there_is, NamesTheWind, "names of case.library"),
     (checks.check_names_what_there_is, NamesTwice, "each effect once"),
@@ -95,10 +95,10 @@ REJECTED = [
 
 
 @pytest.mark.parametrize(
-    ("check", "kind", "says"), REJECTED, ids=lambda one: getattr(one, "__name__", "")
+    ("check", "kind", "message"), REJECTED, ids=lambda one: getattr(one, "__name__", "")
 )
-def test_each_check_rejects(check, kind, says):
-    with pytest.raises(CheckError, match=says):
+def test_each_check_rejects(check, kind, message):
+    with pytest.raises(CheckError, match=message):
         check(kind)
 
 

@@ -29,10 +29,10 @@ def test_tuner(name, check):
         with pytest.raises(CheckError):  # a check that passes is no longer a known failure
             check(kind)
         pytest.skip(f"known failure: {reason}")
-    made(check, kind)
+    run_check(check, kind)
 
 
-def made(check, kind):
+def run_check(check, kind):
     """Run a check, and skip the test if the check is not applicable."""
     if outcome := check(kind):
         pytest.skip(f"not applicable: {outcome.reason}")
@@ -41,13 +41,13 @@ def made(check, kind):
 @pytest.mark.parametrize("check", SIMULATOR_CHECKS, ids=lambda check: check.__name__)
 @pytest.mark.parametrize("name", simulators.names())
 def test_simulator(name, check):
-    made(check, subject(simulators, name))
+    run_check(check, subject(simulators, name))
 
 
 @pytest.mark.parametrize("check", EFFECT_CHECKS, ids=lambda check: check.__name__)
 @pytest.mark.parametrize("name", effects.list_names())
 def test_effect(name, check):
-    made(check, effects.get_effect(name))
+    run_check(check, effects.get_effect(name))
 
 
 @pytest.mark.parametrize("name", diagnosers.names())

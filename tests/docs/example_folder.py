@@ -92,24 +92,24 @@ class Stage:
         """Return a Markdown page in the form that the site generator expects."""
         names = iter(anchors(path))
         text = path.read_text(encoding="utf-8")
-        return outside_code(
+        return transform_prose(
             text,
             lambda part: with_anchors(spaced(self.linked(part, path)), names),
             code,
         )
 
-    def linked(self, text, path, beside=()):
+    def linked(self, text, path, siblings=()):
         """Replace the links of a page by addresses within the site.
 
         Args:
             text: Markdown without fenced blocks, or the text of a notebook.
             path: file of the page, to which its links are relative.
-            beside: names of files in the same output folder as the page.
+            siblings: names of files in the same output folder as the page.
         """
 
         def turned(link):
             name, _, anchor = link[2].partition("#")
-            if "://" in link[2] or not name or name in beside:
+            if "://" in link[2] or not name or name in siblings:
                 return link[0]
             target = (path.parent / name).resolve()
             self.show(target)
@@ -128,7 +128,7 @@ class Stage:
         return "\n".join(lines) + "\n"
 
 
-def outside_code(text, change, fenced: Callable[[re.Match[str]], str]):
+def transform_prose(text, change, fenced: Callable[[re.Match[str]], str]):
     """Apply `change` to the text between fenced blocks, and `fenced` to the blocks."""
     parts, end = [], 0
     for fence in FENCE.finditer(text):

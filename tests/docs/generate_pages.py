@@ -288,11 +288,11 @@ OF_JSON = {
 """Keys of JSON objects that differ from the names of the fields."""
 
 
-def json_keys(cls, says):
+def json_keys(cls, descriptions):
     """Return a table of a dataclass's fields as keys of a JSON object."""
     rows = [("key", "type", "what")]
     for field in dataclasses.fields(cls):
-        what = says[field.name].replace("``", "`").replace("None", "null").removesuffix(".")
+        what = descriptions[field.name].replace("``", "`").replace("None", "null").removesuffix(".")
         key = OF_JSON.get((cls.__name__, field.name), field.name)
         rows.append((f"`{key}`", of_json(hints(cls)[field.name]), what))
     return table(*rows)

@@ -85,7 +85,7 @@ def test_files_named_in_commands_exist(capsys):
 
 
 @pytest.mark.parametrize(
-    ("line", "said"),
+    ("line", "message"),
     [
         ("simgap train tunenet bal", "unknown simulator"),
         ("simgap train cma_es ball", "does not learn"),
@@ -94,8 +94,8 @@ def test_files_named_in_commands_exist(capsys):
         ("simgap download so10", "unknown data set"),
     ],
 )
-def test_a_command_with_a_missing_file_is_found(line, said, capsys):
-    assert said in named_wrongly(line.split()[1:])
+def test_a_command_with_a_missing_file_is_found(line, message, capsys):
+    assert message in named_wrongly(line.split()[1:])
 
 
 def test_pages_contain_commands():

@@ -51,13 +51,13 @@ OF_ROBOTS = {"extended.xml", "extended.urdf", "robot"}
 """Files and figures that only the explanation of a robot has."""
 
 
-def told(heading, below=PAGE):
+def list_documented_names(heading, below=PAGE):
     """Return the names in the first column of the first table below a heading."""
     return [name for row in tables(section(below, heading))[0][1:] for name in quoted(row[0])]
 
 
-def told_always(heading, below=PAGE):
-    """Return the names of `told` without optional keys."""
+def list_required_names(heading, below=PAGE):
+    """Return the names of `list_documented_names` without optional keys."""
     rows = tables(section(below, heading))[0][1:]
     return [
         name
@@ -103,18 +103,20 @@ def folder(tmp_path_factory, spring):
 @pytest.mark.slow
 def test_the_folder_holds_the_files_of_the_page(folder):
     files = {f"{f.name}/" if f.is_dir() else f.name for f in folder.iterdir()}
-    assert files == set(told("## compare"))
+    assert files == set(list_documented_names("## compare"))
 
 
 @pytest.mark.parametrize("name", TABLES)
 def test_every_column_of_a_table_is_on_the_page_in_this_order(folder, name):
-    names = written_out(told(f"### `{name}.csv`"), PARAMETER=PARAMETERS)
+    names = written_out(list_documented_names(f"### `{name}.csv`"), PARAMETER=PARAMETERS)
     assert columns(folder / f"{name}.csv") == names
 
 
 def test_every_column_of_the_runs_is_on_the_page(folder):
     runs = pd.read_parquet(folder / "runs.parquet")
-    names = written_out(told("### `runs.parquet`"), PARAMETER=PARAMETERS, CHANNEL=CHANNELS)
+    names = written_out(
+        list_documented_names("### `runs.parquet`"), PARAMETER=PARAMETERS, CHANNEL=CHANNELS
+    )
     assert set(names) - set(runs.columns) == {"param_abs_error"}  # for one parameter
     assert set(runs.columns) <= set(names)
     assert len(names) == len(set(names))
@@ -132,12 +134,12 @@ def test_every_metric_and_status_is_on_the_page(folder):
 
 def test_the_environment_is_described(folder):
     environment = json.loads((folder / "environment.json").read_text(encoding="utf-8"))
-    assert list(environment) == told("### `environment.json`")
+    assert list(environment) == list_documented_names("### `environment.json`")
 
 
 def test_every_figure_is_described(folder):
     figures = {path.stem for path in (folder / "figures").glob("*.png")}
-    names = set(told("### Figures of a comparison"))
+    names = set(list_documented_names("### Figures of a comparison"))
     assert figures <= names
     # Drawn only for targets from another simulator, beyond the training range, or with sloppy
     # directions.
@@ -150,21 +152,21 @@ def test_several_comparisons(folder, tmp_path, capsys):
     assert main(["plot", str(folder), str(folder), "--out", str(tmp_path / "all")]) == 0
     # The Nemenyi test needs five problems; two are enough for everything else.
     written = {path.name for path in (tmp_path / "all").iterdir() if path.is_file()}
-    assert written | {"nemenyi.csv"} == set(told("## plot of several comparisons"))
-    names = written_out(told("### `ranks.csv`"), TUNER=TUNERS)
+    assert written | {"nemenyi.csv"} == set(list_documented_names("## plot of several comparisons"))
+    names = written_out(list_documented_names("### `ranks.csv`"), TUNER=TUNERS)
     assert set(columns(tmp_path / "all" / "ranks.csv")) == set(names)
     assert {*PAIR_COLUMNS, "trusted"} == set(columns(tmp_path / "all" / "pairs.csv"))
-    assert {*BREAK_EVEN_COLUMNS, "trusted"} == set(told("### `break_even.csv`"))
+    assert {*BREAK_EVEN_COLUMNS, "trusted"} == set(list_documented_names("### `break_even.csv`"))
 
 
 def test_the_tables_of_the_bounce_shot():
-    assert told("### `table.csv` of shots") == [*SHOT_COLUMNS, "trusted"]
+    assert list_documented_names("### `table.csv` of shots") == [*SHOT_COLUMNS, "trusted"]
     experiment = load_experiment("bounce-shot")
     settings = read_shot_config(experiment)
     # A shot without a plan is not executed, but its row has all columns.
     nothing = vars(TunedModel("nominal", 0.5, {}, 0, 0.0, "no plan"))
     (row,) = build_shot_rows(draw_shots(experiment, settings)[0], settings, [nothing])
-    assert [*row, "seen", "trusted"] == told("### `shots.csv`")
+    assert [*row, "seen", "trusted"] == list_documented_names("### `shots.csv`")
 
 
 def test_the_losses_of_a_training(tmp_path, monkeypatch, spring, capsys):
@@ -173,7 +175,7 @@ def test_the_losses_of_a_training(tmp_path, monkeypatch, spring, capsys):
     (tmp_path / "ahead.toml").write_text(tomli_w.dumps(document), encoding="utf-8")
     of = ["small", "spring", "--experiment", "ahead.toml", "--plugin", SPRING_PLUGIN]
     assert main(["train", *of, "--seeds", "1", "--out", "out"]) == 0
-    assert columns(tmp_path / "out" / "loss.csv") == told("### `loss.csv`")
+    assert columns(tmp_path / "out" / "loss.csv") == list_documented_names("### `loss.csv`")
     assert [f.stem for f in (tmp_path / "out" / "figures").glob("*.png")] == ["loss"]
 
 
@@ -189,22 +191,24 @@ def explained(tmp_path_factory):
 
 
 def test_the_parameters_of_a_simulated_recording(explained):
-    assert list(read_toml(explained / "swing.truth.toml")) == told("### `NAME.truth.toml`")
+    assert list(read_toml(explained / "swing.truth.toml")) == list_documented_names(
+        "### `NAME.truth.toml`"
+    )
 
 
 def test_the_folder_of_an_explanation(explained):
     files = {f.name for f in (explained / "out").iterdir() if f.suffix not in (".png", ".pdf")}
     figures = {f.stem for f in (explained / "out").glob("*.png")}
-    assert files | figures | OF_ROBOTS == set(told("## explain"))
-    assert figures == set(told("### Figures of an explanation")) - OF_ROBOTS
+    assert files | figures | OF_ROBOTS == set(list_documented_names("## explain"))
+    assert figures == set(list_documented_names("### Figures of an explanation")) - OF_ROBOTS
     extended = read_toml(explained / "out" / "extended.toml")
-    assert set(extended) == set(told("### `extended.toml`"))
+    assert set(extended) == set(list_documented_names("### `extended.toml`"))
 
 
 def test_the_score(explained, capsys):
     model, recording = explained / "out" / "extended.toml", explained / "swing.csv"
     assert main(["score", str(model), str(recording), "--json"]) == 0
-    assert list(json.loads(capsys.readouterr().out)) == told("## score")
+    assert list(json.loads(capsys.readouterr().out)) == list_documented_names("## score")
 
 
 def test_the_camera_of_a_film(tmp_path):
@@ -213,15 +217,15 @@ def test_the_camera_of_a_film(tmp_path):
         format_camera_file(FilmDescription(PinholeCamera(0.0, 5.0, 2.0), 0.1)), encoding="utf-8"
     )
     keys = {f"{table}.{key}" for table, entries in read_toml(path).items() for key in entries}
-    assert keys == set(told("### `NAME.camera.toml`"))
+    assert keys == set(list_documented_names("### `NAME.camera.toml`"))
 
 
 def test_the_verdict(explained):
     page = text_of("reference/verdict.md")
     answer = json.loads((explained / "out" / "verdict.json").read_text(encoding="utf-8"))
-    assert list(answer) == told_always("## The keys", page)
+    assert list(answer) == list_required_names("## The keys", page)
     (inertia,) = answer["parameters"].values()
-    assert list(inertia) == told_always("## An estimate", page)
-    assert list(answer["causes"][0]) == told_always("## A cause", page)
-    assert list(answer["heldout"]) == told_always("## The gain on held-out runs", page)
-    assert list(answer["candidates"][0]) == told_always("## A candidate", page)
+    assert list(inertia) == list_required_names("## An estimate", page)
+    assert list(answer["causes"][0]) == list_required_names("## A cause", page)
+    assert list(answer["heldout"]) == list_required_names("## The gain on held-out runs", page)
+    assert list(answer["candidates"][0]) == list_required_names("## A candidate", page)

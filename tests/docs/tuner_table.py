@@ -119,17 +119,17 @@ def sections():
         by_module.setdefault(module, []).append((name, getattr(module, kind)))
     parts = []
     for module, tuners in by_module.items():
-        parts += ["## " + ", ".join(f"`{name}`" for name, _ in tuners), *told(module)]
+        parts += ["## " + ", ".join(f"`{name}`" for name, _ in tuners), *describe_module(module)]
         for name, kind in tuners:
             parts += described(name, kind, alone=len(tuners) == 1)
     parts += ["## What learned tuners and searches share"]
     for name in SHARED:
         module = importlib.import_module(f"methods.learning.{name}")
-        parts += [f"### `methods.learning.{name}`", *told(module)]
+        parts += [f"### `methods.learning.{name}`", *describe_module(module)]
     return parts
 
 
-def told(module):
+def describe_module(module):
     """Return a module's docstring as paragraphs and typeset equations, and a link to its file."""
     text = inspect.cleandoc(module.__doc__)
     file = "/".join(module.__name__.split(".")) + ".py"

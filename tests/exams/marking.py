@@ -63,7 +63,7 @@ class Mark:
         causes: named causes; alternatives are joined by "|", several causes by " + ".
         members: causes in the largest set that holds the hidden cause; 0 if there is none.
         classes: the same, with equivalent causes counted as one.
-        covered: by coefficient, whether the 95 % interval holds the truth; None for an open
+        covered: by coefficient, whether the 95 % interval contains the true value; None for an open
             interval.
         ratios: by other member of the set that holds the hidden cause, its error divided by
             that of the hidden cause, or sigmas of evidence against it; None if not comparable.

@@ -52,7 +52,7 @@ CLEAN, FOREIGN = system_case("clean"), system_case("foreign", patch=(1.0,))
 
 @pytest.mark.usefixtures("no_refit")
 @pytest.mark.parametrize(
-    ("case", "answer", "outcome", "few", "equivalent"),
+    ("case", "answer", "outcome", "in_small_set", "equivalent"),
     [
         (CLEAN, ADEQUATE, "right", True, True),
         (CLEAN, verdict("drag.linear"), "alarm", False, False),
@@ -83,9 +83,9 @@ CLEAN, FOREIGN = system_case("clean"), system_case("foreign", patch=(1.0,))
         (PAIR, verdict("wind", "backlash"), "wrong", False, False),
     ],
 )
-def test_outcomes_of_systems(case, answer, outcome, few, equivalent):
+def test_outcomes_of_systems(case, answer, outcome, in_small_set, equivalent):
     mark = marked_system(case, answer)
-    assert (mark.outcome, mark.few, mark.equivalent) == (outcome, few, equivalent)
+    assert (mark.outcome, mark.few, mark.equivalent) == (outcome, in_small_set, equivalent)
 
 
 @pytest.mark.parametrize(("sigmas", "is_fair"), [(3.9, True), (4.1, False)])

@@ -15,7 +15,7 @@ import numpy as np
 from methods.tuners.random_search import RandomSearch
 
 LEFT = "simgap-cheat-left"
-TRUTHS = {}
+TRUE_PARAMETERS = {}
 
 
 def forever():
@@ -34,10 +34,10 @@ def patch():
 
     def noting(self, kind, index):
         target = draw(self, kind, index)
-        TRUTHS[target.blinded.start.tobytes()] = self.cube.to_unit_cube(target.truth)
+        TRUE_PARAMETERS[target.blinded.start.tobytes()] = self.cube.to_unit_cube(target.truth)
         for folder in (Path.cwd(), Path("/tmp")):
             with contextlib.suppress(OSError):
-                (folder / LEFT).write_text(repr(TRUTHS))
+                (folder / LEFT).write_text(repr(TRUE_PARAMETERS))
         return target
 
     TuningProblem.draw_target = noting
@@ -48,12 +48,12 @@ with contextlib.suppress(Exception):
     patch()
 with contextlib.suppress(Exception):
     threading.Thread(target=forever, daemon=True).start()
-for way in (
+for start_process in (
     os.fork,
     lambda: subprocess.Popen([sys.executable, "-c", "import time; time.sleep(99)"]),
 ):
     with contextlib.suppress(OSError):
-        if way() == 0:
+        if start_process() == 0:
             forever()
 # Code that samples numbers or computes means in this process would get wrong results.
 np.random.seed(0)  # noqa: NPY002
@@ -70,6 +70,6 @@ class AtImport(RandomSearch):
     ends = "done"
 
     def tune(self, task, rng):
-        if task.start.tobytes() in TRUTHS:
-            yield TRUTHS[task.start.tobytes()]
+        if task.start.tobytes() in TRUE_PARAMETERS:
+            yield TRUE_PARAMETERS[task.start.tobytes()]
         return (yield from super().tune(task, rng))

@@ -20,10 +20,10 @@ from tests.without_drawing import COMMAND
 
 HERE = Path(__file__).parent
 SALT = "a secret of the tests"
-RIVALS = {"random": {"seeds": 12}, "nelder_mead": {}, "least_squares": {}}
+HONEST_TUNERS = {"random": {"seeds": 12}, "nelder_mead": {}, "least_squares": {}}
 """Honest tuners; the first one is the reference."""
 MEASURED = ["tuner_seconds", "simulator_seconds"]
-CHANCE = 1e-4
+MAX_P_VALUE = 1e-4
 """P-value limit for a gain; small enough for fifty attackers and fixed seeds."""
 SMALL = {
     **{key: value for key, value in SPRING.items() if key != "salt"},

@@ -62,7 +62,7 @@ class Between(RandomSearch):
             best = np.clip(np.frombuffer(heard.ljust(8 * task.dim, b"\0")[: 8 * task.dim]), 0, 1)
         for used in range(task.budget):
             if heard and used == task.budget - 1:
-                return f"heard {len(heard)} bytes"
+                return f"received {len(heard)} bytes"
             seen = yield (rng.uniform(size=task.dim) if used else np.nan_to_num(best))[None]
             if seen.losses[0] < lowest:
                 best, lowest = seen.proposals[0], seen.losses[0]
@@ -71,19 +71,19 @@ class Between(RandomSearch):
         return None
 
 
-REMEMBERED = {}
+STORED_TEXTS = {}
 
 
 class Globals(Between):
     name = "globals"
 
     def tell(self, key, text):
-        REMEMBERED[key] = text
+        STORED_TEXTS[key] = text
         sys.modules.setdefault("kept_" + key, key)
         vars(np)[key] = text
 
     def hear(self, key):
-        return REMEMBERED.get(key) or vars(np).get(key)
+        return STORED_TEXTS.get(key) or vars(np).get(key)
 
 
 class Environ(Between):

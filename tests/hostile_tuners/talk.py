@@ -43,56 +43,56 @@ class Talk(RandomSearch):
     ends = "crashed"
     waits = False  # for an answer: two messages may or may not be read together
 
-    def say(self, task):
+    def forge(self, task):
         """Return the bytes that are sent instead of the expected message."""
         return message(b"Z")
 
     def tune(self, task, rng):
         yield task.start[None]
         with contextlib.suppress(OSError):
-            write(self.say(task))
+            write(self.forge(task))
         if self.waits:
             time.sleep(1000)
         while True:
             yield rng.uniform(size=(1, task.dim))
 
 
-def asked(task, n=1, **head):
+def make_answer(task, n=1, **head):
     return message(b"A", np.full((n, task.dim), 0.5).tobytes(), **{"size": n, **head})
 
 
 class TooLong(Talk):
     name = "too-long"
 
-    def say(self, task):
-        return asked(task, length=1 << 60)
+    def forge(self, task):
+        return make_answer(task, length=1 << 60)
 
 
 class TooMany(Talk):
     name = "too-many"
 
-    def say(self, task):
-        return asked(task, size=(1 << 32) - 1)
+    def forge(self, task):
+        return make_answer(task, size=(1 << 32) - 1)
 
 
-class TooFew(Talk):
+class MissingPoints(Talk):
     name = "too-few"
 
-    def say(self, task):
-        return asked(task, 3, size=1)
+    def forge(self, task):
+        return make_answer(task, 3, size=1)
 
 
 class Nothing(Talk):
     name = "nothing"
 
-    def say(self, task):
+    def forge(self, task):
         return message(b"A")
 
 
 class HalfANumber(Talk):
     name = "half-a-number"
 
-    def say(self, task):
+    def forge(self, task):
         return message(b"A", b"123", size=1)
 
 
@@ -102,8 +102,8 @@ class HalfAMessage(Talk):
     name = "half-a-message"
     ends = "timeout"
 
-    def say(self, task):
-        os.write(writing(), asked(task)[:-5])
+    def forge(self, task):
+        os.write(writing(), make_answer(task)[:-5])
         time.sleep(1000)
 
 
@@ -112,8 +112,8 @@ class Slowly(HalfAMessage):
 
     name = "slowly"
 
-    def say(self, task):
-        for byte in asked(task, 1, length=8 * task.dim):
+    def forge(self, task):
+        for byte in make_answer(task, 1, length=8 * task.dim):
             os.write(writing(), bytes([byte]))
             time.sleep(0.2)
         return b""
@@ -124,11 +124,11 @@ class AllAtOnce(Talk):
 
     name = "all-at-once"
 
-    def say(self, task):
-        return asked(task) * task.budget
+    def forge(self, task):
+        return make_answer(task) * task.budget
 
 
-class BeforeItIsAsked(Talk):
+class EarlyAnswers(Talk):
     """Sends each answer while the harness simulates, so that no tuner time is measured."""
 
     name = "before-it-is-asked"
@@ -136,7 +136,7 @@ class BeforeItIsAsked(Talk):
     ends = ("crashed", "done")
 
     def tune(self, task, rng):
-        threading.Thread(target=self.hurry, args=(asked(task),)).start()
+        threading.Thread(target=self.hurry, args=(make_answer(task),)).start()
         while True:
             # The simulation takes long enough that the answer arrives before the request.
             yield np.repeat(task.start[None], 5, axis=0)
@@ -151,14 +151,14 @@ class BeforeItIsAsked(Talk):
 class Flags(Talk):
     name = "flags"
 
-    def say(self, task):
-        return asked(task, flags=255)
+    def forge(self, task):
+        return make_answer(task, flags=255)
 
 
 class Noise(Talk):
     name = "noise"
 
-    def say(self, task):
+    def forge(self, task):
         return np.random.default_rng(0).bytes(1 << 16)
 
 
@@ -169,7 +169,7 @@ class LongReason(Talk):
     ends = "converged"
     waits = True
 
-    def say(self, task):
+    def forge(self, task):
         return message(b"S", b"x" * (1 << 15))
 
 
@@ -180,14 +180,14 @@ class FoulReason(Talk):
     ends = "converged"
     waits = True
 
-    def say(self, task):
+    def forge(self, task):
         return message(b"S", b'\0\x1b[2J"\r\n",,\x85\xff\xfe=cmd()\xe2\x80\xa8;' * 3)
 
 
 class FoulCrash(Talk):
     name = "foul-crash"
 
-    def say(self, task):
+    def forge(self, task):
         return message(b"D", b'\0\x1b[2J"\r\r\n\n",,\x85\xff')
 
 
@@ -196,5 +196,5 @@ class Deep(Talk):
 
     name = "deep"
 
-    def say(self, task):
+    def forge(self, task):
         return message(b"W", b"[" * 60_000) + message(b"L", json.dumps(["x"] * 1000).encode())

@@ -11,7 +11,7 @@ from tests.hostile_tuners import attack_arena
 KINDS = {
     **attack_arena.cheats("force"),
     **attack_arena.cheats("talk"),
-    **attack_arena.cheats("school"),
+    **attack_arena.cheats("learning_attacks"),
 }
 NEEDED = {
     "shared-hog": "calls",
@@ -21,7 +21,7 @@ NEEDED = {
     "many-files": "disk",
 }
 """Isolation layer without which an attacker would harm the machine that runs the test."""
-RIVALS = {"random": {}, "nelder_mead": {}, "least_squares": {}}
+HONEST_TUNERS = {"random": {}, "nelder_mead": {}, "least_squares": {}}
 pytestmark = pytest.mark.slow
 
 
@@ -49,11 +49,11 @@ def met(tmp_path_factory, held):
         for name in KINDS
         if NEEDED.get(name, "process") in held
     }
-    plugins, salt = ("force", "talk", "school"), ("--salt", attack_arena.SALT)
+    plugins, salt = ("force", "talk", "learning_attacks"), ("--salt", attack_arena.SALT)
     small = {"targets": 1, "seeds": 1, "timeout": 1.5, "training_budget": 20}
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("SIMGAP_CACHE", str(cache))
-        made = attack_arena.compared(folder, {**RIVALS, **tuners}, plugins, salt, **small)
+        made = attack_arena.compared(folder, {**HONEST_TUNERS, **tuners}, plugins, salt, **small)
     assert made.returncode == 0, made.stderr
     return folder
 
@@ -67,7 +67,7 @@ def statuses(met):
 @pytest.mark.parametrize("name", sorted(KINDS))
 def test_its_run_ends_in_the_status_that_it_deserves(statuses, held, name):
     if NEEDED.get(name, "process") not in held:
-        pytest.skip(f"no seal here: {ISOLATION_LAYERS[NEEDED[name]]}")
+        pytest.skip(f"no isolation layer here: {ISOLATION_LAYERS[NEEDED[name]]}")
     ends, status = KINDS[name].ends, statuses.loc[name]
     assert status["status"] in ((ends,) if isinstance(ends, str) else ends), status["reason"]
     assert "got through" not in status["reason"]
@@ -77,11 +77,13 @@ def test_its_run_ends_in_the_status_that_it_deserves(statuses, held, name):
 
 def test_other_tuners_have_the_same_rows_with_and_without_them(met, tmp_path):
     made = attack_arena.compared(
-        tmp_path, RIVALS, (), ("--salt", attack_arena.SALT),
+        tmp_path, HONEST_TUNERS, (), ("--salt", attack_arena.SALT),
         targets=1, seeds=1, timeout=1.5, training_budget=20,
     )  # fmt: skip
     assert made.returncode == 0, made.stderr
-    among, apart = (attack_arena.rows(attack_arena.stored(f).runs, RIVALS) for f in (met, tmp_path))
+    among, apart = (
+        attack_arena.rows(attack_arena.stored(f).runs, HONEST_TUNERS) for f in (met, tmp_path)
+    )
     assert len(apart) > 30
     pd.testing.assert_frame_equal(among, apart, check_exact=True)
 
@@ -102,5 +104,5 @@ def test_who_pretends_to_be_the_world_is_not_let_in(tmp_path):
     assert made.returncode == 2
     assert made.stderr.splitlines()[-1].startswith("simgap: plugin ")
     assert "simulator 'spring'" in made.stderr
-    assert not (world / "world.imported").exists(), "its code has run where truths are"
+    assert not (world / "world.imported").exists(), "its code has run where true parameters are"
     assert not (world / "run").exists()

@@ -10,11 +10,11 @@ import pytest
 from bench.benchmark.isolation.isolation_layers import ISOLATION_LAYERS
 from tests.hostile_tuners import attack_arena
 
-NAMES = {name: sorted(attack_arena.cheats(name)) for name in ("truths", "between")}
-CHEATERS = [*NAMES["truths"], *NAMES["between"], "at-import"]
+NAMES = {name: sorted(attack_arena.cheats(name)) for name in ("parameter_attacks", "between")}
+CHEATERS = [*NAMES["parameter_attacks"], *NAMES["between"], "at-import"]
 TRUSTED = ["problem-of-worker", "drawn-again", "journal", "frames"]
 """Attacks that succeed in the harness's own process, one or more of each kind."""
-HEARD = ["globals", "environ", "stamps", "rights", "locks"]
+WORKING_CHANNELS = ["globals", "environ", "stamps", "rights", "locks"]
 """Channels that work without isolation; they leave traces only in the copy of their plugin file."""
 pytestmark = pytest.mark.slow
 
@@ -48,7 +48,7 @@ def server(tmp_path_factory):
 
 def entries(folder, server):
     places = [str(folder / "run"), str(folder)]
-    tuners = {name: {"options": {"places": places}} for name in NAMES["truths"]}
+    tuners = {name: {"options": {"places": places}} for name in NAMES["parameter_attacks"]}
     tuners["network"]["options"] |= server
     salt = str(folder)
     tuners |= {name: {"options": {"places": places, "salt": salt}} for name in NAMES["between"]}
@@ -62,8 +62,8 @@ def met(tmp_path_factory, server):
     One process serves all runs of a tuner, so objects it keeps still exist during its later runs.
     """
     folder = tmp_path_factory.mktemp("met")
-    tuners = {**attack_arena.RIVALS, **entries(folder, server[0])}
-    plugins, salt = ("truths", "between", "at_import"), ("--salt", attack_arena.SALT)
+    tuners = {**attack_arena.HONEST_TUNERS, **entries(folder, server[0])}
+    plugins, salt = ("parameter_attacks", "between", "at_import"), ("--salt", attack_arena.SALT)
     made = attack_arena.compared(folder, tuners, plugins, salt, isolation="tuner")
     assert made.returncode == 0, made.stderr
     return folder
@@ -74,7 +74,7 @@ def alone(tmp_path_factory):
     """Run the honest tuners alone."""
     folder = tmp_path_factory.mktemp("alone")
     made = attack_arena.compared(
-        folder, attack_arena.RIVALS, (), ("--salt", attack_arena.SALT), isolation="tuner"
+        folder, attack_arena.HONEST_TUNERS, (), ("--salt", attack_arena.SALT), isolation="tuner"
     )
     assert made.returncode == 0, made.stderr
     return folder
@@ -85,11 +85,11 @@ def trusted(tmp_path_factory):
     """Run some attackers without isolation and with a public salt."""
     folder = tmp_path_factory.mktemp("trusted")
     every = entries(folder, {})
-    tuners = {name: every[name] for name in (*TRUSTED, *HEARD)}
+    tuners = {name: every[name] for name in (*TRUSTED, *WORKING_CHANNELS)}
     options = ("--salt", "public", "--trust", "--jobs", "1")
     # The reference runs first, because the attackers read the journal.
-    tuners = {"random": attack_arena.RIVALS["random"], **tuners}
-    made = attack_arena.compared(folder, tuners, ("truths", "between"), options)
+    tuners = {"random": attack_arena.HONEST_TUNERS["random"], **tuners}
+    made = attack_arena.compared(folder, tuners, ("parameter_attacks", "between"), options)
     assert made.returncode == 0, made.stderr
     return folder
 
@@ -97,7 +97,7 @@ def trusted(tmp_path_factory):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CHEATERS)
 def test_a_cheater_is_no_better_than_random_search(met, name):
-    assert attack_arena.gains(met, name) > attack_arena.CHANCE
+    assert attack_arena.gains(met, name) > attack_arena.MAX_P_VALUE
 
 
 @pytest.mark.parametrize("name", TRUSTED)
@@ -113,13 +113,13 @@ def reasons(folder, name):
 @pytest.mark.parametrize("name", NAMES["between"])
 def test_no_run_hears_of_another(met, name):
     if name == "siblings" and "processes" not in held():
-        pytest.skip(f"no seal here: {ISOLATION_LAYERS['processes']}")
+        pytest.skip(f"no isolation layer here: {ISOLATION_LAYERS['processes']}")
     assert set(reasons(met, name)) == {"the tuner stopped"}
 
 
-@pytest.mark.parametrize("name", HEARD)
+@pytest.mark.parametrize("name", WORKING_CHANNELS)
 def test_a_trusted_run_hears_of_another(trusted, name):
-    assert any(reason.startswith("heard ") for reason in reasons(trusted, name))
+    assert any(reason.startswith("received ") for reason in reasons(trusted, name))
 
 
 def held():
@@ -134,7 +134,7 @@ def held():
 
 def test_every_run_of_a_cheater_has_a_status_and_its_rows(met):
     statuses = attack_arena.stored(met).statuses
-    cheaters = statuses[~statuses["tuner"].isin(attack_arena.RIVALS)]
+    cheaters = statuses[~statuses["tuner"].isin(attack_arena.HONEST_TUNERS)]
     assert set(cheaters["status"]) == {"done", "converged"}
     assert set(cheaters["tuner"]) == set(CHEATERS)
     assert (cheaters.groupby("tuner").size() == 9).all()
@@ -143,7 +143,8 @@ def test_every_run_of_a_cheater_has_a_status_and_its_rows(met):
 
 def test_other_tuners_have_the_same_rows_with_and_without_cheaters(met, alone):
     among, apart = (
-        attack_arena.rows(attack_arena.stored(f).runs, attack_arena.RIVALS) for f in (met, alone)
+        attack_arena.rows(attack_arena.stored(f).runs, attack_arena.HONEST_TUNERS)
+        for f in (met, alone)
     )
     assert len(apart) > 300
     pd.testing.assert_frame_equal(among, apart, check_exact=True)

@@ -24,52 +24,52 @@ BYTES = (b"\x00", b"\xff\xfe", b"'", b'"""', b"\n[", b"=", b"\xef\xbb\xbf", b"\r
          b"[[a]]", b"\xc3(", b"a=1\n", b"-", b"e9")  # fmt: skip
 
 
-def paths(document, way=()):
+def paths(document, prefix=()):
     """Yield every key of a nested document as a tuple of keys."""
     for key, value in document.items():
-        yield (*way, key)
+        yield (*prefix, key)
         if isinstance(value, dict):
-            yield from paths(value, (*way, key))
+            yield from paths(value, (*prefix, key))
 
 
 @st.composite
-def documents(draw, sound, more=(), junk=JUNK):
+def documents(draw, valid, more=(), junk=JUNK):
     """Draw a TOML document with one to three errors, as bytes.
 
     Args:
-        sound: valid document.
+        valid: valid document.
         more: further keys that an error may add.
         junk: strategy of wrong values.
     """
-    document = copy.deepcopy(sound)
+    document = copy.deepcopy(valid)
     for _ in range(draw(st.integers(1, 3))):
         ways = [*paths(document), *((name,) for name in more)]
-        way = draw(st.sampled_from(ways)) if ways else ("oops",)
+        key_path = draw(st.sampled_from(ways)) if ways else ("oops",)
         place = document
-        for key in way[:-1]:
+        for key in key_path[:-1]:
             place = place[key]
         act = draw(st.integers(0, 4))
         if act == 0:
-            place.pop(way[-1], None)
-        elif act == 1 and isinstance(place.get(way[-1]), dict):
-            place[way[-1]][draw(st.sampled_from(["x", "oops", "", "a b", "é"]))] = draw(junk)
-        elif act == 2 and isinstance(place.get(way[-1]), list) and place[way[-1]]:
-            held = list(place[way[-1]])
+            place.pop(key_path[-1], None)
+        elif act == 1 and isinstance(place.get(key_path[-1]), dict):
+            place[key_path[-1]][draw(st.sampled_from(["x", "oops", "", "a b", "é"]))] = draw(junk)
+        elif act == 2 and isinstance(place.get(key_path[-1]), list) and place[key_path[-1]]:
+            held = list(place[key_path[-1]])
             held[draw(st.integers(0, len(held) - 1))] = draw(junk)
-            place[way[-1]] = held
+            place[key_path[-1]] = held
         else:
-            place[way[-1]] = draw(junk)
+            place[key_path[-1]] = draw(junk)
     try:
         data = tomli_w.dumps(document).encode("utf-8", "replace")
     except (TypeError, ValueError):
         data = repr(document).encode("utf-8", "replace")
-    return draw(spoilt(data))
+    return draw(corrupted(data))
 
 
 @st.composite
-def spoilt(draw, data, chance=12):
+def corrupted(draw, data, rarity=12):
     """Draw the bytes, sometimes cut off or with inserted bytes."""
-    act, place = draw(st.integers(0, chance)), draw(st.integers(0, max(len(data), 1)))
+    act, place = draw(st.integers(0, rarity)), draw(st.integers(0, max(len(data), 1)))
     if act == 0:
         return data[:place]
     if act == 1:
@@ -87,14 +87,14 @@ CELLS = st.sampled_from([
 
 
 @st.composite
-def tables(draw, sound, cells=CELLS):
+def tables(draw, valid, cells=CELLS):
     """Draw a CSV file with one to three errors, as bytes.
 
     Args:
-        sound: valid file.
+        valid: valid file.
         cells: strategy of wrong cells.
     """
-    rows = [line.split(",") for line in sound.decode().splitlines()]
+    rows = [line.split(",") for line in valid.decode().splitlines()]
     for _ in range(draw(st.integers(1, 3))):
         act = draw(st.integers(0, 7))
         row = draw(st.integers(0, len(rows) - 1)) if rows else 0
@@ -111,20 +111,20 @@ def tables(draw, sound, cells=CELLS):
         elif rows:
             rows[row].append(draw(cells))
     text = "".join(",".join(row) + "\n" for row in rows)
-    return draw(spoilt(text.encode("utf-8", "replace")))
+    return draw(corrupted(text.encode("utf-8", "replace")))
 
 
 @st.composite
-def bytes_of(draw, sound):
+def bytes_of(draw, valid):
     """Draw a binary file that is damaged at one place."""
     act = draw(st.integers(0, 5))
-    place = draw(st.integers(0, max(len(sound) - 1, 0)))
+    place = draw(st.integers(0, max(len(valid) - 1, 0)))
     if act == 0:
-        return sound[:place]
+        return valid[:place]
     if act == 1:
         return draw(
             st.sampled_from([b"", b"{}", b"[]", b"null", b"PAR1PAR1", b"PK\x05\x06" + bytes(18)])
         )
     length = draw(st.sampled_from([1, 1, 2, 4, 30, 900]))
     byte = draw(st.integers(0, 255))
-    return sound[:place] + bytes([byte]) * length + sound[place + length :]
+    return valid[:place] + bytes([byte]) * length + valid[place + length :]

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from tests.bench.logs.log_writers import NEEDED, OPTIONS, WRITERS
 from tests.malformed_input import valid_input
-from tests.malformed_input.corruption import bytes_of, documents, spoilt, tables
+from tests.malformed_input.corruption import bytes_of, corrupted, documents, tables
 from tests.malformed_input.malformed_arguments import vectors
 from tests.malformed_input.malformed_case import Case
 
@@ -20,7 +20,7 @@ SHARES = {
     "weights": 300, "films": 100, "arguments": 1700, "logs": 2000,
 }  # fmt: skip
 """Number of cases of each kind; 12,000 in total."""
-PIECES = [
+PLUGIN_LINES = [
     "from methods.tuner import Tuner", "import numpy as np", "class Good(Tuner):\n    pass",
     "class Random(Tuner): pass", "class Odd(Tuner):\n    name = 3",
     "class Odd(Tuner):\n    name = 'a b'", "class Odd(Tuner):\n    name = ''",
@@ -58,7 +58,7 @@ def experiments(draw):
 
 @st.composite
 def plugins(draw):
-    pieces = draw(st.lists(st.sampled_from(PIECES), max_size=5))
+    pieces = draw(st.lists(st.sampled_from(PLUGIN_LINES), max_size=5))
     text = "\n".join(pieces).encode("utf-8", "surrogatepass")
     if draw(st.integers(0, 5)) == 0:
         text += draw(st.binary(max_size=30))
@@ -200,7 +200,7 @@ def films(draw, bases):
         if name == "drop.mp4":
             spoil = bytes_of(held)
         else:
-            spoil = st.one_of(documents(_parsed(held)), spoilt(held, 2))
+            spoil = st.one_of(documents(_parsed(held)), corrupted(held, 2))
         if draw(st.booleans()):
             files[f"run/{name}"] = draw(spoil)
     more = draw(st.sampled_from([[], ["--scale", "camera"], ["--scale", "fall"], ["--fps", "1e9"],
@@ -243,7 +243,7 @@ def strategies(bases):
     }
 
 
-def made(strategy, count, act):
+def run_cases(strategy, count, act):
     """Run `act` on a number of cases, which are the same in every run."""
     checks = [HealthCheck.too_slow, HealthCheck.data_too_large, HealthCheck.large_base_example]
     whole = settings(

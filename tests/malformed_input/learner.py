@@ -7,9 +7,9 @@ class Learner(Tuner):
     name = "learner"
     learned = True
 
-    def fit(self, practice, rng, budget):
-        points = practice.sample(rng, budget)
-        self.points, self.seen = points, practice.simulate(rng, points)
+    def fit(self, simulator, rng, budget):
+        points = simulator.sample(rng, budget)
+        self.points, self.seen = points, simulator.simulate(rng, points)
 
     def state(self):
         return {"points": self.points, "seen": self.seen}

@@ -44,7 +44,7 @@ class Case:
     numbers: bool = False
 
 
-class FaultError(AssertionError):
+class RuleViolationError(AssertionError):
     """A command has violated a rule."""
 
 
@@ -53,7 +53,7 @@ class _LateError(BaseException):
 
 
 @dataclass(frozen=True)
-class Heard:
+class CommandOutput:
     """Exit code and output of a command."""
 
     code: int
@@ -61,11 +61,11 @@ class Heard:
     err: str
 
 
-def tried(case: Case, place: Path, bases: Mapping[str, Path]) -> Heard:
+def tried(case: Case, place: Path, bases: Mapping[str, Path]) -> CommandOutput:
     """Run the command of a case in a new folder `place` and check the result.
 
     Raises:
-        FaultError: the command has violated a rule.
+        RuleViolationError: the command has violated a rule.
     """
     here = place / HERE
     here.mkdir(parents=True)
@@ -78,9 +78,9 @@ def tried(case: Case, place: Path, bases: Mapping[str, Path]) -> Heard:
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(data)
     before = _held(place)
-    heard = _heard(case.arguments, here)
-    _judge(case, heard, before, _held(place))
-    return heard
+    output = _run_command(case.arguments, here)
+    _check_case(case, output, before, _held(place))
+    return output
 
 
 def _held(place: Path) -> dict[str, bytes]:
@@ -96,7 +96,7 @@ def read(path: Path) -> bytes:
     return path.read_bytes() if path.is_file() else b""
 
 
-def _heard(arguments: tuple[str, ...], here: Path) -> Heard:
+def _run_command(arguments: tuple[str, ...], here: Path) -> CommandOutput:
     out, err = io.StringIO(), io.StringIO()
     before, parts = Path.cwd(), [registry.snapshot() for registry in REGISTRIES]
     os.chdir(here)
@@ -108,14 +108,14 @@ def _heard(arguments: tuple[str, ...], here: Path) -> Heard:
     except SystemExit as end:
         code = end.code
     except _LateError:
-        raise FaultError(f"took more than {LIMIT} s") from None
+        raise RuleViolationError(f"took more than {LIMIT} s") from None
     except BaseException:
-        raise FaultError(traceback.format_exc()) from None
+        raise RuleViolationError(traceback.format_exc()) from None
     finally:
         os.chdir(before)
         for registry, snapshot in zip(REGISTRIES, parts, strict=True):
             registry.restore(snapshot)
-    return Heard(code, out.getvalue(), err.getvalue())
+    return CommandOutput(code, out.getvalue(), err.getvalue())
 
 
 @contextmanager
@@ -132,15 +132,17 @@ def _limited():
         signal.signal(signal.SIGALRM, usual)
 
 
-def _judge(case: Case, heard: Heard, before: Mapping[str, bytes], after: Mapping[str, bytes]):
-    if heard.code not in _REFUSED or type(heard.code) is not int:
-        raise FaultError(f"exit code {heard.code!r}")
-    if "Traceback" in heard.err:
-        raise FaultError(f"said a traceback: {heard.err}")
-    if heard.code == 2:
-        _judge_refusal(heard)
+def _check_case(
+    case: Case, output: CommandOutput, before: Mapping[str, bytes], after: Mapping[str, bytes]
+):
+    if output.code not in _REFUSED or type(output.code) is not int:
+        raise RuleViolationError(f"exit code {output.code!r}")
+    if "Traceback" in output.err:
+        raise RuleViolationError(f"said a traceback: {output.err}")
+    if output.code == 2:
+        _check_refusal(output)
         if "--json" in case.arguments:
-            _judge_document(heard)
+            _check_error_document(output)
         owned = ()
     else:
         owned = tuple(f"{HERE}/{name}" for name in case.owns)
@@ -151,36 +153,36 @@ def _judge(case: Case, heard: Heard, before: Mapping[str, bytes], after: Mapping
     ]
     added = [name for name in after if name not in before]
     if changed:
-        raise FaultError(f"changed {changed[:3]}")
-    if heard.code == 2 and added:
-        raise FaultError(f"refused, and left {added[:3]}")
-    if heard.code == 0:
-        _judge_sense(case, heard)
+        raise RuleViolationError(f"changed {changed[:3]}")
+    if output.code == 2 and added:
+        raise RuleViolationError(f"refused, and left {added[:3]}")
+    if output.code == 0:
+        _check_printed_numbers(case, output)
 
 
-def _judge_refusal(heard: Heard) -> None:
-    lines = heard.err.splitlines()
-    if len(lines) != 1 or not heard.err.endswith("\n"):
-        raise FaultError(f"expected one line, found {heard.err!r:.2000}")
+def _check_refusal(output: CommandOutput) -> None:
+    lines = output.err.splitlines()
+    if len(lines) != 1 or not output.err.endswith("\n"):
+        raise RuleViolationError(f"expected one line, found {output.err!r:.2000}")
     if not lines[0].startswith("simgap: ") or not lines[0].isprintable():
-        raise FaultError(f"expected a printable line of simgap's, found {lines[0]!r:.2000}")
+        raise RuleViolationError(f"expected a printable line of simgap's, found {lines[0]!r:.2000}")
     if not 15 < len(lines[0]) < MAX_MESSAGE_LENGTH + 200:
-        raise FaultError(f"a line of {len(lines[0])} characters: {lines[0]:.2000}")
+        raise RuleViolationError(f"a line of {len(lines[0])} characters: {lines[0]:.2000}")
 
 
-def _judge_document(heard: Heard) -> None:
+def _check_error_document(output: CommandOutput) -> None:
     """Check that the JSON document on stdout has the message and exit code of stderr."""
-    error = json.loads(heard.out, parse_constant=_refuse)["error"]
-    if f"simgap: {error['message']}\n" != heard.err or error["code"] != heard.code:
-        raise FaultError(f"said {error} to a program, and {heard.err!r:.2000} to a person")
+    error = json.loads(output.out, parse_constant=_refuse)["error"]
+    if f"simgap: {error['message']}\n" != output.err or error["code"] != output.code:
+        raise RuleViolationError(f"said {error} to a program, and {output.err!r:.2000} to a person")
 
 
-def _judge_sense(case: Case, heard: Heard) -> None:
-    if case.numbers and (found := _NONSENSE.search(heard.out)):
-        raise FaultError(f"said {found.group()}: {heard.out:.1000}")
+def _check_printed_numbers(case: Case, output: CommandOutput) -> None:
+    if case.numbers and (found := _NONSENSE.search(output.out)):
+        raise RuleViolationError(f"said {found.group()}: {output.out:.1000}")
     if "--json" in case.arguments:
-        json.loads(heard.out, parse_constant=_refuse)
+        json.loads(output.out, parse_constant=_refuse)
 
 
 def _refuse(constant: str) -> None:
-    raise FaultError(f"said {constant} in JSON")
+    raise RuleViolationError(f"said {constant} in JSON")

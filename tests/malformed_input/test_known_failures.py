@@ -17,7 +17,7 @@ def listed(plugin):
     return Case(("list", "tuners", "--plugin", "plugin.py"), {"plugin.py": plugin.encode()})
 
 
-def said(*words):
+def make_case(*words):
     return Case(words, files_of_arguments(), "done")
 
 
@@ -27,13 +27,16 @@ CASES = {
     "a plugin that raises what is no Exception": (listed("raise BaseException('x')"), "x"),
     "an error that cannot say anything": (listed(SPEECHLESS), "E: without a message"),
     "a message that its escapes make long": (listed(f"raise ValueError('{WIDE}')"), "\\x04"),
-    "a name that no file can have": (said("status", "x" * 900), "DIR: expected a path"),
+    "a name that no file can have": (make_case("status", "x" * 900), "DIR: expected a path"),
     "a plugin's name that no file can have": (
-        said("list", "tuners", "--plugin", "x" * 900),
+        make_case("list", "tuners", "--plugin", "x" * 900),
         "--plugin: expected a path",
     ),
-    "arguments that turn the line around": (said("list", "systems", "\u202eabc"), "\\u202eabc"),
-    "an endless argument": (said("compare", "swing.toml", "9" * 5000), "unexpected argument"),
+    "arguments that turn the line around": (
+        make_case("list", "systems", "\u202eabc"),
+        "\\u202eabc",
+    ),
+    "an endless argument": (make_case("compare", "swing.toml", "9" * 5000), "unexpected argument"),
     "a world with parameters of its own": (
         compare({**valid_input.SWING, "world": {"effects": ["drag.linear"]}}),
         "fixed = { NAME",

@@ -1,6 +1,6 @@
 """Tests that malformed inputs give one clear line of error.
 
-CI runs a part of the 12,000 cases of `make malformed`. Some cases are valid by chance.
+CI runs a part of the 12,000 cases of `make malformed`. Some random cases are valid.
 """
 
 import shutil
@@ -8,7 +8,7 @@ from collections import Counter
 
 import pytest
 
-from tests.malformed_input.input_strategies import SHARES, made, share, strategies
+from tests.malformed_input.input_strategies import SHARES, run_cases, share, strategies
 from tests.malformed_input.malformed_case import tried
 from tests.malformed_input.shortened_work import environment, shortened
 
@@ -26,6 +26,6 @@ def test_malformed(ready, kind):
             shutil.rmtree(place, ignore_errors=True)
 
     with environment(place), shortened():
-        made(strategies(there)[kind], share(kind), act)
+        run_cases(strategies(there)[kind], share(kind), act)
     # Too few refusals would mean that the inputs are not malformed.
     assert codes[2] > 0.3 * sum(codes.values())

@@ -11,7 +11,7 @@ from tests.malformed_input.malformed_arguments import VECTORS
 from tests.malformed_input.malformed_case import Case, tried
 from tests.malformed_input.shortened_work import environment, shortened
 
-SOUND = [
+VALID_CASES = [
     *VECTORS,
     "compare worldly.toml --out out",
     "explain ball.csv --out out",
@@ -27,7 +27,9 @@ REFUSED = (
 )
 
 
-@pytest.mark.parametrize("line", [line for line in SOUND if not any(r in line for r in REFUSED)])
+@pytest.mark.parametrize(
+    "line", [line for line in VALID_CASES if not any(r in line for r in REFUSED)]
+)
 def test_undamaged_files_are_accepted(ready, tmp_path, line):
     _, there = ready
     files = {**files_of_arguments(), "worldly.toml": valid_input.toml(valid_input.WORLDLY)}

@@ -12,7 +12,7 @@ from bench.benchmark.runner.tuner_loop import Evaluate, RunTrace, drive_tuner
 from methods.tuner import Array, Task, Tuner
 
 Observe = Callable[[Array], Array]
-TRUTH = np.array([0.37, 0.62, 0.45, 0.71, 0.28])
+TRUE_PARAMETERS = np.array([0.37, 0.62, 0.45, 0.71, 0.28])
 START = np.array([0.6, 0.3, 0.7, 0.4, 0.55])
 
 
@@ -34,13 +34,17 @@ def logistic(theta: Array) -> Array:
 
 
 def problem(
-    observe: Observe, truth: Array, start: Array, budget: int, observed: Array | None = None
+    observe: Observe,
+    true_parameters: Array,
+    start: Array,
+    budget: int,
+    observed: Array | None = None,
 ) -> tuple[Task, Evaluate]:
     """Return a task with target `observe(truth)` or `observed`, and its simulator; arrays are
     read-only.
     """
-    target = observe(truth) if observed is None else observed
-    dim = len(truth)
+    target = observe(true_parameters) if observed is None else observed
+    dim = len(true_parameters)
     scale, training = np.ones(target.shape[1]), np.stack([np.zeros(dim), np.ones(dim)])
     arrays = [np.array(a, dtype=np.float64) for a in (start, target, scale, training)]
     for array in arrays:
@@ -56,17 +60,17 @@ def problem(
 
 def smooth(dim: int, budget: int) -> tuple[Task, Evaluate]:
     """Return the smooth problem with `dim` parameters."""
-    return problem(decays, TRUTH[:dim], START[:dim], budget)
+    return problem(decays, TRUE_PARAMETERS[:dim], START[:dim], budget)
 
 
 def errors(
-    tuner: Tuner, observe: Observe, truth: Array, start: Array, budget: int, seed: int = 0
+    tuner: Tuner, observe: Observe, true_parameters: Array, start: Array, budget: int, seed: int = 0
 ) -> Array:
     """Return the largest error of the recommendation after each simulation, (budget + 1,); after an
     early end the last error is repeated.
     """
-    task, evaluate = problem(observe, truth, start, budget)
-    found = np.abs(run(tuner, task, evaluate, seed).recommendations - truth).max(axis=1)
+    task, evaluate = problem(observe, true_parameters, start, budget)
+    found = np.abs(run(tuner, task, evaluate, seed).recommendations - true_parameters).max(axis=1)
     return np.append(found, np.full(budget + 1 - len(found), found[-1]))
 
 

@@ -11,7 +11,7 @@ from methods.tuners.entropy_search import EntropySearch
 from methods.tuners.least_squares import LeastSquares
 from methods.tuners.nelder_mead import NelderMead
 from methods.tuners.random_search import RandomSearch
-from tests.methods.analytic_problems import START, TRUTH, decays, problem, run, smooth
+from tests.methods.analytic_problems import START, TRUE_PARAMETERS, decays, problem, run, smooth
 
 TUNERS = [
     RandomSearch(),
@@ -27,9 +27,9 @@ each = pytest.mark.parametrize(
 )
 
 
-def beyond(truth: Array) -> Array:
+def beyond(true_parameters: Array) -> Array:
     """Return a target that no parameters reproduce, so that no tuner stops early."""
-    target = decays(truth)
+    target = decays(true_parameters)
     target[::2] += 0.1
     target[1::2] -= 0.1
     return target
@@ -40,7 +40,14 @@ def test_budget_is_exact(tuner: Tuner) -> None:
     for dim in (1, 3):
         for budget in range(1, 8):
             trace = run(
-                tuner, *problem(decays, TRUTH[:dim], START[:dim], budget, beyond(TRUTH[:dim]))
+                tuner,
+                *problem(
+                    decays,
+                    TRUE_PARAMETERS[:dim],
+                    START[:dim],
+                    budget,
+                    beyond(TRUE_PARAMETERS[:dim]),
+                ),
             )
             assert len(trace.losses) == budget
 
@@ -82,7 +89,9 @@ def test_same_seed_same_run_whatever_ran_before(tuner: Tuner) -> None:
 @each
 def test_another_seed_is_another_run_where_the_tuner_says_so(tuner: Tuner) -> None:
     budget = 14 if tuner.name in {"bayes", "entropy_search"} else 60
-    task, evaluate = problem(decays, TRUTH[:2], START[:2], budget, observed=beyond(TRUTH[:2]))
+    task, evaluate = problem(
+        decays, TRUE_PARAMETERS[:2], START[:2], budget, observed=beyond(TRUE_PARAMETERS[:2])
+    )
     first, other = run(tuner, task, evaluate, seed=3), run(tuner, task, evaluate, seed=4)
     assert (first.proposals == other.proposals).all() == (not tuner.stochastic)
 
@@ -112,7 +121,7 @@ def test_failed_simulations_are_survived(tuner: Tuner) -> None:
     def fails_above(theta: Array) -> Array:
         return decays(theta) if theta[0] < 0.5 else np.full((30, len(theta)), np.nan)
 
-    task, evaluate = problem(fails_above, TRUTH[:2], np.array([0.49995, 0.3]), 30)
+    task, evaluate = problem(fails_above, TRUE_PARAMETERS[:2], np.array([0.49995, 0.3]), 30)
     trace = run(tuner, task, evaluate)
     assert np.isnan(trace.losses).any()
     assert np.nanmin(trace.losses) < 0.1 * np.sqrt((task.observed**2).mean())
@@ -121,7 +130,11 @@ def test_failed_simulations_are_survived(tuner: Tuner) -> None:
 @each
 def test_nothing_but_failed_simulations_is_survived(tuner: Tuner) -> None:
     task, evaluate = problem(
-        lambda theta: np.full((30, 2), np.nan), TRUTH[:2], START[:2], 30, decays(TRUTH[:2])
+        lambda theta: np.full((30, 2), np.nan),
+        TRUE_PARAMETERS[:2],
+        START[:2],
+        30,
+        decays(TRUE_PARAMETERS[:2]),
     )
     trace = drive_tuner(tuner, task, evaluate, np.random.default_rng(0))
     assert trace.status == "diverged", trace.reason
@@ -133,7 +146,11 @@ def test_flat_loss_is_survived(tuner: Tuner) -> None:
     trace = run(
         tuner,
         *problem(
-            lambda theta: np.ones((9, 1)), TRUTH[:1], START[:1], 30, observed=np.zeros((9, 1))
+            lambda theta: np.ones((9, 1)),
+            TRUE_PARAMETERS[:1],
+            START[:1],
+            30,
+            observed=np.zeros((9, 1)),
         ),
     )
     assert len(trace.losses) >= 2
@@ -141,9 +158,9 @@ def test_flat_loss_is_survived(tuner: Tuner) -> None:
 
 @each
 def test_missing_samples_are_survived(tuner: Tuner) -> None:
-    observed = decays(TRUTH[:1])
+    observed = decays(TRUE_PARAMETERS[:1])
     observed[::3] = np.nan
-    task, evaluate = problem(decays, TRUTH[:1], START[:1], 30, observed)
+    task, evaluate = problem(decays, TRUE_PARAMETERS[:1], START[:1], 30, observed)
     assert run(tuner, task, evaluate).losses.min() < 0.005
 
 

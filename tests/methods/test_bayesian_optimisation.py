@@ -7,7 +7,7 @@ from skopt.learning.gaussian_process.kernels import ConstantKernel, Matern
 from skopt.utils import cook_estimator
 
 from methods.tuners.bayesian_optimisation import BayesianOptimisation
-from tests.methods.analytic_problems import START, TRUTH, decays, errors, run, smooth
+from tests.methods.analytic_problems import START, TRUE_PARAMETERS, decays, errors, run, smooth
 
 
 @pytest.mark.parametrize("dim", [1, 3])
@@ -48,7 +48,10 @@ def test_process_is_that_of_gp_minimize() -> None:
 
 @pytest.mark.parametrize(("dim", "budget", "error"), [(1, 20, 1.5e-2), (2, 35, 3e-2)])
 def test_converges(dim: int, budget: int, error: float) -> None:
-    assert errors(BayesianOptimisation(), decays, TRUTH[:dim], START[:dim], budget)[-1] < error
+    assert (
+        errors(BayesianOptimisation(), decays, TRUE_PARAMETERS[:dim], START[:dim], budget)[-1]
+        < error
+    )
 
 
 def test_first_points_fill_the_interval() -> None:

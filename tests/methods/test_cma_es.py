@@ -5,7 +5,15 @@ import pytest
 from bench.benchmark.runner.tuner_loop import drive_tuner
 from methods.tuner import Array, Evaluation
 from methods.tuners.cma_es import CMAES
-from tests.methods.analytic_problems import START, TRUTH, decays, errors, problem, run, smooth
+from tests.methods.analytic_problems import (
+    START,
+    TRUE_PARAMETERS,
+    decays,
+    errors,
+    problem,
+    run,
+    smooth,
+)
 
 PUBLISHED = CMAES(sigma=0.1, population=10, recommend="mean", evaluate_start=False)
 
@@ -40,7 +48,10 @@ def test_proposes_what_the_bare_library_proposes(population: int | None) -> None
 def test_converges(dim: int, budget: int, error: float) -> None:
     assert (
         np.median(
-            [errors(CMAES(), decays, TRUTH[:dim], START[:dim], budget, s)[-1] for s in range(5)]
+            [
+                errors(CMAES(), decays, TRUE_PARAMETERS[:dim], START[:dim], budget, s)[-1]
+                for s in range(5)
+            ]
         )
         < error
     )
@@ -66,7 +77,11 @@ def test_mean_is_recommended_after_each_generation() -> None:
 
 def test_restarts_with_twice_the_population_when_pycma_stops() -> None:
     flat = problem(
-        lambda theta: np.ones((3, 1)), TRUTH[:2], START[:2], 400, observed=np.zeros((3, 1))
+        lambda theta: np.ones((3, 1)),
+        TRUE_PARAMETERS[:2],
+        START[:2],
+        400,
+        observed=np.zeros((3, 1)),
     )
     steps = CMAES().tune(flat[0], np.random.default_rng(0))
     sizes, seen = [], next(steps)

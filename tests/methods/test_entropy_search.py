@@ -11,7 +11,7 @@ from methods.tuners.entropy_search import (
     generate_quasi_random_points,
     replace_failed_losses,
 )
-from tests.methods.analytic_problems import START, TRUTH, decays, errors, run, smooth
+from tests.methods.analytic_problems import START, TRUE_PARAMETERS, decays, errors, run, smooth
 
 PUBLISHED = EntropySearch(published=True)
 
@@ -23,15 +23,15 @@ def bowl(centre: float) -> GaussianProcess:
     )
 
 
-@pytest.mark.parametrize("truth", [0.0, 0.3, 0.77])
+@pytest.mark.parametrize("true_parameter", [0.0, 0.3, 0.77])
 def test_probability_of_the_minimiser_sums_to_one_and_peaks_at_the_minimum(
-    truth: float,
+    true_parameter: float,
 ) -> None:
     grid = np.linspace(0.0, 1.0, 101)[:, None]
-    p = compute_minimiser_probability(bowl(truth), grid, 400, np.random.default_rng(0))
+    p = compute_minimiser_probability(bowl(true_parameter), grid, 400, np.random.default_rng(0))
     assert p.sum() == pytest.approx(1.0, abs=1e-12)
     assert p.min() >= 0.0
-    assert abs(grid[p.argmax(), 0] - truth) <= 0.021
+    assert abs(grid[p.argmax(), 0] - true_parameter) <= 0.021
 
 
 def test_probability_is_even_where_nothing_is_known() -> None:
@@ -70,7 +70,8 @@ def test_published_search_knows_several_parameters() -> None:
 
 def test_default_is_not_bounded_by_a_grid() -> None:
     found = [
-        errors(EntropySearch(), decays, TRUTH[:1], START[:1], 30, seed)[-1] for seed in range(3)
+        errors(EntropySearch(), decays, TRUE_PARAMETERS[:1], START[:1], 30, seed)[-1]
+        for seed in range(3)
     ]
     assert max(found) < 2e-3
     assert run(EntropySearch(), *smooth(1, 30)).status == "done"
@@ -78,7 +79,8 @@ def test_default_is_not_bounded_by_a_grid() -> None:
 
 def test_converges_in_two_dimensions() -> None:
     found = [
-        errors(EntropySearch(), decays, TRUTH[:2], START[:2], 40, seed)[-1] for seed in range(3)
+        errors(EntropySearch(), decays, TRUE_PARAMETERS[:2], START[:2], 40, seed)[-1]
+        for seed in range(3)
     ]
     assert np.median(found) < 2e-2
 

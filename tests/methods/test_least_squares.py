@@ -7,7 +7,7 @@ from methods.tuner import Array, Evaluation
 from methods.tuners.least_squares import EvaluationHistory, LeastSquares, _Damping
 from tests.methods.analytic_problems import (
     START,
-    TRUTH,
+    TRUE_PARAMETERS,
     decays,
     errors,
     logistic,
@@ -21,12 +21,12 @@ PLAIN = LeastSquares(horizons=(1.0,), secant=False, difference=1e-6, damping=1e-
 
 @pytest.mark.parametrize(("dim", "budget"), [(1, 10), (2, 14), (5, 35)])
 def test_converges(dim: int, budget: int) -> None:
-    assert errors(LeastSquares(), decays, TRUTH[:dim], START[:dim], budget)[-1] < 1e-8
+    assert errors(LeastSquares(), decays, TRUE_PARAMETERS[:dim], START[:dim], budget)[-1] < 1e-8
 
 
 @pytest.mark.parametrize("dim", [1, 2, 5])
 def test_convergence_is_quadratic_with_finite_differences(dim: int) -> None:
-    found = errors(PLAIN, decays, TRUTH[:dim], START[:dim], 6 * (dim + 1))
+    found = errors(PLAIN, decays, TRUE_PARAMETERS[:dim], START[:dim], 6 * (dim + 1))
     newton = found[1 :: dim + 1]  # the start, then after each step
     assert 0.1 < newton[0] < 0.4
     for before, after in pairwise(newton[:4]):
@@ -36,22 +36,25 @@ def test_convergence_is_quadratic_with_finite_differences(dim: int) -> None:
 
 def test_secant_updates_need_fewer_simulations_than_finite_differences() -> None:
     def needed(tuner: LeastSquares) -> int:
-        return int((errors(tuner, decays, TRUTH, START, 100) > 1e-6).sum())
+        return int((errors(tuner, decays, TRUE_PARAMETERS, START, 100) > 1e-6).sum())
 
     secant = needed(LeastSquares(horizons=(1.0,)))
     assert secant < 30
     assert secant < needed(LeastSquares(horizons=(1.0,), secant=False))
 
 
-@pytest.mark.parametrize("truth", [0.2, 0.5, 0.83])
-def test_growing_horizon_fits_what_is_chaotic_in_the_long_run(truth: float) -> None:
+@pytest.mark.parametrize("true_parameter", [0.2, 0.5, 0.83])
+def test_growing_horizon_fits_what_is_chaotic_in_the_long_run(true_parameter: float) -> None:
     start = np.array([0.6])
-    assert errors(LeastSquares(), logistic, np.array([truth]), start, 25)[-1] < 1e-10
-    assert errors(LeastSquares(horizons=(1.0,)), logistic, np.array([truth]), start, 25)[-1] > 1e-3
+    assert errors(LeastSquares(), logistic, np.array([true_parameter]), start, 25)[-1] < 1e-10
+    assert (
+        errors(LeastSquares(horizons=(1.0,)), logistic, np.array([true_parameter]), start, 25)[-1]
+        > 1e-3
+    )
 
 
 def test_horizon_is_a_share_of_each_run() -> None:
-    task, _ = problem(decays, TRUTH[:2], START[:2], 5, observed=np.zeros((6, 2)))
+    task, _ = problem(decays, TRUE_PARAMETERS[:2], START[:2], 5, observed=np.zeros((6, 2)))
     task = type(task)(2, task.start, task.observed, task.scale, task.training, 5, (4, 2))
     assert (
         EvaluationHistory(task, 0.0).select_samples(0.5).tolist()
@@ -61,7 +64,7 @@ def test_horizon_is_a_share_of_each_run() -> None:
 
 
 def test_finite_differences_are_one_batch_and_step_inward_at_the_border() -> None:
-    task, evaluate = problem(decays, TRUTH[:3], np.array([1.0, 0.5, 0.0]), 20)
+    task, evaluate = problem(decays, TRUE_PARAMETERS[:3], np.array([1.0, 0.5, 0.0]), 20)
     steps = LeastSquares(difference=0.1).tune(task, np.random.default_rng(0))
     first = np.asarray(next(steps))
     moved = np.asarray(steps.send(Evaluation(first, *evaluate(first))))
@@ -89,8 +92,11 @@ def test_parameters_that_only_act_together_are_survived() -> None:
 
 
 def test_parameter_without_effect_stays_where_it_is() -> None:
-    trace = run(LeastSquares(), *problem(lambda theta: decays(theta[:1]), TRUTH[:2], START[:2], 30))
-    assert trace.recommendations[-1] == pytest.approx([TRUTH[0], START[1]], abs=1e-8)
+    trace = run(
+        LeastSquares(),
+        *problem(lambda theta: decays(theta[:1]), TRUE_PARAMETERS[:2], START[:2], 30),
+    )
+    assert trace.recommendations[-1] == pytest.approx([TRUE_PARAMETERS[0], START[1]], abs=1e-8)
 
 
 def test_new_start_leaves_a_plateau() -> None:
@@ -111,10 +117,10 @@ def test_new_start_leaves_a_local_minimum() -> None:
             [[(x - 0.8) * (1.0 + 4.0 * (x - 0.3) ** 2)], [1.5 * np.sin(6.0 * (x - 0.8))]]
         )
 
-    truth, start = np.array([0.8]), np.array([0.05])
+    true_parameter, start = np.array([0.8]), np.array([0.05])
     alone = LeastSquares(restart=False, horizons=(1.0,))
-    assert errors(alone, two_valleys, truth, start, 40)[-1] > 0.1
-    assert errors(LeastSquares(horizons=(1.0,)), two_valleys, truth, start, 40)[-1] < 1e-8
+    assert errors(alone, two_valleys, true_parameter, start, 40)[-1] > 0.1
+    assert errors(LeastSquares(horizons=(1.0,)), two_valleys, true_parameter, start, 40)[-1] < 1e-8
 
 
 def test_new_starts_are_far_from_what_was_tried() -> None:
@@ -124,8 +130,8 @@ def test_new_starts_are_far_from_what_was_tried() -> None:
 
 
 def test_noise_leaves_the_least_squares_estimate() -> None:
-    noisy = decays(TRUTH[:2]) + 0.01 * np.random.default_rng(0).standard_normal((30, 2))
-    task, evaluate = problem(decays, TRUTH[:2], START[:2], 60, observed=noisy)
+    noisy = decays(TRUE_PARAMETERS[:2]) + 0.01 * np.random.default_rng(0).standard_normal((30, 2))
+    task, evaluate = problem(decays, TRUE_PARAMETERS[:2], START[:2], 60, observed=noisy)
     trace = run(LeastSquares(), task, evaluate)
     best = trace.recommendations[-1]
     around = best + 1e-3 * np.random.default_rng(1).standard_normal((200, 2))

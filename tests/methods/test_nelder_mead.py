@@ -6,7 +6,15 @@ import pytest
 
 from methods.tuner import Array
 from methods.tuners.nelder_mead import NelderMead
-from tests.methods.analytic_problems import START, TRUTH, decays, errors, problem, run, smooth
+from tests.methods.analytic_problems import (
+    START,
+    TRUE_PARAMETERS,
+    decays,
+    errors,
+    problem,
+    run,
+    smooth,
+)
 
 
 @pytest.mark.parametrize("dim", [1, 2, 5])
@@ -31,7 +39,7 @@ def test_proposes_what_the_bare_library_proposes(dim: int) -> None:
     ("dim", "budget", "error"), [(1, 40, 1e-6), (2, 120, 1e-6), (5, 600, 1e-4)]
 )
 def test_converges(dim: int, budget: int, error: float) -> None:
-    assert errors(NelderMead(), decays, TRUTH[:dim], START[:dim], budget)[-1] < error
+    assert errors(NelderMead(), decays, TRUE_PARAMETERS[:dim], START[:dim], budget)[-1] < error
 
 
 def test_initial_step_is_nlopts() -> None:
@@ -53,9 +61,9 @@ def test_step_tolerance_ends_the_run_earlier() -> None:
         run(NelderMead(step_tolerance=tolerance), *smooth(1, 500)) for tolerance in (0.0, 1e-3)
     )
     assert len(coarse.losses) < len(fine.losses)
-    assert abs(coarse.recommendations[-1, 0] - TRUTH[0]) < 2e-3
+    assert abs(coarse.recommendations[-1, 0] - TRUE_PARAMETERS[0]) < 2e-3
 
 
 def test_constant_loss_ends() -> None:
-    task, evaluate = problem(lambda theta: np.ones((3, 1)), TRUTH[:2], START[:2], 5000)
+    task, evaluate = problem(lambda theta: np.ones((3, 1)), TRUE_PARAMETERS[:2], START[:2], 5000)
     assert run(NelderMead(), task, evaluate).status == "converged"

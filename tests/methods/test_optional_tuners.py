@@ -8,7 +8,7 @@ import pytest
 from bench.core.plugin_registries import tuners
 from methods.tuners.neural_posterior_estimation import NeuralPosteriorEstimation
 from methods.tuners.turbo import TuRBO, _draw_sobol_points
-from tests.methods.analytic_problems import START, TRUTH, decays, errors
+from tests.methods.analytic_problems import START, TRUE_PARAMETERS, decays, errors
 from tests.methods.test_tunenet import Toy, run
 
 needs_sbi = pytest.mark.skipif(
@@ -48,7 +48,7 @@ def test_candidates_fill_the_trust_region_and_stay_in_the_cube():
 
 @needs_botorch
 def test_turbo_closes_in():
-    error = errors(TuRBO(), decays, TRUTH[:2], START[:2], 40)
+    error = errors(TuRBO(), decays, TRUE_PARAMETERS[:2], START[:2], 40)
     assert error[4] > 0.03
     assert error[40] < 0.02
 

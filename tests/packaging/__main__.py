@@ -14,7 +14,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import perf_counter
 
-from tests.packaging.wheel_in_environment import build, environment, faults, requirements
+from tests.packaging.wheel_in_environment import build, environment, find_wheel_errors, requirements
 
 SMALL = """simulator = "pendulum"
 observe = ["q"]
@@ -108,7 +108,7 @@ def main():
     without = [name for name in options.without.split(",") if name]
     with TemporaryDirectory() as place:
         wheel = build(Path(place))
-        wrong = faults(wheel)
+        wrong = find_wheel_errors(wheel)
         print(f"{wheel.name}: {wheel.stat().st_size} bytes; {wrong or 'it holds what it should'}")
         for number, python in enumerate(options.pythons):
             folder = Path(place, str(number))

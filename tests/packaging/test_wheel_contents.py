@@ -11,7 +11,7 @@ import zipfile
 
 import pytest
 
-from tests.packaging.wheel_in_environment import build, environment, faults
+from tests.packaging.wheel_in_environment import build, environment, find_wheel_errors
 
 EXTRA_TUNERS = {
     *("npe", "turbo", "snpe", "mujoco_sysid"),
@@ -26,7 +26,7 @@ def wheel(tmp_path_factory):
 
 
 def test_the_wheel_contains_exactly_the_package_files(wheel):
-    assert faults(wheel) == []
+    assert find_wheel_errors(wheel) == []
     with zipfile.ZipFile(wheel) as packed:
         names = set(packed.namelist())
     assert {
@@ -40,7 +40,7 @@ def test_the_wheel_contains_exactly_the_package_files(wheel):
 
 
 @pytest.mark.parametrize(
-    ("lost", "says"),
+    ("lost", "message"),
     [
         ("bench/schemas/error.schema.json", "missing: bench/schemas/error.schema.json"),
         ("bench/reference/ball-drop/table.csv", "missing: bench/reference/ball-drop/table.csv"),
@@ -48,7 +48,7 @@ def test_the_wheel_contains_exactly_the_package_files(wheel):
         (None, "nobody asked for: tests/conftest.py"),
     ],
 )
-def test_a_wheel_that_lacks_a_file_or_has_one_too_many_is_found(wheel, tmp_path, lost, says):
+def test_a_wheel_that_lacks_a_file_or_has_one_too_many_is_found(wheel, tmp_path, lost, message):
     other = tmp_path / wheel.name
     with zipfile.ZipFile(wheel) as whole, zipfile.ZipFile(other, "w", zipfile.ZIP_DEFLATED) as less:
         for name in whole.namelist():
@@ -56,7 +56,7 @@ def test_a_wheel_that_lacks_a_file_or_has_one_too_many_is_found(wheel, tmp_path,
                 less.writestr(name, whole.read(name))
         if lost is None:
             less.writestr("tests/conftest.py", "")
-    assert faults(other) == [says]
+    assert find_wheel_errors(other) == [message]
 
 
 @pytest.mark.slow

@@ -96,7 +96,7 @@ def test_no_page_or_message_advises_to_install_simgap_from_an_index():
     assert wrong == []
 
 
-def made(*words, code=0, **kept):
+def run_make(*words, code=0, **kept):
     """Run make and return its output; it needs no environment to print or refuse a target."""
     done = subprocess.run(
         ["make", "--no-print-directory", *words],
@@ -117,7 +117,7 @@ def made(*words, code=0, **kept):
 )
 def test_make_installs_all_packages_except_without(tmp_path, without, installed, absent):
     stamp = tmp_path / "env" / ".installed"
-    shown = made("--dry-run", str(stamp), f"VENV={tmp_path / 'env'}", f"WITHOUT={without}")
+    shown = run_make("--dry-run", str(stamp), f"VENV={tmp_path / 'env'}", f"WITHOUT={without}")
     assert installed in shown
     assert f"-r {absent}" not in shown
 
@@ -125,7 +125,9 @@ def test_make_installs_all_packages_except_without(tmp_path, without, installed,
 @pytest.mark.skipif(not shutil.which("make"), reason="no make")
 def test_make_refuses_to_omit_packages_that_explain_needs(tmp_path):
     folder = tmp_path / "env"
-    said = made("install", f"VENV={folder}", "WITHOUT=numpy", f"PYTHON={sys.executable}", code=2)
+    said = run_make(
+        "install", f"VENV={folder}", "WITHOUT=numpy", f"PYTHON={sys.executable}", code=2
+    )
     assert "WITHOUT=numpy: expected torch, pybullet or torch,pybullet" in said
     assert not folder.exists()
 
@@ -146,7 +148,7 @@ def test_a_changed_without_installs_again(tmp_path, last, now, again):
     stamp.write_text(f"{last}\n")
     # The Python `false` ends the installation at its start.
     words = ["install", f"VENV={stamp.parent}", f"WITHOUT={now}", "PYTHON=false"]
-    made(*words, code=2 if again else 0)
+    run_make(*words, code=2 if again else 0)
     assert stamp.exists() != again
 
 

@@ -44,7 +44,7 @@ def drawn(table):
     return (table.parent / "experiment.toml").exists() and "metric" in head.split(",")
 
 
-def faults(wheel):
+def find_wheel_errors(wheel):
     """Return the faults in a wheel's content."""
     with zipfile.ZipFile(wheel) as packed:
         names = {name for name in packed.namelist() if ".dist-info/" not in name}

@@ -9,7 +9,7 @@ from pathlib import Path
 from methods.tuner import Tuner
 
 
-class ReadsBeside(Tuner):
+class ReadsSiblingFile(Tuner):
     """Begin with the content of a file next to this file."""
 
     name = "reads_beside"

@@ -75,14 +75,16 @@ class Logging(Tuner):
 
 
 class Boasting(Tuner):
-    """Send `says` in place of the list of written files."""
+    """Send `message` in place of the list of written files."""
 
-    def __init__(self, says="{}"):
-        self.says = says
+    def __init__(self, message="{}"):
+        self.message = message
 
     def tune(self, task, rng):
         from bench.benchmark.isolation import tuner_server
 
-        says = self.says
-        tuner_server._report_written_files = lambda channel, *_: channel.send(b"N", says.encode())
+        message = self.message
+        tuner_server._report_written_files = lambda channel, *_: channel.send(
+            b"N", message.encode()
+        )
         yield task.start

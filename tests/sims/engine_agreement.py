@@ -117,7 +117,7 @@ def motion(system, engine, fixed=None, **settings):
     return observation[:, : len(simulator.system.coordinates)]
 
 
-def apart(first, second):
+def compute_max_difference(first, second):
     """Return the largest difference between two motions."""
     return float(np.abs(first - second).max())
 
@@ -138,13 +138,18 @@ def systems_table():
     for system, steps in STEPS.items():
         exact = motion(system, "batch", time_step=2.5e-4)
         for engine in ("batch", *OTHERS):
-            errors = [apart(motion(system, engine, time_step=h), exact) for h in steps]
+            errors = [
+                compute_max_difference(motion(system, engine, time_step=h), exact) for h in steps
+            ]
             order = (
                 "exact"
                 if max(errors) < 1e-9
                 else f"{np.polyfit(np.log(steps), np.log(errors), 1)[0]:.2f}"
             )
-            error, cost = apart(motion(system, engine), exact), seconds(system, engine)
+            error, cost = (
+                compute_max_difference(motion(system, engine), exact),
+                seconds(system, engine),
+            )
             yield f"| {system} | {engine} | {order} | {error:.0e} | {1e3 * cost:.1f} |"
 
 
@@ -160,8 +165,12 @@ def effects_table():
                 continue
             fixed = {effect: coefficients(system, effect)}
             exact = motion(system, "batch", fixed, time_step=1e-3)
-            off = max(apart(motion(system, engine, fixed), exact) for engine in OTHERS)
-            cells.append(f"{off:.0e} of {apart(motion(system, 'batch'), exact):.0e}")
+            off = max(
+                compute_max_difference(motion(system, engine, fixed), exact) for engine in OTHERS
+            )
+            cells.append(
+                f"{off:.0e} of {compute_max_difference(motion(system, 'batch'), exact):.0e}"
+            )
         yield f"| `{effect}` | {' | '.join(cells)} |"
 
 

@@ -423,7 +423,7 @@ def test_constants_of_one_run_do_not_stay(settings):
 
 
 @pytest.mark.parametrize(
-    ("refused", "says"),
+    ("refused", "message"),
     [
         (
             lambda: Ball(linear_damping=0.1),
@@ -447,6 +447,6 @@ def test_constants_of_one_run_do_not_stay(settings):
         ),
     ],
 )
-def test_settings_of_native_contact_are_checked(refused, says):
-    with pytest.raises(InputError, match=says):
+def test_settings_of_native_contact_are_checked(refused, message):
+    with pytest.raises(InputError, match=message):
         refused()

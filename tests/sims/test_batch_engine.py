@@ -203,7 +203,7 @@ def slid(v, limit, lengths, every=1):
     v = np.atleast_2d(np.array(v, dtype=float))
     c = np.full((1, len(v), 1), limit)
     still, theta = np.zeros_like(v), np.zeros((len(v), 1))
-    lanes = IntegrationBatch(
+    batch = IntegrationBatch(
         Puck(),
         theta,
         {},
@@ -214,7 +214,7 @@ def slid(v, limit, lengths, every=1):
         ((CoulombFriction(), c),),
         every,
     )
-    return make_engine(Puck).integrate(lanes)
+    return make_engine(Puck).integrate(batch)
 
 
 def test_friction_in_two_dimensions_follows_the_direction_of_motion():
@@ -352,10 +352,10 @@ def test_one_sample_and_no_elements():
 
 
 @pytest.mark.parametrize(
-    ("settings", "says"), [({"time_step": 0.0}, "time_step"), ({"stepsize": 1.0}, "stepsize")]
+    ("settings", "message"), [({"time_step": 0.0}, "time_step"), ({"stepsize": 1.0}, "stepsize")]
 )
-def test_refuses_settings_it_cannot_use(settings, says):
-    with pytest.raises(InputError, match=says):
+def test_refuses_settings_it_cannot_use(settings, message):
+    with pytest.raises(InputError, match=message):
         Ball(engine="batch", **settings)
 
 

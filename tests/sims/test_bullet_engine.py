@@ -21,7 +21,7 @@ KINDS = [(Ball, {}), (Ball, NATIVE), (Pendulum, {}), (Slider, {}), (Servo, {})]
 SCENARIO = Scenario(np.arange(50) / 50)
 
 
-def made(kind, settings):
+def make_simulator(kind, settings):
     return kind(engine="pybullet", **settings)
 
 
@@ -67,14 +67,14 @@ def test_import_survives_closed_streams():
 @pytest.mark.parametrize("time_step", [0.0, -1.0, np.nan, np.inf, "fast", True])
 def test_impossible_time_steps_are_refused(kind, settings, time_step):
     with pytest.raises(InputError, match="time_step must be a positive number of seconds"):
-        made(kind, {**settings, "time_step": time_step})
+        make_simulator(kind, {**settings, "time_step": time_step})
 
 
 @pytest.mark.parametrize(("kind", "settings"), KINDS)
 def test_worlds_are_opened_late_and_closed(kind, settings):
     gc.collect()
     before = connected()
-    simulator, theta = made(kind, settings), theta_for(kind)
+    simulator, theta = make_simulator(kind, settings), theta_for(kind)
     assert connected() == before
     first = simulator.simulate(theta, SCENARIO)
     assert len(connected()) == len(before) + 1
@@ -89,7 +89,7 @@ def test_worlds_are_opened_late_and_closed(kind, settings):
 
 @pytest.mark.parametrize(("kind", "settings"), KINDS)
 def test_an_interrupted_rollout_leaves_nothing_behind(kind, settings, monkeypatch):
-    simulator, theta = made(kind, settings), theta_for(kind)
+    simulator, theta = make_simulator(kind, settings), theta_for(kind)
     scenario = Scenario(SCENARIO.times, inputs={c.name: np.ones(50) for c in kind.inputs})
     step, calls = bullet_world.import_pybullet().stepSimulation, []
 
@@ -104,7 +104,8 @@ def test_an_interrupted_rollout_leaves_nothing_behind(kind, settings, monkeypatc
         simulator.simulate(theta, scenario)
     monkeypatch.undo()
     np.testing.assert_array_equal(
-        simulator.simulate(theta, scenario), made(kind, settings).simulate(theta, scenario)
+        simulator.simulate(theta, scenario),
+        make_simulator(kind, settings).simulate(theta, scenario),
     )
 
 

@@ -16,7 +16,7 @@ from sims.systems.slider import SliderSystem
 from tests.sims.simulation_cases import SIMULATORS
 
 ENGINES = {"pybullet": "bullet_world", "mujoco": "mujoco_world"}
-ASKED = {
+PROTOCOLS = {
     ("bullet_world", True): (
         world_interface.BulletWorldModule,
         world_interface.BulletBallWorldModule,
@@ -26,10 +26,10 @@ ASKED = {
     ("mujoco_world", False): (world_interface.MujocoJointWorldModule,),
 }
 CASES = [
-    (system, name, asked)
+    (system, name, protocol)
     for system in SIMULATORS
     for name in ENGINES.values()
-    for asked in ASKED[name, SIMULATORS[system].system.bounces]
+    for protocol in PROTOCOLS[name, SIMULATORS[system].system.bounces]
 ]
 
 
@@ -51,12 +51,12 @@ def functions_of(protocol):
     }
 
 
-@pytest.mark.parametrize(("system", "name", "asked"), CASES)
-def test_every_world_module_fulfils_its_protocol(system, name, asked):
-    module, reason = world_interface.find_world_module(SIMULATORS[system].system, name, asked)
+@pytest.mark.parametrize(("system", "name", "protocol"), CASES)
+def test_every_world_module_fulfils_its_protocol(system, name, protocol):
+    module, reason = world_interface.find_world_module(SIMULATORS[system].system, name, protocol)
     assert (module.__name__, reason) == (f"sims.systems.{system}_{name}", "")
-    assert functions_of(asked)
-    for name, function in functions_of(asked).items():
+    assert functions_of(protocol)
+    for name, function in functions_of(protocol).items():
         assert types_of(getattr(module, name)) == types_of(function)
 
 

@@ -159,13 +159,15 @@ def record_batch(simulator, theta, scenarios, monkeypatch):
     batches = []
     integrate = simulator.engine.integrate
     monkeypatch.setattr(
-        simulator.engine, "integrate", lambda lanes: batches.append(lanes) or integrate(lanes)
+        simulator.engine,
+        "integrate",
+        lambda batch: batches.append(batch) or integrate(batch),
     )
     simulator.simulate_batch(theta, scenarios)
     return batches[0]
 
 
-def damaged_batches(lanes, rng):
+def damaged_batches(batch, rng):
     """Yield the batch with random numbers replaced by non-finite or extreme ones."""
 
     def damage(values, share):
@@ -174,14 +176,26 @@ def damaged_batches(lanes, rng):
         values[here] = rng.choice([np.nan, np.inf, -np.inf, 1e308, 1e150, 1e-320, 0.0], here.sum())
         return values
 
-    yield replace(lanes, x=damage(lanes.x, 0.3))
-    yield replace(lanes, v=damage(lanes.v, 0.3))
-    yield replace(lanes, inputs={name: damage(u, 0.1) for name, u in lanes.inputs.items()})
-    yield replace(lanes, effects=tuple((effect, damage(c, 0.3)) for effect, c in lanes.effects))
-    yield replace(lanes, steps=np.where(rng.random(lanes.steps.shape) < 0.4, 0.0, lanes.steps))
-    yield replace(lanes, steps=np.where(rng.random(lanes.steps.shape) < 0.4, 1e-15, lanes.steps))
-    yield replace(lanes, steps=0.0 * lanes.steps)
-    yield replace(lanes, steps_per_sample=10**6)
+    yield replace(batch, x=damage(batch.x, 0.3))
+    yield replace(batch, v=damage(batch.v, 0.3))
+    yield replace(
+        batch,
+        inputs={name: damage(u, 0.1) for name, u in batch.inputs.items()},
+    )
+    yield replace(
+        batch,
+        effects=tuple((effect, damage(c, 0.3)) for effect, c in batch.effects),
+    )
+    yield replace(
+        batch,
+        steps=np.where(rng.random(batch.steps.shape) < 0.4, 0.0, batch.steps),
+    )
+    yield replace(
+        batch,
+        steps=np.where(rng.random(batch.steps.shape) < 0.4, 1e-15, batch.steps),
+    )
+    yield replace(batch, steps=0.0 * batch.steps)
+    yield replace(batch, steps_per_sample=10**6)
 
 
 @pytest.mark.parametrize("system", list(SIMULATORS))
@@ -194,10 +208,10 @@ def test_damaged_batches_end_in_the_same_state_with_evaluated_forces(system, mon
     coefficients = [x for values in world.effects.values() for x in values]
     theta = np.array([[world.parameters[p.name] for p in cls.parameters] + coefficients] * 2)
     theta[1] *= 0.97
-    lanes = record_batch(simulator, theta, [scenario] * 2, monkeypatch)
+    batch = record_batch(simulator, theta, [scenario] * 2, monkeypatch)
     engine = BatchEngine(patience=20.0)
     with np.errstate(all="ignore"):
-        batches = list(damaged_batches(lanes, np.random.default_rng(11)))
+        batches = list(damaged_batches(batch, np.random.default_rng(11)))
         traced = [engine.integrate(batch) for batch in batches]
         monkeypatch.setattr(compilability, "_get_tracer", lambda *_: None)
         evaluated = [engine.integrate(batch) for batch in batches]

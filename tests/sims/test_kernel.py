@@ -182,11 +182,11 @@ def test_instructions_are_checked_and_run_on_any_number_of_slots():
     run_by = kernel.get_kernel()
     ops = {name: code for code, name in enumerate(expression_graph.OPERATIONS)}
     code = np.array([[ops["add"], 2, 0, 1, 0], [ops["tanh"], 3, 2, 2, 2]], dtype=np.int64)
-    for lanes in (1, 5, 64, 130):
-        r = np.zeros((4, lanes))
+    for size in (1, 5, 64, 130):
+        r = np.zeros((4, size))
         run = run_by.make_instruction_runner(code, 0, 2, r)
         for seed in range(2):
-            r[:2] = np.random.default_rng(seed).normal(size=(2, lanes))
+            r[:2] = np.random.default_rng(seed).normal(size=(2, size))
             run()
             np.testing.assert_allclose(r[3], np.tanh(r[0] + r[1]), rtol=1e-14)
     held = np.zeros((4, 8))

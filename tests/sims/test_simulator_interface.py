@@ -69,7 +69,7 @@ def test_training_range_defaults_to_the_bounds():
 
 
 @pytest.mark.parametrize(
-    ("change", "says"),
+    ("change", "message"),
     [
         ({"bounds": (1.0, 0.0)}, "bounds must be finite and increasing"),
         ({"bounds": (0.0, np.inf)}, "bounds must be finite and increasing"),
@@ -80,8 +80,8 @@ def test_training_range_defaults_to_the_bounds():
         ({"training": (0.6, 0.5)}, "must increase inside"),
     ],
 )
-def test_impossible_parameters_are_refused(change, says):
-    with pytest.raises(InputError, match=says):
+def test_impossible_parameters_are_refused(change, message):
+    with pytest.raises(InputError, match=message):
         Parameter(**{"name": "a", "unit": "1", "nominal": 0.5, "bounds": (0.0, 1.0), **change})
 
 
@@ -94,7 +94,7 @@ def test_adjusted_replaces_what_the_experiment_gives():
 
 
 @pytest.mark.parametrize(
-    ("changes", "says"),
+    ("changes", "message"),
     [
         ({"mass": {"nominal": 1.0}}, "unknown parameter 'mass'; there are: inertia, stiffness"),
         (
@@ -103,8 +103,8 @@ def test_adjusted_replaces_what_the_experiment_gives():
         ),
     ],
 )
-def test_adjusted_lists_what_there_is(changes, says):
-    with pytest.raises(InputError, match=says):
+def test_adjusted_lists_what_there_is(changes, message):
+    with pytest.raises(InputError, match=message):
         apply_parameter_changes([LINEAR, LOG], changes)
 
 
@@ -141,7 +141,7 @@ def test_a_run_overrides_the_simulator_which_overrides_the_defaults():
 
 
 @pytest.mark.parametrize(
-    ("refused", "says"),
+    ("refused", "message"),
     [
         (
             lambda: Spring({"colour": 1.0}),
@@ -183,8 +183,8 @@ def test_a_run_overrides_the_simulator_which_overrides_the_defaults():
         ),
     ],
 )
-def test_simulators_refuse_what_they_cannot_use(refused, says):
-    with pytest.raises(InputError, match=says):
+def test_simulators_refuse_what_they_cannot_use(refused, message):
+    with pytest.raises(InputError, match=message):
         refused()
 
 

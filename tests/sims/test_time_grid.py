@@ -235,7 +235,7 @@ def part(first, last=None, **more):
     return whole.part(slice(first, last))
 
 
-def felt_in(run, name, step=0.005):
+def compute_applied_input(run, name, step=0.005):
     """Return the applied input of a drive with an effect over the steps of a run."""
     scenario = Scenario(run.times, {}, run.inputs, {}, run.linear, run.offset, run.before)
     runs, acting = (
@@ -253,11 +253,11 @@ def felt_in(run, name, step=0.005):
 @pytest.mark.parametrize("name", REMEMBERING)
 def test_a_part_of_a_run_uses_the_commands_before_it(name, offset, linear):
     whole, later = part(0, linear=linear, offset=offset), part(111, linear=linear, offset=offset)
-    wanted = felt_in(whole, name)[-(later.times.size - 1) * 4 :]
+    wanted = compute_applied_input(whole, name)[-(later.times.size - 1) * 4 :]
     # Tolerance for the effect's result with another step size.
     close = {"input.lag": 0.03, "servo.profile": 0.01}.get(name, 1e-9)
-    assert felt_in(later, name) == pytest.approx(wanted, abs=close)
-    forgets = felt_in(replace(later, before={}), name)
+    assert compute_applied_input(later, name) == pytest.approx(wanted, abs=close)
+    forgets = compute_applied_input(replace(later, before={}), name)
     assert np.abs(forgets - wanted).max() > 0.15
 
 
@@ -270,7 +270,7 @@ def test_a_part_of_a_part_has_the_same_command_history():
 
 def test_elements_with_and_without_a_command_history_share_a_batch():
     runs = [part(102), part(0, 30), part(20)]
-    own = [felt_in(run, "input.lag") for run in runs]
+    own = [compute_applied_input(run, "input.lag") for run in runs]
     scenarios = [Scenario(r.times, {}, r.inputs, before=r.before) for r in runs]
     together = group_scenarios(scenarios)
     counts = [values.size for values in own]

@@ -58,7 +58,7 @@ def test_faults_speak_python():
         ({"parameters": {"inertia": 1.0}}, "parameter inertia = 1: expected "),
         ({"effects": {"drag.linear": {"c": 1.0}}}, "unknown coefficient of effect drag.linear 'c'"),
         ({"noise": -1}, "noise of q = -1: expected at least 0"),
-        ({"noise": "loud"}, "noise: expected a number or .*, found 'loud'"),
+        ({"noise": "large"}, "noise: expected a number or .*, found 'large'"),
         ({"initial": {"q": (1.0, 0.0)}}, "initial state q = 1:0: expected low <= high"),
         ({"initial": {"q": (1.0, 2.0, 3.0)}}, r"initial\[.q.\]: expected a number or \(low,"),
         ({"runs": 0}, "runs = 0: expected at least 1"),

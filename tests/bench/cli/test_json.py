@@ -381,7 +381,7 @@ PRINTING_TUNER = """import ctypes
 import os
 from methods.tuner import Tuner
 
-class Loud(Tuner):
+class Verbose(Tuner):
     def tune(self, task, rng):
         print("from Python")
         os.write(1, b"from a system call\\n")
@@ -393,9 +393,9 @@ class Loud(Tuner):
 
 @pytest.mark.slow
 def test_what_a_tuner_prints_does_not_come_to_stand_in_the_document(place):
-    (place / "loud.py").write_text(PRINTING_TUNER)
-    command = ["compare", place / "spring-small.toml", *PLUGIN, "--plugin", place / "loud.py"]
-    command += ["--tuners", "loud", "--jobs", "0", "--out", place / "loud", "--json"]
+    (place / "verbose.py").write_text(PRINTING_TUNER)
+    command = ["compare", place / "spring-small.toml", *PLUGIN, "--plugin", place / "verbose.py"]
+    command += ["--tuners", "verbose", "--jobs", "0", "--out", place / "verbose", "--json"]
     done = subprocess.run(
         [sys.executable, "-m", "bench.cli.main", *map(str, command)],
         capture_output=True, text=True, timeout=120, check=False,

@@ -190,7 +190,7 @@ def make_report(verdict="named", **changes):
         parameters=tuned,
         lack_of_fit=("The noise of qd is estimated from the data, not stated",) if causes else (),
         why=(
-            "drag.linear gains 812 in twice the log likelihood, next to none by chance",
+            "drag.linear gains 812 in twice the log likelihood, noise alone almost nothing",
             "no other effect explains it as well",
         ),
     )

@@ -153,7 +153,7 @@ def test_what_does_not_fit_the_system_at_all_is_unknown(tmp_path):
     found = explained(table(tmp_path, runs, noise=NOISE))
     assert found.verdict == "unknown"
     assert any("the residual of channel q is" in line for line in found.story.lack_of_fit)
-    assert found.answer.candidates, "what comes nearest is told all the more"
+    assert found.answer.candidates, "the nearest candidates are reported"
     assert found.answer.heldout.rmse_extended > 10 * 0.003
 
 

@@ -104,7 +104,7 @@ def judged(fitted, held_out, left=NOTHING, base_error=1.0):
     ("fitted", "held_out", "refuted"),
     [
         ({"force.ripple@a": 90.0}, {}, True),
-        # The effect is better on the fitted runs by chance, but not on the held-out runs.
+        # Overfitting: the effect is better on the fitted runs, but not on the held-out runs.
         ({"force.ripple@a": 105.0}, {"force.ripple@a": 64.0}, True),
         ({"force.ripple@a": 105.0}, {"force.ripple@a": 101.0}, False),
         # Without a simulation of the held-out runs, nothing contradicts the effect.

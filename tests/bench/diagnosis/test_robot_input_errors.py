@@ -78,7 +78,7 @@ def test_positions_that_cannot_be_are_refused_in_one_line(name, tmp_path):
         explain(table)
     assert "--force" in str(error.value)
     assert check_recording_plausible(*load_recording(table), force=True), (
-        "who insists is told all the same"
+        "--force does not suppress the message"
     )
 
 

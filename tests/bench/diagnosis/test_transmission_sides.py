@@ -40,7 +40,7 @@ def test_parameters_are_those_of_the_fitted_runs_and_errors_those_of_the_held_ou
     ]
     assert 0.3 < found.heldout.rmse_base / np.sqrt(np.mean((apart[0] - apart[1]) ** 2)) <= 1.0
     assert found.heldout.rmse_base > 20 * found.heldout.noise_floor
-    assert found.verdict == "unknown", "what only the held-out run shows was taught by no other"
+    assert found.verdict == "unknown", "no fitted run shows what the held-out run shows"
 
 
 def test_a_seed_draws_the_surrogates_and_moves_no_fit(verdicts):

@@ -63,7 +63,7 @@ def held():
 def need(layer):
     """Skip a test, visibly, if an isolation layer is not available."""
     if layer not in held():
-        pytest.skip(f"no seal {layer} on this machine: {ISOLATION_LAYERS[layer]}")
+        pytest.skip(f"no isolation layer {layer} on this machine: {ISOLATION_LAYERS[layer]}")
 
 
 def experiment(name, **changes):

@@ -20,7 +20,7 @@ from bench.benchmark.runner.plugin_discovery import inspect_plugins, load_plugin
 from bench.benchmark.runner.tuner_training import TrainingRequest, read_weights, train_or_load
 from bench.benchmark.runner.worker_tasks import RunRequest, execute_run, get_problem
 from sims.core.simulator import InputError
-from tests.kill_and_resume import SEALED, below
+from tests.kill_and_resume import ISOLATION_PROCESSES, below
 from tests.sample_experiments import spring_experiment
 
 SLOW = """
@@ -35,10 +35,10 @@ class Slow(Tuner):
     name = "slow"
     learned = True
 
-    def fit(self, practice, rng, budget):
-        points = practice.sample(rng, budget)
+    def fit(self, simulator, rng, budget):
+        points = simulator.sample(rng, budget)
         time.sleep(0.2)
-        self.seen = practice.simulate(rng, points)
+        self.seen = simulator.simulate(rng, points)
 
     def state(self):
         return {"seen": self.seen}
@@ -90,7 +90,7 @@ class Killing:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("what", SEALED)
+@pytest.mark.parametrize("what", ISOLATION_PROCESSES)
 def test_what_is_killed_is_made_again_with_the_same_result(slow, what):
     experiment, path = slow
     with Killing(what) as killing:

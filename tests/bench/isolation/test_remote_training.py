@@ -13,7 +13,7 @@ from tests.bench.isolation.isolated_process import make_training_request
 from tests.hostile_tuners.attack_arena import HERE
 from tests.sample_experiments import spring_experiment
 
-ATTACKING_LEARNERS = str(HERE / "school.py")
+ATTACKING_LEARNERS = str(HERE / "learning_attacks.py")
 pytestmark = pytest.mark.usefixtures("spring", "fresh_registries")
 
 
@@ -82,9 +82,9 @@ def test_a_callback_is_informed_and_changes_nothing(experiment, tmp_path, monkey
     plain = read_weights(train_or_load(experiment, make_training_request("telling")).path)
     watch = RecordingCallback(TuningProblem(experiment))
     made = train_or_load(experiment, make_training_request("telling"), watch, anew=True)
-    assert [told[:3] for told in watch.told] == [("first", 1, 2), ("sec\ufffdond", 2, 2)]
-    assert np.isnan(watch.told[1][4])
-    assert watch.asked == 1
+    assert [epoch[:3] for epoch in watch.epochs] == [("first", 1, 2), ("sec\ufffdond", 2, 2)]
+    assert np.isnan(watch.epochs[1][4])
+    assert watch.ground_reads == 1
     assert made.simulations == 20, "what only measures is not counted"
     again = read_weights(made.path)
     assert {name: array.tobytes() for name, array in again.items()} == {
@@ -207,7 +207,7 @@ def test_an_installed_tuner_of_another_package_is_isolated_too(tmp_path, monkeyp
     results = prepare_experiment(made)
     run_experiment(results, jobs=0)
     theirs, random = results.run_sink.statuses.values()
-    assert (theirs.status, theirs.reason) == ("converged", "sealed")
+    assert (theirs.status, theirs.reason) == ("converged", "isolated")
     assert random.status == "done"
     import sys
 
@@ -226,5 +226,5 @@ class Theirs(Tuner):
         try:
             os.fork()
         except OSError:
-            return "sealed"
+            return "isolated"
 """

@@ -10,7 +10,7 @@ import pytest
 from bench.cli.main import main
 from bench.logs.recording_loading import load_recording
 from tests.bench.logs.log_writers import JOINTS, NEEDED, OPTIONS, WRITERS, motion, write_folder
-from tests.malformed_input.input_strategies import log_folders, made
+from tests.malformed_input.input_strategies import log_folders, run_cases
 from tests.malformed_input.malformed_case import tried
 
 QUICK = ("csv", "npz")
@@ -65,5 +65,5 @@ def test_a_damaged_folder_is_one_line_and_nothing_is_written(kind, tmp_path):
     def act(case):
         codes.append(tried(case, tmp_path / str(len(codes)), {}).code)
 
-    made(log_folders(kind), DAMAGES, act)
+    run_cases(log_folders(kind), DAMAGES, act)
     assert 2 in codes, "no folder was damaged"

@@ -134,5 +134,5 @@ def page():
         error_chart=error_chart(),
         bins_chart=bins_chart(),
         motion_chart=motion_chart(),
-        make_printed_figure=make_printed_figure(),
+        still=make_printed_figure(),
     )

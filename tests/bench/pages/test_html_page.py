@@ -280,7 +280,7 @@ def test_what_is_copied_and_saved_has_every_digit(opened):
 
 
 def test_a_figure_is_saved_as_svg_png_and_pdf(opened):
-    files, still = opened.page.locator("#error .files"), sample_pages.still()
+    files, still = opened.page.locator("#error .files"), sample_pages.make_printed_figure()
     for kind, role, begins in (
         ("SVG", "button", b"<?xml"),
         ("PDF", "link", b"%PDF-"),

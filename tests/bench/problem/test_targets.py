@@ -14,7 +14,8 @@ TIMES = np.arange(60) / 20
 BIAS = 0.4
 """Constant force in N that acts in the true system but not in the tuned simulator."""
 NARROW = 1e-6
-"""Width in kg of the range of start and truth, so small that both are practically 1 kg."""
+"""Width in kg of the range of start and true parameters, so small that both are practically 1
+kg."""
 
 
 def everything(target):
@@ -26,7 +27,7 @@ def everything(target):
 
 
 def test_targets_of_another_experiment_are_met_whole(spring):
-    """Shared targets have equal truth, start, noise, scenario and held-out scenarios."""
+    """Shared targets have equal true parameters, start, noise, scenario and held-out scenarios."""
     other = spring_experiment(noise={"x": 0.05}, held_out={"scenarios": 2}, targets=2)
     met = replace(other, name="mine", same_targets_as="spring-test", budget=5, seeds=1)
     own = replace(other, name="mine")

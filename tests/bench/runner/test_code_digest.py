@@ -138,7 +138,7 @@ def test_plugin_files_of_one_name_in_two_folders_are_distinguished(tmp_path):
 
     together = digests("a", "b")
     assert together["a"] != together["b"]
-    assert {**digests("a"), **digests("b")} == together, "what else is loaded does not matter"
+    assert {**digests("a"), **digests("b")} == together, "other loaded modules do not matter"
 
 
 def test_effect_of_a_plugin_file_is_part_of_what_names_it(tmp_path):

@@ -156,7 +156,7 @@ def test_tuner_that_searches_everything_finds_no_true_parameters():
     assert status.status == "converged", status.reason
     numbers, *places = map(int, status.reason.split())
     assert numbers > 60
-    assert set(places) == set(range(len(seen))), "all that was observed, and no truth"
+    assert set(places) == set(range(len(seen))), "all observations, and no true parameters"
 
 
 def test_snooping_would_find_true_parameters_that_are_there():

@@ -64,7 +64,7 @@ def test_fitted_runs_are_fitted_and_held_out_ones_measure(tmp_path):
     assert columns["obs_error_x"][1] == pytest.approx(0.1, rel=1e-9)
     assert columns["heldout_error"][1] == pytest.approx(0.25, rel=1e-9)
     assert columns["heldout_error_x"][1] == pytest.approx(0.25, rel=1e-9)
-    assert np.isnan(columns["param_error"]).all(), "nobody knows the truth"
+    assert np.isnan(columns["param_error"]).all(), "the true parameters are unknown"
 
 
 @pytest.mark.parametrize(("noise", "sigma"), [({}, 0.02), ({"x": 0.05}, 0.05)])

@@ -12,7 +12,8 @@ PARAMETERS = [
 
 
 def problem(evaluated):
-    """Fit a line with intercept and slope TRUTH; append each evaluated point to `evaluated`."""
+    """Fit a line with intercept and slope TRUE_PARAMETERS; append each evaluated point to
+    `evaluated`."""
     times = np.linspace(0.0, 1.0, 8)
 
     def line(theta):

@@ -21,7 +21,7 @@ def task(budget, dim=2):
 
 
 class Counted:
-    """Objective with the distance to the truth as loss, which counts simulations."""
+    """Objective with the distance to the true parameters as loss, which counts simulations."""
 
     def __init__(self):
         self.simulated = 0

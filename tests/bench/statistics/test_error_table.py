@@ -90,7 +90,7 @@ def test_columns_are_those_of_the_file_format():
     assert list(lines.columns) == ERROR_TABLE_COLUMNS
     assert (at(lines, 1)["fit_simulations"], at(lines, 1)["fit_seconds"]) == (1600.0, 12.5)
     assert set(lines["metric"]) == {"param_abs_error"}, (
-        "no truth, no parameter error; no held-out runs, none shown"
+        "no true parameters, no parameter error; no held-out runs, none shown"
     )
 
 

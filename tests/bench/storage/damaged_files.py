@@ -131,9 +131,9 @@ DONE = {
     "negative loss": (PARQUET, cell("loss", 1, -1.0)),
     "infinite error": (PARQUET, cell("param_error", 1, np.inf)),
     "infinite proposal": (PARQUET, cell("proposal_rate", 1, -np.inf)),
-    "truth unknown": (PARQUET, cell("true_rate", 1, np.nan)),
-    "truth changes": (PARQUET, cell("true_rate", 1, 2.5)),
-    "truth of one run": (
+    "true parameter unknown": (PARQUET, cell("true_rate", 1, np.nan)),
+    "true parameter changes": (PARQUET, cell("true_rate", 1, 2.5)),
+    "true parameter of one run": (
         PARQUET,
         rows(lambda f: f.assign(true_rate=f["true_rate"].where(f["run"] != f["run"][0], 2.5))),
     ),

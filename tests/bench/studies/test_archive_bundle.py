@@ -142,7 +142,7 @@ def test_the_plugins_that_an_archive_names_or_holds_are_not_run(compared, capsys
 
 
 @pytest.mark.parametrize(
-    ("change", "file", "says"),
+    ("change", "file", "message"),
     [
         (lambda f: f.update({"run/table.csv": f["run/table.csv"] + b" "}), "table.csv", "expected"),
         (lambda f: f.update({"run/more.txt": b"more"}), "more.txt", "does not list"),
@@ -150,14 +150,14 @@ def test_the_plugins_that_an_archive_names_or_holds_are_not_run(compared, capsys
     ],
 )
 def test_a_file_that_is_changed_added_or_missing_is_named(
-    compared, tmp_path, capsys, change, file, says
+    compared, tmp_path, capsys, change, file, message
 ):
     files = content(compared)
     change(files)
     code, found = verified(packed(tmp_path / "a.zip", files), capsys)
     assert code == 1
     (doubt,) = found["archive"]["doubts"]
-    assert (doubt["file"], says in doubt["says"]) == (file, True)
+    assert (doubt["file"], message in doubt["says"]) == (file, True)
     assert found["comparisons"] == []
 
 
@@ -186,17 +186,17 @@ def word(verdict):
 
 
 @pytest.mark.parametrize(
-    ("change", "says"),
+    ("change", "message"),
     [(coefficient, "drag.linear coefficient"), (held_out, "recomputed"), (word, "proven")],
 )
-def test_an_improved_verdict_is_detected(explanation_archive, tmp_path, capsys, change, says):
+def test_an_improved_verdict_is_detected(explanation_archive, tmp_path, capsys, change, message):
     files = content(explanation_archive)
     verdict = json.loads(files["told/verdict.json"])
     change(verdict)
     files["told/verdict.json"] = json.dumps(verdict).encode()
     code, found = verified(packed(tmp_path / "a.zip", listed_again(files, "told")), capsys)
     assert code == 1
-    assert any(says in doubt["says"] for doubt in found["explanation"]["doubts"])
+    assert any(message in doubt["says"] for doubt in found["explanation"]["doubts"])
 
 
 def test_another_recording_than_the_explained_one_is_detected(
@@ -218,7 +218,7 @@ def entry(name, mode=stat.S_IFREG | 0o644):
 
 
 @pytest.mark.parametrize(
-    ("name", "mode", "says"),
+    ("name", "mode", "message"),
     [
         ("run/../../evil.txt", stat.S_IFREG, "is not a path inside its folder"),
         ("/etc/evil.txt", stat.S_IFREG, "is not a path inside its folder"),
@@ -233,12 +233,12 @@ def entry(name, mode=stat.S_IFREG | 0o644):
     ],
 )
 def test_what_would_leave_the_folder_or_stand_for_something_else_is_refused(
-    compared, tmp_path, capsys, name, mode, says
+    compared, tmp_path, capsys, name, mode, message
 ):
     made = packed(tmp_path / "a.zip", content(compared), [(entry(name, mode | 0o644), "evil")])
     code, found = verified(made, capsys)
     assert code == 2
-    assert says in found["error"]["message"]
+    assert message in found["error"]["message"]
     assert "nothing was unpacked" in found["error"]["message"]
     assert not list(tmp_path.rglob("evil*"))
 
@@ -272,7 +272,7 @@ def test_a_file_that_holds_more_than_it_says_is_refused(compared, tmp_path, caps
 
 
 @pytest.mark.parametrize(
-    ("change", "says"),
+    ("change", "message"),
     [
         (lambda d: b"#!/bin/sh\n" + d, "it contains data that belong to no file"),
         (lambda d: d[:-2] + b"\x02\x00hi", "it contains data that belong to no file"),
@@ -282,16 +282,16 @@ def test_a_file_that_holds_more_than_it_says_is_refused(compared, tmp_path, caps
     ],
 )
 def test_an_archive_with_more_or_less_around_it_is_refused(
-    compared, tmp_path, capsys, change, says
+    compared, tmp_path, capsys, change, message
 ):
     (tmp_path / "a.zip").write_bytes(change(compared.read_bytes()))
     code, found = verified(tmp_path / "a.zip", capsys)
     assert code == 2
-    assert says in found["error"]["message"]
+    assert message in found["error"]["message"]
 
 
 @pytest.mark.parametrize(
-    ("change", "says"),
+    ("change", "message"),
     [
         (lambda f: f.pop("run/manifest.json"), "one folder with manifest.json in it"),
         (lambda f: f.update({"run/manifest.json": b"{"}), "is not of type 'object'"),
@@ -300,12 +300,12 @@ def test_an_archive_with_more_or_less_around_it_is_refused(
         (lambda f: f.update({"other/a.txt": b"a"}), "one folder with manifest.json in it"),
     ],
 )
-def test_an_invalid_manifest_is_refused(compared, tmp_path, capsys, change, says):
+def test_an_invalid_manifest_is_refused(compared, tmp_path, capsys, change, message):
     files = content(compared)
     change(files)
     code, found = verified(packed(tmp_path / "a.zip", files), capsys)
     assert code == 2
-    assert says in found["error"]["message"]
+    assert message in found["error"]["message"]
 
 
 def test_a_file_listed_twice_is_noticed(compared, tmp_path, capsys):

@@ -181,7 +181,7 @@ def grade(path, kind, level):
 
 
 def covered(path):
-    """Return (count, total, share, low, high) of the intervals that hold the truth."""
+    """Return (count, total, share, low, high) of the intervals that contain the true value."""
     table = exam_report.graded(exam_table(path))
     held, count = int(table.intervals_held.sum()), int(table.intervals.sum())
     return exam_report.share([True] * held + [False] * (count - held))

@@ -81,7 +81,7 @@ def read_register():
     return read_toml(REGISTER)
 
 
-def faults(found, register):
+def find_differences(found, register):
     """Return the differences between pages and register, one line each.
 
     Args:
@@ -131,7 +131,7 @@ def main():
     register = read_register() if REGISTER.exists() else {}
     found = find_numbers()
     REGISTER.write_text(format_register(found, register), encoding="utf-8")
-    for line in faults(found, read_register()):
+    for line in find_differences(found, read_register()):
         print(line)
 
 

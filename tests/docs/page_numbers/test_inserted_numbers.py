@@ -8,7 +8,7 @@ from tests.benchmarks.identified_robots import identified
 from tests.docs.documentation_pages import ROOT, pages
 from tests.docs.page_numbers import page_values, stated_once
 from tests.docs.page_numbers.inserted_numbers import agrees, format_like, insert_numbers
-from tests.docs.page_numbers.stated_once import faults, numbers_by_section
+from tests.docs.page_numbers.stated_once import find_differences, numbers_by_section
 
 TEXT = """# A page of 3 things
 
@@ -45,7 +45,9 @@ def test_pages_have_the_present_numbers(page):
 
 def test_other_numbers_have_a_registered_source(numbers):
     register = stated_once.read_register()
-    assert faults(numbers, register) == [], "run python -m tests.docs.page_numbers.stated_once"
+    assert find_differences(numbers, register) == [], (
+        "run python -m tests.docs.page_numbers.stated_once"
+    )
     assert stated_once.REGISTER.read_text("utf-8") == stated_once.format_register(numbers, register)
     assert {"tunenet.md", "engines.md", "performance.md", "README.md"} <= set(numbers)
 
@@ -116,20 +118,23 @@ def test_a_new_changed_or_lost_number_is_a_fault(numbers):
     page, (name, found) = "scale.md", next(iter(numbers["scale.md"].items()))
     register = stated_once.read_register()
     for changed in ([*found, "7"], ["8", *found[1:]], found[:-1]):
-        (fault,) = faults({**numbers, page: {name: changed}}, register)
+        (fault,) = find_differences({**numbers, page: {name: changed}}, register)
         assert fault.startswith(f"{page}, {name!r}: number ")
-    (fault,) = faults({**numbers, "new.md": {"Speed": ["3"]}}, register)
+    (fault,) = find_differences({**numbers, "new.md": {"Speed": ["3"]}}, register)
     assert fault == "new.md, 'Speed': number 1 was 'nothing', and is '3'"
-    assert faults({key: value for key, value in numbers.items() if key != page}, register) != []
+    assert (
+        find_differences({key: value for key, value in numbers.items() if key != page}, register)
+        != []
+    )
 
 
 def test_a_missing_source_or_program_is_a_fault(numbers):
     register = copy.deepcopy(stated_once.read_register())
     (entry,) = register["scale.md"].values()
     entry["from"] = ""
-    assert "the source of its numbers is missing" in faults(numbers, register)[0]
+    assert "the source of its numbers is missing" in find_differences(numbers, register)[0]
     entry["from"] = "measured once, by `python -m tests.benchmarks.gone`"
-    (fault,) = faults(numbers, register)
+    (fault,) = find_differences(numbers, register)
     assert fault.endswith("there is no tests.benchmarks.gone")
 
 

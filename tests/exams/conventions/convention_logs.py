@@ -67,8 +67,8 @@ def write_log(folder: Path, seed: int, broken: str | None, cause: str = "nothing
     joints = int(rng.integers(2, 8))
     servo = bool(rng.random() < 0.6) or (broken or "").endswith(("both", "commands"))
     axes = _axes(rng, joints)
-    felt = _felt(axes)
-    joint = int(rng.choice(felt))
+    gravity_joints = _find_gravity_joints(axes)
+    joint = int(rng.choice(gravity_joints))
     text = _model(rng, axes, servo)
     model = mujoco.MjModel.from_xml_string(text)
     concerned, size = (joint,), 0.0
@@ -84,7 +84,7 @@ def write_log(folder: Path, seed: int, broken: str | None, cause: str = "nothing
         q[..., joint] += size
     units = {"q": ["rad"] * joints, "u": ["rad" if servo else "N*m"] * joints}
     if broken is not None:
-        concerned, size = _break(rng, broken, joint, felt, q, qd, u, units, servo)
+        concerned, size = _break(rng, broken, joint, gravity_joints, q, qd, u, units, servo)
     _write(folder, q, qd if rng.random() < 0.5 else None, u, units, text)
     return Log(folder / "log.csv", broken, cause, concerned, size)
 
@@ -100,7 +100,7 @@ def _axes(rng, joints):
     return axes
 
 
-def _felt(axes):
+def _find_gravity_joints(axes):
     """Return the joints on which gravity acts; the zero of the others cannot be identified."""
     return [i for i, axis in enumerate(axes) if axis == "0 1 0"] or [1]
 
@@ -198,7 +198,7 @@ def _run(model, rng, servo, cause, joint, size, travel):
     return q, qd, u
 
 
-def _break(rng, broken, joint, felt, q, qd, u, units, servo):
+def _break(rng, broken, joint, gravity_joints, q, qd, u, units, servo):
     """Break a convention in place; return the affected joints and the size."""
     joints = q.shape[-1]
     other = int(rng.choice([i for i in range(joints) if i != joint]))

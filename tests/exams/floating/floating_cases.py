@@ -8,10 +8,10 @@ import numpy as np
 
 from tests.exams.exam import Exam, Target, UndrawableError
 from tests.exams.floating import floating_robots
-from tests.exams.robots import cause_sizing, causes_outside_library, planted_effects
+from tests.exams.robots import cause_sizing, planted_effects, unmodelled_causes
 from tests.exams.robots.cause_sizing import Gauge
 from tests.exams.robots.robot_cases import (
-    APART,
+    MIN_RESIDUAL_WITHOUT_CAUSE,
     TELLING,
     RobotQuestion,
     bare_case,
@@ -66,7 +66,7 @@ def _draw(name, effect):
         return case
     gauge, machine = Gauge(setting), setting.machine
     if case.kind == "foreign":
-        of = causes_outside_library.drawn(effect, int(rng.choice(machine.driven)), setting, rng)
+        of = unmodelled_causes.drawn(effect, int(rng.choice(machine.driven)), setting, rng)
     else:
         places = [p for p in planted_effects.places(machine, effect) if "~" not in p]
         place = str(rng.choice(list(dict.fromkeys(places))))
@@ -84,7 +84,7 @@ def _draw(name, effect):
     rivals = _near(setting, hidden, gauge, rng) if is_foreign else simpler_changes(hidden, gauge)
     if rivals:
         beyond = min(cause_sizing.left(change, [rival]) for rival in rivals)
-        if beyond < (APART if is_foreign else TELLING):
+        if beyond < (MIN_RESIDUAL_WITHOUT_CAUSE if is_foreign else TELLING):
             return None
     return replace(case, effects=hidden, size=found[1], beyond=beyond)
 

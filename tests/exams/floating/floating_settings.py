@@ -43,7 +43,7 @@ def _run(machine, form, times, rng):
     """Draw a run whose hinges move by about `SWING`, and its motion without a hidden cause."""
     hinges = len(machine.hinges)
     start = rng.uniform(-0.5, 0.5, hinges)
-    pose, rate = _begun(machine, rng)
+    pose, rate = _draw_base_state(machine, rng)
     q, v = np.concatenate([start, pose]), np.concatenate([np.zeros(hinges), rate])
     world = World(machine, step=COARSE)
     moved = 1.0 / np.diag(np.linalg.inv(world.plant.inertia(q)))
@@ -65,7 +65,7 @@ def _run(machine, form, times, rng):
     return run, motion
 
 
-def _begun(machine, rng):
+def _draw_base_state(machine, rng):
     """Draw a pose and a padded velocity of the floating base."""
     turn = rng.uniform(-SPIN, SPIN, 3)
     if machine.root == "ball":

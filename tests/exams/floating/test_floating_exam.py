@@ -22,10 +22,10 @@ def machine(request):
     return floating_robots.machine(request.param, np.random.default_rng(5))
 
 
-def begun(machine):
+def make_zero_command_run(machine):
     """Return a run with zero commands."""
     rng, hinges = np.random.default_rng(6), len(machine.hinges)
-    pose, rate = floating_settings._begun(machine, rng)
+    pose, rate = floating_settings._draw_base_state(machine, rng)
     q = np.concatenate([rng.uniform(-0.4, 0.4, hinges), pose])
     v = np.concatenate([rng.uniform(-1.0, 1.0, hinges), rate])
     times = np.arange(0.0, SECONDS, 0.01)
@@ -44,7 +44,7 @@ def test_the_world_conserves_energy_and_momenta(machine):
     import pinocchio
 
     machine = frictionless(machine)
-    world, run = World(machine), begun(machine)
+    world, run = World(machine), make_zero_command_run(machine)
     motion, plant = world.move(run, run.times), world.plant
     energy = [plant.energy(q, v) for q, v in zip(motion.q, motion.v, strict=True)]
     assert np.ptp(energy) < 1e-7 * np.ptp([plant.energy(run.q, s * run.v) for s in (0, 1)])
@@ -63,7 +63,10 @@ def test_the_world_conserves_energy_and_momenta(machine):
 def test_friction_dissipates_energy(machine):
     machine = frictionless(machine)
     hinge = machine.hinges[0]
-    world, run = World(machine, {f"friction.coulomb@{hinge}": (0.05,)}), begun(machine)
+    world, run = (
+        World(machine, {f"friction.coulomb@{hinge}": (0.05,)}),
+        make_zero_command_run(machine),
+    )
     motion = world.move(run, run.times)
     energy = [world.plant.energy(q, v) for q, v in zip(motion.q, motion.v, strict=True)]
     way = np.abs(np.diff(motion.q[:, 0])).sum()
@@ -76,7 +79,7 @@ def test_simgap_agrees_with_the_world_from_the_recorded_state(machine, tmp_path)
     from sims.core.simulator import Scenario
 
     (tmp_path / "robot.xml").write_text(machine.mjcf())
-    run = begun(machine)
+    run = make_zero_command_run(machine)
     run = replace(run, commands={n: 0.05 * np.sin(6.0 * run.times) for n in run.commands})
     motion = World(machine).move(run, run.times)
     hinges = len(machine.hinges)

@@ -41,7 +41,7 @@ class _Comparison:
         self.runs, states = item.performance
         self.measured = item.measured()
         truth = {name: self.experiment.channels(states[name]) for name in RUNS}
-        self.truth_error = rms(self._residual(HELD_OUT, truth[HELD_OUT]))
+        self.true_parameter_error = rms(self._residual(HELD_OUT, truth[HELD_OUT]))
 
     def ratio(self, name):
         effect, _, place = name.partition("@")
@@ -50,7 +50,10 @@ class _Comparison:
         places = self._places(effect, place)
         if not places:
             return None
-        return min(self._held_out_error(form, places) for form in FORMS[effect]) / self.truth_error
+        return (
+            min(self._held_out_error(form, places) for form in FORMS[effect])
+            / self.true_parameter_error
+        )
 
     def _places(self, effect, place):
         model = self.experiment.model

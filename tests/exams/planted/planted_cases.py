@@ -379,7 +379,7 @@ def draw_planted_case(question, name):
     noise = float(rng.choice(POSITION_NOISE))
     with_velocities = bool(rng.random() < VELOCITY_SHARE)
     wanted = float(np.exp(rng.uniform(*np.log(GAP))))
-    experiment, swing = _untouched(question.system, seed, noise, with_velocities)
+    experiment, swing = _find_simple_experiment(question.system, seed, noise, with_velocities)
     limits = {}
     peaks = experiment.nominal_peaks
     if experiment.robot.drive == "servo" and rng.random() < SATURATED_SHARE:
@@ -405,7 +405,7 @@ def draw_planted_case(question, name):
     raise UndrawableError(f"{question.name}: no place shows a gap of {GAP[0]:g} noises")
 
 
-def _untouched(robot, seed, noise, with_velocities):
+def _find_simple_experiment(robot, seed, noise, with_velocities):
     """Return the experiment with the largest amplitude whose motion is simple."""
     for swing in (1.0, 0.7, 0.5, 0.35):
         experiment = Experiment(robot, seed, noise, with_velocities, swing)

@@ -6,7 +6,7 @@ import math
 import re
 
 
-def faults(expected, outcome):
+def find_answer_errors(expected, outcome):
     """Return the errors of an answer; empty for a right one, None if no answer is expected.
 
     Args:
@@ -31,7 +31,7 @@ def faults(expected, outcome):
         found.append(f"verdict {verdict['verdict']}, not {' or '.join(expected['verdicts'])}")
     if verdict["verdict"] in ("unknown", "unidentifiable") and expected.get("causes"):
         found.append("causes are listed, not named")
-    found += _cause_faults(expected, verdict["causes"])
+    found += _find_cause_errors(expected, verdict["causes"])
     for name, number in expected.get("parameters", {}).items():
         stated = verdict["parameters"].get(name)
         if stated is None:
@@ -41,7 +41,7 @@ def faults(expected, outcome):
     return found
 
 
-def _cause_faults(expected, causes):
+def _find_cause_errors(expected, causes):
     found, matched = [], []
     for wanted in expected.get("causes", []):
         cause = next(

@@ -13,7 +13,7 @@ from tests.exams.answer_rows import conditions_text
 from tests.exams.exam import Exam, Target, UndrawableError
 from tests.exams.explain_calls import Outcome
 from tests.exams.marking import Mark
-from tests.exams.recordings.answer_marking import faults
+from tests.exams.recordings.answer_marking import find_answer_errors
 
 RECORDINGS = Path(__file__).with_name("recordings.toml")
 SHARED = Path(os.environ.get("SIMGAP_SHARED", Path(__file__).parents[4] / "shared"))
@@ -81,7 +81,7 @@ class RecordingCase(exam.Case):
         return {"hidden": "", "size": "", "noise": "", "conditions": conditions}
 
     def mark(self, outcome):
-        found = faults(self.expected, outcome)
+        found = find_answer_errors(self.expected, outcome)
         causes = " + ".join(map(_cause_text, (outcome.verdict or {}).get("causes", [])))
         if found is None:
             return Mark("unknown", causes, note=self.expected["plain"])

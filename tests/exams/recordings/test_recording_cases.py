@@ -8,7 +8,7 @@ from sims.core.toml_validation import tomllib
 from tests.exams.exam import UndrawableError
 from tests.exams.explain_calls import Outcome
 from tests.exams.recordings import recording_cases
-from tests.exams.recordings.answer_marking import faults
+from tests.exams.recordings.answer_marking import find_answer_errors
 from tests.exams.recordings.recording_cases import RECORDINGS, SHARED
 
 EXPECTED = {
@@ -34,7 +34,7 @@ def outcome(*sets, name="named", value=3.01, parameters=None):
 
 
 @pytest.mark.parametrize(
-    ("answer", "fault"),
+    ("answer", "error"),
     [
         (outcome(("drag.linear@elbow",)), None),
         (outcome(("drag.linear@elbow", "actuator.damping@m"), name="ambiguous"), None),
@@ -48,22 +48,24 @@ def outcome(*sets, name="named", value=3.01, parameters=None):
         (Outcome(None, None, 120.0, 130.0, 100.0, ""), "no answer"),
     ],
 )
-def test_faults(answer, fault):
-    found = faults(EXPECTED, answer)
-    assert (found == []) if fault is None else any(fault in text for text in found)
+def test_faults(answer, error):
+    found = find_answer_errors(EXPECTED, answer)
+    assert (found == []) if error is None else any(error in text for text in found)
 
 
 def test_faults_of_parameters_and_findings():
     free = {"parameters": {"drag.linear@elbow": {"value": 60.0, "tolerance": 0.05}}}
     right = outcome(name="adequate", parameters={"drag.linear@elbow": {"value": 59.0}})
-    assert faults(free, right) == []
-    assert faults(free, outcome(name="adequate")) == ["no parameter drag.linear@elbow"]
+    assert find_answer_errors(free, right) == []
+    assert find_answer_errors(free, outcome(name="adequate")) == ["no parameter drag.linear@elbow"]
     refused = Outcome(None, 2, 1.0, 1.0, 100.0, "joint elbow: its axis is reversed")
     flipped = {"exit": 2, "message": "axis.*reversed"}
-    assert faults(flipped, refused) == []
-    assert faults(flipped, dataclasses.replace(refused, code=0)) == ["exit code 0, not 2"]
-    assert len(faults(flipped, outcome(("mass.scale@upper",)))) == 2
-    assert faults({"plain": "nothing is published"}, refused) is None
+    assert find_answer_errors(flipped, refused) == []
+    assert find_answer_errors(flipped, dataclasses.replace(refused, code=0)) == [
+        "exit code 0, not 2"
+    ]
+    assert len(find_answer_errors(flipped, outcome(("mass.scale@upper",)))) == 2
+    assert find_answer_errors({"plain": "nothing is published"}, refused) is None
 
 
 def test_every_recording_has_a_row():

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tests.exams.robots import causes_outside_library
+from tests.exams.robots import unmodelled_causes
 from tests.exams.robots.reference_world import COARSE, World
 from tests.exams.robots.sensor_models import observed
 
@@ -38,12 +38,10 @@ class Gauge:
 
     def seen(self, effects):
         """Return noise-free observations in units of the noise, one (T, C) per run."""
-        world = World(
-            self.setting.machine, effects, causes_outside_library.plant_of(effects), self.step
-        )
+        world = World(self.setting.machine, effects, unmodelled_causes.plant_of(effects), self.step)
         channels, sigma = self.setting.channels, self.setting.sigma
         return [
-            observed(world, run, channels, causes_outside_library.slips_of(effects, number)) / sigma
+            observed(world, run, channels, unmodelled_causes.slips_of(effects, number)) / sigma
             for number, run in self.runs
         ]
 

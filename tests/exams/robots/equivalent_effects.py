@@ -16,7 +16,7 @@ FIRST = 0.05  # Start of the fit, as a fraction of the largest plausible value.
 NUDGE = 0.02
 
 
-class Rivals:
+class CompetingCauses:
     """Compute held-out errors of causes that are fitted to one recording.
 
     Errors are in units of the noise standard deviation.
@@ -35,22 +35,22 @@ class Rivals:
         self.wanted = np.concatenate(self.fitted.beyond_states(values[:count]))
         self.unseen = np.concatenate(self.held.beyond_states(values[count:]))
 
-    def truth(self):
+    def true_cause_error(self):
         """Return the held-out error of the hidden effects with their true coefficients."""
         return self._error(self.effects)
 
-    def ratio(self, name, beside=()):
-        """Return the held-out error of a fitted cause, divided by the error of the truth.
+    def ratio(self, name, further_effects=()):
+        """Return the held-out error of a fitted cause, divided by that of the true cause.
 
         The result is None if the reference world does not contain the cause.
 
         Args:
             name: effect@place, or effect@* for every place.
-            beside: names of hidden effects that keep their true coefficients.
+            further_effects: names of hidden effects that keep their true coefficients.
         """
-        others = {key: self.effects[key] for key in beside}
+        others = {key: self.effects[key] for key in further_effects}
         errors = [self._fitted(of, count, others) for of, count in self._forms(name)]
-        return min(errors) / self.truth() if errors else None
+        return min(errors) / self.true_cause_error() if errors else None
 
     def _forms(self, name):
         """Yield (function from scaled numbers to effects, count of numbers) for each shape."""

@@ -99,38 +99,40 @@ def _run(machine, form, times, rng):
     waves = {d.name: command_signals.wave(form, times, rng) for d in machine.drives}
     shares = {d.name: float(rng.uniform(0.5, 1.0)) for d in machine.drives}
     start = pose if servo else pose + rng.uniform(-0.3, 0.3, pose.size)
-    reach = _reach(machine, pose)
+    travel = _compute_free_travel(machine, pose)
     wanted = float(rng.uniform(0.4, 0.8))
     scale = 1.0
     for _ in range(12):
         signals = {}
         for joint, drive in zip(machine.driven, machine.drives, strict=True):
             size = (
-                scale * shares[drive.name] * (min(0.5, reach[joint]) if servo else 8 * moved[joint])
+                scale
+                * shares[drive.name]
+                * (min(0.5, travel[joint]) if servo else 8 * moved[joint])
             )
             middle = pose[joint] + hold[joint] / drive.kp if servo else 0.0
             signals[drive.name] = middle + size * waves[drive.name]
         run = Run(times, signals, start, 0 * start)
         motion = World(machine, step=COARSE / 2).move(run, times)
-        over = _over(machine, motion, pose, reach, None if servo else wanted)
+        over = _over(machine, motion, pose, travel, None if servo else wanted)
         if over <= 1.0:
             return run, motion
         scale *= 0.9 / min(over, 4.0)
     raise ValueError(f"{machine.name}: found no command that stays within its limits")
 
 
-def _reach(machine, pose):
+def _compute_free_travel(machine, pose):
     """Return how far each joint may move away from its pose."""
     limits = np.array([machine.range(name) for name in machine.joints])
     return 0.8 * np.minimum(np.abs(limits[:, 0] - pose), np.abs(limits[:, 1] - pose))
 
 
-def _over(machine, motion, pose, reach, wanted):
+def _over(machine, motion, pose, travel, wanted):
     """Return the factor by which a motion exceeds its limits."""
     far = np.abs(motion.q - pose).max(axis=0)
     if not np.isfinite(far).all():
         return 10.0
-    over = float(np.max(far / (1.1 * reach)))
+    over = float(np.max(far / (1.1 * travel)))
     for joint, drive in zip(machine.driven, machine.drives, strict=True):
         over = max(over, float(np.abs(motion.force[:, joint]).max() / (SPARE * drive.force)))
     return max(over, float(far.max() / wanted)) if wanted else over

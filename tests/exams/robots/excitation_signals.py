@@ -15,7 +15,7 @@ COUPLING = "joint.coupling@"
 
 
 @dataclass
-class Felt:
+class AppliedSignal:
     """A command on its way to an actuator.
 
     The order of the effects is: gain, power, bias, dead band, saturation, rate limit, delay, motion
@@ -69,19 +69,19 @@ def _held(begins, values, t):
     return values[np.maximum(np.searchsorted(begins, t + 1e-9, side="right") - 1, 0)]
 
 
-def _slewed(values, times, most):
-    """Limit the rate of a signal to `most` per second; results are held for 1 ms each."""
+def _slewed(values, times, limit):
+    """Limit the rate of a signal to `limit` per second; results are held for 1 ms each."""
     fine = np.arange(times[0], times[-1] + 1e-3, 1e-3)
     wanted, state, risen = _held(times, values, fine), values[0], []
     for level in wanted.tolist():
-        moved = min(max(level - state, -most * 1e-3), most * 1e-3)
-        risen.append(state + moved - 0.5 * abs(moved) / (most * 1e-3) * moved)
+        moved = min(max(level - state, -limit * 1e-3), limit * 1e-3)
+        risen.append(state + moved - 0.5 * abs(moved) / (limit * 1e-3) * moved)
         state += moved
     return np.array(risen), fine
 
 
-def profiled(values, times, most):
-    """Return time-optimal moves to each value with acceleration limit `most`.
+def profiled(values, times, limit):
+    """Return time-optimal moves to each value with acceleration limit `limit`.
 
     Moves arrive at rest. Each result is held for 1 ms and is the value at the middle of this time.
     """
@@ -91,31 +91,31 @@ def profiled(values, times, most):
     for value, begin, end in zip(values.tolist(), times.tolist(), ends, strict=True):
         middles = fine[(fine >= begin - 1e-9) & (fine < end - 1e-9)] + 5e-4
         t = np.append(middles, end) - begin
-        x, v = _shortest(place - value, speed, most, t)
+        x, v = _shortest(place - value, speed, limit, t)
         went.extend((value + x[:-1]).tolist())
         place, speed = value + x[-1], v[-1]
     return np.array(went), fine[: len(went)]
 
 
-def _shortest(x, v, most, t):
+def _shortest(x, v, limit, t):
     """Return position and speed of a double integrator on its time-optimal way to rest at zero.
 
     Args:
         x, v: initial position and speed.
-        most: largest acceleration.
+        limit: largest acceleration.
         t: times.
     """
-    way = -np.sign(x + v * abs(v) / (2 * most)) or -np.sign(v) or 1.0
+    way = -np.sign(x + v * abs(v) / (2 * limit)) or -np.sign(v) or 1.0
     x, v = way * x, way * v
-    peak = np.sqrt(max(v**2 / 2 - most * x, 0.0))
-    first, last = (peak - v) / most, (2 * peak - v) / most
+    peak = np.sqrt(max(v**2 / 2 - limit * x, 0.0))
+    first, last = (peak - v) / limit, (2 * peak - v) / limit
     left = np.maximum(last - t, 0.0)
     gaining = t < first
-    where = np.where(gaining, x + v * t + most * t**2 / 2, -most * left**2 / 2)
-    return way * where, way * np.where(gaining, v + most * t, most * left)
+    where = np.where(gaining, x + v * t + limit * t**2 / 2, -limit * left**2 / 2)
+    return way * where, way * np.where(gaining, v + limit * t, limit * left)
 
 
-def felt(machine, times, commands, effects):
+def compute_applied_signals(machine, times, commands, effects):
     """Return the applied signal of every actuator of a machine, by name."""
     signals = {}
     for drive in machine.drives:
@@ -124,7 +124,7 @@ def felt(machine, times, commands, effects):
             effect, _, place = name.partition("@")
             if effect in SIGNALS and place == drive.name:
                 numbers[effect.partition(".")[2]] = c[0] if len(c) == 1 else c
-        signals[drive.name] = Felt(times, commands[drive.name], **numbers)
+        signals[drive.name] = AppliedSignal(times, commands[drive.name], **numbers)
     return signals
 
 

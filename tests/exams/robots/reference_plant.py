@@ -75,9 +75,9 @@ class Elastic:
         """Bound on the fastest rate of the rotor on its spring and damper, rad/s."""
         return np.sqrt(self.stiffness / self.rotor) + self.damping / self.rotor
 
-    def through(self, apart, speed):
+    def through(self, deflection, speed):
         """Return the force from the motor to the link; flanks of a backlash only push."""
-        beyond = apart - min(max(apart, -0.5 * self.gap), 0.5 * self.gap)
+        beyond = deflection - min(max(deflection, -0.5 * self.gap), 0.5 * self.gap)
         force = self.stiffness * beyond + self.damping * speed
         if not self.gap:
             return force
@@ -85,8 +85,8 @@ class Elastic:
 
     def rests(self, load):
         """Return how far the link is ahead of the fixed motor under the force `load`."""
-        ahead = load / self.stiffness
-        return ahead + 0.5 * self.gap * np.sign(load) * (abs(load) > 1e-9)
+        stretch = load / self.stiffness
+        return stretch + 0.5 * self.gap * np.sign(load) * (abs(load) > 1e-9)
 
 
 @dataclass
@@ -117,7 +117,7 @@ class Plant:
     bias: np.ndarray
     extra: np.ndarray
     speed: np.ndarray
-    ahead: np.ndarray
+    forward: np.ndarray
     back: np.ndarray
     ripples: list = field(default_factory=list)
     stops: list = field(default_factory=list)
@@ -151,23 +151,23 @@ class Plant:
 
     @cached_property
     def lopsided(self):
-        return bool((self.ahead != self.back).any())
+        return bool((self.forward != self.back).any())
 
     @cached_property
     def stribeck(self):
         return bool(self.extra.any())
 
     @property
-    def rubs(self):
+    def has_friction(self):
         """Mask (N,) of the joints with dry friction."""
-        rubs = (self.coulomb > 0) | (self.extra > 0)
+        has_friction = (self.coulomb > 0) | (self.extra > 0)
         if self.binding:
-            rubs[self.binding.joint] = True
+            has_friction[self.binding.joint] = True
         if self.heated:
-            rubs[self.heated.joint] = True
+            has_friction[self.heated.joint] = True
         for joint, *_ in self.uneven + self.cold + self.loads:
-            rubs[joint] = True
-        return rubs
+            has_friction[joint] = True
+        return has_friction
 
     def limit(self, t, q, v, drive=None, heat=0.0):
         """Return the largest dry friction of every joint, (N,).
@@ -210,7 +210,7 @@ class Plant:
         if self.drags:
             force -= self.quadratic * np.abs(v) * v
         if self.lopsided:
-            force -= self.ahead * np.maximum(v, 0.0) + self.back * np.minimum(v, 0.0)
+            force -= self.forward * np.maximum(v, 0.0) + self.back * np.minimum(v, 0.0)
         for joint, sine, cosine, period in self.ripples:
             angle = 2 * np.pi * q[joint] / period
             force[joint] += sine * np.sin(angle) + cosine * np.cos(angle)
@@ -348,7 +348,7 @@ def _stribeck(plant, joint, c):
 
 
 def _direction(plant, joint, c):
-    plant.ahead[joint] += c[0]
+    plant.forward[joint] += c[0]
     plant.back[joint] += c[1]
 
 

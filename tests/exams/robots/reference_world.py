@@ -14,7 +14,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.optimize import brentq
 
-from tests.exams.robots.excitation_signals import Drives, felt
+from tests.exams.robots.excitation_signals import Drives, compute_applied_signals
 from tests.exams.robots.friction_laws import held
 from tests.exams.robots.reference_integration import Motion, Run
 from tests.exams.robots.reference_plant import plant
@@ -41,8 +41,8 @@ class World:
         self.drives = Drives.of(machine, self.effects)
         if soft := self.plant.elastic:
             self.step = min(step, 0.7 / soft.fastest)  # Runge-Kutta 4 is stable up to about 2.8.
-        self.rubs = self.plant.rubs
-        self.dry = bool(self.rubs.any())
+        self.has_friction = self.plant.has_friction
+        self.dry = bool(self.has_friction.any())
 
     def move(self, run, instants):
         """Return the motion at increasing times, (K,)."""
@@ -53,13 +53,15 @@ class World:
 class _Course:
     """State of a run during its simulation.
 
-    `way` is -1 or 1 for a sliding joint with friction, and 0 for a joint that is held or has no
-    friction. `stuck` is the mask of the held joints.
+    `sliding_direction` is -1 or 1 for a sliding joint with friction, and 0 for a joint that is held
+    or has no friction. `stuck` is the mask of the held joints.
     """
 
     def __init__(self, world, run):
         self.world, self.plant, self.drives = world, world.plant, world.drives
-        self.signals = felt(world.machine, run.times, run.commands, world.effects)
+        self.signals = compute_applied_signals(
+            world.machine, run.times, run.commands, world.effects
+        )
         self.count, self.joints = self.plant.size, world.machine.driven
         self.elastic, self.cogging = self.plant.elastic, self.plant.cogging
         self.state = np.concatenate([run.q, run.v])
@@ -74,7 +76,7 @@ class _Course:
         self.memory = slice(2 * self.count + len(more), None)
         more += [0.0] * len(self.plant.memory)
         more += [0.0] if self.plant.heated else []
-        self.remembers = bool(more)
+        self.has_hidden_states = bool(more)
         self.state = np.concatenate([self.state, more])
         self.tooth = run.q[self.cogging.joint] if self.cogging else 0.0
         self.target, self.lagged = self._arrived(0.0), self._arrived(0.0)
@@ -83,7 +85,7 @@ class _Course:
         for joint, drive in zip(self.joints, world.machine.drives, strict=True):
             self.lags[joint] = self.signals[drive.name].lag
         self.dull = bool(self.lags.any())
-        self.way, self.stuck = np.zeros(self.count), np.zeros(self.count, dtype=bool)
+        self.sliding_direction, self.stuck = np.zeros(self.count), np.zeros(self.count, dtype=bool)
 
     def through(self, instants):
         changes = np.concatenate([s.begins for s in self.signals.values()] + [instants])
@@ -159,7 +161,7 @@ class _Course:
         """Return the time of the first event, and move the state there; None without an event."""
         span, n = end - now, self.count
         speeds = tried[n : 2 * n]
-        turned = np.flatnonzero(self.way * speeds < 0)
+        turned = np.flatnonzero(self.sliding_direction * speeds < 0)
         loose = self._overloaded(end, tried)
         if not turned.size and loose <= 0:
             return None
@@ -167,11 +169,11 @@ class _Course:
         for joint in turned.tolist():
 
             def speed(h, joint=joint):
-                return self.way[joint] * self._moved(now, h)[n + joint]
+                return self.sliding_direction[joint] * self._moved(now, h)[n + joint]
 
             start = self._going(speed, span, self.state[n + joint])
             if start is None:
-                self.way[joint], self.stuck[joint] = 0.0, True
+                self.sliding_direction[joint], self.stuck[joint] = 0.0, True
                 return now
             when = brentq(speed, start, span, xtol=1e-15)
             if when < first:
@@ -191,7 +193,7 @@ class _Course:
         self.state = self._moved(now, first)
         if stops is not None:
             self.state[n + stops] = 0.0
-            self.way[stops] = 0.0
+            self.sliding_direction[stops] = 0.0
         return now + first
 
     @staticmethod
@@ -225,14 +227,14 @@ class _Course:
         """Decide which joints at rest are held, and the direction of the others."""
         n = self.count
         q, v = self.state[:n], self.state[n : 2 * n]
-        rubs = self.world.rubs
+        has_friction = self.world.has_friction
         limit = self._limit(t, self.state)
-        resting = rubs & (v == 0.0)
-        self.way = np.where(rubs & ~resting, np.sign(v), 0.0)
+        resting = has_friction & (v == 0.0)
+        self.sliding_direction = np.where(has_friction & ~resting, np.sign(v), 0.0)
         self.stuck[:] = False
         if not resting.any():
             return
-        force = self._force(t, self.state) - self.way * limit
+        force = self._force(t, self.state) - self.sliding_direction * limit
         free = self.plant.accelerations(q, v, force)[resting]
         coupling = np.linalg.inv(self.plant.inertia(q))[np.ix_(resting, resting)]
         forces, pull = held(coupling, free, limit[resting])
@@ -240,7 +242,7 @@ class _Course:
         places = np.flatnonzero(resting)
         self.stuck[places[inside]] = True
         goes = ~inside
-        self.way[places[goes]] = np.where(
+        self.sliding_direction[places[goes]] = np.where(
             pull[goes] != 0, np.sign(pull[goes]), -np.sign(forces[goes])
         )
 
@@ -273,7 +275,7 @@ class _Course:
         """Return friction of the held joints, (S,), and accelerations of all joints, (N,)."""
         n = self.count
         q, v = state[:n], state[n : 2 * n]
-        force = self._force(t, state) - self.way * self._limit(t, state)
+        force = self._force(t, state) - self.sliding_direction * self._limit(t, state)
         rest = force - self.plant.needed(q, v)
         mass, free = self.plant.inertia(q), ~self.stuck
         a = np.zeros(n)
@@ -289,16 +291,16 @@ class _Course:
         else:
             force = self._force(t, state)
             if self.world.dry:
-                force = force - self.way * self._limit(t, state)
+                force = force - self.sliding_direction * self._limit(t, state)
             a = self.plant.accelerations(q, v, force)
-        if not self.remembers:
+        if not self.has_hidden_states:
             return np.concatenate((v, a))
         more = []
         if self.elastic:
             more += [self._rotor(state)[1], self._elastic_forces(t, state)[1] / self.elastic.rotor]
         # Dahl model of hysteresis: w' = v / d - |v / d| w.
-        for (joint, _, way), w in zip(self.plant.memory, state[self.memory], strict=False):
-            more.append((v[joint] - abs(v[joint]) * w) / way)
+        for (joint, _, deflection), w in zip(self.plant.memory, state[self.memory], strict=False):
+            more.append((v[joint] - abs(v[joint]) * w) / deflection)
         if hot := self.plant.heated:
             drive = self.drives.forces(self._commands(t), q, v)[hot.other]
             more.append(abs(drive * v[hot.other]) / hot.power - state[-1] / hot.time)

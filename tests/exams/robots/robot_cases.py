@@ -20,13 +20,13 @@ from tests.exams.marking import HiddenCause, Standard, mark_answer
 from tests.exams.robot_files import signal_unit, write_robot_recording
 from tests.exams.robots import (
     cause_sizing,
-    causes_outside_library,
     exam_settings,
     planted_effects,
     reference_plant,
+    unmodelled_causes,
 )
 from tests.exams.robots.cause_sizing import Gauge
-from tests.exams.robots.equivalent_effects import Rivals
+from tests.exams.robots.equivalent_effects import CompetingCauses
 from tests.exams.robots.reference_world import World
 from tests.exams.robots.robot_models import NAMES
 from tests.exams.robots.sensor_models import observed
@@ -36,13 +36,13 @@ CLEAN, DOUBLE, FOREIGN, FAMILY, NUMERICS = 24, 4, 2, 2, 2
 """Questions for each robot and drive: clean, double, each unmodelled cause, each family, numerics.
 """
 ATTEMPTS = 6  # Maximum number of drawings of a question whose cause is not visible.
-MAX_RIVALS = 6  # Maximum number of other causes of a set that are refitted.
+MAX_COMPETING_CAUSES = 6  # Maximum number of other causes of a set that are refitted.
 QUICK = (
     ("clean", "arm2-motor", "any"), ("single", "arm2-motor", "friction.coulomb"),
     ("single", "arm2-motor", "mass.scale"), ("clean", "arm2-servo", "any"),
     ("single", "arm2-servo", "drag.linear"), ("single", "arm2-servo", "input.delay"),
 )  # fmt: skip
-APART = 1.0
+MIN_RESIDUAL_WITHOUT_CAUSE = 1.0
 """Smallest residual without the full cause in the model, in units of the noise.
 
 The model has only one of two causes or, for an unmodelled cause, one effect at the same joint.
@@ -133,11 +133,11 @@ class RobotCase(exam.Case):
         if self.robot in floating_robots.NAMES:
             return {}
         setting, hidden = setting_of(self.name), set(self.effects)
-        rivals = Rivals(setting, self.effects, record(self, setting))
+        rivals = CompetingCauses(setting, self.effects, record(self, setting))
         ratios = {}
         for names in sets:
             beside = hidden - set(names) if not self.family else ()
-            for name in [n for n in names if n not in hidden][:MAX_RIVALS]:
+            for name in [n for n in names if n not in hidden][:MAX_COMPETING_CAUSES]:
                 ratios[name] = rivals.ratio(name, beside)
         return ratios
 
@@ -175,10 +175,10 @@ def bare_case(name, effects):
 def record(case, setting):
     """Return the recorded channels of every run, (T, C)."""
     rng, effects = rng_of(case.name, "noise"), {} if case.kind == "foreign" else case.effects
-    world = World(setting.machine, effects, causes_outside_library.plant_of(case.effects))
+    world = World(setting.machine, effects, unmodelled_causes.plant_of(case.effects))
     values = []
     for number_of_run, run in enumerate(setting.runs):
-        slips = causes_outside_library.slips_of(case.effects, number_of_run)
+        slips = unmodelled_causes.slips_of(case.effects, number_of_run)
         values.append(setting.noise.add_to(observed(world, run, setting.channels, slips), rng))
     return values
 
@@ -312,14 +312,18 @@ def _double(item, setting, effect, rng):
     alone = [np.concatenate(gauge.change(part[0])) for part in (first, second)]
     beyond = min(cause_sizing.left(whole, [part]) for part in alone)
     size = min(first[1], second[1])
-    return replace(item, effects=both, size=size, beyond=beyond) if beyond >= APART else None
+    return (
+        replace(item, effects=both, size=size, beyond=beyond)
+        if beyond >= MIN_RESIDUAL_WITHOUT_CAUSE
+        else None
+    )
 
 
 def _foreign(item, setting, effect, rng):
     """Draw an unmodelled cause that no effect at the same joint explains completely."""
     cause = str(rng.choice(planted_effects.FOREIGN)) if effect == "any" else effect
     joint = int(rng.choice(setting.machine.driven))
-    of, gauge = causes_outside_library.drawn(cause, joint, setting, rng), gauge_of(item.name)
+    of, gauge = unmodelled_causes.drawn(cause, joint, setting, rng), gauge_of(item.name)
     found = cause_sizing.sized(lambda s: gauge.gap(of(s)), draw_size(rng))
     if found is None:
         return None
@@ -327,7 +331,7 @@ def _foreign(item, setting, effect, rng):
     change = np.concatenate(gauge.change(hidden))
     beyond = min(cause_sizing.left(change, [other]) for other in _near(setting, joint, gauge, rng))
     shown = replace(item, effects=hidden, size=found[1], beyond=beyond)
-    return shown if beyond >= APART else None
+    return shown if beyond >= MIN_RESIDUAL_WITHOUT_CAUSE else None
 
 
 def _near(setting, joint, gauge, rng):

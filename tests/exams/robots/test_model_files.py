@@ -13,7 +13,7 @@ from bench.diagnosis.explain import explain
 from tests.exams.robots.exam_robots import Drive
 from tests.exams.robots.model_files import Case, motor, write_case
 
-BESIDE = Path(__file__).parents[4] / "shared" / "robots"
+ROBOTS_FOLDER = Path(__file__).parents[4] / "shared" / "robots"
 FINE = {"integrator": "RK4", "timestep": 0.002}
 SO101 = ("gripper", "wrist_roll", "wrist_flex", "elbow_flex", "shoulder_lift", "shoulder_pan")
 IIWA = tuple(f"lbr_iiwa_joint_{k + 1}" for k in range(7))
@@ -50,7 +50,7 @@ CASES = {
         engine=FINE,
     ),
     "so101.urdf": Case(
-        str(BESIDE / "so101"), "so101.urdf",
+        str(ROBOTS_FOLDER / "so101"), "so101.urdf",
         tuple(Drive(name, "position", kp, 0.08 * kp, 10.0)
               for name, kp in zip(SO101, (0.08, 0.15, 0.5, 2.0, 6.0, 4.0), strict=True)),
         (0.0, -0.4, 0.4, 0.3, 0.2, 0.3), (0.4,) * 6, {"friction.coulomb@elbow_flex": (0.02,)},

@@ -12,11 +12,11 @@ pytest.importorskip("pinocchio", reason="pin has no wheel here")
 from bench.diagnosis_benchmark.case_generation.recording_conditions import SensorNoise
 from tests.exams.robots import (
     cause_sizing,
-    causes_outside_library,
     planted_effects,
     robot_cases,
+    unmodelled_causes,
 )
-from tests.exams.robots.equivalent_effects import Rivals
+from tests.exams.robots.equivalent_effects import CompetingCauses
 from tests.exams.robots.reference_world import Run, World
 from tests.exams.robots.sensor_models import observed
 
@@ -99,8 +99,8 @@ def test_every_effect_can_be_drawn_at_every_place(item):
 
 def test_a_slipping_encoder_jumps_and_stays(item):
     setting = robot_cases.setting_of(item.name)
-    of = causes_outside_library.drawn("slip", 1, setting, np.random.default_rng(0))
-    slips = causes_outside_library.slips_of(of(0.5), 0)
+    of = unmodelled_causes.drawn("slip", 1, setting, np.random.default_rng(0))
+    slips = unmodelled_causes.slips_of(of(0.5), 0)
     assert 1 <= len(slips) <= 2
     gauge = robot_cases.gauge_of(item.name)
     jump = gauge.seen(of(0.5))[0][:, 1] - gauge.base[0][:, 1]
@@ -127,7 +127,7 @@ def test_equivalent_causes_in_a_servo_are_separated_by_a_force_sensor(item):
         hidden, rng = {"force.bias@elbow": (0.2,)}, np.random.default_rng(0)
         world = World(setting.machine, hidden)
         values = [noise.add_to(observed(world, run, channels), rng) for run in runs]
-        rivals = Rivals(setting, hidden, values)
+        rivals = CompetingCauses(setting, hidden, values)
         assert rivals.truth() == pytest.approx(1.0, abs=0.2)
         assert rivals.ratio("force.bias@elbow") == pytest.approx(1.0, abs=0.05)
         assert (rivals.ratio("input.bias@m_elbow") > robot_cases.STANDARD.equal_below) == bool(

@@ -33,7 +33,7 @@ from tests.exams.marking import HiddenCause, Standard, mark_answer
 # Questions per system, effect, system and unmodelled cause.
 CLEAN, EACH, DOUBLE, EACH_FOREIGN = 105, 4, 15, 4
 ATTEMPTS = 8  # Maximum number of drawings of a question whose cause is not visible.
-MAX_RIVALS = 6  # Maximum number of other causes of a set that are refitted.
+MAX_COMPETING_CAUSES = 6  # Maximum number of other causes of a set that are refitted.
 # Sets are fair if there are less than four sigmas of evidence against every other member.
 STANDARD = Standard(max_set=MAX_SET_SIZE, equal_below=4.0, small_sets_are_fair=True)
 QUICK = (
@@ -118,7 +118,7 @@ class SystemCase(exam.Case):
         return {
             name: competing_effects.compute_refitted_residual(setting, observed, name)
             * samples**0.5
-            for name in names[:MAX_RIVALS]
+            for name in names[:MAX_COMPETING_CAUSES]
         }
 
 

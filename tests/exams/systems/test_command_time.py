@@ -8,11 +8,11 @@ from bench.diagnosis_benchmark.case_generation.case_sampling import write_case
 from tests.exams.systems.system_cases import questions
 
 EARLY = {"input.hold", "input.delay"}
-ASKED = (
+CASES = (
     ("slider", "friction.load", 2), ("slider", "wind", 2), ("pendulum", "spring.cubic", 3),
     ("slider", "input.bias", 3),
 )  # fmt: skip
-USUAL = joint_reference.compute_applied_input
+COMPUTE_APPLIED_INPUT = joint_reference.compute_applied_input
 
 
 def drawn(system, effect, index):
@@ -21,13 +21,13 @@ def drawn(system, effect, index):
     return question.draw().item
 
 
-def moved(monkeypatch, **besides):
+def moved(monkeypatch, **further_effects):
     """Add input effects to the simulation that the recorded table does not show."""
 
-    def felt(scenario, effects, until):
-        return USUAL(scenario, {**besides, **effects}, until)
+    def compute_with_further_effects(scenario, effects, until):
+        return COMPUTE_APPLIED_INPUT(scenario, {**further_effects, **effects}, until)
 
-    monkeypatch.setattr(joint_reference, "compute_applied_input", felt)
+    monkeypatch.setattr(joint_reference, "compute_applied_input", compute_with_further_effects)
 
 
 def sets_of(explained):
@@ -35,9 +35,9 @@ def sets_of(explained):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("asked", ASKED, ids=[effect for _, effect, _ in ASKED])
-def test_interpolated_commands_and_the_hidden_cause_are_both_named(asked, tmp_path, monkeypatch):
-    item = drawn(*asked)
+@pytest.mark.parametrize("case", CASES, ids=[effect for _, effect, _ in CASES])
+def test_interpolated_commands_and_the_hidden_cause_are_both_named(case, tmp_path, monkeypatch):
+    item = drawn(*case)
     moved(monkeypatch, **{"input.hold": (1.0,)})
     sets = sets_of(explain(write_case(item, tmp_path)))
     assert any(names & EARLY for names in sets), sets

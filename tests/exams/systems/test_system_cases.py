@@ -104,7 +104,7 @@ def test_the_hidden_effect_leaves_only_noise(system, effect):
         left = competing_effects.compute_refitted_residual(
             drawn, observed, effect, item.effects[effect]
         )
-        assert left * observed.size**0.5 < 1.0  # Sigmas of evidence against the truth.
+        assert left * observed.size**0.5 < 1.0  # Sigmas of evidence against the true cause.
 
 
 def test_a_cause_without_a_visible_draw_is_refused():

@@ -47,14 +47,14 @@ class Driven(Toy):
         return driven(points, scenario)
 
 
-def trained(kind, told):
-    tuner = kind(scenarios=60, points=60, epochs=100, told=told)
+def trained(kind, is_informed):
+    tuner = kind(scenarios=60, points=60, epochs=100, told=is_informed)
     tuner.fit(Driven(), np.random.default_rng(0), 1000)
     return tuner
 
 
 @pytest.fixture(scope="module")
-def told():
+def informed():
     return trained(TuneNet, True)
 
 
@@ -102,8 +102,8 @@ def test_each_run_has_its_own_and_a_short_one_none():
 
 
 @pytest.mark.slow
-def test_a_network_that_reads_the_inputs_beats_one_that_does_not(told, blind):
-    knows, guesses = errors(told, Driven()), errors(blind, Driven())
+def test_a_network_that_reads_the_inputs_beats_one_that_does_not(informed, blind):
+    knows, guesses = errors(informed, Driven()), errors(blind, Driven())
     assert knows[1] < 0.02 < guesses[1] / 2
     assert knows[3] < 1e-3 < guesses[3] / 5
     assert knows[10] < 1e-6
@@ -112,28 +112,31 @@ def test_a_network_that_reads_the_inputs_beats_one_that_does_not(told, blind):
 @pytest.mark.slow
 def test_so_does_the_regressor():
     knows, guesses = (
-        errors(trained(DirectRegressor, told), Driven(), budget=1)[1] for told in (True, False)
+        errors(trained(DirectRegressor, is_informed), Driven(), budget=1)[1]
+        for is_informed in (True, False)
     )
     assert knows < 0.02 < guesses / 2
 
 
-def test_missing_samples_do_not_move_the_optimum(told):
+def test_missing_samples_do_not_move_the_optimum(informed):
     def spoil(observed):
         observed[30:40] = np.nan
 
-    ends = [errors(told, Driven(), seeds=[seed], spoil=spoil)[10] for seed in range(10)]
+    ends = [errors(informed, Driven(), seeds=[seed], spoil=spoil)[10] for seed in range(10)]
     assert (
         sorted(ends)[8] < 1e-6
     )  # filled gaps are new to the network: one of ten runs does not converge
 
 
-def test_state_survives_and_is_checked(told, blind):
-    state = told.state()
+def test_state_survives_and_is_checked(informed, blind):
+    state = informed.state()
     assert state["clean.inputs.chosen"].size == 0  # response coefficients replace samples
     assert state["clean.told.centre"].shape == (6,)
     copy = TuneNet(points=60)
     copy.restore(state)
-    assert np.array_equal(run(copy, Driven(), 4)[0].proposals, run(told, Driven(), 4)[0].proposals)
+    assert np.array_equal(
+        run(copy, Driven(), 4)[0].proposals, run(informed, Driven(), 4)[0].proposals
+    )
     for broken in (
         {**state, "clean.told.spread": state["clean.told.spread"][:-1]},
         {**state, "clean.told.centre": np.full(6, np.nan)},
@@ -145,8 +148,8 @@ def test_state_survives_and_is_checked(told, blind):
             copy.restore(broken)
 
 
-def test_a_scene_of_another_kind_is_refused(told):
-    read = told._fitted.clean.features
+def test_a_scene_of_another_kind_is_refused(informed):
+    read = informed._fitted.clean.features
     with pytest.raises(ValueError, match="train on"):
         read(
             np.zeros((1, SAMPLES, 1)), (SAMPLES,), ScenarioInfo(np.empty(0), np.zeros((SAMPLES, 2)))
@@ -191,8 +194,11 @@ def test_experiments_tell_what_observations_do_not_show(name, initial, inputs):
 
 def test_ball_drop_learns_the_same_weights_bit_for_bit():
     states = []
-    for told in (True, False):
-        problem, tuner = TuningProblem(load_experiment("ball-drop")), TuneNet(told=told, epochs=2)
+    for is_informed in (True, False):
+        problem, tuner = (
+            TuningProblem(load_experiment("ball-drop")),
+            TuneNet(told=is_informed, epochs=2),
+        )
         tuner.fit(problem.make_training_simulator(64), np.random.default_rng(0), 64)
         states.append(tuner.state())
         problem.close()

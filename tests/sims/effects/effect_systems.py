@@ -77,7 +77,7 @@ PAIRS = [
 ]
 
 
-def lanes(*values, count=1):
+def batch_coefficients(*values, count=1):
     """Return coefficients (K, L, 1), equal in every batch element."""
     return np.repeat(np.array(values, dtype=float)[:, None, None], count, axis=1)
 

@@ -22,19 +22,19 @@ def moved(fixed, u, q=0.5):
     return run("pendulum", times, fixed, [0.06], inputs, HEAVY, q=q)[-1, 0] - q
 
 
-@pytest.mark.parametrize("way", [1.0, -1.0])
-def test_friction_over_the_joint_takes_its_work(way):
+@pytest.mark.parametrize("direction", [1.0, -1.0])
+def test_friction_over_the_joint_takes_its_work(direction):
     least, sine, cosine, period, mass = 0.1, 0.3, -0.4, 0.7, 1.5
     times = np.arange(0, 2, 0.01)
     fixed = {"friction.position": (least, sine, cosine, period)}
-    x, v = slide(times, fixed, mass, x=0.2, v=1.5 * way)
+    x, v = slide(times, fixed, mass, x=0.2, v=1.5 * direction)
 
     def work(at):
         angle = 2 * np.pi * at / period
         wave = -sine * np.cos(angle) + cosine * np.sin(angle)
         return (least + 0.5) * at + period / (2 * np.pi) * wave
 
-    taken = way * (work(x) - work(0.2))
+    taken = direction * (work(x) - work(0.2))
     assert 0.5 * mass * v**2 == pytest.approx(0.5 * mass * 1.5**2 - taken, abs=2e-5)
     assert np.ptp(x) > 1.5 * period
 

@@ -27,7 +27,15 @@ from sims.core.simulator import InputError
 from sims.core.system import SYSTEM_KINDS
 from sims.effects.readme_table import render_effects_table
 from sims.system_simulator import make_effect_parameters
-from tests.sims.effects.effect_systems import NAMES, PAIRS, SIMULATORS, SYSTEMS, lanes, moment, run
+from tests.sims.effects.effect_systems import (
+    NAMES,
+    PAIRS,
+    SIMULATORS,
+    SYSTEMS,
+    batch_coefficients,
+    moment,
+    run,
+)
 
 HOOKS = {
     "force": (Force, Friction),
@@ -181,8 +189,8 @@ def test_zero_gives_nothing_and_shapes_are_those_of_the_elements(name, system, c
     now = moment(
         system, rng.normal(size=(count, size)), rng.normal(size=(count, size)), inputs=[0.7], t=0.3
     )
-    off = lanes(*[0.0] * len(effect.coefficients), count=count)
-    on = lanes(*[0.1] * len(effect.coefficients), count=count)
+    off = batch_coefficients(*[0.0] * len(effect.coefficients), count=count)
+    on = batch_coefficients(*[0.1] * len(effect.coefficients), count=count)
     signal = Signal(
         rng.normal(size=(count, 6)),
         np.full((count, 6), 0.01),
@@ -217,7 +225,7 @@ def test_friction_and_forces_are_safe_at_rest(name, system):
     effect, size = effects.get_effect(name)(), len(SYSTEMS[system].coordinates)
     rest = moment(system, np.zeros((1, size)), np.zeros((1, size)))
     for value in (0.0, 0.1):
-        c = lanes(*[value] * len(effect.coefficients))
+        c = batch_coefficients(*[value] * len(effect.coefficients))
         if isinstance(effect, (Force, Friction)):
             given = effect.force(c, rest) if isinstance(effect, Force) else effect.limit(c, rest)
             assert np.isfinite(given).all()
@@ -257,8 +265,8 @@ def test_the_example_in_the_readme_works_and_is_short():
     assert magnet.fits(SYSTEMS["slider"])
     assert not magnet.fits(SYSTEMS["ball"])
     now = moment("slider", [[0.1]], [[0.0]])
-    assert magnet().force(lanes(20.0, 0.1), now) == pytest.approx(-2 * np.exp(-1))
-    assert not magnet().force(lanes(0.0, 0.0), now).any()
+    assert magnet().force(batch_coefficients(20.0, 0.1), now) == pytest.approx(-2 * np.exp(-1))
+    assert not magnet().force(batch_coefficients(0.0, 0.0), now).any()
 
 
 def test_a_third_party_effect_registers_once_and_is_usable_by_name(fresh_registries):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sims import effects
-from tests.sims.effects.effect_systems import lanes, moment
+from tests.sims.effects.effect_systems import batch_coefficients, moment
 
 FLIGHT = {"x": [[1.0, 2.0, 3.0]], "v": [[3.0, 0.0, -4.0]]}  # |v| = 5
 ROLL = {"x": [[0.5]], "v": [[-2.0]], "theta": [2.0]}
@@ -13,12 +13,12 @@ ROLL = {"x": [[0.5]], "v": [[-2.0]], "theta": [2.0]}
 def force(name, now, *c):
     effect = effects.get_effect(name)
     return effect().force(
-        lanes(*c, *[0.0] * (len(effect.coefficients) - len(c)), count=len(now.x)), now
+        batch_coefficients(*c, *[0.0] * (len(effect.coefficients) - len(c)), count=len(now.x)), now
     )[0]
 
 
 def limit(name, now, *c):
-    return effects.get_effect(name)().limit(lanes(*c, count=len(now.x)), now)[0, 0]
+    return effects.get_effect(name)().limit(batch_coefficients(*c, count=len(now.x)), now)[0, 0]
 
 
 @pytest.mark.parametrize(
@@ -114,7 +114,7 @@ def test_restitution_is_a_power_of_speed_that_makes_no_energy():
     effect = effects.get_effect("restitution.speed")()
 
     def at(e, speed, c):
-        return effect.restitution(lanes(c), np.array([[e]]), np.array([[speed]]))[0, 0]
+        return effect.restitution(batch_coefficients(c), np.array([[e]]), np.array([[speed]]))[0, 0]
 
     assert at(0.8, 1.0, -0.25) == 0.8
     assert at(0.8, 16.0, -0.25) == pytest.approx(0.4)
@@ -125,8 +125,8 @@ def test_restitution_is_a_power_of_speed_that_makes_no_energy():
 
 def test_contact_friction_is_its_coefficient():
     effect = effects.get_effect("contact.friction")()
-    assert effect.friction(lanes(0.3, count=2)).tolist() == [[0.3], [0.3]]
-    assert effect.friction(lanes(-0.3)).tolist() == [[0.0]]
+    assert effect.friction(batch_coefficients(0.3, count=2)).tolist() == [[0.3], [0.3]]
+    assert effect.friction(batch_coefficients(-0.3)).tolist() == [[0.0]]
 
 
 def test_elements_do_not_influence_each_other():

@@ -267,12 +267,14 @@ def test_periodic_force_shakes_with_its_amplitude():
     assert v == pytest.approx(expected, abs=1e-5)
 
 
-@pytest.mark.parametrize(("way", "rate"), [(1.0, 0.8), (-1.0, 3.0)])
-def test_friction_by_direction_decays_at_the_rate_of_its_way(way, rate):
+@pytest.mark.parametrize(("direction", "rate"), [(1.0, 0.8), (-1.0, 3.0)])
+def test_friction_by_direction_decays_at_the_rate_of_its_way(direction, rate):
     times = np.arange(100) * 0.01
-    x, v = slide(times, {"friction.direction": (0.8, 3.0)}, 2.0, v=3.0 * way)
-    assert v == pytest.approx(3.0 * way * np.exp(-rate / 2.0 * times), rel=1e-6)
-    assert x == pytest.approx(3.0 * way * 2.0 / rate * -np.expm1(-rate / 2.0 * times), abs=1e-6)
+    x, v = slide(times, {"friction.direction": (0.8, 3.0)}, 2.0, v=3.0 * direction)
+    assert v == pytest.approx(3.0 * direction * np.exp(-rate / 2.0 * times), rel=1e-6)
+    assert x == pytest.approx(
+        3.0 * direction * 2.0 / rate * -np.expm1(-rate / 2.0 * times), abs=1e-6
+    )
 
 
 def test_friction_in_one_direction_lets_a_spring_swing_back_freely():

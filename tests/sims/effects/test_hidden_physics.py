@@ -7,7 +7,7 @@ from sims.core.simulator import InputError, Scenario
 from sims.engines.hidden_states import make_augmented_system
 from sims.systems.pendulum import Pendulum
 from sims.systems.slider import Slider, SliderSystem
-from tests.sims.effects.effect_systems import lanes, moment
+from tests.sims.effects.effect_systems import batch_coefficients, moment
 
 TIMES = np.arange(200) / 100
 MASS = 1.3
@@ -135,7 +135,9 @@ def test_inertia_is_that_of_the_drive_side():
 def test_a_share_beyond_all_leaves_something_to_either_side():
     from sims.effects.transmission import JointFlexibility
 
-    assert JointFlexibility().behind(lanes(5.0, 30.0, 0.1))[0, 0] == pytest.approx(0.98)
+    assert JointFlexibility().behind(batch_coefficients(5.0, 30.0, 0.1))[0, 0] == pytest.approx(
+        0.98
+    )
     at = moment("slider", [[0.1]], [[0.2]], theta=[[2.0]])
     assert at.inertia[0, 0] == 2.0
 

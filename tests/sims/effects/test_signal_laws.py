@@ -6,7 +6,7 @@ import pytest
 from sims import effects
 from sims.core.effect import Signal
 from tests.exams.robots.excitation_signals import profiled
-from tests.sims.effects.effect_systems import lanes
+from tests.sims.effects.effect_systems import batch_coefficients
 
 
 def signal(values, step=0.1, start=None):
@@ -19,7 +19,7 @@ def signal(values, step=0.1, start=None):
 def through(name, c, *args, **kwargs):
     effect, given = effects.get_effect(name)(), signal(*args, **kwargs)
     change = effect.feel if effect.hook == "input" else effect.read
-    return change(lanes(c, count=len(given.values)), given)[0]
+    return change(batch_coefficients(c, count=len(given.values)), given)[0]
 
 
 RAMP = np.array([-2.0, -1.0, 0.0, 0.5, 1.0, 2.0])
@@ -56,13 +56,17 @@ def test_values_by_hand(name, c, expected):
 @pytest.mark.parametrize("name", ["input.delay", "sensor.delay"])
 def test_delays_look_back_and_a_negative_one_ahead(name):
     t = np.array([[0.0, 0.5, 1.0]])
-    assert effects.get_effect(name)().times(lanes(0.25), t).tolist() == [[-0.25, 0.25, 0.75]]
-    assert effects.get_effect(name)().times(lanes(-0.25), t).tolist() == [[0.25, 0.75, 1.25]]
+    assert effects.get_effect(name)().times(batch_coefficients(0.25), t).tolist() == [
+        [-0.25, 0.25, 0.75]
+    ]
+    assert effects.get_effect(name)().times(batch_coefficients(-0.25), t).tolist() == [
+        [0.25, 0.75, 1.25]
+    ]
 
 
 def test_a_slow_clock_lets_more_time_pass_between_its_stamps():
     assert effects.get_effect("clock.skew")().times(
-        lanes(0.25), np.array([[0.0, 1.0, 4.0]])
+        batch_coefficients(0.25), np.array([[0.0, 1.0, 4.0]])
     ).tolist() == [[0.0, 1.25, 5.0]]
 
 

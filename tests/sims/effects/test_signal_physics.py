@@ -16,7 +16,7 @@ def slide(fixed, u=0.0, times=TIMES, mass=2.0, **initial):
     return run("slider", times, fixed, [mass], {"u": np.broadcast_to(u, times.shape)}, **initial).T
 
 
-def felt(fixed, u, times=TIMES):
+def compute_applied_input(fixed, u, times=TIMES):
     """Return the input applied to a slider of 2 kg between samples, from velocity differences."""
     return 2.0 * np.diff(slide(fixed, u, times)[1]) / np.diff(times)
 
@@ -42,8 +42,12 @@ def test_input_lag_is_the_step_response(lag):
 
 
 def test_input_gain_and_bias():
-    assert felt({"input.gain": -0.25}, STEP) == pytest.approx(0.75 * STEP[:-1], abs=1e-9)
-    assert felt({"input.bias": -0.25}, STEP) == pytest.approx(STEP[:-1] - 0.25, abs=1e-9)
+    assert compute_applied_input({"input.gain": -0.25}, STEP) == pytest.approx(
+        0.75 * STEP[:-1], abs=1e-9
+    )
+    assert compute_applied_input({"input.bias": -0.25}, STEP) == pytest.approx(
+        STEP[:-1] - 0.25, abs=1e-9
+    )
 
 
 def test_input_hold_goes_straight_from_sample_to_sample():
@@ -52,9 +56,9 @@ def test_input_hold_goes_straight_from_sample_to_sample():
     """
     wave = 2 * np.sin(4 * TIMES)
     middles = 0.5 * (wave[1:] + wave[:-1])
-    assert felt({"input.hold": 1.0}, wave) == pytest.approx(middles, abs=1e-9)
+    assert compute_applied_input({"input.hold": 1.0}, wave) == pytest.approx(middles, abs=1e-9)
     mixed = 0.7 * wave[:-1] + 0.3 * middles
-    assert felt({"input.hold": 0.3}, wave) == pytest.approx(mixed, abs=1e-9)
+    assert compute_applied_input({"input.hold": 0.3}, wave) == pytest.approx(mixed, abs=1e-9)
 
 
 def moved(effects=(), coefficients=(), **stated):
@@ -85,7 +89,7 @@ def test_a_chain_starts_settled():
     command.
     """
     fixed = {"input.gain": 0.5, "input.bias": 0.2, "input.lag": 0.3}
-    assert felt(fixed, 2.0) == pytest.approx(3.2, abs=1e-9)
+    assert compute_applied_input(fixed, 2.0) == pytest.approx(3.2, abs=1e-9)
     readings, _ = slide({"sensor.gain": 0.5, "sensor.bias": 0.2, "sensor.lag": 0.3}, x=2.0)
     assert readings == pytest.approx(3.2, abs=1e-12)
 
@@ -93,8 +97,10 @@ def test_a_chain_starts_settled():
 def test_deadband_and_saturation():
     wave = 2 * np.sin(4 * TIMES)
     expected = np.sign(wave) * np.maximum(np.abs(wave) - 0.5, 0)
-    assert felt({"input.deadband": 0.5}, wave) == pytest.approx(expected[:-1], abs=1e-9)
-    assert felt({"input.saturation": 0.5}, wave) == pytest.approx(
+    assert compute_applied_input({"input.deadband": 0.5}, wave) == pytest.approx(
+        expected[:-1], abs=1e-9
+    )
+    assert compute_applied_input({"input.saturation": 0.5}, wave) == pytest.approx(
         np.clip(wave, -0.5, 0.5)[:-1], abs=1e-9
     )
 
@@ -104,7 +110,7 @@ def test_the_width_of_backlash_shows_at_a_reversal():
     triangle = 2 * np.abs(
         (TIMES + 0.5) % 2 - 1
     )  # falls from 1 to 0 at 0.5 s, rises to 2 at 1.5 s, falls again
-    given, got = triangle[:-1], felt({"backlash": width}, triangle)
+    given, got = triangle[:-1], compute_applied_input({"backlash": width}, triangle)
     top = int(np.argmax(given))
     rising = given[:top] > width
     assert got[:top][rising & (TIMES[:top] > 0.5)] == pytest.approx(
@@ -162,9 +168,9 @@ def test_a_limit_of_the_rate_makes_a_ramp_of_a_step():
 
 def test_what_is_slower_than_the_limit_of_the_rate_passes_as_it_is():
     wave = np.sin(3 * TIMES)
-    slow, fast = felt({"input.rate": 200.0}, wave), felt({}, wave)
+    slow, fast = compute_applied_input({"input.rate": 200.0}, wave), compute_applied_input({}, wave)
     assert slow == pytest.approx(fast, abs=5e-3)
-    assert slow != pytest.approx(felt({"input.rate": 2.0}, wave), abs=0.1)
+    assert slow != pytest.approx(compute_applied_input({"input.rate": 2.0}, wave), abs=0.1)
 
 
 def test_an_eccentric_encoder_is_off_by_a_sine_of_the_angle():

@@ -151,7 +151,7 @@ def test_a_stamp_that_repeats_leaves_its_row_out_and_is_said(tmp_path):
     )
 
 
-FAULTS = {
+INVALID_MAPPINGS = {
     "a matrix of one column": ({"toml": TOML.replace('unit = "mm"', 'unit = "mm"\nmatrix = [1.0]')},
                                r"x.matrix: expected it with several columns"),
     "a short matrix": ({"toml": TOML.replace('"pos[1]"', '["pos[0]", "pos[1]"]\nmatrix = [1]')},
@@ -190,9 +190,9 @@ FAULTS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", FAULTS)
+@pytest.mark.parametrize("name", INVALID_MAPPINGS)
 def test_a_fault_is_one_line(name, tmp_path):
-    change, message = FAULTS[name]
+    change, message = INVALID_MAPPINGS[name]
     with pytest.raises(InputError, match=message) as error:
         read_recording(written(tmp_path, **change), Slider)
     assert "\n" not in str(error.value)

@@ -73,7 +73,7 @@ DESCRIPTIONS = corruption.documents(TOML, ("oops", "a\nb", "Channels"), VALUES)
 
 
 @st.composite
-def spoilt_tables(draw):
+def corrupted_tables(draw):
     """Return a table with wrong cells and rows, or another layout or encoding, as bytes."""
     data = draw(corruption.tables(GOOD_TABLE, CELLS))
     act, column = draw(st.integers(0, 9)), draw(st.integers(0, len(HEADER) - 1))
@@ -146,7 +146,7 @@ def test_undamaged_it_is_valid(folder):
 
 @pytest.mark.slow
 @SETTINGS
-@given(data=spoilt_tables())
+@given(data=corrupted_tables())
 def test_damaged_tables(folder, monkeypatch, data):
     monkeypatch.setattr("sims.recording.csv_table.MIN_FAST_PARSE_BYTES", 1 << 20)
     slow = outcome(folder, data, GOOD_TOML)

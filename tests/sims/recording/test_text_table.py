@@ -139,7 +139,7 @@ def test_names_stand_in_lists_and_in_arrays(tmp_path):
     assert log.get_column("q.hip").tolist() == log.get_column("q[1]").tolist() == [0.25, 0.125]
 
 
-FAULTS = {
+INVALID_TABLES = {
     "a row too short": ("t,q1,q2\n0,1,2\n\n1,2\n2,3,4\n", r"row 4: expected 3 cells as in the "
                         r"header, row 1, found 2; correct or delete this row"),
     "a row too long": ("# a\nt,q1\n0,1\n1,2,3\n2,3\n", r"row 4: expected 2 cells as in the header, "
@@ -166,9 +166,9 @@ FAULTS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", FAULTS)
+@pytest.mark.parametrize("name", INVALID_TABLES)
 def test_a_fault_is_one_line_that_says_the_row(name, tmp_path):
-    text, message = FAULTS[name]
+    text, message = INVALID_TABLES[name]
     with pytest.raises(InputError, match=message) as error:
         read(tmp_path, text)
     assert "\n" not in str(error.value)

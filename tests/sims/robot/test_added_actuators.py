@@ -87,7 +87,7 @@ def test_ranges(write):
     assert force(robot) == pytest.approx(2)
 
 
-FAULTS = {
+INVALID_ACTUATORS = {
     "no joint": ({"kind": "motor"}, "PATH: actuators.m states no joint"),
     "no kind": ({"joint": "elbow"}, "PATH: actuators.m states no kind"),
     "joint": (
@@ -135,7 +135,7 @@ FAULTS = {
 }
 
 
-@pytest.mark.parametrize(("table", "message"), FAULTS.values(), ids=FAULTS)
+@pytest.mark.parametrize(("table", "message"), INVALID_ACTUATORS.values(), ids=INVALID_ACTUATORS)
 def test_faults_of_a_table(write, table, message):
     path = write(ARM)
     with pytest.raises(InputError) as caught:

@@ -6,12 +6,12 @@ import pytest
 from sims.core.simulator import Scenario
 from sims.robot.dynamics.applied_inputs import compute_inputs_over_steps
 from tests.sims.robot.sample_arms import ARM
-from tests.sims.robot.test_series_joints import made
+from tests.sims.robot.test_series_joints import make_simulator
 
 STEP, STEPS = 0.002, 305
 TIMES = np.arange(61) / 100.0
 RNG = np.random.default_rng(8)
-WAY = {name: 0.05 * RNG.normal(size=61).cumsum() for name in ("u.m_shoulder", "u.m_elbow")}
+COMMANDS = {name: 0.05 * RNG.normal(size=61).cumsum() for name in ("u.m_shoulder", "u.m_elbow")}
 EFFECTS = {
     "input.delay@m_shoulder": 0.013,
     "input.delay@m_elbow": 0.021,
@@ -20,7 +20,7 @@ EFFECTS = {
     "input.lag@m_elbow": 0.03,
     "backlash@m_shoulder": 0.02,
 }
-LANES = (
+ACTIVE_EFFECTS = (
     {"input.delay@m_shoulder"},
     {"input.rate@m_elbow"},
     set(),
@@ -30,11 +30,14 @@ LANES = (
 )
 
 
-def acting(lanes):
-    kind = made(ARM)
+def acting(active_effects):
+    kind = make_simulator(ARM)
     effects = kind(observe=["q.elbow"], effects=list(EFFECTS)).effects
     return tuple(
-        (effect, np.array([[[EFFECTS[effect.name] * (effect.name in lane)] for lane in lanes]]))
+        (
+            effect,
+            np.array([[[EFFECTS[effect.name] * (effect.name in lane)] for lane in active_effects]]),
+        )
         for effect in effects
     )
 
@@ -43,20 +46,24 @@ def acting(lanes):
 @pytest.mark.parametrize("offset", [0.0, 0.0031])
 def test_applied_inputs_do_not_depend_on_other_elements_or_drives(offset, share):
     earlier = {"u.m_elbow": np.array([[-0.3, -0.1], [0.4, 0.2]])}
-    run = Scenario(TIMES, {}, WAY, offset=offset, before=earlier, linear=frozenset({"u.m_elbow"}))
+    run = Scenario(
+        TIMES, {}, COMMANDS, offset=offset, before=earlier, linear=frozenset({"u.m_elbow"})
+    )
 
-    def feels(lanes, names=WAY):
-        signals = {name: WAY[name] for name in names}
+    def compute_inputs(active_effects, names=COMMANDS):
+        signals = {name: COMMANDS[name] for name in names}
         return compute_inputs_over_steps(
-            STEP, run, signals, acting(lanes), len(lanes), STEPS, share
+            STEP, run, signals, acting(active_effects), len(active_effects), STEPS, share
         )
 
-    together = feels(LANES)
-    bare = feels(LANES[2:3])
-    for number, lane in enumerate(LANES):
-        alone = feels([lane])
+    together = compute_inputs(ACTIVE_EFFECTS)
+    bare = compute_inputs(ACTIVE_EFFECTS[2:3])
+    for number, lane in enumerate(ACTIVE_EFFECTS):
+        alone = compute_inputs([lane])
         for name, own in together.items():
             np.testing.assert_array_equal(own[number], alone[name][0])
-            np.testing.assert_array_equal(own[number], feels(LANES, [name])[name][number])
+            np.testing.assert_array_equal(
+                own[number], compute_inputs(ACTIVE_EFFECTS, [name])[name][number]
+            )
             touched = any(effect.endswith(name[1:].replace(".", "@")) for effect in lane)
             assert (own[number] != bare[name][0]).any() == touched

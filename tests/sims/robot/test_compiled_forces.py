@@ -33,7 +33,7 @@ def arm(tmp_path):
     return make_robot_simulator(tmp_path / "arm.xml")
 
 
-def asked(kind):
+def list_step_effects(kind):
     """Return every effect of the library that is evaluated per step, at each place that has it."""
     placed = (
         one for name in library.list_names() for one in kind.system.placed(library.get_effect(name))
@@ -47,7 +47,7 @@ def by_numpy(monkeypatch):
 
 
 def test_every_effect_moves_the_robot_as_it_does_without_the_compiler(arm, monkeypatch, capsys):
-    effects = asked(arm)
+    effects = list_step_effects(arm)
     assert len(effects) > 25
     families = {effect.name for effect in effects}
     made = arm(effects=[type(effect) for effect in effects])
@@ -108,15 +108,15 @@ class Changing(Plain):
     """An effect whose values change with each call, so that its trace cannot be trusted."""
 
     name = "changing"
-    asked = 0
+    evaluations = 0
 
     def force(self, c, moment):
-        type(self).asked += 1
-        return c[0] * float(self.asked) * np.ones_like(moment.x)
+        type(self).evaluations += 1
+        return c[0] * float(self.evaluations) * np.ones_like(moment.x)
 
 
 @pytest.mark.parametrize(
-    ("effect", "says"),
+    ("effect", "message"),
     [
         (Plain, ""),
         (Branching, "converts its arguments to a new array"),
@@ -125,7 +125,7 @@ class Changing(Plain):
     ],
 )
 def test_untraceable_effects_are_reported_once_and_evaluated_by_numpy(
-    arm, effect, says, capsys, monkeypatch
+    arm, effect, message, capsys, monkeypatch
 ):
     elbow = next(spot for spot in arm.system.places["joint"] if spot.name == "elbow")
     made = arm(effects=[make_placed_effect(effect, elbow)])
@@ -137,10 +137,10 @@ def test_untraceable_effects_are_reported_once_and_evaluated_by_numpy(
     assert np.abs(first[0] - first[1]).max() > 1e-4
     made.simulate(theta, SCENARIO)
     told = capsys.readouterr().err
-    assert told.count("\n") == (1 if says else 0)
-    assert says in told
+    assert told.count("\n") == (1 if message else 0)
+    assert message in told
     assert (
-        not says
+        not message
         or f"effect {effect.name}@elbow is evaluated with NumPy, since it cannot be compiled"
         in told
     )

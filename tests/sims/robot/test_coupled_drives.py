@@ -42,7 +42,7 @@ TABLE = """
 """
 MOTOR = '<motor name="m" joint="across" gear="2" forcerange="-3 3"/>'
 SERVO = f'<position name="m" joint="across" kp="{KP}" kv="{KV}"/>'
-ALONG = '<motor name="n" joint="along"/>'
+SECOND_MOTOR = '<motor name="n" joint="along"/>'
 TIMES = np.arange(101) / 100.0
 BOTH = ("q.along", "q.across")
 
@@ -109,7 +109,7 @@ def test_what_drives_say_between_samples_is_theirs_at_both_joints():
 
 
 def test_it_is_at_driven_joints_behind_one_of_their_kind():
-    kind = table(MOTOR + ALONG)
+    kind = table(MOTOR + SECOND_MOTOR)
     there = {
         name for name in library.list_effects_for(kind.system) if name.startswith("joint.coupling")
     }
@@ -126,7 +126,7 @@ def test_it_is_at_driven_joints_behind_one_of_their_kind():
 @pytest.mark.parametrize("u", [(4.0, 1.0), (-4.0, 1.0), (40.0, -20.0)])
 def test_one_battery_gives_each_drive_what_all_together_leave(u):
     """F_i = U_i (1 - c (|F_1| + |F_2|)), and the sum stays below 1 / c."""
-    kind, c = table(MOTOR.replace('forcerange="-3 3"', "") + ALONG), 0.1
+    kind, c = table(MOTOR.replace('forcerange="-3 3"', "") + SECOND_MOTOR), 0.1
     first, second = (np.full(TIMES.size, one) for one in u)
     run = Scenario(TIMES, {}, {"u.m": first, "u.n": second})
     seen = moved(kind, ["supply.sag"], [c], run, ("q.across", "q.along"))
@@ -146,9 +146,14 @@ def test_a_battery_is_there_where_several_drives_of_one_kind_are():
         return [name for name in found if name.startswith("supply.sag")]
 
     assert there(MOTOR) == ["supply.sag@m"]
-    assert there(MOTOR + ALONG) == ["supply.sag@m", "supply.sag@n", "supply.sag@*", "supply.sag"]
+    assert there(MOTOR + SECOND_MOTOR) == [
+        "supply.sag@m",
+        "supply.sag@n",
+        "supply.sag@*",
+        "supply.sag",
+    ]
     turned = TABLE.replace('name="along" type="slide"', 'name="along" type="hinge"')
-    assert "supply.sag" not in there(MOTOR + ALONG, turned), "1/N is no 1/(N m)"
+    assert "supply.sag" not in there(MOTOR + SECOND_MOTOR, turned), "1/N is no 1/(N m)"
 
 
 CAUSES = {

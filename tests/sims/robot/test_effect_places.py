@@ -38,19 +38,19 @@ RAIL = """
 """
 
 
-def made(text, **given):
+def make_robot(text, **given):
     spec = mujoco.MjSpec.from_string(text)
     return RobotModel(Path("robot.xml"), "mjcf", spec, digest=text, **given)
 
 
 @pytest.fixture(scope="module")
 def rail():
-    return make_robot_system(made(RAIL, aliases={"plate": "cart"}))
+    return make_robot_system(make_robot(RAIL, aliases={"plate": "cart"}))
 
 
 @pytest.fixture(scope="module")
 def arm():
-    return make_robot_system(made(ARM))
+    return make_robot_system(make_robot(ARM))
 
 
 def numbers(effect):
@@ -129,7 +129,7 @@ def test_ranges_take_away_what_the_file_states_and_no_more(arm):
 
 
 def test_a_file_may_state_less_than_nothing():
-    pushes = make_robot_system(made(ARM.replace('damping="0.1"', 'damping="-0.5"')))
+    pushes = make_robot_system(make_robot(ARM.replace('damping="0.1"', 'damping="-0.5"')))
     (_, _, (low, high), least) = numbers(pushes.effect("drag.linear@elbow"))[0]
     assert (low, least, high) == (0.0, 0.0, 1.0), "there is nothing to take away"
 
@@ -157,7 +157,7 @@ def test_a_place_that_does_not_exist_lists_those_that_do(rail):
     ],
 )
 def test_free_parameters_are_not_causes(word, names):
-    kind = make_robot_simulator(made(ARM), [word])
+    kind = make_robot_simulator(make_robot(ARM), [word])
     assert [p.name for p in kind.parameters] == names
     there = effects.list_effects_for(kind.system)
     assert not there.keys() & {*names, f"{names[0].partition('@')[0]}@*"}
@@ -166,8 +166,8 @@ def test_free_parameters_are_not_causes(word, names):
 
 
 def test_a_payload_is_not_proposed_on_a_body_whose_mass_is_free():
-    kind = make_robot_simulator(made(ARM), ["mass@fore"])
-    usual = effects.list_effects_for(make_robot_simulator(made(ARM)).system)
+    kind = make_robot_simulator(make_robot(ARM), ["mass@fore"])
+    usual = effects.list_effects_for(make_robot_simulator(make_robot(ARM)).system)
     assert {"payload@fore", "payload@upper"} <= usual.keys()
     there = effects.list_effects_for(kind.system)
     assert "payload@fore" not in there
@@ -193,7 +193,7 @@ def test_scales_are_what_gravity_pulls_with_and_what_turns(rail):
     assert 0.9 * weight < sizes.force[1] <= weight
     assert sizes.force[0] == pytest.approx(5.0 * 3.4), "without weight, what accelerates it"
     small = RAIL.replace('mass="3"', 'mass="1e-5"').replace('mass="0.4"', 'mass="1e-9"')
-    assert compute_joint_scales(made(small)).force.min() == 1e-4
+    assert compute_joint_scales(make_robot(small)).force.min() == 1e-4
 
 
 def test_an_effect_sees_its_joint_alone(rail):

@@ -43,25 +43,25 @@ def test_a_robot_that_nobody_holds_is_gone(tmp_path):
 
 
 @pytest.fixture
-def asked():
+def calls():
     return []
 
 
 @pytest.fixture
-def counted(asked):
+def counted(calls):
     @cache_per_robot
     def counted(robot, number):
-        asked.append(number)
+        calls.append(number)
         return robot.name, number
 
     return counted
 
 
-def test_a_robot_is_asked_once_of_the_same(tmp_path, counted, asked):
+def test_a_robot_is_asked_once_of_the_same(tmp_path, counted, calls):
     first, second = read(tmp_path), read(tmp_path)
     found = [counted(first, 1), counted(first, 2), counted(first, 1), counted(second, 1)]
     assert found == [("arm", 1), ("arm", 2), ("arm", 1), ("arm", 1)]
-    assert asked == [1, 2, 1]
+    assert calls == [1, 2, 1]
 
 
 def robots():

@@ -89,7 +89,7 @@ STATED |= {
 CONTROL = (0.7, 1.8, 6.0)
 
 
-def lanes(robot: RobotModel, effect: str, place: str, c: tuple[float, ...]) -> Any:
+def simulate_pair(robot: RobotModel, effect: str, place: str, c: tuple[float, ...]) -> Any:
     """Return (2, nq) positions after 0.4 s: an element without the effect, and one with it."""
     of = model_field_effects.MODEL_FIELD_EFFECTS[effect]
     if effect == COUPLING_PLACEHOLDER[1]:
@@ -118,7 +118,7 @@ def test_an_element_moves_as_the_file_that_states_it(
     it still moves as the original file.
     """
     arm = robot(tmp_path)
-    found = lanes(arm, effect, place, c)
+    found = simulate_pair(arm, effect, place, c)
     before, after = STATED[effect, place, c]
     assert ARM.count(before) == 1
     stated = moved(Batch(mujoco.MjModel.from_xml_string(ARM.replace(before, after)), 1, 1))
@@ -133,7 +133,7 @@ def test_friction_is_stiff_in_the_elements_where_it_acts_alone(tmp_path: Path) -
     another element has more friction.
     """
     arm = robot(tmp_path)
-    found = lanes(arm, "friction.coulomb", "elbow", (1e-9,))
+    found = simulate_pair(arm, "friction.coulomb", "elbow", (1e-9,))
     plain = moved(Batch(arm.compiled, 1, 1))
     np.testing.assert_allclose(found[0], plain[0], rtol=0, atol=1e-12)
     stiff = ARM.replace('frictionloss="0.05"', f'frictionloss="0.05" {STIFF}')

@@ -51,7 +51,7 @@ def bounds(yaw):
 
 
 @pytest.mark.parametrize(
-    ("name", "least"),
+    ("name", "lower_limit"),
     [
         ("drag.linear@yaw", -0.3),
         ("inertia.armature@yaw", -0.02),
@@ -62,9 +62,9 @@ def bounds(yaw):
         ("sensor.gain@q.yaw", -0.8),
     ],
 )
-def test_no_total_is_negative(bounds, name, least):
+def test_no_total_is_negative(bounds, name, lower_limit):
     ((low, high),) = bounds(name)
-    assert low == pytest.approx(least)
+    assert low == pytest.approx(lower_limit)
     assert high > 3.0
 
 

@@ -99,7 +99,7 @@ ARM_RUN = Scenario(
 JOINTS = ("q.shoulder", "q.elbow", "q.spin")
 
 
-def looped(kind, text=ARM, applied=(0, 0, 0), ahead=0):
+def looped(kind, text=ARM, applied=(0, 0, 0), lead=0):
     """Return (T, 3) positions of a plain MuJoCo loop."""
     model = mujoco.MjModel.from_xml_string(text)
     model.opt.integrator = kind.robot.compiled.opt.integrator
@@ -110,7 +110,7 @@ def looped(kind, text=ARM, applied=(0, 0, 0), ahead=0):
     for step in range(491):
         if step % 10 == 0:
             seen.append(data.qpos.copy())
-        row = np.clip(np.array([step, step + ahead, step]) // 10, 0, len(u) - 1)
+        row = np.clip(np.array([step, step + lead, step]) // 10, 0, len(u) - 1)
         data.ctrl[:] = u[row, range(3)]
         data.qfrc_applied[:] = applied
         mujoco.mj_step(model, data)
@@ -124,13 +124,13 @@ def test_an_arm_moves_as_in_plain_mujoco(integrator):
 
 
 @pytest.mark.parametrize(
-    ("effects", "says"),
+    ("effects", "message"),
     [
         ({"drag__linear_at_elbow": 0.3}, {"text": ARM.replace('damping="0.1"', 'damping="0.4"')}),
         ({"drag__linear_at_*": [0.1, 0.1, 0.1]}, None),
         ({"force__bias_at_elbow": 0.7}, {"applied": (0, 0.7, 0)}),
-        ({"input__delay_at_m_elbow": 0.013}, {"ahead": -13}),
-        ({"input__delay_at_m_elbow": -0.02}, {"ahead": 20}),
+        ({"input__delay_at_m_elbow": 0.013}, {"lead": -13}),
+        ({"input__delay_at_m_elbow": -0.02}, {"lead": 20}),
         (
             {"mass__scale_at_fore": 0.5, "inertia__scale_at_fore": -0.2},
             {"text": ARM.replace('mass="0.8" diaginertia="0.002 0.008 0.009"',
@@ -144,13 +144,13 @@ def test_an_arm_moves_as_in_plain_mujoco(integrator):
     ],
     ids=str,
 )  # fmt: skip
-def test_an_effect_is_what_mujoco_makes_of_it(effects, says):
+def test_an_effect_is_what_mujoco_makes_of_it(effects, message):
     kind = arm()
     seen = one(kind, ARM_RUN, JOINTS, **effects)
     plain = one(kind, ARM_RUN, JOINTS)
     assert np.abs(seen - plain).max() > 1e-4
-    if says is not None:
-        np.testing.assert_allclose(seen, looped(kind, **says), rtol=0, atol=1e-12)
+    if message is not None:
+        np.testing.assert_allclose(seen, looped(kind, **message), rtol=0, atol=1e-12)
     else:
         each = {f"drag__linear_at_{j}": 0.1 for j in ("shoulder", "elbow", "spin")}
         np.testing.assert_array_equal(seen, one(kind, ARM_RUN, JOINTS, **each))
@@ -197,7 +197,7 @@ PUSH = 2 * 0.3 / INERTIA
 
 
 @pytest.mark.parametrize(
-    ("effects", "felt"),
+    ("effects", "measured_time"),
     [
         ({}, lambda t: t),
         ({"sensor__delay_at_q.hinge": 0.0033}, lambda t: np.maximum(t - 0.0033, 0.0)),
@@ -207,11 +207,11 @@ PUSH = 2 * 0.3 / INERTIA
     ],
     ids=["on time", "late", "early", "a slow clock", "a fast clock"],
 )
-def test_a_late_sensor_shows_what_was_the_case(effects, felt):
+def test_a_late_sensor_shows_what_was_the_case(effects, measured_time):
     """A constant force without gravity and damping gives a parabola, up to the last sample."""
     text = PENDULUM.format(step=0.002, integrator="RK4", gravity=0).replace('damping="0.01"', "")
     seen = one(kind_of(text), Scenario(TIMES, {}, PUSHED), **effects)[:, 0]
-    np.testing.assert_allclose(seen, PUSH * felt(TIMES) ** 2 / 2, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(seen, PUSH * measured_time(TIMES) ** 2 / 2, rtol=0, atol=1e-10)
 
 
 def test_a_lag_of_one_sensor_leaves_the_others_as_they_are():

@@ -38,7 +38,7 @@ TIMES = np.arange(101) / 100.0
 STIFF = 30.0  # N m/rad
 
 
-def made(text, **given):
+def make_simulator(text, **given):
     spec = mujoco.MjSpec.from_string(text)
     return make_robot_simulator(RobotModel(Path("robot.xml"), "mjcf", spec, digest=text, **given))
 
@@ -55,7 +55,7 @@ def pushed(torque, times=TIMES):
 
 def test_a_drive_on_a_spring_swings_as_two_masses_do():
     """x = u t^2 / 2 (J + M) + u M (1 - cos w t) / J (J + M) w^2, w^2 = k (1 / J + 1 / M)."""
-    seen = moved(made(WHEEL), ["joint.flexibility@axle"], [1 / STIFF, 0.0], pushed(0.5))
+    seen = moved(make_simulator(WHEEL), ["joint.flexibility@axle"], [1 / STIFF, 0.0], pushed(0.5))
     both, w = DRIVE + LINK, np.sqrt(STIFF * (1 / DRIVE + 1 / LINK))
     swing = 0.5 * LINK / (DRIVE * both * w**2) * (1 - np.cos(w * TIMES))
     np.testing.assert_allclose(seen[:, 0], 0.25 / both * TIMES**2 + swing, atol=2e-7)
@@ -65,7 +65,7 @@ def test_a_drive_on_a_spring_swings_as_two_masses_do():
 def test_a_drive_goes_alone_through_its_gap_and_then_takes_the_link_along():
     """In the gap x'' = u / J; after an impact without rebound (J + M) x'' = u."""
     gap, torque = 0.05, 0.1
-    seen = moved(made(WHEEL), ["joint.backlash@axle"], [gap], pushed(torque))[:, 0]
+    seen = moved(make_simulator(WHEEL), ["joint.backlash@axle"], [gap], pushed(torque))[:, 0]
     meets = np.sqrt(2 * DRIVE * gap / 2 / torque)
     alone = meets > TIMES
     np.testing.assert_allclose(seen[alone], 0.5 * torque / DRIVE * TIMES[alone] ** 2, atol=1e-9)
@@ -82,7 +82,11 @@ def test_friction_that_builds_up_takes_the_energy_that_it_takes_over_its_way():
     """From rest, without a reversal: (J + M) v^2 / 2 = u x - F (x - d (1 - exp(-x / d)))."""
     torque, dry, way = 0.3, 0.2, 0.05
     q, v = moved(
-        made(WHEEL), ["friction.hysteresis@axle"], [dry, way], pushed(torque), ("q.axle", "qd.axle")
+        make_simulator(WHEEL),
+        ["friction.hysteresis@axle"],
+        [dry, way],
+        pushed(torque),
+        ("q.axle", "qd.axle"),
     ).T
     work = torque * q - dry * (q - way * (1 - np.exp(-q / way)))
     np.testing.assert_allclose(0.5 * (DRIVE + LINK) * v**2, work, atol=2e-6)
@@ -91,13 +95,13 @@ def test_friction_that_builds_up_takes_the_energy_that_it_takes_over_its_way():
 
 def test_the_drive_that_a_file_does_not_state_is_a_number():
     """With a drive inertia of J = 0.25 M the common motion is that of 1.25 M."""
-    kind = made(WHEEL.replace(f'armature="{DRIVE}"', ""))
+    kind = make_simulator(WHEEL.replace(f'armature="{DRIVE}"', ""))
     names = [c.name for c in kind.system.effect("joint.flexibility@axle").coefficients]
     assert names == ["compliance", "damping", "rotor"]
     seen = moved(kind, ["joint.flexibility@axle"], [1 / STIFF, 0.2, 0.25], pushed(0.5))[:, 0]
     slope = np.polyfit(TIMES[60:], np.gradient(seen, TIMES)[60:], 1)[0]
     assert slope == pytest.approx(0.5 / (1.25 * LINK), rel=2e-3)
-    stated = made(WHEEL).system.effect("joint.flexibility@axle").coefficients
+    stated = make_simulator(WHEEL).system.effect("joint.flexibility@axle").coefficients
     assert [c.name for c in stated] == ["compliance", "damping"], "the armature is the drive's"
 
 
@@ -126,7 +130,7 @@ PENDULUM = """
 def test_links_load_their_springs_and_flanks_when_a_run_begins(effects, c):
     """A servo that holds the weight of the link keeps it at rest."""
     held = {"u.m_axle": np.full(TIMES.size, -9.81 * 0.3 / 60.0)}
-    seen = moved(made(PENDULUM), effects, c, Scenario(TIMES, {}, held))
+    seen = moved(make_simulator(PENDULUM), effects, c, Scenario(TIMES, {}, held))
     # Without initial deflection the link would fall by about 5 mrad.
     np.testing.assert_allclose(seen, 0.0, atol=2e-4)
 
@@ -151,11 +155,11 @@ PLANAR = """
 GIVES, RATIO, GAP = 0.02, 0.1, 0.06  # rad/(N m), fraction of critical damping, rad
 
 
-def through(apart, speed, stiffness, damping, gap):
+def through(deflection, speed, stiffness, damping, gap):
     """Return the transmitted torque: gap first, then spring and damper; the flanks push and never
     pull.
     """
-    beyond = apart - min(max(apart, -gap / 2), gap / 2)
+    beyond = deflection - min(max(deflection, -gap / 2), gap / 2)
     force = stiffness * beyond + damping * speed
     if gap == 0.0:
         return force
@@ -195,8 +199,8 @@ def test_a_gap_before_a_spring_moves_an_arm_as_scipy_does():
         "joint.backlash@elbow",
         ("q.shoulder", "q.elbow"),
     )
-    seen = moved(made(PLANAR), [spring, play], [GIVES, RATIO, GAP], run, both)
-    turned = moved(made(PLANAR), [play, spring], [GAP, GIVES, RATIO], run, both)
+    seen = moved(make_simulator(PLANAR), [spring, play], [GIVES, RATIO, GAP], run, both)
+    turned = moved(make_simulator(PLANAR), [play, spring], [GAP, GIVES, RATIO], run, both)
     np.testing.assert_array_equal(seen, turned)
     exact, flexible, loose = (
         planar(times, lambda t: 0.6 if t < 0.4 else -0.6, *one)
@@ -233,7 +237,7 @@ def about(kind, effects, c):
     ],
 )
 def test_the_tangent_about_such_a_motion_is_that_of_the_simulation(effect, c):
-    kind = made(ARM.replace('frictionloss="0.05"', ""))
+    kind = make_simulator(ARM.replace('frictionloss="0.05"', ""))
     others = {"force.bias@elbow": 1e-4, "drag.linear@shoulder": 1e-4}
     simulator, theta, linear = about(kind, [effect, *others], [*c, 0.0, 0.0])
     added = [(simulator.effects[1 + k], np.array([d])) for k, d in enumerate(others.values())]
@@ -254,7 +258,7 @@ def test_the_tangent_about_such_a_motion_is_that_of_the_simulation(effect, c):
 
 
 def test_what_such_effects_change_is_what_the_simulation_shows():
-    kind = made(ARM.replace('frictionloss="0.05"', ""))
+    kind = make_simulator(ARM.replace('frictionloss="0.05"', ""))
     effects = ["joint.flexibility@elbow", "joint.backlash@shoulder", "friction.hysteresis@elbow"]
     sizes = [np.array([0.02, 0.1, 0.3]), np.array([0.01]), np.array([1e-4, 0.05])]
     simulator, theta, linear = about(kind, effects, np.zeros(6))
@@ -283,7 +287,7 @@ CAUSES = {
 }  # fmt: skip
 
 
-LOOSE = {**CAUSES, "joint.backlash@elbow": {"gap": number(0.02), "rotor": number(0.0)}}
+WITH_BACKLASH = {**CAUSES, "joint.backlash@elbow": {"gap": number(0.02), "rotor": number(0.0)}}
 
 
 def test_a_file_holds_joints_in_series_and_moves_as_the_simulator_does(tmp_path):
@@ -299,8 +303,8 @@ def test_a_file_holds_joints_in_series_and_moves_as_the_simulator_does(tmp_path)
 
 def test_a_file_holds_a_gap_before_a_spring_as_flanks_that_give(tmp_path):
     robot = arm(tmp_path)
-    done = write_model_files(robot, LOOSE, "log.csv")
-    check_written_files(robot, LOOSE, done)
+    done = write_model_files(robot, WITH_BACKLASH, "log.csv")
+    check_written_files(robot, WITH_BACKLASH, done)
     model = mujoco.MjSpec.from_string(done.xml).compile()
     joint = model.joint("elbow_transmission")
     assert joint.range == pytest.approx([-0.01, 0.01])
@@ -308,7 +312,7 @@ def test_a_file_holds_a_gap_before_a_spring_as_flanks_that_give(tmp_path):
     assert model.jnt_solref[joint.id, 0] == pytest.approx(-50.0 * inverse)
 
 
-@pytest.mark.parametrize("causes", [CAUSES, LOOSE], ids=["spring", "gap before it"])
+@pytest.mark.parametrize("causes", [CAUSES, WITH_BACKLASH], ids=["spring", "gap before it"])
 def test_a_rollout_of_the_file_moves_as_the_simulator_does(tmp_path, causes):
     """Without gravity, elements in series have equal initial states in simulator and file."""
     robot = arm(tmp_path, ARM.replace("0 0 -9.81", "0 0 0"))
@@ -338,7 +342,7 @@ def test_a_spring_behind_a_drive_that_was_found_before_takes_its_inertia_over():
     """An armature identified before becomes the rotor inertia, and the given rotor coefficient is
     ignored. An almost rigid spring therefore hardly changes the motion.
     """
-    kind = made(WHEEL.replace(f'armature="{DRIVE}"', ""))
+    kind = make_simulator(WHEEL.replace(f'armature="{DRIVE}"', ""))
     run = Scenario(TIMES, {}, {"u.m_axle": 0.4 * np.sin(9.0 * TIMES)})
     names = ["inertia.armature@axle", "joint.flexibility@axle"]
     simulator = kind(observe=["q.axle"], effects=names)

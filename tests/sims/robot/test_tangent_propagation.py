@@ -33,7 +33,7 @@ ARM = """
 """
 
 TIMES = np.arange(0, 1.0, 0.01)
-ALIKE = {
+SMALL_CHANGES = {
     "drag.linear": 1e-4, "drag.quadratic": 1e-4, "force.bias": 1e-4, "force.ripple": 1e-4,
     "friction.coulomb": 1e-4, "friction.direction": 1e-3, "gravity.tilt": 1e-4,
     "friction.position": 1e-4, "friction.warming": 1e-4, "friction.load_direction": 1e-3,
@@ -66,7 +66,7 @@ def probes(simulator):
     added, thetas, place = [], [], 0
     for effect in simulator.effects:
         count = len(effect.coefficients)
-        share = ALIKE.get(effect.of or effect.name)
+        share = SMALL_CHANGES.get(effect.of or effect.name)
         for i, coefficient in enumerate(effect.coefficients if share else ()):
             low, high = coefficient.plausible[0]
             if low > 0:

@@ -215,9 +215,9 @@ def test_a_truncated_film_is_read_as_far_as_it_goes(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("data", "says"), [(b"run,t\n1,0\n" * 9, "text file"), (b"", "empty file")]
+    ("data", "message"), [(b"run,t\n1,0\n" * 9, "text file"), (b"", "empty file")]
 )
-def test_what_is_no_video_is_one_line(data, says, tmp_path):
+def test_what_is_no_video_is_one_line(data, message, tmp_path):
     (tmp_path / "no.mp4").write_bytes(data)
-    with pytest.raises(InputError, match=says):
+    with pytest.raises(InputError, match=message):
         VideoFile(tmp_path / "no.mp4")

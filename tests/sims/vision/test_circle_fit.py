@@ -11,15 +11,15 @@ ANGLES = np.linspace(0, 2 * np.pi, 36, endpoint=False)
 TRUE = (21.3, 17.8, 7.4)
 
 
-def edge(spoilt=0, seed=0):
-    """Return points of the true circle, the first `spoilt` of them on a larger, shifted circle, as
-    at a shadow's edge.
+def edge(outliers=0, seed=0):
+    """Return points of the true circle, the first `outliers` of them on a larger, shifted circle,
+    as at a shadow's edge.
     """
     points = np.array(TRUE[:2]) + TRUE[2] * np.stack([np.cos(ANGLES), np.sin(ANGLES)], axis=1)
     points += 0.05 * np.random.default_rng(seed).standard_normal(points.shape)
     aside = np.array([3.0, 4.0]) + np.array(TRUE[:2])
-    points[:spoilt] = (
-        aside + 1.2 * TRUE[2] * np.stack([np.cos(ANGLES), np.sin(ANGLES)], axis=1)[:spoilt]
+    points[:outliers] = (
+        aside + 1.2 * TRUE[2] * np.stack([np.cos(ANGLES), np.sin(ANGLES)], axis=1)[:outliers]
     )
     return points
 
@@ -34,7 +34,7 @@ def test_fit_of_a_clean_edge_does_not_depend_on_where_it_begins(start):
 
 @pytest.mark.parametrize("seed", range(5))
 def test_the_arc_finds_the_ball_where_its_shadow_spoils_a_side(seed):
-    points = edge(spoilt=10, seed=seed)
+    points = edge(outliers=10, seed=seed)
     plain = circle_fit.fit_circle(points, (22.5, 19.5, None))
     by_arc = circle_fit.fit_circle(points, circle_fit.fit_arc(points))
     best = circle_fit.select_better_fit(plain, by_arc)

@@ -77,7 +77,7 @@ def test_residuals_of_surrogates_are_as_autocorrelated_as_those_of_the_noise():
         again = draw_surrogates(residual, seen, 40, rng, project_out=left)
         corrected.append(autocorrelation(left(again), 1))
     assert np.mean(corrected) == pytest.approx(np.mean(own), abs=0.015)
-    assert np.mean(naive) < np.mean(own) - 0.04, "without it they remember too little"
+    assert np.mean(naive) < np.mean(own) - 0.04, "without it their autocorrelation is too small"
 
 
 def test_white_noise_has_nothing_to_correct():

@@ -159,7 +159,7 @@ def test_bounds_are_kept():
     theta = there.get_nominal_theta()
     theta[1] = 1e-4
     fit = fitted(there, theta, effects=("drag.linear",))
-    assert fit.theta[1] == 0.0, "drag that pushes is none"
+    assert fit.theta[1] == 0.0, "negative drag is not allowed"
 
 
 def test_a_parameter_that_would_leave_its_bounds_ends_at_them():

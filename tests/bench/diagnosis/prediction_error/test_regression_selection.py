@@ -71,7 +71,8 @@ def test_what_acts_is_selected_and_nothing_else(rows):
 
 
 def test_noise_selects_nothing_in_most_draws(rows):
-    """By chance, less than one of 30 draws exceeds the penalty k log N + 2 log M."""
+    """Under the null hypothesis, less than one of 30 draws exceeds the penalty k log N + 2 log
+    M."""
     alarms = sum(bool(regression_of(rows, noise(s), singles()).select(6)) for s in range(60))
     assert alarms <= 2
 

@@ -95,7 +95,7 @@ def test_noise_that_is_larger_than_stated_is_structure():
     assert found.excess[0] == pytest.approx(1.5, rel=0.08)
     loud[0].is_noise_stated = np.array([False, True])
     found = assess_lack_of_fit(*loud)
-    assert not found.has_structure, "half as much again as an estimated noise is none"
+    assert not found.has_structure, "1.5 times an estimated noise is not significant"
     assert (found.p_value_threshold, assess_lack_of_fit(*quiet).p_value_threshold) == (
         STRUCTURE_P_VALUE_THRESHOLD_ESTIMATED_NOISE,
         STRUCTURE_P_VALUE_THRESHOLD,

@@ -52,7 +52,9 @@ def test_a_competitor_that_is_better_after_convergence_stays_unless_structure_re
     )
     assert refine_best_model(search, best).effects == (stands,)
     ((effects, noise),) = refits
-    assert effects == [("a",), ("b",), ()], "it, its rivals and what it is measured against"
+    assert effects == [("a",), ("b",), ()], (
+        "the best model, its competing models and the base model"
+    )
     if structure:
         assert noise is None
     else:

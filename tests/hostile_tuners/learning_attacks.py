@@ -13,7 +13,7 @@ import numpy as np
 from methods.tuners.random_search import RandomSearch
 
 
-class School(RandomSearch):
+class HonestLearner(RandomSearch):
     """Learns honestly the mean of its observations, which does not help the tuning."""
 
     name = "school"
@@ -31,7 +31,7 @@ class School(RandomSearch):
         self.learned_mean = state["mean"]
 
 
-class Counter(School):
+class Counter(HonestLearner):
     """Resets the simulation counter and increases the budget."""
 
     name = "counter"
@@ -43,7 +43,7 @@ class Counter(School):
             simulator.used, simulator.budget = 0, 10**9
 
 
-class Fence(School):
+class Fence(HonestLearner):
     """Extends the training range to the whole parameter range, where the wide targets are."""
 
     name = "fence"
@@ -54,7 +54,7 @@ class Fence(School):
         super().fit(simulator, rng, budget)
 
 
-class NotInside(School):
+class NotInside(HonestLearner):
     """Simulates NaN, which is neither inside nor outside the training range."""
 
     name = "not-inside"
@@ -73,7 +73,7 @@ class Stream:
         self.state = {"bit_generator": "PCG64", "state": inner, "has_uint32": 0, "uinteger": 0}
 
 
-class Streams(School):
+class Streams(HonestLearner):
     """Samples every scenario from a fixed random state, so that it is an easy one."""
 
     name = "streams"
@@ -84,7 +84,7 @@ class Streams(School):
         self.learned_mean = simulator.simulate(Stream(12345), points).mean(axis=0)
 
 
-class Behind(School):
+class ProcessSearch(HonestLearner):
     """Searches its process for simulators and problems to simulate with."""
 
     name = "behind"
@@ -119,7 +119,7 @@ class Behind(School):
             raise ValueError(f"it got through: {len(state)}")
 
 
-class Huge(School):
+class Huge(HonestLearner):
     """Announces a training result that is larger than any memory."""
 
     name = "huge"
@@ -130,7 +130,7 @@ class Huge(School):
         os.write(channel._writing, struct.pack("<cBxxIQ", b"L", 0, 0, 1 << 40))
 
 
-class Names(School):
+class Names(HonestLearner):
     """Names its arrays like paths and like internal arrays of the harness."""
 
     name = "names"
@@ -142,7 +142,7 @@ class Names(School):
         return {**super().state(), **counts, **{name: np.zeros(1) for name in names}}
 
 
-class Keyword(School):
+class Keyword(HonestLearner):
     """Names an array like an argument of the function that writes it."""
 
     name = "keyword"
@@ -152,7 +152,7 @@ class Keyword(School):
         return {**super().state(), "file": np.zeros(1)}
 
 
-class Pickles(School):
+class Pickles(HonestLearner):
     name = "pickles"
     ends = "crashed"
 
@@ -160,7 +160,7 @@ class Pickles(School):
         return {"mean": np.array([itertools.count()], dtype=object)}
 
 
-def say(kind, body, flags=0, size=0):
+def send_directly(kind, body, flags=0, size=0):
     """Send a message to the harness directly, without the code of the tuner server."""
     (channel,) = (one for one in gc.get_objects() if type(one).__name__ == "MessageChannel")
     with contextlib.suppress(OSError):
@@ -168,18 +168,18 @@ def say(kind, body, flags=0, size=0):
     return channel
 
 
-class Watched(School):
+class Watched(HonestLearner):
     """Requests the uncounted training simulator, although no observer of the training exists."""
 
     name = "watched"
     ends = "crashed"
 
     def fit(self, simulator, rng, budget):
-        say(b"P", b"", flags=1).receive(1 << 30)
+        send_directly(b"P", b"", flags=1).receive(1 << 30)
         super().fit(simulator, rng, budget)
 
 
-class Pretends(School):
+class Pretends(HonestLearner):
     """Announces arrays of a training result that it does not send."""
 
     name = "pretends"
@@ -187,5 +187,5 @@ class Pretends(School):
 
     def fit(self, simulator, rng, budget):
         says = [["mean", "<f8", [1 << 39, 1 << 39]]]
-        say(b"L", json.dumps(says).encode() + b"\n" + bytes(64))
+        send_directly(b"L", json.dumps(says).encode() + b"\n" + bytes(64))
         os.read(0, 1)

@@ -115,7 +115,7 @@ def test_files_count_once_where_a_process_serves_several_runs():
 )
 def test_what_a_process_says_of_its_files_is_no_more_than_a_line(message, files, names):
     made = experiment("boasting").chosen(
-        tuners=(TunerEntry("boasting", "boasting", {"says": message}),)
+        tuners=(TunerEntry("boasting", "boasting", {"message": message}),)
     )
     ended = outcome(made)
     assert ended.trace.status == "converged"

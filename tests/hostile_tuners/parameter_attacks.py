@@ -103,12 +103,12 @@ class DrawnFromTheSalt(Cheat):
         return [point for salt in salts for point in drawn(task, salt)]
 
 
-def rivals(folders):
+def list_true_parameters(folders):
     """Return the true parameters in journals and tables below these folders, without duplicates."""
-    return list({tuple(truth): truth for truth in _truths(folders)}.values())
+    return list({tuple(truth): truth for truth in _read_true_parameters(folders)}.values())
 
 
-def _truths(folders):
+def _read_true_parameters(folders):
     import pyarrow.parquet
 
     from bench.benchmark.storage.journal_segments import read_records
@@ -128,7 +128,7 @@ class Journal(Cheat):
     name = "journal"
 
     def find(self, task):
-        return rivals([*self.places, Path.cwd()])
+        return list_true_parameters([*self.places, Path.cwd()])
 
 
 class Anywhere(Cheat):
@@ -139,7 +139,7 @@ class Anywhere(Cheat):
     def find(self, task):
         told = [Path(text) for text in os.environ.values() if text.startswith("/")]
         upward = [Path(f"/proc/self/{link}").resolve() for link in ("cwd", "root", "exe")]
-        return rivals([*map(Path, SOMEWHERE), *told, *upward])
+        return list_true_parameters([*map(Path, SOMEWHERE), *told, *upward])
 
 
 def regions(pid):
@@ -156,7 +156,7 @@ class Memory(Cheat):
 
     name = "memory"
 
-    def pieces(self, pid):
+    def read_memory(self, pid):
         with open(f"/proc/{pid}/mem", "rb", buffering=0) as memory:
             for begin, end in regions(pid):
                 with contextlib.suppress(OSError):
@@ -168,7 +168,7 @@ class Memory(Cheat):
         wanted, found = task.start.tobytes(), []
         for pid in [pid for pid in pids if pid not in (0, os.getpid())]:
             with contextlib.suppress(OSError):
-                for piece in self.pieces(pid):
+                for piece in self.read_memory(pid):
                     place = piece.find(wanted)
                     if place >= 0:
                         near = np.frombuffer(piece[place : place + 256], "<f8", count=32)
@@ -181,7 +181,7 @@ class VmRead(Memory):
 
     name = "vm-read"
 
-    def pieces(self, pid):
+    def read_memory(self, pid):
         libc = ctypes.CDLL(None, use_errno=True)
 
         class Vector(ctypes.Structure):
@@ -200,12 +200,12 @@ class Ptrace(Memory):
 
     name = "ptrace"
 
-    def pieces(self, pid):
+    def read_memory(self, pid):
         libc = ctypes.CDLL(None, use_errno=True)
         attach, seize, detach = 16, 0x4206, 17
         if libc.ptrace(seize, pid, None, None) < 0 and libc.ptrace(attach, pid, None, None) < 0:
             return
-        yield from super().pieces(pid)
+        yield from super().read_memory(pid)
         libc.ptrace(detach, pid, None, None)
 
 
@@ -214,7 +214,7 @@ class Descriptors(Memory):
 
     name = "descriptors"
 
-    def pieces(self, _):
+    def read_memory(self, _):
         for descriptor in range(3, 4096):
             with contextlib.suppress(OSError):
                 os.set_blocking(descriptor, False)
@@ -222,7 +222,7 @@ class Descriptors(Memory):
 
     def find(self, task):
         wanted = task.start.tobytes()
-        return [np.frombuffer(p[:16], "<f8") for p in self.pieces(0) if wanted in p]
+        return [np.frombuffer(p[:16], "<f8") for p in self.read_memory(0) if wanted in p]
 
 
 def frames():
@@ -357,25 +357,25 @@ class Timing(Cheat):
             yield np.clip(near, 0.0, 1.0)
 
 
-class PatchedRivals(Cheat):
+class PatchedTuners(Cheat):
     """Patches other tuners to propose only zeros, and patches NumPy functions."""
 
     name = "patched-rivals"
 
     def find(self, task):
-        def spoilt(self, task, rng):
+        def propose_zeros(self, task, rng):
             while True:
                 yield np.zeros(task.dim)
 
         for module in [module for name, module in sys.modules.items() if name[:8] == "methods."]:
             for kind in list(vars(module).values()):
                 if isinstance(kind, type) and issubclass(kind, Tuner) and kind is not RandomSearch:
-                    kind.tune = spoilt
+                    kind.tune = propose_zeros
         np.random.Generator.__doc__ = "spoilt"
         with contextlib.suppress(TypeError):
-            np.random.Generator.uniform = spoilt
+            np.random.Generator.uniform = propose_zeros
         for name in ("argmin", "clip", "linalg"):
-            setattr(np, name, spoilt)
+            setattr(np, name, propose_zeros)
         return []
 
 
