@@ -101,7 +101,7 @@ def test_a_model_that_diverges_between_samples_gives_no_difference(tmp_path):
     """Milliseconds read as seconds: in 20 s an unstable joint exceeds the range of numbers."""
     model = valid_input.ARM.replace(b'name="hip"', b'name="hip" stiffness="-5e4"')
     (tmp_path / "arm.xml").write_bytes(model)
-    (tmp_path / "log.csv").write_bytes(valid_input.logs()["log.csv"])
+    (tmp_path / "log.csv").write_bytes(valid_input.MAPPED_LOG)
     mapped = {**valid_input.MAPPED, "time": {"column": "stamp"}}
     (tmp_path / "mapped.toml").write_bytes(valid_input.toml(mapped))
     assert check(tmp_path / "mapped.toml").differences() == []
