@@ -238,9 +238,9 @@ def best_of(evaluator, dim):
     evaluator = getattr(evaluator, "_evaluate", evaluator)
     points = np.random.default_rng(0).uniform(size=(1000, dim))
     problem = evaluator._problem
-    before, seen = problem.simulated, list(evaluator._seen)
+    before, seen = problem.simulated, list(evaluator._evaluated_squares)
     _, losses = evaluator(points)
-    problem.simulated, evaluator._seen[:] = before, seen
+    problem.simulated, evaluator._evaluated_squares[:] = before, seen
     return points[np.argsort(losses)[:1]]
 
 
