@@ -6,8 +6,9 @@ a spring and a damper moves as
     q'' = w^2 (u - q) - 2 d w q'                                                                 (1)
 
 with the natural frequency w and the damping ratio d. Commands are held over a sample, so (1) is
-integrated exactly from sample to sample (C. Van Loan, IEEE Trans. Autom. Control 23(3), 395, 1978);
-w and d are the grid values with the smallest residual of the position after removal of an offset.
+integrated exactly from sample to sample (K. J. Astrom and B. Wittenmark, Computer-Controlled
+Systems, 3rd edition, 1997, section 2.3); w and d are the grid values with the smallest residual of
+the position after removal of an offset.
 """
 
 from __future__ import annotations
@@ -112,22 +113,45 @@ def estimate_servo_response(runs: Sequence[tuple[Array, Array, Array]]) -> Servo
     if not moving:
         return None
     # Import SciPy's signal module only here, since it is large.
-    from scipy.signal import cont2discrete, lfilter
+    from scipy.signal import lfilter
 
     step = float(np.median([np.median(np.diff(t)) for t, _, _ in moving]))
-    total_variation = sum(float(np.var(q)) * q.size for _, _, q in moving)
-    best, smallest_residual = None, (1.0 - MIN_EXPLAINED_VARIANCE) * total_variation
-    for frequency, damping in product(FREQUENCY_GRID.tolist(), DAMPING_GRID.tolist()):
-        system = [frequency**2], [1.0, 2.0 * damping * frequency, frequency**2]
-        numerator, denominator, _ = cont2discrete(system, step)
-        residual = 0.0
-        for _, u, q in moving:
-            residual += (
-                float(np.var(q - lfilter(np.ravel(numerator), denominator, u - u[0]))) * q.size
-            )
-        if residual < smallest_residual:
-            best, smallest_residual = ServoResponse(frequency, damping), residual
-    return best
+    responses = [ServoResponse(*pair) for pair in product(FREQUENCY_GRID, DAMPING_GRID)]
+    numerators, denominators = _compute_transfer_functions(responses, step)
+    residuals = np.zeros(len(responses))
+    for _, command, position in moving:
+        for i in range(len(responses)):
+            followed = lfilter(numerators[i], denominators[i], command - command[0])
+            residuals[i] += float(np.var(position - followed)) * position.size
+    total_variation = sum(float(np.var(position)) * position.size for _, _, position in moving)
+    best = int(np.argmin(residuals))
+    is_following = residuals[best] < (1.0 - MIN_EXPLAINED_VARIANCE) * total_variation
+    return responses[best] if is_following else None
+
+
+def _compute_transfer_functions(
+    responses: Sequence[ServoResponse], step: float
+) -> tuple[Array, Array]:
+    """Discretise (1) for commands that are held over a step.
+
+    With the poles p = -w (d -+ sqrt(d^2 - 1)), which the grid keeps apart, the response of (1) to
+    a unit step is
+
+        q(t) = 1 - (p2 exp(p1 t) - p1 exp(p2 t)) / (p2 - p1)                                     (2)
+
+    Returns:
+        (n, 3) coefficients of the numerators and of the denominators, by descending powers of z.
+    """
+    frequency, damping = np.array(responses).T
+    root = np.emath.sqrt(damping**2 - 1.0)
+    p1, p2 = -frequency * (damping - root), -frequency * (damping + root)
+    z1, z2 = np.exp(p1 * step), np.exp(p2 * step)
+    zeros, ones = np.zeros_like(frequency), np.ones_like(frequency)
+    denominators = np.stack([ones, -(z1 + z2).real, (z1 * z2).real], axis=1)
+    first = 1.0 - ((p2 * z1 - p1 * z2) / (p2 - p1)).real  # (2) after one step
+    # The gain at rest is 1, so the coefficients of both polynomials have the same sum.
+    second = denominators.sum(axis=1) - first
+    return np.stack([zeros, first, second], axis=1), denominators
 
 
 def _select_present_samples(

@@ -12,7 +12,7 @@ from tests.exams.exam import Exam, Target
 from tests.exams.explain_calls import Outcome
 from tests.exams.marking import Mark
 
-COUNT = 120  # Logs of each kind.
+COUNT = 200  # Logs of each kind.
 FIRST = 100  # Seed of the first log.
 WORDS = {
     "sign of position": "the sign of q.", "sign of command": "the sign of u.",
