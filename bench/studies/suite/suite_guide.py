@@ -142,8 +142,8 @@ def describe_losses(tables: SuiteTables) -> Iterator[str]:
             count = len(tables.curves)
             if losses.empty:
                 yield (
-                    f"{tuner} is not significantly worse in any of {count} cells after {k} "
-                    "simulations."
+                    f"{tuner} is worse by a factor of {LOSS_FACTOR:g} in none of {count} cells "
+                    f"after {k} simulations."
                 )
                 continue
             examples = ", ".join(
@@ -151,8 +151,8 @@ def describe_losses(tables: SuiteTables) -> Iterator[str]:
                 for row in losses.itertuples()
             )
             yield (
-                f"{tuner} is significantly worse in {len(losses)} of {count} cells after {k} "
-                f"simulations: {examples}."
+                f"{tuner} is worse by a factor of {LOSS_FACTOR:g} in {len(losses)} of {count} "
+                f"cells after {k} simulations: {examples}."
             )
 
 

@@ -1,12 +1,18 @@
 """The published results of the suite: headline, guide and pages follow from the stored runs."""
 
+import re
 from pathlib import Path
 
 import pandas as pd
 import pytest
 
 from bench.benchmark.problem.experiment import load_experiment
-from bench.studies.suite.suite_guide import build_guide, build_headline, describe_losses
+from bench.studies.suite.suite_guide import (
+    LOSS_FACTOR,
+    build_guide,
+    build_headline,
+    describe_losses,
+)
 from bench.studies.suite.suite_runs import read_suite_runs
 from bench.studies.suite.suite_tables import FREE, SuiteTables
 
@@ -39,8 +45,17 @@ def test_pages_state_the_headline_and_where_the_methods_lose(tables):
     page = (FOLDER / "report.html").read_text(encoding="utf-8")
     for text in (readme, page):
         assert build_headline(tables) in text
-        for line in describe_losses(tables):
-            assert line in text
+    for line in describe_losses(tables):
+        assert line in page
+    columns = [("hybrid", 10), ("tunenet", 10), ("tunenet", 100)]
+    for place, (tuner, simulations) in enumerate(columns):
+        losses = tables.find_losses(tuner, simulations, LOSS_FACTOR).itertuples()
+        expected = {row.cell: f"{row.winner}, {float(f'{row.ratio:.2g}'):g}" for row in losses}
+        rows = re.findall(r"^\| ([a-z0-9 -]+) \|(.*)\|(.*)\|(.*)\|$", readme, re.MULTILINE)
+        stated = {row[0]: row[1 + place].strip() for row in rows if row[0] in set(tables.curves)}
+        assert {cell: text for cell, text in stated.items() if text} == expected
+    assert tables.find_losses("hybrid", 100, LOSS_FACTOR).empty
+    assert "After 100 simulations, `hybrid` is in no cell worse by this factor." in readme
     ranks = tables.ranks[tables.ranks["training"] == FREE]
     for row in ranks[ranks["simulations"] == 100].itertuples():
         assert f"| `{row.tuner}` |" in readme

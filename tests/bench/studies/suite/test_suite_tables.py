@@ -118,7 +118,7 @@ def test_losses_of_the_reference_methods():
     curves = {cell: {"hybrid": LATE, "tunenet": NEVER, "random": LATE * 2} for cell in CELLS}
     curves[CELLS[2]] = {"hybrid": LATE * 10, "tunenet": NEVER, "random": LATE}
     lines = list(describe_losses(SuiteTables(make_suite(curves))))
-    worse = "is significantly worse in"
+    worse = "is worse by a factor of 3 in"
     assert (
         lines[0] == f"hybrid {worse} 1 of 8 cells after 10 simulations: {CELLS[2]} (random, 10×)."
     )
