@@ -17,7 +17,7 @@ from bench.diagnosis.evaluation.surrogate_residuals import draw_surrogates
 from bench.diagnosis.fitting.base_fit import fit_base_model
 from bench.diagnosis.search.candidate_directions import compute_directions
 from bench.diagnosis.search.score_test import ScoreTest
-from tests.bench.diagnosis.explained_samples import correlated, recording, white, world
+from tests.bench.diagnosis.explained_samples import correlated, evaluator, recording, white
 
 LEVELS = (0.3, 0.1, 0.05, 0.01, 0.003)
 SYSTEMS = {"pendulum": "q", "slider": "x"}
@@ -29,7 +29,7 @@ def tested(system, runs):
     recorded = recording(
         system, runs=runs, seconds=3.0, rate=20.0, seed=5, observe=[SYSTEMS[system]]
     )
-    there = world(recorded)
+    there = evaluator(recorded)
     fit = fit_base_model(there, white(there, SIGMA / 10.0)).fit
     seen = np.ones(fit.simulated.shape, dtype=bool)
     found = compute_directions(there, fit, there.library)
