@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
@@ -23,7 +23,7 @@ from bench.diagnosis.evaluation.noise_floor import (
 from bench.diagnosis.evaluation.noise_free_runs import add_minimal_noise
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.diagnosis.evaluation.search_control import STAGES
+from bench.diagnosis.evaluation.search_control import STAGES, SearchStoppedError
 from bench.diagnosis.evaluation.worker_pool import ForkedWorkerPool
 from bench.diagnosis.experiment_design.next_run import NextRunDesign, design_next_run
 from bench.diagnosis.explain_options import ExplainOptions
@@ -587,7 +587,9 @@ class _ExplainRun:
                 # This import is needed for robots only.
                 from bench.diagnosis.kalman.contact_proposals import propose_contact_effects
 
-                propose_contact_effects(search, self._list_run_evaluators())
+                # A search that has to end early still gives its best model.
+                with suppress(SearchStoppedError):
+                    propose_contact_effects(search, self._list_run_evaluators())
             return diagnose(search, self.validation)
         # This import is needed for robots only.
         from bench.diagnosis.prediction_error.simulation_confirmation import Confirmation

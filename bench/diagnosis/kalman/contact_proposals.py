@@ -12,6 +12,7 @@ from collections.abc import Sequence
 
 from bench.diagnosis.evaluation.coefficient_bounds import compute_coefficient_bounds
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.evaluation.search_control import SearchStoppedError
 from bench.diagnosis.fitting.fit_state import FitStart
 from bench.diagnosis.kalman.first_states import estimate_first_states
 from bench.diagnosis.search.effect_search import EffectSearch
@@ -48,6 +49,9 @@ def propose_contact_effects(search: EffectSearch, evaluators: Sequence[RunEvalua
     Args:
         search: search with the fitted base model; it gets models with one effect each.
         evaluators: its runs, followed by held-out runs, whose initial states are estimated again.
+
+    Raises:
+        SearchStoppedError: the search had to end; it has the models that were fitted so far.
     """
     evaluator, base = search.evaluator, search.base_model.fit
     names = [
@@ -67,13 +71,15 @@ def propose_contact_effects(search: EffectSearch, evaluators: Sequence[RunEvalua
         return
     set_first_states_in_contact(evaluators, best.fit.theta, search.noise.sigma)
     # Sums of squares about other initial states are not comparable.
-    known = [search.base_model, *fits]
+    known = dict(search.models)
     search.models.clear()
-    search.refit_models(
-        [
-            FitStart(model.effects, model.fit.theta, evaluator.initial_state_guesses)
-            for model in known
-        ],
-        is_racing=False,
-    )
+    starts = [
+        FitStart(model.effects, model.fit.theta, evaluator.initial_state_guesses)
+        for model in known.values()
+    ]
+    try:
+        search.refit_models(starts, is_racing=False)
+    except SearchStoppedError:
+        search.models.update(known)
+        raise
     search.fit_to_convergence(search.models[frozenset(best.effects)])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -35,6 +35,8 @@ CHECKED_INSTANTS = 100
 
 MAX_CONTACTS = 12
 """Maximum number of contacts at which effects are candidates."""
+_STATIC_TREE = -1
+"""Index by which MuJoCo marks bodies that do not move."""
 
 
 def compute_static_accelerations(run: Run, kind: type[Simulator]) -> Array:
@@ -63,7 +65,8 @@ def compute_static_accelerations(run: Run, kind: type[Simulator]) -> Array:
 def find_recorded_contacts(recording: Recording, kind: type[Simulator]) -> tuple[str, ...]:
     """Return the names of the pairs of a robot's geoms that touch in the recorded poses.
 
-    Joints that are not recorded keep their initial position.
+    Joints that are not recorded keep their initial position. Contacts that cannot act on a recorded
+    joint, such as those of an object that rests on a table beside the robot, are left out.
 
     Args:
         recording: Recording of the robot.
@@ -76,12 +79,48 @@ def find_recorded_contacts(recording: Recording, kind: type[Simulator]) -> tuple
     from sims.robot.contact_pairs import make_pair_name
 
     model = kind.robot.compiled  # type: ignore[attr-defined]
-    counts = Counter[str]()
+    counts = Counter[tuple[int, int]]()
     for run in recording.training():
         for data in iterate_poses(kind, run.channels):
             touching = data.contact.geom[: data.ncon][data.contact.dist[: data.ncon] <= 0.0]
-            counts.update({make_pair_name(model, pair) for pair in touching.tolist()})
-    return tuple(sorted(name for name, _ in counts.most_common(MAX_CONTACTS)))
+            counts.update({(int(min(pair)), int(max(pair))) for pair in touching})
+    recorded = {
+        int(model.body_treeid[model.joint(joint.name).bodyid[0]])
+        for run in recording.training()
+        for joint in kind.robot.joints  # type: ignore[attr-defined]
+        if f"q.{joint.name}" in run.channels
+    }
+    acting = _select_acting_pairs(model, counts, recorded)
+    named = Counter[str]()
+    for pair in acting:
+        named[make_pair_name(model, pair)] += counts[pair]
+    return tuple(sorted(name for name, _ in named.most_common(MAX_CONTACTS)))
+
+
+def _select_acting_pairs(
+    model: Any, pairs: Iterable[tuple[int, int]], recorded: Collection[int]
+) -> list[tuple[int, int]]:
+    """Return the pairs of geoms whose contact can act on a recorded joint.
+
+    A force is passed on within a kinematic tree, and from tree to tree at a contact, but not by a
+    body that does not move.
+
+    Args:
+        model: Compiled model (mujoco.MjModel).
+        pairs: Pairs of geoms that touch.
+        recorded: Kinematic trees (`MjModel.body_treeid`) with recorded joints.
+    """
+    trees = {
+        pair: {int(model.body_treeid[model.geom_bodyid[geom]]) for geom in pair} - {_STATIC_TREE}
+        for pair in pairs
+    }
+    reached = set(recorded)
+    while True:
+        acting = [pair for pair, own_trees in trees.items() if own_trees & reached]
+        larger = reached.union(*(trees[pair] for pair in acting))
+        if larger == reached:
+            return acting
+        reached = larger
 
 
 def iterate_poses(
