@@ -66,7 +66,7 @@ def find_recorded_contacts(recording: Recording, kind: type[Simulator]) -> tuple
     """Return the names of the pairs of a robot's geoms that touch in the recorded poses.
 
     Joints that are not recorded keep their initial position. Contacts that cannot act on a recorded
-    joint, such as those of an object that rests on a table beside the robot, are left out.
+    joint, such as those of an object that rests on a table next to the robot, are left out.
 
     Args:
         recording: Recording of the robot.

@@ -126,7 +126,7 @@ def test_contacts_of_a_recording_are_candidates(tmp_path: Path) -> None:
         assert [effect.name for effect in placed] == [f"{name}@floor/box"]
 
 
-ARM_BESIDE_BLOCK = """<mujoco model="arm"><worldbody>
+ARM_NEXT_TO_BLOCK = """<mujoco model="arm"><worldbody>
 <geom name="table" type="plane" size="2 2 0.1"/>
 <body name="arm" pos="0 0 0.3"><joint name="swing" axis="0 0 1"/>
 <geom name="link" type="capsule" fromto="0 0 0 0.5 0 0" size="0.05"/></body>
@@ -149,7 +149,7 @@ def test_contacts_that_act_on_no_recorded_joint_are_left_out(
 ) -> None:
     """A block on the table matters only if the arm touches it."""
     path = tmp_path / "arm.xml"
-    path.write_text(ARM_BESIDE_BLOCK.format(place, height - 1e-4, height))
+    path.write_text(ARM_NEXT_TO_BLOCK.format(place, height - 1e-4, height))
     run = Run("1", TIMES, {"q.swing": 0.0 * TIMES}, {}, {}, {}, False)
     recording = Recording(tmp_path / "log.csv", "arm", "", {}, {}, (run,))
     found = find_recorded_contacts(recording, make_robot_simulator(read_robot(path)))
