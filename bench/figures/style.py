@@ -137,7 +137,7 @@ DPI = 160
 MEDIAN_LINE_CAPTION = (
     "Line: median over targets of the recommendation's error (mean over seeds). "
     "Band or bar: 95 % bootstrap interval of the median. "
-    f"Errors below {ERROR_FLOOR:g} are drawn there."
+    f"Errors below {ERROR_FLOOR:g} are drawn at {ERROR_FLOOR:g}."
 )
 
 PANEL_TITLES = {

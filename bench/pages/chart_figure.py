@@ -33,6 +33,8 @@ PANEL_SIZE = (4.3, 4.0)
 """Width and height of a panel in inches."""
 _FOOT_SHARE = 0.035
 """Height of a strip at the bottom of a panel, as a share of the panel."""
+_FOOT_MARGIN = 0.12
+"""Margin above and below the series that keeps them off a strip and its name, as their share."""
 _MIN_NAMED_DECADES = 1.5
 """Minimum width of a strip that has its name, in decades of a logarithmic axis."""
 _NAME_LINE = 34
@@ -117,6 +119,8 @@ def _draw_panel(axis: Axes, panel: Panel, table: pd.DataFrame | Table, horizonta
     style_axis(axis)
     for span in panel.spans:
         _draw_span(axis, span)
+    if any(span.foot for span in panel.spans):
+        axis.margins(y=_FOOT_MARGIN)
     for series in panel.series:
         _draw_series(axis, panel, series, read_series(table, panel.x, series), horizontal)
     across, up = (panel.up, panel.across) if horizontal else (panel.across, panel.up)

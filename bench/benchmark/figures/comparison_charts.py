@@ -146,7 +146,7 @@ def make_distance_chart(view: ComparisonView) -> ComparisonChart:
     table = view.statistics.medians_by_distance
     label = f"{view.format_metric_label(view.statistics.parameter_error_metric)}, median"
     x_axis = Axis(
-        "distance from the training range [widths of it]", names=tuple(format_bin_labels(table))
+        "distance from the training range [range widths]", names=tuple(format_bin_labels(table))
     )
     panels = []
     for k in select_distance_checkpoints(view.experiment.budget):

@@ -147,7 +147,7 @@ def explain_ranking(statistics: ComparisonStatistics, kind: str) -> str:
     if not comparison_count:
         return ""
     return (
-        f"5.8x (8/10): median error 5.8 times the best one's, larger on 8 of 10 targets. Worse: "
+        f"Nx (k/n): median error N times the best one's, larger on k of n targets. Worse: "
         f"p < {SIGNIFICANCE:g} in Wilcoxon's signed-rank test against the best, Holm-corrected for "
         f"{comparison_count} comparison{'s' if comparison_count > 1 else ''}."
     )

@@ -198,7 +198,7 @@ def _draw_shares(axis: Axes, report: DiagnosisReportData, candidates: Sequence[C
     ticks = [tick for tick in (-0.5, 0.0, 0.25, 0.5, 0.75, 1.0) if tick >= lowest - 0.03]
     axis.set_xticks(ticks, [f"{100 * tick:.0f}".replace("-", "−") for tick in ticks])
     axis.set_xlabel("share of the held-out gap closed [%]")
-    axis.set_title("How much it closes (95 %)", fontsize=9.5, loc="left")
+    axis.set_title("Share of the gap closed, 95 % interval", fontsize=9.5, loc="left")
 
 
 def _draw_scores(

@@ -37,6 +37,7 @@ from bench.diagnosis.report.run_selection import (
     MAX_OUTLINED_DOTS,
     RunView,
     decimate,
+    format_selected_run,
     select_worst_run,
 )
 from bench.diagnosis.report.wording import sanitise
@@ -198,15 +199,11 @@ def _draw_overview(report: DiagnosisReportData) -> Figure:
     figure, axes = make_panel_grid(2, count, size, layout=None, sharex=True, height_ratios=(3, 2))
     for column, c in enumerate(view.channels):
         _draw_signal(axes[0][column], axes[1][column], report, view, c)
-    # A sample time counts once, however many channels were recorded.
-    samples = int(np.isfinite(view.data_split.observed[view.row]).any(axis=1).sum())
-    kind = f"{report.validation_run} run" if view.held_out else "run"
-    reason = "that fits worst" if report.verdict.verdict == "adequate" else "with the largest gap"
     selection = (
         f"; {count} of {len(report.channels)} channels" if count < len(report.channels) else ""
     )
-    name = shorten_label(view.data_split.names[view.row])
-    title = f"The {kind} {reason}: {name} ({samples} samples{selection})"
+    samples = view.count_samples()
+    title = f"{format_selected_run(report, view)} ({samples} samples{selection})"
     figure.suptitle(title, fontsize=11, y=0.985)
     # The columns differ only in the channel, so they share one legend.
     handles, labels = axes[0][0].get_legend_handles_labels()

@@ -20,7 +20,12 @@ from bench.diagnosis.report.figure_panels import (
     shorten_label,
 )
 from bench.diagnosis.report.report_data import DiagnosisReportData
-from bench.diagnosis.report.run_selection import MAX_OUTLINED_DOTS, RunView, decimate
+from bench.diagnosis.report.run_selection import (
+    MAX_OUTLINED_DOTS,
+    RunView,
+    decimate,
+    format_selected_run,
+)
 from bench.diagnosis.report.wording import ALL_PLACES, format_number, sanitise
 from bench.figures.style import (
     BLUE,
@@ -347,12 +352,8 @@ def _add_title_and_legend(
     selection = (
         f"; the worst {len(rows)} of {total} joints and sensors" if len(rows) < total else ""
     )
-    # A sample time counts once, however many channels were recorded.
-    samples = int(np.isfinite(view.data_split.observed[view.row]).any(axis=1).sum())
-    kind = f"{report.validation_run} run" if view.held_out else "run"
-    reason = "that fits worst" if report.verdict.verdict == "adequate" else "with the largest gap"
-    title = f"The {kind} {reason}, joint by joint: {shorten_label(view.data_split.names[view.row])}"
-    title += f" ({samples} samples{selection})"
+    selected_run = format_selected_run(report, view)
+    title = f"{selected_run}, joint by joint ({view.count_samples()} samples{selection})"
     figure.suptitle(title, fontsize=11, x=0.012, ha="left", y=1 - 0.2 / height, va="center")
     handles, labels = axes[0, 0].get_legend_handles_labels()
     with warnings.catch_warnings():

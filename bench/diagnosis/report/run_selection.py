@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from bench.diagnosis.report.figure_panels import shorten_label
 from bench.diagnosis.report.report_data import DataSplit, DiagnosisReportData
 from bench.diagnosis.report.summary_text import list_data_splits
 from sims.core.simulator import Array
@@ -36,6 +37,10 @@ class RunView(NamedTuple):
     held_out: bool
     channels: list[int]
 
+    def count_samples(self) -> int:
+        """Count the sample times; one counts once, however many channels were recorded."""
+        return int(np.isfinite(self.data_split.observed[self.row]).any(axis=1).sum())
+
 
 def select_worst_run(report: DiagnosisReportData) -> RunView:
     """Select the run with the largest gap in units of the noise, a held-out one if there is any."""
@@ -49,6 +54,13 @@ def select_worst_run(report: DiagnosisReportData) -> RunView:
         by_channel = np.nan_to_num(np.nanmean(squares[row], axis=0))
     channels = np.argsort(-by_channel, kind="stable")[:MAX_CHANNELS]
     return RunView(split, row, split is report.held_out, sorted(int(c) for c in channels))
+
+
+def format_selected_run(report: DiagnosisReportData, view: RunView) -> str:
+    """Format the name of the run, and why `select_worst_run` has selected it."""
+    kind = f"{report.validation_run} run" if view.held_out else "run"
+    reason = "that fits worst" if report.verdict.verdict == "adequate" else "with the largest gap"
+    return f"Run {shorten_label(view.data_split.names[view.row])}, the {kind} {reason}"
 
 
 def decimate(values: Array) -> NDArray[np.intp]:
