@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from bench.cli.output import CommandResult, PrintLine
-from bench.cli.shared_options import add_force_option, parse_path
+from bench.cli.shared_options import add_force_option, add_out_option, parse_path
 
 
 def add_film_arguments(parser: argparse.ArgumentParser) -> None:
@@ -16,13 +16,7 @@ def add_film_arguments(parser: argparse.ArgumentParser) -> None:
         type=parse_path,
         help="a recording of a ball, with channel z",
     )
-    parser.add_argument(
-        "--out",
-        metavar="FILM.mp4",
-        type=parse_path,
-        required=True,
-        help="new file for the video",
-    )
+    add_out_option(parser, "new file for the video", "FILM.mp4", required=True)
     parser.add_argument("--run", metavar="NAME", help="name of the run (default: the first)")
     parser.add_argument(
         "--size", metavar="PX", type=int, default=100, help="width and height (default: 100)"

@@ -4,15 +4,8 @@ from __future__ import annotations
 
 import argparse
 
-from bench.cli.output import (
-    CommandResult,
-    PrintLine,
-)
-from bench.cli.shared_options import (
-    add_force_option,
-    add_plugin_option,
-    parse_path,
-)
+from bench.cli.output import CommandResult, PrintLine
+from bench.cli.shared_options import add_force_option, add_plugin_option, parse_path
 
 
 def add_score_arguments(parser: argparse.ArgumentParser) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from bench.cli.output import CommandResult, PrintLine
 from bench.cli.shared_options import (
@@ -13,9 +13,6 @@ from bench.cli.shared_options import (
     collect_options,
     parse_positive_int,
 )
-
-if TYPE_CHECKING:
-    pass
 
 
 class _SystemAction(argparse.Action):

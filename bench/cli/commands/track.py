@@ -6,7 +6,7 @@ import argparse
 import sys
 
 from bench.cli.output import CommandResult, PrintLine
-from bench.cli.shared_options import add_pdf, parse_path
+from bench.cli.shared_options import add_out_option, add_pdf, parse_path
 
 
 def add_track_arguments(parser: argparse.ArgumentParser) -> None:
@@ -17,13 +17,7 @@ def add_track_arguments(parser: argparse.ArgumentParser) -> None:
         type=parse_path,
         help="a film of one dropped ball by a fixed camera",
     )
-    parser.add_argument(
-        "--out",
-        metavar="NAME.csv",
-        type=parse_path,
-        required=True,
-        help="new file for the recording",
-    )
+    add_out_option(parser, "new file for the recording", "NAME.csv", required=True)
     parser.add_argument(
         "--ball-diameter", metavar="M", type=float, help="the ball's diameter in metres"
     )
