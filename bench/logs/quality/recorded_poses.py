@@ -12,6 +12,13 @@ from sims.core.simulator import Array, Simulator
 from sims.recording.recording import Recording, Run
 from sims.robot.mujoco_messages import capture_mujoco_warnings
 
+CHECKED_INSTANTS = 100
+"""Maximum number of times of a run at which forces or contacts are evaluated."""
+MAX_CONTACTS = 12
+"""Maximum number of contacts at which effects are candidates."""
+_STATIC_TREE = -1
+"""Index by which MuJoCo marks bodies that do not move."""
+
 
 def find_contacts(
     kind: type[Simulator], positions: Mapping[str, Array]
@@ -27,16 +34,6 @@ def find_contacts(
     for data in iterate_poses(kind, positions):
         pairs |= {(int(min(pair)), int(max(pair))) for pair in data.contact.geom[: data.ncon]}
     return frozenset(pairs)
-
-
-CHECKED_INSTANTS = 100
-"""Maximum number of times of a run at which forces or contacts are evaluated."""
-
-
-MAX_CONTACTS = 12
-"""Maximum number of contacts at which effects are candidates."""
-_STATIC_TREE = -1
-"""Index by which MuJoCo marks bodies that do not move."""
 
 
 def compute_static_accelerations(run: Run, kind: type[Simulator]) -> Array:
@@ -84,21 +81,19 @@ def find_recorded_contacts(recording: Recording, kind: type[Simulator]) -> tuple
         for data in iterate_poses(kind, run.channels):
             touching = data.contact.geom[: data.ncon][data.contact.dist[: data.ncon] <= 0.0]
             counts.update({(int(min(pair)), int(max(pair))) for pair in touching})
-    recorded = {
-        int(model.body_treeid[model.joint(joint.name).bodyid[0]])
+    recorded_trees = {
+        int(model.dof_treeid[joint.velocity])
         for run in recording.training()
         for joint in kind.robot.joints  # type: ignore[attr-defined]
         if f"q.{joint.name}" in run.channels
     }
-    acting = _select_acting_pairs(model, counts, recorded)
-    named = Counter[str]()
-    for pair in acting:
-        named[make_pair_name(model, pair)] += counts[pair]
-    return tuple(sorted(name for name, _ in named.most_common(MAX_CONTACTS)))
+    acting = Counter({p: counts[p] for p in _select_acting_pairs(model, counts, recorded_trees)})
+    frequent_pairs = acting.most_common(MAX_CONTACTS)
+    return tuple(sorted({make_pair_name(model, pair) for pair, _ in frequent_pairs}))
 
 
 def _select_acting_pairs(
-    model: Any, pairs: Iterable[tuple[int, int]], recorded: Collection[int]
+    model: Any, pairs: Iterable[tuple[int, int]], recorded_trees: Collection[int]
 ) -> list[tuple[int, int]]:
     """Return the pairs of geoms whose contact can act on a recorded joint.
 
@@ -108,16 +103,16 @@ def _select_acting_pairs(
     Args:
         model: Compiled model (mujoco.MjModel).
         pairs: Pairs of geoms that touch.
-        recorded: Kinematic trees (`MjModel.body_treeid`) with recorded joints.
+        recorded_trees: Kinematic trees (`MjModel.body_treeid`) with recorded joints.
     """
-    trees = {
+    trees_by_pair = {
         pair: {int(model.body_treeid[model.geom_bodyid[geom]]) for geom in pair} - {_STATIC_TREE}
         for pair in pairs
     }
-    reached = set(recorded)
+    reached = set(recorded_trees)
     while True:
-        acting = [pair for pair, own_trees in trees.items() if own_trees & reached]
-        larger = reached.union(*(trees[pair] for pair in acting))
+        acting = [pair for pair, trees in trees_by_pair.items() if trees & reached]
+        larger = reached.union(*(trees_by_pair[pair] for pair in acting))
         if larger == reached:
             return acting
         reached = larger
