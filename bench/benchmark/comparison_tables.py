@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pandas as pd
 
-from bench.benchmark.figures.comparison_figures import compute_statistics
 from bench.benchmark.statistics.comparison_statistics import ComparisonStatistics
 from bench.benchmark.statistics.error_table import build_error_table
 from bench.benchmark.statistics.expected_running_time import build_ert_table
@@ -16,9 +15,7 @@ from bench.benchmark.statistics.training_amortisation import (
     build_break_even_table,
     find_cheapest_tuners,
 )
-from bench.benchmark.storage.result_folder import (
-    StoredComparison,
-)
+from bench.benchmark.storage.result_folder import StoredComparison
 
 WINNER_COLUMNS = ["experiment", "range", "threshold", "from_seconds", "to_seconds", "tuner"]
 
@@ -38,7 +35,7 @@ def build_tables(
     if stored.runs.empty:
         return {}
     experiment = stored.experiment
-    statistics = statistics or compute_statistics(stored)
+    statistics = statistics or ComparisonStatistics(stored)
     lines = build_error_table(stored.runs, stored.statuses, experiment.budget, stored.costs)
     frames = {
         "table": statistics.sort_rows(add_salt_column(lines, experiment)),

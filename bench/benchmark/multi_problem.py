@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from bench.benchmark.figures.comparison_figures import compute_statistics
 from bench.benchmark.figures.rank_figure import draw_critical_difference_figure
 from bench.benchmark.problem.experiment import Experiment, TunerEntry
 from bench.benchmark.report_page.multi_problem_page import (
@@ -132,7 +131,7 @@ def load_comparisons(folders: Sequence[Path]) -> ComparisonCollection:
         stored = read_comparison(folder, REQUIRED_RUN_COLUMNS)
         if stored.runs.empty:
             raise InputError(f"{folder}: contains no runs")
-        parts.append(LoadedComparison(compute_statistics(stored), stored.experiment))
+        parts.append(LoadedComparison(ComparisonStatistics(stored), stored.experiment))
     first_labels, *other_labels = (part.statistics.curves.list_tuners() for part in parts)
     tuners = [t for t in first_labels if all(t in labels for labels in other_labels)]
     if not tuners:
@@ -290,7 +289,9 @@ class ComparisonCollection:
         each = [
             problem
             for part in self.parts
-            for problem in _compute_runtime_shares(part.statistics.curves, part.statistics.spread)
+            for problem in _compute_runtime_shares(
+                part.statistics.curves, part.statistics.runtime_thresholds
+            )
         ]
         return {t: np.mean([problem[t] for problem in each], axis=0) for t in self.tuners}
 

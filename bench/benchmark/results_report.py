@@ -11,7 +11,6 @@ import pandas as pd
 
 from bench.benchmark.comparison_tables import build_tables
 from bench.benchmark.figures import comparison_figures
-from bench.benchmark.figures.comparison_figures import compute_statistics
 from bench.benchmark.figures.comparison_view import AxisLabels, ComparisonView, make_axis_labels
 from bench.benchmark.isolation.process_exit import ISOLATION_NOTE, without_isolation
 from bench.benchmark.problem.experiment import Experiment
@@ -85,7 +84,7 @@ def write_report(folder: Path, problem: TuningProblem, print_line: Callable[[str
     if stored.runs.empty:
         print_line(f"no run was made; {folder}/status.csv has the reasons")
         return 0
-    labels, statistics = make_axis_labels(problem), compute_statistics(stored)
+    labels, statistics = make_axis_labels(problem), ComparisonStatistics(stored)
     tables = build_tables(stored, statistics)
     for name, frame in tables.items():
         write_atomically(folder / f"{name}.csv", frame.to_csv(index=False))

@@ -17,12 +17,12 @@ import numpy as np
 import pandas as pd
 
 from bench.benchmark.comparison_tables import build_tables
-from bench.benchmark.figures import comparison_figures
 from bench.benchmark.figures.comparison_view import AxisLabels, ComparisonView
 from bench.benchmark.problem.experiment import load_experiment
 from bench.benchmark.report_page.comparison_page import render_page
 from bench.benchmark.report_page.comparison_page_data import ComparisonReportData
 from bench.benchmark.results_report import _render_figures
+from bench.benchmark.statistics.comparison_statistics import ComparisonStatistics
 from bench.benchmark.storage.result_folder import StoredComparison
 from tests.browser import Opened, launched
 
@@ -91,7 +91,7 @@ def clicked(page):
 def ours(browser, place, targets, budget):
     stored = invented(targets, budget)
     labels = AxisLabels("z [m]", "restitution")
-    statistics = comparison_figures.compute_statistics(stored)
+    statistics = ComparisonStatistics(stored)
     started = process_time()
     frames = build_tables(stored, statistics)
     tabled = process_time()

@@ -95,11 +95,6 @@ _LAYOUTS = {
 }
 
 
-def compute_statistics(stored: StoredComparison) -> ComparisonStatistics:
-    """Compute the statistics for tables and figures; needs at least one run."""
-    return ComparisonStatistics(stored.experiment, stored.runs, stored.statuses, stored.costs)
-
-
 def list_figure_names(stored: StoredComparison) -> list[str]:
     """List the names of the figures that a comparison's data allow; empty without a run."""
     experiment, runs = stored.experiment, stored.runs
@@ -134,7 +129,7 @@ def draw_figure(
         stored: The comparison, as read by `bench.benchmark.storage.result_folder.read_comparison`.
         labels: Axis labels, see `make_axis_labels`.
         name: One of `list_figure_names(stored)`.
-        statistics: Result of `compute_statistics(stored)`, to share it between several figures.
+        statistics: Result of `ComparisonStatistics(stored)`, to share it between several figures.
         references: Reference results that are drawn in grey, if the figure is one of
             `OVERLAYABLE_FIGURES`.
 
@@ -149,7 +144,7 @@ def draw_figure(
         assert stored.spectra is not None
         figure = draw_spectra_figure(stored.experiment, stored.spectra)
     else:
-        view = ComparisonView(stored, labels, statistics or compute_statistics(stored))
+        view = ComparisonView(stored, labels, statistics or ComparisonStatistics(stored))
         figure = _draw_chart_figure(view, name, references)
     return add_trust_note(figure, stored.experiment.trusted)
 
@@ -199,17 +194,17 @@ def _draw_chart_figure(
             _draw_reference_lines(axis, panel, reference, style)
     caption = layout.caption.format(
         level=view.statistics.reference_level,
-        thresholds=format_threshold_caption(view.statistics.spread),
+        thresholds=format_threshold_caption(view.statistics.runtime_thresholds),
     )
     finish_figure(figure, axes, style, view.experiment, caption, layout.legend)
     return figure
 
 
-def format_threshold_caption(spread: Array) -> str:
+def format_threshold_caption(thresholds: Array) -> str:
     """Return a caption that explains a runtime distribution over these thresholds."""
-    span = f"from {spread[0]:.2g} to {spread[-1]:.2g} on a logarithmic scale"
+    span = f"from {thresholds[0]:.2g} to {thresholds[-1]:.2g} on a logarithmic scale"
     return (
-        f"{len(spread)} thresholds {span}. "
+        f"{len(thresholds)} thresholds {span}. "
         "Reached: the recommendation's error stays at or below it from there on. "
         "A failed run reaches none."
     )

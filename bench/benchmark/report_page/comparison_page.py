@@ -58,7 +58,7 @@ def render_page(results: ComparisonReportData) -> str:
         mean_seconds=conclusion.list_mean_seconds(results),
         shown_label=view.format_metric_label(view.shown_metric),
         last_simulations=str(int(results.tables["table"]["simulations"].max())),
-        threshold_caption=format_threshold_caption(view.statistics.spread),
+        threshold_caption=format_threshold_caption(view.statistics.runtime_thresholds),
         stiff_threshold=f"{STIFF_SIGMA_THRESHOLD:g}",
         targets_per_training=TARGETS_PER_TRAINING,
         joined=joined,

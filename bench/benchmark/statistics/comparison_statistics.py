@@ -8,7 +8,6 @@ from functools import cached_property
 import numpy as np
 import pandas as pd
 
-from bench.benchmark.problem.experiment import Experiment
 from bench.benchmark.statistics.error_curves import RunCurves, RunRowTable, select_primary_metric
 from bench.benchmark.statistics.expected_running_time import select_thresholds
 from bench.benchmark.statistics.median_curves import (
@@ -23,6 +22,7 @@ from bench.benchmark.statistics.tuner_ranking import (
     rank_after_budget,
     rank_tuners,
 )
+from bench.benchmark.storage.result_folder import StoredComparison
 
 PRICED_LEVEL_COUNT = 3
 """Number of thresholds for which costs are computed, the loosest first.
@@ -35,44 +35,36 @@ class ComparisonStatistics:
     """Statistics of one comparison: the deciding metric, rankings, medians and costs.
 
     Args:
-        experiment: configuration of the comparison.
-        runs: rows of runs.parquet.
-        statuses: rows of status.csv.
-        costs: (simulations, seconds) of one training, by tuner.
+        stored: the stored comparison; it has at least one run.
 
     Attributes:
         metric: name of the deciding metric, see `select_primary_metric`.
         runs: runs that have the deciding metric.
         curves: deciding metric of every run.
-        spread: thresholds of the runtime distribution.
+        runtime_thresholds: thresholds of the runtime distribution.
         levels: thresholds of the tables.
         all_runs: all runs, including those without the deciding metric.
         floor: errors of the deciding metric below this value count as equal to it.
     """
 
-    def __init__(
-        self,
-        experiment: Experiment,
-        runs: pd.DataFrame,
-        statuses: pd.DataFrame,
-        costs: Mapping[str, tuple[float, float]],
-    ) -> None:
+    def __init__(self, stored: StoredComparison) -> None:
         """Select the deciding metric, its curves and thresholds.
 
         Other statistics are computed when they are used. `floor` is the error below which tuners
         count as equal. `_curves` and `_medians` cache the results of other metrics by name.
         """
-        self.metric, self.runs, in_widths = select_primary_metric(runs)
-        self._statuses, self._budget, self._costs = statuses, experiment.budget, costs
+        self.metric, self.runs, in_widths = select_primary_metric(stored.runs)
+        self._statuses, self._costs = stored.statuses, stored.costs
+        self._budget = stored.experiment.budget
         self._rows = self._make_run_rows(self.runs)
         self.curves = self._rows.build_curves(self.metric)
-        self.spread, self.levels = select_thresholds(self.curves, in_widths)
-        self.floor = experiment.negligible_error
+        self.runtime_thresholds, self.levels = select_thresholds(self.curves, in_widths)
+        self.floor = stored.experiment.negligible_error
         if not in_widths:
             # For a recording no error is known to be zero; the smallest median error is used
             # instead.
             self.floor = (1.0 + self.floor) * _find_lowest_median(self.curves)
-        self.all_runs = runs
+        self.all_runs = stored.runs
         self._curves: dict[str, RunCurves] = {}
         self._medians: dict[tuple[str, str], pd.DataFrame] = {}
 
@@ -226,7 +218,7 @@ class ComparisonStatistics:
     @cached_property
     def runtime_distribution(self) -> pd.DataFrame:
         """Runtime distribution of every range; see `runtime_distribution.build_runtime_table`."""
-        return build_runtime_table(self.curves, self.spread)
+        return build_runtime_table(self.curves, self.runtime_thresholds)
 
     @cached_property
     def tuning_costs(self) -> dict[float, dict[str, dict[str, TuningCost]]]:

@@ -48,8 +48,8 @@ def select_thresholds(curves: RunCurves, simulated: bool) -> tuple[Array, tuple[
     # At most half of the initial error, so that thresholds differ even if no tuner improved.
     best = min(float(np.nanmin(curves.compute_final_values())), 0.5 * start)
     # Slightly above the smallest error, so that the best run reaches it despite rounding.
-    spread = np.geomspace(start, 1.001 * best, 21)
-    return spread, tuple(float(x) for x in spread[[5, 10, 15, 18, 20]])
+    thresholds = np.geomspace(start, 1.001 * best, 21)
+    return thresholds, tuple(float(x) for x in thresholds[[5, 10, 15, 18, 20]])
 
 
 def compute_hitting_times(curves: RunCurves, threshold: float) -> Array:

@@ -12,24 +12,24 @@ from bench.benchmark.statistics.expected_running_time import compute_hitting_tim
 from sims.core.simulator import Array
 
 RUNTIME_SHARE_COLUMNS = ["range", "tuner", "simulations", "share"]
-
-
 _RUNTIME_POINT_COUNT = 60
 """Number of points of a runtime distribution, on a logarithmic scale of simulations."""
 
 
-def compute_solved_fraction(curves: RunCurves, spread: Array, points: NDArray[np.int64]) -> Array:
+def compute_solved_fraction(
+    curves: RunCurves, thresholds: Array, points: NDArray[np.int64]
+) -> Array:
     """Compute the share of (run, threshold) pairs that are reached.
 
     Args:
         curves: values of the deciding metric.
-        spread: thresholds.
+        thresholds: thresholds of that metric.
         points: (P,) numbers of simulations.
 
     Returns:
         (P,) shares.
     """
-    times = np.concatenate([compute_hitting_times(curves, float(t)) for t in spread])
+    times = np.concatenate([compute_hitting_times(curves, float(t)) for t in thresholds])
     return np.array([(times <= k).mean() for k in points])
 
 

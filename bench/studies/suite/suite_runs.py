@@ -15,9 +15,9 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from bench.benchmark.figures.comparison_figures import compute_statistics
 from bench.benchmark.problem.experiment import Experiment
 from bench.benchmark.results_report import REQUIRED_RUN_COLUMNS
+from bench.benchmark.statistics.comparison_statistics import ComparisonStatistics
 from bench.benchmark.storage.journal_segments import SEGMENTS_FOLDER
 from bench.benchmark.storage.result_folder import CONFIGURATION_FILE, read_comparison
 from bench.misspecification.comparison_experiments import MODEL_LABELS, PLAIN
@@ -155,7 +155,7 @@ def _collect_comparison(folder: Path, condition: str) -> SuiteRuns:
     skipped = stored.statuses[stored.statuses["status"] == "skipped"]
     if stored.runs.empty:
         return _make_empty(skipped)
-    statistics = compute_statistics(stored)
+    statistics = ComparisonStatistics(stored)
     curves = statistics.curves
     statuses = stored.statuses.drop_duplicates("run").set_index("run")
     run_statuses = statuses.reindex(curves.keys["run"])

@@ -11,10 +11,10 @@ from bench.benchmark.comparison_tables import build_tables
 from bench.benchmark.figures import comparison_figures
 from bench.benchmark.figures.comparison_figures import (
     FIGURE_FILES,
-    compute_statistics,
     draw_figure,
     list_figure_names,
 )
+from bench.benchmark.statistics.comparison_statistics import ComparisonStatistics
 from bench.benchmark.statistics.error_table import build_error_table
 from sims.core.simulator import InputError
 from tests.bench.figures.sample_comparisons import LABELS, stored
@@ -98,12 +98,12 @@ def test_errors_that_count_as_equal_are_shaded_and_cut_no_curve():
 
 def test_statistics_are_computed_once_for_several_figures(monkeypatch):
     whole = stored()
-    statistics = compute_statistics(whole)
+    statistics = ComparisonStatistics(whole)
 
     def again(_):
         raise AssertionError("computed again")
 
-    monkeypatch.setattr(comparison_figures, "compute_statistics", again)
+    monkeypatch.setattr(comparison_figures, "ComparisonStatistics", again)
     for name in ("runtime", "cost", "amortisation"):
         draw_figure(whole, LABELS, name, statistics)
 
@@ -112,7 +112,7 @@ def test_tables_can_be_had_without_a_file():
     whole = stored()
     made = build_tables(whole)
     assert list(made) == ["table", "ert", "ranking", "pairs", "break_even", "who_wins"]
-    expected = compute_statistics(whole).sort_rows(
+    expected = ComparisonStatistics(whole).sort_rows(
         build_error_table(whole.runs, whole.statuses, 12, whole.costs)
     )
     assert list(dict.fromkeys(expected["tuner"])) == ["tunenet", "random"]
@@ -140,7 +140,7 @@ def test_break_even_is_drawn_at_the_numbers_of_its_table():
     whole = stored()
     drawn = draw_figure(whole, LABELS, "amortisation")
     evens = build_tables(whole)["break_even"]
-    level = compute_statistics(whole).reference_level
+    level = ComparisonStatistics(whole).reference_level
     for axis, kind in zip(drawn.axes, ("in", "wide"), strict=True):
         part = evens[(evens["range"] == kind) & (evens["threshold"] == level)]
         (line,) = (one for one in axis.containers if one.get_label() == "tunenet")

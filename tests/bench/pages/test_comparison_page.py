@@ -21,6 +21,7 @@ from bench.benchmark.report_page.comparison_conclusion import (
 )
 from bench.benchmark.report_page.comparison_page import render_page
 from bench.benchmark.report_page.comparison_page_data import ComparisonReportData
+from bench.benchmark.statistics.comparison_statistics import ComparisonStatistics
 from bench.benchmark.statistics.training_amortisation import build_time_per_target_table
 from bench.figures.style import render_all_formats
 from bench.pages.text_format import format_number
@@ -42,7 +43,7 @@ def statuses(of):
 
 def results(whole=None, pictures=None, missing=0):
     whole = whole or stored()
-    statistics = comparison_figures.compute_statistics(whole)
+    statistics = ComparisonStatistics(whole)
     if pictures is None:
         pictures = {}
     environment = {"simgap": "0.1", "plugins": ["/a b/mine.py"], "packages": {"numpy": "2.0"}}

@@ -4,10 +4,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from bench.benchmark.figures.comparison_figures import compute_statistics
 from bench.benchmark.multi_problem import ComparisonCollection, LoadedComparison
 from bench.benchmark.problem.experiment import load_experiment
 from bench.benchmark.report_page.multi_problem_page import render_multi_problem_page
+from bench.benchmark.statistics.comparison_statistics import ComparisonStatistics
 from bench.benchmark.statistics.problem_ranks import MIN_PROBLEMS_FOR_RANKS
 from bench.bounce_shot.hit_rate_table import build_result_table, compute_wilson_interval
 from bench.bounce_shot.shot_page import render_page
@@ -40,7 +40,7 @@ def page_of(count, tmp_path, drop=None):
     whole = with_third(stored())
     if drop:
         whole = whole._replace(runs=whole.runs[whole.runs["tuner"] != drop])
-    one = LoadedComparison(compute_statistics(whole), whole.experiment)
+    one = LoadedComparison(ComparisonStatistics(whole), whole.experiment)
     together = ComparisonCollection([one] * count, one.statistics.curves.list_tuners())
     frames = together.build_tables()
     pictures = dict.fromkeys(["runtime-distribution", "critical-difference"], drawn())
