@@ -69,9 +69,7 @@ def build_answer_row(
     """
     answer = stored_answer["answer"]
     grade = grade_answer(case, answer)
-    is_covered_by_interval = [
-        is_covered for is_covered in grade.covered.values() if is_covered is not None
-    ]
+    known_coverage = [covered for covered in grade.covered.values() if covered is not None]
     causes = answer["causes"] if answer else []
     case_columns = {name: getattr(case, name) for name in CASE_COLUMNS}
     case_columns[RUN_SECONDS_COLUMN] = case_columns.pop("seconds")
@@ -95,8 +93,8 @@ def build_answer_row(
         "found_class": grade.is_correct_up_to_equivalence,
         "alarm": answer is None or answer["verdict"] != "adequate",
         "p_value": answer["p_value"] if answer else None,
-        "intervals": len(is_covered_by_interval),
-        "holding": sum(is_covered_by_interval),
+        "intervals": len(known_coverage),
+        "holding": sum(known_coverage),
         "simulations": stored_answer["simulations"],
         "seconds": stored_answer["seconds"],
         "processor_seconds": stored_answer["processor_seconds"],

@@ -87,11 +87,11 @@ def list_unmodelled_causes(system: str) -> list[str]:
     )
 
 
-def find_equivalent_effects(item: BenchmarkCase, effect: str) -> frozenset[str]:
+def find_equivalent_effects(case: BenchmarkCase, effect: str) -> frozenset[str]:
     """Return an effect and all effects that are equivalent to it in the recording of a case."""
-    if item.system in machines.MACHINE_NAMES:
-        return machines.find_equivalent_causes(item.system, effect)
-    return case_sampling.find_equivalent_effects(item.system, item.driven, effect)
+    if case.system in machines.MACHINE_NAMES:
+        return machines.find_equivalent_causes(case.system, effect)
+    return case_sampling.find_equivalent_effects(case.system, case.driven, effect)
 
 
 def list_coefficient_names(system: str, name: str) -> list[str]:
@@ -108,19 +108,19 @@ def list_coefficient_names(system: str, name: str) -> list[str]:
     return [coefficient.name for coefficient in effect.on(system_model)]
 
 
-def render_recording(item: BenchmarkCase) -> RecordingFiles:
+def render_recording(case: BenchmarkCase) -> RecordingFiles:
     """Render the recording of a case as texts, for the process of a diagnoser.
 
     The process receives these texts and no path, so that it cannot find other files of the case.
 
     Args:
-        item: the case; its true causes are not among the texts.
+        case: the case; its true causes are not among the texts.
     """
     with tempfile.TemporaryDirectory() as folder:
-        if item.system in machines.MACHINE_NAMES:
-            path = machine_case_files.write_case(item, Path(folder))
+        if case.system in machines.MACHINE_NAMES:
+            path = machine_case_files.write_case(case, Path(folder))
         else:
-            path = case_sampling.write_case(item, folder, truth=False)
+            path = case_sampling.write_case(case, folder, truth=False)
         description = path.with_suffix(".toml")
         other_files = [
             file for file in sorted(Path(folder).iterdir()) if file not in (path, description)

@@ -81,7 +81,7 @@ def evaluate_case(
     question: dict[str, Any],
     seed: int,
     salt: str,
-    known_item: dict[str, Any] | None,
+    known_case: dict[str, Any] | None,
     examined: Sequence[EvaluatedDiagnoser],
     limits: AnswerLimits,
     hidden: tuple[str, ...],
@@ -92,7 +92,7 @@ def evaluate_case(
         question: case specification as JSON.
         seed: seed of the public case set.
         salt: salt from which cases are drawn.
-        known_item: the case as JSON if it was already drawn, {} if its cause was found to be
+        known_case: the case as JSON if it was already drawn, {} if its cause was found to be
             unobservable, None if it was not drawn yet.
         examined: diagnosers to evaluate.
         limits: limits of each answer.
@@ -105,9 +105,9 @@ def evaluate_case(
     case_spec = CaseSpec.from_json(question)
     case = (
         case_spec.draw_case(seed, salt)
-        if known_item is None
-        else BenchmarkCase.from_json(known_item)
-        if known_item
+        if known_case is None
+        else BenchmarkCase.from_json(known_case)
+        if known_case
         else None
     )
     if case is None:

@@ -398,12 +398,12 @@ class _EvaluationRun:
         for question in questions:
             answer = self._answer_store.answered.get(question.name)
             diagnosers_to_run = [evaluated[name] for name in self._list_unanswered(question)]
-            known_item = answer["item"] if answer else None
+            known_case = answer["item"] if answer else None
             case_args = (
                 question.to_json(),
                 self._study.config.seed,
                 self._salt,
-                known_item,
+                known_case,
                 diagnosers_to_run,
             )
             calls.append((evaluate_case, (*case_args, self._limits, self._hidden)))

@@ -67,22 +67,22 @@ class Grade:
         )
 
 
-def grade_answer(item: BenchmarkCase, verdict: Mapping[str, Any] | None) -> Grade:
+def grade_answer(case: BenchmarkCase, verdict: Mapping[str, Any] | None) -> Grade:
     """Grade one answer.
 
     Args:
-        item: the case with its true causes.
+        case: the case with its true causes.
         verdict: the answer as a dictionary; None for a missing answer.
     """
     if verdict is None:
         return Grade("failed", 0, 0, "", {})
     sets = list_named_sets(verdict)
     outcome, set_size, class_size = grade_sets(
-        item.kind, item.effects, verdict, lambda effect: find_equivalent_effects(item, effect)
+        case.kind, case.effects, verdict, lambda effect: find_equivalent_effects(case, effect)
     )
     covered = (
-        _count_covered_intervals(item, verdict, sets)
-        if outcome in ("right", "set") and item.kind != "foreign"
+        _count_covered_intervals(case, verdict, sets)
+        if outcome in ("right", "set") and case.kind != "foreign"
         else {}
     )
     named_effects = " + ".join("|".join(names) for names in sets)
@@ -200,12 +200,12 @@ def _count_classes(names: Sequence[str], equivalents: EquivalentEffects) -> int:
 
 
 def _count_covered_intervals(
-    item: BenchmarkCase, verdict: Mapping[str, Any], sets: NamedSets
+    case: BenchmarkCase, verdict: Mapping[str, Any], sets: NamedSets
 ) -> dict[str, bool | None]:
     """Compare the intervals of base parameters and of leading causes with the true values.
 
     Args:
-        item: the case with its true causes.
+        case: the case with its true causes.
         verdict: the answer as a dictionary.
         sets: the named sets; the first name of each is its leading cause.
 
@@ -213,15 +213,15 @@ def _count_covered_intervals(
         By parameter or coefficient, whether the 95 % interval contains the true value; see
         `Grade`. It is empty if a leading cause is wrong.
     """
-    truth, intervals = dict(item.parameters), dict(verdict["parameters"])
+    truth, intervals = dict(case.parameters), dict(verdict["parameters"])
     leading_causes = {names[0] for names in sets}
     for cause in verdict["causes"]:
-        if cause["effect"] in item.effects:
-            names = list_coefficient_names(item.system, cause["effect"])
-            for name, value in zip(names, item.effects[cause["effect"]], strict=False):
+        if cause["effect"] in case.effects:
+            names = list_coefficient_names(case.system, cause["effect"])
+            for name, value in zip(names, case.effects[cause["effect"]], strict=False):
                 truth[f"{cause['effect']}.{name}"] = value
                 intervals[f"{cause['effect']}.{name}"] = cause["coefficients"].get(name)
-    if not set(item.effects) <= leading_causes:
+    if not set(case.effects) <= leading_causes:
         return {}  # parameters fitted together with a wrong cause are not comparable
     return {
         name: _contains_value(intervals[name], value)

@@ -45,11 +45,12 @@ def _warm_up_search(system: str) -> None:
     assert issubclass(kind, SystemSimulator)
     with closing(
         RunEvaluator(kind, simulated.recording, simulated.recording.training(), "batch")
-    ) as world:
+    ) as evaluator:
         noise = NoiseModel(
-            compute_noise_floor(world, simulated.recording).sigma, np.zeros(len(world.channels))
+            compute_noise_floor(evaluator, simulated.recording).sigma,
+            np.zeros(len(evaluator.channels)),
         )
-        compute_directions(world, fit_base_model(world, noise).fit, world.library)
+        compute_directions(evaluator, fit_base_model(evaluator, noise).fit, evaluator.library)
 
 
 kernel.get_kernel()

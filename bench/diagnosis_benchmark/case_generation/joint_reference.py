@@ -46,7 +46,7 @@ class JointDynamics:
         weight: gravity force as a function of position.
         forces: laws of the acting forces.
         limits: laws of the dry friction limits.
-        hidden_effects: hidden-state effects: driven loads and hysteresis.
+        hidden_state_effects: hidden-state effects: driven loads and hysteresis.
     """
 
     def __init__(self, true_system: TrueSystem, number: int) -> None:
@@ -98,12 +98,12 @@ class JointDynamics:
             {"force.periodic", "input.lag", "friction.warming"} & set(active_effects)
         )
         total_inertia, gravity_of_all = self.inertia, self.weight
-        self.hidden_effects: list[Any] = [
+        self.hidden_state_effects: list[Any] = [
             HIDDEN_STATE_EFFECTS[name](total_inertia, gravity_of_all, *c)
             for name, c in active_effects.items()
             if name in HIDDEN_STATE_EFFECTS
         ]
-        self.inertia = total_inertia - sum(part.inertia for part in self.hidden_effects)
+        self.inertia = total_inertia - sum(part.inertia for part in self.hidden_state_effects)
 
     def set_input_segment(self, segment: InputSegment) -> None:
         """Set the input interval in which the motion is integrated, before the integration starts.
@@ -127,7 +127,7 @@ class JointDynamics:
         total = self.segment.evaluate(t) + self.weight(x)
         for force in self.forces:
             total += force(t, x, v)
-        for part, part_states in zip(self.hidden_effects, pair_up(z), strict=True):
+        for part, part_states in zip(self.hidden_state_effects, pair_up(z), strict=True):
             total += part.force(x, v, *part_states)
         return total
 
@@ -139,7 +139,7 @@ class JointDynamics:
             v: velocity.
             *z: states of the hidden-state effects.
         """
-        parts = zip(self.hidden_effects, pair_up(z), strict=True)
+        parts = zip(self.hidden_state_effects, pair_up(z), strict=True)
         return [rate for part, part_states in parts for rate in part.rates(x, v, *part_states)]
 
     def compute_friction_limit(self, t: float, x: float, v: float) -> float:
@@ -444,7 +444,9 @@ def simulate_joint(
     joint, end_time = JointDynamics(true_system, number), float(instants[-1])
     names = ("q", "qd") if true_system.system == "pendulum" else ("x", "v")
     state = np.array([scenario.initial[name] for name in names])
-    hidden = [value for load in joint.hidden_effects for value in load.get_initial_state(*state)]
+    hidden = [
+        value for load in joint.hidden_state_effects for value in load.get_initial_state(*state)
+    ]
     state = np.concatenate([state, hidden])
     states = np.empty((instants.size, 2))
     states[instants <= 0] = state[:2]

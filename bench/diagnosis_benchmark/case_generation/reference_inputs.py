@@ -12,10 +12,7 @@ from bench.diagnosis_benchmark.case_generation.true_system import EffectCoeffici
 from sims.core.simulator import Array, Scenario
 
 SLEW_STEP = 2e-3  # seconds for which an input with limited rate is held constant
-
-
 SUBDIVISIONS = 10  # number of parts of an interval in which a linear command is held constant
-
 
 NONLINEAR_INPUT_EFFECTS = (
     "input.deadband",
@@ -60,7 +57,7 @@ def compute_applied_input(
     Args:
         scenario: the run.
         effects: the hidden effects.
-        end_time: end time.
+        end_time: end of the run, in seconds after its first sample.
 
     Raises:
         NotImplementedError: a nonlinear input effect follows a lag.

@@ -23,19 +23,19 @@ def build_description(
         case: the case.
         conditions: its recording conditions.
     """
-    robot = case.system == "arm2"
+    is_arm = case.system == "arm2"
     plant = MACHINES[case.system]
     noise_entry = {"noise": conditions.noise_sigmas} if case.stated else {}
     channels = {name: {"unit": "rad", **noise_entry} for name in plant.channels}
     inputs = (
         {f"u.{name}": {"unit": "N*m"} for name in plant.motors}
-        if robot
+        if is_arm
         else {"goal": {"unit": "rad"}, "torque_enable": {"unit": "1"}}
     )
     first = case.runs - conditions.held_out
     runs = {str(number): {"held_out": True} for number in range(first, case.runs)}
-    source_entry = {"model": MODEL_FILE_NAME} if robot else {"system": case.system}
-    constants = {} if robot else {"constants": _get_stated_constants(conditions)}
+    source_entry = {"model": MODEL_FILE_NAME} if is_arm else {"system": case.system}
+    constants = {} if is_arm else {"constants": _get_stated_constants(conditions)}
     return {**source_entry, "channels": channels, "inputs": inputs, **constants, "runs": runs}
 
 
@@ -56,12 +56,12 @@ def format_table(
         conditions: its recording conditions.
         readings: encoder readings, (R, T, N).
     """
-    plant, robot = MACHINES[case.system], case.system == "arm2"
-    inputs = [f"u.{name}" for name in plant.motors] if robot else ["goal", "torque_enable"]
+    plant, is_arm = MACHINES[case.system], case.system == "arm2"
+    inputs = [f"u.{name}" for name in plant.motors] if is_arm else ["goal", "torque_enable"]
     lines = [",".join(["run", "t", *inputs, *plant.channels])]
     for number, run in enumerate(readings):
         for k, t in enumerate(conditions.runs.times.tolist()):
-            commands = conditions.runs.commands[number, k].tolist() + ([] if robot else [1.0])
+            commands = conditions.runs.commands[number, k].tolist() + ([] if is_arm else [1.0])
             cells = [t, *commands, *run[k].tolist()]
             lines.append(",".join([str(number), *(f"{value:.9g}" for value in cells)]))
     return "\n".join(lines) + "\n"

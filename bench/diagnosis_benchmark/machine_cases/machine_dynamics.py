@@ -223,13 +223,13 @@ class MachineDynamics(ABC):
         elif cause == "gust":
             push, start, duration = c
 
-            def act_as_gust(t: float, q: Array, v: Array, u: Array) -> Array:
+            def compute_gust_force(t: float, q: Array, v: Array, u: Array) -> Array:
                 """Return the generalised forces (L, N) of the gust at time t."""
                 pushed = np.zeros_like(q)
                 pushed[:, joint] = push * (start <= t < start + duration)
                 return pushed
 
-            self.acts.append(act_as_gust)
+            self.acts.append(compute_gust_force)
 
 
 JOINT_FORCE_LAWS: dict[str, Callable[[list[float], Array, Array], Array]] = {
