@@ -143,7 +143,7 @@ def diagnose_case(
     path.with_suffix(".toml").write_text(question["description"], encoding="utf-8")
     for name, text in question.get("beside", {}).items():
         (folder / name).write_text(text, encoding="utf-8")
-    kind = get_simulator_class(path, path)
+    kind = get_simulator_class(path)
     assert issubclass(kind, SystemSimulator)
     if reason := diagnoser.cannot(kind):
         return {"answer": None, "simulations": 0, "processor_seconds": 0.0, "skipped": str(reason)}

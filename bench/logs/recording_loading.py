@@ -11,12 +11,7 @@ import numpy as np
 from bench.core.plugin_registries import make_robot_simulator, simulators
 from sims.core.simulator import InputError, Simulator
 from sims.core.value_limits import MAX_NUMBER
-from sims.recording.recording import (
-    Recording,
-    read_recording,
-    read_system_name,
-    split_held_out,
-)
+from sims.recording.recording import Recording, read_recording, read_system_name, split_held_out
 from sims.recording.recording_description import ModelFileReference, read_model_reference
 
 
@@ -45,10 +40,11 @@ def load_recording(
     Raises:
         InputError: It cannot be read, or there is no such system.
     """
-    path = source.path if isinstance(source, Recording) else Path(source)
-    kind = get_simulator_class(source, path, system, model, free, fix_base)
-    memory = source if isinstance(source, Recording) else None
-    recording = memory or read_recording(path, kind, whole=True)
+    kind = get_simulator_class(source, system, model, free, fix_base)
+    if isinstance(source, Recording):
+        recording = source
+    else:
+        recording = read_recording(Path(source), kind, whole=True)
     if divide:
         recording = split_held_out(recording, folds=True)
     check_value_sizes(recording)
@@ -57,7 +53,6 @@ def load_recording(
 
 def get_simulator_class(
     source: str | Path | Recording,
-    path: Path,
     system: str | None = None,
     model: str | Path | None = None,
     free: Sequence[str] = (),
@@ -65,13 +60,7 @@ def get_simulator_class(
 ) -> type[Simulator]:
     """Find the simulator of the system or robot of a recording.
 
-    Args:
-        source: Path of the table, or a recording in memory.
-        path: Path of the table.
-        system: Registered system to use instead of the one that the recording names.
-        model: Model file of a robot to use instead of the one that the recording names.
-        free: Numbers of a robot's model file to tune; empty for those of the description.
-        fix_base: Whether to fix floating bodies of a robot in the pose of its model file.
+    The arguments are those of `load_recording`.
 
     Raises:
         InputError: A system and a model file are both given, or the system is unknown.
@@ -79,14 +68,17 @@ def get_simulator_class(
     if system is not None and model is not None:
         raise InputError("expected a system or a model file, found both; leave one out")
     if isinstance(source, Recording):
-        of_file = source.model
+        path, reference = source.path, source.model
         if model is not None:
-            of_file = replace(of_file or ModelFileReference(Path(), {}, {}), path=Path(model))
+            reference = replace(reference or ModelFileReference(Path(), {}, {}), path=Path(model))
     else:
-        of_file = None if system is not None else read_model_reference(path, model)
-    if of_file is not None and system is None:
-        engine = {**of_file.engine, **({"fix_base": True} if fix_base else {})}
-        return make_robot_simulator(of_file.path, of_file.actuators, engine, free or of_file.free)
+        path = Path(source)
+        reference = None if system is not None else read_model_reference(path, model)
+    if reference is not None and system is None:
+        engine = {**reference.engine, **({"fix_base": True} if fix_base else {})}
+        return make_robot_simulator(
+            reference.path, reference.actuators, engine, free or reference.free
+        )
     name = system or (source.system if isinstance(source, Recording) else read_system_name(path))
     try:
         return simulators.get(name)
