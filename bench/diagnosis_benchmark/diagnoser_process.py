@@ -19,6 +19,7 @@ import numpy as np
 
 from bench.benchmark.isolation.isolation_layers import AccessPolicy
 from bench.benchmark.isolation.message_channel import (
+    MAX_HARNESS_MESSAGE_BYTES,
     MAX_TEXT_BYTES,
     MessageChannel,
     PeerClosedError,
@@ -41,8 +42,6 @@ from sims.core.simulator import Array
 from sims.recording.recording import read_recording
 from sims.system_simulator import SystemSimulator
 
-_MAX_MESSAGE_BYTES = 1 << 40
-"""Maximum size in bytes of a message from the harness; large, because the harness is trusted."""
 _MAX_DOCUMENT_BYTES = 1 << 30
 """Maximum size in bytes of a case document."""
 
@@ -65,7 +64,7 @@ def serve_requests(
     trained_arrays: Mapping[str, Array] = {}
     with suppress(PeerClosedError):
         while True:
-            message = channel.receive(_MAX_MESSAGE_BYTES)
+            message = channel.receive(MAX_HARNESS_MESSAGE_BYTES)
             try:
                 match message.kind:
                     case b"L":

@@ -40,6 +40,8 @@ MAX_PROPOSAL_BYTES = 1 << 28
 """Maximum size of proposals in bytes."""
 MAX_STATE_BYTES = 1 << 31
 """Maximum size of trained weights in bytes."""
+MAX_HARNESS_MESSAGE_BYTES = 1 << 40
+"""Maximum size of a message from the harness in bytes; practically unlimited, as it is trusted."""
 
 
 class PeerClosedError(Exception):

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from bench.benchmark.isolation.isolation_layers import AccessPolicy
 from bench.benchmark.isolation.message_channel import (
+    MAX_HARNESS_MESSAGE_BYTES,
     MAX_TEXT_BYTES,
     Message,
     MessageChannel,
@@ -43,9 +44,6 @@ from methods.tuner import (
     TunerGenerator,
 )
 
-_MAX_MESSAGE_BYTES = 1 << 40
-"""Maximum size of a message from the harness in bytes; practically unlimited, as it is trusted."""
-
 
 def serve_requests(channel: MessageChannel, policy: AccessPolicy, active_layers: list[str]) -> None:
     """Serve requests until the harness closes the channel.
@@ -63,7 +61,7 @@ def serve_requests(channel: MessageChannel, policy: AccessPolicy, active_layers:
         tuner = None
         reported_paths: set[str] = set()
         while True:
-            message = channel.receive(_MAX_MESSAGE_BYTES)
+            message = channel.receive(MAX_HARNESS_MESSAGE_BYTES)
             if message.kind == b"N":
                 _report_written_files(channel, policy.folder, reported_paths)
                 continue
@@ -224,7 +222,7 @@ def _exchange_evaluations(channel: MessageChannel, steps: TunerGenerator, task: 
         # One point beyond the budget is enough for the harness to see that the budget is exceeded.
         points = points[: max(task.budget - used_simulations, 0) + 1]
         channel.send(b"A", recommendation, points, flags=len(recommendation) > 0, size=len(points))
-        answer = channel.receive(_MAX_MESSAGE_BYTES)
+        answer = channel.receive(MAX_HARNESS_MESSAGE_BYTES)
         if answer.kind != b"E":
             raise GeneratorExit
         if answer.flags:
@@ -257,7 +255,7 @@ class _RemoteTrainingSimulator:
     def __init__(self, channel: MessageChannel, which: int) -> None:
         self._channel, self._which = channel, which
         channel.send(b"P", flags=which)
-        self._read_properties(channel.receive(_MAX_MESSAGE_BYTES))
+        self._read_properties(channel.receive(MAX_HARNESS_MESSAGE_BYTES))
 
     def _read_properties(self, answer: Message) -> dict[str, NDArray[Any]]:
         """Store the properties of the training simulator from an answer, and return its arrays.
@@ -304,7 +302,7 @@ class _RemoteTrainingSimulator:
         requested = np.array(points, dtype=np.float64).reshape(-1, self.dim)
         request = pack_arrays({"rng": encode_rng_state(rng_state), "points": requested})
         self._channel.send(b"P", *request, flags=2 + self._which)
-        arrays = self._read_properties(self._channel.receive(_MAX_MESSAGE_BYTES))
+        arrays = self._read_properties(self._channel.receive(MAX_HARNESS_MESSAGE_BYTES))
         if is_sendable:
             rng.bit_generator.state = decode_rng_state(arrays["rng"])
         return arrays["observations"]
@@ -322,7 +320,7 @@ class _RemoteTrainingCallback:
 
     def epoch(self, stage: str, epoch: int, epochs: int, loss: float, held_out: float) -> None:
         self._channel.send_document(b"W", [stage, epoch, epochs, float(loss), float(held_out)])
-        self._channel.receive(_MAX_MESSAGE_BYTES)
+        self._channel.receive(MAX_HARNESS_MESSAGE_BYTES)
 
 
 def _train_tuner(channel: MessageChannel, message: Message, tuner: Tuner) -> None:
