@@ -17,9 +17,9 @@ _GRID_COUNT = 4
 """Number of successive grids, each around the best height of the previous one."""
 _LATER_GRID_SIZE = 9
 """Number of heights of each later grid, which covers two intervals of the previous one."""
-_SECONDS = 3.0
+_FLIGHT_SECONDS = 3.0
 """Length of a simulated flight in seconds."""
-_RATE = 240.0
+_SAMPLING_RATE = 240.0
 """Sampling rate in Hz; the crossing of the hoop's plane is interpolated linearly."""
 
 
@@ -70,7 +70,7 @@ def plan_shot(
     low, high = heights
     if not 0 < low < high:
         raise InputError(f"expected drop heights above 0, the first the lower, found {heights}")
-    times = np.arange(round(_SECONDS * _RATE) + 1) / _RATE
+    times = np.arange(round(_FLIGHT_SECONDS * _SAMPLING_RATE) + 1) / _SAMPLING_RATE
     grid = np.linspace(low, high, _FIRST_GRID_SIZE)
     best = float("nan")
     for _ in range(_GRID_COUNT):

@@ -232,22 +232,22 @@ def _train_or_read_weights(
     )
     learn = _train_in_process if request.tuned is None else _train_isolated
     randomised_simulator = RandomisedSimulator(problem) if entry.randomised else None
-    practice = _ReplayCheckedSimulator(
+    simulator = _ReplayCheckedSimulator(
         problem, experiment.training_budget, earlier_requests, randomised_simulator
     )
     started = perf_counter()
-    state = learn(request, practice, stream, callback)
+    state = learn(request, simulator, stream, callback)
     seconds = perf_counter() - started
     problem.close()
     if randomised_simulator is not None:
         randomised_simulator.close()
     # Cost and key are stored with the weights, so that an exchanged file is detected.
     metadata = {
-        _COST_ARRAY: np.array([practice.used, seconds]),
+        _COST_ARRAY: np.array([simulator.used, seconds]),
         _KEY_ARRAY: np.frombuffer(name.encode(), dtype=np.uint8),
     }
     _write_atomically(path, {**state, **metadata})
-    return TrainingResult(path, practice.used, seconds)
+    return TrainingResult(path, simulator.used, seconds)
 
 
 class _ReplayCheckedSimulator(CountedTrainingSimulator):

@@ -39,18 +39,18 @@ SEGMENT_REMEDY = "restore it, or delete it and resume the comparison: the runs a
 _PLAN_INDEX = ColumnSpec("place in the plan", int, low=0, high=2.0**31)
 
 
-def encode_record(place: int, status: RunStatus, rows: pa.Table) -> bytes:
+def encode_record(plan_index: int, status: RunStatus, rows: pa.Table) -> bytes:
     """Encode a finished run as a record of a journal, with a checksum.
 
     Args:
-        place: Index of the run in the plan.
+        plan_index: Index of the run in the plan.
         status: How the run ended.
         rows: Rows of the run.
     """
     import pyarrow as pa
 
     sink = pa.BufferOutputStream()
-    head = json.dumps([place, asdict(status)])
+    head = json.dumps([plan_index, asdict(status)])
     rows = rows.replace_schema_metadata({"status": head})
     with pa.ipc.new_stream(sink, rows.schema) as stream:
         stream.write_table(rows)
@@ -119,15 +119,15 @@ def _convert_statuses(entries: Any) -> dict[int, RunStatus]:
     Raises:
         CellError: A value violates its declaration.
     """
-    places = cell_validation.parse_json_column(_PLAN_INDEX, [place for place, _ in entries])
-    cell_validation.check_cells(_PLAN_INDEX, places)
+    plan_indices = cell_validation.parse_json_column(_PLAN_INDEX, [index for index, _ in entries])
+    cell_validation.check_cells(_PLAN_INDEX, plan_indices)
     columns = [c for c in STATUS_COLUMNS if c.name in STATUS_COLUMN_NAMES]
     for column in columns:
         values = [status[column.name] for _, status in entries]
         cell_validation.check_cells(column, cell_validation.parse_json_column(column, values))
     return {
-        place: RunStatus(**{name: status[name] for name in STATUS_COLUMN_NAMES})
-        for place, status in entries
+        plan_index: RunStatus(**{name: status[name] for name in STATUS_COLUMN_NAMES})
+        for plan_index, status in entries
     }
 
 
@@ -136,19 +136,19 @@ def _make_damage_error(path: Path, expected: str) -> InputError:
 
 
 def check_no_duplicate_runs(
-    path: Path, plan_indices: Iterable[int], known_places: Container[int]
+    path: Path, plan_indices: Iterable[int], known_indices: Container[int]
 ) -> None:
     """Reject runs that another file contains already.
 
     Args:
         path: Path of the file.
         plan_indices: Indices of its runs.
-        known_places: Indices of the runs in other files.
+        known_indices: Indices of the runs in other files.
 
     Raises:
         InputError: A run is in both.
     """
-    if repeated_indices := [place for place in plan_indices if place in known_places]:
+    if repeated_indices := [index for index in plan_indices if index in known_indices]:
         raise _make_damage_error(
             path, f"every run once, found that of line {repeated_indices[0] + 1} of the plan again"
         )
@@ -180,9 +180,9 @@ def read_finished_statuses(folder: Path) -> dict[int, RunStatus]:
         InputError: A file is damaged.
     """
     return {
-        place: status
+        plan_index: status
         for _, statuses in read_statuses_by_file(folder)
-        for place, status in statuses.items()
+        for plan_index, status in statuses.items()
     }
 
 
@@ -191,12 +191,12 @@ def read_statuses_by_file(folder: Path) -> Iterator[tuple[Path, dict[int, RunSta
     # Journals first: a journal that becomes a part in the meantime is then found among the parts.
     for path in list_segments(folder / SEGMENTS_FOLDER, "journal"):
         with suppress(FileNotFoundError):
-            yield path, {place: status for place, status, _, _ in read_records(path)}
-    known_places: set[int] = set()
+            yield path, {index: status for index, status, _, _ in read_records(path)}
+    known_indices: set[int] = set()
     for path in list_segments(folder / SEGMENTS_FOLDER, "parquet"):
         statuses = read_part_statuses(path)
-        check_no_duplicate_runs(path, statuses, known_places)
-        known_places.update(statuses)
+        check_no_duplicate_runs(path, statuses, known_indices)
+        known_indices.update(statuses)
         yield path, statuses
 
 

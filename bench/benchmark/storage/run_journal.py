@@ -116,11 +116,11 @@ class RunJournal:
         file.seek(end)
         return file
 
-    def append(self, place: int, columns: Mapping[str, Any], status: RunStatus) -> None:
+    def append(self, plan_index: int, columns: Mapping[str, Any], status: RunStatus) -> None:
         """Append a finished run; when this returns, the run survives a kill.
 
         Args:
-            place: Index of the run in the plan.
+            plan_index: Index of the run in the plan.
             columns: Rows of the run, by column.
             status: How the run ended.
         """
@@ -129,9 +129,9 @@ class RunJournal:
         rows = pa.table(dict(columns))
         # A single write: after a kill a record is complete or cut off, but never mixed with
         # another.
-        self._file.write(encode_record(place, status, rows))
-        self._records.append((place, status, rows))
-        self.statuses[place] = status
+        self._file.write(encode_record(plan_index, status, rows))
+        self._records.append((plan_index, status, rows))
+        self.statuses[plan_index] = status
         if len(self._records) >= self._part_runs:
             self._make_part()
 
@@ -142,8 +142,8 @@ class RunJournal:
 
         self._records.sort(key=lambda record: record[0])
         # The footer allows reading the statuses without reading the rows.
-        statuses = json.dumps([[place, asdict(status)] for place, status, _ in self._records])
-        tables = [_add_place_column(place, rows) for place, _, rows in self._records]
+        statuses = json.dumps([[index, asdict(status)] for index, status, _ in self._records])
+        tables = [_add_place_column(index, rows) for index, _, rows in self._records]
         table = pa.concat_tables(tables).replace_schema_metadata({"statuses": statuses})
         path = self._make_file_path("parquet")
         with atomic_replacement(path) as partial:
@@ -151,7 +151,7 @@ class RunJournal:
         # Not earlier: until the part exists, the journal is the only copy of these runs.
         self._file.close()
         self._make_file_path("journal").unlink()
-        self._index[path] = [place for place, _, _ in self._records]
+        self._index[path] = [index for index, _, _ in self._records]
         self._records = []
         self._number += 1
         self._file = self._reopen_journal(self._make_file_path("journal"))
@@ -165,16 +165,16 @@ class RunJournal:
         import pyarrow as pa
         from pyarrow import compute, parquet
 
-        rows_by_index = {place: rows for place, _, rows in self._records}
+        rows_by_index = {index: rows for index, _, rows in self._records}
         plan_indices = sorted(self.statuses)
         # In chunks, since all rows of a million runs would not fit in memory.
         for first in range(0, len(plan_indices), runs):
             chunk = plan_indices[first : first + runs]
             low, high = chunk[0], chunk[-1]
             parts = [
-                _add_place_column(place, rows_by_index[place])
-                for place in chunk
-                if place in rows_by_index
+                _add_place_column(plan_index, rows_by_index[plan_index])
+                for plan_index in chunk
+                if plan_index in rows_by_index
             ]
             for path, file_indices in self._index.items():
                 if file_indices[0] <= high and file_indices[-1] >= low:
@@ -194,10 +194,10 @@ class RunJournal:
         The content is the statuses by index in the plan, and the rows of the current journal; the
         rows of a part are None, since they are in its file.
         """
-        for path, places in self._index.items():
-            yield path, {place: self.statuses[place] for place in places}, None
+        for path, plan_indices in self._index.items():
+            yield path, {index: self.statuses[index] for index in plan_indices}, None
         if self._records:
-            statuses = {place: status for place, status, _ in self._records}
+            statuses = {index: status for index, status, _ in self._records}
             yield self._make_file_path("journal"), statuses, [rows for _, _, rows in self._records]
 
     def close(self) -> None:
@@ -218,9 +218,9 @@ class RunJournal:
         shutil.rmtree(trash_folder)
 
 
-def _add_place_column(place: int, rows: pa.Table) -> pa.Table:
+def _add_place_column(plan_index: int, rows: pa.Table) -> pa.Table:
     """Add the column ``place``, the index of the run in the plan, by which rows are sorted."""
     import numpy as np
     import pyarrow as pa
 
-    return rows.append_column("place", pa.array(np.full(len(rows), place)))
+    return rows.append_column("place", pa.array(np.full(len(rows), plan_index)))

@@ -2,7 +2,8 @@
 
 Two exact simulations of one system differ by their integration errors, 10^-9 to 10^-4 of the range
 of a channel. Without noise, every test would find this difference significant, and a search would
-explain the integrator. White noise of 10^-4 of the range (`floor.PRECISION`) covers the difference.
+explain the integrator. White noise of 10^-4 of the range (`INTEGRATION_ERROR_SHARE`) covers the
+difference.
 """
 
 from __future__ import annotations
