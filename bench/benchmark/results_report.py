@@ -170,8 +170,8 @@ def _describe_best_tuners(view: ComparisonView) -> list[str]:
         lines = [
             f"\nbest tuners, {range_text} ({label}; {headline.format_error_floor(statistics)})"
         ]
-        for verdicts in headline.rank_at_checkpoints(statistics, kind):
-            lines += _format_ranking(verdicts)
+        for ranking in headline.rank_at_checkpoints(statistics, kind):
+            lines += _format_ranking(ranking)
         lines += [headline.list_failed_runs(statistics, kind)]
         lines += [
             headline.warn_about_target_count(statistics, kind)
@@ -181,18 +181,16 @@ def _describe_best_tuners(view: ComparisonView) -> list[str]:
     return texts
 
 
-def _format_ranking(verdicts: headline.TunerRanking) -> list[str]:
+def _format_ranking(ranking: headline.TunerRanking) -> list[str]:
     """Format the lines of one number of simulations; verdicts without tuners are left out."""
     best = (
-        f"{', '.join(verdicts.best)} ({verdicts.error})"
-        if verdicts.best
-        else "none: every run failed"
+        f"{', '.join(ranking.best)} ({ranking.error})" if ranking.best else "none: every run failed"
     )
     parts = {
         "best": best,
-        "worse": ", ".join(verdicts.worse),
-        "not decided": ", ".join(verdicts.undecided),
-        "all runs failed": ", ".join(verdicts.failed),
+        "worse": ", ".join(ranking.worse),
+        "not decided": ", ".join(ranking.undecided),
+        "all runs failed": ", ".join(ranking.failed),
     }
     lines = [
         textwrap.fill(
@@ -201,7 +199,7 @@ def _format_ranking(verdicts: headline.TunerRanking) -> list[str]:
         for verdict, names in parts.items()
         if names
     ]
-    lines[0] = f"  after {verdicts.simulations}".ljust(12) + lines[0].lstrip()
+    lines[0] = f"  after {ranking.simulations}".ljust(12) + lines[0].lstrip()
     return lines
 
 

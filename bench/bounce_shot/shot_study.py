@@ -222,7 +222,7 @@ class _ShotStages:
 
     Args:
         study: the study.
-        left: the missing shots.
+        missing_shots: the missing shots.
         progress: makes progress callbacks.
     """
 
@@ -235,12 +235,14 @@ class _ShotStages:
         folders, which isolated tuners must not read, are the result folder and the cache of trained
         weights.
         """
-        self._study, self._left, self._progress = study, missing_shots, progress
+        self._study, self._missing_shots, self._progress = study, missing_shots, progress
         self._experiment, self._settings = study.experiment, study.config
         self._tuned: dict[str, TunerSpec] = {}
         if not self._experiment.trusted:
             self._tuned = {entry.label: make_tuner_spec(entry) for entry in self._experiment.tuners}
-        self._hidden = tuple(str(place.resolve()) for place in (study.folder, get_weights_folder()))
+        self._hidden = tuple(
+            str(folder.resolve()) for folder in (study.folder, get_weights_folder())
+        )
         self._paths = [
             study.folder / RECORDINGS_FOLDER / f"{shot.name}.csv" for shot in missing_shots
         ]
@@ -277,7 +279,7 @@ class _ShotStages:
         """
         calls: list[Call] = [
             (record_drop, (self._experiment, setup, self._settings, path))
-            for setup, path in zip(self._left, self._paths, strict=True)
+            for setup, path in zip(self._missing_shots, self._paths, strict=True)
         ]
         step = self._progress("dropping", len(calls))
         recording_errors: dict[int, BaseException] = {}
@@ -327,15 +329,17 @@ class _ShotStages:
             recording_errors: errors of drops that could not be recorded, by index of the shot.
             weights: files of trained weights, by label of the tuner.
         """
-        recorded = [index for index in range(len(self._left)) if index not in recording_errors]
+        recorded = [
+            index for index in range(len(self._missing_shots)) if index not in recording_errors
+        ]
         calls: list[Call] = []
         for index in recorded:
-            setup = self._left[index]
+            setup = self._missing_shots[index]
             inputs = shot_planning.ShotInputs(
                 setup.name, self._paths[index], setup.scene, weights, self._tuned, self._hidden
             )
             calls.append((shot_planning.tune_and_plan, (self._experiment, self._settings, inputs)))
-        step = self._progress("shooting", len(self._left))
+        step = self._progress("shooting", len(self._missing_shots))
         for index, error in recording_errors.items():
             status = "no recording" if isinstance(error, InputError) else "crashed"
             self._execute_and_store(
@@ -355,7 +359,9 @@ class _ShotStages:
         self, index: int, models: list[dict[str, Any]], visible_share: float
     ) -> None:
         """Execute a shot in the true world with every model, and store the result."""
-        store_shot(self._study.folder, self._left[index], self._settings, models, visible_share)
+        store_shot(
+            self._study.folder, self._missing_shots[index], self._settings, models, visible_share
+        )
 
 
 def _make_failed_models(

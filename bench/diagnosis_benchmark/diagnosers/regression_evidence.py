@@ -104,7 +104,7 @@ class RegressionEvidence:
 
     Args:
         case: the case.
-        every: whether held-out runs are fitted too.
+        has_held_out: whether held-out runs are fitted too.
 
     Attributes:
         evaluator: the runs and the simulator.

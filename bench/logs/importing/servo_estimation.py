@@ -25,6 +25,7 @@ from sims.robot.robot_model import Joint
 FREQUENCY_GRID = np.geomspace(2.0, 200.0, 33)
 """Grid of natural frequencies in rad/s."""
 DAMPING_GRID = np.geomspace(0.3, 6.0, 14)
+"""Grid of damping ratios; it does not contain 1, where both poles of (2) are equal."""
 MIN_EXPLAINED_VARIANCE = 0.8
 """Minimum share of a position's variance that (1) must explain."""
 MAX_SAMPLES = 4000
@@ -134,8 +135,8 @@ def _compute_transfer_functions(
 ) -> tuple[Array, Array]:
     """Discretise (1) for commands that are held over a step.
 
-    With the poles p = -w (d -+ sqrt(d^2 - 1)), which the grid keeps apart, the response of (1) to
-    a unit step is
+    With the poles p1, p2 = -w (d -+ sqrt(d^2 - 1)), which must differ, the response of (1) to a
+    unit step is
 
         q(t) = 1 - (p2 exp(p1 t) - p1 exp(p2 t)) / (p2 - p1)                                     (2)
 

@@ -10,7 +10,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from sims.core.simulator import Array
 
-_SIGMA_PER_MEDIAN = 1.4826
+SIGMA_PER_MEDIAN = 1.4826
 """Ratio of the standard deviation of a normal variable to its median magnitude."""
 _QUANTISED_SHARE = 0.05
 """Share of unchanged samples above which a signal counts as quantised."""
@@ -87,7 +87,7 @@ def _estimate_sigma(runs: list[tuple[Array, Array]], order: int) -> float:
     """Return 1 sigma from differences of one order, over all runs; NaN if all are too short."""
     differences = [_compute_divided_differences(t, y, order) for t, y in runs if t.size > order + 1]
     pooled = np.concatenate(differences) if differences else np.empty(0)
-    return _SIGMA_PER_MEDIAN * float(np.median(np.abs(pooled))) if pooled.size else np.nan
+    return SIGMA_PER_MEDIAN * float(np.median(np.abs(pooled))) if pooled.size else np.nan
 
 
 def _compute_divided_differences(times: Array, values: Array, order: int) -> Array:

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from bench.logs.quality.noise_estimation import SIGMA_PER_MEDIAN
 from bench.logs.quality.quality_finding import QualityFinding, format_names
 from sims.core.simulator import Array
 from sims.recording.recording import Recording, Run
@@ -27,7 +28,6 @@ A signal that changes this fast does not repeat its value by coincidence.
 """
 SIGNIFICANCE_SIGMAS = 4.0
 """Detection threshold in standard deviations."""
-_SIGMA_PER_MEDIAN = 1.4826
 
 
 def check_intervals(recording: Recording) -> Iterator[QualityFinding]:
@@ -40,7 +40,7 @@ def check_intervals(recording: Recording) -> Iterator[QualityFinding]:
         ratios = steps / np.median(steps)
         counts = np.maximum(np.round(ratios), 1.0)
         deviations = ratios - counts
-        jitter = _SIGMA_PER_MEDIAN * float(np.median(np.abs(deviations - np.median(deviations))))
+        jitter = SIGMA_PER_MEDIAN * float(np.median(np.abs(deviations - np.median(deviations))))
         jitters.append(jitter)
         if jitter > JITTER_THRESHOLD:
             jittered.append(run.name)

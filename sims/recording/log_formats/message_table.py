@@ -36,7 +36,7 @@ class MessageTable:
     """Table to which the messages of a topic are added one by one.
 
     Args:
-        wanted: Names of the numbers to store, in any case; all if empty.
+        wanted_names: Names of the numbers to store, in any case; all if empty.
     """
 
     def __init__(self, wanted_names: Collection[str] = ()) -> None:
