@@ -7,7 +7,7 @@ without such a change keep exactly the constants of the file.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import Any, Protocol
@@ -229,6 +229,8 @@ class MujocoBatch:
         }
         self._file_values = {name: values[:1].copy() for name, values in self.fields.items()}
         self._changed_fields: set[str] = set()
+        # Effects in the fields; None if the fields have been changed since they were written.
+        self._written_effects: tuple[tuple[str, bytes], ...] | None = None
 
     @property
     def model(self) -> Any:
@@ -247,7 +249,13 @@ class MujocoBatch:
         return int(self.model.nbuffer + sum(values.nbytes for values in own))
 
     def write_effects(self, acting: ActiveEffects) -> None:
-        """Write model-field effects, with coefficients (K, N, 1), into the batch's fields."""
+        """Write model-field effects, with coefficients (K, N, 1), into the batch's fields.
+
+        Nothing is done if the fields have them already.
+        """
+        written_effects = tuple((effect.name, c.tobytes()) for effect, c in acting)
+        if written_effects == self._written_effects:
+            return
         for name in self._changed_fields:
             self.fields[name][...] = self._file_values[name]
         was_derived = any(self._needs_recomputed_constants(name) for name in self._changed_fields)
@@ -269,6 +277,12 @@ class MujocoBatch:
         if self.robot.series:
             convert_flank_parameters(self.fields, self.robot)
         self._loaded_friction = self.fields["dof_frictionloss"].copy()
+        self._written_effects = written_effects
+
+    def _mark_changed(self, field_names: Iterable[str]) -> None:
+        """Record that fields are changed after effects were written; the next write resets them."""
+        self._changed_fields.update(field_names)
+        self._written_effects = None
 
     @staticmethod
     def _needs_recomputed_constants(field: str) -> bool:
@@ -399,7 +413,7 @@ class MujocoBatch:
 
     def force_ranges(self) -> ForceRanges:
         """Return the force ranges, to switch actuators off until the next `write_effects`."""
-        self._changed_fields.update(FORCE_FIELDS)
+        self._mark_changed(FORCE_FIELDS)
         return ForceRanges(self.fields)
 
     def step_with_forces(
@@ -486,7 +500,7 @@ class MujocoBatch:
         if step_forces.has_dry_friction.any():
             batch_indices, joints = np.nonzero(step_forces.has_dry_friction)
             write_friction_form(self.fields, self.robot, batch_indices, dofs[joints])
-            self._changed_fields.update(MODEL_FIELD_EFFECTS["friction.coulomb"].fields)
+            self._mark_changed(MODEL_FIELD_EFFECTS["friction.coulomb"].fields)
         return file_friction
 
     def get_servo_stiffness(self, joints: JointAddresses) -> Array:
@@ -519,9 +533,7 @@ class MujocoBatch:
             limit: (n,) friction limits to add.
         """
         loss = self.fields["dof_frictionloss"]
-        changed = MODEL_FIELD_EFFECTS["friction.coulomb"].fields
-        if not self._changed_fields.issuperset(changed):
-            self._changed_fields.update(changed)
+        self._mark_changed(MODEL_FIELD_EFFECTS["friction.coulomb"].fields)
         loss[:n, dof] = self._loaded_friction[:n, dof] + limit
         write_friction_form(self.fields, self.robot, slice(n), dof)
 
