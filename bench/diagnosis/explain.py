@@ -461,7 +461,7 @@ class _ExplainRun:
             is_comparison_needed = (
                 has_dry_friction(self.fitting, ())
                 and not self.unit_errors
-                and not self.search_control.has_abandoned_fits()
+                and not self.search_control.is_over()
             )
             if not is_comparison_needed or not is_likelier_soft(
                 search, result.finding.model, INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
@@ -473,7 +473,7 @@ class _ExplainRun:
             if (
                 not error.is_preliminary
                 or self._is_explained(soft_result)
-                or self.search_control.has_abandoned_fits()
+                or self.search_control.is_over()
             ):
                 return soft_result
         self.say(STIFF_FRICTION)
@@ -604,7 +604,7 @@ class _ExplainRun:
         For a robot, units are usually tested only if no effect has explained the gap before.
         """
         is_explained = finding.verdict in EXPLAINED_VERDICTS
-        if not self._checks_units_late or is_explained or self.search_control.has_abandoned_fits():
+        if not self._checks_units_late or is_explained or self.search_control.is_over():
             return ()
         remaining_excess = search.compute_excess_residual(finding.model)
         base_excess = search.compute_excess_residual(search.base_model)
@@ -689,7 +689,7 @@ class _ExplainRun:
         base = fit_base_model(self.fitting, self.noise, self._get_given_starts())
         if self._checks_units_late:
             return self._prepare_robot_base(base)
-        if not self.search_control.has_abandoned_fits():
+        if not self.search_control.is_over():
             fault = find_wrong_units(self._unit_check_subject, self.fitting, self.noise, base)
             self.unit_errors = (fault,) if fault is not None else ()
         if self.unit_errors:
@@ -744,7 +744,7 @@ class _ExplainRun:
         if self.has_base_parameters and self.tuner is None:
             filtered_runs = self._filter_with_fitted_parameters(filtered_runs)
         evaluator.follow(filtered_runs)
-        for evaluator in held_out:
+        for evaluator in [] if self.search_control.is_over() else held_out:
             # Held-out runs are only simulated; without a filter they begin at their measured
             # values.
             theta = evaluator.get_nominal_theta()
@@ -826,7 +826,7 @@ class _ExplainRun:
     def _shows_step_errors(self, base: BaseFit) -> bool:
         """Return whether the recording shows the discretisation error of the engine's steps."""
         has_no_filter = self.fitting.filtered_runs is None or not np.isfinite(base.fit.cost)
-        if self.search_control.has_abandoned_fits() or has_no_filter:
+        if self.search_control.is_over() or has_no_filter:
             return True
         # These imports are needed for robots only.
         from bench.diagnosis.kalman.candidate_responses import FollowedRuns
@@ -869,7 +869,7 @@ class _ExplainRun:
         A system has few parameters, and would have no result without them; there the verdict
         reports it.
         """
-        if self.search_control.has_abandoned_fits() or not np.isfinite(base.fit.cost):
+        if self.search_control.is_over() or not np.isfinite(base.fit.cost):
             return base
         reduced_base = freeze_unidentified_parameters(
             self.fitting, self.noise, base, lambda base: self._create_search(base, self._make_rng())
@@ -930,11 +930,21 @@ class _ExplainRun:
         base: BaseFit,
         file_evaluators: _RunEvaluators,
     ) -> None:
-        """Record that the file's own step is too coarse; the finer step is in use already."""
+        """Record that the file's own step is too coarse; the finer step is in use already.
+
+        A URDF specifies no step, so that a finer one corrects nothing in it.
+        """
+        # This import is needed for robots only.
+        from sims.robot.integrator_settings import specifies_integrator
+
         numerics = refinement.numerics
         self.say(
             f"simulated with a smaller time step: {numerics.integrator}, {numerics.timestep:g} s"
         )
+        robot: Any = self.kind
+        if not specifies_integrator(robot.robot):
+            self.finer = None
+            return
         self.coarse, self.file = CoarseStepFinding(refinement, gain), file_evaluators
         self.assessor = replace(
             self.assessor, before=self._predict_with_file_step(base, file_evaluators.validation)
@@ -956,7 +966,7 @@ class _ExplainRun:
             self.finer is None
             or self.unit_errors
             or finding.early_stop is not None
-            or self.search_control.has_abandoned_fits()
+            or self.search_control.is_over()
         ):
             return None
         if not finding.causes and (self.coarse is not None or finding.verdict == "adequate"):
@@ -1060,7 +1070,7 @@ class _ExplainRun:
         """Return the error that explains why nothing could be simulated."""
         if self.unit_errors:
             return InputError(f"{self.path}: {self.unit_errors[0].says}")
-        if self.search_control.has_abandoned_fits():
+        if self.search_control.is_over():
             return InputError(
                 f"{self.path}: the search was stopped before the first fit of the recording was "
                 "finished"

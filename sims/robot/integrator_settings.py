@@ -30,6 +30,10 @@ class IntegratorSettings(NamedTuple):
         return {"timestep": self.timestep, "integrator": INTEGRATOR_IDS[self.integrator]}
 
 
+DEFAULT_SETTINGS = IntegratorSettings(0.002, "Euler")
+"""MuJoCo's default settings."""
+
+
 class RobotEngine:
     """MuJoCo at the time step of the model; `RobotSimulator` does the simulation."""
 
@@ -57,3 +61,12 @@ def read_integrator_settings(robot: RobotModel) -> IntegratorSettings:
     option = robot.compiled.opt
     names = {number: name for name, number in INTEGRATOR_IDS.items()}
     return IntegratorSettings(float(option.timestep), names[int(option.integrator)])
+
+
+def specifies_integrator(robot: RobotModel) -> bool:
+    """Return whether the robot's model file specifies how it is simulated.
+
+    An MJCF does, by its defaults too. A URDF describes the robot alone, unless it contains options
+    of MuJoCo.
+    """
+    return robot.format == "mjcf" or read_integrator_settings(robot) != DEFAULT_SETTINGS

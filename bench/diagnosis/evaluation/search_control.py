@@ -224,6 +224,10 @@ class SearchControl:
         """Return whether any fit was stopped early."""
         return self._has_abandoned_fits
 
+    def is_over(self) -> bool:
+        """Return whether the search has to end, so that no further fits or filters are started."""
+        return self._has_abandoned_fits or self.should_stop()
+
     def make_early_stop(self, held_out: bool) -> EarlyStop:
         """Return the reason of the early end and the questions that were skipped.
 

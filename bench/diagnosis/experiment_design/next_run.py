@@ -118,7 +118,7 @@ def design_next_run(
         if (
             not ranked_runs
             or ranked_runs[0].value >= ranker.max_total_value
-            or models.evaluator.search_control.has_abandoned_fits()
+            or models.evaluator.search_control.is_over()
         ):
             break
         plans = [

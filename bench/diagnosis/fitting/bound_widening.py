@@ -61,7 +61,7 @@ def fit_wider(
     new_bounds: dict[str, Bounds] = {}
     for _ in range(MAX_WIDENING_ROUNDS):
         places = list_parameters_at_bounds(evaluator, base)
-        if not places or evaluator.search_control.has_abandoned_fits():
+        if not places or evaluator.search_control.is_over():
             break
         for i in places:
             parameter = evaluator.parameters[i]

@@ -321,7 +321,7 @@ class ModelSet:
                 self.evaluator, noise, self.fixed_parameters, is_final_fit=True
             )
             (fit,) = fitter.fit_models([self.make_final_start(model)], MAX_ITERATIONS)
-            if self.evaluator.search_control.has_abandoned_fits():
+            if self.evaluator.search_control.is_over():
                 break
             refitted = self._rate_fit(replace(fit, cost=compute_cost(fit)))
             if refitted.fit.cost > MAX_REWEIGHTED_SQUARES_RATIO * compute_cost(model.fit):

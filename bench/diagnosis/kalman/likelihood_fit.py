@@ -19,6 +19,7 @@ import numpy as np
 from bench.diagnosis.evaluation.coefficient_bounds import bound_of, get_bounds_by_index
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.evaluation.search_control import SearchStoppedError
 from bench.diagnosis.fitting.bound_widening import Bounds, compute_range_around, use_bounds
 from bench.diagnosis.kalman.candidate_responses import FollowedRuns
 from sims.core.simulator import Array
@@ -59,11 +60,13 @@ def identify_base(
 
     Returns:
         The runs, filtered with the estimates, and the new ranges by name. If the likelihood gains
-        nothing or an estimate is at its widest bound, the filter with nominal parameters.
+        nothing, an estimate is at its widest bound, or the search has to end, the filter with
+        nominal parameters.
     """
+    search_control = evaluator.search_control
 
     def follow(theta: Array, best: FollowedRuns) -> FollowedRuns:
-        evaluator.search_control.begin_stage("identifying the base parameters")
+        search_control.begin_stage("identifying the base parameters")
         return FollowedRuns.follow(evaluator, theta, noise, force=best.force)
 
     base_indices = evaluator.base_indices.tolist()
@@ -71,9 +74,13 @@ def identify_base(
     resisting_bounds = get_bounds_by_index(evaluator, _list_resisting_effects(followed))
     accepted = []
     for further_bounds in [resisting_bounds] if is_resisted else [{}, resisting_bounds]:
-        fitted = maximise_innovation_likelihood(
-            followed, limits | further_bounds, MAX_BASE_ITERATIONS, follow
-        )
+        try:
+            fitted = maximise_innovation_likelihood(
+                followed, limits | further_bounds, MAX_BASE_ITERATIONS, follow
+            )
+        except SearchStoppedError:
+            search_control.record_abandoned_fit(True)
+            return followed, {}
         bounds_reached = [bound_of(float(fitted.theta[i]), *bounds) for i, bounds in limits.items()]
         if fitted.has_expected_innovations and not any(bounds_reached):
             accepted.append(fitted)
@@ -122,16 +129,18 @@ def maximise_innovation_likelihood(
 
     Returns:
         The runs, filtered with the likeliest parameters.
+
+    Raises:
+        SearchStoppedError: the search has to end.
     """
     best = followed
     for _ in range(iterations):
-        if best.evaluator.search_control.has_abandoned_fits():
-            break
         step, predicted_gain = compute_likelihood_step(best, bounds)
         if predicted_gain < min_gain:
             break
         gain = 0.0
         for _ in range(1 + MAX_HALVINGS):
+            followed.evaluator.search_control.check_not_stopped()
             trial = follow(best.theta + step, best)
             gain = trial.log_likelihood - best.log_likelihood
             if gain > 0:
@@ -195,7 +204,11 @@ def _compute_innovation_derivative(
 
     It is a one-sided difference that stays within the bounds. `target` has the innovations at the
     present parameters, and `index` is the index of the parameter in theta.
+
+    Raises:
+        SearchStoppedError: the search has to end.
     """
+    followed.evaluator.search_control.check_not_stopped()
     low, high = bounds
     plausible_low, plausible_high = followed.evaluator.parameters[index].bounds
     step = DIFFERENCE_SHARE * min(plausible_high - plausible_low, high - low)

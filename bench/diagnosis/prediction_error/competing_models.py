@@ -71,7 +71,7 @@ def fit_single_in_place(context: SearchContext, best: FittedModel) -> FittedMode
     if (
         not explained
         or has_series(context.evaluator, best.effects)
-        or context.evaluator.search_control.has_abandoned_fits()
+        or context.evaluator.search_control.is_over()
     ):
         return best
     filters = context.filters
@@ -209,7 +209,7 @@ def _refine_near(context: SearchContext, size: int) -> None:
     Otherwise, incomplete fits would decide between them.
     """
     search, near_models = context.search, _list_models_near_the_best(context, size)
-    if context.evaluator.search_control.has_abandoned_fits() or len(near_models) < 2:
+    if context.evaluator.search_control.is_over() or len(near_models) < 2:
         return
     fitter = TrajectoryFitter(
         context.evaluator, search.noise, search.fixed_parameters, is_final_fit=True

@@ -111,17 +111,13 @@ def select_in_model(context: SearchContext, friction: FitStart | None = None) ->
     best = base if larger_sets else fit_filtered(context, current)
     for trial in _select_nearly_as_likely(context, larger_sets):
         best = select_more_likely(best, fit_filtered(context, trial))
-        if search_control.has_abandoned_fits():
+        if search_control.is_over():
             break
-    if (
-        friction is None
-        and not is_explained(context, best)
-        and not search_control.has_abandoned_fits()
-    ):
+    if friction is None and not is_explained(context, best) and not search_control.is_over():
         check_filter(context, larger_sets[0].followed.log_likelihood)
         best = select_more_likely(best, _fit_all_servos(context))
     # Two effects together may explain what neither explains alone.
-    if larger_sets and not is_explained(context, best) and not search_control.has_abandoned_fits():
+    if larger_sets and not is_explained(context, best) and not search_control.is_over():
         best = select_more_likely(best, fit_filtered(context, _grow_set(context, larger_sets[0])))
     if not np.isfinite(best.fit.cost) or not best.effects:
         return base

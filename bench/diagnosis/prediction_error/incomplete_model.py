@@ -114,11 +114,7 @@ def identify_incomplete(context: SearchContext) -> IdentifiedSet | None:
     """
     evaluator, filters = context.evaluator, context.filters
     excess = context.search.compute_excess_residual(context.search.base_model)
-    if (
-        not is_long(evaluator)
-        or not excess > MIN_EXCESS
-        or evaluator.search_control.has_abandoned_fits()
-    ):
+    if not is_long(evaluator) or not excess > MIN_EXCESS or evaluator.search_control.is_over():
         return None
     evaluator.search_control.begin_stage("identifying the joints and bodies")
     textbook = [
@@ -165,17 +161,18 @@ def _get_bounds(context: SearchContext, names: Sequence[str]) -> dict[int, Bound
 
 def _fit_set(context: SearchContext, followed: FollowedRuns, names: Sequence[str]) -> FilteredSet:
     """Maximise the likelihood of the innovations with effects in the filter's model."""
-
-    def follow(theta: Array, best: FollowedRuns) -> FollowedRuns:
-        context.evaluator.search_control.check_not_stopped()
-        return best.with_parameters(theta)
-
     base_log_likelihood = context.filters.base.log_likelihood
     min_gain = max(
         MIN_STEP_GAIN_SHARE * (followed.log_likelihood - base_log_likelihood), MIN_STEP_GAIN
     )
     bounds = _get_bounds(context, names)
-    best = maximise_innovation_likelihood(followed, bounds, MAX_SET_ITERATIONS, follow, min_gain)
+    best = maximise_innovation_likelihood(
+        followed,
+        bounds,
+        MAX_SET_ITERATIONS,
+        lambda theta, best: best.with_parameters(theta),
+        min_gain,
+    )
     return FilteredSet(best, tuple(names))
 
 

@@ -136,10 +136,7 @@ class PredictionErrorSearch(EffectSearch):
         if not is_explained(context, best):
             selected = select_with_shapes(context, selected)
             best = select_more_likely(best, fit_quick_selection(context, selected))
-        if (
-            not is_explained(context, best)
-            and not self.evaluator.search_control.has_abandoned_fits()
-        ):
+        if not is_explained(context, best) and not self.evaluator.search_control.is_over():
             best = select_more_likely(best, fit_series_effects(context, selected))
         if not best.effects:
             best = fit_selection(context, selected)
@@ -155,7 +152,7 @@ class PredictionErrorSearch(EffectSearch):
         return (
             is_force_missing
             and not is_explained(self._search_context, best)
-            and not self.evaluator.search_control.has_abandoned_fits()
+            and not self.evaluator.search_control.is_over()
         )
 
     def _add_missing_effects(

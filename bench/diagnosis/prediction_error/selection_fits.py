@@ -455,7 +455,7 @@ def refine_single_effects(context: SearchContext, fitted: Sequence[FittedModel])
         if not is_at_noise(context, refined) and is_nearly_explained(context, refined):
             refined = fit_nearby(context, refined, refined.effects[0])
         best = select_more_likely(best, refined)
-        if is_explained(context, best) or context.evaluator.search_control.has_abandoned_fits():
+        if is_explained(context, best) or context.evaluator.search_control.is_over():
             break
     return best
 

@@ -54,6 +54,33 @@ def log(folder, change=("", ""), noise=NOISE, divide=1, integrator="Euler"):
     return folder / "log.csv"
 
 
+URDF = """<robot name="arm">
+  <link name="base"/>
+  <link name="upper"><inertial><origin xyz="0 0 -0.2"/><mass value="1.2"/>
+    <inertia ixx="0.02" iyy="0.02" izz="0.002" ixy="0" ixz="0" iyz="0"/></inertial></link>
+  <link name="fore"><inertial><origin xyz="0 0 -0.1"/><mass value="0.8"/>
+    <inertia ixx="0.01" iyy="0.01" izz="0.001" ixy="0" ixz="0" iyz="0"/></inertial></link>
+  <joint name="shoulder" type="continuous"><parent link="base"/><child link="upper"/>
+    <axis xyz="0 1 0"/><dynamics damping="0.3"/></joint>
+  <joint name="elbow" type="continuous"><parent link="upper"/><child link="fore"/>
+    <origin xyz="0 0 -0.4"/><axis xyz="0 1 0"/><dynamics damping="0.1"/></joint>
+</robot>
+"""
+SERVOS = "".join(
+    f'[actuators.m_{joint}]\njoint = "{joint}"\nkind = "position"\nkp = {kp}\nkv = {kv}\n'
+    for joint, kp, kv in (("shoulder", 150, 6), ("elbow", 60, 2))
+)
+
+
+def describe_by_urdf(path):
+    """Replace the model file of a log by a URDF of the same arm, which has no time step."""
+    (path.parent / "arm.urdf").write_text(URDF)
+    description = path.with_suffix(".toml")
+    text = description.read_text().replace("arm.xml", "arm.urdf")
+    description.write_text(text + SERVOS)
+    return path
+
+
 def chosen(path):
     """Return the explainer of a log after the base fit and the choice of the step."""
     explainer = _ExplainRun([path], ExplainOptions(), ForkedWorkerPool(1))
@@ -78,6 +105,14 @@ def test_a_step_that_is_the_only_thing_wrong_is_found_before_any_cause(tmp_path)
     assert there.coarse is not None
     assert there.coarse.gain > MIN_FINER_STEP_GAIN
     assert there.kind.numerics.integrator == "RK4"
+
+
+def test_a_urdf_has_no_step_that_could_be_wrong(tmp_path):
+    there = chosen(describe_by_urdf(log(tmp_path, divide=4, integrator="RK4")))
+    # The better integrator is used, and is no finding about the model file.
+    assert there.kind.numerics.integrator == "RK4"
+    assert there.coarse is None
+    assert there.assessor.before is None
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from bench.diagnosis.explain import explain
+from bench.diagnosis.kalman.candidate_responses import FollowedRuns
 
 CARRIAGE = """<mujoco><option timestep="0.001" integrator="implicitfast"/>
 <worldbody><body name="carriage"><joint name="screw" type="slide" axis="1 0 0" {joint}/>
@@ -41,9 +42,8 @@ def rows_of(seed):
     return rows
 
 
-@pytest.fixture(scope="module")
-def answer(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("carriage")
+def write_log(folder):
+    """Write three runs of the carriage and the model file with a wrong mass and no friction."""
     (folder / "model.xml").write_text(CARRIAGE.format(joint="", mass=100))
     rows = [row for seed in (1, 2, 3) for row in rows_of(seed)]
     lines = ["run,t,x,u", *(",".join(f"{value:.9g}" for value in row) for row in rows)]
@@ -54,7 +54,26 @@ def answer(tmp_path_factory):
         '[inputs."u.drive"]\ncolumn = "u"\nunit = "N"\n[runs.3]\nheld_out = true\n'
     )
     (folder / "log.toml").write_text(description)
-    return explain(folder / "log.csv").answer
+    return folder / "log.csv"
+
+
+@pytest.fixture(scope="module")
+def answer(tmp_path_factory):
+    return explain(write_log(tmp_path_factory.mktemp("carriage"))).answer
+
+
+def test_the_identification_ends_with_the_time_of_the_search(tmp_path, monkeypatch):
+    filters, follow = [], FollowedRuns.compute_whitened_innovations
+
+    def counted(self, theta):
+        filters.append(theta)
+        return follow(self, theta)
+
+    monkeypatch.setattr(FollowedRuns, "compute_whitened_innovations", counted)
+    stopped = explain(write_log(tmp_path), force=True, stop=lambda: bool(filters)).answer
+    assert len(filters) == 1
+    assert stopped.cut.reason == "interrupt"
+    assert not stopped.causes
 
 
 @pytest.mark.slow
