@@ -9,7 +9,8 @@ computation that may have been stopped, so an incomplete fit is never evaluated.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -50,6 +51,8 @@ QUESTION_SECONDS: Mapping[str, float] = {
 """Time to answer each question, in seconds for a small recording; it scales the progress bar."""
 LARGER_MODEL_SECONDS = 6.0
 """Time to search models with one more effect, in seconds for a small recording."""
+VALIDATION_RESERVE = 0.07
+"""Share of the time limit that is kept for predicting held-out runs with the best model so far."""
 PROGRESS_STEP_SHARE = 0.4
 """Share of the remaining progress of a question that each step is assumed to take."""
 
@@ -92,7 +95,7 @@ class SearchControl:
 
     Attributes:
         deadline: end of the search on the clock `time.monotonic`, which all processes share; None
-            for no limit.
+            for no limit. A part of the time limit is left (`use_reserve`).
 
     Args:
         budget: wall-clock time limit in seconds; None for no limit.
@@ -113,7 +116,11 @@ class SearchControl:
         A search answers a sequence of questions, such as ``base_fit``. Each has a weight, its usual
         duration in seconds, from which the finished share is estimated.
         """
-        self.deadline = None if budget is None else time.monotonic() + budget
+        self.deadline: float | None = None
+        self._reserve = 0.0
+        if budget is not None:
+            self._reserve = VALIDATION_RESERVE * budget
+            self.deadline = time.monotonic() + budget - self._reserve
         self._stop = stop
         self._progress = progress
         self._listener = listener or SilentListener()
@@ -227,6 +234,21 @@ class SearchControl:
     def is_over(self) -> bool:
         """Return whether the search has to end, so that no further fits or filters are started."""
         return self._has_abandoned_fits or self.should_stop()
+
+    @contextmanager
+    def use_reserve(self) -> Iterator[None]:
+        """Continue a search that its time limit ended, until the reserve is used up.
+
+        A search that the user ended is not continued.
+        """
+        state = self.deadline, self._stop_reason, self._has_abandoned_fits
+        if self.deadline is not None:
+            self.deadline += self._reserve
+        self._stop_reason, self._has_abandoned_fits = None, False
+        try:
+            yield
+        finally:
+            self.deadline, self._stop_reason, self._has_abandoned_fits = state
 
     def make_early_stop(self, held_out: bool) -> EarlyStop:
         """Return the reason of the early end and the questions that were skipped.

@@ -182,6 +182,19 @@ class PredictionErrorSearch(EffectSearch):
         """Fit the sets that are nearly as good, and return the best of all."""
         return fit_competing_models(self._search_context, best)
 
+    def get_best_so_far(self) -> FittedModel:
+        """Return the likeliest model if its gain is significant, without any simulation."""
+        base, library_size = self.base_model, len(self.evaluator.library)
+        best = max(self.models.values(), key=lambda model: model.penalised_log_likelihood)
+        indices = [i for name in best.effects for i in self.evaluator.get_coefficient_indices(name)]
+        gain = best.likelihood.value - base.likelihood.value
+        is_significant = (
+            bool(indices)
+            and compute_p_value_of_gain(gain, len(indices), library_size)
+            <= EFFECT_P_VALUE_THRESHOLD
+        )
+        return best if is_significant else base
+
     def take_over(self, other: PredictionErrorSearch) -> None:
         """Reuse the filter and the responses of another search of the same base model.
 

@@ -31,6 +31,17 @@ COMPARED_MODEL_MARGIN = 15.0
 """Maximum distance in twice the log-likelihood of models that are evaluated on held-out runs."""
 
 
+@dataclass(frozen=True)
+class _RobotAlternatives(AlternativeFinder):
+    """Collects alternatives of a robot's effects; p-values are those of the chi-squared law."""
+
+    def _compute_p_value(self, rest: FittedModel, effect: str, gain: float) -> float:  # noqa: ARG002
+        slot = self.search.evaluator.coefficient_slices[effect]
+        return compute_p_value_of_gain(
+            gain, slot.stop - slot.start, len(self.search.evaluator.library)
+        )
+
+
 class Confirmation(Inquiry):
     """The steps of the diagnosis of a robot's recording.
 
@@ -38,6 +49,8 @@ class Confirmation(Inquiry):
         search: search by prediction errors, which contains the fitted base model.
         held_out: held-out runs for validation; None if there are none.
     """
+
+    alternative_finder = _RobotAlternatives
 
     def __init__(self, search: EffectSearch, held_out: Validation | None) -> None:
         super().__init__(search, held_out)
@@ -72,7 +85,7 @@ class Confirmation(Inquiry):
         self._model = search.fit_to_convergence(self._model)
         lack_of_fit = assess_lack_of_fit(search, self._model)
         search_control.begin_question("alternatives")
-        causes = _RobotAlternatives(
+        causes = self.alternative_finder(
             search, self._trial, lack_of_fit.has_structure
         ).collect_evidence(self._model)
         search_control.check_not_stopped()
@@ -152,14 +165,3 @@ class Confirmation(Inquiry):
         self._search_control.check_not_stopped()
         self._trial = trial
         self._model = trial.drop_unhelpful_effects(search, model)
-
-
-@dataclass(frozen=True)
-class _RobotAlternatives(AlternativeFinder):
-    """Collects alternatives of a robot's effects; p-values are those of the chi-squared law."""
-
-    def _compute_p_value(self, rest: FittedModel, effect: str, gain: float) -> float:  # noqa: ARG002
-        slot = self.search.evaluator.coefficient_slices[effect]
-        return compute_p_value_of_gain(
-            gain, slot.stop - slot.start, len(self.search.evaluator.library)
-        )

@@ -9,6 +9,7 @@ The thresholds are in `bench.diagnosis.search.verdict_rules`.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -90,7 +91,12 @@ class Inquiry:
         search: the search, which contains the fitted base model.
         held_out: predicts held-out runs, or each run by cross-validation; None if neither is
             possible.
+
+    Attributes:
+        alternative_finder: collects the evidence for each cause.
     """
+
+    alternative_finder: type[AlternativeFinder] = AlternativeFinder
 
     def __init__(self, search: EffectSearch, held_out: Validation | None) -> None:
         """Start a diagnosis without results.
@@ -215,14 +221,23 @@ class Inquiry:
     def build_early_result(self) -> DiagnosisResult:
         """Return the result of a search that had to end early, which claims only what was tested.
 
-        Only existing fits and scores are used; nothing is simulated here.
+        Only existing fits and scores are used; nothing is simulated here but held-out runs, for
+        which a part of the time limit was kept.
         """
         search = self._search
         early_stop = self._search_control.make_early_stop(self._held_out is not None)
         model = self._model or search.get_best_so_far()
+        if self._trial is None and self._held_out is not None and model.effects:
+            validation = HeldOutValidation(self._held_out)
+            with suppress(SearchStoppedError), self._search_control.use_reserve():
+                validation.evaluate_models([search.base_model, model])
+                self._search_control.check_not_stopped()
+                self._trial = validation
         # The residual was not tested, so it is counted as structure and not as noise.
         lack_of_fit = replace(assess_residual_size(search, model), p_value=0.0)
-        alternatives = AlternativeFinder(search, self._trial, structure=False, simulates=False)
+        alternatives = self.alternative_finder(
+            search, self._trial, structure=False, simulates=False
+        )
         causes = alternatives.collect_evidence(model)
         share = compute_gap_closed(search, model, lack_of_fit)
         verdict = decide_early_stop_verdict(len(causes), share, early_stop.skipped_questions)

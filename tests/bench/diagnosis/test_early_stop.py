@@ -1,10 +1,12 @@
 """Tests that a search stopped early reports its results and claims no more."""
 
 import json
+from pathlib import Path
 
 import pytest
 
 from bench.api.explain import explain
+from bench.diagnosis.prediction_error.prediction_error_search import PredictionErrorSearch
 from bench.diagnosis.search.verdict_rules import EARLY_STOP_MEANINGS
 from bench.diagnosis.verdict import Verdict
 from sims.core.simulator import InputError
@@ -82,6 +84,21 @@ def test_an_end_that_never_comes_changes_nothing(swing):
     assert found.verdict == "named"
     assert found.answer.cut is None
     assert 0.0 <= told[0] < told[-1] < 1.0
+
+
+def test_the_best_model_of_a_robot_is_measured_after_its_budget(monkeypatch):
+    def use_up_budget(search, best):
+        search.evaluator.search_control._stop_reason = "budget"
+        return best
+
+    monkeypatch.setattr(PredictionErrorSearch, "fit_competing_models", use_up_budget)
+    found = explain(Path(__file__).parents[3] / "examples/robot/log.csv")
+    assert found.verdict == "unknown"
+    assert found.answer.cut.reason == "budget"
+    (cause,) = found.causes
+    assert cause.effect == "friction.coulomb@elbow"
+    assert cause.p_value < 1e-12
+    assert found.answer.heldout.gap_closed > 0.95
 
 
 @pytest.mark.parametrize("budget", [0, -1.0, float("nan")])

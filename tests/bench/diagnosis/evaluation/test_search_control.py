@@ -31,10 +31,11 @@ def clock(monkeypatch):
 def test_a_budget_ends_between_fits_and_within_them(clock):
     watch = SearchControl(budget=2.0)
     watch.report_and_check("scores")
-    clock.now += 1.9
+    clock.now += 1.85
     assert not watch.should_abandon_fit(0.5)
     watch.check_not_stopped()
-    clock.now += 0.1
+    # The last 7 % are kept for the validation.
+    clock.now += 0.02
     assert watch.should_abandon_fit(0.6)
     for ask in (
         watch.check_not_stopped,
@@ -111,3 +112,24 @@ def test_larger_models_are_more_to_do():
         < (QUESTION_SECONDS["base_fit"] + QUESTION_SECONDS["search"])
         / sum(QUESTION_SECONDS.values())
     )
+
+
+def test_a_part_of_the_budget_is_left_for_validation(clock):
+    watch = SearchControl(budget=100.0)
+    clock.now += 92.9
+    assert not watch.should_stop()
+    clock.now += 0.2
+    assert watch.should_abandon_fit(0.5)
+    with watch.use_reserve():
+        assert not watch.is_over()
+        clock.now += 7.0
+        assert watch.should_stop()
+    assert watch.is_over()
+    assert watch.make_early_stop(held_out=True).reason == "budget"
+
+
+def test_an_interrupt_leaves_no_time_for_validation(clock):
+    watch = SearchControl(budget=100.0, stop=lambda: True)
+    assert watch.should_stop()
+    with watch.use_reserve():
+        assert watch.should_stop()
