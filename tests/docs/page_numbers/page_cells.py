@@ -12,10 +12,10 @@ from bench.benchmark.problem.experiment import load_experiment
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from tests.benchmarks import real_recordings
 from tests.docs.page_numbers.page_values import (
-    REFERENCE,
     SEVERAL,
     answers,
     covered,
+    document,
     error,
     frame,
     grade,
@@ -235,7 +235,6 @@ def history_missing(row, heading):
 
 def real_table():
     """Return the lines of the table of measured recordings."""
-    real = REFERENCE / "real"
-    names = re.findall(r"^\| \[([\w/]+)\]", (real / "table.md").read_text("utf-8"), re.M)
-    lines = [real_recordings.row(real, real / name) for name in names]
+    verdicts = {name: document(f"real/{name}/verdict.json") for name in real_recordings.RECORDINGS}
+    lines = [real_recordings.row(name, verdict) for name, verdict in verdicts.items()]
     return [*real_recordings.HEAD.splitlines(), *lines]

@@ -248,11 +248,6 @@ def cause(folder, effect, name="coefficient"):
     return estimates(folder, effect)[name]["value"]
 
 
-def shares_of(folder, effect):
-    """Return all coefficients of a diagnosed cause in percent, sorted."""
-    return sorted(100 * number["value"] for number in estimates(folder, effect).values())
-
-
 def half_width(estimate):
     """Return half the width of an interval."""
     return (estimate["high"] - estimate["low"]) / 2
@@ -274,13 +269,3 @@ def so101_errors():
         for row in body
         for joint, cell in zip(head[2:], row[2:], strict=True)
     }
-
-
-def so101_worse_joints(motion):
-    """Return the joints that the extended model predicts worse than the imported one."""
-    return [
-        joint
-        for (name, model, joint), cell in so101_errors().items()
-        if (name, model) == (motion, "extended")
-        and float(cell) > float(so101_errors()[motion, "as imported", joint])
-    ]
