@@ -18,9 +18,9 @@ from bench.diagnosis.conventions.unit_check import Subject, find_imitated_unit, 
 from bench.diagnosis.evaluation.noise_floor import (
     INTEGRATION_ERROR_SHARE,
     NoiseFloor,
+    add_minimal_noise,
     compute_noise_floor,
 )
-from bench.diagnosis.evaluation.noise_free_runs import add_minimal_noise
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.evaluation.search_control import STAGES, SearchStoppedError
@@ -31,12 +31,10 @@ from bench.diagnosis.explanation import Explanation
 from bench.diagnosis.fitting.base_fit import (
     FINAL_ITERATIONS,
     BaseFit,
-    correct_discretisation,
-    fit_base_model,
-)
-from bench.diagnosis.fitting.bound_widening import (
     Bounds,
+    correct_discretisation,
     describe_unusual_values,
+    fit_base_model,
     fit_wider,
     use_bounds,
 )
@@ -57,8 +55,7 @@ from bench.diagnosis.search.diagnose import DiagnosisResult, answer, diagnose
 from bench.diagnosis.search.effect_search import EffectSearch
 from bench.diagnosis.search.lack_of_fit import assess_lack_of_fit, list_hat_effects
 from bench.diagnosis.search.verdict_rules import INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
-from bench.diagnosis.validation.cross_validation import CrossValidation
-from bench.diagnosis.validation.held_out_runs import HeldOutRuns, Validation
+from bench.diagnosis.validation.held_out_runs import CrossValidation, HeldOutRuns, Validation
 from bench.diagnosis.verdict import RecordingFault
 from bench.diagnosis.verdict_builder import VerdictBuilder
 from bench.logs.importing.filter_start import leave_out_settling
@@ -830,7 +827,7 @@ class _ExplainRun:
             return True
         # These imports are needed for robots only.
         from bench.diagnosis.kalman.candidate_responses import FollowedRuns
-        from bench.diagnosis.prediction_error.effect_selection import shows_step_errors
+        from bench.diagnosis.prediction_error.regression_selection import shows_step_errors
 
         return shows_step_errors(
             FollowedRuns.get_or_follow(self.fitting, base.fit.theta, self.noise)
@@ -842,7 +839,7 @@ class _ExplainRun:
         The error is corrected if the recording shows it, or if no filter could decide.
         """
         # This import is needed for robots only.
-        from bench.diagnosis.prediction_error.effect_selection import shows_step_errors
+        from bench.diagnosis.prediction_error.regression_selection import shows_step_errors
 
         filtered_runs = self.fitting.filtered_runs
         if filtered_runs is not None and not shows_step_errors(filtered_runs):

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from bench.diagnosis.evaluation.progress_events import ProgressListener
-from bench.diagnosis.evaluation.search_control import SearchControl
+from bench.diagnosis.evaluation.search_control import ProgressListener, SearchControl
 from bench.logs.data_frames import FrameDescription
 from sims.core.argument_checks import Count, Name, Names, Seconds
 

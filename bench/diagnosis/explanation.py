@@ -8,12 +8,15 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bench.diagnosis.extended_robot_files import ExtendedRobotFiles, build_robot_files
+from bench.diagnosis.extended_robot_files import (
+    ExtendedRobotFiles,
+    build_robot_files,
+    find_model_file_changes,
+)
 from bench.diagnosis.randomization.ranges import RandomizationRanges, list_randomization_ranges
 from bench.diagnosis.report import explanation_figures
 from bench.diagnosis.report.consistency_section import AGREEMENT_COLUMNS, build_consistency_rows
 from bench.diagnosis.report.explanation_page import render_report
-from bench.diagnosis.report.model_file_changes import find_model_file_changes
 from bench.diagnosis.report.report_data import DiagnosisReportData
 from bench.diagnosis.report.summary_text import format_early_stop, format_interval, has_gap_closed
 from bench.diagnosis.report.wording import format_fitted_value, format_percent, joined, sanitise
@@ -111,7 +114,7 @@ class Explanation:
         contents |= {folder / name: text for name, text in self._robot_files.contents.items()}
         if ranges:
             # This import is needed only if ranges are requested.
-            from bench.diagnosis.randomization.files import build_range_files
+            from bench.diagnosis.randomization.range_files import build_range_files
 
             range_contents = build_range_files(self.ranges, self.extended, folder)
             contents |= {folder / name: text for name, text in range_contents.items()}

@@ -156,7 +156,7 @@ def _run_explain_batch(options: argparse.Namespace, print_line: PrintLine) -> Co
     )
     from bench.cli.search_progress import ProgressDisplay
     from bench.core.resource_estimates import count_available_cores
-    from bench.diagnosis.batch.log_rows import (
+    from bench.diagnosis.batch.log_tables import (
         LOGS_TABLE_FILE,
         LogResult,
         format_cause,

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from bench.benchmark.runner.worker_pools import Pool
-from bench.diagnosis.batch.log_rows import LOGS_TABLE_FILE, LogResult, format_log_table
+from bench.diagnosis.batch.log_tables import LOGS_TABLE_FILE, LogResult, format_log_table
 from bench.diagnosis.explain import explain
 from bench.figures.figure_files import is_pdf_wanted
 from bench.logs.joined_recordings import make_log_names

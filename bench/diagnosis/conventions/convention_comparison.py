@@ -8,7 +8,7 @@ recorded values y,
 
 with k_c the factor of channel c and N_c its number of samples. A convention differs if (1) is
 clearly larger than for the log as it is described, and larger than with the best set of causes that
-prediction-error identification selects (`prediction_error.effect_selection`): friction,
+prediction-error identification selects (`prediction_error.regression_selection`): friction,
 delays and small offsets are causes, not conventions.
 
 Hypotheses are compared on a short part of some runs; the selected ones are confirmed on all
@@ -33,8 +33,8 @@ from bench.diagnosis.conventions.convention_hypotheses import (
     HypothesisGenerator,
     JointSignals,
     SignalChange,
+    find_copied_commands,
 )
-from bench.diagnosis.conventions.copied_commands import find_copied_commands
 from bench.diagnosis.conventions.unit_check import Subject
 from bench.diagnosis.evaluation.coefficient_bounds import get_bounds_by_index
 from bench.diagnosis.evaluation.noise_floor import compute_noise_floor
@@ -44,18 +44,18 @@ from bench.diagnosis.fitting.fit_state import TrajectoryFit
 from bench.diagnosis.friction_form_verdict import make_soft_kind
 from bench.diagnosis.identifiability import join_first_names
 from bench.diagnosis.kalman.candidate_responses import MAX_LINEARISATIONS, FollowedRuns
-from bench.diagnosis.kalman.joint_forces import compute_joint_forces, has_joint_forces
 from bench.diagnosis.kalman.likelihood_fit import maximise_innovation_likelihood
-from bench.diagnosis.prediction_error.effect_selection import identify
-from bench.diagnosis.prediction_error.joint_effects import MANY_SHAPES
+from bench.diagnosis.kalman.measured_states import compute_joint_forces, has_joint_forces
 from bench.diagnosis.prediction_error.library_columns import group_coefficients
 from bench.diagnosis.prediction_error.model_filters import (
     GAUSS_NEWTON_STEPS,
+    MANY_SHAPES,
     make_soft_friction_models,
 )
+from bench.diagnosis.prediction_error.regression_selection import identify
 from bench.diagnosis.search.candidate_directions import iterate_first_probes
-from bench.diagnosis.search.explained_variance import DirectionGroup
 from bench.diagnosis.search.lack_of_fit import list_hat_effects
+from bench.diagnosis.search.score_test import DirectionGroup
 from sims.recording.recording import Recording, Run
 from sims.robot.robot_model import RobotModel
 from sims.robot.robot_simulator import RobotSimulator

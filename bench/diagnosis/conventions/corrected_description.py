@@ -9,8 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from bench.diagnosis.conventions.convention_comparison import ConventionDifference
-from bench.diagnosis.conventions.convention_hypotheses import ConventionHypothesis, SignalChange
-from bench.diagnosis.conventions.copied_commands import UNKNOWN_COLUMN
+from bench.diagnosis.conventions.convention_hypotheses import (
+    UNKNOWN_COLUMN,
+    ConventionHypothesis,
+    SignalChange,
+)
 from sims.core.atomic_files import write_files
 from sims.core.simulator import InputError
 from sims.core.toml_validation import toml_key, toml_text

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bench.diagnosis.datasheet.drive_diagram import DriveDiagram
-from bench.diagnosis.datasheet.sheet_content import SheetContent
-from bench.diagnosis.datasheet.wording import (
+from bench.diagnosis.datasheet.sheet_content import (
+    SheetContent,
     format_confounding,
     format_detection_limit,
     format_evidence,

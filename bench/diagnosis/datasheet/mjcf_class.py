@@ -1,5 +1,7 @@
 """Data sheet as an MJCF default class, and a model that uses it and can be scored.
 
+With it, the exported model can be scored on the same log (`simgap score`).
+
 Comments state what MuJoCo cannot express. For a system, whose state is known at every sample, a dry
 friction law that MuJoCo lacks is replaced by its mean over the runs, which is the best
 approximation in MJCF.
@@ -9,19 +11,157 @@ from __future__ import annotations
 
 import re
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from os.path import relpath
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from bench.diagnosis.datasheet.constants_groups import ConstantsGroup, group_runs_by_constants
-from bench.diagnosis.datasheet.exported_log_description import describe_log_for_model
-from bench.diagnosis.datasheet.mean_friction_limit import compute_mean_friction_limit
+import numpy as np
+
 from bench.diagnosis.datasheet.sheet_content import SheetContent
 from bench.diagnosis.extended_robot_files import collect_causes
 from sims import effects as library
 from sims.core.effect import Friction
-from sims.core.system import RenderedModelFile
+from sims.core.simulator import Array
+from sims.core.system import RenderedModelFile, StateSnapshot
+from sims.core.toml_validation import read_toml
 from sims.extended_simulator import FittedValue
+from sims.recording.recording import Run
+from sims.recording.recording_description import get_description_path
+
+
+@dataclass(frozen=True)
+class ConstantsGroup:
+    """Runs of a recording with equal constants.
+
+    Attributes:
+        name: Short name from the constants; empty if there are none.
+        numbers: Parameters and constants.
+        runs: Runs of the recording.
+    """
+
+    name: str
+    numbers: Mapping[str, float]
+    runs: tuple[Run, ...]
+
+
+def group_runs_by_constants(sheet: SheetContent) -> list[ConstantsGroup]:
+    """Group the runs with equal constants, such as one load, in the order of the recording.
+
+    An MJCF model has fixed numbers, so each group needs its own model.
+    """
+    by_constants: dict[tuple[tuple[str, float], ...], list[Run]] = {}
+    for run in sheet.recording.runs:
+        by_constants.setdefault(tuple(sorted(run.constants.items())), []).append(run)
+    defaults = {c.name: c.value for c in sheet.subject.kind.constants}
+    defaults |= {p.name: p.nominal for p in sheet.subject.kind.parameters}
+    fitted_values = {name: number.value for name, number in sheet.extended.parameters.items()}
+    numbers = {**defaults, **sheet.recording.constants, **sheet.extended.constants, **fitted_values}
+    return [
+        ConstantsGroup(
+            "_".join(f"{name}{value:g}" for name, value in constants) if by_constants else "",
+            {**numbers, **dict(constants)},
+            tuple(runs),
+        )
+        for constants, runs in by_constants.items()
+    ]
+
+
+MOTOR_ON_THRESHOLD = 0.5
+"""Value of a switching input above which the motor is on."""
+
+
+def describe_log_for_model(
+    sheet: SheetContent, group: ConstantsGroup, model: RenderedModelFile, stem: str, folder: Path
+) -> Iterator[tuple[str, str]]:
+    """Yield a description of the log for the model, in which its runs are marked held out.
+
+    Nothing is yielded for a log of several files.
+    """
+    import tomli_w
+
+    path = sheet.recording.path
+    if path.suffix != ".csv" or any(run.log for run in sheet.recording.runs):
+        return
+    log_description = read_toml(get_description_path(path))
+    file = relpath(path.resolve(), folder.resolve())
+    document: dict[str, Any] = {
+        "model": f"{stem}.xml",
+        "title": f"{sheet.name} as {stem}.xml",
+        "channels": {},
+        "inputs": {},
+        "runs": {
+            run.name: {"held_out": True} for run in group.runs if _is_motor_always_on(run, model)
+        },
+    }
+    for kind in ("channels", "inputs"):
+        for name, description in log_description.get(kind, {}).items():
+            if name in model.signals:
+                document[kind][model.signals[name]] = {"file": file, "column": name, **description}
+    yield f"{stem}.toml", tomli_w.dumps(document)
+
+
+def _is_motor_always_on(run: Run, model: RenderedModelFile) -> bool:
+    """Return whether the inputs that switch the motor are on all the time."""
+    switches = [values for name, values in run.inputs.items() if name not in model.signals]
+    return all(bool((values > MOTOR_ON_THRESHOLD).all()) for values in switches)
+
+
+def compute_mean_friction_limit(
+    sheet: SheetContent,
+    group: ConstantsGroup,
+    effect: type[Friction],
+    numbers: Mapping[str, FittedValue],
+) -> float:
+    """Compute the mean limit of a friction law over the samples of some runs, in N or N·m.
+
+    The limit is the largest force with which the friction holds the joint. MuJoCo has only a
+    constant limit, of which the mean is the best approximation.
+
+    Args:
+        sheet: Content of the data sheet.
+        group: Runs with equal constants.
+        effect: Friction law.
+        numbers: Its fitted coefficients by name; missing ones are zero.
+    """
+    limits = [_compute_friction_limits(sheet, group, run, effect, numbers) for run in group.runs]
+    values = np.concatenate(limits)
+    return float(values[np.isfinite(values)].mean())
+
+
+def _compute_friction_limits(
+    sheet: SheetContent,
+    group: ConstantsGroup,
+    run: Run,
+    effect: type[Friction],
+    numbers: Mapping[str, FittedValue],
+) -> Array:
+    """Compute the limit (T,) of a friction law at each sample of a run, as one batch."""
+    kind = sheet.subject.kind
+    system = kind.system()
+    (coordinate,) = system.coordinates
+    position = run.channels[coordinate]
+    rate = np.gradient(position, run.times)
+    shape = (len(position), 1)
+    theta = np.array([[group.numbers[p.name] for p in kind.parameters]])
+    effect_coefficients = effect.on(system)
+    coefficients = [
+        numbers[c.name].value if c.name in numbers else 0.0 for c in effect_coefficients
+    ]
+    moment = StateSnapshot(
+        system,
+        np.repeat(theta, len(position), axis=0),
+        {c.name: np.full(shape, group.numbers[c.name]) for c in kind.constants},
+        (run.times - run.times[0])[:, None],
+        position[:, None],
+        rate[:, None],
+        {name: values[:, None] for name, values in run.inputs.items()},
+    )
+    c = np.array(coefficients)[:, None, None]
+    limit: Array = effect().limit(np.broadcast_to(c, (len(c), *shape)), moment)[:, 0]
+    return limit
+
 
 CLASS_FILE = "class.xml"
 """File name of the classes."""

@@ -1,5 +1,8 @@
 """Deadline, interruption and progress of a search, and the questions that it has not answered.
 
+A search reports events to a `ProgressListener`, for example a progress display. The search and the
+display do not depend on each other, so one display serves every search.
+
 A search ends early in one of two ways. A fit stops after its present step and keeps the best point
 so far (`SearchControl.should_abandon_fit`). Between fits, an exception ends the search.
 `SearchControl.check_not_stopped` follows every
@@ -12,9 +15,54 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, Protocol, runtime_checkable
 
-from bench.diagnosis.evaluation.progress_events import ProgressListener, SilentListener
+
+@runtime_checkable
+class ProgressListener(Protocol):
+    """Receives the events of one search in the order in which they happen.
+
+    Every method returns quickly and never raises: a listener must not end or delay a search.
+    """
+
+    def stage(self, name: str, total: int | None = None) -> None:
+        """Begin a stage, which ends the previous one.
+
+        Args:
+            name: description of the stage, such as ``testing 38 effects``.
+            total: number of steps of the stage; None if unknown.
+        """
+
+    def advance(self, count: int = 1) -> None:
+        """Report `count` further finished steps of the stage."""
+
+    def found(self, effects: Sequence[str], share: float) -> None:
+        """Report the best model so far.
+
+        Args:
+            effects: names of its effects, such as ``friction.coulomb@elbow``.
+            share: share of the discrepancy on the fitted runs that the model removes, 0 to 1.
+        """
+
+    def completed(self, share: float) -> None:
+        """Report the estimated share of the whole search that is finished, 0 to 1."""
+
+
+class SilentListener:
+    """A `ProgressListener` that ignores all events."""
+
+    def stage(self, name: str, total: int | None = None) -> None:
+        """Ignore the event."""
+
+    def advance(self, count: int = 1) -> None:
+        """Ignore the event."""
+
+    def found(self, effects: Sequence[str], share: float) -> None:
+        """Ignore the event."""
+
+    def completed(self, share: float) -> None:
+        """Ignore the event."""
+
 
 StopReason = Literal["budget", "interrupt"]
 StopCallback = Callable[[], bool]

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.diagnosis.experiment_design.model_file_limits import (
+from bench.diagnosis.experiment_design.candidate_runs import (
     UNLIMITED,
     Interval,
     StatedLimits,

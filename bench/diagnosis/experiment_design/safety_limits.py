@@ -3,7 +3,7 @@
 Runs are also rejected if bodies touch that did not touch before. The runs are simulated, and all
 moving channels are monitored, whether they are recorded or not.
 
-A limit of the model file (`experiment_design.model_file_limits`) holds whatever the present runs
+A limit of the model file (`experiment_design.candidate_runs`) holds whatever the present runs
 did. Where the file specifies no limit, it follows from the values in the present runs.
 """
 
@@ -17,8 +17,11 @@ from typing import Any
 import numpy as np
 
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.diagnosis.experiment_design.candidate_runs import CandidateRun
-from bench.diagnosis.experiment_design.model_file_limits import Interval, read_model_file_limits
+from bench.diagnosis.experiment_design.candidate_runs import (
+    CandidateRun,
+    Interval,
+    read_model_file_limits,
+)
 from bench.diagnosis.fitting.model_set import FittedModel
 from bench.logs.quality.recorded_poses import find_contacts
 from sims.core.simulator import Array, Scenario

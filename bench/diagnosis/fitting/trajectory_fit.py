@@ -17,13 +17,6 @@ import numpy as np
 from bench.diagnosis.evaluation.coefficient_bounds import get_bounds_by_index
 from bench.diagnosis.evaluation.noise_model import Mask, NoiseModel, whiten
 from bench.diagnosis.evaluation.run_evaluator import MIN_CHUNK_SIZE, Indices, RunEvaluator
-from bench.diagnosis.fitting.finite_differences import (
-    INITIAL_PARAMETER_STEP,
-    INITIAL_STATE_STEP,
-    build_displaced_inputs,
-    compute_difference_steps,
-    is_finite_response,
-)
 from bench.diagnosis.fitting.fit_state import (
     MAX_DAMPING,
     FitPoint,
@@ -31,7 +24,14 @@ from bench.diagnosis.fitting.fit_state import (
     FitState,
     TrajectoryFit,
 )
-from bench.diagnosis.fitting.gauss_newton import compute_gauss_newton_step
+from bench.diagnosis.fitting.gauss_newton import (
+    INITIAL_PARAMETER_STEP,
+    INITIAL_STATE_STEP,
+    build_displaced_inputs,
+    compute_difference_steps,
+    compute_gauss_newton_step,
+    is_finite_response,
+)
 from sims.core.simulator import Array
 
 MIN_ITERATIONS_BEFORE_ELIMINATION = 4

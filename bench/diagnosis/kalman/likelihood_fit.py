@@ -20,7 +20,7 @@ from bench.diagnosis.evaluation.coefficient_bounds import bound_of, get_bounds_b
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.evaluation.search_control import SearchStoppedError
-from bench.diagnosis.fitting.bound_widening import Bounds, compute_range_around, use_bounds
+from bench.diagnosis.fitting.base_fit import Bounds, compute_range_around, use_bounds
 from bench.diagnosis.kalman.candidate_responses import FollowedRuns
 from sims.core.simulator import Array
 

@@ -1,4 +1,4 @@
-"""States of a robot from its recorded positions and velocities alone, without its dynamics.
+"""States and joint forces of a robot from its recorded motion alone, without simulation.
 
 Each joint is filtered separately, as a body whose jerk j is constant between samples and otherwise
 unknown,
@@ -7,17 +7,25 @@ unknown,
 
 (Y. Bar-Shalom, X. R. Li, T. Kirubarajan, Estimation with Applications to Tracking and Navigation,
 2001, section 6.2). The size of the jerk is selected from a grid by maximum likelihood.
+
+Positions, velocities and accelerations are estimated from the readings alone (`track_joints`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.kalman.filter_and_smoother import LinearRuns, filter_runs, smooth_runs
+from bench.logs.quality.noise_estimation import estimate_noise
 from sims.core.simulator import Array
+from sims.recording.recording import Recording, Run
+from sims.robot.dynamics.activation_filters import activation_filters
+from sims.robot.dynamics.inverse_dynamics import motion_forces
+from sims.robot.robot_model import RobotModel
 
 JERKS = 10.0 ** np.arange(-2.0, 3.1, 1.0)
 """Sizes of the jerk that are tried, in units of the range of positions over seconds cubed."""
@@ -130,3 +138,117 @@ def track_joints(times: Array, readings: list[tuple[Array, Array]]) -> list[Arra
     states = smoothed.states
     states[:, :, 0] += first[:, None]
     return list(states)
+
+
+class JointForces(NamedTuple):
+    """Forces at the D joints of a robot in the T samples of a run, (T, D) each.
+
+    Attributes:
+        needed: forces that the measured motion requires.
+        driven: forces of the model's drives at the measured motion.
+        holding: forces that hold the joints still.
+        velocity: velocities of the joints.
+    """
+
+    needed: Array
+    driven: Array
+    holding: Array
+    velocity: Array
+
+    def residuals(self, joint: int) -> Array:
+        """Return the residuals (3, T) at a joint of a drive that is on, off, or held by a brake."""
+        needed = self.needed[:, joint]
+        return np.stack([needed - self.driven[:, joint], needed, needed - self.holding[:, joint]])
+
+
+def has_joint_forces(robot: RobotModel, recording: Recording) -> bool:
+    """Return whether joint forces can be computed from the recorded positions.
+
+    All joints must be recorded, and have one coordinate each; none is coupled by an equality.
+    """
+    recorded = recording.runs[0].channels
+    singles = all(
+        joint.has_one_coordinate and f"q.{joint.name}" in recorded for joint in robot.joints
+    )
+    return singles and not robot.compiled.neq and bool(robot.actuators)
+
+
+def compute_joint_forces(robot: RobotModel, recording: Recording, run: Run) -> JointForces:
+    """Compute the joint forces of a run by MuJoCo's inverse dynamics.
+
+    Positions, velocities and accelerations are estimated from the recorded positions first.
+    """
+    model = robot.compiled
+    states = np.stack(track_joints(run.times, _get_readings(robot, recording, run)))
+    motion = np.transpose(states, (2, 1, 0))
+    rest_motion = np.stack([motion[0], np.zeros_like(motion[0]), np.zeros_like(motion[0])])
+    controls, activations = _compute_controls(robot, run)
+    applied = np.zeros(motion.shape[1:])
+    for column, joint in enumerate(robot.joints):
+        name = f"force.{joint.name}"
+        if name in run.inputs:
+            applied[:, column] = _compute_mean_input(run, name)
+    needed, driven = motion_forces(model, robot.joints, motion, controls, activations)
+    holding, _ = motion_forces(model, robot.joints, rest_motion, controls, activations)
+    names = [joint.name for joint in robot.joints]
+    for name, off_mask in run.off.items():
+        joint_name = robot.actuator(name).joint
+        if joint_name is not None:
+            # Where the drive is known to be off, both hypotheses agree.
+            driven[off_mask, names.index(joint_name)] = 0.0
+    return JointForces(needed - applied, driven, holding - applied, motion[1])
+
+
+def _get_readings(robot: RobotModel, recording: Recording, run: Run) -> list[tuple[Array, Array]]:
+    """Return for each joint its recorded positions and velocities (T, 2), and their noise (2,).
+
+    A velocity that is not recorded is NaN. Noise that is not stated is estimated.
+    """
+    readings = []
+    for joint in robot.joints:
+        columns, noise = [], []
+        for name in (f"q.{joint.name}", f"qd.{joint.name}"):
+            values = run.channels.get(name, np.full(run.times.size, np.nan))
+            columns.append(values)
+            sigma = recording.noise.get(name, 0.0)
+            if not sigma > 0 and name in run.channels:
+                sigma = estimate_noise([(run.times, values)]).sigma
+            noise.append(sigma if np.isfinite(sigma) and sigma > 0 else 1e-6)
+        readings.append((np.stack(columns, axis=1), np.array(noise)))
+    return readings
+
+
+def _compute_mean_input(run: Run, name: str) -> Array:
+    """Return an input (T,) at each sample: the mean of its values before and after the sample."""
+    values = run.inputs[name]
+    if name in run.linear:
+        return values
+    earlier = np.concatenate([values[:1], values[:-1]])
+    mean: Array = 0.5 * (values + earlier)
+    return mean
+
+
+def _compute_controls(robot: RobotModel, run: Run) -> tuple[Array, Array]:
+    """Return the controls (T, nu) and filtered activations (T, na) of a run at its samples.
+
+    nu and na are MuJoCo's numbers of actuators and of activation states.
+    """
+    model = robot.compiled
+    controls = np.zeros((run.times.size, model.nu))
+    activations = np.zeros((run.times.size, model.na))
+    for actuator in robot.actuators:
+        name = f"u.{actuator.name}"
+        if name in run.inputs:
+            controls[:, actuator.control] = _compute_mean_input(run, name)
+    steps = np.diff(run.times)
+    for activation_filter in activation_filters(robot):
+        clipped_controls = activation_filter.clip_controls(
+            controls[:, activation_filter.actuator.control]
+        )
+        activation = float(clipped_controls[0])
+        for k, decay in enumerate(
+            np.exp(-np.append(steps, 0.0) / max(activation_filter.seconds, 1e-9)).tolist()
+        ):
+            activations[k, activation_filter.address] = activation
+            activation = clipped_controls[k] + decay * (activation - clipped_controls[k])
+    return controls, activations

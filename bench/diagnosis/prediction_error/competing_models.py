@@ -18,14 +18,14 @@ from bench.diagnosis.prediction_error.forward_growth import (
     LINEARISATION_ERROR,
     try_one_more_effect,
 )
-from bench.diagnosis.prediction_error.joint_effects import (
+from bench.diagnosis.prediction_error.model_filters import (
+    GAUSS_NEWTON_STEPS,
     JOINT_MODEL,
     SERVO_MODEL,
     has_series,
     list_at_coupled_joints,
     list_joint_model_effects,
 )
-from bench.diagnosis.prediction_error.model_filters import GAUSS_NEWTON_STEPS
 from bench.diagnosis.prediction_error.selection_fits import MAX_IMPROVED_SIZE, refine_single_effects
 from bench.diagnosis.prediction_error.simulated_fits import (
     fit_filtered,

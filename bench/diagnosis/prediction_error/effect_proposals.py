@@ -20,15 +20,16 @@ from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.fit_state import FitStart
 from bench.diagnosis.kalman.candidate_responses import FollowedRuns
 from bench.diagnosis.kalman.likelihood_fit import compute_likelihood_step
-from bench.diagnosis.prediction_error.joint_effects import (
+from bench.diagnosis.prediction_error.library_columns import LibraryColumns, build_regression_about
+from bench.diagnosis.prediction_error.model_filters import (
     JOINT_MODEL,
     SERVO_MODEL,
+    FilteredSet,
+    ModelFilters,
     get_joint_name,
     get_servo_input,
     offset_from_command,
 )
-from bench.diagnosis.prediction_error.library_columns import LibraryColumns, build_regression_about
-from bench.diagnosis.prediction_error.model_filters import FilteredSet, ModelFilters
 from bench.diagnosis.search.effect_search import EffectSearch
 from bench.diagnosis.search.refit_starts import add_effect_to_start
 from sims.core.simulator import Array

@@ -18,9 +18,8 @@ from bench.diagnosis.prediction_error.effect_proposals import (
     MAX_REGRESSION_PROPOSALS,
     SearchContext,
 )
-from bench.diagnosis.prediction_error.effect_selection import Selected
-from bench.diagnosis.prediction_error.joint_effects import SERVO_MODEL
-from bench.diagnosis.prediction_error.model_filters import FilteredSet
+from bench.diagnosis.prediction_error.model_filters import SERVO_MODEL, FilteredSet
+from bench.diagnosis.prediction_error.regression_selection import Selected
 from bench.diagnosis.prediction_error.selection_fits import (
     MIN_FURTHER_GAIN_SHARE,
     check_filter,

@@ -3,7 +3,7 @@
 If a drive is switched off, if a servo is limp after a fault, or after an emergency stop, the
 commands continue. Effects of the library could only imitate this. Velocities and accelerations are
 estimated from positions alone, and from them three forces at each joint and sample
-(`kalman.joint_forces`): the force f that the motion requires by inverse dynamics, the force τ of
+(`kalman.measured_states`): the force f that the motion requires by inverse dynamics, the force τ of
 the model's drive, and the force g that holds the joint still. Three hypotheses have the residuals
 
     on: f - τ,        off: f,        held (by a brake): f - g                                    (1)
@@ -36,7 +36,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.diagnosis.kalman.joint_forces import (
+from bench.diagnosis.kalman.measured_states import (
     JointForces,
     compute_joint_forces,
     has_joint_forces,

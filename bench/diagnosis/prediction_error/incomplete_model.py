@@ -25,7 +25,7 @@ import numpy as np
 
 from bench.diagnosis.evaluation.coefficient_bounds import get_bounds_by_index
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.diagnosis.fitting.bound_widening import Bounds, compute_range_around
+from bench.diagnosis.fitting.base_fit import Bounds, compute_range_around
 from bench.diagnosis.fitting.fit_state import FitStart
 from bench.diagnosis.fitting.model_set import FittedModel
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
@@ -36,12 +36,11 @@ from bench.diagnosis.kalman.likelihood_fit import (
     maximise_innovation_likelihood,
 )
 from bench.diagnosis.prediction_error.effect_proposals import SearchContext
-from bench.diagnosis.prediction_error.joint_effects import has_many_shapes
 from bench.diagnosis.prediction_error.library_columns import (
     build_regression_about,
     group_coefficients,
 )
-from bench.diagnosis.prediction_error.model_filters import FilteredSet
+from bench.diagnosis.prediction_error.model_filters import FilteredSet, has_many_shapes
 from bench.diagnosis.prediction_error.selection_fits import (
     MAX_IMPROVED_SIZE,
     MIN_FURTHER_GAIN_SHARE,

@@ -20,14 +20,20 @@ from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.fit_state import FitStart, KnownJacobian
 from bench.diagnosis.fitting.model_set import FittedModel
 from bench.diagnosis.kalman.candidate_responses import Columns, FollowedRuns
-from bench.diagnosis.prediction_error.effect_selection import Selected, identify, regress
-from bench.diagnosis.prediction_error.joint_effects import has_many_shapes
-from bench.diagnosis.prediction_error.model_filters import FilteredSet, ModelFilters
-from bench.diagnosis.prediction_error.regression_selection import Regression
+from bench.diagnosis.prediction_error.model_filters import (
+    FilteredSet,
+    ModelFilters,
+    has_many_shapes,
+)
+from bench.diagnosis.prediction_error.regression_selection import (
+    Regression,
+    Selected,
+    identify,
+    regress,
+)
 from bench.diagnosis.search.candidate_directions import CandidateDirection, iterate_first_probes
-from bench.diagnosis.search.explained_variance import DirectionGroup
-from bench.diagnosis.search.joint_force_basis import JointHatForce
-from bench.diagnosis.search.lack_of_fit import list_hat_probes
+from bench.diagnosis.search.lack_of_fit import JointHatForce, list_hat_probes
+from bench.diagnosis.search.score_test import DirectionGroup
 from sims.core.simulator import Array
 
 RELATIVE_DIFFERENCE = 0.02

@@ -1,8 +1,8 @@
 """Search for the effects that a robot's model lacks, by prediction errors.
 
-`effect_selection` selects effects by the innovations of a filter. Here, selected sets are fitted to
-whole simulated runs (output errors), which decide. The search ends as soon as the residual of a set
-is only noise. The order is:
+`regression_selection` selects effects by the innovations of a filter. Here, selected sets are
+fitted to whole simulated runs (output errors), which decide. The search ends as soon as the
+residual of a set is only noise. The order is:
 
     1. Select effects with few shapes by regression. Fit the dry friction among them first, because
        it is not linear where a joint sticks and then the set (`selection_fits`).
@@ -37,17 +37,16 @@ from bench.diagnosis.prediction_error.competing_models import (
     fit_single_in_place,
 )
 from bench.diagnosis.prediction_error.effect_proposals import SearchContext
-from bench.diagnosis.prediction_error.effect_selection import Selected
 from bench.diagnosis.prediction_error.forward_growth import (
     add_to_dry_friction,
     add_to_model,
     select_in_model,
 )
 from bench.diagnosis.prediction_error.incomplete_model import IdentifiedSet, identify_incomplete
-from bench.diagnosis.prediction_error.joint_effects import has_series
 from bench.diagnosis.prediction_error.library_columns import build_regression_about
-from bench.diagnosis.prediction_error.model_filters import FilteredSet
+from bench.diagnosis.prediction_error.model_filters import FilteredSet, has_series
 from bench.diagnosis.prediction_error.regression_selection import (
+    Selected,
     compute_p_value_of_gain,
     score_by_regression,
 )

@@ -21,13 +21,13 @@ from bench.diagnosis.friction_form_verdict import (
     replace_by_stateless_friction,
 )
 from bench.diagnosis.prediction_error.effect_proposals import MIN_GAIN_SHARE, SearchContext
-from bench.diagnosis.prediction_error.effect_selection import Selected
-from bench.diagnosis.prediction_error.joint_effects import (
+from bench.diagnosis.prediction_error.model_filters import (
     JOINT_MODEL,
     SERVO_MODEL,
     acts_at_joint,
     has_many_shapes,
 )
+from bench.diagnosis.prediction_error.regression_selection import Selected
 from bench.diagnosis.prediction_error.simulated_fits import (
     fit_by_simulation,
     fit_nearby,

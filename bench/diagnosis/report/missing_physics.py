@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 
-from bench.diagnosis.validation.run_covariates import CovariateKind
+from bench.diagnosis.validation.run_consistency import CovariateKind
 
 LAW_PREFIXES: Mapping[str, tuple[str, ...]] = {
     "viscous": ("drag.linear", "friction.direction"),

@@ -25,8 +25,11 @@ from bench.diagnosis.search.lack_of_fit import (
     assess_lack_of_fit,
     assess_residual_size,
 )
-from bench.diagnosis.search.refine_candidates import list_competing_models, refine_best_model
-from bench.diagnosis.search.subsampled_search import search_with_subsampling
+from bench.diagnosis.search.refine_candidates import (
+    list_competing_models,
+    refine_best_model,
+    search_with_subsampling,
+)
 from bench.diagnosis.search.verdict_rules import (
     DiagnosisState,
     VerdictName,

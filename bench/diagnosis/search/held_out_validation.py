@@ -1,7 +1,7 @@
 """Validation of the models of a search on held-out runs.
 
 If there are too few runs to hold one out, each run is predicted by fits to the others
-(`validation.cross_validation`), and counts as held out. An effect that makes held-out predictions
+(`validation.held_out_runs`), and counts as held out. An effect that makes held-out predictions
 worse is dropped. A discrepancy that only held-out runs show is something that the model does not
 contain. Between models that explain the fitted runs equally well, the held-out likelihood counts,
 too.

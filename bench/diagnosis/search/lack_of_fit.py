@@ -1,5 +1,9 @@
 """Lack-of-fit test: structure in the residual that no effect of the library explains.
 
+A hat is a triangular basis function of time, position or speed: eq. (1) of
+`bench.diagnosis.search.lack_of_fit`. The forces here are for systems in which each coordinate has
+its own drive and friction.
+
 There are two tests. If the recording specifies its noise, the residual must not exceed it. In any
 case, an additional force of any shape must not improve the fit. Hat basis functions over time,
 position and speed, along each axis and against the motion, represent unknown causes (a
@@ -34,8 +38,6 @@ from bench.diagnosis.search.candidate_directions import (
     DirectionSet,
     compute_responses,
 )
-from bench.diagnosis.search.joint_force_basis import JointHatFamily, JointHatForce
-from bench.diagnosis.search.joint_force_basis import list_joint_families as joint_families
 from bench.diagnosis.search.score_test import ScoreTest, compute_calibrated_scores
 from bench.diagnosis.search.verdict_rules import (
     STRUCTURE_P_VALUE_THRESHOLD,
@@ -47,6 +49,109 @@ from sims.core.effect import Coefficient, Effect, Force
 from sims.core.simulator import Array
 from sims.core.system import StateSnapshot
 from sims.system_simulator import SystemSimulator
+
+TIME, POSITION, SPEED = 0, 1, 2
+"""Variables of a hat: time, position or speed of the joint."""
+ALONG, AGAINST, DRY = 0, 1, 2
+"""Directions of a hat: along the joint, against its motion in proportion to speed, or dry."""
+
+
+class JointHatForce(Force):
+    """A force within an interval of time, position or speed of one joint."""
+
+    name = "probe.joint_hat"
+    says = "a force acts in an interval of time, position or speed"
+    source = "this module"
+    of = "probe.joint_hat"
+    is_traceable = False  # joint, variable and direction are chosen by the values of coefficients
+    coefficients = tuple(
+        Coefficient(name, ("1", "1", "1"), ((-1, 1), (-1, 1), (-1, 1)))
+        for name in ("strength", "joint", "variable", "centre", "width", "direction", "slow")
+    )
+
+    def force(self, c: Array, moment: StateSnapshot) -> Array:
+        """Return strength times a triangle around the centre.
+
+        All batch elements of a call have the same joint, variable and direction.
+        """
+        strength, joint, variable, centre, width, direction, reversal_speed = c
+        active_elements = np.flatnonzero(strength[:, 0])
+        if not active_elements.size:
+            return np.zeros_like(moment.x)
+        j = int(joint[active_elements[0], 0])
+        x, v = moment.x[:, j, None], moment.v[:, j, None]
+        variable_index = int(variable[active_elements[0], 0])
+        value = (moment.t, x, np.abs(v))[variable_index]
+        # A hat that is off has zero width, which must not be a divisor.
+        height = np.maximum(1.0 - np.abs(value - centre) / np.maximum(width, 1e-12), 0.0)
+        dry_direction = -v / (np.abs(v) + np.maximum(reversal_speed, 1e-9))
+        force_direction = (np.ones_like(v), -v, dry_direction)[
+            int(direction[active_elements[0], 0])
+        ]
+        result = np.zeros_like(moment.x)
+        result[:, j] = (strength * height * force_direction)[:, 0]
+        return result
+
+
+class JointHatFamily(NamedTuple):
+    """Hats over the range of one variable of one joint, with one direction."""
+
+    label: str
+    joint: int
+    variable: int
+    direction: int
+    low: float
+    high: float
+    slow: float
+
+
+def list_joint_families(evaluator: RunEvaluator, speed_share: float) -> Iterator[JointHatFamily]:
+    """Yield every family of hats that the recording can show.
+
+    Args:
+        evaluator: the runs.
+        speed_share: speed over which dry friction reverses its sign, as a share of the high speed
+            of a joint.
+    """
+    longest_run = evaluator.longest_duration
+    for joint, name in enumerate(evaluator.simulator.system.coordinates):
+        if name not in evaluator.channels:
+            continue
+        values = evaluator.observed[:, :, evaluator.channels.index(name)]
+        # Quantiles instead of extremes, so that single outliers do not widen the range.
+        low, high = (float(v) for v in np.nanquantile(values, [0.01, 0.99]))
+        speed = _compute_high_speed(evaluator, evaluator.channels.index(name))
+        reversal_speed = speed_share * speed
+        yield JointHatFamily(
+            f"time, along {name}", joint, TIME, ALONG, 0.0, longest_run, reversal_speed
+        )
+        if high > low:
+            for direction, direction_text in (
+                (ALONG, "along it"),
+                (AGAINST, "against it"),
+                (DRY, "dry"),
+            ):
+                label = f"position {name}, {direction_text}"
+                yield JointHatFamily(label, joint, POSITION, direction, low, high, reversal_speed)
+        if speed > 0:
+            for direction, direction_text in ((AGAINST, "against it"), (DRY, "dry")):
+                label = f"speed of {name}, {direction_text}"
+                yield JointHatFamily(label, joint, SPEED, direction, 0.0, speed, reversal_speed)
+
+
+def _compute_high_speed(evaluator: RunEvaluator, channel: int) -> float:
+    """Return the 98 % quantile of the speed of a joint, from differences of its recorded position.
+
+    The quantile is used instead of the maximum, because single differences may be noise.
+    """
+    rates = [np.zeros(1)]
+    for track in evaluator.prepared_runs:
+        if len(track.observed) > 3:
+            # Use every third sample, because differences of neighbours are mostly noise.
+            step = np.diff(track.scenario.times[::3])
+            rates.append(np.diff(track.observed[::3, channel]) / step)
+    return float(np.nanquantile(np.abs(np.concatenate(rates)), 0.98))
+
 
 HAT_COUNT = 7
 """Number of hats over the range of a variable."""
@@ -281,7 +386,7 @@ def _iterate_hat_families(
     `size` is the strength of a hat.
     """
     if JointHatForce.name in evaluator.coefficient_slices:
-        for joint in joint_families(evaluator, SIGN_CHANGE_SPEED_SHARE):
+        for joint in list_joint_families(evaluator, SIGN_CHANGE_SPEED_SHARE):
             yield joint.label, joint.low, joint.high, partial(_make_joint_hat, joint, size)
         return
     reversal_speed = SIGN_CHANGE_SPEED_SHARE * _compute_high_speed_quantile(evaluator)

@@ -14,12 +14,11 @@ from bench.diagnosis.fitting.base_fit import FIT_HORIZONS
 from bench.diagnosis.fitting.fit_state import FitStart, KnownJacobian
 from bench.diagnosis.fitting.model_set import EffectNames, FittedModel
 from bench.diagnosis.search.candidate_directions import DirectionSet
-from bench.diagnosis.search.explained_variance import DirectionGroup
 from bench.diagnosis.search.initial_values import (
     generate_event_times,
     generate_neighbouring_end_stops,
 )
-from bench.diagnosis.search.score_test import CandidateScores
+from bench.diagnosis.search.score_test import CandidateScores, DirectionGroup
 from sims.core.simulator import Array
 
 MAX_REFITS_BY_SQUARES = 3

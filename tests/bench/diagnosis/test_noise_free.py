@@ -9,10 +9,10 @@ import pytest
 
 from bench.diagnosis.evaluation.noise_floor import (
     INTEGRATION_ERROR_SHARE,
+    add_minimal_noise,
     compute_noise_floor,
     compute_value_range,
 )
-from bench.diagnosis.evaluation.noise_free_runs import add_minimal_noise
 from bench.diagnosis.explain import explain
 from bench.diagnosis.search.diagnose import DiagnosisResult
 from bench.diagnosis.search.lack_of_fit import LackOfFitResult

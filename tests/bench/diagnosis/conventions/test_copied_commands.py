@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from bench.cli.main import main
-from bench.diagnosis.conventions.copied_commands import find_copied_commands
+from bench.diagnosis.conventions.convention_hypotheses import find_copied_commands
 from bench.logs.recording_loading import load_recording
 
 ARM = """<mujoco model="arm"><option timestep="0.002"/><worldbody>

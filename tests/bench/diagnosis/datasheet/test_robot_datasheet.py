@@ -8,10 +8,9 @@ import pytest
 
 from bench.core.plugin_registries import make_robot_simulator
 from bench.diagnosis.datasheet.datasheet import build_datasheet
-from bench.diagnosis.datasheet.sheet_content import SheetContent
+from bench.diagnosis.datasheet.sheet_content import SheetContent, format_name, format_short_name
 from bench.diagnosis.datasheet.sheet_rows import SheetRow
 from bench.diagnosis.datasheet.subject import make_subject
-from bench.diagnosis.datasheet.wording import format_name, format_short_name
 from bench.logs.joined_recordings import load_joined
 from sims.core.simulator import InputError
 from sims.extended_simulator import FittedValue

@@ -9,12 +9,16 @@ import pytest
 from bench.cli.main import main
 from bench.core.plugin_registries import make_robot_simulator
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.diagnosis.experiment_design.candidate_runs import RigModel, RunPlan
+from bench.diagnosis.experiment_design.candidate_runs import (
+    UNLIMITED,
+    RigModel,
+    RunPlan,
+    read_model_file_limits,
+)
 from bench.diagnosis.experiment_design.discriminating_run import (
     _compute_largest_factor,
     _iterate_changed_runs,
 )
-from bench.diagnosis.experiment_design.model_file_limits import UNLIMITED, read_model_file_limits
 from bench.diagnosis.experiment_design.safety_limits import RigLimits
 from sims.core.simulator import Scenario
 from sims.recording.recording import Recording, Run

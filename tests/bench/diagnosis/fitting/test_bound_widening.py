@@ -6,8 +6,7 @@ import pytest
 from bench.cli.main import main
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.explain import explain
-from bench.diagnosis.fitting.base_fit import fit_base_model
-from bench.diagnosis.fitting.bound_widening import fit_wider, widen_range
+from bench.diagnosis.fitting.base_fit import fit_base_model, fit_wider, widen_range
 from bench.diagnosis.report.summary_text import format_headline, format_summary
 from bench.diagnosis.search.verdict_rules import BORDERING
 from sims.core.simulator import Parameter

@@ -5,7 +5,7 @@ import pytest
 from scipy.optimize import lsq_linear
 
 from bench.diagnosis.prediction_error.regression_selection import Regression
-from bench.diagnosis.search.explained_variance import DirectionGroup
+from bench.diagnosis.search.score_test import DirectionGroup
 
 RUNS, SAMPLES, COLUMNS = 4, 80, 6
 

@@ -9,11 +9,12 @@ from scipy.optimize import nnls
 from bench.diagnosis.evaluation.noise_model import PHI_GRID, NoiseModel
 from bench.diagnosis.evaluation.surrogate_residuals import draw_surrogates
 from bench.diagnosis.search.candidate_directions import CandidateDirection, DirectionSet
-from bench.diagnosis.search.explained_variance import compute_explained_squares, group_directions
 from bench.diagnosis.search.score_test import (
     ScoreTest,
     compute_calibrated_scores,
+    compute_explained_squares,
     estimate_tail_p_value,
+    group_directions,
 )
 from bench.diagnosis.search.whitened_products import InnerProducts, WhiteningDesign
 from tests.bench.diagnosis.explained_samples import correlated, covariance_of, linear_fit

@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bench.diagnosis.evaluation.progress_events import SilentListener
-from bench.diagnosis.evaluation.search_control import SearchControl
+from bench.diagnosis.evaluation.search_control import SearchControl, SilentListener
 from bench.diagnosis.search.lack_of_fit import assess_lack_of_fit
 from tests.bench.diagnosis.explained_samples import recording, searched
 

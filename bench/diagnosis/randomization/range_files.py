@@ -1,4 +1,4 @@
-"""Ranges as event terms of Isaac Lab.
+"""Files of `simgap explain --ranges`: TOML, CSV, and code for Isaac Lab and MuJoCo Playground.
 
 The terms are functions of `isaaclab.envs.mdp` (source/isaaclab/isaaclab/envs/mdp/events.py of
 isaac-sim/IsaacLab): `randomize_joint_parameters`, `randomize_actuator_gains`,
@@ -6,25 +6,120 @@ isaac-sim/IsaacLab): `randomize_joint_parameters`, `randomize_actuator_gains`,
 Lab 3) and `randomize_physics_scene_gravity`. Isaac Lab defines stiffness and damping of a drive at
 its joint. The gains of a servo are therefore multiplied by the square of its gear, and the damping
 of the joint is added.
+
+Such a function takes the model of MJX and one random key for each environment. It returns the model
+with a leading axis in the fields that it sets, and `in_axes` for `jax.vmap`
+(mujoco_playground/_src/locomotion/go1/randomize.py of google-deepmind/mujoco_playground). All
+numbers are absolute, so that the function can be used with the original model file and with
+extended.xml.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+import textwrap
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from bench.diagnosis.randomization.code_text import (
-    identifiers,
-    list_heading,
-    literal,
-    number,
-    render_code,
-)
 from bench.diagnosis.randomization.ranges import RandomizationRange, RandomizationRanges, texts
+from bench.pages.csv_text import format_csv
+from bench.pages.text_format import sanitise
 from sims.extended_simulator import ExtendedSimulator
+
+COMMENT_WIDTH = 96
+"""Maximum number of characters of a comment line."""
+
+
+def literal(text: str) -> str:
+    """Format text from a file as an ASCII Python literal that cannot end early or become code."""
+    has_no_quotes = not {"'", '"'} & set(text)
+    return f'"{ascii(text)[1:-1]}"' if has_no_quotes else ascii(text)
+
+
+def number(value: float) -> str:
+    """Format a number as a Python literal with nine digits."""
+    return repr(float(f"{value:.9g}"))
+
+
+def comment(texts: str | Sequence[str], indent: str = "") -> str:
+    """Format comments; line breaks and control characters in names are escaped.
+
+    Args:
+        texts: Text of a comment, or of several.
+        indent: Indentation of the lines.
+    """
+    begin = f"{indent}# "
+    lines: list[str] = []
+    for text in [texts] if isinstance(texts, str) else texts:
+        sanitised_text = sanitise(text, 2000)
+        lines += textwrap.wrap(
+            sanitised_text, COMMENT_WIDTH, initial_indent=begin, subsequent_indent=begin,
+            break_long_words=False, break_on_hyphens=False,
+        )  # fmt: skip
+    return "\n".join(lines)
+
+
+def identifiers(names: Iterable[str]) -> Iterator[str]:
+    """Yield an identifier for each name that differs from all earlier ones."""
+    used_identifiers: set[str] = set()
+    for name in names:
+        base = re.sub(r"\W+", "_", name, flags=re.ASCII).strip("_").lower() or "range"
+        base = base if base[0].isalpha() else f"n_{base}"
+        identifier, count = base, 1
+        while identifier in used_identifiers:
+            count += 1
+            identifier = f"{base}_{count}"
+        used_identifiers.add(identifier)
+        yield identifier
+
+
+def list_heading(extended: ExtendedSimulator, framework: str, left_out: Iterable[str]) -> list[str]:
+    """List the comments at the beginning of a file: its origin, and ranges that are left out.
+
+    Args:
+        extended: Extended simulator with the numbers.
+        framework: Name of the framework.
+        left_out: Reasons for ranges that are left out.
+    """
+    model = extended.robot.path.name if extended.robot is not None else extended.system
+    return [
+        f"Domain randomisation for {framework}, written by simgap explain --ranges: robot "
+        f"{model}, recording {extended.title}.",
+        "Each range is the 95 % interval of a number of the model file with the causes found. "
+        "It states how well this recording determines the number, not how robots of one type "
+        "differ.",
+        *(f"Left out: {line}." for line in left_out),
+    ]
+
+
+def render_code(name: str, **values: Any) -> str:
+    """Render a template of this folder as Python code.
+
+    Args:
+        name: File name of the code; the template has the suffix ``.jinja``.
+        **values: Values of the template.
+    """
+    from jinja2 import Environment, StrictUndefined
+
+    environment = Environment(
+        autoescape=False,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+        undefined=StrictUndefined,
+    )
+    environment.filters |= {
+        "comment": comment,
+        "literal": literal,
+        "number": number,
+        "variable": lambda field: field.replace(".", "_"),
+    }
+    source = Path(__file__).with_name(f"{name}.jinja").read_text(encoding="utf-8")
+    return environment.from_string(source).render(**values).rstrip() + "\n"
+
 
 FRICTION_NOTE = (
     "On PhysX this term draws static, dynamic and viscous friction of the joint from one range; "
@@ -269,3 +364,109 @@ def _sum_ranges(parts: Sequence[tuple[float, float]]) -> tuple[float, float]:
 
 def _format_pair(low: float, high: float) -> str:
     return f"({number(low)}, {number(high)})"
+
+
+OBJECTS = {"joint": "mjOBJ_JOINT", "body": "mjOBJ_BODY", "actuator": "mjOBJ_ACTUATOR"}
+"""MuJoCo's object types by kind of place."""
+
+
+def render_mujoco_playground_code(
+    ranges: RandomizationRanges, extended: ExtendedSimulator, robot: Any
+) -> str:
+    """Return a Python file with a function `domain_randomize`.
+
+    Args:
+        ranges: Ranges to write.
+        extended: Extended simulator with the numbers.
+        robot: Robot with its compiled model.
+    """
+    sentences = dict(texts(ranges))
+    # Setting the mass also scales the inertia, and setting the size of gravity its components, so
+    # inertia and components are set afterwards.
+    with_fields = sorted((r for r in ranges.ranges if r.fields), key=_is_last)
+    fields = dict.fromkeys(name for entry in with_fields for name in _list_fields(entry))
+    places = dict.fromkeys((r.kind, r.name) for r in with_fields if r.kind in OBJECTS)
+    return render_code(
+        "ranges_mujoco_playground.py",
+        heading=list_heading(extended, "MuJoCo Playground", ranges.left_out),
+        ranges=with_fields,
+        texts=sentences,
+        fields=list(fields),
+        variables={place: f"{place[0]}_{k}" for k, place in enumerate(places)},
+        gravity=robot.compiled.opt.gravity.tolist(),
+        robot=robot,
+        without_field=[f"- {sentences[r]}" for r in ranges.ranges if not r.fields],
+        index=_format_index,
+        OBJECTS=OBJECTS,
+    )
+
+
+def _is_last(entry: RandomizationRange) -> bool:
+    return entry.effect in ("inertia.scale", "gravity.tilt")
+
+
+def _list_fields(entry: RandomizationRange) -> list[str]:
+    """List the names of the fields that a range sets."""
+    names = [field.name for field in entry.fields]
+    return [*names, "body_inertia"] if entry.effect == "mass.scale" else names
+
+
+def _format_index(entry: RandomizationRange, place: str, address: tuple[int, ...]) -> str:
+    """Format the index of an element, based on the variable of its joint, body or actuator."""
+    if not place:
+        return ", ".join(str(k) for k in address)
+    first = f"model.jnt_dofadr[{place}]" if entry.field.startswith("dof_") else place
+    return ", ".join([first, *(str(k) for k in address[1:])])
+
+
+FORMAT_VERSION = 1
+"""Format version of ranges.toml."""
+COLUMNS = (
+    "cause", "coefficient", "source", "kind", "name", "field", "address", "sign", "unit",
+    "nominal", "value", "low", "high", "operation", "minimum", "maximum",
+)  # fmt: skip
+"""Columns of ranges.csv: the keys of a range in ranges.toml."""
+
+
+def build_range_files(
+    ranges: RandomizationRanges, extended: ExtendedSimulator, folder: Path | None = None
+) -> Mapping[str, str]:
+    """Return the content of each file by its name.
+
+    Without ranges there are no files, and without model fields for the numbers there is no code.
+
+    Args:
+        ranges: Ranges to write.
+        extended: Extended simulator with the numbers.
+        folder: Folder of the files; the path of the model file is relative to it.
+    """
+    if not ranges.ranges:
+        return {}
+    import tomli_w
+
+    rows = [entry.document() for entry in ranges.ranges]
+    assert extended.robot is not None
+    document: dict[str, Any] = {
+        "format": FORMAT_VERSION,
+        "model": extended.robot.to_document(folder)["model"],
+        "recording": extended.title,
+        "left_out": list(ranges.left_out),
+        "ranges": rows,
+    }
+    table = [[_format_cell(row.get(column)) for column in COLUMNS] for row in rows]
+    tables = {"ranges.toml": tomli_w.dumps(document), "ranges.csv": format_csv(COLUMNS, table)}
+    if not any(entry.fields for entry in ranges.ranges):
+        return tables
+    robot = getattr(extended.kind, "robot", None)
+    return {
+        **tables,
+        "ranges_isaac_lab.py": render_isaac_lab_code(ranges, extended, robot),
+        "ranges_mujoco_playground.py": render_mujoco_playground_code(ranges, extended, robot),
+    }
+
+
+def _format_cell(value: Any) -> object:
+    """Format a value as a cell: an address as numbers with spaces, a missing value as empty."""
+    if isinstance(value, list):
+        return " ".join(str(number) for number in value)
+    return "" if value is None else value
