@@ -8,6 +8,7 @@ both are also a JSON document (`bench.cli.output`).
 from __future__ import annotations
 
 import argparse
+import atexit
 import gc
 import os
 import sys
@@ -243,6 +244,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         mark_as_command()
         # Most objects that a command creates while it loads modules live until its end.
         gc.set_threshold(GARBAGE_THRESHOLD)
+        # The operating system frees the memory at once; Python would search all objects for cycles.
+        atexit.register(gc.freeze)
     try:
         with printer.capture_output(), pdf_figures(getattr(options, "pdf", False)):
             answer: CommandResult = options.command(options, printer.print_line)

@@ -44,6 +44,18 @@ def simgap(*arguments, cwd=None):
     )
 
 
+def test_a_command_ends_without_a_search_for_unused_objects():
+    code = (
+        "import atexit, gc, sys; from bench.cli.main import main; "
+        "atexit.register(lambda: print('frozen', gc.get_freeze_count())); "
+        "sys.argv = ['simgap', 'completion', 'bash']; main()"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert int(result.stdout.splitlines()[-1].removeprefix("frozen ")) > 1000
+
+
 def test_help_is_quick_and_imports_nothing_heavy():
     code = "import bench.cli.main; bench.cli.main.main(['--help'])"
     command = [sys.executable, "-c", code]
