@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from sims import effects as library
-from sims.core import atomic_files
+from sims.core import files
 from sims.core.simulator import InputError, Parameter, Simulator
 from sims.core.toml_validation import (
     check_finite,
@@ -174,7 +174,7 @@ def write_extended(extended: ExtendedSimulator, path: Path) -> None:
         extended: Extended simulator.
         path: Path of the file.
     """
-    atomic_files.write_atomically(path, format_extended(extended, path.parent))
+    files.write_atomically(path, format_extended(extended, path.parent))
 
 
 def format_extended(extended: ExtendedSimulator, folder: Path | None = None) -> str:

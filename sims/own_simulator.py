@@ -19,10 +19,9 @@ from sims.core.effect import Contact, Effect, Force, Friction, HiddenStateEffect
 from sims.core.engine import Engine
 from sims.core.simulator import Array, Channel, InputError, Parameter
 from sims.core.system import SYSTEM_KINDS, StateSnapshot, System, SystemKind
-from sims.core.value_limits import is_plausible_number, truncate_text
+from sims.core.values import is_plausible_number, truncate_text
 from sims.engines.adapters.bullet_world import import_pybullet
-from sims.own_simulator_engine import OwnSimulatorEngine
-from sims.own_simulator_levels import find_level_effect, make_level_effects
+from sims.own_simulator_engine import OwnSimulatorEngine, find_level_effect, make_level_effects
 from sims.system_simulator import SystemSimulator
 
 

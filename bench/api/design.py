@@ -16,8 +16,7 @@ from bench.diagnosis.experiment_design.next_run import NextRunDesign
 from bench.diagnosis.explain_options import ExplainOptions
 from bench.diagnosis.explanation import Explanation
 from sims.core.argument_checks import Seconds, check_arguments
-from sims.core.atomic_files import write_files
-from sims.core.path_checks import check_absent
+from sims.core.files import check_absent, write_files
 from sims.core.simulator import InputError
 
 MAX_RUN_SECONDS = 600.0

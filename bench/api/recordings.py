@@ -18,7 +18,7 @@ from bench.logs.synthetic_recording import (
     simulate_recording,
 )
 from sims.core.argument_checks import Expected, Name, check_arguments
-from sims.core.path_checks import check_absent
+from sims.core.files import check_absent
 from sims.core.simulator import InputError
 from sims.recording.recording import Recording
 from sims.robot.parsing.read_model_file import read_robot

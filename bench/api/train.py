@@ -30,7 +30,7 @@ from bench.core.plugin_registries import simulators, tuners
 from bench.figures.loss_figure import write_loss_figure
 from methods.learning.training_data import TrainingBudgetTooSmallError
 from methods.tuner import TrainingCallback, TrainingSimulator
-from sims.core import atomic_files
+from sims.core import files
 from sims.core.simulator import InputError
 
 LOSS_COLUMNS = ("seed", "stage", "epoch", "training_loss", "held_out_loss")
@@ -219,5 +219,5 @@ class LossRecorder:
             raise InputError(f"{folder}: cannot be made ({error.strerror})") from None
         text = io.StringIO(newline="")
         csv.writer(text).writerows([LOSS_COLUMNS, *self.rows])
-        atomic_files.write_atomically(folder / "loss.csv", text.getvalue())
+        files.write_atomically(folder / "loss.csv", text.getvalue())
         return [folder / "loss.csv", write_loss_figure(folder, title, self.rows)]

@@ -33,7 +33,7 @@ from bench.benchmark.storage.study_progress import (
     StudyOutcome,
     StudyProgress,
 )
-from sims.core.atomic_files import write_atomically
+from sims.core.files import write_atomically
 from sims.core.simulator import InputError
 
 if TYPE_CHECKING:

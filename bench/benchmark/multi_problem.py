@@ -40,7 +40,7 @@ from bench.figures.style import (
     write_figure_files,
 )
 from bench.pages.chart_figure import draw_chart
-from sims.core.atomic_files import write_atomically
+from sims.core.files import write_atomically
 from sims.core.simulator import Array, InputError
 
 if TYPE_CHECKING:

@@ -36,7 +36,7 @@ from bench.figures.style import (
     render_all_formats,
     write_figure_files,
 )
-from sims.core.atomic_files import write_atomically
+from sims.core.files import write_atomically
 
 REQUIRED_RUN_COLUMNS = (
     "run",

@@ -10,10 +10,13 @@ import numpy as np
 from bench.figures.track_figure import render_track_figure
 from bench.logs import film_tracking
 from sims.core.simulator import Array
-from sims.vision.ball_renderer import BallScene
-from sims.vision.camera_file import FilmDescription, format_camera_file, get_camera_file_path
-from sims.vision.pinhole_camera import PinholeCamera
-from sims.vision.scene_appearance import SceneAppearance
+from sims.vision.ball_renderer import BallScene, SceneAppearance
+from sims.vision.pinhole_camera import (
+    FilmDescription,
+    PinholeCamera,
+    format_camera_file,
+    get_camera_file_path,
+)
 from sims.vision.video_files import write_video
 
 CAMERA_DISTANCE_RANGE = (2.8, 3.4)

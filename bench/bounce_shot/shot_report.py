@@ -25,7 +25,7 @@ from bench.bounce_shot.shot_page import render_page
 from bench.bounce_shot.shot_sampling import ShotSetup
 from bench.bounce_shot.shot_store import read_shot
 from bench.figures import style
-from sims.core.atomic_files import write_atomically
+from sims.core.files import write_atomically
 
 SIMULATOR_NAME = "bounce-shot"
 """Name of the simulator in status.csv."""

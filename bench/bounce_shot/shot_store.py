@@ -23,9 +23,9 @@ from bench.benchmark.storage.table_schemas import (
 from bench.bounce_shot.shot_config import ShotConfig
 from bench.bounce_shot.shot_execution import build_shot_rows
 from bench.bounce_shot.shot_sampling import ShotSetup
-from sims.core.atomic_files import write_atomically
-from sims.core.plain_values import to_json_value
+from sims.core.files import write_atomically
 from sims.core.simulator import InputError
+from sims.core.values import to_json_value
 
 SHOTS_FOLDER = "shots"
 """Name of the folder of finished shots, in the folder of a study."""

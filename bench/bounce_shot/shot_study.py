@@ -48,7 +48,7 @@ from bench.bounce_shot.shot_sampling import (
 from bench.bounce_shot.shot_store import SHOTS_FOLDER, check_shots, list_missing_shots, store_shot
 from bench.core.plugin_registries import tuners
 from sims.core.simulator import InputError
-from sims.vision import video_packages
+from sims.vision import video_files
 
 PrintLine = Callable[[str], None]
 
@@ -85,7 +85,7 @@ class BounceShotStudy:
 
         experiment = new.experiment
         if read_shot_config(experiment).filmed:
-            video_packages.check_installed("; or set shot.filmed = 0")
+            video_files.check_installed("; or set shot.filmed = 0")
         if experiment.simulator != "ball" or experiment.observe != ("z",):
             raise InputError(
                 f'experiment {experiment.name}: a shot needs simulator = "ball" and observe = ["z"]'

@@ -212,7 +212,7 @@ class _Parser(argparse.ArgumentParser):
         """
         from difflib import get_close_matches
 
-        from sims.core.value_limits import truncate_text
+        from sims.core.values import truncate_text
 
         similar_names = get_close_matches(
             name[:_MAX_COMPARED_CHARACTERS], list(known_names), cutoff=0.5

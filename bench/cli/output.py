@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext, redirect_stdout
 from typing import Any, Literal, NamedTuple, Protocol
 
-from sims.core.plain_values import to_json_value
+from sims.core.values import to_json_value
 
 JsonDocument = dict[str, Any]
 """Data that can be written as JSON after conversion by `to_json_value`."""

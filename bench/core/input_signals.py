@@ -10,7 +10,7 @@ from collections.abc import Callable
 import numpy as np
 
 from sims.core.simulator import Array, InputError, make_unknown_name_error
-from sims.core.value_limits import MAX_NUMBER, truncate_text
+from sims.core.values import MAX_NUMBER, truncate_text
 
 _TAU = 2 * np.pi
 """Radians of one period."""

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from sims.core.atomic_files import Content
+from sims.core.files import Content
 from sims.core.simulator import InputError
 
 Conversion = Callable[[Mapping[str, bytes]], dict[str, Content]]

@@ -15,7 +15,7 @@ from pathlib import Path
 from bench import __version__
 from bench.datasets.dataset_catalogue import DataSet, SourceFile
 from bench.datasets.dataset_conversion import CONVERSIONS
-from sims.core.atomic_files import Content, atomic_new_folder
+from sims.core.files import Content, atomic_new_folder
 from sims.core.simulator import InputError
 
 _TIMEOUT = 30.0

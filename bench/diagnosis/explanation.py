@@ -27,7 +27,7 @@ from bench.pages.csv_text import format_csv
 from bench.pages.html_page import make_iframe
 from sims import extended_simulator as extending
 from sims.core.argument_checks import check_arguments
-from sims.core.atomic_files import Content, write_all_atomically
+from sims.core.files import Content, write_all_atomically
 from sims.core.simulator import InputError
 from sims.extended_simulator import ExtendedSimulator
 

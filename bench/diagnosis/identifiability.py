@@ -33,7 +33,7 @@ from bench.diagnosis.search.candidate_directions import DirectionSet, compute_di
 from bench.diagnosis.validation.gain_and_intervals import Z95
 from sims.core.effect import ALL_PLACES
 from sims.core.simulator import Array
-from sims.core.unit_text import format_unit
+from sims.core.values import format_unit
 
 IdentifiabilityLevel = Literal["identifiable", "weak", "not identifiable"]
 

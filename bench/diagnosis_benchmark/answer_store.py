@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from sims.core.file_lock import open_locked
+from sims.core.files import open_locked
 
 ANSWERS_FILE = "answers.jsonl"
 """File of the answers. It contains the true causes too; no diagnoser can read it."""

@@ -29,7 +29,7 @@ from bench.diagnosis_benchmark.result_tables import (
 from bench.diagnosis_benchmark.training_costs import read_training_costs
 from bench.diagnosis_benchmark.wrong_answers import build_failure_table
 from bench.figures.style import FigureFiles, add_trust_note, render_all_formats, write_figure_files
-from sims.core.atomic_files import write_atomically
+from sims.core.files import write_atomically
 
 ANSWERS_TABLE_FILE = "items.csv"
 """File with one row per answer."""

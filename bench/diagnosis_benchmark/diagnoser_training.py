@@ -22,7 +22,7 @@ from bench.benchmark.runner.sandboxed_tuner import retry_if_killed
 from bench.benchmark.runner.tuner_training import get_weights_folder
 from bench.core.random_streams import make_seed_words
 from bench.diagnosis_benchmark.case_evaluation import train_isolated
-from sims.core.atomic_files import atomic_replacement
+from sims.core.files import atomic_replacement
 
 CACHE_SUBFOLDER = "diagnosers"
 """Subfolder of the cache of trained weights."""

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
-from sims.core.atomic_files import write_atomically
+from sims.core.files import write_atomically
 
 TRAINING_COSTS_FILE = "training.csv"
 TRAINING_COST_COLUMNS = ("diagnoser", "system", "simulations", "seconds", "fault")

@@ -18,7 +18,7 @@ from bench.figures.style import (
 )
 from bench.logs.signal_statistics import list_recorded_signals
 from sims.core.simulator import Array, Simulator
-from sims.core.unit_text import format_unit
+from sims.core.values import format_unit
 from sims.recording.recording import Recording, Run
 
 if TYPE_CHECKING:

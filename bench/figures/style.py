@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from bench.benchmark.statistics.error_floor import ERROR_FLOOR
 from bench.figures.figure_files import is_pdf_wanted
 from bench.figures.png_encoder import encode_png
-from sims.core.atomic_files import write_all_atomically
+from sims.core.files import write_all_atomically
 from sims.core.simulator import InputError
 
 if TYPE_CHECKING:

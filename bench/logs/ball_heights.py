@@ -27,7 +27,7 @@ import numpy as np
 
 from sims.core.simulator import Array, InputError
 from sims.vision.ball_tracker import BallTrack
-from sims.vision.camera_file import FilmDescription
+from sims.vision.pinhole_camera import FilmDescription
 
 DEFAULT_GRAVITY = 9.81
 """Gravity assumed for a film, m/s^2."""

@@ -8,14 +8,17 @@ import numpy as np
 
 from bench.core.random_streams import make_rng
 from bench.logs.size_limits import check_film_size
-from sims.core.path_checks import check_absent
+from sims.core.files import check_absent
 from sims.core.simulator import InputError, make_unknown_name_error
 from sims.recording.recording import read_recording, read_system_name
 from sims.systems.ball import BallSystem
-from sims.vision.ball_renderer import BallScene
-from sims.vision.camera_file import FilmDescription, format_camera_file, get_camera_file_path
-from sims.vision.pinhole_camera import PinholeCamera
-from sims.vision.scene_appearance import SceneAppearance
+from sims.vision.ball_renderer import BallScene, SceneAppearance
+from sims.vision.pinhole_camera import (
+    FilmDescription,
+    PinholeCamera,
+    format_camera_file,
+    get_camera_file_path,
+)
 from sims.vision.video_files import write_video
 
 

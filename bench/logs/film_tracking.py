@@ -9,14 +9,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bench.logs import ball_heights
-from sims.core.path_checks import check_absent
+from sims.core.files import check_absent
 from sims.core.simulator import InputError, make_read_only
-from sims.core.value_limits import LENGTH_RANGE
+from sims.core.values import LENGTH_RANGE
 from sims.recording.recording import Recording, Run
 from sims.recording.recording_writer import write_recording
 from sims.systems.ball import BallSystem
 from sims.vision.ball_tracker import BallTrack, estimate_roughness, track_ball
-from sims.vision.camera_file import get_camera_file_path, read_camera_file
+from sims.vision.pinhole_camera import get_camera_file_path, read_camera_file
 from sims.vision.video_files import VideoFile
 
 _TABLE_DIGITS = 9

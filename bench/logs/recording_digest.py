@@ -9,7 +9,7 @@ from pathlib import Path
 
 from sims.core.simulator import InputError
 from sims.recording.column_mapping import list_mapped_files
-from sims.recording.log_formats.hdf5_files import group_of
+from sims.recording.log_formats.hdf5_and_parquet import group_of
 from sims.recording.log_formats.lerobot_dataset import list_episode_files, split_episode_path
 from sims.recording.log_formats.ros_bags import split_bag_path
 from sims.recording.recording_description import get_description_path

@@ -10,7 +10,7 @@ import numpy as np
 
 from bench.core.plugin_registries import make_robot_simulator, simulators
 from sims.core.simulator import InputError, Simulator
-from sims.core.value_limits import MAX_NUMBER
+from sims.core.values import MAX_NUMBER
 from sims.recording.recording import Recording, read_recording, read_system_name, split_held_out
 from sims.recording.recording_description import ModelFileReference, read_model_reference
 

@@ -12,7 +12,7 @@ from bench.logs.signal_statistics import (
     list_recorded_signals,
 )
 from sims.core.simulator import Simulator
-from sims.core.unit_text import format_unit
+from sims.core.values import format_unit
 from sims.recording.recording import (
     Recording,
     Run,

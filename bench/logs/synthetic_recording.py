@@ -20,15 +20,15 @@ from bench.core.random_streams import make_rng
 from bench.logs.size_limits import check_simulation_size
 from sims import effects as library
 from sims.core.argument_checks import Expected, Name, Names, check_arguments
-from sims.core.path_checks import check_absent
+from sims.core.files import check_absent
 from sims.core.simulator import Array, InputError, Scenario, Simulator
 from sims.core.system import DefaultRecording
 from sims.core.toml_validation import check_known_names
-from sims.core.unit_text import append_unit
-from sims.core.value_limits import (
+from sims.core.values import (
     MAX_NUMBER,
     MAX_SAMPLING_RATE_HZ,
     MIN_RUN_SECONDS,
+    append_unit,
     is_plausible_number,
     truncate_text,
 )

@@ -23,7 +23,7 @@ from bench.figures.style import add_trust_note, write_figure
 from bench.misspecification import misspecification_figures as figures
 from bench.misspecification import misspecification_scores
 from bench.misspecification.comparison_experiments import EXTENDED, MODEL_LABELS, PLAIN
-from sims.core.atomic_files import write_atomically
+from sims.core.files import write_atomically
 
 PrintLine = Callable[[str], None]
 VERDICT_FILE = "explain/verdict.json"

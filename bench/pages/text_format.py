@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from math import floor, isfinite, log10
 
-from sims.core.unit_text import SUPERSCRIPT_DIGITS
+from sims.core.values import SUPERSCRIPT_DIGITS
 
 _MIN_FIXED_POINT = 1e-3
 """Magnitude below which numbers are written with a power of ten."""

@@ -34,7 +34,7 @@ from bench.misspecification.comparison_experiments import MODEL_LABELS
 from bench.schemas import find_violations
 from bench.studies.study import list_study_folders
 from bench.studies.verification import VerificationFailure, VerificationResult, verify_comparison
-from sims.core.atomic_files import get_first_line
+from sims.core.files import get_first_line
 from sims.core.simulator import InputError
 from sims.extended_simulator import ExtendedSimulator, open_extended
 

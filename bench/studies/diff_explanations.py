@@ -32,7 +32,7 @@ from bench.studies.diff_changes import (
     format_number,
     select_relevant_environment,
 )
-from sims.core.atomic_files import get_first_line
+from sims.core.files import get_first_line
 from sims.core.simulator import InputError
 from sims.core.toml_validation import read_toml
 from sims.extended_simulator import FittedValue

@@ -9,8 +9,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from methods.learning.gap_filling import fill_gaps
-from methods.learning.input_features import FeatureConfig, InputFeatures
+from methods.learning.input_features import FeatureConfig, InputFeatures, fill_gaps
 from methods.learning.noise_matched_networks import (
     NoiseMatchedNetworks,
     add_noise_to_held_out,

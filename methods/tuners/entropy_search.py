@@ -9,7 +9,7 @@ whose minimiser, among candidates, is θ; the next simulation is where
 
     (1)  -P(θ) log P(θ)
 
-is largest. Candidates are quasi-random points (`methods.learning.quasi_random`).
+is largest. Candidates are quasi-random points (`methods.learning.training_data`).
 
 As published the candidates are a fixed grid, which bounds the accuracy, and the search stops when
 its estimate repeats, which is often too early. The default draws new candidates each time, dense
@@ -23,7 +23,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from methods.learning.gaussian_process import GaussianProcess, KernelSettings
-from methods.learning.quasi_random import generate_quasi_random_points
+from methods.learning.training_data import generate_quasi_random_points
 from methods.tuner import Array, Proposal, Task, Tuner, TunerGenerator
 
 _PUBLISHED_DRAWS = 200

@@ -27,15 +27,17 @@ from typing import ClassVar
 
 import numpy as np
 
-from methods.learning.history_training import (
+from methods.learning.history_transformer import (
+    HistoryIndices,
+    HistoryTransformerDesign,
     HistoryValidationMonitor,
     TrainingHistories,
-    train_history_transformer,
-)
-from methods.learning.history_transformer import (
-    HistoryTransformerDesign,
+    draw_binary_search,
     get_weight_shapes,
+    make_ordered_histories,
+    make_shuffled_histories,
     predict_proposals,
+    train_history_transformer,
 )
 from methods.learning.input_features import FeatureConfig, InputFeatures
 from methods.learning.noise_matched_networks import (
@@ -44,12 +46,6 @@ from methods.learning.noise_matched_networks import (
     check_shapes,
 )
 from methods.learning.training_data import TrainingData, generate_training_data
-from methods.learning.tuning_histories import (
-    HistoryIndices,
-    draw_binary_search,
-    make_ordered_histories,
-    make_shuffled_histories,
-)
 from methods.tuner import Array, Proposal, Task, TrainingSimulator, Tuner, TunerGenerator
 from methods.tuners.tunenet import MIN_STEP
 

@@ -56,7 +56,7 @@ class TuneNet(PairTuner):
         rate: learning rate at the beginning.
         weight_decay: lambda in Eq. 1.
         told: read what is known of the scenario too, where scenarios differ in it
-            (`methods.learning.scenario_features`).
+            (`methods.learning.input_features`).
         channels: first and last channel that is read, by number, where targets do not show the
             others; None for all.
         clean: whether targets may be as clean as simulations. False for a sensor whose errors last

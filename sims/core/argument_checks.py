@@ -20,7 +20,7 @@ from typing import Annotated, Any, ParamSpec, TypeVar, Union, get_args, get_orig
 import numpy as np
 
 from sims.core.simulator import InputError, make_unknown_name_error
-from sims.core.value_limits import truncate_text
+from sims.core.values import truncate_text
 
 P = ParamSpec("P")
 R = TypeVar("R")

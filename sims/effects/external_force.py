@@ -1,4 +1,4 @@
-"""External forces along the primary coordinate: constant, periodic in position or in time.
+"""External forces: constant, periodic, of springs, and of gravity.
 
 The primary coordinate of a ball is its height.
 
@@ -10,13 +10,21 @@ With x the primary coordinate and t the time since the start of the run:
 
 Periodic forces have sine and cosine coefficients instead of amplitude and phase: the motion is
 linear in both while they are small, and no phase is undetermined where the amplitude is zero.
+
+* (1) linear: F = -c x
+* (2) cubic: F = -c x^3
+
+* (1) scale: the weight times 1 + c
+* (2) tilt: accelerations x g and y g along the horizontal axes
+* (3) compensation: a force of -c times the weight of a body at its centre of mass (MuJoCo's
+  ``gravcomp``), such as a counterweight, a spring, or a controller that carries it
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from sims.core.effect import Coefficient, Force
+from sims.core.effect import Coefficient, Force, ModelValueEffect
 from sims.core.simulator import Array
 from sims.core.system import StateSnapshot
 
@@ -108,3 +116,115 @@ def _compute_wave(c: Array, cycles: Array) -> Array:
     angle = 2 * np.pi * cycles
     wave: Array = c[0] * np.sin(angle) + c[1] * np.cos(angle)
     return wave
+
+
+_DUFFING = (
+    "I. Kovacic, M. J. Brennan (eds.), The Duffing Equation (2011), doi:10.1002/9780470977859"
+)
+_CUBIC_STIFFNESS_UNITS = ("1/(m^2*s^2)", "N/m^3", "N*m/rad^3")
+"""Units of a force per cube of position."""
+_CUBIC_STIFFNESS_RANGES = ((-5, 5), (-50, 50), (-0.5, 0.5))
+"""Plausible cubic terms, in the units of `_CUBIC_STIFFNESS_UNITS`: springs harden or soften."""
+
+
+class LinearSpring(Force):
+    """Linear spring (Hooke's law): -c x."""
+
+    name = "spring.linear"
+    noun = "a linear spring"
+    says = "a spring pulls back in proportion to the distance from zero"
+    source = "J. R. Taylor, Classical Mechanics (2005), section 5.1"
+    needs = "guide"
+    coefficients = (
+        Coefficient("coefficient", ("1/s^2", "N/m", "N*m/rad"), ((0, 10), (0, 50), (0, 1))),
+    )
+
+    def force(self, c: Array, moment: StateSnapshot) -> Array:
+        """Return the force (L, D), towards zero.
+
+        Args:
+            c: (K, L, 1) coefficients.
+            moment: state snapshot of L batch elements.
+        """
+        return moment.along_primary(-c[0] * moment.primary)  # (1)
+
+
+class CubicSpring(Force):
+    """Cubic term of a spring that hardens (or softens, c < 0): -c x^3."""
+
+    name = "spring.cubic"
+    noun = "a cubic spring"
+    says = "a spring pulls back in proportion to the cube of the distance from zero"
+    source = _DUFFING
+    needs = "guide"
+    coefficients = (Coefficient("coefficient", _CUBIC_STIFFNESS_UNITS, _CUBIC_STIFFNESS_RANGES),)
+
+    def force(self, c: Array, moment: StateSnapshot) -> Array:
+        """Return the force (L, D), towards zero for c > 0.
+
+        Args:
+            c: (K, L, 1) coefficients.
+            moment: state snapshot of L batch elements.
+        """
+        x = moment.primary
+        return moment.along_primary(-c[0] * x * x * x)  # (2); a power would be slower
+
+
+_DIMENSIONLESS = ("1", "1", "1")
+"""Units of a dimensionless coefficient on every kind of system."""
+_SCALE_RANGES = ((-0.2, 0.2), (-0.2, 0.2), (-0.2, 0.2))
+"""Plausible relative changes of gravity: up to a fifth."""
+
+
+class GravityScale(Force):
+    """Gravity g (1 + c)."""
+
+    name = "gravity.scale"
+    noun = "a correction of gravity"
+    says = "gravity is stronger or weaker than the stated value"
+    source = "J. R. Taylor, Classical Mechanics (2005), section 1.4"
+    needs, at = "gravity", "world"
+    coefficients = (Coefficient("coefficient", _DIMENSIONLESS, _SCALE_RANGES),)
+
+    def force(self, c: Array, moment: StateSnapshot) -> Array:
+        """Return the force (L, D), a fraction of the weight.
+
+        Args:
+            c: (K, L, 1) coefficients.
+            moment: state snapshot of L batch elements.
+        """
+        return c[0] * moment.weight  # (1): the system's own force already contains the weight
+
+
+class GravityTilt(Force):
+    """Tilted gravity: accelerations of x g and y g along the horizontal axes."""
+
+    name = "gravity.tilt"
+    noun = "a tilt of gravity"
+    says = "the ground is not level: gravity has a horizontal component"
+    source = "J. R. Taylor, Classical Mechanics (2005), section 1.4"
+    needs, at = "push", "world"
+    coefficients = (
+        Coefficient("x", _DIMENSIONLESS, _SCALE_RANGES),
+        Coefficient("y", ("1", None, None), ((-0.2, 0.2), (0, 0), (0, 0))),
+    )
+
+    def force(self, c: Array, moment: StateSnapshot) -> Array:
+        """Return the force (L, D) of gravity along the horizontal axes.
+
+        Args:
+            c: (K, L, 1) coefficients.
+            moment: state snapshot of L batch elements.
+        """
+        return moment.gravity * (c[0] * moment.push("x") + c[1] * moment.push("y"))  # (2)
+
+
+class GravityCompensation(ModelValueEffect):
+    """Share c of the weight of a body that is carried, in addition to the file's ``gravcomp``."""
+
+    name = "gravity.compensation"
+    noun = "gravity compensation"
+    says = "part of the body's weight is compensated, such as by a counterweight or the controller"
+    source = "V. Arakelian, Gravity compensation in robotics, Advanced Robotics 30(2), 79 (2016)"
+    at = "body"
+    coefficients = (Coefficient("coefficient", _DIMENSIONLESS, ((0, 1), (0, 1), (0, 1))),)  # (3)

@@ -1,4 +1,4 @@
-"""Errors of numbers that a robot's model file specifies.
+"""Errors of numbers that a robot's model file specifies, its geometry included.
 
 The coefficients are relative errors c or differences, so that zero is the number in the file:
 
@@ -12,11 +12,27 @@ The coefficients are relative errors c or differences, so that zero is the numbe
 
 The range of c keeps masses positive and inertia tensors physical: a tensor times a positive number
 keeps the triangle inequality of its moments.
+
+The coefficients are differences or relative errors, so that zero is the number in the file:
+
+* (1) joint zero: the joint is in its reference pose where its encoder shows c more than the file
+  says (MJCF ``ref``); command and reading refer to the same zero
+* (2) joint axis: the axis a of the file turned by the rotation vector r = (x, y, z) in the frame of
+  the body, exp([r]) a; a turn by pi reverses it
+* (3) link length: the distance of a body's frame from the frame of its parent times (1 + c), in the
+  same direction
+* (4) payload: a point mass m on the body, at (x, y, z) from the body's stated centre of mass, along
+  the axes of the body's frame
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+import numpy as np
+
 from sims.core.effect import Coefficient, ModelValueEffect
+from sims.core.simulator import Array
 
 _DIMENSIONLESS = ("1", "1", "1")
 """Units of a dimensionless coefficient on every kind of system."""
@@ -125,3 +141,105 @@ class ActuatorForceLimit(ModelValueEffect):
     coefficients = (
         Coefficient("coefficient", ("N", "N", "N*m"), ((0, 50), (0, 50), (0, 5)), of="drive"),
     )
+
+
+_CALIBRATION = (
+    "J. M. Hollerbach, W. Khalil, M. Gautier, Model Identification, in Springer Handbook of "
+    "Robotics (2016), chapter 6"
+)
+_TILT_RANGES = ((0.0, 0.0), (-0.2, 0.2), (-0.2, 0.2))
+"""Plausible tilts of an axis in rad."""
+_ANGLE_UNITS = (None, "rad", "rad")
+_PAYLOAD_OFFSET_RANGES = ((-0.1, 0.1), (-0.1, 0.1), (-0.1, 0.1))
+"""Plausible distances of a payload from the centre of mass of its body, in metres."""
+_SMALL_MASS = 1e-4
+"""Mass whose change of the motion is linear in it, as a share of the largest plausible one."""
+_MASS_RANGES = ((0.0, 1.0), (0.0, 1.0), (0.0, 1.0))
+"""Plausible mass of a payload in kg."""
+
+
+class JointZeroOffset(ModelValueEffect):
+    """Zero of a joint moved by c, for its command and its encoder alike."""
+
+    name = "joint.zero"
+    noun = "a wrong joint zero"
+    says = "the zero position of the joint, for command and encoder, differs from the model file"
+    source = _CALIBRATION
+    at = "joint"
+    coefficients = (
+        Coefficient("coefficient", (None, "m", "rad"), ((0, 0), (-0.05, 0.05), (-0.2, 0.2))),
+    )
+
+
+class JointAxisTilt(ModelValueEffect):
+    """Axis of a joint turned by a rotation vector in the frame of its body."""
+
+    name = "joint.axis"
+    noun = "a wrong joint axis"
+    says = "the joint axis has a different direction than in the model file"
+    source = _CALIBRATION
+    at = "joint"
+    coefficients = tuple(
+        Coefficient(axis, _ANGLE_UNITS, _TILT_RANGES, least=-np.pi, most=np.pi) for axis in "xyz"
+    )
+
+
+class LinkLengthScale(ModelValueEffect):
+    """Distance of a body from its parent times 1 + c."""
+
+    name = "link.length"
+    noun = "a wrong link length"
+    says = "the distance of the body from its parent differs from the model file"
+    source = _CALIBRATION
+    at = "body"
+    coefficients = (
+        Coefficient(
+            "coefficient", ("1", "1", "1"), ((-0.3, 0.3), (-0.3, 0.3), (-0.3, 0.3)), least=-0.99
+        ),
+    )
+
+
+class PayloadMass(ModelValueEffect):
+    """Point mass on a body, which is no body of the model file."""
+
+    name = "payload"
+    noun = "a payload"
+    says = "the body carries an additional mass that is not in the model file"
+    source = "W. Khalil, E. Dombre, Modeling, Identification and Control of Robots (2002), ch. 12"
+    at = "body"
+    coefficients = (
+        Coefficient("mass", ("kg", "kg", "kg"), _MASS_RANGES, least=0.0),
+        *(Coefficient(axis, _LENGTH_UNITS, _PAYLOAD_OFFSET_RANGES) for axis in "xyz"),
+    )
+
+    def probe_points(self) -> Sequence[Array]:
+        """Return coefficients at which a search compares the effect with the data, (4,) each.
+
+        The first point is a small mass at the middle of the link; each of the others moves it along
+        one observable axis. The coefficients are the mass, then the position along x, y and z. An
+        axis whose limits are equal is not observable.
+        """
+        limits = np.array([c.plausible[0] for c in self.coefficients])
+        middle = limits.mean(axis=1)
+        middle[0] = _SMALL_MASS * limits[0, 1]
+        observable_axes = [k for k, c in enumerate(self.coefficients) if k and c.least != c.most]
+        middle[[k for k in range(1, len(middle)) if k not in observable_axes]] = 0.0
+        points = [middle]
+        for k in observable_axes:
+            point = middle.copy()
+            point[k] = 0.5 * (limits[k].mean() + limits[k, 1])
+            points.append(point)
+        return points
+
+    def combine(self, points: Array, weights: Array) -> Array:
+        """Return the sum of point masses (n, 4), at their centre of mass.
+
+        Args:
+            points: masses and positions.
+            weights: (n,) multiple of each mass.
+        """
+        masses = weights * points[:, 0]
+        total = float(masses.sum())
+        centre = masses @ points[:, 1:] / total if total > 0.0 else np.zeros(3)
+        result: Array = np.array([max(total, 0.0), *centre])
+        return result

@@ -23,7 +23,7 @@ from sims.core.effect import Effect, Force, Friction, HiddenState, HiddenStateEf
 from sims.core.engine import Engine, IntegrationBatch, Trajectories
 from sims.core.simulator import Array
 from sims.core.system import StateSnapshot, System
-from sims.engines.batch_slicing import join_trajectories, slice_batch
+from sims.engines.batch import join_trajectories, slice_batch
 
 
 class AugmentedSystem(System):

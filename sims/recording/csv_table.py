@@ -1,4 +1,6 @@
-"""Read the table `NAME.csv` of a recording cell by cell; errors state row and column.
+"""Read the table `NAME.csv` of a recording, fast if it is faultless; errors state row and column.
+
+Tables with anything unusual are left to the slower reader, which inspects each cell.
 
 Rows are lines of the file, counted from 1 with the header, as in an editor.
 """
@@ -8,7 +10,7 @@ from __future__ import annotations
 import csv
 import math
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import suppress
 from itertools import islice, pairwise
 from pathlib import Path
@@ -16,11 +18,65 @@ from typing import NamedTuple, NoReturn
 
 import numpy as np
 
-from sims.core.path_checks import require_file
+from sims.core.files import require_file
 from sims.core.simulator import Array, InputError, make_read_only
 from sims.core.toml_validation import format_value
-from sims.core.value_limits import MAX_NAME_LENGTH, MAX_TIMESTAMP_SECONDS, MIN_RUN_SECONDS
-from sims.recording.fast_csv import MIN_FAST_PARSE_BYTES, read_csv_fast
+from sims.core.values import MAX_NAME_LENGTH, MAX_TIMESTAMP_SECONDS, MIN_RUN_SECONDS
+
+MIN_FAST_PARSE_BYTES = 1 << 20
+"""Minimum size in bytes of a table for which importing the fast parser is worthwhile."""
+
+
+def read_csv_fast(
+    path: Path, header: Sequence[str], column_names: Sequence[str], gaps: Collection[str]
+) -> tuple[list[str], dict[str, Array]] | None:
+    """Read the run names and the numeric columns of a CSV table with pyarrow.
+
+    Args:
+        path: Table whose first line is its header.
+        header: Checked names of its columns, including ``run``.
+        column_names: Names of the numeric columns to read.
+        gaps: Those among them whose cells may be empty (NaN).
+
+    Returns:
+        Name of the run of each row, and the numeric columns (T,) by name; None if anything in the
+        table is unusual.
+    """
+    import pyarrow as arrow
+    from pyarrow import csv
+
+    types = {"run": arrow.string()}
+    types |= {name: arrow.float64() for name in column_names}
+    try:
+        table = csv.read_csv(
+            path,
+            # Use one thread, because there is already one worker process per core.
+            csv.ReadOptions(column_names=list(header), skip_rows=1, use_threads=False),
+            # Quotes may hide commas and line ends; such tables are left to the other reader.
+            csv.ParseOptions(quote_char=False),
+            csv.ConvertOptions(
+                column_types=types,
+                null_values=[""],
+                strings_can_be_null=False,
+            ),
+        )
+    except (arrow.ArrowException, OSError):
+        return None
+    columns: dict[str, Array] = {}
+    for name in column_names:
+        cells = table[name]
+        values = cells.to_numpy()
+        # An empty cell is NaN and allowed in a gap; NaN or inf written as text is not.
+        allowed_gaps = cells.null_count if name in gaps else 0
+        if np.count_nonzero(~np.isfinite(values)) != allowed_gaps:
+            return None
+        columns[name] = values
+    runs = table["run"].combine_chunks().dictionary_encode()
+    names = [str(name).strip() for name in runs.dictionary.to_pylist()]
+    if any('"' in name for name in names):
+        return None
+    return [names[code] for code in runs.indices.to_numpy().tolist()], columns
+
 
 _ROWS_PER_CHUNK = 1 << 13
 """Number of rows that are converted to numbers at once, which limits the memory for their text."""

@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sims.core.simulator import Array, InputError, make_read_only
-from sims.recording.angle_unwrapping import unwrapped
 from sims.recording.column_mapping import RecordingSources
 from sims.recording.csv_table import CsvRun, has_run_column, read_table
 from sims.recording.drive_switches import apply_drive_switches
@@ -39,7 +38,7 @@ from sims.recording.recording_frame import (
     move_index_to_columns,
     read_frame,
 )
-from sims.recording.unit_conversion import IDENTITY_SCALE, UnitScale
+from sims.recording.unit_conversion import IDENTITY_SCALE, UnitScale, unwrapped
 
 __all__ = ["DeclaredSignals", "Recording", "Run", "read_recording", "read_system_name"]
 

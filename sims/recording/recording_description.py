@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
-from sims.core.path_checks import require_file
+from sims.core.files import require_file
 from sims.core.simulator import Channel, InputError, Simulator
 from sims.core.system import System
 from sims.core.toml_validation import (

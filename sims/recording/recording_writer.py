@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from sims.core.atomic_files import Content, write_files
+from sims.core.files import Content, write_files
 from sims.core.simulator import Array, InputError, make_unknown_name_error
 from sims.recording.recording import DeclaredSignals, Recording, Run
 from sims.recording.recording_description import get_description_path

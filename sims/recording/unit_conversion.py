@@ -1,4 +1,4 @@
-"""Convert units, so that a recording may use its own.
+"""Convert units, and unwrap angles that are recorded within one turn.
 
 Angles have their own dimension here: with the SI definition, hertz would be accepted as radians per
 second, and a plain number as an angle.
@@ -6,11 +6,14 @@ second, and a plain number as an angle.
 
 from __future__ import annotations
 
+import math
 import re
 from functools import lru_cache
 from typing import Any, NamedTuple
 
-from sims.core.simulator import InputError
+import numpy as np
+
+from sims.core.simulator import Array, InputError
 
 _MAX_UNIT_LENGTH = 60
 """Maximum number of characters of a unit."""
@@ -126,3 +129,23 @@ def _get_unit_registry() -> Any:
     # Clear the cache, in which an angle is still a plain number.
     registry._build_cache()
     return registry
+
+
+def unwrapped(positions: Array, command: Array | None = None) -> Array:
+    """Restore the whole turns of a wrapped position; NaN stays NaN.
+
+    Args:
+        positions: (T,) positions, rad.
+        command: (T,) command of the joint's position servo, rad, which determines the turn; None if
+            there is none.
+
+    Returns:
+        (T,) positions, rad.
+    """
+    result = positions.copy()
+    finite = np.isfinite(positions)
+    result[finite] = np.unwrap(positions[finite])
+    if command is not None and finite.any():
+        difference = float(np.mean((command - result)[finite]))
+        result += 2.0 * math.pi * round(difference / (2.0 * math.pi))
+    return result

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sims.core.simulator import Array
-from sims.core.unit_text import append_unit
+from sims.core.values import append_unit
 from sims.extended_simulator import FittedValue
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ import numpy as np
 from sims.core.freed_memory import release_free_memory
 from sims.robot.coupled_drives import name_unnamed_elements
 from sims.robot.mujoco_messages import capture_mujoco_warnings
-from sims.robot.parsing import contact_exclusion
+from sims.robot.parsing import collision_hulls
 from sims.robot.parsing.collision_hulls import (
     MIN_FACES,
     TESTED_VERSION_PREFIX,
@@ -198,7 +198,7 @@ def _reduce_geoms(spec: Any, model: Any) -> tuple[dict[str, Hull], dict[str, int
     """
     import mujoco
 
-    collision_mask = contact_exclusion.find_colliding_geoms(model)
+    collision_mask = collision_hulls.find_colliding_geoms(model)
     is_tested_version = mujoco.__version__.startswith(TESTED_VERSION_PREFIX)
     hull_by_mesh: dict[str, Hull] = {}
     geom_numbers: dict[str, int] = {}

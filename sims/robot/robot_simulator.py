@@ -44,7 +44,6 @@ from sims.robot.dynamics.applied_inputs import (
     STEP_COUNT_TOLERANCE,
     compute_inputs_over_steps,
 )
-from sims.robot.dynamics.batch_cache import RefusedModelError, get_batch_cache
 from sims.robot.dynamics.batch_work import (
     BatchInputs,
     BatchResult,
@@ -56,11 +55,16 @@ from sims.robot.dynamics.batch_work import (
 from sims.robot.dynamics.callback_stepping import step_in_callback
 from sims.robot.dynamics.compiled_forces import compile_forces
 from sims.robot.dynamics.disabled_drives import compute_off_steps, find_working_servos
-from sims.robot.dynamics.drive_sensors import DriveSensorModel
 from sims.robot.dynamics.effect_forces import EffectForces, compute_time_dependent_forces
 from sims.robot.dynamics.midpoint_state import IndexArray, Mask
-from sims.robot.dynamics.mujoco_batch import BATCH_SIZE, JointAddresses, MujocoBatch
-from sims.robot.dynamics.sensor_sampling import sample_readings
+from sims.robot.dynamics.mujoco_batch import (
+    BATCH_SIZE,
+    JointAddresses,
+    MujocoBatch,
+    RefusedModelError,
+    get_batch_cache,
+)
+from sims.robot.dynamics.sensor_sampling import DriveSensorModel, sample_readings
 from sims.robot.floating_joints import FloatingJoints, FloatingState
 from sims.robot.friction_form import FrictionForm
 from sims.robot.integrator_settings import (

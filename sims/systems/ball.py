@@ -10,7 +10,7 @@ import numpy as np
 
 from sims.core.simulator import Array, Channel, Constant, Parameter
 from sims.core.system import DefaultRecording, StateSnapshot, System, SystemKind
-from sims.core.value_limits import GRAVITY_RANGE, LENGTH_RANGE, MASS_RANGE
+from sims.core.values import GRAVITY_RANGE, LENGTH_RANGE, MASS_RANGE
 from sims.system_simulator import SystemSimulator
 
 

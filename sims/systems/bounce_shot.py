@@ -24,7 +24,7 @@ import numpy as np
 from sims.core.effect import Effect
 from sims.core.simulator import Array, Channel, Constant, Parameter
 from sims.core.system import StateSnapshot, System, SystemKind
-from sims.core.value_limits import ANGLE_RANGE, GRAVITY_RANGE, LENGTH_RANGE, MASS_RANGE, RATIO_RANGE
+from sims.core.values import ANGLE_RANGE, GRAVITY_RANGE, LENGTH_RANGE, MASS_RANGE, RATIO_RANGE
 from sims.system_simulator import SystemSimulator
 
 _LEVEL_ONLY = ("force.bias", "force.periodic", "lift.magnus")

@@ -18,7 +18,7 @@ from sims.core.system import (
     System,
     SystemKind,
 )
-from sims.core.value_limits import (
+from sims.core.values import (
     GAIN_RANGE,
     GRAVITY_RANGE,
     LENGTH_RANGE,

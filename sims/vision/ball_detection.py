@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from sims.core.simulator import Array
 from sims.vision import circle_fit
 from sims.vision.ball_renderer import RgbImage
-from sims.vision.video_packages import import_package
+from sims.vision.video_files import import_package
 
 _RAY_COUNT = 36
 """Number of rays, evenly spaced over the full circle, along which an edge is located."""

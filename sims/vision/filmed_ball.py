@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from sims.core.simulator import Array, Channel, Constant, InputError, Parameter, Scenario, Simulator
-from sims.core.value_limits import ANGLE_RANGE, IMAGE_SIZE_RANGE, LENGTH_RANGE
+from sims.core.values import ANGLE_RANGE, IMAGE_SIZE_RANGE, LENGTH_RANGE
 from sims.systems.ball import Ball, BallSystem
-from sims.vision import video_packages
+from sims.vision import video_files
 from sims.vision.pinhole_camera import PinholeCamera
 
 FILM_MODES = ("projected", "tracked")
@@ -89,7 +89,7 @@ class FilmedBall(Simulator):
             )
         if film == "tracked":
             # Fail here with one message, not in the middle of a training.
-            video_packages.check_installed()
+            video_files.check_installed()
         self._tracked = film == "tracked"
         self._ball = Ball(
             self._select_ball_constants(self.constant_values), ["x", "y", "z"], **settings
@@ -142,9 +142,8 @@ def _track_film(camera: PinholeCamera, radius: float, places: Array, times: Arra
 
     NaN stands where it finds none.
     """
-    from sims.vision.ball_renderer import BallScene
+    from sims.vision.ball_renderer import BallScene, SceneAppearance
     from sims.vision.ball_tracker import track_ball
-    from sims.vision.scene_appearance import SceneAppearance
     from sims.vision.video_files import VideoFile, write_video
 
     rows: Array = np.full(times.size, np.nan)

@@ -1,4 +1,4 @@
-"""Read and write video files with their true time stamps.
+"""Read and write video files with the optional packages that do so.
 
 PyAV contains its own codecs and reports each frame's time as stated in the file, also for uneven
 frame rates.
@@ -6,18 +6,50 @@ frame rates.
 
 from __future__ import annotations
 
+import importlib
+import importlib.util
 from collections.abc import Iterable, Iterator, Mapping
 from fractions import Fraction
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from sims.core.atomic_files import atomic_replacement, write_files
-from sims.core.path_checks import check_absent, require_file
+from sims.core.files import atomic_replacement, check_absent, require_file, write_files
 from sims.core.simulator import Array, InputError
 from sims.vision.ball_renderer import RgbImage
-from sims.vision.video_packages import import_package
+
+REQUIRED_PACKAGES = ("av", "cv2")
+"""Packages for films: PyAV reads and writes video files, OpenCV measures pictures."""
+
+
+def check_installed(instead: str = "") -> None:
+    """Check that the packages for films are installed, without importing them.
+
+    Args:
+        instead: Alternative for the user, appended to the message.
+
+    Raises:
+        InputError: A package is missing.
+    """
+    if not all(map(importlib.util.find_spec, REQUIRED_PACKAGES)):
+        raise InputError(f'films need PyAV and OpenCV: pip install -e ".[vision]"{instead}')
+
+
+@cache
+def import_package(name: str) -> Any:
+    """Import one of the packages for films.
+
+    Raises:
+        InputError: The package is missing.
+    """
+    try:
+        return importlib.import_module(name)
+    except ImportError:
+        check_installed()
+        raise
+
 
 _FRAME_RATE_RANGE = (1e-3, 1e7)
 """Range of plausible frame rates, frames per second."""

@@ -25,7 +25,7 @@ from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.benchmark.runner.tuner_training import TrainingRequest, train_or_load
 from bench.benchmark.runner.worker_tasks import RunRequest, execute_run
 from bench.core.random_streams import make_rng
-from sims.core.atomic_files import write_atomically
+from sims.core.files import write_atomically
 
 TUNERS = ("regressor", "tunenet", "in_context")
 TARGETS, CALIBRATION, BUDGET = 20, 60, 12

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from sims.core.atomic_files import write_atomically
+from sims.core.files import write_atomically
 
 AFTER = (0, 1, 2, 3, 5, 10, 20)
 """Simulation counts at which errors are reported."""

@@ -20,10 +20,9 @@ import pandas as pd
 
 from sims.core.simulator import InputError, Scenario
 from sims.systems.ball import Ball
-from sims.vision.ball_renderer import BallScene
+from sims.vision.ball_renderer import BallScene, SceneAppearance
 from sims.vision.ball_tracker import track_ball
 from sims.vision.pinhole_camera import PinholeCamera
-from sims.vision.scene_appearance import SceneAppearance
 from sims.vision.video_files import VideoFile, write_video
 
 RATE = 60.0

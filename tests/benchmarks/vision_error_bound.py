@@ -18,7 +18,7 @@ from bench.benchmark.problem.experiment import TunerEntry, load_experiment
 from bench.benchmark.runner.tuner_training import TrainingRequest, train_or_load
 from bench.bounce_shot import shot_planning
 from bench.bounce_shot.shot_config import read_shot_config
-from sims.core.atomic_files import write_atomically
+from sims.core.files import write_atomically
 from sims.recording.recording import read_recording
 from sims.systems.ball import Ball
 

@@ -24,8 +24,7 @@ from bench.bounce_shot.shot_planning import TunedModel
 from bench.bounce_shot.shot_sampling import draw_shots
 from bench.cli.main import main
 from sims.core.toml_validation import read_toml
-from sims.vision.camera_file import FilmDescription, format_camera_file
-from sims.vision.pinhole_camera import PinholeCamera
+from sims.vision.pinhole_camera import FilmDescription, PinholeCamera, format_camera_file
 from tests.conftest import PLUGINS
 from tests.docs.documentation_pages import quoted, section, tables, text_of
 from tests.sample_experiments import SPRING, spring_experiment

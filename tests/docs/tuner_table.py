@@ -15,6 +15,12 @@ SET = {
     "e_i = P(e_j, a_j, s_j, r_j for j = i - k ... i - 1)": (
         r"e_i = P\left(e_j, a_j, s_j, r_j \text{ for } j = i - k, \ldots, i - 1\right)"
     ),
+    "q'' = k0 + k1 q + k3 q^3 + kf sense(q') + ku u + kd q'": (
+        r"\ddot q = k_0 + k_1 q + k_3 q^3 + k_f \operatorname{sense}(\dot q) + k_u u + k_d \dot q"
+    ),
+    "integral of w q'' = integral of w'' q, integral of w q' = -integral of w' q": (
+        r"\int w \ddot q = \int \ddot w q, \quad \int w \dot q = -\int \dot w q"
+    ),
     "zeta_k = zeta_{k-1} + h(o_P, o_T)": r"\zeta_k = \zeta_{k-1} + h(o_P, o_T)",
     "s = -B^-1 h, at first B = -1, which is (1)": (
         r"s = -B^{-1} h, \quad \text{at first } B = -1, \text{ which is (1)}"
@@ -92,8 +98,7 @@ EQUATION = re.compile(r"\(([\d.]+)\)  (.*)", re.S)
 SHARED = (
     "pair_network",
     "observation_features",
-    "scenario_features",
-    "gap_filling",
+    "input_features",
     "gaussian_process",
 )
 """Modules below methods/learning that several tuners share."""

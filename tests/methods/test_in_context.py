@@ -3,13 +3,11 @@ import pytest
 
 from methods.learning.history_transformer import (
     HistoryTransformerDesign,
-    get_weight_shapes,
-    predict_proposals,
-)
-from methods.learning.tuning_histories import (
     draw_binary_search,
+    get_weight_shapes,
     make_ordered_histories,
     make_shuffled_histories,
+    predict_proposals,
 )
 from methods.tuners.in_context import InContextTransformer
 from tests.methods.test_tunenet import Toy, errors, run

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from bench.benchmark.runner.tuner_loop import drive_tuner
-from methods.learning.noise_estimation import estimate_noise_sigma
+from methods.learning.noise_matched_networks import estimate_noise_sigma
 from methods.learning.observation_features import make_weighted_features, resample_runs
 from methods.learning.pair_network import (
     PUBLISHED_DESIGN,

@@ -11,7 +11,7 @@ import tempfile
 from pathlib import Path
 from typing import NamedTuple
 
-from sims.core.file_lock import lock_file
+from sims.core.files import lock_file
 
 _FOLDER_PREFIX = "simgap-tuner-"
 

@@ -24,7 +24,7 @@ from bench.benchmark.problem.suite_version import (
     compute_problem_hash,
 )
 from bench.benchmark.problem.tuner_entries import TunerEntry, parse_entries
-from sims.core.path_checks import is_existing_file
+from sims.core.files import is_existing_file
 from sims.core.simulator import InputError, make_unknown_name_error
 from sims.core.toml_validation import (
     Range,
@@ -36,7 +36,7 @@ from sims.core.toml_validation import (
     make_error,
     read_toml,
 )
-from sims.core.value_limits import MAX_DESCRIPTION_LENGTH, MAX_NAME_LENGTH, MAX_SAMPLING_RATE_HZ
+from sims.core.values import MAX_DESCRIPTION_LENGTH, MAX_NAME_LENGTH, MAX_SAMPLING_RATE_HZ
 
 __all__ = [
     "Experiment",

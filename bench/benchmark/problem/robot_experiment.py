@@ -13,7 +13,7 @@ from bench.benchmark.problem.experiment import (
 )
 from bench.benchmark.problem.model_file_simulator import complete_robot_experiment
 from bench.benchmark.problem.tuner_entries import TunerEntry
-from sims.core.path_checks import require_file
+from sims.core.files import require_file
 from sims.core.simulator import InputError
 from sims.recording.recording_description import read_model_reference
 

@@ -24,7 +24,7 @@ from bench.benchmark.runner.code_digest import hash_package_versions, hash_sourc
 from bench.benchmark.runner.plugin_discovery import Plugin
 from bench.benchmark.runner.tuner_training import TrainingResult, get_weights_folder, train_or_load
 from bench.benchmark.runner.worker_pools import Call, LocalPool, PoolLostError
-from sims.core.atomic_files import get_first_line, write_atomically
+from sims.core.files import get_first_line, write_atomically
 from sims.core.simulator import InputError
 
 _SCHEDULER_TIMEOUT_SECONDS = 20.0

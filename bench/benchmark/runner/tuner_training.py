@@ -41,7 +41,7 @@ from bench.benchmark.runner.sandboxed_tuner import retry_if_killed, start_isolat
 from bench.core.plugin_registries import tuners
 from bench.core.random_streams import make_seed_words
 from methods.tuner import TrainingCallback, Tuner
-from sims.core.atomic_files import atomic_replacement
+from sims.core.files import atomic_replacement
 from sims.core.simulator import Array, InputError
 
 _COST_ARRAY = "__simulations_and_seconds__"

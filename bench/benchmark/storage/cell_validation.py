@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.benchmark.storage.table_schemas import Columns, ColumnSpec, EmptyCellRule
-from sims.core.atomic_files import get_first_line
+from sims.core.files import get_first_line
 from sims.core.toml_validation import format_value
 
 if TYPE_CHECKING:

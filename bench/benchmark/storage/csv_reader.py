@@ -14,7 +14,7 @@ from bench.benchmark.storage.cell_validation import (
     select_declared_columns,
 )
 from bench.benchmark.storage.table_schemas import Columns
-from sims.core.atomic_files import get_first_line
+from sims.core.files import get_first_line
 from sims.core.simulator import InputError
 from sims.core.toml_validation import format_value
 

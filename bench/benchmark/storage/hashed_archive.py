@@ -21,7 +21,7 @@ from typing import IO, Any, NamedTuple
 
 from bench.benchmark.storage.provenance import compute_sha256
 from bench.schemas import find_violations
-from sims.core.atomic_files import atomic_replacement
+from sims.core.files import atomic_replacement
 from sims.core.simulator import InputError
 
 MANIFEST_FILE = "manifest.json"

@@ -18,7 +18,7 @@ from bench.benchmark.storage import cell_validation
 from bench.benchmark.storage.cell_validation import CellError
 from bench.benchmark.storage.run_status import STATUS_COLUMN_NAMES, RunStatus
 from bench.benchmark.storage.table_schemas import STATUS_COLUMNS, ColumnSpec
-from sims.core.atomic_files import get_first_line, write_atomically
+from sims.core.files import get_first_line, write_atomically
 from sims.core.simulator import InputError
 
 if TYPE_CHECKING:

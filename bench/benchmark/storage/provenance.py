@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from bench import __version__
-from sims.core.atomic_files import write_atomically
+from sims.core.files import write_atomically
 
 ENVIRONMENT_FILE = "environment.json"
 

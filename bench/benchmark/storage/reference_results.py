@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from bench.benchmark.storage.csv_reader import CsvTable
 from bench.benchmark.storage.result_folder import CONFIGURATION_FILE
 from bench.benchmark.storage.table_schemas import ERROR_TABLE_COLUMNS
-from sims.core.atomic_files import get_first_line
+from sims.core.files import get_first_line
 from sims.core.simulator import InputError, make_unknown_name_error
 from sims.core.toml_validation import read_toml
 

@@ -24,16 +24,17 @@ from bench.benchmark.storage.table_schemas import (
     STATUS_COLUMNS,
     Columns,
 )
-from sims.core.atomic_files import (
+from sims.core.files import (
     atomic_new_folder,
     atomic_replacement,
+    check_folder_empty,
     get_first_line,
+    make_timestamped_path,
     write_atomically,
 )
-from sims.core.path_checks import check_folder_empty, make_timestamped_path
-from sims.core.plain_values import to_toml_value
 from sims.core.simulator import InputError
 from sims.core.toml_validation import check_entries, format_value, read_toml
+from sims.core.values import to_toml_value
 from sims.engines import describe_stepping
 
 if TYPE_CHECKING:

@@ -26,8 +26,7 @@ from bench.benchmark.storage.journal_segments import (
     read_records,
 )
 from bench.benchmark.storage.run_status import RunStatus
-from sims.core.atomic_files import atomic_replacement
-from sims.core.file_lock import open_locked
+from sims.core.files import atomic_replacement, open_locked
 from sims.core.simulator import InputError
 
 if TYPE_CHECKING:

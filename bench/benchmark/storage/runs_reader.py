@@ -29,7 +29,7 @@ from bench.benchmark.storage.table_schemas import (
     list_channels,
     list_parameters,
 )
-from sims.core.atomic_files import get_first_line
+from sims.core.files import get_first_line
 from sims.core.simulator import InputError
 
 if TYPE_CHECKING:

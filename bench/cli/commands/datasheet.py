@@ -46,7 +46,7 @@ def _run_datasheet(options: argparse.Namespace, print_line: PrintLine) -> Comman
     from bench.core.plugin_registries import load_plugins
     from bench.diagnosis.explain_options import ExplainOptions
     from sims.core.argument_checks import check_options
-    from sims.core.path_checks import check_folder_empty
+    from sims.core.files import check_folder_empty
 
     load_plugins(options.plugin)
     # Check this before the work, which may take minutes.

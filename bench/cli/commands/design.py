@@ -48,7 +48,7 @@ def _run_design(options: argparse.Namespace, print_line: PrintLine) -> CommandRe
     from bench.cli.interrupt_handler import InterruptHandler
     from bench.cli.search_progress import ProgressDisplay
     from bench.core.plugin_registries import load_plugins
-    from sims.core.path_checks import check_absent
+    from sims.core.files import check_absent
 
     load_plugins(options.plugin)
     check_absent([options.out])

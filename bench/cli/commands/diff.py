@@ -48,8 +48,7 @@ def _run_diff(options: argparse.Namespace, print_line: PrintLine) -> CommandResu
     Returns:
         The JSON document of the command, and its exit code; EXIT_PROBLEMS_FOUND for a failure.
     """
-    from sims.core.atomic_files import write_files
-    from sims.core.path_checks import check_absent
+    from sims.core.files import check_absent, write_files
 
     if options.out is not None:
         check_absent([options.out])

@@ -86,7 +86,7 @@ def _run_explain(options: argparse.Namespace, print_line: PrintLine) -> CommandR
     from bench.core.plugin_registries import load_plugins
     from bench.diagnosis.explain_options import ExplainOptions
     from bench.diagnosis.report.summary_text import format_summary
-    from sims.core.path_checks import check_folder_empty, make_timestamped_path
+    from sims.core.files import check_folder_empty, make_timestamped_path
     from sims.core.simulator import InputError
 
     if options.cluster and not options.each:
@@ -164,7 +164,7 @@ def _run_explain_batch(options: argparse.Namespace, print_line: PrintLine) -> Co
     )
     from bench.diagnosis.batch.run_batch import explain_batch, list_logs
     from bench.diagnosis.batch.summary_page import BatchPageInput, write_summary_page
-    from sims.core.path_checks import make_timestamped_path
+    from sims.core.files import make_timestamped_path
 
     settings = {
         name: getattr(options, name)

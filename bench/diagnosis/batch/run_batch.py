@@ -20,8 +20,7 @@ from bench.diagnosis.explain import explain
 from bench.figures.figure_files import is_pdf_wanted
 from bench.logs.joined_recordings import make_log_names
 from bench.logs.recording_digest import compute_recording_digest, read_content
-from sims.core.atomic_files import get_first_line, write_atomically
-from sims.core.path_checks import check_folder_empty
+from sims.core.files import check_folder_empty, get_first_line, write_atomically
 from sims.core.simulator import InputError
 
 BATCH_STATE_FILE = "logs.json"

@@ -26,7 +26,7 @@ from bench.figures.text_layout import break_name
 from bench.pages.chart import Axis, Panel, PrintedFigure, ReferenceLine, Series
 from bench.pages.chart_figure import draw_chart
 from bench.pages.html_page import HtmlPage
-from sims.core.atomic_files import write_atomically
+from sims.core.files import write_atomically
 from sims.core.simulator import InputError
 
 if TYPE_CHECKING:

@@ -23,12 +23,12 @@ from bench.diagnosis.conventions.unit_check import UNITS, UNITS_IN_WORDS, Signal
 from bench.diagnosis.identifiability import join_first_names
 from bench.logs.importing.joint_order import find_best_order
 from sims.core.simulator import Array, InputError, Simulator
-from sims.recording.angle_unwrapping import unwrapped
 from sims.recording.column_mapping import list_mapped_files
-from sims.recording.log_formats.lerobot_calibration import range_scale
+from sims.recording.log_formats.lerobot_dataset import range_scale
 from sims.recording.log_formats.log_files import LogFile, read_log
 from sims.recording.recording import Recording, Run
 from sims.recording.recording_description import read_meta
+from sims.recording.unit_conversion import unwrapped
 
 TRIED_ZERO_OFFSETS = (
     np.array([-120.0, -70.0, -35.0, -15.0, 15.0, 35.0, 70.0, 120.0, 180.0]) * math.pi / 180.0

@@ -14,7 +14,7 @@ from bench.diagnosis.conventions.convention_hypotheses import (
     ConventionHypothesis,
     SignalChange,
 )
-from sims.core.atomic_files import write_files
+from sims.core.files import write_files
 from sims.core.simulator import InputError
 from sims.core.toml_validation import toml_key, toml_text
 from sims.recording.recording_description import DeclaredSignals, dotted, read_meta

@@ -31,8 +31,8 @@ from bench.pages.html_page import HtmlPage
 from bench.pages.page_table import Table
 from sims import effects as library
 from sims.core.argument_checks import check_arguments
-from sims.core.atomic_files import Content, write_all_atomically
 from sims.core.effect import ALL_PLACES, Effect
+from sims.core.files import Content, write_all_atomically
 from sims.core.simulator import InputError, make_unknown_name_error
 from sims.extended_simulator import ExtendedSimulator
 from sims.recording.recording import Recording

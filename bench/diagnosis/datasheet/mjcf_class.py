@@ -277,7 +277,7 @@ def _render_class(
     """
     from sims.robot.export.apply_causes import apply_causes
     from sims.robot.export.default_class import render_default_class, render_model_using_class
-    from sims.robot.export.xml_editing import NotEditableError
+    from sims.robot.export.mjcf_document import NotEditableError
 
     applied = apply_causes(robot, causes, sheet.extended.title)
     ids = robot.joint(joint).id, robot.actuator(actuator).id if actuator else None

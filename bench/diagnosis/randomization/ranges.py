@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from bench.diagnosis.extended_robot_files import collect_causes
 from bench.diagnosis.verdict import Verdict
 from bench.pages.text_format import joined
-from sims.core.unit_text import append_unit
+from sims.core.values import append_unit
 from sims.extended_simulator import ExtendedSimulator, FittedValue
 
 if TYPE_CHECKING:
     from sims.robot.fitted_causes import FittedCause
-    from sims.robot.model_fields import ModelField
+    from sims.robot.model_field_effects import ModelField
     from sims.robot.robot_model import RobotModel
 
 NO_MODEL = "no ranges are written: {system} has no model file whose numbers could be randomised"
@@ -232,7 +232,7 @@ def _convert_to_range(
 
     Its operation says whether a simulator sets, adds or multiplies with the random value.
     """
-    from sims.robot.model_fields import model_fields, operation_of
+    from sims.robot.model_field_effects import model_fields, operation_of
 
     cause, fitted = entry.cause, entry.cause.numbers[entry.coefficient]
     assert fitted.low is not None

@@ -16,7 +16,7 @@ from bench.logs.importing.run_logs import RunLogs
 from bench.logs.importing.signal_assignment import SignalAssignment
 from bench.logs.importing.velocity_assignment import assign_velocities
 from bench.logs.recording_loading import load_recording
-from sims.core.atomic_files import write_files
+from sims.core.files import write_files
 from sims.core.simulator import InputError
 from sims.core.toml_validation import check_known_names
 from sims.robot.robot_model import RobotModel

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from sims.core.simulator import InputError
-from sims.recording.log_formats.hdf5_files import is_hdf5, list_run_paths
+from sims.recording.log_formats.hdf5_and_parquet import is_hdf5, list_run_paths
 from sims.recording.log_formats.lerobot_dataset import is_dataset
 from sims.recording.log_formats.log_files import LOG_SUFFIXES, list_logs, read_log
 from sims.recording.log_formats.ros_bags import BAG_SUFFIXES, is_bag

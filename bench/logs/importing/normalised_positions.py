@@ -15,7 +15,7 @@ import numpy as np
 from bench.logs.quality.anomaly import Anomaly
 from sims.core.simulator import Array, InputError
 from sims.core.toml_validation import read_toml
-from sims.recording.log_formats.lerobot_calibration import (
+from sims.recording.log_formats.lerobot_dataset import (
     AngleScale,
     MotorRange,
     compute_angle_scale,
@@ -23,8 +23,8 @@ from sims.recording.log_formats.lerobot_calibration import (
     motor_of,
     range_scale,
     read_calibration,
+    split_episode_path,
 )
-from sims.recording.log_formats.lerobot_dataset import split_episode_path
 from sims.recording.recording import Recording
 
 if TYPE_CHECKING:  # A recording without a robot needs no model.

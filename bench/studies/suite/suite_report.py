@@ -19,7 +19,7 @@ from bench.studies.suite.suite_runs import (
     write_suite_runs,
 )
 from bench.studies.suite.suite_tables import FREE, SuiteTables
-from sims.core.atomic_files import write_atomically
+from sims.core.files import write_atomically
 
 PrintLine = Callable[[str], None]
 _REFERENCE_NAME = "suite"

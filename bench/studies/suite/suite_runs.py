@@ -21,7 +21,7 @@ from bench.benchmark.statistics.comparison_statistics import ComparisonStatistic
 from bench.benchmark.storage.journal_segments import SEGMENTS_FOLDER
 from bench.benchmark.storage.result_folder import CONFIGURATION_FILE, read_comparison
 from bench.misspecification.comparison_experiments import MODEL_LABELS, PLAIN
-from sims.core.atomic_files import atomic_replacement, write_atomically
+from sims.core.files import atomic_replacement, write_atomically
 from sims.core.simulator import Array, InputError
 
 CURVES_FILE = "curves.parquet"

@@ -14,12 +14,12 @@ from typing import cast
 from sims.core.engine import Engine, IntegrationBatch, Trajectories
 from sims.core.simulator import InputError
 from sims.core.system import System
-from sims.engines.adapters import bullet_joints, bullet_world
+from sims.engines.adapters import bullet_world
 from sims.engines.external import ball_rollout, joint_rollout, native_contact
 from sims.engines.external.ball_rollout import BallState
-from sims.engines.external.element_forces import Vector
 from sims.engines.external.external_engine import (
     RolloutFunction,
+    Vector,
     integrate_batch,
     resolve_time_step,
 )
@@ -138,7 +138,7 @@ class BulletEngine:
         elif system.bounces:
             self._rollout = partial(ball_rollout.integrate_ball, BulletBall(self._world))
         else:
-            joint = bullet_joints.BulletJoint(self._world, cast(BulletJointWorldModule, module))
+            joint = bullet_world.BulletJoint(self._world, cast(BulletJointWorldModule, module))
             self._rollout = partial(joint_rollout.integrate_joint, joint)
 
     def integrate(self, batch: IntegrationBatch) -> Trajectories:

@@ -15,14 +15,14 @@ from typing import cast
 from sims.core.engine import Engine, IntegrationBatch, Trajectories
 from sims.core.simulator import InputError
 from sims.core.system import System
-from sims.core.value_limits import truncate_text
+from sims.core.values import truncate_text
 from sims.engines.adapters.mujoco_bodies import (
     CompiledWorld,
     MujocoBall,
     MujocoJoint,
+    MujocoSoftBall,
     import_mujoco,
 )
-from sims.engines.adapters.mujoco_soft_contact import MujocoSoftBall
 from sims.engines.external import ball_rollout, joint_rollout, native_contact
 from sims.engines.external.external_engine import (
     RolloutFunction,

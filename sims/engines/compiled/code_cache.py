@@ -12,7 +12,7 @@ import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from sims.core.file_lock import lock_file
+from sims.core.files import lock_file
 
 _DIGEST_BYTES = hashlib.sha256().digest_size
 

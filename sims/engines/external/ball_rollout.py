@@ -34,8 +34,13 @@ from typing import Protocol
 
 import numpy as np
 
-from sims.engines.external.element_forces import ElementForces, Vector
-from sims.engines.external.external_engine import ElementWork, Trajectory, split_into_legs
+from sims.engines.external.external_engine import (
+    ElementForces,
+    ElementWork,
+    Trajectory,
+    Vector,
+    split_into_legs,
+)
 from sims.engines.ground_contact import MAX_SHORT_FLIGHTS, MIN_FLIGHT_SECONDS, SHORT_FLIGHT_SECONDS
 
 BallState = tuple[Vector, Vector]

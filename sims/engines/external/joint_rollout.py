@@ -44,8 +44,12 @@ from typing import Any, Protocol
 import numpy as np
 
 from sims.core.simulator import Array
-from sims.engines.external.element_forces import ElementForces
-from sims.engines.external.external_engine import ElementWork, Trajectory, split_into_legs
+from sims.engines.external.external_engine import (
+    ElementForces,
+    ElementWork,
+    Trajectory,
+    split_into_legs,
+)
 
 VELOCITY_STEP = 1e-3
 """Velocity difference (m/s or rad/s) used to compute the slope of the force."""

@@ -22,8 +22,13 @@ import numpy as np
 from sims.core.effect import Contact
 from sims.core.simulator import Array
 from sims.engines.external.ball_rollout import BallBody, get_gravity, make_trajectory
-from sims.engines.external.element_forces import ElementForces, Vector
-from sims.engines.external.external_engine import ElementWork, Trajectory, split_into_legs
+from sims.engines.external.external_engine import (
+    ElementForces,
+    ElementWork,
+    Trajectory,
+    Vector,
+    split_into_legs,
+)
 
 _MAX_RESTING_SPEED = 0.2
 """Speed in m/s below which Bullet treats a ball on the ground as resting."""

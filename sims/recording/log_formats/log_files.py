@@ -16,12 +16,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sims.core.path_checks import require_file
+from sims.core.files import require_file
 from sims.core.simulator import Array, InputError, make_read_only
-from sims.recording.log_formats import hdf5_files, lerobot_dataset, ros_bags
+from sims.recording.log_formats import hdf5_and_parquet, lerobot_dataset, ros_bags
+from sims.recording.log_formats.column_names import arrays_by_name
+from sims.recording.log_formats.hdf5_and_parquet import make_unreadable_error, read_numeric_columns
 from sims.recording.log_formats.message_table import TIME_COLUMN
-from sims.recording.log_formats.named_entries import arrays_by_name
-from sims.recording.log_formats.parquet_columns import make_unreadable_error, read_numeric_columns
 from sims.recording.log_formats.text_table import read_text_table
 
 LOG_SUFFIXES = (
@@ -164,7 +164,7 @@ def read_log(path: str | Path, columns_to_read: frozenset[str] = frozenset()) ->
         return _read_episode(
             FileVersion(path, changed, sum(file_stat.st_size for file_stat in file_stats))
         )
-    group = hdf5_files.group_of(path)
+    group = hdf5_and_parquet.group_of(path)
     if group is not None:
         file_stat = group[0].stat()
         return _read_group(FileVersion(path, file_stat.st_mtime_ns, file_stat.st_size))
@@ -205,9 +205,9 @@ def _read_episode(stamp: FileVersion) -> LogFile:
 @lru_cache(maxsize=8)
 def _read_group(stamp: FileVersion) -> LogFile:
     """Read a group of an HDF5 file; cached by file version."""
-    group = hdf5_files.group_of(stamp.path)
+    group = hdf5_and_parquet.group_of(stamp.path)
     assert group is not None  # the caller checked the path
-    return _make_array_log(stamp.path, *hdf5_files.read_group(*group))
+    return _make_array_log(stamp.path, *hdf5_and_parquet.read_group(*group))
 
 
 @lru_cache(maxsize=8)

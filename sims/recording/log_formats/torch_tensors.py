@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sims.core.simulator import Array, InputError, make_read_only
-from sims.recording.log_formats.parquet_columns import MAX_COLUMNS
+from sims.recording.log_formats.hdf5_and_parquet import MAX_COLUMNS
 from sims.recording.log_formats.read_errors import make_memory_error
 
 ENDINGS = (".pt", ".pth")

@@ -1,4 +1,4 @@
-"""Joint forces along a measured motion, by MuJoCo's inverse dynamics."""
+"""Inverse dynamics along a measured motion, and the joint-space inertia matrix."""
 
 from __future__ import annotations
 
@@ -61,3 +61,13 @@ def motion_forces(
         mujoco.mj_fwdActuation(model, data)
         driven[k] = data.qfrc_actuator[dofs]
     return MotionForces(needed, driven)
+
+
+def inertia_matrix(model: Any) -> Array:
+    """Return the inertia matrix (nv, nv) of a MuJoCo model in its reference pose `qpos0`."""
+    import mujoco
+
+    data, matrix = mujoco.MjData(model), np.zeros((model.nv, model.nv))
+    mujoco.mj_forward(model, data)
+    mujoco.mj_fullM(model, data, matrix)
+    return matrix

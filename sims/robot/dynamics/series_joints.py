@@ -37,7 +37,7 @@ from numpy.typing import NDArray
 from sims.core.effect import ActiveEffects, Effect, HiddenStateEffect, SeriesElement
 from sims.core.simulator import Array
 from sims.robot.coupled_drives import name_unnamed_elements
-from sims.robot.dynamics.inertia_matrix import inertia_matrix
+from sims.robot.dynamics.inverse_dynamics import inertia_matrix
 from sims.robot.integrator_settings import RK4_INTEGRATOR_ID
 from sims.robot.robot_model import RobotModel, cache_per_robot
 

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sims.core.simulator import Array
-from sims.robot.dynamics.inertia_matrix import inertia_matrix
+from sims.robot.dynamics.inverse_dynamics import inertia_matrix
 
 MIN_STIFF_RATIO = 0.1
 """Minimum r (see the module) of a stiff servo."""

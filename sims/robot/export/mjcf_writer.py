@@ -20,8 +20,7 @@ from sims.robot.export.mjcf_attributes import (
     get_enum_word,
     list_all_attributes,
 )
-from sims.robot.export.mjcf_document import MjcfDocument
-from sims.robot.export.xml_editing import XmlElement, format_number, format_numbers
+from sims.robot.export.mjcf_document import MjcfDocument, XmlElement, format_number, format_numbers
 
 _ORIENTATION_ATTRIBUTES = ("axisangle", "euler", "xyaxes", "zaxis", "fullinertia")
 """Attributes that are alternatives to ``quat`` and ``diaginertia``."""

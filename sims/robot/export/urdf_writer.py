@@ -22,7 +22,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sims.core.simulator import Array
-from sims.robot.export.xml_editing import (
+from sims.robot.export.mjcf_document import (
     XmlElement,
     XmlText,
     format_heading,

@@ -23,16 +23,16 @@ from sims.robot.export.apply_causes import (
     apply_causes,
 )
 from sims.robot.export.mjcf_attributes import AttributeStatement, find_missing_statements
-from sims.robot.export.mjcf_document import MjcfDocument
-from sims.robot.export.mjcf_writer import MjcfWriter
-from sims.robot.export.model_comparison import find_first_difference
-from sims.robot.export.urdf_writer import UrdfWriter
-from sims.robot.export.xml_editing import (
+from sims.robot.export.mjcf_document import (
+    MjcfDocument,
     NotEditableError,
     format_heading,
     format_number,
     format_numbers,
 )
+from sims.robot.export.mjcf_writer import MjcfWriter
+from sims.robot.export.model_comparison import find_first_difference
+from sims.robot.export.urdf_writer import UrdfWriter
 from sims.robot.fitted_causes import expand_families
 from sims.robot.model_field_effects import get_coupling_address, get_write_order
 from sims.robot.mujoco_messages import capture_mujoco_warnings
@@ -133,7 +133,7 @@ def render_with_series_joints(applied: ModifiedModel) -> bytes:
 
 
 def _fix_base(document: MjcfDocument) -> None:
-    """Remove free joints and keyframes, as `parsing.engine_settings.fix_bases` does."""
+    """Remove free joints and keyframes, as `parsing.compile_repairs.fix_bases` does."""
     for tag in document.walk():
         is_free = tag.name == "joint" and tag.attributes.get("type") == "free"
         if tag.name in ("freejoint", "keyframe") or is_free:

@@ -9,9 +9,9 @@ from pathlib import PurePosixPath
 from typing import Any
 from xml.etree.ElementTree import Element
 
-from sims.core.path_checks import is_existing_file
-from sims.core.value_limits import truncate_text
-from sims.robot.parsing.missing_meshes import OmittedShapes
+from sims.core.files import is_existing_file
+from sims.core.values import truncate_text
+from sims.robot.parsing.mesh_files import OmittedShapes
 from sims.robot.parsing.xml_files import MAX_ASSET_BYTES, ModelFileReader, find_children, parse_tree
 
 PLACEHOLDER_MESH_VERTICES = "0 0 0 1 0 0 0 1 0 0 0 1"

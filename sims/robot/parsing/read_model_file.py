@@ -12,19 +12,22 @@ import numpy as np
 
 from sims.core.freed_memory import release_free_memory
 from sims.core.simulator import InputError
-from sims.core.value_limits import MAX_NUMBER, truncate_text
-from sims.robot.mujoco_messages import capture_mujoco_warnings, format_mujoco_error
-from sims.robot.note_text import format_name_list
+from sims.core.values import MAX_NUMBER, truncate_text
+from sims.robot.mujoco_messages import (
+    capture_mujoco_warnings,
+    format_mujoco_error,
+    format_name_list,
+)
 from sims.robot.parsing import (
     added_actuators,
-    contact_exclusion,
-    element_names,
-    engine_settings,
+    collision_hulls,
+    compile_repairs,
     mjcf_loading,
     urdf_loading,
+    xml_files,
 )
 from sims.robot.parsing.compile_repairs import CompileRepairs
-from sims.robot.parsing.missing_meshes import OmittedShapes
+from sims.robot.parsing.mesh_files import OmittedShapes
 from sims.robot.parsing.xml_files import ModelFileReader, format_tree, parse_tree, resolve_includes
 from sims.robot.robot_model import Format, RobotModel
 
@@ -94,7 +97,7 @@ def _make_robot(
         engine: time step and integrator that the recording sets.
         warnings: list to which MuJoCo's warnings are appended while it compiles.
     """
-    source, notes = str(files.path), element_names.rename_invalid_names(root)
+    source, notes = str(files.path), xml_files.rename_invalid_names(root)
     repairs = CompileRepairs(files, OmittedShapes(source))
     if kind == "urdf":
         notes += urdf_loading.repair_urdf(files, root)
@@ -105,13 +108,13 @@ def _make_robot(
         spec = _parse_repaired_file(files, root)
         missing_files.remove_from_spec(spec, repairs.left)
     rate_controlled = added_actuators.add_actuators(spec, actuators, source)
-    notes += engine_settings.apply_engine_settings(spec, engine, source)
-    notes += element_names.name_unnamed_elements(spec)
+    notes += compile_repairs.apply_engine_settings(spec, engine, source)
+    notes += xml_files.name_unnamed_elements(spec)
     parents = {body.name: body.parent.name for body in spec.bodies if body.parent is not None}
     spec, model = repairs.compile(spec)
     _check_model(files, model)
     exclusion_notes = (
-        contact_exclusion.exclude_spurious_contacts(spec, model) if kind == "urdf" else []
+        collision_hulls.exclude_spurious_contacts(spec, model) if kind == "urdf" else []
     )
     if exclusion_notes:
         spec, model = repairs.compile(spec)
@@ -155,8 +158,8 @@ def _check_model(files: ModelFileReader, model: Any) -> None:
     if model.njnt == 0:
         raise InputError(f"{files.path}: it has no movable joint")
     step = float(model.opt.timestep)
-    if not engine_settings.MIN_TIME_STEP <= step <= engine_settings.MAX_TIME_STEP:
-        span = f"{engine_settings.MIN_TIME_STEP:g} to {engine_settings.MAX_TIME_STEP:g} s"
+    if not compile_repairs.MIN_TIME_STEP <= step <= compile_repairs.MAX_TIME_STEP:
+        span = f"{compile_repairs.MIN_TIME_STEP:g} to {compile_repairs.MAX_TIME_STEP:g} s"
         raise InputError(f"{files.path}: option timestep: expected {span}, found {step:g}")
     for field in CHECKED_MODEL_FIELDS:
         values = np.asarray(getattr(model, field), dtype=float)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sims.core.simulator import Array
-from sims.robot.dynamics.inertia_matrix import inertia_matrix
+from sims.robot.dynamics.inverse_dynamics import inertia_matrix
 from sims.robot.floating_joints import FloatingJoints
 from sims.robot.robot_model import RobotModel
 

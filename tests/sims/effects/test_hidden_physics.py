@@ -123,7 +123,7 @@ def test_elements_with_and_without_a_state_are_each_as_alone():
 
 
 def test_inertia_is_that_of_the_drive_side():
-    from sims.effects.friction_hysteresis import FrictionHysteresis
+    from sims.effects.friction import FrictionHysteresis
     from sims.effects.transmission import JointFlexibility
 
     system = make_augmented_system(SliderSystem, (JointFlexibility, FrictionHysteresis))()

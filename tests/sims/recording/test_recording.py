@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from sims.core.simulator import Channel, Constant, InputError, Simulator
-from sims.recording.fast_csv import read_csv_fast
+from sims.recording.csv_table import read_csv_fast
 from sims.recording.recording import Run, read_recording, read_system_name
 from sims.recording.recording_writer import write_recording
 from sims.systems.ball import Ball

@@ -1,6 +1,6 @@
 import mujoco
 
-from sims.robot.places.coupled_joints import coupled_joints
+from sims.robot.places.place_list import coupled_joints
 
 FOURBAR = """
 <mujoco><worldbody>

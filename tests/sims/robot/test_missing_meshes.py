@@ -9,7 +9,7 @@ import simgap
 from bench.core.plugin_registries import make_robot_simulator
 from sims import effects
 from sims.core.simulator import InputError, Scenario
-from sims.robot.dynamics.batch_cache import RefusedModelError, get_batch_cache
+from sims.robot.dynamics.mujoco_batch import RefusedModelError, get_batch_cache
 from tests.sims.robot.sample_arms import ARM
 
 TAKEN = ARM.replace('name="spin"', 'name="elbow_flexibility"').replace(

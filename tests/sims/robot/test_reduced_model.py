@@ -12,8 +12,7 @@ import pytest
 
 from bench.core.plugin_registries import make_robot_simulator as simulator_of
 from sims.core.simulator import Scenario
-from sims.robot.dynamics.batch_cache import BatchCache, get_batch_cache
-from sims.robot.dynamics.mujoco_batch import MujocoBatch
+from sims.robot.dynamics.mujoco_batch import BatchCache, MujocoBatch, get_batch_cache
 from sims.robot.dynamics.series_joints import add_series_joints
 from sims.robot.integrator_settings import read_integrator_settings
 from sims.robot.parsing.read_model_file import read_robot

@@ -4,7 +4,7 @@ import numpy as np
 
 from bench.core.plugin_registries import make_robot_simulator
 from sims.core.simulator import Scenario
-from sims.robot.dynamics.batch_cache import get_batch_cache
+from sims.robot.dynamics.mujoco_batch import get_batch_cache
 from tests.sims.robot.sample_arms import ARM
 
 TIMES = np.arange(40) / 100.0

@@ -13,10 +13,9 @@ from dataclasses import replace
 from sims.core.simulator import InputError
 from sims.vision import background_model
 from sims.vision import ball_tracker as tracking
-from sims.vision.ball_renderer import BallScene
+from sims.vision.ball_renderer import BallScene, SceneAppearance
 from sims.vision.ball_tracker import track_ball
 from sims.vision.pinhole_camera import PinholeCamera
-from sims.vision.scene_appearance import SceneAppearance
 from sims.vision.video_files import VideoFile, write_video
 
 TIMES = np.arange(60) / 60

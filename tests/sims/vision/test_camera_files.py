@@ -1,8 +1,12 @@
 import pytest
 
 from sims.core.simulator import InputError
-from sims.vision.camera_file import FilmDescription, format_camera_file, read_camera_file
-from sims.vision.pinhole_camera import PinholeCamera
+from sims.vision.pinhole_camera import (
+    FilmDescription,
+    PinholeCamera,
+    format_camera_file,
+    read_camera_file,
+)
 
 FILMED = FilmDescription(PinholeCamera(0.1, 6.0, 5.0), 0.03, 0.2, 0.0)
 

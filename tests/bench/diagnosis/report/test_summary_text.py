@@ -283,7 +283,7 @@ def test_units_and_names_read_well():
 
 def test_a_plugin_says_its_own_noun_or_stands_with_what_it_says(fresh_registries):
     from sims import effects
-    from sims.effects.spring import LinearSpring
+    from sims.effects.external_force import LinearSpring
 
     class Magnet(LinearSpring):
         name = "spring.magnet"

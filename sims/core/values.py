@@ -1,13 +1,64 @@
-"""Largest plausible numbers, counts and text lengths.
+"""Values: plain Python values, units as text, and the largest plausible numbers.
 
 Larger values are mistakes, and would cause an overflow or an endless computation later.
 """
 
 from __future__ import annotations
 
+import math
+import re
+from collections.abc import Mapping
+from pathlib import PurePath
 from typing import Any
 
 import numpy as np
+
+
+def to_toml_value(value: Any) -> Any:
+    """Copy a value as plain dicts, lists and numbers, as TOML gives them."""
+    # The command line imports this module, and starts faster without NumPy.
+    import numpy as np
+
+    if isinstance(value, Mapping):
+        return {str(key): to_toml_value(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [to_toml_value(item) for item in value]
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def to_json_value(value: Any) -> Any:
+    """Convert a value to JSON types: paths to text, tuples to lists, NaN and infinity to None."""
+    if isinstance(value, Mapping):
+        return {str(key): to_json_value(item) for key, item in value.items()}
+    if isinstance(value, tuple | list | set | frozenset):
+        return [to_json_value(item) for item in value]
+    if isinstance(value, PurePath):
+        return str(value)
+    # NumPy numbers and arrays have this method.
+    if hasattr(value, "tolist"):
+        return to_json_value(value.tolist())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    # Text from files or system calls may contain lone surrogates, which cannot be encoded.
+    return value.encode("utf-8", "replace").decode() if isinstance(value, str) else value
+
+
+SUPERSCRIPT_DIGITS = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
+"""Translation of digits and minus sign to superscripts."""
+_POWER_PATTERN = re.compile(r"(?:\^|\*\*)(-?\d+)")
+
+
+def format_unit(unit: str) -> str:
+    """Format a unit for print, such as ``kg·m²`` for ``kg*m^2``; empty for a pure number."""
+    raised = _POWER_PATTERN.sub(lambda match: match[1].translate(SUPERSCRIPT_DIGITS), unit)
+    return "" if raised == "1" else raised.replace("*", "·")
+
+
+def append_unit(text: str, unit: str) -> str:
+    """Append a unit to a number; a pure number has none."""
+    unit_text = format_unit(unit)
+    return f"{text} {unit_text}" if unit_text else text
+
 
 MAX_NUMBER = 1e15
 """Maximum magnitude of any number, SI units: its powers and products remain finite."""
