@@ -110,7 +110,7 @@ def test_code_that_cannot_be_stored_is_compiled_again(monkeypatch, tmp_path, cap
     code = code_cache.read_cached(path)
     (tmp_path / "file").touch()
     monkeypatch.setenv("SIMGAP_COMPILED", str(tmp_path / "file"))
-    monkeypatch.setattr(kernel_build, "build_kernel", lambda _: code)
+    monkeypatch.setattr(kernel_build, "build_kernel", lambda *_: code)
     assert load_kernel() is not None
     assert "set SIMGAP_COMPILED to a folder that can be written" in capsys.readouterr().err
 

@@ -1,38 +1,195 @@
 """Compiled recursions of the filter and the smoother, eqs. (1) to (6) of `filter_and_smoother`.
 
 Matrices of a few joints are too small for one library call each: a step in Python takes fifty
-microseconds whatever their size. numba stores the compiled code in the user's cache.
+microseconds whatever their size. numba translates the functions once; the machine code is stored in
+the user's cache and loaded with llvmlite alone (`sims.engines.compiled.kernel`), because loading
+numba would take longer than filtering a short log. The functions allocate no memory.
 """
 
 from __future__ import annotations
 
 import importlib.util
-from typing import Any
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sims.core.simulator import Array
+from sims.engines.compiled.kernel import get_address, load_compiled_module
+
+if TYPE_CHECKING:
+    # These functions exist in compiled code only, see `sims.engines.compiled.kernel_build`.
+
+    def carray(pointer: Any, shape: Any) -> Any:
+        """Return the array at a pointer; the compiler's own function."""
+
+    def to_real_pointer(address: int) -> Any:
+        """Return an address as a pointer to floating-point numbers."""
 
 
-def _compile(function: Any) -> Any:
-    """Compile a function, and cache the code if possible.
+FILTER, SMOOTHER = range(2)
+"""Recursions, by the first argument of `recursion_entry`."""
+SIZE_COUNT = 6
+"""Number of integers before the addresses in the argument of `recursion_entry`."""
+MAX_ARRAYS = 26
+"""Maximum number of addresses in the argument of `recursion_entry`."""
+FILTER_SHAPES = (
+    *("bizz", "biz", "bize", "btcz", "btc", "biz", "btc", "z", "be", "1"),
+    *("btz", "btzz", "btc", "btzc", "btcc", "b"),
+    *("z", "z", "zz", "zz", "zz", "cc", "cc", "zc", "zc", "c"),
+)
+"""Shapes of the arguments of `run_filter`.
 
-    If numba does not support this Python version, the function runs uncompiled, a hundred times
-    slower.
+A letter is a size: b runs, t samples, i = t - 1 intervals, c channels, z states, e forces.
+"""
+SMOOTHER_SHAPES = (
+    *("bizz", "bize", "btcz", "be", "btz", "btzz", "btc", "btzc", "btcc"),
+    *("btz", "bie", "e", "e"),
+    *("z", "z", "c", "zz", "zz", "zz", "zz", "zz", "zz", "cz"),
+)
+"""Shapes of the arguments of `run_smoother`, as in `FILTER_SHAPES`."""
+BUFFER_COUNT = 10
+"""Number of buffers, which are the last arguments of both recursions."""
+
+
+def filter_recursion(*arrays: Array) -> None:
+    """Run the filter: the arguments of `run_filter` without the buffers.
+
+    Raises:
+        ValueError: an array has another shape or layout.
     """
-    if importlib.util.find_spec("numba") is None:
-        return function
-    import numba
-
-    settings: dict[str, Any] = {"error_model": "numpy", "nogil": True}
-    try:
-        return numba.njit(cache=True, **settings)(function)
-    except RuntimeError:
-        # Neither the package folder nor the user's cache is writable.
-        return numba.njit(**settings)(function)
+    _run(FILTER, FILTER_SHAPES, run_filter, arrays, arrays[3].shape, arrays[2].shape[3])
 
 
-def _multiply_sparse(a: Array, b: Array, out: Array) -> None:
+def smoother_recursion(*arrays: Array) -> None:
+    """Run the smoother: the arguments of `run_smoother` without the buffers.
+
+    Raises:
+        ValueError: an array has another shape or layout.
+    """
+    _run(SMOOTHER, SMOOTHER_SHAPES, run_smoother, arrays, arrays[2].shape, arrays[1].shape[3])
+
+
+def _run(
+    function: int,
+    shapes: tuple[str, ...],
+    python_function: Callable[..., None],
+    arrays: tuple[Array, ...],
+    readings_shape: tuple[int, ...],
+    force_count: int,
+) -> None:
+    """Allocate the buffers and run a recursion, compiled if numba supports this Python version.
+
+    Args:
+        function: `FILTER` or `SMOOTHER`.
+        shapes: shapes of all arguments of the recursion.
+        python_function: the same recursion in Python.
+        arrays: arguments of the recursion without the buffers.
+        readings_shape: (B, T, C, Z).
+        force_count: E.
+    """
+    b, t, c, z = readings_shape
+    sizes = {"b": b, "t": t, "i": t - 1, "c": c, "z": z, "e": force_count, "1": 1}
+    expected_shapes = [tuple(sizes[letter] for letter in shape) for shape in shapes]
+    buffers = tuple(np.zeros(shape) for shape in expected_shapes[-BUFFER_COUNT:])
+    arguments = (*arrays, *buffers)
+    # The compiled code does not check array bounds.
+    for array, shape in zip(arguments, expected_shapes, strict=True):
+        if array.shape != shape or array.dtype != np.float64 or not array.flags.c_contiguous:
+            raise ValueError(f"expected a contiguous array of shape {shape}, got {array.shape}")
+    if t < 1:
+        return
+    compiled = _load_compiled_recursions()
+    if compiled is None:
+        python_function(*arguments)
+        return
+    numbers = np.zeros(SIZE_COUNT + MAX_ARRAYS, dtype=np.int64)
+    numbers[:SIZE_COUNT] = function, b, t, c, z, force_count
+    numbers[SIZE_COUNT : SIZE_COUNT + len(arguments)] = [get_address(a) for a in arguments]
+    compiled(get_address(numbers))
+
+
+@cache
+def _load_compiled_recursions() -> Callable[[int], None] | None:
+    """Return the compiled `recursion_entry`; None if numba does not support this Python version.
+
+    The recursions then run uncompiled, a hundred times slower.
+    """
+    if importlib.util.find_spec("llvmlite") is None:
+        return None
+    return load_compiled_module(__name__, "recursion_entry", Path(__file__), "the Kalman filter")
+
+
+def recursion_entry(arguments_at: Any) -> None:
+    """Run a recursion (compiled code only).
+
+    The argument is the address of `SIZE_COUNT` + `MAX_ARRAYS` integers: the recursion, the sizes
+    B, T, C, Z and E, and the addresses of its arguments.
+    """
+    numbers = carray(arguments_at, (SIZE_COUNT + MAX_ARRAYS,))
+    b, t, c, z, e = numbers[1], numbers[2], numbers[3], numbers[4], numbers[5]
+    i = t - 1
+    at = numbers[SIZE_COUNT:]
+    if numbers[0] == FILTER:
+        run_filter(
+            carray(to_real_pointer(at[0]), (b, i, z, z)),
+            carray(to_real_pointer(at[1]), (b, i, z)),
+            carray(to_real_pointer(at[2]), (b, i, z, e)),
+            carray(to_real_pointer(at[3]), (b, t, c, z)),
+            carray(to_real_pointer(at[4]), (b, t, c)),
+            carray(to_real_pointer(at[5]), (b, i, z)),
+            carray(to_real_pointer(at[6]), (b, t, c)),
+            carray(to_real_pointer(at[7]), (z,)),
+            carray(to_real_pointer(at[8]), (b, e)),
+            carray(to_real_pointer(at[9]), (1,)),
+            carray(to_real_pointer(at[10]), (b, t, z)),
+            carray(to_real_pointer(at[11]), (b, t, z, z)),
+            carray(to_real_pointer(at[12]), (b, t, c)),
+            carray(to_real_pointer(at[13]), (b, t, z, c)),
+            carray(to_real_pointer(at[14]), (b, t, c, c)),
+            carray(to_real_pointer(at[15]), (b,)),
+            carray(to_real_pointer(at[16]), (z,)),
+            carray(to_real_pointer(at[17]), (z,)),
+            carray(to_real_pointer(at[18]), (z, z)),
+            carray(to_real_pointer(at[19]), (z, z)),
+            carray(to_real_pointer(at[20]), (z, z)),
+            carray(to_real_pointer(at[21]), (c, c)),
+            carray(to_real_pointer(at[22]), (c, c)),
+            carray(to_real_pointer(at[23]), (z, c)),
+            carray(to_real_pointer(at[24]), (z, c)),
+            carray(to_real_pointer(at[25]), (c,)),
+        )
+    else:
+        run_smoother(
+            carray(to_real_pointer(at[0]), (b, i, z, z)),
+            carray(to_real_pointer(at[1]), (b, i, z, e)),
+            carray(to_real_pointer(at[2]), (b, t, c, z)),
+            carray(to_real_pointer(at[3]), (b, e)),
+            carray(to_real_pointer(at[4]), (b, t, z)),
+            carray(to_real_pointer(at[5]), (b, t, z, z)),
+            carray(to_real_pointer(at[6]), (b, t, c)),
+            carray(to_real_pointer(at[7]), (b, t, z, c)),
+            carray(to_real_pointer(at[8]), (b, t, c, c)),
+            carray(to_real_pointer(at[9]), (b, t, z)),
+            carray(to_real_pointer(at[10]), (b, i, e)),
+            carray(to_real_pointer(at[11]), (e,)),
+            carray(to_real_pointer(at[12]), (e,)),
+            carray(to_real_pointer(at[13]), (z,)),
+            carray(to_real_pointer(at[14]), (z,)),
+            carray(to_real_pointer(at[15]), (c,)),
+            carray(to_real_pointer(at[16]), (z, z)),
+            carray(to_real_pointer(at[17]), (z, z)),
+            carray(to_real_pointer(at[18]), (z, z)),
+            carray(to_real_pointer(at[19]), (z, z)),
+            carray(to_real_pointer(at[20]), (z, z)),
+            carray(to_real_pointer(at[21]), (z, z)),
+            carray(to_real_pointer(at[22]), (c, z)),
+        )
+
+
+def multiply_sparse(a: Array, b: Array, out: Array) -> None:
     """Write a b to `out`; zeros of a are skipped, because most entries of a are zero."""
     for i in range(a.shape[0]):
         for j in range(b.shape[1]):
@@ -44,12 +201,12 @@ def _multiply_sparse(a: Array, b: Array, out: Array) -> None:
                     out[i, j] += factor * b[k, j]
 
 
-def _propagate_covariance(a: Array, p: Array, half: Array, out: Array) -> None:
+def propagate_covariance(a: Array, p: Array, half: Array, out: Array) -> None:
     """Write a p aᵀ for a symmetric matrix p to `out`, as a covariance is propagated.
 
     `half` receives the product a p. Only one triangle is computed; the other one is copied.
     """
-    product(a, p, half)
+    multiply_sparse(a, p, half)
     size = a.shape[0]
     for i in range(size):
         for j in range(i, size):
@@ -65,7 +222,7 @@ def _propagate_covariance(a: Array, p: Array, half: Array, out: Array) -> None:
             out[i, j] = out[j, i]
 
 
-def _run_filter(
+def run_filter(
     states: Array,
     defects: Array,
     forces: Array,
@@ -75,15 +232,27 @@ def _run_filter(
     variances: Array,
     prior: Array,
     deviations: Array,
-    largest: float,
+    limits: Array,
     predicted: Array,
     covariances: Array,
     innovations: Array,
     gains: Array,
     whiteners: Array,
     likelihood: Array,
+    x: Array,
+    moved: Array,
+    p: Array,
+    work: Array,
+    spread: Array,
+    root: Array,
+    inverse: Array,
+    crossed: Array,
+    half: Array,
+    w: Array,
 ) -> None:
-    """Filter B runs of T samples by (1) to (4); results are written to the last six arguments.
+    """Filter B runs of T samples by (1) to (4).
+
+    Results are written to `predicted` and the five arguments after it; the last ten are buffers.
 
     Args:
         states: A (B, T - 1, Z, Z).
@@ -95,24 +264,31 @@ def _run_filter(
         variances: variances of white noise (B, T, C).
         prior: (Z,) standard deviations of the first states.
         deviations: (B, E) standard deviations of the missing forces.
-        largest: maximum covariance; a run with larger ones is treated as lost.
+        limits: (1,) maximum covariance; a run with larger ones is treated as lost.
         predicted: δ- (B, T, Z).
         covariances: P- (B, T, Z, Z).
         innovations: e (B, T, C).
         gains: K (B, T, Z, C).
         whiteners: W (B, T, C, C).
         likelihood: log L (B,).
+        x: (Z,) deviation of the state.
+        moved: (Z,) deviation of the next state.
+        p: (Z, Z) covariance of the state.
+        work: (Z, Z) product.
+        spread: (Z, Z) propagated covariance.
+        root: (C, C) Cholesky factor L of S.
+        inverse: (C, C) inverse of L.
+        crossed: (Z, C) P Hᵀ.
+        half: (Z, C) P Hᵀ L⁻ᵀ.
+        w: (C,) whitened innovation.
     """
     runs, samples, channels, size = readings.shape
     count = forces.shape[3]
     for run in range(runs):
-        x, moved = np.zeros(size), np.zeros(size)
-        p, work, spread = np.zeros((size, size)), np.zeros((size, size)), np.zeros((size, size))
-        root, inverse = np.zeros((channels, channels)), np.zeros((channels, channels))
-        crossed, half = np.zeros((size, channels)), np.zeros((size, channels))
-        w = np.zeros(channels)
         for z in range(size):
-            p[z, z] = prior[z] * prior[z]
+            x[z] = 0.0
+            for y in range(size):
+                p[z, y] = prior[z] * prior[z] if z == y else 0.0
         total = 0.0
         for i in range(samples):
             h = readings[run, i]
@@ -188,7 +364,7 @@ def _run_filter(
                 moved[z] = value
             for z in range(size):
                 x[z] = moved[z]
-            sandwich(a, p, work, spread)
+            propagate_covariance(a, p, work, spread)
             lost = False
             for z in range(size):
                 for y in range(z + 1):
@@ -200,7 +376,7 @@ def _run_filter(
                             value += g * forces[run, i, y, e] * q * q
                     p[z, y] = value
                     p[y, z] = value
-                    if not abs(value) < largest:
+                    if not abs(value) < limits[0]:
                         lost = True
             if lost:
                 # If the motion is unstable, the state after the step is unknown.
@@ -210,7 +386,7 @@ def _run_filter(
         likelihood[run] = total
 
 
-def _run_smoother(
+def run_smoother(
     states: Array,
     forces: Array,
     readings: Array,
@@ -224,8 +400,20 @@ def _run_smoother(
     missing: Array,
     measured: Array,
     expected: Array,
+    adjoint: Array,
+    moved: Array,
+    white: Array,
+    information: Array,
+    spread: Array,
+    work: Array,
+    back: Array,
+    transposed: Array,
+    closed: Array,
+    weighed: Array,
 ) -> None:
-    """Smooth B runs by (5) and (6); results are written to the last four arguments.
+    """Smooth B runs by (5) and (6).
+
+    Results are written to `smoothed` and the three arguments after it; the last ten are buffers.
 
     Args:
         states: A (B, T - 1, Z, Z).
@@ -241,28 +429,34 @@ def _run_smoother(
         missing: f (B, T - 1, E).
         measured: (E,) numerator of (7), to which the runs are added.
         expected: (E,) denominator of (7), to which the runs are added.
+        adjoint: (Z,) λ.
+        moved: (Z,) λ of the previous sample.
+        white: (C,) whitened innovation.
+        information: (Z, Z) Λ.
+        spread: (Z, Z) propagated Λ.
+        work: (Z, Z) product.
+        back: (Z, Z) A C.
+        transposed: (Z, Z) transpose of `back`.
+        closed: (Z, Z) C.
+        weighed: (C, Z) W H.
     """
     runs, samples, channels, size = readings.shape
     count = forces.shape[3]
     for run in range(runs):
-        adjoint, moved, white = np.zeros(size), np.zeros(size), np.zeros(channels)
-        information, spread = np.zeros((size, size)), np.zeros((size, size))
-        work, back, transposed = (
-            np.zeros((size, size)),
-            np.zeros((size, size)),
-            np.zeros((size, size)),
-        )
-        closed, weighed = np.zeros((size, size)), np.zeros((channels, size))
+        for z in range(size):
+            adjoint[z] = 0.0
+            for y in range(size):
+                information[z, y] = 0.0
         for i in range(samples - 1, -1, -1):
             h, whitener = readings[run, i], whiteners[run, i]
-            product(whitener, h, weighed)
+            multiply_sparse(whitener, h, weighed)
             if i + 1 < samples:
                 # closed = I - K H
-                product(gains[run, i], h, closed)
+                multiply_sparse(gains[run, i], h, closed)
                 for z in range(size):
                     for y in range(size):
                         closed[z, y] = (1.0 if z == y else 0.0) - closed[z, y]
-                product(states[run, i], closed, back)
+                multiply_sparse(states[run, i], closed, back)
                 for z in range(size):
                     value = 0.0
                     for y in range(size):
@@ -271,7 +465,7 @@ def _run_smoother(
                     moved[z] = value
                 for z in range(size):
                     adjoint[z] = moved[z]
-                sandwich(transposed, information, work, spread)
+                propagate_covariance(transposed, information, work, spread)
                 for z in range(size):
                     for y in range(size):
                         information[z, y] = spread[z, y]
@@ -306,9 +500,3 @@ def _run_smoother(
                 missing[run, i - 1, e] = -q * q * pushed
                 measured[e] += pushed * pushed
                 expected[e] += known
-
-
-product: Any = _compile(_multiply_sparse)
-sandwich: Any = _compile(_propagate_covariance)
-filter_recursion: Any = _compile(_run_filter)
-smoother_recursion: Any = _compile(_run_smoother)

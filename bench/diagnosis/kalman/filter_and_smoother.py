@@ -280,7 +280,7 @@ def filter_runs(runs: LinearRuns, force: Array, white: Array) -> Filtered:
     filter_recursion(
         *_make_contiguous(runs.states, runs.defects, runs.forces, runs.readings, runs.residuals),
         *(np.square(runs.jumps), variances, runs.prior),
-        *(_complete_deviations(force, runs), LARGEST_COVARIANCE),
+        *(_complete_deviations(force, runs), np.array([LARGEST_COVARIANCE])),
         *(predicted, covariances, innovations, gains, whiteners, likelihood),
     )
     # The likelihood of a model that diverges is set to zero.

@@ -12,7 +12,7 @@ from bench.diagnosis.kalman.filter_and_smoother import LinearRuns, filter_runs, 
 
 
 def precompile() -> None:
-    """Filter and smooth a tiny example, so that numba compiles the code and caches it on disk."""
+    """Filter and smooth a tiny example, so that the code is compiled and stored in the cache."""
     states, forces = np.ones((1, 1, 2, 2)), np.ones((1, 1, 2, 1))
     runs = LinearRuns(
         states=states,

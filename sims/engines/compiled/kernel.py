@@ -10,7 +10,7 @@ from __future__ import annotations
 import ctypes
 import hashlib
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache, partial
 from pathlib import Path
 from threading import Lock
@@ -38,6 +38,8 @@ KERNEL_SOURCE_MODULES = (
     *("lockstep_stepping", "mujoco_callback", "step_size"),
 )
 """Modules of this package on which the compiled code depends."""
+_COMPILER_MODULES = ("kernel_build", "llvm_code")
+"""Modules of this package that compile functions of other packages."""
 _COMPILE_SECONDS = 20
 """Approximate compilation time in seconds."""
 _lock = Lock()
@@ -119,9 +121,9 @@ class CompiledKernel:
         arguments = np.zeros(kernel_entry.ARGUMENT_COUNT, dtype=np.int64)
         arguments[:5] = kernel_entry.RUN_INSTRUCTIONS, first, last, 1, len(code)
         arguments[11:14] = len(r), r.shape[1], r.shape[1]
-        arguments[kernel_entry.SIZE_COUNT] = _get_address(code)
-        arguments[kernel_entry.SIZE_COUNT + kernel_entry.INT_ARRAY_COUNT] = _get_address(r)
-        run: Any = partial(self._function, ctypes.c_void_p(_get_address(arguments)))
+        arguments[kernel_entry.SIZE_COUNT] = get_address(code)
+        arguments[kernel_entry.SIZE_COUNT + kernel_entry.INT_ARRAY_COUNT] = get_address(r)
+        run: Any = partial(self._function, ctypes.c_void_p(get_address(arguments)))
         run.owners = arguments, code, r  # keeps the memory at the addresses
         return run  # type: ignore[no-any-return]
 
@@ -152,15 +154,15 @@ class CompiledKernel:
             *(arrays.records, spans, divisions, limits),
         ]
         arguments = np.array(
-            [*sizes, *map(_get_address, ints), *map(_get_address, reals)], dtype=np.int64
+            [*sizes, *map(get_address, ints), *map(get_address, reals)], dtype=np.int64
         )
-        self._function(_get_address(arguments))
+        self._function(get_address(arguments))
 
 
 _NullArray = ctypes.c_char * 0
 
 
-def _get_address(array: Array) -> int:
+def get_address(array: Array) -> int:
     """Return the address of an array; NumPy's own way takes four times as long."""
     if array.flags.writeable:
         return ctypes.addressof(_NullArray.from_buffer(array.data))
@@ -182,6 +184,35 @@ def _load_kernel() -> CompiledKernel:
     return CompiledKernel(_load_function())
 
 
+def load_compiled_module(
+    module: str, entry: str, source: Path, description: str
+) -> Callable[[int], None]:
+    """Return a function of a module, compiled on first use with all functions that it calls.
+
+    Args:
+        module: name of the module, which imports nothing that the compiled functions use.
+        entry: name of the function. It receives the address of integers; its code may use
+            `carray` and the functions `to_*_pointer` of `kernel_build`.
+        source: source file of the module.
+        description: what is compiled, for the message to the user.
+
+    Raises:
+        InputError: the compiler or its machine code cannot be used.
+    """
+    compile_sources = [Path(__file__).with_name(f"{name}.py") for name in _COMPILER_MODULES]
+
+    def compile_module() -> bytes:
+        """Compile the module with numba, and tell the user why this takes time."""
+        _print_line(f"compiling {description}, once after an install: about 10 s")
+        from sims.engines.compiled.kernel_build import build_module
+
+        return build_module(module, entry)
+
+    key = _hash_sources([source, *compile_sources])
+    with _lock:
+        return _load_stored(f"{source.stem}-{key}.bin", compile_module, 1)
+
+
 def load_callback(offsets: Mapping[str, int]) -> Callable[..., None]:
     """Return the compiled callback of MuJoCo's steps, compiled on first use.
 
@@ -197,9 +228,30 @@ def load_callback(offsets: Mapping[str, int]) -> Callable[..., None]:
 
 def _load_function(offsets: Mapping[str, int] | None = None) -> Callable[..., None]:
     """Return the function of the kernel, or with offsets the callback, see `load_callback`."""
+    name = "stepping" if offsets is None else "callback"
+    return _load_stored(
+        f"{name}-{_compute_cache_key(offsets)}.bin",
+        lambda: _compile_machine_code(offsets),
+        1 if offsets is None else 2,
+    )
+
+
+def _load_stored(
+    name: str, compile_code: Callable[[], bytes], pointers: int
+) -> Callable[..., None]:
+    """Return the function whose machine code is in a file of the cache, compiled if necessary.
+
+    Args:
+        name: name of the file.
+        compile_code: function that compiles the code if the file does not exist.
+        pointers: number of pointer arguments of the function.
+
+    Raises:
+        InputError: the compiler or its machine code cannot be used.
+    """
     try:
-        code = llvm_code.MachineCode.unpack(_get_machine_code(offsets))
-        return llvm_code.load_machine_code(code, 1 if offsets is None else 2)
+        code = llvm_code.MachineCode.unpack(_get_machine_code(name, compile_code))
+        return llvm_code.load_machine_code(code, pointers)
     # A compiler that does not match this Python or its NumPy may raise any error.
     except Exception as error:
         text = (str(error) or type(error).__name__).splitlines()[0]
@@ -209,26 +261,25 @@ def _load_function(offsets: Mapping[str, int] | None = None) -> Callable[..., No
         ) from error
 
 
-def _get_machine_code(offsets: Mapping[str, int] | None) -> bytes:
-    """Return the machine code: from the cache, or compiled.
+def _get_machine_code(name: str, compile_code: Callable[[], bytes]) -> bytes:
+    """Return the machine code: from the file `name` of the cache, or compiled.
 
     Compilation takes about 20 s, so the code is stored in the user's cache. If the cache cannot
     be written, each process compiles again.
     """
     folder = code_cache.get_cache_folder()
-    name = "stepping" if offsets is None else "callback"
-    path = folder / f"{name}-{_compute_cache_key(offsets)}.bin"
+    path = folder / name
     data = code_cache.read_cached(path)
     if data is not None:
         return data
     try:
-        return code_cache.make_cached(path, lambda: _compile_machine_code(offsets), _report_wait)
+        return code_cache.make_cached(path, compile_code, _report_wait)
     except OSError as error:
         _print_line(
             f"machine code cannot be stored in {folder} ({error.strerror or error}), so each"
             " process compiles it; set SIMGAP_COMPILED to a folder that can be written"
         )
-        return _compile_machine_code(offsets)
+        return compile_code()
 
 
 def _compile_machine_code(offsets: Mapping[str, int] | None) -> bytes:
@@ -251,8 +302,7 @@ def _compile_machine_code(offsets: Mapping[str, int] | None) -> bytes:
 def _report_wait() -> None:
     """Tell the user that another process is compiling, so that this one waits for its result."""
     _print_line(
-        "another process compiles the batch engine, once after an install:"
-        f" {_COMPILE_SECONDS} s at most"
+        f"another process compiles this code, once after an install: {_COMPILE_SECONDS} s at most"
     )
 
 
@@ -264,12 +314,18 @@ def _print_line(text: str) -> None:
 
 def _compute_cache_key(offsets: Mapping[str, int] | None = None) -> str:
     """Return a hash of everything on which the code depends: sources, compiler, processor."""
+    return _hash_sources(
+        list_source_files(), "" if offsets is None else repr(sorted(offsets.items()))
+    )
+
+
+def _hash_sources(sources: Sequence[Path], further_text: str = "") -> str:
+    """Return a hash of source files, the compiler, the processor and a further text."""
     digest = hashlib.sha256()
-    for source in list_source_files():
+    for source in sources:
         digest.update(source.read_bytes())
     digest.update(repr(llvm_code.describe_processor()).encode())
-    if offsets is not None:
-        digest.update(repr(sorted(offsets.items())).encode())
+    digest.update(further_text.encode())
     return digest.hexdigest()[:24]
 
 

@@ -12,6 +12,7 @@ import subprocess
 import sys
 from collections.abc import Collection, Mapping, Sequence
 from graphlib import TopologicalSorter
+from importlib import import_module
 from types import FunctionType, ModuleType
 from typing import Any
 
@@ -61,7 +62,7 @@ _INLINED_FUNCTIONS = frozenset(
 """Functions that are inlined, because a call costs more than their body."""
 _START = (
     "import sys; sys.path[:] = {path!r}; "
-    "from sims.engines.compiled.kernel_build import main; main({offsets!r})"
+    "from sims.engines.compiled.kernel_build import main; main(*{arguments!r})"
 )
 
 
@@ -76,11 +77,29 @@ def build_kernel(offsets: Mapping[str, int] | None = None) -> bytes:
         llvm_code.CodeNotLoadableError: the compilation failed; the message is the last line of
             the compiler's output.
     """
+    return _run_compiler(offsets)
+
+
+def build_module(module: str, entry: str) -> bytes:
+    """Return the packed machine code of a function of a module and all functions that it calls.
+
+    Args:
+        module: name of the module.
+        entry: name of the function, which receives a pointer to integers.
+
+    Raises:
+        llvm_code.CodeNotLoadableError: as for `build_kernel`.
+    """
+    return _run_compiler(None, module, entry)
+
+
+def _run_compiler(*arguments: Any) -> bytes:
+    """Run `main` with these arguments in another process, and return its output."""
     environment = {k: v for k, v in os.environ.items() if not k.startswith("NUMBA_")}
     # Everything is optimised once at the end, instead of each function with all its callees.
     environment["NUMBA_OPT"] = "0"
     process = subprocess.run(
-        [sys.executable, "-c", _START.format(path=sys.path, offsets=offsets)],
+        [sys.executable, "-c", _START.format(path=sys.path, arguments=arguments)],
         env=environment,
         capture_output=True,
         stdin=subprocess.DEVNULL,
@@ -94,9 +113,12 @@ def build_kernel(offsets: Mapping[str, int] | None = None) -> bytes:
     return process.stdout
 
 
-def main(offsets: Mapping[str, int] | None = None) -> None:
-    """Write the code to the standard output, where `build_kernel` reads it."""
-    emitted = emit_llvm() if offsets is None else emit_callback(offsets)
+def main(offsets: Mapping[str, int] | None = None, module: str = "", entry: str = "") -> None:
+    """Write the code to the standard output, where `build_kernel` or `build_module` reads it."""
+    if module:
+        emitted = emit_module(module, entry)
+    else:
+        emitted = emit_llvm() if offsets is None else emit_callback(offsets)
     sys.stdout.buffer.write(llvm_code.compile_llvm(*emitted).pack())
 
 
@@ -128,6 +150,31 @@ def emit_callback(offsets: Mapping[str, int]) -> tuple[str, str]:
         FunctionType(limits.__code__, space, "set_friction_limits")
     )
     return _emit_llvm_code(numba, mujoco_callback.add_effect_forces, space, 2)
+
+
+def emit_module(module: str, entry: str) -> tuple[str, str]:
+    """Return the LLVM intermediate code of a function of a module, and the name of the function.
+
+    Args:
+        module: name of the module.
+        entry: name of the function, which receives a pointer to integers.
+    """
+    import numba as typed
+
+    numba: Any = typed
+    names = _list_module_names(import_module(module))
+    space = {**names, **_make_intrinsics(numba), "carray": numba.carray}
+    functions = {
+        name: value
+        for name, value in names.items()
+        if isinstance(value, FunctionType) and value.__module__ == module
+    }
+    # A function is compiled for the types of its arguments when its caller is compiled.
+    for name, function in functions.items():
+        space[name] = numba.njit(
+            error_model="numpy", _nrt=False, no_cpython_wrapper=True, no_cfunc_wrapper=True
+        )(FunctionType(function.__code__, space, name))
+    return _emit_llvm_code(numba, functions[entry], space, 1)
 
 
 def _list_module_names(module: ModuleType, excluded: Collection[str] = ()) -> dict[str, Any]:

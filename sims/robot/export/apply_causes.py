@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from sims import effects as library
 from sims.core.effect import SeriesElement
@@ -358,6 +357,9 @@ def _convert_to_inner_frame(body: Any, position: Sequence[float]) -> Array:
 
     MuJoCo replaces the bodies that it fuses by such frames.
     """
+    # Importing scipy.spatial takes 0.1 s, and most model files have no fused bodies.
+    from scipy.spatial.transform import Rotation
+
     rotation, origin = Rotation.identity(), np.zeros(3)
     frame = body.frame
     while frame is not None:

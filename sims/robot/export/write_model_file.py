@@ -32,7 +32,6 @@ from sims.robot.export.mjcf_document import (
 )
 from sims.robot.export.mjcf_writer import MjcfWriter
 from sims.robot.export.model_comparison import find_first_difference
-from sims.robot.export.urdf_writer import UrdfWriter
 from sims.robot.fitted_causes import expand_families
 from sims.robot.model_field_effects import get_coupling_address, get_write_order
 from sims.robot.mujoco_messages import capture_mujoco_warnings
@@ -220,6 +219,9 @@ def _render_urdf(
     robot: RobotModel, causes: CauseCoefficients, recording: str, notes: list[str]
 ) -> str | None:
     """Render the URDF with the causes that it can express, and add notes about all others."""
+    # Importing scipy.spatial takes 0.1 s, and only robots from a URDF need it.
+    from sims.robot.export.urdf_writer import UrdfWriter
+
     try:
         writer = UrdfWriter(robot, recording)
     except NotEditableError as unfit:

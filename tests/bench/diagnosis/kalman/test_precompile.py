@@ -1,26 +1,76 @@
+"""Tests of the stored machine code of the Kalman recursions."""
+
 import os
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
-SIGNATURES = """
-from bench.diagnosis.kalman.precompile import precompile
-from bench.diagnosis.kalman.compiled_recursions import (
-    filter_recursion, smoother_recursion
-)
-precompile()
-before = [set(f.signatures) for f in (filter_recursion, smoother_recursion)]
-assert all(before), before
-from bench.diagnosis.explain import explain
-explain("examples/robot/log.csv")
-assert before == [set(f.signatures) for f in (filter_recursion, smoother_recursion)]
-"""
+from bench.diagnosis.kalman import compiled_recursions
+from bench.diagnosis.kalman.filter_and_smoother import LinearRuns, filter_runs, smooth_runs
 
 
 @pytest.mark.slow
-def test_an_explanation_needs_no_other_code(tmp_path):
+def test_one_file_holds_the_code_and_is_loaded_without_the_compiler(tmp_path):
     pytest.importorskip("numba")
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
-    subprocess.run([sys.executable, "-c", SIGNATURES], check=True, env=environment)
-    assert list(tmp_path.rglob("*_filter*.nbc"))
+    environment = {**os.environ, "SIMGAP_COMPILED": str(tmp_path)}
+    command = [sys.executable, "-m", "bench.diagnosis.kalman.precompile"]
+    first = subprocess.run(command, check=True, env=environment, capture_output=True, text=True)
+    assert "compiling the Kalman filter, once after an install" in first.stderr
+    assert [path.suffix for path in sorted(tmp_path.iterdir())] == [".bin", ".lock"]
+    without = (
+        "import sys; sys.modules['numba'] = None; "
+        "from bench.diagnosis.kalman.precompile import precompile; precompile()"
+    )
+    again = [sys.executable, "-c", without]
+    second = subprocess.run(again, check=True, env=environment, capture_output=True, text=True)
+    assert second.stderr == ""
+
+
+def make_runs():
+    rng = np.random.default_rng(3)
+    b, t, c, z, e = 2, 30, 2, 4, 3
+    return LinearRuns(
+        states=0.9 * np.eye(z) + 0.05 * rng.standard_normal((b, t - 1, z, z)),
+        defects=0.1 * rng.standard_normal((b, t - 1, z)),
+        forces=rng.standard_normal((b, t - 1, z, e)),
+        inputs=np.zeros((b, t - 1, z, e)),
+        readings=rng.standard_normal((b, t, c, z)),
+        residuals=rng.standard_normal((b, t, c)),
+        recorded=rng.random((b, t, c)) < 0.9,
+        prior=np.ones(z),
+        step_errors=np.zeros((b, t - 1, z)),
+        jumps=np.full((b, t - 1, z), 0.01),
+    )
+
+
+def run_both(runs):
+    force, white = np.array([0.1, 0.2, 0.3]), np.array([0.01, 0.02])
+    filtered = filter_runs(runs, force, white)
+    smoothed = smooth_runs(runs, filtered, force)
+    return [
+        filtered.predicted,
+        filtered.covariances,
+        filtered.whitened,
+        filtered.log_likelihood,
+        smoothed.states,
+        smoothed.forces,
+        smoothed.score,
+    ]
+
+
+def test_compiled_and_interpreted_recursions_agree(monkeypatch):
+    pytest.importorskip("llvmlite")
+    compiled = run_both(make_runs())
+    monkeypatch.setattr(compiled_recursions, "_load_compiled_recursions", lambda: None)
+    for fast, slow in zip(compiled, run_both(make_runs()), strict=True):
+        np.testing.assert_allclose(fast, slow, rtol=1e-9, atol=1e-12)
+
+
+def test_arrays_of_another_shape_are_rejected():
+    runs = make_runs()
+    with pytest.raises(ValueError, match=r"expected a contiguous array of shape \(2, 29, 4\)"):
+        filter_runs(
+            LinearRuns(**{**vars(runs), "defects": np.zeros((2, 28, 4))}), np.ones(3), np.ones(2)
+        )
