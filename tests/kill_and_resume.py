@@ -26,9 +26,9 @@ import pandas as pd
 import psutil
 import tomli_w
 
-from bench.benchmark.isolation.scratch_folders import remove_stale_folders
-from bench.benchmark.storage.journal_segments import read_finished_statuses
+from bench.benchmark.isolation.tuner_processes import remove_stale_folders
 from bench.benchmark.storage.result_folder import read_configuration
+from bench.benchmark.storage.run_journal import read_finished_statuses
 from tests.conftest import PLUGINS
 from tests.local_cluster import cluster, command_line
 from tests.sample_experiments import SPRING

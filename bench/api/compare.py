@@ -11,15 +11,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeAlias
 
 from bench.api.comparison_options import ComparisonOptions, StudyOptions
-from bench.benchmark.comparison_tables import build_tables
-from bench.benchmark.figures import comparison_figures, comparison_view
+from bench.benchmark.figures import comparison_charts, comparison_figures
 from bench.benchmark.problem.availability import leave_out_missing_problems
 from bench.benchmark.problem.experiment import Experiment, list_experiment_names, load_experiment
-from bench.benchmark.problem.model_file_simulator import complete_robot_experiment
-from bench.benchmark.problem.robot_experiment import make_robot_experiment
+from bench.benchmark.problem.robot_experiment import (
+    complete_robot_experiment,
+    make_robot_experiment,
+)
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.benchmark.runner.plugin_discovery import load_plugins_for_experiment
 from bench.benchmark.runner.resource_checks import check_comparison_size
+from bench.benchmark.statistics.comparison_tables import build_tables
 from bench.benchmark.storage.csv_reader import CsvTable
 from bench.benchmark.storage.reference_results import find_reference
 from bench.benchmark.storage.result_folder import StoredComparison, read_comparison
@@ -48,7 +50,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from bench.benchmark.runner.worker_pools import Pool
-    from bench.benchmark.storage.study_progress import StudyOutcome
+    from bench.benchmark.storage.run_status import StudyOutcome
 
 _SHOT_TABLE_COLUMNS = {
     "status": SHOT_STATUS_COLUMNS,
@@ -374,14 +376,14 @@ class ComparisonResult:
         return read_comparison(self.folder)
 
     @cached_property
-    def _axis_labels(self) -> comparison_view.AxisLabels:
+    def _axis_labels(self) -> comparison_charts.AxisLabels:
         """Labels of axes in figures: names and units of the parameters and channels.
 
         The problem is built to read them, which takes time, so the labels are cached.
         """
         problem = TuningProblem(self.experiment)
         try:
-            return comparison_view.make_axis_labels(problem)
+            return comparison_charts.make_axis_labels(problem)
         finally:
             problem.close()
 

@@ -8,14 +8,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from bench.benchmark.isolation.process_exit import RunEndedError
+from bench.benchmark.isolation.process_limits import RunEndedError
 from bench.benchmark.problem.experiment import (
     Experiment,
     TunerEntry,
     list_experiment_names,
     load_experiment,
 )
-from bench.benchmark.problem.model_file_simulator import complete_robot_experiment
+from bench.benchmark.problem.robot_experiment import complete_robot_experiment
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.benchmark.runner.experiment_runner import ProgressFactory
 from bench.benchmark.runner.plugin_discovery import load_plugins_for_experiment, must_build_isolated

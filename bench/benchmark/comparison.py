@@ -7,29 +7,35 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from bench.benchmark.storage.csv_reader import RunsTable
 from bench.benchmark.storage.integrity_checks import (
+    check_plan,
     check_rows_match_statuses,
     check_runs,
     check_segment_statuses,
 )
-from bench.benchmark.storage.journal_segments import (
+from bench.benchmark.storage.result_folder import (
+    read_comparison,
+    read_configuration,
+    read_salt,
+    reveal_salt,
+    write_results,
+)
+from bench.benchmark.storage.run_journal import (
     PLAN_FILE,
     PLAN_REMEDY,
     SEGMENT_REMEDY,
     SEGMENTS_FOLDER,
+    RunJournal,
     read_plan,
     read_statuses_by_file,
     write_plan,
 )
-from bench.benchmark.storage.plan_checks import check_plan
-from bench.benchmark.storage.result_folder import read_comparison, read_configuration, write_results
-from bench.benchmark.storage.run_journal import RunJournal
-from bench.benchmark.storage.run_status import STATUS_COLUMN_NAMES, RunStatus
-from bench.benchmark.storage.runs_reader import RunsTable
-from bench.benchmark.storage.salt_file import read_salt, reveal_salt
-from bench.benchmark.storage.study_progress import (
+from bench.benchmark.storage.run_status import (
     MISSING_STATUS,
+    STATUS_COLUMN_NAMES,
     RunEnd,
+    RunStatus,
     StudyOutcome,
     StudyProgress,
 )
@@ -263,7 +269,7 @@ class Comparison:
         single parameter.
         """
         if results.spectra:
-            from bench.benchmark.statistics.identifiability_table import build_identifiability_table
+            from bench.benchmark.statistics.comparison_tables import build_identifiability_table
 
             problem = results.problem
             table = build_identifiability_table(

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from bench.benchmark.figures.rank_figure import draw_critical_difference_figure
+from bench.benchmark.figures.comparison_figures import draw_critical_difference_figure
 from bench.benchmark.problem.experiment import Experiment, TunerEntry
 from bench.benchmark.report_page.multi_problem_page import (
     MultiProblemPageData,
@@ -20,16 +20,18 @@ from bench.benchmark.report_page.multi_problem_page import (
 )
 from bench.benchmark.results_report import REPORT_FILE, REQUIRED_RUN_COLUMNS
 from bench.benchmark.statistics.comparison_statistics import ComparisonStatistics
+from bench.benchmark.statistics.comparison_tables import add_trust_column
 from bench.benchmark.statistics.error_curves import RunCurves
-from bench.benchmark.statistics.expected_running_time import build_ert_table
+from bench.benchmark.statistics.expected_running_time import (
+    build_ert_table,
+    compute_solved_fraction,
+)
 from bench.benchmark.statistics.paired_tests import compare_all_pairs
-from bench.benchmark.statistics.problem_ranks import (
+from bench.benchmark.statistics.tuner_ranking import (
     MIN_PROBLEMS_FOR_RANKS,
     compute_nemenyi_p_values,
     compute_problem_ranks,
 )
-from bench.benchmark.statistics.provenance_columns import add_trust_column
-from bench.benchmark.statistics.runtime_distribution import compute_solved_fraction
 from bench.benchmark.storage.result_folder import read_comparison
 from bench.figures.style import (
     FigureFiles,

@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from bench.benchmark.figures import comparison_figures
+from bench.benchmark.figures.comparison_charts import make_axis_labels
 from bench.benchmark.figures.comparison_figures import (
     FIGURE_FILES,
     OVERLAYABLE_FIGURES,
     check_references_allowed,
 )
-from bench.benchmark.figures.comparison_view import make_axis_labels
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.benchmark.results_report import REQUIRED_RUN_COLUMNS
 from bench.benchmark.storage.reference_results import ReferenceResult

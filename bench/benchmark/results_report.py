@@ -9,26 +9,27 @@ from pathlib import Path
 
 import pandas as pd
 
-from bench.benchmark.comparison_tables import build_tables
 from bench.benchmark.figures import comparison_figures
-from bench.benchmark.figures.comparison_view import AxisLabels, ComparisonView, make_axis_labels
-from bench.benchmark.isolation.process_exit import ISOLATION_NOTE, without_isolation
+from bench.benchmark.figures.comparison_charts import AxisLabels, ComparisonView, make_axis_labels
+from bench.benchmark.isolation.process_limits import ISOLATION_NOTE, without_isolation
 from bench.benchmark.problem.experiment import Experiment
-from bench.benchmark.problem.numeric_warnings import numeric_warnings_silenced
-from bench.benchmark.problem.tuning_problem import TuningProblem
+from bench.benchmark.problem.tuning_problem import TuningProblem, numeric_warnings_silenced
 from bench.benchmark.report_page import headline
-from bench.benchmark.report_page.comparison_conclusion import format_redraws
-from bench.benchmark.report_page.comparison_page import render_page
-from bench.benchmark.report_page.comparison_page_data import ComparisonReportData
+from bench.benchmark.report_page.comparison_page import (
+    ComparisonReportData,
+    format_redraws,
+    render_page,
+)
 from bench.benchmark.statistics.comparison_statistics import ComparisonStatistics
-from bench.benchmark.statistics.error_table import build_summary
-from bench.benchmark.storage.journal_segments import SEGMENTS_FOLDER, read_plan
+from bench.benchmark.statistics.comparison_tables import build_tables
+from bench.benchmark.statistics.error_curves import build_summary
 from bench.benchmark.storage.result_folder import (
     CONFIGURATION_FILE,
     StoredComparison,
     read_comparison,
     read_environment,
 )
+from bench.benchmark.storage.run_journal import SEGMENTS_FOLDER, read_plan
 from bench.benchmark.storage.run_status import FAILED_OR_SKIPPED_STATUSES
 from bench.figures.style import (
     TRUSTED_TUNERS_NOTE,

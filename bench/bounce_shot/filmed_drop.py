@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.figures.track_figure import render_track_figure
+from bench.figures.recording_figure import render_track_figure
 from bench.logs import film_tracking
 from sims.core.simulator import Array
 from sims.vision.ball_renderer import BallScene, SceneAppearance

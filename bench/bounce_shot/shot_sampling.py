@@ -13,13 +13,12 @@ from pathlib import Path
 import numpy as np
 
 from bench.benchmark.problem.experiment import Experiment
-from bench.benchmark.problem.salt import PUBLIC_SALT
 from bench.bounce_shot.ball_kinds import BallKind, get_ball_kind
 from bench.bounce_shot.filmed_drop import film_and_track_drop
 from bench.bounce_shot.shot_config import ShotConfig
 from bench.bounce_shot.shot_geometry import ShotGeometry
 from bench.bounce_shot.true_world import GRAVITY, InclinedGround, simulate_shot
-from bench.core.random_streams import make_rng
+from bench.core.random_streams import PUBLIC_SALT, make_rng
 from sims.recording.recording import Recording, Run, read_recording
 from sims.recording.recording_writer import write_recording
 from sims.systems.ball import Ball as BallSimulator

@@ -28,9 +28,8 @@ from bench.benchmark.runner.tuner_training import (
     train_or_load,
 )
 from bench.benchmark.runner.worker_pools import Call, Pool, PoolLostError, make_pool
-from bench.benchmark.storage.result_folder import read_configuration
-from bench.benchmark.storage.salt_file import read_salt, reveal_salt
-from bench.benchmark.storage.study_progress import (
+from bench.benchmark.storage.result_folder import read_configuration, read_salt, reveal_salt
+from bench.benchmark.storage.run_status import (
     MISSING_STATUS,
     RunEnd,
     StudyOutcome,

@@ -1,9 +1,16 @@
-"""Progress bars on stderr with an estimate of the remaining time, for work of counted steps."""
+"""Show progress on stderr: bars of counted steps, and the live line of a search."""
 
 from __future__ import annotations
 
+import os
+import shutil
+import signal
 import sys
-from collections.abc import Callable
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, TextIO
 
 _TERMINAL_REFRESH_SECONDS = 0.2
 """Minimum time between two updates of a bar on a terminal, in seconds."""
@@ -55,3 +62,375 @@ class ProgressBars:
             bar.update()
 
         return step
+
+
+TERMINAL_INTERVAL = 0.2
+"""Minimum time between two updates of the live line, in seconds."""
+LOG_INTERVAL = 10.0
+"""Minimum time between two lines if stderr is not a terminal, in seconds."""
+UPDATE_INTERVAL = 0.5
+"""Interval of the timer that updates the display between two events, in seconds."""
+HINT_AFTER = 20.0
+"""Elapsed time after which `BUDGET_HINT` is printed, in seconds."""
+BUDGET_HINT = "add --budget 60 to stop after a minute with the best result so far"
+MIN_SHARE_FOR_ESTIMATE = 0.02
+"""Minimum share of the search that must be done before the remaining time is estimated."""
+MIN_REMAINING_RATIO = 0.5
+"""Minimum ratio of the estimated remaining time to the time since the last event."""
+BAR_WIDTH = 10
+"""Width of the bar, in characters."""
+
+
+class SearchProgress:
+    """The state of a running search: a `ProgressListener` that stores the latest events.
+
+    Args:
+        clock: Returns the time in seconds.
+        budget: Seconds after which the search ends; None without such a limit.
+    """
+
+    def __init__(
+        self, clock: Callable[[], float] = time.monotonic, budget: float | None = None
+    ) -> None:
+        """Begin with nothing done, no stage and no model found.
+
+        `_share` is the share of the search that is done, `_best` the effects of the best model so
+        far and the percentage of the gap that it closes, both as text.
+        """
+        self._clock = clock
+        self._budget = budget
+        self._started = clock()
+        self._name = ""
+        self._total: int | None = None
+        self._done = 0
+        self._best: tuple[str, str] | None = None
+        self._share = 0.0
+        self._is_searching = True
+        # The remaining time as estimated when the share last increased, and the time of that
+        # estimate.
+        self._estimate: float | None = None
+        self._estimated_at = self._started
+
+    def stage(self, name: str, total: int | None = None) -> None:
+        """Begin a stage; see `ProgressListener`."""
+        self._name, self._total, self._done = name, total, 0
+
+    def advance(self, count: int = 1) -> None:
+        """Finish steps of the stage; see `ProgressListener`."""
+        self._done += count
+
+    def found(self, effects: Sequence[str], share: float) -> None:
+        """Store the best model so far; see `ProgressListener`."""
+        # 99.96 % must not be shown as 100 %.
+        percent = "over 99" if 0.99 < share < 1.0 else f"{100.0 * share:.0f}"
+        self._best = " + ".join(effects), percent
+
+    def completed(self, share: float) -> None:
+        """Estimate the remaining time from the share done; see `ProgressListener`."""
+        # A model with more effects makes the share smaller, but a bar must not go back.
+        if share <= self._share:
+            return
+        self._share = min(share, 1.0)
+        self._estimated_at = self._clock()
+        if self._share >= MIN_SHARE_FOR_ESTIMATE:
+            self._estimate = self.elapsed() * (1.0 - self._share) / self._share
+
+    def elapsed(self) -> float:
+        """Return the seconds since the search began."""
+        return self._clock() - self._started
+
+    def remaining(self) -> float | None:
+        """Return the estimated remaining seconds; None if unknown or if the search has ended.
+
+        The estimate assumes the mean speed so far. Between two events it counts down; if the next
+        event is overdue, it grows with the time since the last one.
+        """
+        if self._estimate is None or not self._is_searching:
+            return None
+        estimate_age = self._clock() - self._estimated_at
+        return max(self._estimate - estimate_age, MIN_REMAINING_RATIO * estimate_age)
+
+    def finish(self, name: str) -> None:
+        """End the search and begin a stage that follows it, such as drawing figures."""
+        self._is_searching = False
+        self.stage(name)
+
+    def lines(self, empty: str = "", full: str = "") -> Iterator[str]:
+        """Yield the state of the search as one line, first the longest form, then shorter ones.
+
+        The caller shows the first one that fits into the width of the terminal.
+
+        Args:
+            empty: Character of the bar for the part that is not done; empty for no bar.
+            full: Character of the bar for the part that is done.
+        """
+        # Rounded down: a full bar means that everything is done.
+        filled_width = int(BAR_WIDTH * self._share)
+        percent, bar = f"{100 * self._share:3.0f}% ", ""
+        if not self._is_searching:
+            # The share refers to the search, which may have ended early.
+            percent = ""
+        elif empty:
+            bar = f"|{full * filled_width}{empty * (BAR_WIDTH - filled_width)}| "
+        long = self._join_parts(
+            self._format_times(), self._format_stage(), self._format_best_so_far()
+        )
+        short = self._join_parts(
+            self._format_times(), self._format_stage(), self._format_best_so_far("best {1} % {0}")
+        )
+        yield f"simgap {percent}{bar}{long}"
+        yield f"{percent}{bar}{short}"
+        yield f"{percent}{short}"
+
+    def report(self) -> str:
+        """Return the state as a line of a log."""
+        times = self._format_times() if self.elapsed() >= 1.0 else ""
+        return self._join_parts(self._format_stage(), self._format_best_so_far(), times)
+
+    @staticmethod
+    def _join_parts(*parts: str) -> str:
+        return "; ".join(part for part in parts if part)
+
+    def _format_best_so_far(self, form: str = "best so far {0} closes {1} % of the gap") -> str:
+        return form.format(*self._best) if self._best is not None else ""
+
+    def _format_stage(self) -> str:
+        if self._total is None or self._total < 2:
+            return self._name
+        return f"{self._name}, {min(self._done, self._total)} of {self._total}"
+
+    def _format_times(self) -> str:
+        """Format the elapsed time, and the remaining time while the search is running.
+
+        With a time budget the remaining time is an upper limit; otherwise it is an estimate, or
+        missing.
+        """
+        elapsed = format_clock(self.elapsed())
+        if not self._is_searching:
+            return elapsed
+        if self._budget is not None:
+            remaining_seconds = self._budget - self.elapsed()
+            remaining_text = (
+                f"at most {format_clock(remaining_seconds)} left"
+                if remaining_seconds > 0
+                else "budget used up, finishing this step"
+            )
+            return f"{elapsed}, {remaining_text}"
+        remaining = self.remaining()
+        return elapsed if remaining is None else f"{elapsed}, about {format_clock(remaining)} left"
+
+
+def format_clock(seconds: float) -> str:
+    """Return a duration as ``0:07`` or ``1:02:03``."""
+    minutes, seconds_part = divmod(round(max(seconds, 0.0)), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02}:{seconds_part:02}" if hours else f"{minutes}:{seconds_part:02}"
+
+
+class ProgressDisplay(SearchProgress):
+    """Context that shows a search's progress on stderr.
+
+    On a terminal it keeps one live line, which it erases at the end. Elsewhere it prints a line at
+    most every `LOG_INTERVAL` seconds. Events only store values and read the clock, so that the
+    search is not slowed down. A timer signal redraws between events instead of a thread, because a
+    process with threads cannot fork workers safely.
+
+    Args:
+        budget: Seconds after which the search ends; None without such a limit.
+        silent: Whether to show nothing.
+        hint: Whether to print `BUDGET_HINT` in a long search without a budget.
+        stream: Output stream; stderr if None.
+        clock: Returns the time in seconds.
+    """
+
+    def __init__(
+        self,
+        budget: float | None = None,
+        *,
+        silent: bool = False,
+        hint: bool = True,
+        stream: TextIO | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """Choose the form of the display; nothing is shown before the first event.
+
+        `_shown` is the live line now on the terminal, `_shown_at` the time of the last output, and
+        `_waiting` has permanent lines that are still to be printed.
+        """
+        super().__init__(clock, budget)
+        self._stream = sys.stderr if stream is None else stream
+        self._live = self._stream.isatty()
+        self._silent = silent
+        self._hints = hint and budget is None
+        self._interval = TERMINAL_INTERVAL if self._live else LOG_INTERVAL
+        self._shown_at: float | None = None
+        self._shown = ""
+        # A signal may arrive while a line is written; its own output waits until that is done.
+        self._busy = False
+        self._waiting: list[str] = []
+        self._has_timer = False
+
+    def __enter__(self) -> ProgressDisplay:
+        """Start the timer that redraws the live line, where signals can be used."""
+        if not self._silent and _can_use_timer():
+            signal.signal(signal.SIGALRM, lambda *_: self._redraw_if_due())
+            # System calls of libraries continue after the signal.
+            signal.siginterrupt(signal.SIGALRM, False)
+            signal.setitimer(signal.ITIMER_REAL, UPDATE_INTERVAL, UPDATE_INTERVAL)
+            self._has_timer = True
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Stop the timer, erase the live line, print what is waiting, and show nothing any more."""
+        if self._has_timer:
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
+            signal.signal(signal.SIGALRM, signal.SIG_DFL)
+        # An exception may have occurred while a line was written.
+        self._busy = False
+        with self._block_timer_writes():
+            self._erase_live_line()
+            self._print_waiting()
+        self._silent = True
+
+    def stage(self, name: str, total: int | None = None) -> None:
+        """Begin a stage and show it.
+
+        Args:
+            name: Name of the stage.
+            total: Number of its steps; None if unknown.
+        """
+        super().stage(name, total)
+        self._redraw_if_due()
+
+    def advance(self, count: int = 1) -> None:
+        """Finish steps of the stage and show it."""
+        super().advance(count)
+        self._redraw_if_due()
+
+    def found(self, effects: Sequence[str], share: float) -> None:
+        """Store the best model so far and show it.
+
+        Args:
+            effects: Effects of the model.
+            share: Share of the gap that it closes.
+        """
+        super().found(effects, share)
+        self._redraw_if_due()
+
+    def completed(self, share: float) -> None:
+        """Store the share done and show it."""
+        super().completed(share)
+        self._redraw_if_due()
+
+    def note(self, text: str) -> None:
+        """Print a permanent line: above the live line on a terminal."""
+        if self._silent:
+            return
+        self._waiting.append(text)
+        if not self._busy:
+            with self._block_timer_writes():
+                self._draw_lines()
+
+    @contextmanager
+    def paused(self) -> Iterator[None]:
+        """Erase the live line while something else is printed on the terminal."""
+        with self._block_timer_writes():
+            self._erase_live_line()
+        self._busy = True
+        try:
+            yield
+        finally:
+            self._busy = False
+
+    def _redraw_if_due(self) -> None:
+        """Show the state, unless that was done less than an interval ago."""
+        if self._silent or self._busy or not self._name:
+            return
+        current_time = self._clock()
+        if self._shown_at is not None and current_time - self._shown_at < self._interval:
+            return
+        with self._block_timer_writes():
+            if self._hints and self.elapsed() >= HINT_AFTER and self._is_searching:
+                self._hints = False
+                self._waiting.append(BUDGET_HINT)
+            self._shown_at = current_time
+            if self._live:
+                self._draw_lines()
+            else:
+                self._print_waiting()
+                self._stream.write(f"simgap: {self.report()} ...\n")
+                self._stream.flush()
+
+    @contextmanager
+    def _block_timer_writes(self) -> Iterator[None]:
+        """Mark the time in which stderr is written, so that the timer signal does not write too."""
+        self._busy = True
+        try:
+            yield
+        except (OSError, ValueError):
+            # stderr is closed or no longer read; the search continues without display.
+            self._silent = True
+        finally:
+            self._busy = False
+
+    def _draw_lines(self) -> None:
+        """Write the waiting lines, then the live line on a terminal."""
+        if self._waiting:
+            self._erase_live_line()
+            self._print_waiting()
+        if not self._live or not self._name:
+            return
+        from tqdm.utils import disp_len, disp_trim
+
+        columns = _get_terminal_width(self._stream) - 1
+        lines = list(self.lines(*_choose_bar_characters(self._stream)))
+        line = next((candidate for candidate in lines if disp_len(candidate) <= columns), lines[-1])
+        line = disp_trim(line, columns)
+        # A terminal echoes ^C at the end of the line, so two more characters are overwritten.
+        padding = min(disp_len(self._shown) + 2, columns) - disp_len(line)
+        self._stream.write("\r" + line + " " * max(padding, 0) + "\b" * max(padding, 0))
+        self._stream.flush()
+        self._shown = line
+
+    def _print_waiting(self) -> None:
+        while self._waiting:
+            self._stream.write(f"simgap: {self._waiting.pop(0)}\n")
+            self._stream.flush()
+
+    def _erase_live_line(self) -> None:
+        """Overwrite the live line with spaces; nothing to do without a terminal or a line.
+
+        Two more characters are overwritten, because a terminal echoes ^C at the end of the line.
+        """
+        if self._live and self._shown:
+            from tqdm.utils import disp_len
+
+            width = min(disp_len(self._shown) + 2, _get_terminal_width(self._stream) - 1)
+            self._stream.write("\r" + " " * width + "\r")
+            self._stream.flush()
+            self._shown = ""
+
+
+def _can_use_timer() -> bool:
+    """Return whether this process has a timer signal that nothing else uses."""
+    is_main = threading.current_thread() is threading.main_thread()
+    has_timer = hasattr(signal, "setitimer") and hasattr(signal, "SIGALRM")
+    return is_main and has_timer and signal.getsignal(signal.SIGALRM) is signal.SIG_DFL
+
+
+def _get_terminal_width(stream: Any) -> int:
+    """Return the width of a terminal in columns."""
+    try:
+        columns = os.get_terminal_size(stream.fileno()).columns
+    except (OSError, ValueError, AttributeError):
+        columns = 0
+    return columns or shutil.get_terminal_size().columns
+
+
+def _choose_bar_characters(stream: Any) -> tuple[str, str]:
+    """Return the bar's characters for the open part and the done part, in the stream's encoding."""
+    try:
+        "█░".encode(getattr(stream, "encoding", None) or "ascii")
+    except (UnicodeEncodeError, LookupError):
+        return "-", "#"
+    return "░", "█"

@@ -8,7 +8,7 @@ import sys
 import numpy as np
 
 from bench.benchmark.isolation.isolation_layers import PROJECT_ROOT
-from bench.benchmark.isolation.process_exit import KilledExternallyError, RunEndedError
+from bench.benchmark.isolation.process_limits import KilledExternallyError, RunEndedError
 from bench.benchmark.isolation.tuner_client import IsolatedRun, TunerSpec
 from bench.benchmark.runner.sandboxed_tuner import find_preloadable_packages, start_isolated_tuner
 from bench.benchmark.runner.tuner_loop import drive_tuner

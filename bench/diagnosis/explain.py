@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from bench.benchmark.runner.thread_limit import limit_to_one_thread
+from bench.benchmark.runner.worker_setup import limit_to_one_thread
 from bench.core.random_streams import make_rng
 from bench.diagnosis.conventions.unit_check import Subject, find_imitated_unit, find_wrong_units
 from bench.diagnosis.evaluation.noise_floor import (

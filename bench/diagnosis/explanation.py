@@ -23,8 +23,8 @@ from bench.diagnosis.report.wording import format_fitted_value, format_percent, 
 from bench.diagnosis.search.verdict_rules import VerdictName
 from bench.diagnosis.verdict import Cause, Verdict
 from bench.figures.figure_files import pdf_figures
-from bench.pages.csv_text import format_csv
 from bench.pages.html_page import make_iframe
+from bench.pages.text_format import format_csv
 from sims import extended_simulator as extending
 from sims.core.argument_checks import check_arguments
 from sims.core.files import Content, write_all_atomically

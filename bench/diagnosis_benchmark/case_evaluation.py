@@ -23,7 +23,7 @@ from bench.benchmark.isolation.message_channel import (
     pack_arrays,
     unpack_arrays,
 )
-from bench.benchmark.isolation.process_exit import RunEndedError
+from bench.benchmark.isolation.process_limits import RunEndedError
 from bench.benchmark.isolation.tuner_client import TunerSpec
 from bench.benchmark.isolation.tuner_processes import START_TIMEOUT_SECONDS, IsolatedProcess
 from bench.benchmark.runner.sandboxed_tuner import get_fork_server, retry_if_killed

@@ -12,8 +12,7 @@ from dataclasses import asdict, dataclass
 from itertools import product
 from typing import Any
 
-from bench.benchmark.problem.salt import PUBLIC_SALT
-from bench.core.random_streams import make_rng
+from bench.core.random_streams import PUBLIC_SALT, make_rng
 from bench.diagnosis_benchmark.benchmark_config import BenchmarkConfig, CaseRequest
 from bench.diagnosis_benchmark.case_catalogue import (
     ALL_SYSTEMS,

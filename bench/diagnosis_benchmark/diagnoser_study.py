@@ -11,10 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from bench.benchmark.isolation.linux_syscalls import not_dumpable
-from bench.benchmark.isolation.process_exit import RunEndedError
+from bench.benchmark.isolation.process_limits import RunEndedError
 from bench.benchmark.isolation.tuner_client import TunerSpec
 from bench.benchmark.problem.experiment import Experiment
-from bench.benchmark.problem.salt import PUBLIC_SALT
 from bench.benchmark.runner.code_digest import (
     compute_digest,
     hash_class_source,
@@ -38,17 +37,16 @@ from bench.benchmark.runner.sandboxed_tuner import find_preloadable_packages
 from bench.benchmark.runner.study_setup import PreparedStudy
 from bench.benchmark.runner.tuner_training import get_weights_folder as trained
 from bench.benchmark.runner.worker_pools import Call, Pool, PoolLostError, make_pool
-from bench.benchmark.storage.result_folder import read_configuration
-from bench.benchmark.storage.salt_file import read_salt as kept_salt
-from bench.benchmark.storage.salt_file import reveal_salt
-from bench.benchmark.storage.study_progress import (
+from bench.benchmark.storage.result_folder import read_configuration, reveal_salt
+from bench.benchmark.storage.result_folder import read_salt as kept_salt
+from bench.benchmark.storage.run_status import (
     MISSING_STATUS,
     RunEnd,
     StudyOutcome,
     StudyProgress,
 )
 from bench.core.plugin_registries import PartUnavailableError, diagnosers, simulators
-from bench.core.random_streams import make_rng
+from bench.core.random_streams import PUBLIC_SALT, make_rng
 from bench.diagnosis_benchmark.answer_store import AnswersByCase, AnswerStore, read_answers
 from bench.diagnosis_benchmark.benchmark_config import BenchmarkConfig, read_config
 from bench.diagnosis_benchmark.case_evaluation import (

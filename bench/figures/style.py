@@ -16,8 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from bench.benchmark.statistics.error_floor import ERROR_FLOOR
-from bench.figures.figure_files import is_pdf_wanted
-from bench.figures.png_encoder import encode_png
+from bench.figures.figure_files import encode_png, is_pdf_wanted
 from sims.core.files import write_all_atomically
 from sims.core.simulator import InputError
 

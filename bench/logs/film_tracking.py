@@ -76,7 +76,7 @@ def track_film(
     Args:
         video: Path of the film.
         out: Path NAME.csv of a new file.
-        draw: Function that draws the figure, see `bench.figures.track_figure.render_track_figure`.
+        draw: Function that draws the figure (`figures.recording_figure.render_track_figure`).
         diameter: Diameter of the ball, m.
         fps: Frames per second, instead of the file's time stamps.
         scale: "camera", "diameter" or "fall"; None for the best available one.

@@ -12,10 +12,10 @@ import numpy as np
 
 from bench.benchmark.problem import targets
 from bench.benchmark.problem.experiment import CalibrationConfig, Experiment
-from bench.benchmark.problem.model_file_simulator import find_model
-from bench.benchmark.problem.salt import TargetStreams
+from bench.benchmark.problem.robot_experiment import find_model
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.core.plugin_registries import simulators
+from bench.core.random_streams import TargetStreams
 from sims import extended_simulator as extending
 from sims.core.simulator import Array, Scenario
 from sims.extended_simulator import ExtendedSimulator

@@ -9,10 +9,9 @@ from typing import Protocol
 
 import pandas as pd
 
-from bench.benchmark.comparison_tables import build_tables
 from bench.benchmark.problem.experiment import Experiment
 from bench.benchmark.results_report import format_failures
-from bench.benchmark.statistics.provenance_columns import add_trust_column
+from bench.benchmark.statistics.comparison_tables import add_trust_column, build_tables
 from bench.benchmark.storage.result_folder import (
     FolderConfiguration,
     read_comparison,

@@ -19,13 +19,11 @@ from bench.benchmark.problem.experiment import Experiment
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.benchmark.statistics.bootstrap import compute_bootstrap_interval, compute_resampled_means
 from bench.benchmark.statistics.error_curves import RunRowTable
-from bench.benchmark.statistics.problem_ranks import (
+from bench.benchmark.statistics.tuner_ranking import (
     MIN_PROBLEMS_FOR_RANKS,
-    compute_nemenyi_p_values,
-)
-from bench.benchmark.statistics.rank_agreement import (
     compute_kendall_tau,
     compute_mean_ranks,
+    compute_nemenyi_p_values,
     compute_rank_agreement,
 )
 from bench.benchmark.storage.result_folder import read_comparison

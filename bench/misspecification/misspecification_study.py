@@ -14,10 +14,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bench.benchmark.comparison import Comparison
-from bench.benchmark.storage.journal_segments import SEGMENTS_FOLDER
-from bench.benchmark.storage.result_folder import CONFIGURATION_FILE, read_configuration
-from bench.benchmark.storage.salt_file import read_salt, reveal_salt
-from bench.benchmark.storage.study_progress import (
+from bench.benchmark.storage.result_folder import (
+    CONFIGURATION_FILE,
+    read_configuration,
+    read_salt,
+    reveal_salt,
+)
+from bench.benchmark.storage.run_journal import SEGMENTS_FOLDER
+from bench.benchmark.storage.run_status import (
     MISSING_STATUS,
     RunEnd,
     StudyOutcome,
@@ -216,7 +220,7 @@ class MisspecificationStudy:
         Args:
             model: `PLAIN` or `EXTENDED`.
         """
-        from bench.benchmark.problem.model_file_simulator import get_simulator_class
+        from bench.benchmark.problem.robot_experiment import get_simulator_class
 
         experiment = self.configuration.experiment
         if model == PLAIN:

@@ -17,8 +17,7 @@ from typing import TYPE_CHECKING, Any
 from markupsafe import Markup, escape
 
 from bench.pages.chart import Chart, Panel, PrintedFigure
-from bench.pages.data_grid import INITIAL_ROWS, DataGrid, GridColumn, select_initial_rows
-from bench.pages.page_table import Table
+from bench.pages.page_table import INITIAL_ROWS, DataGrid, GridColumn, Table, select_initial_rows
 from bench.pages.page_template import load_template
 
 if TYPE_CHECKING:

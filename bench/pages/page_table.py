@@ -1,4 +1,4 @@
-"""Table of a page: named columns of equal length, without pandas.
+"""Tables of a page: named columns, sortable grids, and intervals drawn in a cell.
 
 Importing pandas takes longer than drawing a figure, and the report of `explain` only needs rows,
 columns and CSV.
@@ -8,8 +8,13 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from io import StringIO
-from typing import Any
+from math import isfinite
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 class Table:
@@ -93,3 +98,172 @@ def _cell(value: object, float_format: str | None) -> object:
     if is_missing(value):
         return ""
     return float_format % value if float_format and isinstance(value, float) else value
+
+
+INITIAL_ROWS = 15
+"""Number of rows that a page shows without its script, and initially with it."""
+
+
+@dataclass(frozen=True)
+class GridColumn:
+    """A displayed column.
+
+    Attributes:
+        name: Name in the table.
+        head: Head with unit; empty for the name.
+        digits: Significant digits of numbers; 0 for text.
+        says: Description, shown over the head.
+    """
+
+    name: str
+    head: str = ""
+    digits: int = 0
+    says: str = ""
+
+
+@dataclass(frozen=True)
+class DataGrid:
+    """A table to work with.
+
+    Attributes:
+        name: Name in the page's address and ids: letters, digits and hyphens.
+        title: Title above the table, also for screen readers.
+        table: Name of the table in the page.
+        columns: Displayed columns; a saved file has all columns.
+        filters: Columns of which a reader chooses a value.
+        only: Initial choices, by column of `filters`.
+        sort: Column of the initial order, descending if followed by ``,down``; empty to keep the
+            order.
+        switch: Column of names that legends switch on and off; empty for none.
+        marked: A column, and the beginning of its text in highlighted rows; empty for none.
+        lights: Column of names by which rows are highlighted together with everything of the same
+            name on the page.
+        links: Column of addresses to which the first displayed column links; empty for none. Such
+            an address is a path relative to the page, quoted (`urllib.parse.quote`).
+    """
+
+    name: str
+    title: str
+    table: str
+    columns: tuple[GridColumn, ...]
+    filters: tuple[str, ...] = ()
+    only: Mapping[str, str] = field(default_factory=dict)
+    sort: str = ""
+    switch: str = ""
+    marked: tuple[str, ...] = ()
+    lights: str = ""
+    links: str = ""
+
+    def build_spec(self) -> dict[str, Any]:
+        """Build the grid's JSON specification for the page's script."""
+        return {**asdict(self), "few": INITIAL_ROWS}
+
+    @property
+    def headings(self) -> list[str]:
+        """Headings of the columns, those of numbers with a hyphen before them."""
+        return [f"{'-' * bool(c.digits)}{c.head or c.name}" for c in self.columns]
+
+    def is_marked(self, row: Mapping[Any, Any]) -> bool:
+        """Return whether a row is highlighted."""
+        return bool(self.marked) and str(row[self.marked[0]]).startswith(self.marked[1])
+
+
+def select_initial_rows(grid: DataGrid, frame: pd.DataFrame | Table) -> list[dict[str, Any]]:
+    """Select the rows of a grid's initial choice, in its initial order.
+
+    Args:
+        grid: The grid.
+        frame: The table that the page contains as CSV.
+    """
+    table = (
+        frame
+        if isinstance(frame, Table)
+        else Table({str(name): frame[name].tolist() for name in frame})
+    )
+    rows = [
+        row
+        for row in table.rows()
+        if all(str(row[name]) == value for name, value in grid.only.items())
+    ]
+    if not grid.sort:
+        return rows
+    name, _, direction = grid.sort.partition(",")
+    missing = [row for row in rows if is_missing(row[name])]
+    present = [row for row in rows if not is_missing(row[name])]
+    return sorted(present, key=lambda row: row[name], reverse=direction == "down") + missing
+
+
+SCALE_WIDTH = 180.0
+"""Width of the scale; the drawing is 200 wide, with margins for the marks."""
+_MARGIN = 10.0
+
+
+class DrawnInterval(NamedTuple):
+    """An interval with its estimate, in the coordinates of the drawing.
+
+    Attributes:
+        kind: Class of the style sheet.
+        value: Position of the estimate.
+        low: Position of the lower end.
+        high: Position of the upper end.
+        y: Vertical position.
+    """
+
+    kind: str
+    value: float
+    low: float
+    high: float
+    y: int
+
+
+class IntervalDrawing(NamedTuple):
+    """Content of a drawing that is 200 wide.
+
+    Attributes:
+        rows: Intervals from top to bottom.
+        height: Height of the drawing.
+        radius: Radius of the estimates' marks.
+        band: Left edge and width of the interval behind the others; None for none.
+    """
+
+    rows: tuple[DrawnInterval, ...]
+    height: int
+    radius: float
+    band: tuple[float, float] | None = None
+
+
+def draw_intervals(
+    intervals: Sequence[tuple[str, float, float, float]],
+    band: tuple[float, float] | None = None,
+    distance: int = 14,
+) -> IntervalDrawing | None:
+    """Arrange intervals on one scale, which ends with the outermost of them.
+
+    Args:
+        intervals: Class of the style sheet, estimate, lower and upper end of each.
+        band: Lower and upper end of an interval behind the others, clipped to the drawing.
+        distance: Vertical distance between two intervals.
+
+    Returns:
+        The drawing; None if an end is not finite, or all of them are equal.
+    """
+    low = min(interval[2] for interval in intervals)
+    high = max(interval[3] for interval in intervals)
+    values = [number for interval in intervals for number in interval[1:]]
+    if not all(map(isfinite, values)) or high <= low:
+        return None
+    scale = SCALE_WIDTH / (high - low)
+
+    def place(value: float) -> float:
+        return round(min(max(_MARGIN + (value - low) * scale, 0.0), SCALE_WIDTH + 2 * _MARGIN), 1)
+
+    rows = tuple(
+        DrawnInterval(
+            kind, place(value), place(begin), place(end), distance // 2 + 1 + distance * i
+        )
+        for i, (kind, value, begin, end) in enumerate(intervals)
+    )
+    band_extent = None
+    if band is not None:
+        band_extent = place(band[0]), max(place(band[1]) - place(band[0]), 1.5)
+    return IntervalDrawing(rows, distance * len(rows) + 2, distance / 4 + 0.5, band_extent)

@@ -1,8 +1,10 @@
-"""Format text and numbers for people, in pages, figures and on the terminal."""
+"""Format text and numbers for people, and tables as CSV text that is safe in a spreadsheet."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import csv
+import io
+from collections.abc import Iterable, Sequence
 from math import floor, isfinite, log10
 
 from sims.core.values import SUPERSCRIPT_DIGITS
@@ -139,3 +141,22 @@ def _format_sign(text: str) -> str:
     """Replace the hyphen by a true minus sign, and remove it from zero."""
     zero = not text.strip("-0.")
     return text.lstrip("-") if zero else text.replace("-", "−")
+
+
+def format_csv(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """Format a table as CSV.
+
+    Args:
+        head: Names of the columns.
+        rows: Rows.
+    """
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(head)
+    # A spreadsheet would run text that begins like a formula, and names come from files.
+    writer.writerows([_escape_formula(cell) for cell in row] for row in rows)
+    return text.getvalue()
+
+
+def _escape_formula(cell: object) -> object:
+    return f"'{cell}" if isinstance(cell, str) and cell.startswith(("=", "+", "-", "@")) else cell

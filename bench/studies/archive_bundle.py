@@ -20,13 +20,13 @@ from bench.benchmark.storage.hashed_archive import (
     unpack_archive,
     write_archive,
 )
-from bench.benchmark.storage.journal_segments import SEGMENTS_FOLDER
 from bench.benchmark.storage.provenance import (
     compute_sha256,
     format_explain_command,
     read_environment,
 )
 from bench.benchmark.storage.result_folder import CONFIGURATION_FILE, read_configuration
+from bench.benchmark.storage.run_journal import SEGMENTS_FOLDER
 from bench.core.plugin_registries import simulators
 from bench.diagnosis.score_extended import score_model
 from bench.diagnosis.verdict import Verdict

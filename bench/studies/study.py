@@ -11,12 +11,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
-from bench.benchmark.problem.salt import generate_salt
 from bench.benchmark.storage.result_folder import (
     CONFIGURATION_FILE,
     choose_free_folder,
     read_configuration,
 )
+from bench.core.random_streams import generate_salt
 
 if TYPE_CHECKING:
     from bench.benchmark.comparison import PrintLine
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from bench.benchmark.runner.study_setup import PreparedStudy
     from bench.benchmark.runner.worker_pools import Pool
     from bench.benchmark.storage.result_folder import FolderConfiguration
-    from bench.benchmark.storage.study_progress import StudyOutcome, StudyProgress
+    from bench.benchmark.storage.run_status import StudyOutcome, StudyProgress
 
 
 class Study(Protocol):

@@ -13,20 +13,19 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from bench.benchmark.comparison_tables import build_tables
 from bench.benchmark.problem.experiment import Experiment
-from bench.benchmark.problem.numeric_warnings import numeric_warnings_silenced
 from bench.benchmark.problem.targets import Target
-from bench.benchmark.problem.tuning_problem import TuningProblem
+from bench.benchmark.problem.tuning_problem import TuningProblem, numeric_warnings_silenced
 from bench.benchmark.runner.plugin_discovery import load_plugins_for_experiment
-from bench.benchmark.runner.proposal_evaluator import ProposalEvaluator
-from bench.benchmark.storage.journal_segments import SEGMENTS_FOLDER
+from bench.benchmark.runner.tuner_loop import ProposalEvaluator
+from bench.benchmark.statistics.comparison_tables import build_tables
 from bench.benchmark.storage.result_folder import (
     CONFIGURATION_FILE,
     StoredComparison,
     read_checked_comparison,
     read_configuration,
 )
+from bench.benchmark.storage.run_journal import SEGMENTS_FOLDER
 from sims.core.simulator import Array, InputError
 
 PrintLine = Callable[[str], None]

@@ -17,10 +17,10 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from bench.benchmark.problem.domain_randomisation import RandomisedSimulator
 from bench.benchmark.problem.experiment import load_experiment
+from bench.benchmark.problem.experiment_tables import TunerEntry
 from bench.benchmark.problem.recorded_runs import ObservedRuns
-from bench.benchmark.problem.tuner_entries import TunerEntry
+from bench.benchmark.problem.training_simulator import RandomisedSimulator
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.benchmark.runner.tuner_training import TrainingRequest, train_or_load
 from bench.benchmark.runner.worker_tasks import RunRequest, execute_run

@@ -17,9 +17,8 @@ import numpy as np
 
 from bench.benchmark.problem.experiment import TunerEntry
 from bench.benchmark.problem.tuning_problem import TuningProblem
-from bench.benchmark.runner.proposal_evaluator import ProposalEvaluator
 from bench.benchmark.runner.result_rows import build_rows
-from bench.benchmark.runner.tuner_loop import drive_tuner
+from bench.benchmark.runner.tuner_loop import ProposalEvaluator, drive_tuner
 from bench.benchmark.runner.worker_tasks import RunOutcome, RunRequest
 from bench.core.plugin_registries import load_plugins
 from methods.tuner import Task, Tuner

@@ -28,8 +28,7 @@ from bench.benchmark.isolation.tuner_client import IsolatedRun, IsolatedTuner
 from bench.benchmark.problem.experiment import TunerEntry
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.benchmark.runner import sandboxed_tuner
-from bench.benchmark.runner.proposal_evaluator import ProposalEvaluator
-from bench.benchmark.runner.tuner_loop import drive_tuner
+from bench.benchmark.runner.tuner_loop import ProposalEvaluator, drive_tuner
 from bench.benchmark.runner.tuner_training import build_tuner
 from bench.benchmark.runner.worker_tasks import RunRequest, execute_run, get_problem
 from bench.core.plugin_registries import load_plugins

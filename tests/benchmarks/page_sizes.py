@@ -16,13 +16,12 @@ from time import perf_counter, process_time
 import numpy as np
 import pandas as pd
 
-from bench.benchmark.comparison_tables import build_tables
-from bench.benchmark.figures.comparison_view import AxisLabels, ComparisonView
+from bench.benchmark.figures.comparison_charts import AxisLabels, ComparisonView
 from bench.benchmark.problem.experiment import load_experiment
-from bench.benchmark.report_page.comparison_page import render_page
-from bench.benchmark.report_page.comparison_page_data import ComparisonReportData
+from bench.benchmark.report_page.comparison_page import ComparisonReportData, render_page
 from bench.benchmark.results_report import _render_figures
 from bench.benchmark.statistics.comparison_statistics import ComparisonStatistics
+from bench.benchmark.statistics.comparison_tables import build_tables
 from bench.benchmark.storage.result_folder import StoredComparison
 from tests.browser import Opened, launched
 

@@ -12,8 +12,11 @@ from pathlib import Path
 
 import pandas as pd
 
-from bench.benchmark.statistics.error_curves import RunRowTable, select_primary_metric
-from bench.benchmark.statistics.error_table import select_checkpoints
+from bench.benchmark.statistics.error_curves import (
+    RunRowTable,
+    select_checkpoints,
+    select_primary_metric,
+)
 from bench.benchmark.statistics.paired_tests import compare_all_pairs
 from bench.benchmark.storage.result_folder import read_comparison, read_configuration
 

@@ -17,8 +17,7 @@ import pandas as pd
 
 from bench.benchmark.problem.experiment import load_experiment
 from bench.benchmark.problem.tuning_problem import TuningProblem
-from bench.benchmark.runner.proposal_evaluator import ProposalEvaluator
-from bench.benchmark.runner.tuner_loop import drive_tuner
+from bench.benchmark.runner.tuner_loop import ProposalEvaluator, drive_tuner
 from bench.core.random_streams import make_rng
 from bench.figures.style import (
     BLACK,

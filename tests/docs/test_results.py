@@ -13,7 +13,7 @@ from bench.benchmark.comparison import Comparison
 from bench.benchmark.figures.comparison_figures import FIGURE_FILES
 from bench.benchmark.problem.experiment import load_experiment
 from bench.benchmark.runner.study_setup import prepare_study
-from bench.benchmark.statistics.error_table import ERROR_METRICS
+from bench.benchmark.statistics.error_curves import ERROR_METRICS
 from bench.benchmark.statistics.paired_tests import PAIR_COLUMNS
 from bench.benchmark.statistics.training_amortisation import BREAK_EVEN_COLUMNS
 from bench.benchmark.storage.run_status import FAILED_OR_SKIPPED_STATUSES

@@ -71,7 +71,7 @@ class ProblemOfWorker(Cheat):
 
 def drawn(task, salt):
     """Yield the true parameters that belong to this start, computed with public functions."""
-    from bench.benchmark.problem.salt import TargetStreams
+    from bench.core.random_streams import TargetStreams
 
     whole = np.array([[0.0], [1.0]])
     for index in range(20):
@@ -111,7 +111,7 @@ def list_true_parameters(folders):
 def _read_true_parameters(folders):
     import pyarrow.parquet
 
-    from bench.benchmark.storage.journal_segments import read_records
+    from bench.benchmark.storage.run_journal import read_records
 
     for folder in folders:
         for path in folder.rglob("*.journal"):

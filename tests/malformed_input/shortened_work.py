@@ -58,7 +58,7 @@ SHORT = {
     "bench.conformance.run_checks._run_all_checks": _cut,
     "bench.logs.film_recording.write_video": _cut,
     "bench.figures.recording_figure.write_recording_figure": _nothing,
-    "bench.figures.track_figure.render_track_figure": lambda *_: (b"", b""),
+    "bench.figures.recording_figure.render_track_figure": lambda *_: (b"", b""),
     "bench.api.train.LossRecorder.write": _nothing,
 }
 """Replacements of functions that would do the actual work."""

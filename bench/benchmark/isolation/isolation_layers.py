@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from bench.benchmark.isolation import linux_syscalls, seccomp_filter
-from bench.benchmark.isolation.memory_limit import limit_memory
+from bench.benchmark.isolation.process_limits import limit_memory
 
 ISOLATION_LAYERS = {
     "process": "the tuner runs in its own process, which gets only its task and a pipe",

@@ -1,4 +1,4 @@
-"""Message protocol of the pipes between the harness and a tuner's process: arrays and JSON.
+"""Messages between the harness and a tuner's process: arrays, JSON, proposals, random generators.
 
 Objects are never sent. A message has a head (kind, flags, size, length of the body) and a body.
 Each side sends only in response to the other. The tuner's side may write anything: an invalid
@@ -322,3 +322,46 @@ def _read_array(
         raise ValueError
     array = np.frombuffer(data[offset : offset + size], dtype=kind).reshape(shape)
     return array.copy(), offset + size
+
+
+def to_points(proposed: object, dim: int, label: str) -> Array:
+    """Convert proposals or recommendations to a new array (n, dim) of any numbers.
+
+    Args:
+        proposed: points from the tuner.
+        dim: number of parameters.
+        label: name of the points, for messages.
+
+    Raises:
+        ValueError: the points have another shape.
+    """
+    # The array is copied, because the tuner may change its own.
+    points = np.array(proposed, dtype=np.float64, ndmin=2)
+    if points.ndim != 2 or points.shape[1] != dim or not len(points):
+        raise ValueError(
+            f"the tuner gave {label} of shape {points.shape}; expected (n, {dim}) with n >= 1"
+        )
+    return points
+
+
+def encode_rng_state(state: Any) -> NDArray[np.uint8]:
+    """Return the state of a PCG64 generator as JSON in an array of bytes."""
+    return np.frombuffer(json.dumps(state).encode(), dtype=np.uint8)
+
+
+def decode_rng_state(text: NDArray[Any]) -> dict[str, Any]:
+    """Return the state of a PCG64 generator from the result of `encode_rng_state`.
+
+    Raises:
+        ValueError: the text is not a valid state.
+    """
+    generator = np.random.PCG64()
+    try:
+        state = json.loads(text.tobytes())
+        generator.state = state
+        # With an even increment the stream may be constant, and rejection sampling would never end.
+        if generator.state == state and state["state"]["inc"] & 1:
+            return dict(state)
+    except (ValueError, TypeError, LookupError, OverflowError, RecursionError):
+        pass
+    raise ValueError("not the state of a random generator")

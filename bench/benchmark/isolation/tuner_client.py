@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.benchmark.isolation.cpu_affinity import AffinityController
 from bench.benchmark.isolation.message_channel import (
     MAX_PROPOSAL_BYTES,
     MAX_TEXT_BYTES,
     ProtocolError,
     pack_arrays,
 )
+from bench.benchmark.isolation.process_limits import AffinityController
 from bench.benchmark.isolation.tuner_processes import START_TIMEOUT_SECONDS, IsolatedProcess
 from methods.tuner import Array, Evaluation, Proposal, Task
 

@@ -1,4 +1,7 @@
-"""Client of the fork server, and handles of the isolated processes that it starts."""
+"""Client of the fork server, and the isolated processes that it starts, with temporary folders.
+
+Folders of killed processes are deleted by the next process that makes one.
+"""
 
 from __future__ import annotations
 
@@ -10,12 +13,13 @@ import signal
 import socket
 import subprocess
 import sys
+import tempfile
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from time import perf_counter
 from typing import Any, NamedTuple
 
-from bench.benchmark.isolation import fork_server, scratch_folders
+from bench.benchmark.isolation import fork_server
 from bench.benchmark.isolation.isolation_layers import PROJECT_ROOT, list_readable_paths
 from bench.benchmark.isolation.message_channel import (
     MAX_TEXT_BYTES,
@@ -25,14 +29,76 @@ from bench.benchmark.isolation.message_channel import (
     ProtocolError,
     to_printable,
 )
-from bench.benchmark.isolation.process_exit import (
+from bench.benchmark.isolation.process_limits import (
     KilledExternallyError,
     RunEndedError,
     describe_exit,
     with_isolation,
 )
 from methods.tuner import Array
+from sims.core.files import lock_file
 from sims.engines.compiled import code_cache as compiled
+
+_FOLDER_PREFIX = "simgap-tuner-"
+
+
+class LockedFolder(NamedTuple):
+    """Temporary folder that is locked by this process.
+
+    Attributes:
+        path: path of the folder.
+        lock: file descriptor with the lock; the folder is in use while it is open.
+    """
+
+    path: str
+    lock: int
+
+    def remove(self) -> None:
+        """Delete the folder and release its lock."""
+        shutil.rmtree(self.path, ignore_errors=True)
+        os.close(self.lock)
+
+
+def create_locked_folder() -> LockedFolder:
+    """Create a new locked folder."""
+    remove_stale_folders()
+    while True:
+        path = tempfile.mkdtemp(prefix=_FOLDER_PREFIX)
+        lock = _lock_folder(path, is_blocking=True)
+        # Between creation and lock another process may have removed the folder as unused.
+        if lock is not None and os.path.isdir(path):
+            return LockedFolder(path, lock)
+
+
+def remove_stale_folders() -> None:
+    """Delete the folders of processes that were killed."""
+    for path in Path(tempfile.gettempdir()).glob(f"{_FOLDER_PREFIX}*"):
+        lock = _lock_folder(str(path), is_blocking=False)
+        if lock is not None:
+            LockedFolder(str(path), lock).remove()
+
+
+def _lock_folder(path: str, is_blocking: bool) -> int | None:
+    """Lock a folder, and return the file descriptor.
+
+    Args:
+        path: path of the folder.
+        is_blocking: True to wait for the lock.
+
+    Returns:
+        File descriptor; None if another process has the lock, or the folder does not exist.
+    """
+    try:
+        lock = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+    except OSError:
+        return None
+    try:
+        lock_file(lock, is_blocking)
+    except OSError:
+        os.close(lock)
+        return None
+    return lock
+
 
 _BOOTSTRAP_CODE = (
     "import sys; sys.path[:] = {path!r}; "
@@ -89,7 +155,7 @@ class ForkServerClient:
         current folder for modules. `_loaded` are the modules that it has already imported;
         processes that it forks start fast, because they inherit these modules.
         """
-        self._place: scratch_folders.LockedFolder | None = scratch_folders.create_locked_folder()
+        self._place: LockedFolder | None = create_locked_folder()
         self._folder = self._place.path
         self._loaded: set[str] = set()
         self._link, server_link = socket.socketpair()
@@ -197,7 +263,7 @@ class ForkServerClient:
             self._place.remove()
             self._place = None
         # Workers that have ended may have left their folders.
-        scratch_folders.remove_stale_folders()
+        remove_stale_folders()
 
 
 def _make_environment(folder: str) -> dict[str, str]:

@@ -27,11 +27,12 @@ from bench.benchmark.isolation.message_channel import (
     Message,
     MessageChannel,
     PeerClosedError,
+    decode_rng_state,
+    encode_rng_state,
     pack_arrays,
+    to_points,
     unpack_arrays,
 )
-from bench.benchmark.isolation.proposal_arrays import to_points
-from bench.benchmark.isolation.rng_transfer import decode_rng_state, encode_rng_state
 from methods.tuner import (
     Array,
     BudgetExceededError,

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from bench.benchmark.problem.experiment import Experiment, expand_sweep
-from bench.benchmark.problem.model_file_simulator import find_missing_model_file
 from bench.benchmark.problem.recorded_runs import find_recording
+from bench.benchmark.problem.robot_experiment import find_missing_model_file
 from bench.core.plugin_registries import PartUnavailableError, simulators, tuners
 from bench.datasets import dataset_catalogue as datasets
 from bench.datasets.dataset_catalogue import DataSet

@@ -15,15 +15,16 @@ from importlib import resources
 from pathlib import Path
 from typing import Any, TypedDict
 
-from bench.benchmark.problem import experiment_sweep
-from bench.benchmark.problem.recorded_runs import resolve_recording_path
-from bench.benchmark.problem.salt import check_commitment
-from bench.benchmark.problem.suite_version import (
+from bench.benchmark.problem import experiment_tables
+from bench.benchmark.problem.experiment_tables import (
+    TunerEntry,
     check_problem_hash,
     compute_hash,
     compute_problem_hash,
+    parse_entries,
 )
-from bench.benchmark.problem.tuner_entries import TunerEntry, parse_entries
+from bench.benchmark.problem.recorded_runs import resolve_recording_path
+from bench.core.random_streams import check_commitment
 from sims.core.files import is_existing_file
 from sims.core.simulator import InputError, make_unknown_name_error
 from sims.core.toml_validation import (
@@ -178,7 +179,7 @@ class Experiment:
         parameters: changes to parameters' nominal, bounds, training range.
         nuisance: effects that the simulator has not and the world may have, by coefficient, each
             with the range from which it is drawn while a tuner trains whose entry says
-            ``randomised = true`` (`bench.benchmark.problem.domain_randomisation`).
+            ``randomised = true`` (`bench.benchmark.problem.training_simulator`).
         initial: initial state: a number, or [low, high] for uniform between.
         inputs: input signals by name, as `simgap simulate` writes them, e.g. ``sine:2:0.5``
             (`bench.core.input_signals`).
@@ -211,7 +212,7 @@ class Experiment:
         suite: name and version of the benchmark suite that the experiment belongs to; empty for
             none.
         problem_hashes: hash by name of each of the `experiments` of a suite, or of the questions
-            of a comparison of diagnosers (`problem.suite_version`); a changed problem is refused.
+            of a comparison of diagnosers (`experiment_tables`); a changed problem is refused.
         tuners: a list of registered names, and of tables with ``tuner`` and, where two entries have
             the same, a ``label``; or a table for each by its label.
     """
@@ -578,7 +579,7 @@ def _expand_combinations(experiment: Experiment, path: Path) -> list[Experiment]
     # All combinations have the same targets, so that only the swept values make a difference.
     document["same_targets_as"] = experiment.same_targets_as or experiment.name
     experiments = []
-    for label, changed in experiment_sweep.expand_documents(path, document, experiment.sweep):
+    for label, changed in experiment_tables.expand_documents(path, document, experiment.sweep):
         if experiment.title:
             values = label.replace("=", " = ").replace(",", ", ")
             changed["title"] = f"{experiment.title} ({values})"

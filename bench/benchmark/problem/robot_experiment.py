@@ -1,9 +1,12 @@
-"""Build an experiment from a robot's model file and a recording, without an experiment file."""
+"""Get the simulator of an experiment, and build experiments from a robot's model file."""
 
 from __future__ import annotations
 
+import importlib.util
+import os
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from bench.benchmark.problem.experiment import (
     Experiment,
@@ -11,11 +14,136 @@ from bench.benchmark.problem.experiment import (
     RecordingSource,
     check_name,
 )
-from bench.benchmark.problem.model_file_simulator import complete_robot_experiment
-from bench.benchmark.problem.tuner_entries import TunerEntry
-from sims.core.files import require_file
-from sims.core.simulator import InputError
+from bench.benchmark.problem.experiment_tables import TunerEntry
+from bench.benchmark.problem.recorded_runs import find_recording
+from bench.core.plugin_registries import make_robot_simulator, simulators
+from bench.datasets import dataset_catalogue as datasets
+from sims.core.files import is_existing_file, require_file
+from sims.core.registry import PartUnavailableError
+from sims.core.simulator import InputError, Simulator
+from sims.core.values import truncate_text
+from sims.recording.recording import read_recording
 from sims.recording.recording_description import read_model_reference
+from sims.system_simulator import SystemSimulator
+
+PACKAGE_SCHEME = "package://"
+"""Prefix of a model file's path in an installed Python package, as in URDF files."""
+
+
+def get_simulator_class(experiment: Experiment) -> type[Simulator]:
+    """Return the class of the simulator that an experiment tunes.
+
+    Raises:
+        InputError: there is no simulator of that name, or its model file cannot be used.
+        PartUnavailableError: something that it needs is missing on this machine.
+    """
+    if not experiment.model:
+        return simulators.get(experiment.simulator)
+    subject = f"experiment {experiment.name}"
+    path = find_model(experiment.model, experiment.name)
+    free_names, actuators, engine = experiment.free, dict(experiment.actuators), {}
+    if experiment.recording:
+        reference = read_model_reference(find_recording(experiment.recording.path), path)
+        assert reference is not None  # a model was given
+        actuators, engine = {**reference.actuators, **actuators}, dict(reference.engine)
+        free_names = free_names or reference.free
+    if not free_names:
+        expected = 'free = ["damping@*", ...] or --free, numbers of the model file to tune'
+        raise InputError(f"{subject}: expected {expected}; found none")
+    return make_robot_simulator(path, actuators, engine, free_names)
+
+
+def complete_robot_experiment(experiment: Experiment) -> Experiment:
+    """Complete a robot experiment that does not specify channels, commands and initial pose.
+
+    They are taken from its recording, or from the robot's default recording.
+    """
+    if not experiment.model:
+        return experiment
+    kind = get_simulator_class(experiment)
+    changes: dict[str, Any] = {}
+    if experiment.recording:
+        path = find_recording(experiment.recording.path)
+        changes["observe"] = tuple(read_recording(path, kind).runs[0].channels)
+    elif issubclass(kind, SystemSimulator):
+        default_recording = kind.system.usual_recording
+        changes["observe"] = default_recording.observe
+        changes["initial"] = dict(default_recording.initial)
+        changes["inputs"] = dict(default_recording.inputs)
+    left_out = {key: value for key, value in changes.items() if not getattr(experiment, key)}
+    return experiment.chosen(**left_out)
+
+
+def find_missing_model_file(experiment: Experiment) -> str:
+    """Return why an experiment's model file is missing; empty if it exists or is not needed."""
+    if not experiment.model:
+        return ""
+    try:
+        find_model(experiment.model, experiment.name)
+    except PartUnavailableError as error:
+        return error.reason
+    return ""
+
+
+def find_model(path: str, name: str) -> Path:
+    """Find the model file of an experiment.
+
+    It can be in an installed package (``package://NAME/FILE``), below $SIMGAP_ROBOTS, in the user's
+    folder of data sets, or a path.
+
+    Args:
+        path: path of the model file in the experiment.
+        name: name of the experiment, for messages.
+
+    Raises:
+        PartUnavailableError: the file is in none of these places.
+    """
+    if path.startswith(PACKAGE_SCHEME):
+        return _find_packaged_model(path, name)
+    if robot_path := datasets.find("robot", path):
+        return robot_path
+    if is_existing_file(Path(path)):
+        return Path(path)
+    if data_set := datasets.find_providing_data_set("robot", path):
+        raise PartUnavailableError("experiment", name, f"it {data_set.advice}")
+    robots_folder = os.environ.get("SIMGAP_ROBOTS")
+    places = (
+        f"in {robots_folder} (SIMGAP_ROBOTS)"
+        if robots_folder
+        else "here (SIMGAP_ROBOTS is not set)"
+    )
+    raise PartUnavailableError(
+        "experiment", name, f"model {truncate_text(path)}: no such file {places}"
+    )
+
+
+def _find_packaged_model(path: str, name: str) -> Path:
+    """Find a model file inside an installed Python package, given as ``package://NAME/FILE``.
+
+    `path` is this address, and `name` the experiment that needs the file.
+
+    Raises:
+        InputError: the address is not of this form.
+        PartUnavailableError: the package is not installed, or has no such file.
+    """
+    package, _, inner_path = path.removeprefix(PACKAGE_SCHEME).partition("/")
+    if not (package.isidentifier() and inner_path):
+        expected = f"{PACKAGE_SCHEME}NAME/FILE of an installed package"
+        raise InputError(
+            f"experiment {name}: model: expected {expected}, found '{truncate_text(path)}'"
+        )
+    # The package is located without importing it, so that its code does not run.
+    package_spec = importlib.util.find_spec(package)
+    if package_spec is None:
+        reason = f"needs {package}, not installed (pip install {package.split('_')[0]})"
+        raise PartUnavailableError("experiment", name, reason)
+    for folder in package_spec.submodule_search_locations or ():
+        if (file := Path(folder, inner_path)).is_file():
+            return file
+    raise PartUnavailableError(
+        "experiment", name, f"model {truncate_text(path)}: package {package} has no such file"
+    )
+
 
 DEFAULT_TUNERS = (
     "random",

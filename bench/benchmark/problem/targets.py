@@ -1,6 +1,6 @@
 """Draw targets: scenarios and observations whose true parameters are hidden from the tuners.
 
-A target's numbers are drawn from its own random streams (`problem.salt`), in a fixed order:
+A target's numbers are drawn from its own random streams (`core.random_streams`), in a fixed order:
 start and true parameters, initial state, inputs, constants, sensor noise. Another order gives
 another target.
 
@@ -19,8 +19,8 @@ import numpy as np
 
 from bench.benchmark.problem.experiment import Experiment, FixedOrRange
 from bench.benchmark.problem.recorded_runs import ObservedRuns, RecordedRuns
-from bench.benchmark.problem.salt import TargetStreams
 from bench.core.input_signals import evaluate_signal
+from bench.core.random_streams import TargetStreams
 from sims.core.simulator import Array, Channel, InputError, Scenario, Simulator, UnitCube
 
 _CUBE_CORNERS = np.array([[0.0], [1.0]])

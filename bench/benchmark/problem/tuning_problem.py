@@ -7,7 +7,9 @@ simulator through `bench.benchmark.problem.training_simulator`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -15,11 +17,11 @@ import numpy as np
 from bench.benchmark.problem import targets
 from bench.benchmark.problem.experiment import Experiment
 from bench.benchmark.problem.fisher_information import InformationSpectrum, compute_spectrum
-from bench.benchmark.problem.model_file_simulator import (
+from bench.benchmark.problem.recorded_runs import RecordedRuns, load_recorded_runs
+from bench.benchmark.problem.robot_experiment import (
     complete_robot_experiment,
     get_simulator_class,
 )
-from bench.benchmark.problem.recorded_runs import RecordedRuns, load_recorded_runs
 from bench.benchmark.problem.targets import Target
 from bench.benchmark.problem.training_simulator import CountedTrainingSimulator
 from methods.tuner import ScenarioInfo
@@ -268,3 +270,15 @@ class TuningProblem:
     def make_training_simulator(self, budget: int) -> CountedTrainingSimulator:
         """Return the training simulator for a learned tuner."""
         return CountedTrainingSimulator(self, budget)
+
+
+@contextmanager
+def numeric_warnings_silenced() -> Iterator[None]:
+    """Silence NumPy's floating-point warnings and other RuntimeWarnings; also a decorator.
+
+    A simulation that overflows is a valid result: its loss is infinite, and status and report say
+    so. A warning for each of its time steps gives no further information.
+    """
+    with np.errstate(all="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        yield

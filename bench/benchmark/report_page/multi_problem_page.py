@@ -11,9 +11,9 @@ import numpy as np
 import pandas as pd
 
 from bench.benchmark.problem.experiment import Experiment
-from bench.benchmark.report_page.comparison_conclusion import SIGNIFICANCE_LEVEL
+from bench.benchmark.report_page.comparison_page import SIGNIFICANCE_LEVEL
 from bench.benchmark.statistics.comparison_statistics import ComparisonStatistics
-from bench.benchmark.statistics.error_table import select_checkpoints
+from bench.benchmark.statistics.error_curves import select_checkpoints
 from bench.figures.style import PANEL_TITLES, FigureFiles, MarkStyle, get_mark_style
 from bench.pages.chart import Axis, Panel, PrintedFigure, Series
 from bench.pages.html_page import HtmlPage

@@ -15,20 +15,22 @@ from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 from bench.benchmark.isolation.linux_syscalls import not_dumpable
-from bench.benchmark.isolation.memory_limit import import_resource_module
-from bench.benchmark.isolation.process_exit import RunEndedError
+from bench.benchmark.isolation.process_limits import RunEndedError, import_resource_module
 from bench.benchmark.isolation.tuner_client import TunerSpec
 from bench.benchmark.problem.experiment import Experiment, TunerEntry
 from bench.benchmark.problem.fisher_information import InformationSpectrum
-from bench.benchmark.problem.numeric_warnings import numeric_warnings_silenced
 from bench.benchmark.problem.targets import Redraws, Target, count_redraws
-from bench.benchmark.problem.tuning_problem import TuningProblem
+from bench.benchmark.problem.tuning_problem import TuningProblem, numeric_warnings_silenced
 from bench.benchmark.runner.code_digest import list_effect_names
 from bench.benchmark.runner.plugin_discovery import describe_plugins, must_build_isolated
-from bench.benchmark.runner.result_rows import build_rows, make_status, make_unfinished_outcome
+from bench.benchmark.runner.result_rows import (
+    Notes,
+    build_rows,
+    make_status,
+    make_unfinished_outcome,
+)
 from bench.benchmark.runner.run_ids import RunIds
 from bench.benchmark.runner.sandboxed_tuner import make_tuner_spec
-from bench.benchmark.runner.tuner_notes import Notes
 from bench.benchmark.runner.tuner_training import (
     TrainingRequest,
     TrainingResult,

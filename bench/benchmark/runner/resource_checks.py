@@ -9,8 +9,8 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from bench.benchmark.problem.experiment import Experiment, TunerEntry, expand_sweep
-from bench.benchmark.problem.model_file_simulator import get_simulator_class
 from bench.benchmark.problem.recorded_runs import find_recording
+from bench.benchmark.problem.robot_experiment import get_simulator_class
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.benchmark.runner.experiment_runner import check_tuners, count_seeds
 from bench.core.plugin_registries import tuners

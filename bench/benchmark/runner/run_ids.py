@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from bench.benchmark.problem.experiment import Experiment, TunerEntry
-from bench.benchmark.problem.model_file_simulator import get_simulator_class
+from bench.benchmark.problem.robot_experiment import get_simulator_class
 from bench.benchmark.problem.targets import BlindedTarget
 from bench.benchmark.runner.code_digest import (
     BOUNCE_SHOT_SOURCE_FOLDERS,

@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 from numpy.typing import NDArray
 
-from bench.benchmark.isolation.process_exit import KilledExternallyError, RunEndedError
+from bench.benchmark.isolation.process_limits import KilledExternallyError, RunEndedError
 from bench.benchmark.isolation.tuner_client import IsolatedTuner, TunerSpec
 from bench.benchmark.isolation.tuner_processes import ForkServerClient
 from bench.benchmark.problem.experiment import TunerEntry

@@ -13,8 +13,8 @@ from bench.benchmark.storage.result_folder import (
     FolderConfiguration,
     choose_free_folder,
     create_folder,
+    draw_salt_if_needed,
 )
-from bench.benchmark.storage.salt_file import draw_salt_if_needed
 
 
 class PreparedStudy(NamedTuple):

@@ -22,10 +22,13 @@ from dataclasses import dataclass, field
 from time import monotonic
 from typing import TYPE_CHECKING, Any, Protocol
 
-from bench.benchmark.isolation.process_exit import describe_exit
-from bench.benchmark.runner.spawn_context import WorkerContext
-from bench.benchmark.runner.thread_limit import THREAD_COUNT_VARIABLES, limit_to_one_thread
-from bench.benchmark.runner.worker_setup import initialise_worker
+from bench.benchmark.isolation.process_limits import describe_exit
+from bench.benchmark.runner.worker_setup import (
+    THREAD_COUNT_VARIABLES,
+    WorkerContext,
+    initialise_worker,
+    limit_to_one_thread,
+)
 from sims.core.simulator import InputError
 from sims.engines import describe_stepping
 

@@ -8,14 +8,15 @@ from functools import cached_property
 import numpy as np
 import pandas as pd
 
-from bench.benchmark.statistics.error_curves import RunCurves, RunRowTable, select_primary_metric
-from bench.benchmark.statistics.expected_running_time import select_thresholds
-from bench.benchmark.statistics.median_curves import (
+from bench.benchmark.statistics.error_curves import (
+    RunCurves,
+    RunRowTable,
     compute_median_curves,
     compute_medians_by_distance,
     find_coinciding_curves,
+    select_primary_metric,
 )
-from bench.benchmark.statistics.runtime_distribution import build_runtime_table
+from bench.benchmark.statistics.expected_running_time import build_runtime_table, select_thresholds
 from bench.benchmark.statistics.training_amortisation import TuningCost, compute_tuning_costs
 from bench.benchmark.statistics.tuner_ranking import (
     format_failure_notes,
@@ -167,7 +168,7 @@ class ComparisonStatistics:
     def compute_median_curves(self, metric: str, kind: str) -> pd.DataFrame:
         """Return medians of a metric against simulations in a range, of the runs that have it.
 
-        See `bench.benchmark.statistics.median_curves.compute_median_curves`.
+        See `bench.benchmark.statistics.error_curves.compute_median_curves`.
 
         Args:
             metric: name of the metric.
@@ -209,7 +210,7 @@ class ComparisonStatistics:
     def medians_by_distance(self) -> pd.DataFrame:
         """Errors by distance from the training range.
 
-        See `median_curves.compute_medians_by_distance`.
+        See `error_curves.compute_medians_by_distance`.
         """
         first = self.select_range("wide").drop_duplicates("target").set_index("target")["outside"]
         curves = self._get_curves_of_all_runs(self.parameter_error_metric).select(range="wide")
@@ -217,7 +218,7 @@ class ComparisonStatistics:
 
     @cached_property
     def runtime_distribution(self) -> pd.DataFrame:
-        """Runtime distribution of every range; see `runtime_distribution.build_runtime_table`."""
+        """Runtime distribution of every range; see `expected_running_time.build_runtime_table`."""
         return build_runtime_table(self.curves, self.runtime_thresholds)
 
     @cached_property

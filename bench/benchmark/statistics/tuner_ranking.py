@@ -1,4 +1,4 @@
-"""Rank tuners after k simulations, and test the best one against each other tuner.
+"""Rank tuners after k simulations and over several problems; agreement of rankings.
 
 This is the only ranking rule of a comparison: headline, tables, legends and terminal use it.
 
@@ -19,12 +19,20 @@ others was selected. Two-sided p-values make each test twice as strict as the on
 Hsu, which leaves room for Holm's larger levels after the first rejections; a test simulates equal
 tuners and checks the error rate. What is controlled is the exclusion of the best tuner, not every
 statement about pairs: these are in pairs.csv, corrected over all pairs.
+
+Tests over several problems (Friedman, Nemenyi): J. Demsar, JMLR 7, 2006 (scikit-posthocs).
+
+Agreement of rankings: M. G. Kendall, Biometrika 30, 81, 1938, doi:10.1093/biomet/30.1-2.81 (tau-b
+of scipy); the percentile bootstrap of B. Efron, R. Tibshirani, An Introduction to the Bootstrap,
+1993, ch. 13; the permutation test for paired conditions of P. Good, Permutation, Parametric, and
+Bootstrap Tests of Hypotheses, 2005, ch. 3.
 """
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -32,10 +40,13 @@ import pandas as pd
 
 from bench.benchmark.statistics.error_curves import RunCurves
 from bench.benchmark.statistics.paired_tests import (
+    MIN_ERROR,
     build_log_error_table,
     compare_pair,
     correct_holm,
 )
+from bench.core.random_streams import make_rng
+from sims.core.simulator import Array
 
 RANKING_COLUMNS = [
     "experiment",
@@ -221,3 +232,179 @@ def format_failure_notes(failed: Mapping[str, tuple[int, int]]) -> dict[str, str
         for tuner, (failure_count, runs) in failed.items()
         if failure_count
     }
+
+
+MIN_PROBLEMS_FOR_RANKS = 5
+"""Minimum number of problems for mean ranks."""
+
+
+def compute_problem_ranks(curves: RunCurves, floor: float = MIN_ERROR) -> pd.DataFrame:
+    """Rank tuners on each problem by their median error over targets.
+
+    A problem is an experiment and a range. The best tuner has rank 1 and failures are last. Tuners
+    that miss a problem are left out.
+
+    Args:
+        curves: error of every run.
+        floor: errors below this value count as equal to it.
+
+    Returns:
+        Ranks with one row per problem and one column per tuner.
+    """
+    rows = {}
+    for (experiment, kind), _ in curves.keys.groupby(["experiment", "range"], sort=False):
+        logs = build_log_error_table(
+            curves.select(experiment=str(experiment), range=str(kind)), floor=floor
+        )
+        rows[f"{experiment} {kind}"] = logs.median(axis=0)
+    medians = pd.DataFrame(rows).T.dropna(axis="columns")
+    # Rounding gives errors that differ by the last bit the same rank.
+    return medians.round(9).rank(axis=1)
+
+
+def compute_nemenyi_p_values(ranked: pd.DataFrame) -> tuple[float, pd.DataFrame]:
+    """Test ranks (problems, tuners) with Friedman's test and Nemenyi's post-hoc test.
+
+    Returns:
+        Friedman's p-value, and Nemenyi's p-value for each pair of tuners.
+
+    Raises:
+        ValueError: there are fewer than `MIN_PROBLEMS_FOR_RANKS` problems or fewer than three
+            tuners.
+    """
+    if len(ranked) < MIN_PROBLEMS_FOR_RANKS or ranked.shape[1] < 3:
+        raise ValueError(
+            f"mean ranks need {MIN_PROBLEMS_FOR_RANKS} problems and 3 tuners, found {ranked.shape}"
+        )
+    from scikit_posthocs import posthoc_nemenyi_friedman
+    from scipy.stats import friedmanchisquare
+
+    table = posthoc_nemenyi_friedman(ranked.to_numpy())
+    table.index = table.columns = ranked.columns
+    return float(friedmanchisquare(*ranked.to_numpy().T).pvalue), table
+
+
+BOOTSTRAP_RESAMPLES = 500
+"""Number of bootstrap resamples of the targets for an interval."""
+PERMUTATION_COUNT = 9999
+"""Number of random permutations of the conditions for a p-value."""
+HALF_SPLIT_COUNT = 200
+"""Number of random splits of the targets into halves, for the agreement of one condition."""
+
+
+@dataclass(frozen=True)
+class RankAgreement:
+    """Agreement of two rankings.
+
+    Attributes:
+        tau: Kendall's tau-b between the mean ranks; 1 is the same order, -1 the reverse.
+        low: lower bound of its 95 % bootstrap interval over targets, extended to contain
+            `compute_kendall_tau`.
+        high: upper bound of this interval.
+        halves: mean tau between halves of the targets in the first condition; the value that is
+            reached by two rankings which differ in their targets only.
+        p_value: p-value of the permutation test that exchanges the conditions of each target at
+            random; the null hypothesis is that no tuner's mean rank changes.
+    """
+
+    tau: float
+    low: float
+    high: float
+    halves: float
+    p_value: float
+
+
+def compute_mean_ranks(errors: Array) -> Array:
+    """Compute each tuner's mean rank (tuners,) over targets from errors (targets, tuners).
+
+    Rank 1 is best. A tuner whose error is NaN or infinite has the last rank on that target.
+    """
+    mean_ranks: Array = _rank_within_targets(errors).mean(axis=0)
+    return mean_ranks
+
+
+def _rank_within_targets(errors: Array) -> Array:
+    """Compute ranks (targets, tuners) within each target; equal errors share one."""
+    from scipy.stats import rankdata
+
+    # Rounded logarithms give errors that differ by the last bit the same rank.
+    logs = np.log(np.maximum(np.where(np.isfinite(errors), errors, np.inf), 1e-12))
+    ranks: Array = rankdata(np.round(logs, 9), axis=1)
+    return ranks
+
+
+def compute_kendall_tau(first: Array, second: Array) -> float:
+    """Compute Kendall's tau-b of two lists of numbers; NaN if one of them is constant.
+
+    With C and D the numbers of pairs in the same and in opposite order, T1 and T2 the numbers of
+    pairs that are tied in the first or in the second list only,
+
+        tau = (C - D) / sqrt((C + D + T1) (C + D + T2))                        (1)
+
+    Args:
+        first: (n,) numbers.
+        second: (n,) numbers in the same order.
+    """
+    from scipy.stats import kendalltau
+
+    return float(kendalltau(np.round(first, 9), np.round(second, 9)).statistic)
+
+
+def compute_rank_agreement(first: Array, second: Array, *names: str) -> RankAgreement:
+    """Compare the rankings of the same tuners on the same targets under two conditions.
+
+    Args:
+        first: (targets, tuners) errors in the first condition.
+        second: (targets, tuners) errors in the second condition.
+        names: names of the comparison, which determine the random stream.
+    """
+    rng = make_rng("agreement", *names)
+    ranks = np.stack(
+        [_rank_within_targets(first), _rank_within_targets(second)]
+    )  # (2, targets, tuners)
+    count = ranks.shape[1]
+    observed = compute_kendall_tau(*ranks.mean(axis=1))
+    resamples = rng.integers(count, size=(BOOTSTRAP_RESAMPLES, count))
+    resampled_taus = [compute_kendall_tau(*ranks[:, rows].mean(axis=1)) for rows in resamples]
+    low, high = np.nanquantile(resampled_taus, [0.025, 0.975]) if count > 1 else (np.nan, np.nan)
+    # Targets that are drawn twice make ranks noisier, and noise moves tau towards 0.
+    low, high = min(low, observed), max(high, observed)
+    p = _compute_permutation_p_value(ranks[1] - ranks[0], rng)
+    return RankAgreement(
+        observed, float(low), float(high), _compute_mean_split_half_tau(ranks[0], rng), p
+    )
+
+
+def _compute_permutation_p_value(changes: Array, rng: np.random.Generator) -> float:
+    """Compute the permutation p-value for changes of rank (targets, tuners).
+
+    The null hypothesis is that no tuner's mean rank changes. The statistic is the sum over tuners
+    of the squared mean change. Exchanging the conditions of a target changes the signs of its rank
+    changes. Tau itself is not a suitable statistic: mean ranks that are all reversed stay reversed,
+    only less so, under any exchange.
+    """
+    signs = rng.choice([-1.0, 1.0], size=(PERMUTATION_COUNT, len(changes)))
+    sums = ((signs @ changes) ** 2).sum(axis=1)
+    observed = (changes.sum(axis=0) ** 2).sum()
+    # The observed statistic is one of the permutations, so p is at least 1 / (n + 1).
+    return float((1 + (sums >= observed * (1 - 1e-12)).sum()) / (1 + PERMUTATION_COUNT))
+
+
+def _compute_mean_split_half_tau(ranks: Array, rng: np.random.Generator) -> float:
+    """Compute the mean Kendall tau between the rankings on two random halves of the targets.
+
+    It says how well a ranking of tuners repeats on other targets: 1 is the same order, 0 a random
+    one. `ranks` (targets, tuners) are the ranks on each target. NaN with fewer than two targets.
+    """
+    half_count = len(ranks) // 2
+    if not half_count:
+        return float("nan")
+    taus = []
+    for _ in range(HALF_SPLIT_COUNT):
+        order = rng.permutation(len(ranks))
+        taus.append(
+            compute_kendall_tau(
+                ranks[order[:half_count]].mean(axis=0), ranks[order[half_count:]].mean(axis=0)
+            )
+        )
+    return float(np.nanmean(taus))

@@ -1,25 +1,45 @@
-"""Read CSV files of a result folder by their declared columns; errors name the line."""
+"""Read the CSV files of a result folder, runs batch by batch, and check every cell.
+
+Rows of runs are those of runs.parquet and of the parts of a journal.
+"""
 
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.benchmark.problem.experiment import Experiment
 from bench.benchmark.storage.cell_validation import (
     CellError,
+    Mask,
     check_cells,
     parse_csv_column,
+    parse_parquet_column,
     select_declared_columns,
+    to_numpy_mask,
 )
-from bench.benchmark.storage.table_schemas import Columns
+from bench.benchmark.storage.table_schemas import (
+    RUN_COLUMNS,
+    RUN_CONSTANT_COLUMNS,
+    Columns,
+    ColumnSpec,
+    expand_columns,
+    list_channels,
+    list_parameters,
+)
 from sims.core.files import get_first_line
 from sims.core.simulator import InputError
 from sims.core.toml_validation import format_value
 
 if TYPE_CHECKING:
+    import pandas as pd
     import pyarrow as pa
+
 
 ColumnResolver = Callable[[list[str]], Columns]
 """Returns the declared columns of a file for its header."""
@@ -159,3 +179,261 @@ class CsvTable:
             number for place, (number, _) in enumerate(self._iterate_records()) if place == row + 1
         )
         return next(lines, row + 2)
+
+
+_BATCH_ROWS = 131_072
+"""Number of rows checked at a time; all columns of many rows would not fit in memory."""
+
+
+class RunsTable(NamedTuple):
+    """A file of runs.
+
+    Attributes:
+        path: Path of the file.
+        remedy: Advice for a damaged file.
+    """
+
+    path: Path
+    remedy: str
+
+    def make_error(self, row: int | None, problem: str) -> InputError:
+        """Make the error for a row, counted from 0, or for the whole file.
+
+        Args:
+            row: Row, or None for the file.
+            problem: What is wrong.
+        """
+        place = "" if row is None else f", row {row}"
+        return InputError(f"{self.path}{place}: {problem}; {self.remedy}")
+
+    def list_columns(self) -> list[str]:
+        """List the columns of the file.
+
+        Raises:
+            InputError: It is not a Parquet file.
+        """
+        from pyarrow import ArrowException, parquet
+
+        try:
+            return list(parquet.read_schema(self.path).names)
+        # In a damaged file even the names of columns may be invalid text.
+        except (OSError, ArrowException, UnicodeDecodeError) as error:
+            raise self._make_read_error(error) from None
+
+    def read_runs(
+        self, experiment: Experiment, records: Sequence[pa.Table] | None = None
+    ) -> pd.DataFrame:
+        """Read one line per run, in the order of the file.
+
+        Each line has the columns that are constant within the run, ``row``, at which it begins, and
+        ``used``, its last k.
+
+        Args:
+            experiment: Experiment of the runs.
+            records: Tables that were read before, for a file that is not Parquet.
+
+        Raises:
+            InputError: The file is damaged; the message is one line.
+        """
+        import pyarrow as pa
+
+        try:
+            if records is None:
+                return read_checked_runs(self._read_batches(), self.list_columns(), experiment)
+            table = pa.concat_tables(records)
+            return read_checked_runs([table], table.column_names, experiment)
+        except CellError as error:
+            raise self.make_error(error.row, error.says) from None
+        except (OSError, pa.ArrowException, UnicodeDecodeError) as error:
+            raise self._make_read_error(error) from None
+
+    def _read_batches(self) -> Iterator[pa.Table]:
+        """Yield the rows of the Parquet file in batches of at most `_BATCH_ROWS` rows."""
+        import pyarrow as pa
+        from pyarrow import parquet
+
+        with parquet.ParquetFile(self.path) as file:
+            for batch in file.iter_batches(_BATCH_ROWS):
+                yield pa.Table.from_batches([batch])
+
+    def _make_read_error(self, error: Exception) -> InputError:
+        """Make the one-line error for a file that is missing, or is not a Parquet file."""
+        missing = isinstance(error, FileNotFoundError)
+        reason = (
+            "no such file" if missing else f"expected a Parquet file, found {get_first_line(error)}"
+        )
+        return InputError(f"{self.path}: not a complete comparison: {reason}; {self.remedy}")
+
+
+def declare_run_columns(names: list[str], experiment: Experiment) -> list[ColumnSpec]:
+    """Return the declared columns of an experiment's runs.
+
+    The parameters and channels are those in the file's columns and those of the experiment.
+
+    Args:
+        names: Names of the file's columns.
+        experiment: The experiment.
+    """
+    parameters = dict.fromkeys([*list_parameters(names), *experiment.parameters])
+    channels = experiment.observe or list_channels(names)
+    columns = expand_columns(RUN_COLUMNS, parameters or ["PARAMETER"], channels or ["CHANNEL"])
+    # A single parameter also has its error in its own unit.
+    return [c for c in columns if c.name != "param_abs_error" or len(parameters) == 1]
+
+
+def read_checked_runs(
+    batches: Iterable[pa.Table], names: list[str], experiment: Experiment
+) -> pd.DataFrame:
+    """Check rows of runs and return one line per run; see `RunsTable.read_runs`.
+
+    Args:
+        batches: The rows, as consecutive tables.
+        names: Names of the columns.
+        experiment: Experiment of the runs.
+
+    Raises:
+        CellError: A cell or a run violates its declaration.
+    """
+    import pandas as pd
+
+    # Without runs there are no columns.
+    columns = (
+        select_declared_columns(names, declare_run_columns(names, experiment)) if names else []
+    )
+    summaries: list[pd.DataFrame] = []
+    last_row: pa.Table | None = None
+    offset = 0
+    for batch in batches:
+        if not len(batch):
+            continue
+        rows = _convert_batch(batch, columns, last_row, offset)
+        summaries.append(_summarise_new_runs(rows, last_row is not None, offset))
+        offset += len(batch)
+        last_row = rows.slice(len(rows) - 1)
+    runs = (
+        pd.concat(summaries, ignore_index=True)
+        if summaries
+        else pd.DataFrame(columns=["run", *RUN_CONSTANT_COLUMNS, "row"])
+    )
+    # k counts without gaps, so the number of rows gives the last k.
+    runs["used"] = np.diff(np.append(runs["row"].to_numpy(dtype=np.int64), offset)) - 1
+    is_repeated = runs["run"].duplicated().to_numpy(dtype=bool)
+    if is_repeated.any():
+        place = int(is_repeated.argmax())
+        name = runs["run"].iloc[place]
+        raise CellError(int(runs["row"].iloc[place]), "run", "every run once", f"{name} again")
+    return runs
+
+
+def _convert_batch(
+    batch: pa.Table, columns: list[ColumnSpec], last_row: pa.Table | None, offset: int
+) -> pa.Table:
+    """Convert a batch to its declared types and prepend the last row of the previous batch.
+
+    Raises:
+        CellError: A cell violates its declaration, or a run is incomplete.
+    """
+    import pyarrow as pa
+    from pyarrow import compute
+
+    try:
+        typed = {c.name: parse_parquet_column(c, batch[c.name].combine_chunks()) for c in columns}
+        at_start = typed["k"].to_numpy() == 0
+        is_recording = to_numpy_mask(compute.equal(typed["range"], "real"))
+        for column in columns:
+            check_cells(column, typed[column.name], at_start, is_recording)
+    except CellError as error:
+        row = None if error.row is None else error.row + offset
+        raise _shift_error_row(error, row) from None
+    rows = pa.table(typed)
+    rows = rows if last_row is None else pa.concat_tables([last_row, rows]).combine_chunks()
+    try:
+        _check_counts(rows, last_row is not None)
+        _check_same(rows)
+    except CellError as error:
+        raise _shift_error_row(error, (error.row or 0) + offset - (last_row is not None)) from None
+    return rows
+
+
+def _shift_error_row(error: CellError, row: int | None) -> CellError:
+    error.row = row
+    return error
+
+
+def _find_run_starts(rows: pa.Table) -> Mask:
+    """Return an (n,) mask of rows where a run begins, including the first row."""
+    return np.append(True, _find_changes(rows["run"]))
+
+
+def _find_changes(values: pa.ChunkedArray) -> Mask:
+    """Return an (n - 1,) mask of values that differ from the previous one; NaN equals NaN."""
+    import pyarrow as pa
+    from pyarrow import compute
+
+    column = values.combine_chunks()
+    if pa.types.is_floating(column.type):
+        numbers = column.to_numpy()
+        is_both_missing = np.isnan(numbers[1:]) & np.isnan(numbers[:-1])
+        is_changed: Mask = (numbers[1:] != numbers[:-1]) & ~is_both_missing
+        return is_changed
+    changed = compute.not_equal(column.slice(1), column.slice(0, max(len(column) - 1, 0)))
+    return to_numpy_mask(changed)
+
+
+def _check_counts(rows: pa.Table, goes_on: bool) -> None:
+    """Check that k counts 0, 1, 2, ... in every run.
+
+    `rows` is one batch of the file; `goes_on` is True if its first row continues the last run of
+    the batch before.
+
+    Raises:
+        CellError: k has another value, so that a row is missing or added.
+    """
+    k: NDArray[np.int64] = rows["k"].to_numpy()
+    expected = np.append(0, k[:-1] + 1)
+    expected[_find_run_starts(rows)] = 0
+    if goes_on:  # The first row was checked with the previous batch.
+        expected[0] = k[0]
+    is_wrong = k != expected
+    if is_wrong.any():
+        row = int(is_wrong.argmax())
+        run = rows["run"][row].as_py()
+        raise CellError(row, "k", f"{expected[row]}, the next of {run}", str(k[row]))
+
+
+def _list_constant_columns(rows: pa.Table) -> list[str]:
+    """List the columns that are constant within a run."""
+    names = rows.column_names
+    return [name for name in names if name in RUN_CONSTANT_COLUMNS or name.startswith("true_")]
+
+
+def _check_same(rows: pa.Table) -> None:
+    """Check that the columns that describe a run are constant within it.
+
+    These are columns such as tuner and target, which are repeated in each row of the run.
+
+    Raises:
+        CellError: a value differs from the row before.
+    """
+    is_same_run = ~_find_run_starts(rows)[1:]
+    for name in _list_constant_columns(rows):
+        is_changed = _find_changes(rows[name]) & is_same_run
+        if is_changed.any():
+            row = int(is_changed.argmax()) + 1
+            values = rows[name].slice(row - 1, 2).to_pylist()
+            raise CellError(row, name, f"{values[0]} as in the row before", str(values[1]))
+
+
+def _summarise_new_runs(rows: pa.Table, goes_on: bool, offset: int) -> pd.DataFrame:
+    """Return one line for each run that begins in these rows, a batch of a larger file.
+
+    `goes_on` is True if the first row belongs to the last run of the batch before. `offset` is the
+    number of rows before the batch, so that ``row`` is the row of the file at which the run begins.
+    """
+    new = _find_run_starts(rows)
+    if goes_on:
+        new[0] = False
+    places = np.flatnonzero(new)
+    keys = rows.select(["run", *_list_constant_columns(rows)])
+    summary: pd.DataFrame = keys.take(places).to_pandas()
+    return summary.assign(row=places + offset - goes_on)

@@ -24,7 +24,7 @@ from bench.cli.shared_options import (
 
 if TYPE_CHECKING:
     from bench.benchmark.runner.worker_pools import Pool
-    from bench.benchmark.storage.study_progress import StudyOutcome
+    from bench.benchmark.storage.run_status import StudyOutcome
     from bench.studies.study import Study
 
 _UNCHANGED_BY_RESUME = ("jobs", "plugins", "cluster", "force", "pdf", "progress")
@@ -130,8 +130,8 @@ def _run_study(
         JSON document and exit code; not EXIT_OK if runs are missing, or if some failed and failures
         are not allowed.
     """
+    from bench.cli.output import summarise_study
     from bench.cli.progress_display import ProgressBars
-    from bench.cli.study_summary import summarise_study
 
     with ProgressBars() as bars:
         outcome = study.run(options.jobs, bars.start_bar, pool)

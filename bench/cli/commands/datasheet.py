@@ -42,7 +42,7 @@ def _run_datasheet(options: argparse.Namespace, print_line: PrintLine) -> Comman
     """Make a data sheet; explain the logs first unless an explanation is given."""
     from bench.api.datasheet import DatasheetOptions, check_joint_exists, datasheet
     from bench.api.explain import explain
-    from bench.cli.search_progress import ProgressDisplay
+    from bench.cli.progress_display import ProgressDisplay
     from bench.core.plugin_registries import load_plugins
     from bench.diagnosis.explain_options import ExplainOptions
     from sims.core.argument_checks import check_options

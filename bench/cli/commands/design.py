@@ -46,7 +46,7 @@ def _run_design(options: argparse.Namespace, print_line: PrintLine) -> CommandRe
     """
     from bench.api.design import DesignOptions, design
     from bench.cli.interrupt_handler import InterruptHandler
-    from bench.cli.search_progress import ProgressDisplay
+    from bench.cli.progress_display import ProgressDisplay
     from bench.core.plugin_registries import load_plugins
     from sims.core.files import check_absent
 

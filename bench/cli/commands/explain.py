@@ -82,7 +82,7 @@ def _run_explain(options: argparse.Namespace, print_line: PrintLine) -> CommandR
     """Explain a recording, write the results, print the text summary."""
     from bench.api.explain import explain
     from bench.benchmark.storage.provenance import get_utc_time, write_explanation_environment
-    from bench.cli.search_progress import ProgressDisplay
+    from bench.cli.progress_display import ProgressDisplay
     from bench.core.plugin_registries import load_plugins
     from bench.diagnosis.explain_options import ExplainOptions
     from bench.diagnosis.report.summary_text import format_summary
@@ -154,7 +154,7 @@ def _run_explain_batch(options: argparse.Namespace, print_line: PrintLine) -> Co
         get_utc_time,
         write_explanation_environment,
     )
-    from bench.cli.search_progress import ProgressDisplay
+    from bench.cli.progress_display import ProgressDisplay
     from bench.core.resource_estimates import count_available_cores
     from bench.diagnosis.batch.log_tables import (
         LOGS_TABLE_FILE,

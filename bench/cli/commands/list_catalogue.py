@@ -44,7 +44,7 @@ def _run_list(options: argparse.Namespace, print_line: PrintLine) -> CommandResu
         The JSON document of the command, and its exit code (0).
     """
     from bench.cli import catalogue
-    from bench.cli.catalogue_text import format_documents
+    from bench.cli.catalogue import format_documents
     from bench.cli.main import build_parser
     from bench.core.plugin_registries import load_plugins
     from sims.core.simulator import InputError

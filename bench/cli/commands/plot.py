@@ -100,7 +100,7 @@ def _report_again(
     folder: Path, references: Sequence[ReferenceResult], print_line: PrintLine
 ) -> CommandResult:
     """Report again a study, or the studies of a sweep or of a file with several studies."""
-    from bench.cli.study_summary import summarise_study
+    from bench.cli.output import summarise_study
     from bench.studies.study import list_study_folders, open_study, report_jointly
 
     comparisons = []

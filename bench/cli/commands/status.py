@@ -10,7 +10,7 @@ from bench.cli.output import EXIT_OK, EXIT_PROBLEMS_FOUND, CommandResult, JsonDo
 from bench.cli.shared_options import parse_path
 
 if TYPE_CHECKING:
-    from bench.benchmark.storage.study_progress import RunEnd, StudyProgress
+    from bench.benchmark.storage.run_status import RunEnd, StudyProgress
     from bench.studies.study import Study
 
 _MAX_LISTED_RUNS = 20
@@ -145,7 +145,7 @@ def _count_endings(progress: StudyProgress) -> dict[str, dict[str, int]]:
 
 def _format_counts(groups: dict[str, dict[str, int]]) -> list[str]:
     """Format the counts as text, missing runs last."""
-    from bench.benchmark.storage.study_progress import MISSING_STATUS
+    from bench.benchmark.storage.run_status import MISSING_STATUS
 
     width = max(map(len, groups), default=0)
     lines = []
@@ -157,7 +157,7 @@ def _format_counts(groups: dict[str, dict[str, int]]) -> list[str]:
 
 def _select_notable_runs(progress: StudyProgress) -> tuple[RunEnd, ...]:
     """Select the runs to list: those without success, or all; at most `_MAX_LISTED_RUNS`."""
-    from bench.benchmark.storage.study_progress import SUCCESS_STATUSES
+    from bench.benchmark.storage.run_status import SUCCESS_STATUSES
 
     unsuccessful = tuple(
         run_end for run_end in progress.ends if run_end.status not in SUCCESS_STATUSES

@@ -15,7 +15,7 @@ from urllib.parse import quote
 import pandas as pd
 
 from bench.diagnosis.report.wording import append_unit, format_label
-from bench.pages.csv_text import format_csv
+from bench.pages.text_format import format_csv
 
 LOGS_TABLE_FILE = "logs.csv"
 """File name of the table, which has one row for each number of each cause of each log."""

@@ -25,8 +25,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bench.diagnosis.randomization.ranges import RandomizationRange, RandomizationRanges, texts
-from bench.pages.csv_text import format_csv
-from bench.pages.text_format import sanitise
+from bench.pages.text_format import format_csv, sanitise
 from sims.extended_simulator import ExtendedSimulator
 
 COMMENT_WIDTH = 96

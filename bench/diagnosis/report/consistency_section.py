@@ -21,7 +21,7 @@ from bench.diagnosis.validation.run_consistency import (
     SIGNIFICANCE_LEVEL,
     ParameterConsistency,
 )
-from bench.pages.interval_drawing import IntervalDrawing, draw_intervals
+from bench.pages.page_table import IntervalDrawing, draw_intervals
 
 MAX_TABLE_ROWS = 12
 """Maximum number of rows of the table, the least consistent first."""

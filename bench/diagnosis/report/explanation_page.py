@@ -65,7 +65,7 @@ from bench.diagnosis.report.wording import (
 from bench.diagnosis.verdict import Cause
 from bench.pages.chart import PrintedFigure
 from bench.pages.html_page import HtmlPage
-from bench.pages.interval_drawing import IntervalDrawing, draw_intervals
+from bench.pages.page_table import IntervalDrawing, draw_intervals
 from sims.core.simulator import Array
 
 _TEMPLATE = Path(__file__).with_name("explanation.html")

@@ -12,7 +12,7 @@ import pandas as pd
 import pytest
 import tomli_w
 
-from bench.benchmark.statistics.error_table import ERROR_TABLE_COLUMNS
+from bench.benchmark.statistics.error_curves import ERROR_TABLE_COLUMNS
 from bench.cli.main import main
 from tests.conftest import PLUGINS
 from tests.sample_experiments import SPRING

@@ -6,7 +6,7 @@ import signal
 import pytest
 
 from bench.cli.main import main
-from bench.cli.search_progress import ProgressDisplay
+from bench.cli.progress_display import ProgressDisplay
 from bench.core.plugin_registries import simulators
 from sims.extended_simulator import load_extended, read_extended
 from tests.bench.diagnosis import verdict_schema

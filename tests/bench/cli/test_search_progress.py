@@ -15,7 +15,7 @@ import pytest
 
 from bench.api.explain import explain
 from bench.cli.main import main
-from bench.cli.search_progress import (
+from bench.cli.progress_display import (
     BUDGET_HINT,
     HINT_AFTER,
     LOG_INTERVAL,

@@ -7,7 +7,6 @@ import pandas as pd
 import pytest
 from matplotlib.figure import Figure
 
-from bench.benchmark.comparison_tables import build_tables
 from bench.benchmark.figures import comparison_figures
 from bench.benchmark.figures.comparison_figures import (
     FIGURE_FILES,
@@ -15,7 +14,8 @@ from bench.benchmark.figures.comparison_figures import (
     list_figure_names,
 )
 from bench.benchmark.statistics.comparison_statistics import ComparisonStatistics
-from bench.benchmark.statistics.error_table import build_error_table
+from bench.benchmark.statistics.comparison_tables import build_tables
+from bench.benchmark.statistics.error_curves import build_error_table
 from sims.core.simulator import InputError
 from tests.bench.figures.sample_comparisons import LABELS, stored
 

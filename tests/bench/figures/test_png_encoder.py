@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from bench.figures.png_encoder import encode_png
+from bench.figures.figure_files import encode_png
 from bench.figures.style import make_panel_grid, render_png
 
 

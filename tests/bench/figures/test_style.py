@@ -12,15 +12,17 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
 import bench
-from bench.benchmark.figures.comparison_figures import draw_figure, list_figure_names
-from bench.benchmark.figures.rank_figure import draw_critical_difference_figure
-from bench.benchmark.statistics.problem_ranks import compute_nemenyi_p_values
+from bench.benchmark.figures.comparison_figures import (
+    draw_critical_difference_figure,
+    draw_figure,
+    list_figure_names,
+)
+from bench.benchmark.statistics.tuner_ranking import compute_nemenyi_p_values
 from bench.diagnosis.report import explanation_figures
 from bench.figures import loss_figure, style
 from bench.figures.figure_files import pdf_figures
-from bench.figures.recording_figure import draw_recording_figure
+from bench.figures.recording_figure import draw_recording_figure, draw_track_figure
 from bench.figures.style import make_panel_grid, render_all_formats, render_png, write_figure
-from bench.figures.track_figure import draw_track_figure
 from bench.logs.ball_heights import BallHeights
 from bench.logs.recording_loading import load_recording
 from sims.core.simulator import InputError

@@ -12,8 +12,8 @@ import numpy as np
 import psutil
 import pytest
 
-from bench.benchmark.isolation.process_exit import KilledExternallyError
-from bench.benchmark.isolation.scratch_folders import create_locked_folder, remove_stale_folders
+from bench.benchmark.isolation.process_limits import KilledExternallyError
+from bench.benchmark.isolation.tuner_processes import create_locked_folder, remove_stale_folders
 from bench.benchmark.problem.experiment import TunerEntry
 from bench.benchmark.runner import sandboxed_tuner
 from bench.benchmark.runner.plugin_discovery import inspect_plugins, load_plugins_for_experiment

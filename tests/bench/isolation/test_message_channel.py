@@ -16,12 +16,13 @@ from bench.benchmark.isolation.message_channel import (
     MessageChannel,
     PeerClosedError,
     ProtocolError,
+    decode_rng_state,
+    encode_rng_state,
     pack_arrays,
     to_printable,
     unpack_arrays,
 )
-from bench.benchmark.isolation.process_exit import RunEndedError
-from bench.benchmark.isolation.rng_transfer import decode_rng_state, encode_rng_state
+from bench.benchmark.isolation.process_limits import RunEndedError
 from bench.benchmark.isolation.tuner_processes import IsolatedProcess
 
 HEAD = struct.Struct("<cBxxIQ")

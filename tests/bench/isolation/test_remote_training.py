@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bench.benchmark.isolation.process_exit import RunEndedError
+from bench.benchmark.isolation.process_limits import RunEndedError
 from bench.benchmark.runner import sandboxed_tuner
 from bench.benchmark.runner.plugin_discovery import load_plugins_for_experiment
 from bench.benchmark.runner.tuner_training import TrainingRequest, read_weights, train_or_load
@@ -163,7 +163,7 @@ def test_weights_of_a_trusted_tuner_are_not_those_of_an_isolated_one(experiment)
 
 
 def test_a_training_that_is_made_again_after_a_kill_must_ask_for_the_same(experiment, monkeypatch):
-    from bench.benchmark.isolation.process_exit import KilledExternallyError
+    from bench.benchmark.isolation.process_limits import KilledExternallyError
     from bench.benchmark.problem.training_simulator import CountedTrainingSimulator
 
     asked = []

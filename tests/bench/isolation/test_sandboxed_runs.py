@@ -6,7 +6,7 @@ import pytest
 
 from bench.benchmark.problem.experiment import TunerEntry
 from bench.benchmark.runner import sandboxed_tuner
-from bench.benchmark.runner.proposal_evaluator import ProposalEvaluator
+from bench.benchmark.runner.tuner_loop import ProposalEvaluator
 from tests.bench.isolation.isolated_process import experiment, outcome
 from tests.kill_and_resume import below
 

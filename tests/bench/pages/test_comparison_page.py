@@ -11,17 +11,17 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from bench.benchmark.comparison_tables import build_tables
 from bench.benchmark.figures import comparison_figures
-from bench.benchmark.figures.comparison_view import ComparisonView
-from bench.benchmark.report_page.comparison_conclusion import (
+from bench.benchmark.figures.comparison_charts import ComparisonView
+from bench.benchmark.report_page.comparison_page import (
+    ComparisonReportData,
+    render_page,
     write_conclusion,
     write_provenance_notes,
     write_running_times,
 )
-from bench.benchmark.report_page.comparison_page import render_page
-from bench.benchmark.report_page.comparison_page_data import ComparisonReportData
 from bench.benchmark.statistics.comparison_statistics import ComparisonStatistics
+from bench.benchmark.statistics.comparison_tables import build_tables
 from bench.benchmark.statistics.training_amortisation import build_time_per_target_table
 from bench.figures.style import render_all_formats
 from bench.pages.text_format import format_number

@@ -6,8 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from bench.pages.data_grid import DataGrid, GridColumn, select_initial_rows
-from bench.pages.page_table import Table
+from bench.pages.page_table import DataGrid, GridColumn, Table, select_initial_rows
 
 COLUMNS = {
     "text": ['a "quoted", one', "b", "=c", "", "two\nlines"],

@@ -5,10 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bench.benchmark.problem.domain_randomisation import NO_EFFECT_SHARE, RandomisedSimulator
 from bench.benchmark.problem.experiment import load_experiment
-from bench.benchmark.problem.training_simulator import CountedTrainingSimulator
-from bench.benchmark.problem.tuner_entries import TunerEntry
+from bench.benchmark.problem.experiment_tables import TunerEntry
+from bench.benchmark.problem.training_simulator import (
+    NO_EFFECT_SHARE,
+    CountedTrainingSimulator,
+    RandomisedSimulator,
+)
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.benchmark.runner.run_ids import RunIds
 from bench.benchmark.runner.tuner_training import compute_training_key

@@ -12,20 +12,20 @@ from bench.benchmark.problem.experiment import (
     load_experiment,
     parse_experiment,
 )
-from bench.benchmark.problem.model_file_simulator import (
+from bench.benchmark.problem.experiment_tables import TunerEntry
+from bench.benchmark.problem.robot_experiment import (
     complete_robot_experiment,
     find_missing_model_file,
     find_model,
     get_simulator_class,
+    make_robot_experiment,
 )
-from bench.benchmark.problem.robot_experiment import make_robot_experiment
-from bench.benchmark.problem.tuner_entries import TunerEntry
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.benchmark.runner.code_digest import hash_class_source, hash_effect_sources
 from bench.benchmark.runner.run_ids import RunIds, compute_fingerprint
 from bench.benchmark.runner.tuner_training import compute_training_key
 from bench.cli import catalogue
-from bench.cli.catalogue_text import format_documents
+from bench.cli.catalogue import format_documents
 from sims import effects
 from sims.core.registry import PartUnavailableError
 from sims.core.simulator import InputError
@@ -176,7 +176,7 @@ def test_model_files_are_found_in_packages_and_in_the_folder_of_robots(tmp_path,
 
 
 def test_what_a_shipped_experiment_lacks_is_said_in_the_list(tmp_path, monkeypatch):
-    from bench.cli.catalogue_text import format_catalogue
+    from bench.cli.catalogue import format_catalogue
 
     monkeypatch.setenv("SIMGAP_ROBOTS", str(tmp_path))
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))

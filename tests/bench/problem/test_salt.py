@@ -6,14 +6,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bench.benchmark.problem.salt import (
+from bench.benchmark.problem.tuning_problem import TuningProblem
+from bench.core.random_streams import (
     TargetStreams,
     check_commitment,
     compute_commitment,
     generate_salt,
+    make_rng,
 )
-from bench.benchmark.problem.tuning_problem import TuningProblem
-from bench.core.random_streams import make_rng
 from sims.core.simulator import InputError
 from tests.sample_experiments import spring_experiment
 

@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 import tomli_w
 
-from bench.benchmark.storage.journal_segments import read_finished_statuses
+from bench.benchmark.storage.run_journal import read_finished_statuses
 from bench.cli.main import main
 from sims.core.simulator import InputError
 from tests.conftest import PLUGINS

@@ -7,7 +7,7 @@ import time
 import pandas as pd
 import pytest
 
-from bench.benchmark.storage.journal_segments import read_finished_statuses
+from bench.benchmark.storage.run_journal import read_finished_statuses
 from bench.cli.main import main
 from tests.bench.runner.test_comparison import CHAOS, SPRING_PLUGIN, same, simgap, write
 from tests.local_cluster import cluster

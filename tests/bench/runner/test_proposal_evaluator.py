@@ -3,7 +3,7 @@ import pytest
 
 from bench.benchmark.problem.recorded_runs import ObservedRuns
 from bench.benchmark.problem.tuning_problem import TuningProblem
-from bench.benchmark.runner.proposal_evaluator import ProposalEvaluator
+from bench.benchmark.runner.tuner_loop import ProposalEvaluator
 from tests.sample_experiments import spring_experiment
 
 pytestmark = pytest.mark.usefixtures("spring")

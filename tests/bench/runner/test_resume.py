@@ -13,9 +13,13 @@ from bench.benchmark.problem.recorded_runs import ObservedRuns
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.benchmark.runner.run_ids import RunIds
 from bench.benchmark.runner.study_setup import prepare_study
-from bench.benchmark.storage.journal_segments import read_finished_statuses, read_plan, write_plan
 from bench.benchmark.storage.result_folder import read_comparison
-from bench.benchmark.storage.run_journal import RunJournal
+from bench.benchmark.storage.run_journal import (
+    RunJournal,
+    read_finished_statuses,
+    read_plan,
+    write_plan,
+)
 from bench.core.plugin_registries import load_plugins
 from sims.core.simulator import InputError
 from tests.conftest import PLUGINS

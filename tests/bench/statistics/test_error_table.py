@@ -3,7 +3,7 @@ import pandas as pd
 import pytest
 
 from bench.benchmark.statistics.bootstrap import compute_bootstrap_interval, compute_resampled_means
-from bench.benchmark.statistics.error_table import (
+from bench.benchmark.statistics.error_curves import (
     ERROR_TABLE_COLUMNS,
     build_error_table,
     build_summary,

@@ -9,7 +9,7 @@ from bench.benchmark.statistics.bootstrap import (
     compute_resampled_means,
     compute_resampled_medians,
 )
-from bench.benchmark.statistics.error_table import build_error_table
+from bench.benchmark.statistics.error_curves import build_error_table
 from bench.benchmark.statistics.expected_running_time import (
     build_ert_table,
     compute_percentile_interval,

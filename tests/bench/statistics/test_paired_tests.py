@@ -4,8 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from bench.benchmark.statistics.error_curves import select_primary_metric
-from bench.benchmark.statistics.error_table import build_error_table
+from bench.benchmark.statistics.error_curves import build_error_table, select_primary_metric
 from bench.benchmark.statistics.expected_running_time import compute_effort
 from bench.benchmark.statistics.paired_tests import compare_all_pairs, correct_holm
 from tests.bench.statistics.test_error_table import at, runs_of, statuses_of

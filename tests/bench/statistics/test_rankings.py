@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bench.benchmark.statistics.rank_agreement import (
+from bench.benchmark.statistics.tuner_ranking import (
     compute_kendall_tau,
     compute_mean_ranks,
     compute_rank_agreement,

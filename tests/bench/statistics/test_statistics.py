@@ -13,10 +13,9 @@ from bench.benchmark.statistics.expected_running_time import (
     build_ert_table,
     compute_effort,
     compute_hitting_times,
+    compute_solved_fraction,
 )
 from bench.benchmark.statistics.paired_tests import compare_all_pairs
-from bench.benchmark.statistics.problem_ranks import compute_nemenyi_p_values, compute_problem_ranks
-from bench.benchmark.statistics.runtime_distribution import compute_solved_fraction
 from bench.benchmark.statistics.training_amortisation import (
     TuningCost,
     build_break_even_table,
@@ -24,6 +23,7 @@ from bench.benchmark.statistics.training_amortisation import (
     compute_tuning_costs,
     find_cheapest_tuners,
 )
+from bench.benchmark.statistics.tuner_ranking import compute_nemenyi_p_values, compute_problem_ranks
 from tests.bench.statistics.test_error_table import runs_of, statuses_of
 
 
@@ -218,7 +218,7 @@ def test_a_million_rows_are_read_for_the_table_within_five_seconds(tmp_path):
 
     from bench.benchmark.comparison import Comparison
     from bench.benchmark.results_report import REQUIRED_RUN_COLUMNS
-    from bench.benchmark.statistics.error_table import build_error_table
+    from bench.benchmark.statistics.error_curves import build_error_table
     from bench.benchmark.storage.result_folder import read_comparison
     from bench.core.plugin_registries import load_plugins
     from tests.conftest import PLUGINS

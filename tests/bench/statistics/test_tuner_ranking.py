@@ -4,8 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from bench.benchmark.statistics.error_curves import RunCurves
-from bench.benchmark.statistics.median_curves import find_coinciding_curves
+from bench.benchmark.statistics.error_curves import RunCurves, find_coinciding_curves
 from bench.benchmark.statistics.tuner_ranking import (
     compute_min_targets,
     list_ranking_points,

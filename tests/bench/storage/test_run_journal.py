@@ -4,14 +4,14 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from bench.benchmark.storage.journal_segments import (
+from bench.benchmark.storage.run_journal import (
     SEGMENTS_FOLDER,
+    RunJournal,
     read_finished_statuses,
     read_plan,
     read_records,
     write_plan,
 )
-from bench.benchmark.storage.run_journal import RunJournal
 from bench.benchmark.storage.run_status import RunStatus
 from sims.core.simulator import InputError
 

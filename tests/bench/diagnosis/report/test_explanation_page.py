@@ -14,8 +14,8 @@ from bench.diagnosis.identifiability import ParameterIdentifiability
 from bench.diagnosis.report.explanation_figures import RenderedFigure
 from bench.diagnosis.report.explanation_page import compute_channel_errors, render_report
 from bench.diagnosis.report_data_builder import DiagnosisReportDataBuilder
-from bench.pages.data_grid import INITIAL_ROWS
 from bench.pages.html_page import make_iframe
+from bench.pages.page_table import INITIAL_ROWS
 from tests.bench.diagnosis.report.test_summary_text import VERDICTS
 from tests.bench.diagnosis.sample_report_data import DRAG, EVIL, HELD_OUT, TILT, evil, make_report
 

@@ -17,7 +17,7 @@ from bench.diagnosis.report.explanation_page import render_report
 from bench.diagnosis.report.joint_figure import list_joint_rows
 from bench.diagnosis.report.run_selection import select_worst_run
 from bench.figures import robot_figure as drawing
-from bench.pages.data_grid import INITIAL_ROWS
+from bench.pages.page_table import INITIAL_ROWS
 from tests.bench.diagnosis.report.test_explanation_page import Reader, cells, make_rendered_figure
 from tests.bench.diagnosis.robot_report_data import (
     CHANGE,

@@ -10,7 +10,7 @@ import pytest
 
 from bench.benchmark.problem.availability import leave_out_missing_problems
 from bench.benchmark.problem.experiment import expand_sweep, load_experiment
-from bench.benchmark.problem.suite_version import compute_problem_hash
+from bench.benchmark.problem.experiment_tables import compute_problem_hash
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.core.plugin_registries import tuners
 from bench.studies.archive_bundle import verify_archive, write_bundle

@@ -1,14 +1,17 @@
-"""Tables of a comparison: errors, running times, rankings, pairs, break-even and fastest tuners."""
+"""Tables of a comparison: errors, running times, rankings, pairs, break-even, identifiability."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
 import pandas as pd
 
+from bench.benchmark.problem.experiment import Experiment
+from bench.benchmark.problem.fisher_information import InformationSpectrum
 from bench.benchmark.statistics.comparison_statistics import ComparisonStatistics
-from bench.benchmark.statistics.error_table import build_error_table
+from bench.benchmark.statistics.error_curves import build_error_table
 from bench.benchmark.statistics.expected_running_time import build_ert_table
 from bench.benchmark.statistics.paired_tests import compare_all_pairs
-from bench.benchmark.statistics.provenance_columns import add_salt_column, add_trust_column
 from bench.benchmark.statistics.training_amortisation import (
     BREAK_EVEN_COLUMNS,
     TARGETS_PER_TRAINING,
@@ -16,6 +19,18 @@ from bench.benchmark.statistics.training_amortisation import (
     find_cheapest_tuners,
 )
 from bench.benchmark.storage.result_folder import StoredComparison
+from sims.core.simulator import Parameter
+
+
+def add_trust_column(frame: pd.DataFrame, experiment: Experiment) -> pd.DataFrame:
+    """Add the column `trusted`, True if the tuners ran without isolation."""
+    return frame.assign(trusted=experiment.trusted)
+
+
+def add_salt_column(frame: pd.DataFrame, experiment: Experiment) -> pd.DataFrame:
+    """Add the column `salt`: ``secret`` if the salt is committed by a hash, else ``public``."""
+    return frame.assign(salt="secret" if experiment.salt_sha256 else "public")
+
 
 WINNER_COLUMNS = ["experiment", "range", "threshold", "from_seconds", "to_seconds", "tuner"]
 
@@ -78,3 +93,46 @@ def _build_fastest_tuner_table(experiment: str, statistics: ComparisonStatistics
         for line in find_cheapest_tuners(by_tuner, TARGETS_PER_TRAINING)
     ]
     return pd.DataFrame(lines, columns=WINNER_COLUMNS)
+
+
+IDENTIFIABILITY_COLUMNS = [
+    "experiment",
+    "target",
+    "range",
+    "direction",
+    "eigenvalue",
+    "sigma",
+    "stiff",
+]
+
+
+def build_identifiability_table(
+    experiment: Experiment,
+    spectra: Mapping[str, InformationSpectrum],
+    parameters: Sequence[Parameter],
+) -> pd.DataFrame:
+    """Build a table with one row per target and direction, the stiffest direction first.
+
+    Args:
+        experiment: experiment of the targets.
+        spectra: identifiability spectrum by target.
+        parameters: tuned parameters.
+
+    Returns:
+        Table of eigenvalues, standard deviations and the components of each parameter.
+    """
+    lines = [
+        [
+            experiment.name,
+            target,
+            target.split("-")[0],
+            i + 1,
+            spectrum.values[i],
+            spectrum.sigmas[i],
+            spectrum.is_stiff[i],
+            *spectrum.vectors[:, i],
+        ]
+        for target, spectrum in spectra.items()
+        for i in range(len(spectrum.values))
+    ]
+    return pd.DataFrame(lines, columns=[*IDENTIFIABILITY_COLUMNS, *(p.name for p in parameters)])
