@@ -19,14 +19,14 @@ Published: next is always linear in h.
 Source: X. Zhang, S. Liu et al., Dynamics as Prompts, IEEE RA-L 2025, arXiv 2410.20357, Algorithm 1.
 From a source to a target, the next point lies between the nearest points tried on either side:
 
-    (1)  l = max tried below the target, u = min tried above it, in each parameter
-    (2)  next = l + r (u - l), r from Beta(a, a)
+    (6)  l = max tried below the target, u = min tried above it, in each parameter
+    (7)  next = l + r (u - l), r from Beta(a, a)
 
 Source: X. Zhang, S. Liu et al., IEEE RA-L 2025, arXiv 2410.20357, Algorithm 2. With e_i the
 simulations of a history and t the target's parameters:
 
-    (1)  loss = mean |first guess - t|^2 + |next after e_i - t|^2 / (|e_i - t|^2 + relative^2)
-    (2)  published: loss = mean |next after e_i - e_(i + 1)|^2
+    (8)  loss = mean |first guess - t|^2 + |next after e_i - t|^2 / (|e_i - t|^2 + relative^2)
+    (9)  published: loss = mean |next after e_i - e_(i + 1)|^2
 
 The penalty lambda |weights|^2 is added to both.
 """
@@ -217,7 +217,7 @@ def _compute_swish(xp: Any, x: Any) -> Any:
 
 
 _BETA_PARAMETER = 2.0
-"""Parameter a of (2), which the paper does not state; 1 would be a uniform distribution."""
+"""Parameter a of (7), which the paper does not state; 1 would be a uniform distribution."""
 
 
 def draw_binary_search(simulator: TrainingSimulator, rng: np.random.Generator, count: int) -> Array:
@@ -237,10 +237,10 @@ def draw_binary_search(simulator: TrainingSimulator, rng: np.random.Generator, c
     while len(points) < count:
         last = points[-1]
         is_below = last < target
-        lower = np.where(is_below, last, lower)  # (1)
+        lower = np.where(is_below, last, lower)  # (6)
         upper = np.where(is_below, upper, last)
         share = rng.beta(_BETA_PARAMETER, _BETA_PARAMETER, size=last.size)
-        points.append(lower + share * (upper - lower))  # (2)
+        points.append(lower + share * (upper - lower))  # (7)
     return np.array(points[:count])
 
 
@@ -431,10 +431,10 @@ def _minimise_loss(
 def _compute_loss(
     w: dict[str, Any], design: HistoryTransformerDesign, parts: list[Any], histories: HistoryIndices
 ) -> Any:
-    """Compute the mean squared error of the proposals: loss (1), or (2) if published.
+    """Compute the mean squared error of the proposals: loss (8), or (9) if published.
 
-    (1) compares each proposal with the target's parameters, relative to the distance of the
-    simulation before; (2) compares it with the next point of the history. `parts` are input rows
+    (8) compares each proposal with the target's parameters, relative to the distance of the
+    simulation before; (9) compares it with the next point of the history. `parts` are input rows
     without and with noise, and parameters, of one batch of scenarios; `histories` are the indices
     of the simulations that form each history and of its target.
     """
@@ -447,9 +447,9 @@ def _compute_loss(
     truth = parameters[:, histories.targets][:, :, None]
     proposals = predict_proposals(torch, w, design, aim, tokens, proposed)
     if design.published:
-        return ((proposals[:, :, 1:-1] - proposed[:, :, 1:]) ** 2).mean()  # (2)
+        return ((proposals[:, :, 1:-1] - proposed[:, :, 1:]) ** 2).mean()  # (9)
     squares = ((proposals - truth) ** 2).sum(dim=-1)
     # Small distances matter in the last steps of tuning, so they must have enough weight.
     distances = ((proposed - truth) ** 2).sum(dim=-1) + design.relative**2
     parts = [squares[:, :, :1], squares[:, :, 1:] / distances * _ERROR_FACTOR]
-    return torch.cat(parts, dim=2).mean()  # (1)
+    return torch.cat(parts, dim=2).mean()  # (8)

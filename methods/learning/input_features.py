@@ -20,12 +20,12 @@ whose meaning changes from scenario to scenario only mislead.
 
 A camera that stands still shows a motion x along a line as
 
-    (1)  y = (a + b x) / (1 + c x)
+    (4)  y = (a + b x) / (1 + c x)
 
 (Hartley and Zisserman, Multiple View Geometry, 2004, chapter 2). Multiplied by the denominator it
 is linear in the three numbers:
 
-    (2)  y = a + b x - c x y
+    (5)  y = a + b x - c x y
 """
 
 from __future__ import annotations
@@ -481,7 +481,7 @@ _MIN_CAUCHY_WIDTH = 1e-6
 A closer agreement counts as exact.
 """
 _MIN_DENOMINATOR = 0.1
-"""Minimum denominator of (1).
+"""Minimum denominator of (4).
 
 A smaller one means that the pole of the map is near, where the motion reaches the camera.
 """
@@ -490,8 +490,8 @@ A smaller one means that the pole of the map is near, where the motion reaches t
 def fill_gaps(channel: Array, simulated: Array) -> Array:
     """Fill the gaps of a sensor's channel from a simulation, through a fitted map between them.
 
-    The map is y = (a + b x) / (1 + c x), as a camera maps a line (1). Its three numbers are fitted
-    to the available samples in linear form (2) and with Cauchy's weights, because an inaccurate
+    The map is y = (a + b x) / (1 + c x), as a camera maps a line (4). Its three numbers are fitted
+    to the available samples in linear form (5) and with Cauchy's weights, because an inaccurate
     model agrees with the sensor only in parts of a run.
 
     Args:
@@ -507,7 +507,7 @@ def fill_gaps(channel: Array, simulated: Array) -> Array:
     # A simulation at rest does not determine the map.
     if not np.ptp(simulated[is_present]) > 0:
         return channel
-    # Metres and pixels differ by orders of magnitude; scaling gives all columns of (2) equal
+    # Metres and pixels differ by orders of magnitude; scaling gives all columns of (5) equal
     # weight.
     x = _scale_like(simulated, simulated[is_present])
     y = _scale_like(channel, channel[is_present])
@@ -517,14 +517,14 @@ def fill_gaps(channel: Array, simulated: Array) -> Array:
     # A change of sign would put a part of the run behind the camera.
     if not (denominator > _MIN_DENOMINATOR).all():
         return channel
-    scaled_values = (a + b * x) / denominator  # (1)
+    scaled_values = (a + b * x) / denominator  # (4)
     unscaled = scaled_values * float(channel[is_present].std()) + float(channel[is_present].mean())
     result: Array = np.where(is_present, channel, unscaled)
     return result
 
 
 def _fit_camera_line(design_matrix: Array, values: Array) -> Array:
-    """Fit the numbers a, b, c (3,) of (2), the linear form of the camera's line, robustly.
+    """Fit the numbers a, b, c (3,) of (5), the linear form of the camera's line, robustly.
 
     The method is iteratively reweighted least squares with Cauchy's weights, so that a few wrong
     samples do not spoil the fit. `design_matrix` (n, 3) has the regressors 1, x and -x y of n
@@ -539,7 +539,7 @@ def _fit_camera_line(design_matrix: Array, values: Array) -> Array:
         coefficients = solution.astype(np.float64)
         residual: Array = values - design_matrix @ coefficients
         width = max(_CAUCHY_WIDTH * float(np.median(np.abs(residual))), _MIN_CAUCHY_WIDTH)
-        # This is the root of Cauchy's weight, because it multiplies both sides of (2).
+        # This is the root of Cauchy's weight, because it multiplies both sides of (5).
         weights = 1 / np.sqrt(1 + (residual / width) ** 2)
     return coefficients
 

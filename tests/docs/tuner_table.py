@@ -21,6 +21,9 @@ SET = {
     "integral of w q'' = integral of w'' q, integral of w q' = -integral of w' q": (
         r"\int w \ddot q = \int \ddot w q, \quad \int w \dot q = -\int \dot w q"
     ),
+    "w(s) = (1 - s^2)^4, s from -1 to 1 over the bump": (
+        r"w(s) = (1 - s^2)^4, \quad s \text{ from } -1 \text{ to } 1 \text{ over the bump}"
+    ),
     "zeta_k = zeta_{k-1} + h(o_P, o_T)": r"\zeta_k = \zeta_{k-1} + h(o_P, o_T)",
     "s = -B^-1 h, at first B = -1, which is (1)": (
         r"s = -B^{-1} h, \quad \text{at first } B = -1, \text{ which is (1)}"
