@@ -11,8 +11,6 @@ from collections.abc import Mapping
 from pathlib import PurePath
 from typing import Any
 
-import numpy as np
-
 
 def to_toml_value(value: Any) -> Any:
     """Copy a value as plain dicts, lists and numbers, as TOML gives them."""
@@ -94,6 +92,9 @@ def truncate_text(text: str, max_length: int = MAX_QUOTED_NAME_LENGTH) -> str:
 
 def is_plausible_number(value: Any) -> bool:
     """Return whether a value is a number of plausible size; booleans and NaN are not."""
+    # As above.
+    import numpy as np
+
     if isinstance(value, bool) or not isinstance(value, (int, float, np.number)):
         return False
     size: Any = value
