@@ -39,7 +39,7 @@ from bench.core.plugin_registries import tuners as registered
 from bench.diagnosis_benchmark import table_columns as diagnosis
 from bench.diagnosis_benchmark.diagnosers import language_model
 from bench.figures.figure_files import pdf_figures
-from bench.misspecification.comparison_experiments import MODEL_LABELS
+from bench.misspecification.calibration import MODEL_LABELS
 from bench.studies import study
 from methods.tuner import Tuner
 from sims.core.argument_checks import Expected, check_arguments

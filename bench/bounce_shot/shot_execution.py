@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 
 from bench.bounce_shot.shot_config import ShotConfig
-from bench.bounce_shot.shot_geometry import compute_hoop_crossings
-from bench.bounce_shot.shot_planner import simulate_flights
+from bench.bounce_shot.shot_planner import compute_hoop_crossings, simulate_flights
 from bench.bounce_shot.shot_planning import (
     TunedModel,
     get_planning_constants,

@@ -14,7 +14,7 @@ from bench.benchmark.problem.experiment import Experiment
 from bench.bounce_shot.hit_rate_table import make_success_panel
 from bench.bounce_shot.shot_config import ShotConfig
 from bench.bounce_shot.shot_execution import ShotResult, execute_shot
-from bench.bounce_shot.shot_geometry import ShotGeometry
+from bench.bounce_shot.shot_planner import ShotGeometry
 from bench.bounce_shot.shot_planning import (
     EXPLAIN_METHOD,
     EXPLAIN_SUFFIX,

@@ -3,7 +3,7 @@
 No code in this module uses the true ball. The models are those of the tuners, in the original
 simulator and in the one that `explain` extended from the same recording, and the fit of `explain`
 itself. Heights are shifted as if every ball had the radius of the experiment, so that one trained
-network serves all balls. Vision tuners get pixel rows instead (`bounce_shot.pixel_observations`).
+network serves all balls. Vision tuners get pixel rows instead (`bounce_shot.shot_sampling`).
 """
 
 from __future__ import annotations
@@ -22,10 +22,9 @@ from bench.benchmark.problem.experiment import Experiment, TunerEntry
 from bench.benchmark.problem.recorded_runs import ObservedRuns, make_scenario
 from bench.benchmark.problem.targets import BlindedTarget
 from bench.benchmark.runner.worker_tasks import RunRequest, execute_run, get_problem
-from bench.bounce_shot.pixel_observations import build_pixel_runs, make_pixel_experiment
 from bench.bounce_shot.shot_config import ShotConfig
-from bench.bounce_shot.shot_geometry import ShotGeometry
-from bench.bounce_shot.shot_planner import ShotPlan, plan_shot
+from bench.bounce_shot.shot_planner import ShotGeometry, ShotPlan, plan_shot
+from bench.bounce_shot.shot_sampling import build_pixel_runs, make_pixel_experiment
 from sims.core.simulator import Array, InputError, Scenario
 from sims.recording.recording import Recording, read_recording
 from sims.systems.ball import Ball as BallSimulator

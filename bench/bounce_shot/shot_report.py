@@ -1,8 +1,9 @@
-"""Write the tables, figures and HTML report of a bounce-shot study and print a summary."""
+"""Tables, figures and HTML report of a bounce-shot study, and its summary."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Protocol
 
@@ -14,18 +15,61 @@ from bench.benchmark.statistics.comparison_tables import add_trust_column
 from bench.benchmark.storage.run_journal import SEGMENTS_FOLDER
 from bench.benchmark.storage.run_status import STATUS_COLUMN_NAMES
 from bench.bounce_shot.hit_rate_table import (
+    ALL_BALLS,
     NO_SHOT_STATUSES,
     build_result_table,
     format_result_table,
+    make_success_panel,
 )
 from bench.bounce_shot.shot_animation import write_animation
 from bench.bounce_shot.shot_config import ShotConfig
 from bench.bounce_shot.shot_figures import draw_figures, select_example_shots
-from bench.bounce_shot.shot_page import render_page
 from bench.bounce_shot.shot_sampling import ShotSetup
 from bench.bounce_shot.shot_store import read_shot
 from bench.figures import style
+from bench.figures.style import FigureFiles
+from bench.pages.chart import PrintedFigure
+from bench.pages.html_page import HtmlPage
 from sims.core.files import write_atomically
+
+_TEMPLATE = Path(__file__).with_name("shots.html")
+
+
+def render_page(
+    experiment: Experiment,
+    folder: str,
+    lines: pd.DataFrame,
+    rows: pd.DataFrame,
+    pictures: Mapping[str, FigureFiles],
+) -> str:
+    """Render the HTML report.
+
+    Args:
+        experiment: the experiment.
+        folder: result folder.
+        lines: table of `bench.bounce_shot.hit_rate_table.build_result_table`.
+        rows: one row per method and shot.
+        pictures: printed figures by name.
+    """
+    success_panel, success = make_success_panel(lines)
+    page = HtmlPage()
+    page.add_table("table", lines)
+    page.add_table("shots", rows, 6)
+    page.add_table(success_panel.table, success)
+    over = lines[lines["ball"] == ALL_BALLS].sort_values("rate", ascending=False, kind="stable")
+    best, *other_rows = over.to_dict("records")
+    return page.render(
+        _TEMPLATE,
+        experiment=experiment,
+        folder=folder,
+        ALL_BALLS=ALL_BALLS,
+        best=best,
+        has_others=bool(other_rows),
+        similar=[row["method"] for row in other_rows if row["high"] >= best["low"]],
+        success_panel=success_panel,
+        figure=partial(PrintedFigure.from_files, pictures),
+    )
+
 
 SIMULATOR_NAME = "bounce-shot"
 """Name of the simulator in status.csv."""

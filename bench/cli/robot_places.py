@@ -8,7 +8,7 @@ from typing import cast
 
 from bench.cli.output import JsonDocument
 from bench.core.plugin_registries import make_robot_simulator
-from bench.logs.robot_summary import format_robot_summary
+from bench.logs.recording_summary import format_robot_summary
 from sims import effects
 from sims.core.values import append_unit, format_unit
 from sims.robot.robot_model import RobotModel

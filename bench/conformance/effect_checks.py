@@ -9,8 +9,6 @@ from contextlib import suppress
 import numpy as np
 
 from bench.conformance.check_base import Check, CheckError, NotApplicable, check, is_bitwise_equal
-from bench.conformance.first_order_tank import FirstOrderTank
-from bench.conformance.robot_arm_fixture import list_effect_places
 from bench.conformance.robot_place_checks import (
     PLACE_CHECKS,
     check_family_is_the_sum_of_its_members,
@@ -19,6 +17,7 @@ from bench.conformance.robot_place_checks import (
     check_nothing_at_zero_at_a_place,
     check_places_are_declared,
 )
+from bench.conformance.sample_subjects import FirstOrderTank, list_effect_places
 from bench.core.plugin_registries import PartUnavailableError, simulators
 from sims import effects
 from sims.core.effect import (

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from bench.conformance.check_base import Check, CheckError, NotApplicable, check, is_bitwise_equal
-from bench.conformance.robot_arm_fixture import (
+from bench.conformance.sample_subjects import (
     OBSERVED_CHANNELS,
     list_effect_places,
     make_arm_simulator,

@@ -13,9 +13,8 @@ from typing import Any, NamedTuple
 
 from bench.benchmark.runner.plugin_discovery import Plugin
 from bench.benchmark.runner.worker_pools import LocalPool
-from bench.conformance.check_base import Check, CheckError
+from bench.conformance.check_base import CALL_TIMEOUT_SECONDS, Check, CheckError
 from bench.conformance.check_suites import SUITES, failed_need, title_of
-from bench.conformance.subprocess_calls import CALL_TIMEOUT_SECONDS
 from bench.conformance.tuner_checks import check_same_run_in_other_processes
 from bench.core.plugin_registries import REGISTRIES
 from sims.core.simulator import InputError, make_unknown_name_error

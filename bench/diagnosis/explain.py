@@ -61,9 +61,9 @@ from bench.diagnosis.verdict_builder import VerdictBuilder
 from bench.logs.importing.filter_start import leave_out_settling
 from bench.logs.importing.sample_thinning import thin_recording
 from bench.logs.joined_recordings import load_joined
-from bench.logs.quality.timestamp_check import check_recording_plausible
+from bench.logs.quality.sampling_clock import check_recording_plausible
+from bench.logs.recording_loading import check_recording_size
 from bench.logs.segmentation import segment_recording
-from bench.logs.size_limits import check_recording_size
 from bench.pages.text_format import joined
 from sims import extended_simulator as extend
 from sims.core.simulator import Array, InputError, Simulator
@@ -298,7 +298,7 @@ class _ExplainRun:
         if not kind.has_model:
             return kind
         # These imports are needed for robots only.
-        from bench.logs.quality.recorded_poses import find_recorded_contacts
+        from bench.logs.quality.pose_check import find_recorded_contacts
         from sims.robot.robot_simulator import RobotSimulator
 
         assert issubclass(kind, RobotSimulator)

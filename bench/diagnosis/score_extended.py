@@ -18,9 +18,8 @@ from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.validation.held_out_runs import HeldOutRuns
 from bench.logs.importing.filter_start import leave_out_settling
-from bench.logs.quality.timestamp_check import check_recording_plausible
-from bench.logs.recording_loading import check_value_sizes
-from bench.logs.size_limits import check_recording_size
+from bench.logs.quality.sampling_clock import check_recording_plausible
+from bench.logs.recording_loading import check_recording_size, check_value_sizes
 from sims.core.simulator import Array, InputError, make_unknown_name_error
 from sims.extended_simulator import ExtendedSimulator, open_extended, read_extended
 from sims.recording.recording import Recording, read_recording, read_system_name

@@ -21,7 +21,7 @@ from bench.benchmark.storage.run_status import FAILED_OR_SKIPPED_STATUSES
 from bench.figures.style import add_trust_note, write_figure
 from bench.misspecification import misspecification_figures as figures
 from bench.misspecification import misspecification_scores
-from bench.misspecification.comparison_experiments import EXTENDED, MODEL_LABELS, PLAIN
+from bench.misspecification.calibration import EXTENDED, MODEL_LABELS, PLAIN
 from sims.core.files import write_atomically
 
 PrintLine = Callable[[str], None]

@@ -27,7 +27,7 @@ from bench.benchmark.statistics.tuner_ranking import (
     compute_rank_agreement,
 )
 from bench.benchmark.storage.result_folder import read_comparison
-from bench.misspecification.comparison_experiments import EXTENDED, MODEL_LABELS, PLAIN
+from bench.misspecification.calibration import EXTENDED, MODEL_LABELS, PLAIN
 from sims.core.simulator import Array, Parameter
 
 BIAS, ABSOLUTE, PARAMETERS, PREDICTION = "bias", "absolute_error", "param_error", "heldout_error"

@@ -28,15 +28,13 @@ from bench.benchmark.storage.run_status import (
     StudyProgress,
 )
 from bench.misspecification.calibration import (
-    load_extended,
-    run_explain,
-    write_calibration_recording,
-)
-from bench.misspecification.comparison_experiments import (
     MODEL_LABELS,
     PLAIN,
+    load_extended,
     make_base_experiment,
     make_extended_experiment,
+    run_explain,
+    write_calibration_recording,
 )
 from sims.extended_simulator import list_effect_coefficients
 

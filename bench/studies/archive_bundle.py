@@ -30,7 +30,7 @@ from bench.benchmark.storage.run_journal import SEGMENTS_FOLDER
 from bench.core.plugin_registries import simulators
 from bench.diagnosis.score_extended import score_model
 from bench.diagnosis.verdict import Verdict
-from bench.misspecification.comparison_experiments import MODEL_LABELS
+from bench.misspecification.calibration import MODEL_LABELS
 from bench.schemas import find_violations
 from bench.studies.study import list_study_folders
 from bench.studies.verification import VerificationFailure, VerificationResult, verify_comparison

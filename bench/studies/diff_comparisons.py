@@ -25,7 +25,7 @@ from bench.benchmark.statistics.paired_tests import compare_pair, compute_log_er
 from bench.benchmark.storage.provenance import read_environment
 from bench.benchmark.storage.result_folder import StoredComparison, read_comparison
 from bench.benchmark.storage.run_status import FAILED_OR_SKIPPED_STATUSES
-from bench.studies.diff_changes import (
+from bench.studies.diff_explanations import (
     FAMILYWISE_ERROR_RATE,
     describe_side,
     find_changes,

@@ -172,7 +172,7 @@ def report_jointly(folder: Path, print_line: PrintLine) -> None:
 
         write_joint_report(folder, parts, print_line)
     if experiments and all(experiment.suite for experiment in experiments):
-        from bench.studies.suite.suite_report import report_suite
+        from bench.studies.suite.suite_page import report_suite
 
         report_suite(folder, print_line)
 

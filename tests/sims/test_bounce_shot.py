@@ -10,12 +10,12 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from bench.bounce_shot.ball_kinds import BALL_KINDS, get_ball_kind
-from bench.bounce_shot.shot_geometry import (
+from bench.bounce_shot.shot_planner import (
     ShotGeometry,
     compute_hoop_crossings,
     compute_rim_margins,
+    plan_shot,
 )
-from bench.bounce_shot.shot_planner import plan_shot
 from bench.bounce_shot.true_world import (
     AIR_DENSITY,
     CONTACT_SECONDS,

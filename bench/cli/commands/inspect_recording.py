@@ -79,10 +79,10 @@ def _run_inspect(options: argparse.Namespace, print_line: PrintLine) -> CommandR
     """
     from bench.core.plugin_registries import load_plugins
     from bench.figures.recording_figure import write_recording_figure
-    from bench.logs import robot_summary, signal_statistics
-    from bench.logs.quality.floating_base_check import find_missing_base_poses
+    from bench.logs import recording_summary, signal_statistics
     from bench.logs.quality.log_quality import check_log_quality
-    from bench.logs.quality.timestamp_check import find_anomalies, find_log_anomalies
+    from bench.logs.quality.pose_check import find_missing_base_poses
+    from bench.logs.quality.sampling_clock import find_anomalies, find_log_anomalies
     from bench.logs.recording_loading import load_recording
     from bench.logs.recording_summary import format_summary
     from sims.core.simulator import InputError
@@ -93,7 +93,7 @@ def _run_inspect(options: argparse.Namespace, print_line: PrintLine) -> CommandR
     recording, kind = load_recording(
         options.recording, options.system, options.model, fix_base=options.fix_base
     )
-    robot_lines = list(robot_summary.format_robot_summary(kind))
+    robot_lines = list(recording_summary.format_robot_summary(kind))
     oddities = [
         *find_log_anomalies(recording),
         *find_anomalies(recording, kind),
@@ -101,7 +101,7 @@ def _run_inspect(options: argparse.Namespace, print_line: PrintLine) -> CommandR
     ]
     warnings_to_print = [
         *(o.text for o in oddities),
-        *robot_summary.format_log_warnings(recording, kind),
+        *recording_summary.format_log_warnings(recording, kind),
     ]
     findings = list(check_log_quality(recording, kind))
     active_recording, inactive = _remove_inactive_drives(recording, kind)

@@ -58,7 +58,7 @@ def _run_plot(options: argparse.Namespace, print_line: PrintLine) -> CommandResu
     from bench.benchmark.runner.plugin_discovery import load_plugins_for_experiment
     from bench.benchmark.storage.reference_results import find_reference
     from bench.studies.study import list_study_folders, open_study
-    from bench.studies.suite.suite_report import report_suite
+    from bench.studies.suite.suite_page import report_suite
     from bench.studies.suite.suite_runs import is_stored_suite
     from sims.core.simulator import InputError
 

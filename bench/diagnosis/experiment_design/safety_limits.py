@@ -23,7 +23,7 @@ from bench.diagnosis.experiment_design.candidate_runs import (
     read_model_file_limits,
 )
 from bench.diagnosis.fitting.model_set import FittedModel
-from bench.logs.quality.recorded_poses import find_contacts
+from bench.logs.quality.pose_check import find_contacts
 from sims.core.simulator import Array, Scenario
 
 TRAVEL_FACTOR = 3.0

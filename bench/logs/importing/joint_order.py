@@ -1,4 +1,4 @@
-"""Find the joint of each column of a log without joint names.
+"""Order of the joints in the columns of a log, by names and by ranges.
 
 Joints with position servos follow their commands, so a position belongs to the joint whose command
 it is closest to. With the commands u_i and the positions q_j of a run, both in SI units, the order
@@ -11,10 +11,15 @@ of the columns is the permutation p that minimises the root mean square distance
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
+from bench.logs.importing.import_result import MAX_NAMES, ImportResult
+from bench.logs.importing.joint_order_by_model import find_order_by_model
+from bench.logs.importing.run_logs import RunLogs
+from bench.logs.importing.signal_assignment import Placement, SignalAssignment
 from sims.core.simulator import Array
 
 MAX_DISTANCE_RATIO = 0.5
@@ -90,3 +95,189 @@ def _compute_square_distances(
         return None
     squares: Array = np.mean((u[:, None, finite] - q[None][:, :, finite]) ** 2, axis=2)
     return squares
+
+
+class _ServoSignals(NamedTuple):
+    """Joints with a position servo, and their signals at the times of the positions.
+
+    Attributes:
+        joints: Names of the joints.
+        inputs: Name of the input of each servo.
+        commands: (T,) command of each servo, SI units; empty if orders cannot or need not be
+            compared.
+        positions: (T,) position of each joint, SI units; empty like `commands`.
+    """
+
+    joints: list[str]
+    inputs: list[str]
+    commands: list[Array]
+    positions: list[Array]
+
+
+def assign_order(
+    logs: RunLogs, signals: SignalAssignment, is_normalised: bool, result: ImportResult
+) -> Mapping[str, str]:
+    """Check each position against its command if the order of joints is a guess, and exchange both.
+
+    Args:
+        logs: Logs that are imported.
+        signals: Signals whose columns are exchanged.
+        is_normalised: Whether positions are normalised to the ranges of their joints.
+        result: Result to which messages are added.
+
+    Returns:
+        For each joint, the joint at whose index its column is, if positions were exchanged.
+    """
+    servos = _collect_servo_signals(logs, signals)
+    by_order = [
+        all(table[name].placement.is_order for name in names)
+        for table, names in (
+            (signals.inputs, servos.inputs),
+            (signals.channels, [f"q.{joint}" for joint in servos.joints]),
+        )
+    ]
+    if not servos.commands:
+        _report_order(signals, [], result)
+        return {}
+    exchanged = _follow_commands(signals, servos, by_order[0]) if any(by_order) else {}
+    is_following = follow(servos.commands, servos.positions) or bool(exchanged)
+    if all(by_order) and is_following and not exchanged and not is_normalised:
+        preferred = _prefer_model(logs, signals, servos, result)
+        if preferred:
+            return preferred
+    _report_order(signals, servos.joints if is_following else [], result)
+    return exchanged if by_order[1] and not by_order[0] else {}
+
+
+def _collect_servo_signals(logs: RunLogs, signals: SignalAssignment) -> _ServoSignals:
+    """Collect the joints that have a servo, a recorded command and a recorded position.
+
+    Their values (T,) are included only if the order of the columns is a guess, to test other
+    orders.
+    """
+    joints = [
+        joint
+        for joint in signals.joints
+        if signals.get_servo_input(joint.name) in signals.inputs
+        and signals.get_position(joint.name) is not None
+    ]
+    names = [joint.name for joint in joints]
+    inputs = [signals.get_servo_input(name) for name in names]
+    pairs = [
+        (signals.inputs[u], signals.channels[f"q.{name}"])
+        for u, name in zip(inputs, names, strict=True)
+    ]
+    is_guess = any(signal.placement.is_order for pair in pairs for signal in pair)
+    signal_pairs = [logs.hold_command(u.column, q.column) for u, q in pairs]
+    # Positions of one file share their sample times; those of several files may not.
+    if len(joints) < 2 or not is_guess or len({u.size for u, _ in signal_pairs}) > 1:
+        return _ServoSignals(names, inputs, [], [])
+    commands, positions = [], []
+    for joint, (command, position), (u, q) in zip(joints, pairs, signal_pairs, strict=True):
+        commands.append(command.convert(joint.unit, u))
+        positions.append(position.convert(joint.unit, q))
+    return _ServoSignals(names, inputs, commands, positions)
+
+
+def _follow_commands(
+    signals: SignalAssignment, servos: _ServoSignals, are_commands_guessed: bool
+) -> dict[str, str]:
+    """Exchange columns whose order is a guess if positions then follow the commands better.
+
+    Commands are exchanged if their order is a guess, otherwise positions.
+
+    Returns:
+        For each joint, the joint at whose index its column is; empty if nothing is exchanged.
+    """
+    order = order_of_commands(servos.commands, servos.positions)
+    if order is None:
+        return {}
+    joints = servos.joints
+    if are_commands_guessed:
+        columns = [signals.inputs[name] for name in servos.inputs]
+        for place, signal in zip(order, columns, strict=True):
+            signals.inputs[servos.inputs[place]] = signal.with_placement(Placement.COMMANDS)
+    else:
+        columns = [signals.channels[f"q.{joint}"] for joint in joints]
+        for joint, place in zip(joints, order, strict=True):
+            signals.channels[f"q.{joint}"] = columns[place].with_placement(Placement.COMMANDS)
+    return {joint: joints[place] for place, joint in zip(order, joints, strict=True)}
+
+
+def _prefer_model(
+    logs: RunLogs, signals: SignalAssignment, servos: _ServoSignals, result: ImportResult
+) -> dict[str, str]:
+    """Exchange unnamed columns if the model then explains the motion far better.
+
+    Returns:
+        For each joint, the joint at whose index its column is; empty if the order is not changed.
+    """
+    joints = servos.joints
+    actuators = [signals.get_actuator(joint) for joint in joints]
+    driven = [
+        (signals.robot.joint(joint), actuator)
+        for joint, actuator in zip(joints, actuators, strict=True)
+        if actuator is not None
+    ]
+    # Unknown gains explain nothing.
+    if len(driven) < len(joints) or all(map(signals.has_number_of_joint, joints)):
+        return {}
+    seconds = logs.seconds[signals.channels[f"q.{joints[0]}"].column.file]
+    preferred = find_order_by_model(
+        signals.robot, driven, seconds, servos.commands, servos.positions
+    )
+    if preferred is None or not preferred.is_certain():
+        return {}
+    positions = [signals.channels[f"q.{joint}"] for joint in joints]
+    commands = [signals.inputs[name] for name in servos.inputs]
+    for joint, name, place in zip(joints, servos.inputs, preferred.order, strict=True):
+        signals.channels[f"q.{joint}"] = positions[place].with_placement(Placement.MODEL)
+        signals.inputs[name] = commands[place].with_placement(Placement.MODEL)
+    columns = sorted(joints, key=lambda joint: preferred.order[joints.index(joint)])
+    result.checks.append(
+        "order of joints: the log does not name those of its columns; they are taken in the "
+        f"order {', '.join(columns)}, in which the model explains the motion best (a residual of "
+        f"{preferred.residual:.2g} of the drives' forces, "
+        f"{preferred.model_order_residual:.2g} in the model's "
+        f"order, {', '.join(joints)}); it is a guess: compare it with the logger's order"
+    )
+    return {joint: joints[place] for joint, place in zip(joints, preferred.order, strict=True)}
+
+
+def _report_order(
+    signals: SignalAssignment, following_joints: Sequence[str], result: ImportResult
+) -> None:
+    """Report which positions follow their commands, and which joint orders are a guess.
+
+    Args:
+        signals: Signals of the robot.
+        following_joints: Joints with a servo each of which follows its own command best; empty if
+            some do not.
+        result: Result to which messages are added.
+    """
+    guessed: dict[str, set[str]] = {"q": set(), "u": set()}
+    for table in (signals.channels, signals.inputs):
+        for name, signal in table.items():
+            if signal.placement not in (Placement.MODEL_ORDER, Placement.COMMANDS):
+                continue
+            joint = signals.get_joint(name)
+            if signal.placement is Placement.MODEL_ORDER and joint in following_joints:
+                table[name] = signal.with_placement(Placement.CONFIRMED_ORDER)
+            guessed.setdefault(name.partition(".")[0], set()).add(joint)
+    positions, commands = guessed["q"], guessed["u"]
+    # A position that follows a named command, and a command that a named position follows, are
+    # certain.
+    if following_joints and not positions & commands:
+        return
+    names = [joint.name for joint in signals.joints if joint.name in positions | commands]
+    if len(names) < 2 or all(map(signals.has_number_of_joint, names)):
+        return
+    model, alphabet = ", ".join(names[:MAX_NAMES]), ", ".join(sorted(names)[:MAX_NAMES])
+    sorted_order_note = f" (sorted by name, as ROS drivers have it, they would be {alphabet})"
+    subject = "columns" if positions else "commands"
+    result.checks.append(
+        f"order of joints: the log does not name those of its {subject}; they are taken in the "
+        f"model's order, {model}, which is a "
+        f"guess{sorted_order_note if model != alphabet else ''}; if another order is right, "
+        "exchange the `column` lines"
+    )

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bench.logs.quality.anomaly import Anomaly
+from bench.logs.quality.quality_finding import Anomaly
 from sims.core.simulator import Array, InputError
 from sims.core.toml_validation import read_toml
 from sims.recording.log_formats.lerobot_dataset import (

@@ -1,4 +1,4 @@
-"""Result of one quality check of a recording."""
+"""Result of one quality check of a recording, and its anomalies."""
 
 from __future__ import annotations
 
@@ -40,3 +40,15 @@ def format_names(names: Iterable[str]) -> str:
     return ", ".join(distinct_names[:_MAX_NAMES]) + (
         f" and {unnamed_count} more" if unnamed_count > 0 else ""
     )
+
+
+class Anomaly(NamedTuple):
+    """An implausible property of a recording.
+
+    Attributes:
+        text: One line, without the file's name.
+        certain: Whether no correct recording can have this property.
+    """
+
+    text: str
+    certain: bool

@@ -1,4 +1,19 @@
-"""Check the sampling clock of a recording: jitter, lost samples and repeated samples."""
+"""Check the clock of a recording: jitter, lost samples, and stamps that cannot be seconds.
+
+The time in which a coordinate moves is estimated twice. From the recording: the shortest lag T
+after which its values x differ by as much as their spread,
+
+    mean (x(t + T) - x(t))^2 >= var x                                      (1)
+
+and from the system: at rest in the recorded positions, driven by the recorded inputs, its own
+forces would move it equally far within
+
+    T' = (var x / mean a^2)^(1/4)                                          (2)
+
+with its acceleration a at nominal parameters. An oscillation has T = 1.05/w and T' = 1/w. Dust,
+friction and a wrong mass change the ratio a few times, milliseconds read as seconds a thousand
+times; then the sampling interval exceeds (2), too, which nobody would record on purpose.
+"""
 
 from __future__ import annotations
 
@@ -6,10 +21,16 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from bench.core.resource_estimates import FORCE_HINT
+from bench.logs.importing.normalised_positions import check_normalised_positions
+from bench.logs.quality import pose_check
 from bench.logs.quality.noise_estimation import SIGMA_PER_MEDIAN
-from bench.logs.quality.quality_finding import QualityFinding, format_names
-from sims.core.simulator import Array
+from bench.logs.quality.pose_check import find_missing_base_poses
+from bench.logs.quality.quality_finding import Anomaly, QualityFinding, format_names
+from sims.core.simulator import Array, InputError, Simulator
+from sims.core.system import StateSnapshot, System
 from sims.recording.recording import Recording, Run
+from sims.system_simulator import SystemSimulator
 
 JITTER_THRESHOLD = 0.02
 """Smallest jitter that is reported, 1 sigma, as a fraction of the sampling interval."""
@@ -156,3 +177,196 @@ def _count_quantisation_steps(values: Array) -> Array:
         return np.zeros_like(changes)
     # Without quantisation the smallest change is tiny, so that any motion is many steps.
     return np.asarray(np.round(changes / nonzero_sizes.min()), dtype=np.float64)
+
+
+TIME_UNIT_RATIO_THRESHOLD = 300.0
+"""Ratio of the two times (1) and (2) above which a unit is wrong."""
+DRIVEN_SYSTEM_FACTOR = 10.0
+"""Minimum ratio of the sampling interval to (2) for a certain anomaly of a driven system.
+
+A driven system may be moved arbitrarily slowly.
+"""
+MIN_MOTION_SHARE = 0.01
+"""Minimum spread of a coordinate for this check, as a fraction of its usual size."""
+MAX_GAP_RATIO = 100.0
+"""Ratio of a gap to the rest of its run above which the run is rejected.
+
+The samples before such a gap do not determine the motion after it.
+"""
+_MIN_CHECKED_SAMPLES = 10
+"""Minimum number of samples of a run that is checked."""
+_TIME_UNITS = {1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds"}
+
+
+def check_recording_plausible(
+    recording: Recording, kind: type[Simulator], force: bool = False
+) -> list[str]:
+    """Reject impossible time stamps and impossible robot positions; return lesser anomalies.
+
+    Args:
+        recording: Recording as it was read.
+        kind: Simulator class of its system.
+        force: Whether the user insists.
+
+    Returns:
+        Texts of the anomalies, to be shown to the user.
+
+    Raises:
+        InputError: An anomaly is certain and `force` is False; the message is one line.
+    """
+    # Positions first: their wrong units make stamps look implausible, but not vice versa.
+    anomalies = [
+        *find_log_anomalies(recording),
+        *pose_check.check_poses(recording, kind),
+        *find_anomalies(recording, kind),
+        *find_missing_base_poses(recording, kind),
+        *(
+            Anomaly(overlap.text_line, False)
+            for overlap in pose_check.find_overlaps(recording, kind)
+        ),
+    ]
+    for oddity in anomalies:
+        if oddity.certain and not force:
+            raise InputError(f"{recording.path}: {oddity.text}, {FORCE_HINT}")
+    return [oddity.text for oddity in anomalies]
+
+
+def find_log_anomalies(recording: Recording) -> Iterator[Anomaly]:
+    """Yield the omissions from a recording's logs, and units that they do not state."""
+    yield from (Anomaly(note, False) for note in recording.notes)
+    yield from check_normalised_positions(recording)
+
+
+def find_anomalies(recording: Recording, kind: type[Simulator]) -> Iterator[Anomaly]:
+    """Yield the anomalies of time stamps, at most one for each run.
+
+    Args:
+        recording: Recording to check.
+        kind: Simulator class of its system.
+    """
+    for run in recording.runs:
+        if run.times.size < _MIN_CHECKED_SAMPLES:
+            continue
+        anomaly = _check_gap(run) or _check_time_scale(recording, run, kind)
+        if anomaly is not None:
+            yield anomaly
+
+
+def _check_gap(run: Run) -> Anomaly | None:
+    """Find a gap that is more than `MAX_GAP_RATIO` times as long as the rest of the run.
+
+    Such a run probably consists of two. Return None if there is no such gap.
+    """
+    intervals = np.diff(run.times)
+    place = int(intervals.argmax())
+    gap = float(intervals[place])
+    sampled_seconds = float(intervals.sum()) - gap
+    if gap <= MAX_GAP_RATIO * sampled_seconds:
+        return None
+    gap_text = f"{gap:.4g} s without a sample from t = {run.times[place]:.6g} s on"
+    sampled_text = f"in a run that has samples for {sampled_seconds:.4g} s"
+    return Anomaly(
+        f"run {run.name}: {gap_text}, {sampled_text}; split it there into two runs", True
+    )
+
+
+def _check_time_scale(recording: Recording, run: Run, kind: type[Simulator]) -> Anomaly | None:
+    """Find a run in which every coordinate moves far more slowly or far faster than expected.
+
+    All coordinates share the stamps, so a coordinate that moves as expected clears them; another
+    one may belong to a link without inertia in the model file.
+    """
+    # The forces of a system with its own stepping are not accessible.
+    if not issubclass(kind, SystemSimulator) or (kind.own_engine and not kind.has_model):
+        return None
+    system = kind.system()
+    interval = float(np.median(np.diff(run.times)))
+    if kind.has_model:
+        accelerations = pose_check.compute_static_accelerations(run, kind)
+    else:
+        accelerations = _compute_rest_accelerations(recording, run, system)
+    # A servo holds its position by force, so large forces at rest are normal.
+    is_driven = kind.has_model and _has_inputs(run)
+    typical_sizes = {channel.name: channel.scale for channel in system.channels}
+    doubtful: Anomaly | None = None
+    for column, name in enumerate(system.coordinates):
+        x = run.channels.get(name)
+        if x is None:
+            continue
+        spread = float(np.nanstd(x))
+        rms_acceleration = float(np.sqrt(np.nanmean(accelerations[:, column] ** 2)))
+        if not (spread > MIN_MOTION_SHARE * typical_sizes.get(name, 1.0) and rms_acceleration > 0):
+            continue
+        expected_seconds = (spread / rms_acceleration) ** 0.5  # Equation (2).
+        recorded_seconds = interval * _estimate_lag(x)
+        ratio = recorded_seconds / expected_seconds
+        if 0 < ratio < 1 / TIME_UNIT_RATIO_THRESHOLD:
+            moves = (
+                f"{name} moves in {recorded_seconds:.3g} s as {kind.name} would within "
+                f"{expected_seconds:.2g} s"
+            )
+            doubtful = doubtful or Anomaly(
+                f"run {run.name}: {moves}; are the stamps seconds?", False
+            )
+            continue
+        if ratio < TIME_UNIT_RATIO_THRESHOLD or interval < (
+            DRIVEN_SYSTEM_FACTOR * expected_seconds if is_driven else expected_seconds
+        ):
+            return None
+        unit = min(_TIME_UNITS, key=lambda factor: abs(np.log(ratio / factor)))
+        moves = (
+            f"{name} takes {recorded_seconds:.3g} s to move as {kind.name} would within "
+            f"{expected_seconds:.2g} s"
+        )
+        interval_text = f"samples lie {interval:.3g} s apart"
+        remedy = f"are the stamps {_TIME_UNITS[unit]}? then divide t by {unit:g}"
+        certain = not _has_inputs(run) or interval >= DRIVEN_SYSTEM_FACTOR * expected_seconds
+        doubtful = doubtful or Anomaly(
+            f"run {run.name}: {moves}, and {interval_text}; {remedy}", certain
+        )
+    return doubtful
+
+
+def _has_inputs(run: Run) -> bool:
+    return any(np.any(signal) for signal in run.inputs.values())
+
+
+def _compute_rest_accelerations(recording: Recording, run: Run, system: System) -> Array:
+    """Compute the accelerations (T, D) that the system's forces cause at the recorded positions.
+
+    The system is at rest, so drag and friction do not act; D is the number of coordinates.
+    """
+    count = run.times.size
+    values = {**recording.constants, **run.constants}
+    constants = {c.name: np.full((count, 1), values.get(c.name, c.value)) for c in system.constants}
+    theta = np.tile([p.nominal for p in system.parameters], (count, 1))
+    default = [np.full(count, system.states[name]) for name in system.coordinates]
+    columns = [
+        run.channels.get(name, default_position)
+        for name, default_position in zip(system.coordinates, default, strict=True)
+    ]
+    x = np.stack(columns, axis=1)
+    zeros = np.zeros((count, 1))
+    inputs = {c.name: zeros for c in system.inputs}
+    inputs |= {name: signal[:, None] for name, signal in run.inputs.items()}
+    moment = StateSnapshot(system, theta, constants, zeros, x, np.zeros_like(x), inputs)
+    with np.errstate(all="ignore"):
+        accelerations: Array = system.force(moment) / system.mass(theta, constants)
+    return accelerations
+
+
+def _estimate_lag(x: Array) -> float:
+    """Return the shortest lag in samples after which values differ by their spread (1).
+
+    Returns 0 if the first lag exceeds the spread already, since motion between samples is not
+    recorded.
+    """
+    variance = float(np.nanvar(x))
+    lag, previous_lag = 1, 0
+    while lag < x.size:
+        differences = x[lag:] - x[:-lag]
+        differences = differences[np.isfinite(differences)]
+        if differences.size and float(np.mean(differences**2)) >= variance:
+            return float(previous_lag)
+        previous_lag, lag = lag, 2 * lag
+    return float(previous_lag)

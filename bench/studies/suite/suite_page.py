@@ -1,9 +1,13 @@
-"""Page of a benchmark suite: headline, guide, methods x problems, statistics and curves."""
+"""Report of a benchmark suite: headline, guide, statistics, curves and tables.
+
+No method has a sentence of its own: every name comes from a rank, so that the guide changes with
+the results.
+"""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,17 +15,170 @@ import numpy as np
 import pandas as pd
 from pandas.api.types import is_numeric_dtype
 
+from bench.benchmark.results_report import REPORT_FILE
+from bench.benchmark.storage.reference_results import REFERENCE_FOLDERS
 from bench.figures.style import MarkStyle, get_mark_style
 from bench.pages.chart import Axis, Panel, Series
 from bench.pages.html_page import HtmlPage
-from bench.studies.suite.suite_guide import (
-    LOSS_FACTOR,
-    build_guide,
-    build_headline,
-    describe_losses,
-    describe_tests,
+from bench.studies.suite.suite_runs import (
+    CURVES_FILE,
+    SuiteRuns,
+    collect_suite_runs,
+    list_comparison_folders,
+    merge_runs,
+    read_suite_runs,
+    write_suite_runs,
 )
 from bench.studies.suite.suite_tables import FREE, SuiteTables
+from sims.core.files import write_atomically
+
+GUIDE_COLUMNS = ["property", "value", "cells", "simulations", "best", "best_untrained"]
+LOSS_CHECKPOINTS = (10, 100)
+"""Numbers of simulations at which losses of the reference methods are listed."""
+LOSS_FACTOR = 3.0
+"""Ratio to the smallest error above which a method counts as losing."""
+REFERENCE_TUNERS = ("hybrid", "tunenet")
+"""Methods of this project, whose losses the page lists."""
+RANK_TOLERANCE = 0.5
+"""Difference from the lowest mean rank up to which the headline keeps a method."""
+_SIGNIFICANCE = 0.05
+"""Significance level of the tests against the best method."""
+
+
+def build_headline(tables: SuiteTables) -> str:
+    """Build one sentence that a practitioner can act on.
+
+    Args:
+        tables: tables of the suite.
+    """
+    ranks = tables.ranks[tables.ranks["training"] == FREE]
+    mean_ranks = ranks.pivot(index="tuner", columns="simulations", values="mean_rank")
+    untrained = mean_ranks[~mean_ranks.index.isin(tables.get_trained_tuners())]
+    best = join_segments(choose_segments(mean_ranks))
+    best_untrained = join_segments(choose_segments(untrained))
+    if best == best_untrained or untrained.empty:
+        return f"Use {best}."
+    return (
+        f"If you can train on your simulator beforehand, use {best}. "
+        f"Without training, use {best_untrained}."
+    )
+
+
+def choose_segments(means: pd.DataFrame) -> list[tuple[str, int]]:
+    """Choose as few methods as possible, each near the lowest mean rank at its checkpoints.
+
+    Args:
+        means: mean ranks, a row per tuner, a column per number of simulations.
+
+    Returns:
+        Methods, each with the last number of simulations for which it is chosen.
+    """
+    is_near_best = means <= means.min() + RANK_TOLERANCE
+    checkpoints = [int(str(k)) for k in means]
+    segments, start = [], 0
+    while start < len(checkpoints):
+        segment_lengths = is_near_best.iloc[:, start:].cumprod(axis=1).sum(axis=1)
+        longest = segment_lengths.index[segment_lengths == segment_lengths.max()]
+        stop = start + int(segment_lengths.max())
+        tuner = str(means.loc[longest, checkpoints[start:stop]].mean(axis=1).idxmin())
+        segments.append((tuner, checkpoints[stop - 1]))
+        start = stop
+    return segments
+
+
+def join_segments(segments: Sequence[tuple[str, int]]) -> str:
+    """Describe which method is best up to which number of simulations.
+
+    Args:
+        segments: methods, each with its last number of simulations.
+
+    Returns:
+        For example ``hybrid up to 30 simulations, then least_squares``.
+    """
+    *first, (last, _) = segments
+    words = [f"{name} up to {k} simulation{'' if k == 1 else 's'}" for name, k in first]
+    return ", ".join([*words, f"then {last}" if words else last])
+
+
+def build_guide(tables: SuiteTables) -> pd.DataFrame:
+    """Build the decision guide: the best method for each kind of problem and budget.
+
+    Args:
+        tables: tables of the suite.
+
+    Returns:
+        Columns `GUIDE_COLUMNS`: best of all methods, and best of those that need no training.
+    """
+    trained = tables.get_trained_tuners()
+    lines = []
+    rows = tables.profile
+    overall = tables.ranks[tables.ranks["training"] == FREE]
+    overall = overall.assign(property="all problems", value="")
+    frame = pd.concat([overall[rows.columns], rows], ignore_index=True)
+    for (name, value, k), group in frame.groupby(["property", "value", "simulations"], sort=False):
+        group = group.sort_values("mean_rank", kind="stable")
+        untrained = group[~group["tuner"].isin(trained)]
+        # An equal rank goes to the method that is named first in the ranking.
+        lines.append(
+            (
+                name,
+                value,
+                int(group["cells"].iloc[0]),
+                k,
+                group["tuner"].iloc[0],
+                untrained["tuner"].iloc[0] if len(untrained) else "",
+            )
+        )
+    return pd.DataFrame(lines, columns=GUIDE_COLUMNS)
+
+
+def describe_tests(tables: SuiteTables) -> Iterator[str]:
+    """Describe at each checkpoint from which methods the best one differs significantly."""
+    for k in tables.checkpoints:
+        rows = tables.pairs
+        rows = rows[(rows["training"] == FREE) & (rows["simulations"] == k)]
+        if rows.empty:
+            continue
+        best = str(rows["best"].iloc[0])
+        significant = rows[(rows["p_holm"] < _SIGNIFICANCE) & (rows["best_better"] > 0.5)]
+        undecided_tuners = [
+            str(name) for name in rows["tuner"] if name not in set(significant["tuner"])
+        ]
+        if significant.empty:
+            yield f"After {k}: none of the {len(rows)} differences from {best} is significant."
+            continue
+        count = f"{len(significant)} of {len(rows)}"
+        text = f"After {k}: {best} is significantly better than {count} others"
+        yield text + (f"; not decided: {', '.join(undecided_tuners)}." if undecided_tuners else ".")
+
+
+def describe_losses(tables: SuiteTables) -> Iterator[str]:
+    """Describe where the methods of this project lose, and to which method."""
+    for tuner in REFERENCE_TUNERS:
+        if tuner not in tables.suite.tuners:
+            continue
+        for k in (k for k in LOSS_CHECKPOINTS if k <= tables.suite.budget):
+            losses = tables.find_losses(tuner, k, LOSS_FACTOR)
+            count = len(tables.curves)
+            if losses.empty:
+                yield (
+                    f"{tuner} is worse by a factor of {LOSS_FACTOR:g} in none of {count} cells "
+                    f"after {k} simulations."
+                )
+                continue
+            examples = ", ".join(
+                f"{row.cell} ({row.winner}, {_format_ratio(float(row.ratio))})"  # type: ignore[arg-type]
+                for row in losses.itertuples()
+            )
+            yield (
+                f"{tuner} is worse by a factor of {LOSS_FACTOR:g} in {len(losses)} of {count} "
+                f"cells after {k} simulations: {examples}."
+            )
+
+
+def _format_ratio(ratio: float) -> str:
+    return f"{ratio:.2g}×" if ratio < 1e4 else "more than 10000×"
+
 
 _TEMPLATE = Path(__file__).with_name("suite_page.html")
 _CURVE_POINTS = (0, 1, 2, 3, 4, 5, 6, 8, 10, 13, 16, 20, 25, 30, 40, 50, 65, 80, 100)
@@ -238,3 +395,79 @@ def _list_columns(frame: pd.DataFrame) -> list[tuple[str, str, int]]:
     return [
         (str(column), "", _DIGITS if is_numeric_dtype(frame[column]) else 0) for column in frame
     ]
+
+
+PrintLine = Callable[[str], None]
+_REFERENCE_NAME = "suite"
+"""Folder of the stored runs among the reference results."""
+_MAX_PRINTED_TUNERS = 30
+"""Maximum number of tuners in the printed table."""
+
+
+def report_suite(folder: Path, print_line: PrintLine) -> SuiteTables:
+    """Write and print the results of a suite, together with the stored runs of other methods.
+
+    Args:
+        folder: folder of the suite, with one subfolder per problem or with stored runs.
+        print_line: callback that prints one line.
+
+    Raises:
+        InputError: there are no results.
+    """
+    has_comparisons = any(list_comparison_folders(folder))
+    new_runs = collect_suite_runs(folder) if has_comparisons else read_suite_runs(folder)
+    suite = new_runs
+    stored = find_stored_runs(new_runs.version) if has_comparisons else None
+    if stored is not None:
+        suite = merge_runs(new_runs, stored)
+    if has_comparisons:
+        write_suite_runs(new_runs, folder)
+    tables = SuiteTables(suite)
+    for name, frame in {**tables.build_tables(), "guide": build_guide(tables)}.items():
+        write_atomically(folder / f"{name}.csv", frame.to_csv(index=False))
+    write_atomically(folder / REPORT_FILE, render_suite_page(tables))
+    _print_results(tables, new_runs, print_line)
+    print_line(f"report  {folder / REPORT_FILE}")
+    return tables
+
+
+def find_stored_runs(version: str) -> SuiteRuns | None:
+    """Return the stored runs of a version of a suite; None if there are none."""
+    for place in REFERENCE_FOLDERS:
+        folder = place / _REFERENCE_NAME
+        if (folder / CURVES_FILE).is_file():
+            stored = read_suite_runs(folder)
+            if stored.version == version:
+                return stored
+    return None
+
+
+def _print_results(tables: SuiteTables, new_runs: SuiteRuns, print_line: PrintLine) -> None:
+    """Print the headline, the mean ranks and the losses of the reference methods."""
+    targets = new_runs.runs.groupby("cell")["target"].nunique()
+    stored_tuners = [name for name in tables.suite.tuners if name not in new_runs.tuners]
+    count = (
+        f"{targets.min()} to {targets.max()}" if targets.min() != targets.max() else targets.max()
+    )
+    print_line(f"\n{new_runs.version}: {len(tables.curves)} cells, {count} targets in each")
+    if stored_tuners:
+        print_line(
+            f"stored results of {len(stored_tuners)} other methods on the same targets are included"
+        )
+    for row in tables.suite.skipped.itertuples():
+        print_line(f"skipped: {row.tuner}: {row.reason}")
+    missing = [name for name in tables.suite.tuners if name not in tables.complete_tuners]
+    if missing:
+        print_line(f"not ranked, because results are missing in some cells: {', '.join(missing)}")
+    if not tables.complete_tuners:
+        print_line("no method has results in all cells; there are no mean ranks")
+        return
+    print_line(f"\n{build_headline(tables)}")
+    ranks = tables.ranks[tables.ranks["training"] == FREE]
+    table = ranks.pivot(index="tuner", columns="simulations", values="mean_rank")
+    table = table.sort_values(by=table.columns[-1]).head(_MAX_PRINTED_TUNERS).round(1)
+    print_line("\nmean rank after N simulations (1 is best)")
+    print_line(table.rename_axis(index=None, columns=None).to_string())
+    print_line("")
+    for line in describe_losses(tables):
+        print_line(line)

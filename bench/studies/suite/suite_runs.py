@@ -20,7 +20,7 @@ from bench.benchmark.results_report import REQUIRED_RUN_COLUMNS
 from bench.benchmark.statistics.comparison_statistics import ComparisonStatistics
 from bench.benchmark.storage.result_folder import CONFIGURATION_FILE, read_comparison
 from bench.benchmark.storage.run_journal import SEGMENTS_FOLDER
-from bench.misspecification.comparison_experiments import MODEL_LABELS, PLAIN
+from bench.misspecification.calibration import MODEL_LABELS, PLAIN
 from sims.core.files import atomic_replacement, write_atomically
 from sims.core.simulator import Array, InputError
 

@@ -17,7 +17,6 @@ from bench.benchmark.runner.tuner_training import TrainingRequest, train_or_load
 from bench.benchmark.runner.worker_pools import PoolLostError
 from bench.bounce_shot import shot_planning, shot_study
 from bench.bounce_shot.hit_rate_table import ALL_BALLS, build_result_table, compute_wilson_interval
-from bench.bounce_shot.pixel_observations import build_pixel_runs
 from bench.bounce_shot.shot_config import read_shot_config
 from bench.bounce_shot.shot_execution import execute_shot
 from bench.bounce_shot.shot_planning import (
@@ -26,7 +25,7 @@ from bench.bounce_shot.shot_planning import (
     select_transferable_effects,
     tune_and_plan,
 )
-from bench.bounce_shot.shot_sampling import draw_shot, draw_shots, record_drop
+from bench.bounce_shot.shot_sampling import build_pixel_runs, draw_shot, draw_shots, record_drop
 from bench.bounce_shot.true_world import InclinedGround, simulate_shot
 from bench.cli import main
 from bench.core.plugin_registries import REGISTRIES

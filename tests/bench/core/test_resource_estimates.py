@@ -17,7 +17,7 @@ from bench.core.resource_estimates import (
     check_feasible,
     get_machine_resources,
 )
-from bench.logs.quality.timestamp_check import check_recording_plausible, find_anomalies
+from bench.logs.quality.sampling_clock import check_recording_plausible, find_anomalies
 from bench.logs.recording_loading import load_recording as recorded
 from sims.core.simulator import InputError
 

@@ -152,7 +152,7 @@ def test_a_download_is_a_recording_with_its_licence_and_source(served, tmp_path,
 
 
 def test_runs_from_the_seventh_on_are_held_out():
-    from bench.datasets.dataset_conversion import free_swing
+    from bench.datasets.dataset_download import free_swing
 
     swing = np.stack([np.linspace(3.0, 3.2, 40_000), np.linspace(-1.0, 1.0, 40_000)])
     content = io.BytesIO()
@@ -290,7 +290,7 @@ def test_a_folder_that_cannot_be_written(repository, tmp_path, capsys):
 
 @pytest.mark.parametrize("content", [b"", b"MATLAB 5.0 MAT-file" * 20, None])
 def test_a_file_of_other_content_is_no_recording(content):
-    from bench.datasets.dataset_conversion import free_swing
+    from bench.datasets.dataset_download import free_swing
     from sims.core.simulator import InputError
 
     if content is None:
@@ -337,7 +337,7 @@ def test_the_published_swing_is_the_recording_that_results_were_made_with(record
     published = os.environ.get("SIMGAP_FREE_SWING")
     if not published:
         pytest.skip("SIMGAP_FREE_SWING does not name the published file")
-    from bench.datasets.dataset_conversion import free_swing
+    from bench.datasets.dataset_download import free_swing
 
     for name, content in free_swing({"x.mat": Path(published).read_bytes()}).items():
         assert content == (recordings / "pendulum_free_swing" / name).read_text(), name

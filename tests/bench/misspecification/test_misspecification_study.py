@@ -25,11 +25,11 @@ from bench.benchmark.runner.study_setup import prepare_study
 from bench.cli.main import main
 from bench.core.plugin_registries import simulators
 from bench.misspecification import misspecification_scores
-from bench.misspecification.calibration import write_calibration_recording
-from bench.misspecification.comparison_experiments import (
+from bench.misspecification.calibration import (
     MODEL_LABELS,
     make_base_experiment,
     make_extended_experiment,
+    write_calibration_recording,
 )
 from bench.misspecification.misspecification_study import MisspecificationStudy
 from bench.studies.study import begin_studies, get_study_class

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from bench.logs.quality.recorded_poses import find_recorded_contacts
+from bench.logs.quality.pose_check import find_recorded_contacts
 from sims.core.simulator import InputError, Scenario
 from sims.recording.recording import Recording, Run
 from sims.robot.contact_pairs import add_contact_pairs

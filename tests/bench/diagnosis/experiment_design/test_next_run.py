@@ -12,7 +12,7 @@ from bench.diagnosis.experiment_design.next_run import (
     _iterate_connected_groups,
     _may_longer_run_help,
 )
-from bench.logs.quality.recorded_poses import find_contacts
+from bench.logs.quality.pose_check import find_contacts
 from sims.core.simulator import InputError
 
 MASS, LENGTH, INERTIA, NOISE = 0.2, 0.15, 0.006, 4e-3

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from bench.benchmark.problem.experiment import load_experiment
-from bench.studies.suite.suite_guide import (
+from bench.studies.suite.suite_page import (
     LOSS_FACTOR,
     build_guide,
     build_headline,

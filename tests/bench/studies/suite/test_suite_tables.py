@@ -4,15 +4,15 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from bench.studies.suite.suite_guide import (
+from bench.studies.suite.suite_page import (
     build_guide,
     build_headline,
     choose_segments,
     describe_losses,
     describe_tests,
     join_segments,
+    render_suite_page,
 )
-from bench.studies.suite.suite_page import render_suite_page
 from bench.studies.suite.suite_tables import COUNTED, FREE, SuiteTables
 from tests.bench.studies.suite.synthetic_suite import BUDGET, make_suite, power_law
 

@@ -1,4 +1,4 @@
-"""Toy problem for checks of tuners: a smooth, identifiable simulator of any dimension.
+"""Sample subjects on which checks run: a toy problem, a tank and a robot arm.
 
 Parameter i has the rate r_i = 0.5 + 0.6 p_i. The two channels are the sums over i = 1, 2, ... of
 
@@ -6,18 +6,32 @@ Parameter i has the rate r_i = 0.5 + 0.6 p_i. The two channels are the sums over
     exp(-r_i t) (1 + 0.1 i)           (2)
 
 so that every parameter is observable, no two can be exchanged, and there is no symmetry in p.
+
+It has two joints, driven by a servo and a motor. Every quantity that an effect may change is stated
+in its model file.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Mapping
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from bench.benchmark.runner.tuner_loop import Evaluate, RunTrace, drive_tuner
 from bench.conformance.check_base import CheckError
 from methods.tuner import EMPTY_SCENE, BudgetExceededError, Task, Tuner
-from sims.core.simulator import Array
+from sims.core.simulator import Array, Channel, Parameter, Scenario
+from sims.effects import registry
+from sims.own_simulator import OwnSimulator
+
+if TYPE_CHECKING:
+    from sims.core.effect import Effect
+    from sims.robot.robot_simulator import RobotSimulator
+
 
 SAMPLE_TIMES = np.linspace(0.0, 3.0, 40)
 """Sample times of the toy simulator, seconds."""
@@ -179,3 +193,133 @@ def make_evaluate(task: Task, fails: Callable[[int], bool] = lambda _: False) ->
         return observations, losses
 
     return evaluate
+
+
+class FirstOrderTank(OwnSimulator):
+    """Tank with an inflow and a drain proportional to the level, integrated exactly."""
+
+    name = "tub"
+    parameters = (Parameter("drain", "1/s", 0.8, (0.1, 2.0)),)
+    inputs = (Channel("tap", "m/s"),)
+    channels = (Channel("level", "m"),)
+    states = {"level": 0.5}  # noqa: RUF012
+    levels = ("level",)
+    time_step = 0.05
+
+    def reset(
+        self,
+        theta: Mapping[str, float],
+        constants: Mapping[str, float],  # noqa: ARG002
+        initial: Mapping[str, float],
+    ) -> None:
+        """Start at a given level.
+
+        Args:
+            theta: parameters by name.
+            constants: not used.
+            initial: initial states by name.
+        """
+        self.drain, self.level = theta["drain"], initial["level"]
+
+    def step(self, inputs: Mapping[str, float], seconds: float) -> None:
+        """Advance the level; it approaches the value at which inflow and outflow are equal.
+
+        Args:
+            inputs: inputs by name.
+            seconds: length of the step.
+        """
+        end = inputs["tap"] / self.drain
+        self.level = end + (self.level - end) * math.exp(-self.drain * seconds)
+
+    def observe(self) -> dict[str, float]:
+        """Return the level."""
+        return {"level": self.level}
+
+    def put(self, levels: Mapping[str, float]) -> None:
+        """Set the level."""
+        self.level = levels["level"]
+
+
+ARM_MJCF = """
+<mujoco model="checks">
+  <compiler angle="radian" autolimits="true"/>
+  <option timestep="0.004" integrator="RK4">
+    <flag contact="disable"/>
+  </option>
+  <worldbody>
+    <geom name="table" type="plane" pos="0 0 -0.57" size="2 2 1"/>
+    <body name="upper">
+      <inertial pos="0.01 0 -0.2" mass="1.2" diaginertia="0.02 0.021 0.002"/>
+      <joint name="shoulder" axis="0 1 0" damping="0.3 0.02 0" armature="0.01" stiffness="0.2"/>
+      <body name="fore" pos="0 0 -0.4">
+        <inertial pos="0 0.02 -0.1" mass="0.8" diaginertia="0.01 0.0095 0.001"/>
+        <joint name="elbow" axis="0.2 1 0.1" damping="0.1" frictionloss="0.05" armature="0.005"/>
+        <geom name="ball" size="0.02" pos="0 0 -0.2"/>
+        <site name="tip" pos="0 0 -0.2"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <position name="m_shoulder" joint="shoulder" kp="40" kv="2" forcerange="-30 30"/>
+    <motor name="m_elbow" joint="elbow" gear="2"/>
+  </actuator>
+  <sensor>
+    <gyro name="wrist" site="tip"/>
+  </sensor>
+</mujoco>
+"""
+"""Model file of the arm. All values differ, so that confusing two places is detected.
+
+The ball at its tip slides on the table where contacts are enabled.
+"""
+
+_TESTED_CONTACT = "table/ball"
+"""Contact at which effects at contacts act."""
+
+OBSERVED_CHANNELS = ("q.shoulder", "q.elbow", "qd.shoulder", "tau.elbow", "s.wrist.y")
+"""Observed channels, one of each kind."""
+
+_RUN_SECONDS = 0.8
+"""Duration of a run in seconds."""
+
+
+@lru_cache(maxsize=1)
+def make_arm_simulator(effect: type[Effect]) -> type[RobotSimulator]:
+    """Make the simulator of the arm, with its contact enabled for effects at contacts.
+
+    It is made anew for each effect, because it caches the places of effects by name.
+    """
+    import mujoco
+
+    from sims.robot.robot_model import RobotModel
+    from sims.robot.robot_simulator import make_robot_simulator
+
+    spec = mujoco.MjSpec.from_string(ARM_MJCF)
+    contacts = (_TESTED_CONTACT,) if effect.at == "contact" else ()
+    if contacts:
+        spec.option.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+    robot = RobotModel(Path("checks.xml"), "mjcf", spec, digest="checks", contacts=contacts)
+    return make_robot_simulator(robot)
+
+
+def list_effect_places(effect: type[Effect]) -> tuple[type[Effect], ...]:
+    """Return an effect at all places of the arm where it can act, and its family.
+
+    The result is empty if MuJoCo is not installed.
+    """
+    from importlib.util import find_spec
+
+    if find_spec("mujoco") is None:
+        return ()
+    if effect.name not in registry.names():
+        registry.register(effect)
+    return tuple(make_arm_simulator(effect).system.placed(effect))
+
+
+def make_scenario() -> Scenario:
+    """Make a run in which both joints reverse and every command changes."""
+    # The first samples are at the ends of simulation steps, the others between them.
+    times = np.concatenate([np.arange(0.0, 0.3, 0.02), np.arange(0.301, _RUN_SECONDS, 0.021)])
+    initial = {"q.shoulder": 0.4, "q.elbow": -0.7, "qd.shoulder": -1.0, "qd.elbow": 2.0}
+    first = np.where(times % 0.4 < 0.2, 0.6, -0.3)
+    return Scenario(times, initial, {"u.m_shoulder": first, "u.m_elbow": 0.4 - 2.0 * first})
