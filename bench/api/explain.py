@@ -13,7 +13,7 @@ from bench.diagnosis import explain as explaining
 from bench.diagnosis.explain_options import ExplainOptions
 from bench.diagnosis.explanation import Explanation
 from bench.diagnosis.score_extended import MODEL_FILES, score_model
-from bench.logs.data_frames import FrameDescription, Units, read_frame_recording
+from bench.logs.recording_loading import FrameDescription, Units, read_frame_recording
 from bench.logs.synthetic_recording import SimulatedRecording
 from sims import extended_simulator as extended_file
 from sims.core.argument_checks import Expected, check_arguments

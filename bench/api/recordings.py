@@ -9,10 +9,9 @@ from typing import Annotated, Any, TypeAlias
 
 from bench.api.explain import RecordingSource, list_sources
 from bench.core.options import takes_options
-from bench.logs.data_frames import FrameDescription, Units
 from bench.logs.importing.import_result import ImportOptions, ImportResult
 from bench.logs.importing.log_import import describe_logs, write_checked_description
-from bench.logs.recording_loading import load_recording
+from bench.logs.recording_loading import FrameDescription, Units, load_recording
 from bench.logs.synthetic_recording import (
     SimulationSpec,
     simulate_recording,

@@ -73,7 +73,7 @@ def add_recordings_argument(parser: argparse.ArgumentParser, text: str) -> None:
 
 def add_system_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the system that a recording is of, ``--system`` and ``--model``."""
-    from bench.logs.data_frames import FrameDescription
+    from bench.logs.recording_loading import FrameDescription
 
     add_options(parser, FrameDescription)
 

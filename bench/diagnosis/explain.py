@@ -58,8 +58,7 @@ from bench.diagnosis.search.verdict_rules import INDISTINGUISHABLE_LOG_LIKELIHOO
 from bench.diagnosis.validation.held_out_runs import CrossValidation, HeldOutRuns, Validation
 from bench.diagnosis.verdict import RecordingFault
 from bench.diagnosis.verdict_builder import VerdictBuilder
-from bench.logs.importing.filter_start import leave_out_settling
-from bench.logs.importing.sample_thinning import thin_recording
+from bench.logs.importing.sample_thinning import leave_out_settling, thin_recording
 from bench.logs.joined_recordings import load_joined
 from bench.logs.quality.sampling_clock import check_recording_plausible
 from bench.logs.recording_loading import check_recording_size
@@ -1085,7 +1084,7 @@ class _ExplainRun:
         if self.tuner is None:
             return self.identified
         # Few users request a tuner, and the code that drives one is slow to import.
-        from bench.diagnosis.fitting.tuner_initialisation import find_start_with_tuner
+        from bench.diagnosis.fitting.base_fit import find_start_with_tuner
 
         return find_start_with_tuner(self.tuner, self.fitting, self.noise, self.seed)
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from bench.diagnosis.evaluation.search_control import ProgressListener, SearchControl
-from bench.logs.data_frames import FrameDescription
+from bench.logs.recording_loading import FrameDescription
 from sims.core.argument_checks import Count, Name, Names, Seconds
 
 

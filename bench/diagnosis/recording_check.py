@@ -15,7 +15,7 @@ from bench.diagnosis.evaluation.worker_pool import ForkedWorkerPool
 from bench.diagnosis.fitting.base_fit import fit_base_model
 from bench.diagnosis.identifiability import ParameterIdentifiability, assess_identifiability
 from bench.diagnosis.validation.gain_and_intervals import compute_central_jacobian
-from bench.logs.importing.filter_start import leave_out_settling
+from bench.logs.importing.sample_thinning import leave_out_settling
 from bench.logs.recording_loading import load_recording
 from bench.logs.segmentation import segment_recording
 from sims.core.simulator import InputError

@@ -17,7 +17,7 @@ from bench.diagnosis.evaluation.noise_floor import compute_noise_floor
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.validation.held_out_runs import HeldOutRuns
-from bench.logs.importing.filter_start import leave_out_settling
+from bench.logs.importing.sample_thinning import leave_out_settling
 from bench.logs.quality.sampling_clock import check_recording_plausible
 from bench.logs.recording_loading import check_recording_size, check_value_sizes
 from sims.core.simulator import Array, InputError, make_unknown_name_error

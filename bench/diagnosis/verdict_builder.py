@@ -16,8 +16,8 @@ from bench.diagnosis.evaluation.coefficient_bounds import (
     is_unusual,
 )
 from bench.diagnosis.evaluation.noise_floor import NoiseFloor
+from bench.diagnosis.evaluation.run_data import is_instant
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.diagnosis.evaluation.time_scale import is_instant
 from bench.diagnosis.experiment_design.discriminating_run import (
     DiscriminatingRun,
     propose_discriminating_run,

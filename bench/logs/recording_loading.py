@@ -1,10 +1,14 @@
-"""Load a recording with the simulator class of its system or robot, if it is not too large."""
+"""Load a recording from files or data frames, check its size, and hash its files."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+import hashlib
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
+from typing import Annotated, Any, TypeAlias
 
 import numpy as np
 
@@ -19,10 +23,28 @@ from bench.core.resource_estimates import (
     get_machine_resources,
     get_max_step,
 )
+from sims.core.argument_checks import Expected, Name
 from sims.core.simulator import InputError, Simulator
+from sims.core.toml_validation import check_table
 from sims.core.values import MAX_NUMBER
-from sims.recording.recording import Recording, read_recording, read_system_name, split_held_out
-from sims.recording.recording_description import ModelFileReference, read_model_reference
+from sims.recording.column_mapping import list_mapped_files
+from sims.recording.log_formats.hdf5_and_parquet import group_of
+from sims.recording.log_formats.lerobot_dataset import list_episode_files, split_episode_path
+from sims.recording.log_formats.ros_bags import split_bag_path
+from sims.recording.recording import (
+    Recording,
+    read_recording,
+    read_system_name,
+    recording_of_frame,
+    split_held_out,
+)
+from sims.recording.recording_description import (
+    ModelFileReference,
+    get_description_path,
+    model_in,
+    read_model_reference,
+)
+from sims.recording.recording_frame import Frame
 
 
 def load_recording(
@@ -202,3 +224,164 @@ def check_film_size(recording: Path, frames: int, pixels: int, force: bool = Fal
         seconds=frames * area * _PIXEL_SECONDS,
     )
     check_feasible(str(recording), need, get_machine_resources(), force)
+
+
+Units: TypeAlias = Annotated[
+    Mapping[str, str], Expected("units of columns by their names, as {'q': 'rad'}")
+]
+"""Units of a data frame's columns, by column name."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameDescription:
+    """System of a recording, and the description of a data frame, which has no `NAME.toml` file.
+
+    Attributes:
+        system: Name of the system, instead of the one that the .toml file states.
+        model: Model file of a robot, MJCF or URDF, instead of what the .toml file states.
+        units: Units of a DataFrame's columns by name (default: those in ``df.attrs["units"]``).
+        constants: Known numbers of the system in SI units, with a DataFrame.
+        description: Any further entries about a DataFrame, with the keys of ``NAME.toml``.
+    """
+
+    system: Name | None = None
+    model: str | Path | None = None
+    units: Units | None = None
+    constants: Mapping[str, float] | None = None
+    description: Mapping[str, Any] | None = None
+
+    def refuse_for_files(self, recording: object) -> None:
+        """Reject a description of a data frame if the recording is not a data frame.
+
+        Raises:
+            InputError: units, constants or a description are given.
+        """
+        for name in ("units", "constants", "description"):
+            if getattr(self, name):
+                raise InputError(
+                    f"{name}: expected only with a DataFrame; {recording} has a description "
+                    "that states them"
+                )
+
+
+def read_frame_recording(
+    frame: Frame, frame_description: FrameDescription, name: str = "DataFrame"
+) -> Recording:
+    """Read the recording in a data frame; only runs that are marked so are held out.
+
+    Args:
+        frame: Columns ``run`` (if there are several), ``t`` and one for each channel and input.
+        frame_description: Description by the user.
+        name: Name of the recording in messages.
+
+    Raises:
+        InputError: The data frame or its description is malformed; the message is one line.
+    """
+    meta = dict(frame_description.description or {})
+    if frame_description.system is not None:
+        meta.pop("model", None)
+        meta["system"] = frame_description.system
+    if frame_description.model is not None:
+        meta.pop("system", None)
+        meta["model"] = str(frame_description.model)
+    if frame_description.constants:
+        stated_constants = check_table(name, "constants", meta.get("constants", {}))
+        meta["constants"] = {**stated_constants, **frame_description.constants}
+    kind = _get_simulator_class(name, meta)
+    meta.setdefault("title", f"{kind.name}, {name}")
+    return recording_of_frame(frame, kind, meta, frame_description.units or {}, name)
+
+
+def _get_simulator_class(name: str, meta: Mapping[str, Any]) -> type[Simulator]:
+    """Return the simulator class of the system or robot model that a description names.
+
+    Raises:
+        InputError: It names neither, or an unknown system.
+    """
+    file = model_in(Path(name), meta)
+    if file is not None:
+        return make_robot_simulator(file.path, file.actuators, file.engine, file.free)
+    system = meta.get("system")
+    if not isinstance(system, str):
+        raise InputError(
+            f"{name}: expected a system or model: system='NAME' or model='robot.xml'; "
+            f"systems are {', '.join(simulators.names())}"
+        )
+    try:
+        return simulators.get(system)
+    except InputError as error:
+        raise InputError(f"{name}: {error}") from None
+
+
+CHUNK_BYTES = 1 << 20
+"""Number of bytes read at once; a bag file may be larger than the memory."""
+_INCLUDE = re.compile(rb"<include\s+file\s*=\s*[\"']([^\"']+)[\"']")
+
+
+def compute_recording_digest(path: Path, further_text: str = "") -> str:
+    """Hash a recording: its table, its description, the mapped logs and bags, and its model.
+
+    Args:
+        path: Path of its table or description.
+        further_text: Further text that is part of the hash.
+
+    Raises:
+        InputError: The table or the description cannot be read.
+    """
+    digest = hashlib.sha256(further_text.encode())
+    description = get_description_path(path)
+    for file in dict.fromkeys([path, description]):
+        try:
+            digest.update(file.read_bytes())
+        except OSError as error:
+            raise InputError(f"{file}: cannot be read ({error.strerror})") from None
+    for file in list_mapped_files(description):
+        digest.update(read_content(file))
+    return digest.hexdigest()
+
+
+def read_content(path: Path) -> bytes:
+    """Return the hash of a file and of the files that it includes, or of the bag or episode.
+
+    Missing files contribute nothing; reading them later reports the error.
+    """
+    episode = split_episode_path(path)
+    if episode is not None:
+        try:
+            return b"".join(read_content(file) for file in list_episode_files(*episode))
+        except InputError:
+            return b""
+    bag = split_bag_path(path) or group_of(path)
+    root = path if bag is None else bag[0]
+    files = sorted(root.rglob("*")) if bag is not None and root.is_dir() else [root]
+    content = hashlib.sha256()
+    for file in files if root.suffix.lower() != ".xml" else _list_included_files(root):
+        if file.is_file():
+            file_stat = file.stat()
+            content.update(_hash_file(file, file_stat.st_mtime_ns, file_stat.st_size))
+    return content.digest()
+
+
+def _list_included_files(model: Path) -> list[Path]:
+    """Return a model file and the files that it includes, searched in the folder of the model."""
+    files, visited_count = [model], 0
+    while visited_count < len(files):
+        visited_file = files[visited_count]
+        names = _INCLUDE.findall(visited_file.read_bytes()) if visited_file.is_file() else []
+        included_files = [model.parent / name.decode(errors="replace") for name in names]
+        files += [file for file in dict.fromkeys(included_files) if file not in files]
+        visited_count += 1
+    return files
+
+
+@lru_cache(maxsize=256)
+def _hash_file(path: Path, _changed: int, _size: int) -> bytes:
+    """Return the hash of a file; cached, as many logs may use the same file.
+
+    The unused arguments are part of the cache key, so a changed file is hashed again.
+    """
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        while chunk := file.read(CHUNK_BYTES):
+            digest.update(chunk)
+    return digest.digest()

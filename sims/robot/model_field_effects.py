@@ -31,12 +31,12 @@ import numpy as np
 
 from sims.core.simulator import Array
 from sims.robot.contact_pairs import find_pair
-from sims.robot.friction_constraint import write_friction_form
 from sims.robot.inertia_tensors import (
     compute_inertia_tensors,
     compute_point_inertias,
     compute_quaternions,
 )
+from sims.robot.integrator_settings import write_friction_form
 from sims.robot.places.centre_of_mass_limits import observable_tilts
 from sims.robot.robot_model import COUPLING_TENDON_SUFFIX, RobotModel
 

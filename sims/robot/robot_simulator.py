@@ -30,14 +30,6 @@ from sims.robot.dynamics.activation_filters import (
     is_rk4_integrator,
     select_initial_activations,
 )
-from sims.robot.dynamics.active_effects import (
-    changes_derived_constants,
-    find_active_elements,
-    is_evaluated_per_step,
-    pad_coefficients,
-    select_model_field_effects,
-    slice_active_effects,
-)
 from sims.robot.dynamics.added_elements import AddedElements, group_by_added_elements
 from sims.robot.dynamics.applied_inputs import (
     SAME_INSTANT_SHARE,
@@ -54,8 +46,17 @@ from sims.robot.dynamics.batch_work import (
 )
 from sims.robot.dynamics.callback_stepping import step_in_callback
 from sims.robot.dynamics.compiled_forces import compile_forces
-from sims.robot.dynamics.disabled_drives import compute_off_steps, find_working_servos
-from sims.robot.dynamics.effect_forces import EffectForces, compute_time_dependent_forces
+from sims.robot.dynamics.drive_limits import compute_off_steps, find_working_servos
+from sims.robot.dynamics.effect_forces import (
+    EffectForces,
+    changes_derived_constants,
+    compute_time_dependent_forces,
+    find_active_elements,
+    is_evaluated_per_step,
+    pad_coefficients,
+    select_model_field_effects,
+    slice_active_effects,
+)
 from sims.robot.dynamics.midpoint_state import IndexArray, Mask
 from sims.robot.dynamics.mujoco_batch import (
     BATCH_SIZE,

@@ -18,8 +18,7 @@ import numpy as np
 from bench.core.plugin_registries import make_robot_simulator
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.diagnosis.fitting.base_fit import fit_base_model
-from bench.diagnosis.fitting.tuner_initialisation import find_start_with_tuner
+from bench.diagnosis.fitting.base_fit import find_start_with_tuner, fit_base_model
 from bench.diagnosis.identifiability import assess_identifiability
 from bench.diagnosis.validation.gain_and_intervals import compute_central_jacobian
 from sims.core.simulator import Scenario

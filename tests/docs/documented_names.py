@@ -8,8 +8,8 @@ from bench.api.datasheet import DatasheetOptions
 from bench.api.design import DesignOptions
 from bench.api.recordings import ImportRequest
 from bench.diagnosis.explain_options import ExplainOptions
-from bench.logs.data_frames import FrameDescription
 from bench.logs.importing.import_result import ImportOptions
+from bench.logs.recording_loading import FrameDescription
 from bench.logs.synthetic_recording import SimulationSpec
 
 GROUPS = {

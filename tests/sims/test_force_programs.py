@@ -12,9 +12,13 @@ from sims.core.simulator import InputError, Scenario
 from sims.engines import make_engine
 from sims.engines.batch import BatchEngine
 from sims.engines.compiled import compilability
-from sims.engines.compiled.expression_graph import OPERATION_CODES, PER_ELEMENT, ExpressionGraph
+from sims.engines.compiled.expression_graph import (
+    OPERATION_CODES,
+    PER_ELEMENT,
+    ExpressionGraph,
+    NotTraceableError,
+)
 from sims.engines.compiled.kernel import get_kernel
-from sims.engines.compiled.node_arrays import NotTraceableError
 from sims.engines.compiled.traced_array import TracedArray
 from sims.systems.ball import Ball
 from sims.systems.pendulum import Pendulum

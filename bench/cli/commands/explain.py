@@ -156,13 +156,14 @@ def _run_explain_batch(options: argparse.Namespace, print_line: PrintLine) -> Co
     )
     from bench.cli.progress_display import ProgressDisplay
     from bench.core.resource_estimates import count_available_cores
-    from bench.diagnosis.batch.log_tables import (
+    from bench.diagnosis.batch.run_batch import (
         LOGS_TABLE_FILE,
         LogResult,
+        explain_batch,
         format_cause,
+        list_logs,
         summarise_causes,
     )
-    from bench.diagnosis.batch.run_batch import explain_batch, list_logs
     from bench.diagnosis.batch.summary_page import BatchPageInput, write_summary_page
     from sims.core.files import make_timestamped_path
 

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import pandas as pd
 
-from bench.diagnosis.batch import log_tables
-from bench.diagnosis.batch.log_tables import LOGS_TABLE_FILE, LogResult, format_cause
+from bench.diagnosis.batch import run_batch
+from bench.diagnosis.batch.run_batch import LOGS_TABLE_FILE, LogResult, format_cause
 from bench.diagnosis.report.wording import (
     append_unit,
     format_effect_name,
@@ -80,7 +80,7 @@ def write_summary_page(rows: Sequence[LogResult], batch: BatchPageInput) -> Path
     Raises:
         InputError: The page cannot be written.
     """
-    path = batch.out / log_tables.REPORT_FILE
+    path = batch.out / run_batch.REPORT_FILE
     try:
         write_atomically(path, render_summary_page(rows, batch))
     except OSError as error:
@@ -95,11 +95,11 @@ def render_summary_page(rows: Sequence[LogResult], batch: BatchPageInput) -> str
         rows: Result of each log, in the order given.
         batch: Input of the page in addition to the rows.
     """
-    logs = log_tables.build_log_table(rows, batch.folders)
-    numbers = log_tables.build_number_table(rows)
+    logs = run_batch.build_log_table(rows, batch.folders)
+    numbers = run_batch.build_number_table(rows)
     charts = make_summary_charts(logs, numbers)
     page = HtmlPage()
-    tables = {"each": logs, "logs": log_tables.read_log_table(rows), **charts.tables}
+    tables = {"each": logs, "logs": run_batch.read_log_table(rows), **charts.tables}
     for name, table in tables.items():
         page.add_table(name, table)
     closed_shares = logs["gap_closed"][logs["causes"] != ""].dropna()
@@ -196,7 +196,7 @@ def _format_ranges(numbers: pd.DataFrame) -> str:
         ends = dict.fromkeys(
             format_number(end) for end in (values["value"].min(), values["value"].max())
         )
-        label = "" if name == "coefficient" else f"{log_tables.place_of(str(name))} "
+        label = "" if name == "coefficient" else f"{run_batch.place_of(str(name))} "
         parts.append(label + append_unit(" to ".join(ends), str(values["unit"].iloc[0])))
     return f": {joined(parts)}" if parts else ""
 

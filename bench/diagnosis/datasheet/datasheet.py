@@ -12,8 +12,7 @@ from bench.diagnosis.datasheet.detection_limits import compute_detection_limits
 from bench.diagnosis.datasheet.drive_diagram import DriveDiagram
 from bench.diagnosis.datasheet.drive_figure import render_diagram, render_pdf
 from bench.diagnosis.datasheet.mjcf_class import CLASS_FILE, MjcfFiles, build_mjcf
-from bench.diagnosis.datasheet.sheet_content import SheetContent
-from bench.diagnosis.datasheet.sheet_rows import build_sheet_rows
+from bench.diagnosis.datasheet.sheet_content import SheetContent, build_sheet_rows
 from bench.diagnosis.datasheet.subject import SheetSubject, make_subject
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.report.wording import (
@@ -24,7 +23,7 @@ from bench.diagnosis.report.wording import (
     joined,
 )
 from bench.diagnosis.verdict import Verdict
-from bench.logs.importing.filter_start import leave_out_settling
+from bench.logs.importing.sample_thinning import leave_out_settling
 from bench.logs.segmentation import segment_recording
 from bench.pages.chart import PrintedFigure
 from bench.pages.html_page import HtmlPage

@@ -1,18 +1,21 @@
-"""Content of a data sheet for any output format, and its text."""
+"""Rows and content of a data sheet for any output format, and its text."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Literal
 
+import numpy as np
+
+from bench.diagnosis.datasheet.detection_limits import DetectionLimit, DetectionLimits
 from bench.diagnosis.datasheet.drive_diagram import DriveDiagram, compute_drive_diagram
-from bench.diagnosis.datasheet.sheet_rows import SheetRow
-from bench.diagnosis.datasheet.subject import PLACE_KIND_TITLES, SheetSubject
+from bench.diagnosis.datasheet.subject import PLACE_KIND_TITLES, ModelFileValue, SheetSubject
 from bench.diagnosis.report.wording import (
     append_unit,
+    format_effect_name,
     format_fitted_value,
     format_number,
     format_p_value,
@@ -20,9 +23,329 @@ from bench.diagnosis.report.wording import (
     joined,
     sanitise,
 )
-from bench.diagnosis.verdict import Verdict
-from sims.extended_simulator import ExtendedSimulator
+from bench.diagnosis.validation.gain_and_intervals import Z95
+from bench.diagnosis.verdict import Cause, Verdict
+from sims import effects as library
+from sims.core.effect import ALL_PLACES
+from sims.extended_simulator import ExtendedSimulator, FittedValue
 from sims.recording.recording import Recording
+
+QuantityState = Literal["found", "fitted", "derived", "not shown"]
+DERIVATIVE_STEP_SHARE = 1e-6
+"""Relative step of a parameter for the derivatives of derived quantities."""
+
+
+@dataclass(frozen=True)
+class SheetRow:
+    """Row of the sheet: one number.
+
+    Attributes:
+        name: Name of the effect here, with its coefficient if it has several; or of the parameter.
+        says: Name in words.
+        part: ``joint``, ``actuator``, ``channel``, or ``system`` for a parameter of a system.
+        state: ``found`` for a cause, ``fitted`` for a parameter, ``derived`` for a number that
+            follows from others, or ``not shown``.
+        unit: Unit of the number.
+        number: Value with its 95 % interval; None if it is not shown.
+        stated: Value in the model file; None if the file has none.
+        detection_limit: Detection limit of an effect that is not shown.
+        p_value: Probability of a gain like that of the cause if it were absent.
+        share: Share of the held-out gap that the cause closes alone; None if not measured.
+        alternatives: Effects that explain the data as well.
+        prediction_half_width: Half the 95 % interval for a log, or a run, that is not yet recorded;
+            None if unknown.
+        strongest: Whether it is the force limit of the drive, at rest.
+    """
+
+    name: str
+    says: str
+    part: str
+    state: QuantityState
+    unit: str
+    number: FittedValue | None = None
+    stated: float | None = None
+    detection_limit: DetectionLimit | None = None
+    p_value: float | None = None
+    share: float | None = None
+    alternatives: tuple[str, ...] = ()
+    prediction_half_width: float | None = None
+    strongest: bool = False
+
+    def to_document(self) -> dict[str, Any]:
+        """Return the row as TOML data, which has no null."""
+        row: dict[str, Any] = {"state": self.state, "says": self.says, "unit": self.unit}
+        row["part"] = self.part
+        if self.number is not None:
+            row |= self.number.to_table()
+        if self.prediction_half_width is not None:
+            row["another"] = self.prediction_half_width
+        if self.stated is not None:
+            row["stated"] = self.stated
+        if self.detection_limit is not None:
+            row |= self.detection_limit.to_document()
+        if self.p_value is not None:
+            row["p_value"] = self.p_value
+        if self.share is not None:
+            row["heldout_gain"] = self.share
+        if self.alternatives:
+            row["alternatives"] = list(self.alternatives)
+        return row
+
+
+def build_sheet_rows(
+    subject: SheetSubject, extended: ExtendedSimulator, verdict: Verdict, limits: DetectionLimits
+) -> tuple[SheetRow, ...]:
+    """Build the rows of a sheet.
+
+    Args:
+        subject: Joint or system.
+        extended: Extended simulator.
+        verdict: Verdict with the evidence.
+        limits: Covariance and detection limits.
+
+    Returns:
+        Derived quantities, parameters, causes, then effects that are not shown.
+    """
+    rows = _Rows(subject, extended, verdict, limits)
+    return (*rows.derived(), *rows.parameters(), *rows.causes(), *rows.absent())
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Builder of the rows of a data sheet, from a verdict and the detection limits."""
+
+    subject: SheetSubject
+    extended: ExtendedSimulator
+    verdict: Verdict
+    detection_limits: DetectionLimits
+
+    def derived(self) -> Iterator[SheetRow]:
+        """Yield quantities derived from the system's parameters, by error propagation."""
+        parameters = self.extended.parameters
+        values = {name: number.value for name, number in parameters.items()}
+        values_by_name = {**self.extended.constants, **values}
+        free = [name for name in self.detection_limits.free if name in values]
+        indices = [self.detection_limits.free.index(name) for name in free]
+        covariance = self.detection_limits.covariance[np.ix_(indices, indices)]
+        for derived in self.subject.kind.system.derived:
+            try:
+                value = derived.of(values_by_name)
+            except (KeyError, ZeroDivisionError):
+                # A constant that differs between runs has no single value.
+                continue
+            slopes = []
+            for name in free:
+                step = DERIVATIVE_STEP_SHARE * (abs(values_by_name[name]) or 1.0)
+                slopes.append(
+                    (derived.of({**values_by_name, name: values_by_name[name] + step}) - value)
+                    / step
+                )
+            gradient = np.array(slopes)
+            half_width = Z95 * float(np.sqrt(max(gradient @ covariance @ gradient, 0.0)))
+            number = FittedValue(value, derived.unit, value - half_width, value + half_width)
+            row = SheetRow(derived.name, derived.says, "system", "derived", derived.unit, number)
+            yield replace(row, strongest=derived.strongest)
+
+    def parameters(self) -> Iterator[SheetRow]:
+        """Yield the parameters of the system, or the free numbers of the robot's file here."""
+        if not self.subject.joint:
+            for parameter in self.subject.kind.parameters:
+                nominal = FittedValue(parameter.nominal, parameter.unit, None, None)
+                # A parameter that is not in the file has its nominal value.
+                number = self.extended.parameters.get(parameter.name, nominal)
+                description = parameter.says or parameter.name
+                row = _make_fitted_row(
+                    parameter.name, description, "system", "fitted", number, None
+                )
+                yield replace(
+                    row,
+                    prediction_half_width=self.detection_limits.prediction_half_widths.get(
+                        parameter.name
+                    ),
+                )
+            return
+        for name, number in self.extended.parameters.items():
+            # The coefficient of an effect with several has its name after a point.
+            effect, _, place_and_coefficient = name.partition("@")
+            local_place = next(
+                (
+                    own_place
+                    for own_place in self.subject.places
+                    if place_and_coefficient
+                    in (own_place, f"{own_place}.{_get_coefficient_part(place_and_coefficient)}")
+                ),
+                "",
+            )
+            if local_place:
+                row = self._make_effect_row(f"{effect}@{local_place}", name, number, "fitted")
+                yield self._add_prediction_interval(row, f"{effect}@{local_place}", name)
+
+    def causes(self) -> Iterator[SheetRow]:
+        """Yield the diagnosed causes; members of a family that may be zero here are not shown."""
+        for name, numbers in self.extended.effects.items():
+            local_coefficients = list(self.subject.localise_effect(name, numbers))
+            for effect, coefficient, number in local_coefficients:
+                if number.value == 0:
+                    # A coefficient of zero means that the effect is absent; its detection limit is
+                    # computed.
+                    continue
+                has_several = (
+                    sum(other_effect == effect for other_effect, _, _ in local_coefficients) > 1
+                )
+                label = f"{effect} {coefficient}" if has_several else effect
+                row = self._make_effect_row(effect, label, number, "found", self._find_cause(name))
+                if _may_be_zero(number):
+                    yield self._make_hidden_row(row, effect, number)
+                    continue
+                place_suffix = (
+                    "" if name.partition("@")[2] != ALL_PLACES else f"@{effect.partition('@')[2]}"
+                )
+                parameter = name if len(numbers) == 1 else f"{name}.{coefficient}{place_suffix}"
+                yield self._add_prediction_interval(row, effect, parameter)
+
+    def _add_prediction_interval(self, row: SheetRow, effect: str, parameter: str) -> SheetRow:
+        """Add to a row the interval of its value for a run that is not yet recorded.
+
+        It is known only if several runs or logs identify the value. For a number of the model file
+        it is converted to the unit of that number.
+        """
+        half_width, file_value = (
+            self.detection_limits.prediction_half_widths.get(parameter),
+            self.subject.get_model_file_value(effect),
+        )
+        if half_width is None or file_value is None:
+            return replace(row, prediction_half_width=half_width)
+        return replace(row, prediction_half_width=file_value.compute_half_width(half_width))
+
+    def _make_hidden_row(self, row: SheetRow, effect: str, number: FittedValue) -> SheetRow:
+        """Build the row of a cause at other places that is not shown here."""
+        detection_limit = _make_limit_from_interval(
+            number, self.subject.get_model_file_value(effect)
+        )
+        return SheetRow(
+            row.name,
+            row.says,
+            row.part,
+            "not shown",
+            row.unit,
+            stated=row.stated,
+            detection_limit=detection_limit,
+        )
+
+    def absent(self) -> Iterator[SheetRow]:
+        """Yield the effects that are not in the model, with their detection limits."""
+        for (effect, coefficient), detection_limit in self.detection_limits.limits.items():
+            has_several = len({c for e, c in self.detection_limits.limits if e == effect}) > 1
+            label = f"{effect} {coefficient}" if has_several else effect
+            placed_effect = library.find_effect(effect, self.subject.kind.system)
+            c = next(c for c in placed_effect.coefficients if c.name == coefficient)
+            unit = c.unit_on(self.subject.kind.system, self.extended.observe) or "1"
+            yield self._make_absent_effect_row(effect, label, unit, detection_limit)
+
+    def _make_absent_effect_row(
+        self, effect: str, label: str, unit: str, detection_limit: DetectionLimit
+    ) -> SheetRow:
+        """Build the row of an effect that is not in the model, with its detection limit.
+
+        If the effect changes a number of the model file, the limit is converted to the unit of that
+        number. `label` is the name of the row, and `unit` the unit of the coefficient.
+        """
+        file_value = self.subject.get_model_file_value(effect)
+        value = None
+        if file_value is not None:
+            unit, value = file_value.unit, file_value.value
+            detection_limit = replace(
+                detection_limit,
+                size=file_value.compute_half_width(detection_limit.size),
+                estimate_if_fitted=file_value.compute_half_width(
+                    detection_limit.estimate_if_fitted
+                ),
+            )
+        alternatives = tuple(c.effect for c in self.verdict.causes if effect in c.alternatives)
+        description = format_effect_name(effect.partition("@")[0])
+        part = library.find_effect(effect, self.subject.kind.system).at
+        return SheetRow(
+            label,
+            description,
+            part,
+            "not shown",
+            unit,
+            stated=value,
+            detection_limit=detection_limit,
+            alternatives=alternatives,
+        )
+
+    def _make_effect_row(
+        self,
+        effect: str,
+        label: str,
+        number: FittedValue,
+        state: QuantityState,
+        cause: Cause | None = None,
+    ) -> SheetRow:
+        """Build the row of a fitted parameter or a diagnosed cause.
+
+        Args:
+            effect: Effect with its place, as ``name@place``.
+            label: Name of the row.
+            number: Fitted coefficient of the effect. If the effect changes a number of the model
+                file, the row has the resulting total of that number instead.
+            state: State of the quantity, such as ``fitted`` or ``found``.
+            cause: Cause in the verdict, for its p-value and alternatives; None for a parameter.
+        """
+        placed_effect = library.find_effect(effect, self.subject.kind.system)
+        file_value = self.subject.get_model_file_value(effect)
+        if file_value is not None:
+            number = file_value.compute_total(number)
+        row = _make_fitted_row(
+            label,
+            format_effect_name(effect.partition("@")[0]),
+            placed_effect.at,
+            state,
+            number,
+            file_value,
+        )
+        if cause is None:
+            return row
+        gains = [c.heldout_gain for c in self.verdict.candidates if c.effect == cause.effect]
+        share = next(iter(gains), None)
+        return replace(row, p_value=cause.p_value, share=share, alternatives=cause.alternatives)
+
+    def _find_cause(self, name: str) -> Cause | None:
+        return next((c for c in self.verdict.causes if c.effect == name), None)
+
+
+def _make_fitted_row(
+    name: str,
+    description: str,
+    part: str,
+    state: QuantityState,
+    number: FittedValue,
+    file_value: Any,
+) -> SheetRow:
+    """Build a row with a fitted value and, unless `file_value` is None, the model file's value."""
+    nominal = None if file_value is None else file_value.value
+    return SheetRow(name, description, part, state, number.unit, number, nominal)
+
+
+def _get_coefficient_part(place: str) -> str:
+    return place.rpartition(".")[2]
+
+
+def _may_be_zero(number: FittedValue) -> bool:
+    """Return whether zero lies in the 95 % interval of a coefficient; False without an interval."""
+    if number.low is None or number.high is None:
+        return False
+    return number.low <= 0 <= number.high
+
+
+def _make_limit_from_interval(
+    number: FittedValue, file_value: ModelFileValue | None
+) -> DetectionLimit:
+    low, high = number.low or 0.0, number.high or 0.0
+    size = max(abs(low), abs(high))
+    return DetectionLimit(size if file_value is None else file_value.compute_half_width(size))
+
 
 FORMAT_VERSION = 1
 """Format version of sheet.toml."""

@@ -1,6 +1,6 @@
 """Ranges of effect coefficients: where they are plausible, and where a fit may move them.
 
-Times and frequencies follow the time scale of the recording (`evaluation.time_scale`).
+Times and frequencies follow the time scale of the recording (`evaluation.run_data`).
 """
 
 from __future__ import annotations
@@ -10,8 +10,8 @@ from typing import Literal
 
 import numpy as np
 
+from bench.diagnosis.evaluation.run_data import is_instant
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.diagnosis.evaluation.time_scale import is_instant
 from sims.core.effect import Coefficient, Effect, Friction
 from sims.core.simulator import Array, Parameter
 

@@ -11,10 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.diagnosis.evaluation.noise_model import Mask
-from bench.diagnosis.evaluation.run_data import RunData, prepare_run, take_first_samples
+from bench.diagnosis.evaluation.run_data import (
+    RunData,
+    SimulationCache,
+    adapt_to_time_scale,
+    prepare_run,
+    take_first_samples,
+)
 from bench.diagnosis.evaluation.search_control import SearchControl
-from bench.diagnosis.evaluation.simulation_cache import SimulationCache
-from bench.diagnosis.evaluation.time_scale import adapt_to_time_scale
 from bench.diagnosis.evaluation.worker_pool import ForkedWorkerPool
 from sims import effects as library
 from sims.core.effect import Effect, Input, Sensor, members_of

@@ -40,9 +40,9 @@ from bench.diagnosis.search.candidate_directions import CandidateDirection
 from sims.core.effect import Effect, members_of
 from sims.core.simulator import Array
 from sims.robot.dynamics.effect_forces import TIME_DEPENDENT_EFFECTS
+from sims.robot.dynamics.inverse_dynamics import compute_floating_forces, compute_joint_scales
 from sims.robot.dynamics.measured_linearisation import MeasuredLinear, SingleArray, Trajectory
 from sims.robot.dynamics.run_linearisation import compute_control_changes
-from sims.robot.places.typical_forces import compute_floating_forces, compute_joint_scales
 from sims.robot.robot_simulator import RobotSimulator
 
 POSITION_PRIOR, VELOCITY_PRIOR = 1.0, 0.3

@@ -34,15 +34,15 @@ from bench.diagnosis.fitting.fit_state import FitStart
 from bench.diagnosis.kalman.measured_states import estimate_measured_states
 from bench.diagnosis.search.effect_search import EffectSearch
 from sims.core.simulator import Array
-from sims.robot.dynamics.active_effects import (
+from sims.robot.dynamics.batch_work import RobotRunBatch
+from sims.robot.dynamics.effect_forces import (
     is_evaluated_per_step,
     select_model_field_effects,
     slice_active_effects,
 )
-from sims.robot.dynamics.batch_work import RobotRunBatch
+from sims.robot.dynamics.inverse_dynamics import compute_joint_scales
 from sims.robot.floating_joints import FloatingState
 from sims.robot.mujoco_messages import capture_mujoco_warnings
-from sims.robot.places.typical_forces import compute_joint_scales
 from sims.robot.robot_simulator import LINEARISATION_BATCH_SIZE, RobotSimulator
 
 FORCE_SHARES = (0.001, 0.01, 0.1, 1.0)

@@ -33,7 +33,7 @@ from bench.diagnosis.prediction_error.model_filters import (
 from bench.diagnosis.search.effect_search import EffectSearch
 from bench.diagnosis.search.refit_starts import add_effect_to_start
 from sims.core.simulator import Array
-from sims.robot.places.typical_forces import compute_joint_scales
+from sims.robot.dynamics.inverse_dynamics import compute_joint_scales
 from sims.robot.robot_simulator import RobotSimulator
 
 MAX_REGRESSION_PROPOSALS = 4

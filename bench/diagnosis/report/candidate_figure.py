@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bench.diagnosis.report.candidate_ranking import (
+from bench.diagnosis.report.cause_text import (
     get_candidate_status,
+    has_placed_causes,
     rank_candidates,
     select_shown_candidates,
     shorten_effect_name,
 )
-from bench.diagnosis.report.cause_text import has_placed_causes
 from bench.diagnosis.report.report_data import DataSplit, DiagnosisReportData
 from bench.diagnosis.report.wording import format_number, format_p_value, format_percent, sanitise
 from bench.diagnosis.verdict import Candidate

@@ -5,8 +5,13 @@ Their numbers are those of verdict.json and of the report data.
 
 from __future__ import annotations
 
-from bench.diagnosis.report.candidate_ranking import get_candidate_status, rank_candidates
-from bench.diagnosis.report.cause_text import format_effect_set, has_placed_causes, strip_place
+from bench.diagnosis.report.cause_text import (
+    format_effect_set,
+    get_candidate_status,
+    has_placed_causes,
+    rank_candidates,
+    strip_place,
+)
 from bench.diagnosis.report.figure_panels import (
     MAX_LABEL_LENGTH,
     has_extended_model,

@@ -15,31 +15,28 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from bench.diagnosis.report.candidate_figure import draw_candidates_figure
-from bench.diagnosis.report.candidate_ranking import select_shown_candidates
-from bench.diagnosis.report.cause_text import list_place_marks
+from bench.diagnosis.report.cause_text import list_place_marks, select_shown_candidates
 from bench.diagnosis.report.figure_panels import (
     BASE_MODEL_LINE,
     EXTENDED_MODEL_LINE,
     LONGEST_NAME,
+    MAX_OUTLINED_DOTS,
+    RunView,
+    decimate,
     draw_gap_location_panel,
     draw_profile_panel,
     format_profile_label,
+    format_selected_run,
     get_legend_entries,
     has_extended_model,
     place_names,
     select_gap_locations,
     select_informative_profiles,
+    select_worst_run,
     shorten_label,
 )
 from bench.diagnosis.report.joint_figure import draw_joint_figure, is_robot
 from bench.diagnosis.report.report_data import DiagnosisReportData
-from bench.diagnosis.report.run_selection import (
-    MAX_OUTLINED_DOTS,
-    RunView,
-    decimate,
-    format_selected_run,
-    select_worst_run,
-)
 from bench.diagnosis.report.wording import sanitise
 from bench.figures import style
 from bench.figures.figure_files import is_pdf_wanted

@@ -16,16 +16,14 @@ from bench.diagnosis.report.cause_text import list_place_marks
 from bench.diagnosis.report.figure_panels import (
     BASE_MODEL_LINE,
     EXTENDED_MODEL_LINE,
-    has_extended_model,
-    shorten_label,
-)
-from bench.diagnosis.report.report_data import DiagnosisReportData
-from bench.diagnosis.report.run_selection import (
     MAX_OUTLINED_DOTS,
     RunView,
     decimate,
     format_selected_run,
+    has_extended_model,
+    shorten_label,
 )
+from bench.diagnosis.report.report_data import DiagnosisReportData
 from bench.diagnosis.report.wording import ALL_PLACES, format_number, sanitise
 from bench.figures.style import (
     BLUE,

@@ -10,7 +10,6 @@ from textwrap import wrap
 import numpy as np
 
 from bench.diagnosis.evaluation.search_control import QUESTION_TEXTS
-from bench.diagnosis.report.candidate_ranking import rank_candidates
 from bench.diagnosis.report.cause_text import (
     format_causes,
     format_effect_set,
@@ -19,6 +18,7 @@ from bench.diagnosis.report.cause_text import (
     format_values,
     has_placed_causes,
     is_overstated,
+    rank_candidates,
     strip_place,
 )
 from bench.diagnosis.report.consistency_section import format_consistency

@@ -26,8 +26,8 @@ from bench.diagnosis.evaluation.coefficient_bounds import (
     compute_coefficient_bounds,
 )
 from bench.diagnosis.evaluation.noise_model import Mask
+from bench.diagnosis.evaluation.run_data import MAX_DECAY_FACTOR, is_instant
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.diagnosis.evaluation.time_scale import MAX_DECAY_FACTOR, is_instant
 from bench.diagnosis.fitting.fit_state import FitStart, TrajectoryFit
 from bench.diagnosis.fitting.gauss_newton import is_finite_response
 from bench.diagnosis.search.initial_values import (

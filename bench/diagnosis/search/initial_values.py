@@ -7,9 +7,8 @@ from itertools import product
 
 import numpy as np
 
-from bench.diagnosis.evaluation.run_data import RunData
+from bench.diagnosis.evaluation.run_data import RunData, is_instant
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.diagnosis.evaluation.time_scale import is_instant
 from sims.core.effect import Effect, members_of
 from sims.core.simulator import Array, Parameter
 

@@ -12,7 +12,7 @@ from bench.logs.importing.servo_estimation import AddedServo, estimate_added_ser
 from bench.logs.importing.signal_assignment import Signal, SignalAssignment
 from sims.core.simulator import Array
 from sims.core.toml_validation import toml_key, toml_text
-from sims.robot.places.typical_forces import compute_joint_scales
+from sims.robot.dynamics.inverse_dynamics import compute_joint_scales
 from sims.robot.robot_model import Joint
 
 FREE_GAINS = "actuator.stiffness", "actuator.damping"

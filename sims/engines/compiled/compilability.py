@@ -25,8 +25,8 @@ from sims.engines.compiled.data_layout import (
     OUT_MU,
     InputNames,
 )
+from sims.engines.compiled.expression_graph import NotTraceableError
 from sims.engines.compiled.force_program import ForceProgram, NumpyForceProgram, SystemTracer
-from sims.engines.compiled.node_arrays import NotTraceableError
 
 _tracers: dict[tuple[type[System], InputNames], SystemTracer | None] = {}
 _effects: dict[tuple[type[System], InputNames, type[Effect]], bool] = {}

@@ -33,9 +33,10 @@ from sims.engines.compiled.expression_graph import (
     PER_IMPACT,
     ExpressionGraph,
     ExpressionNode,
+    NotTraceableError,
+    make_constant_nodes,
 )
 from sims.engines.compiled.kernel import get_kernel
-from sims.engines.compiled.node_arrays import NotTraceableError, make_constant_nodes
 from sims.engines.compiled.numpy_forces import NUMPY_BLOCK_WIDTH, NumpyForces, lay_out_registers
 from sims.engines.compiled.traced_array import TracedArray
 

@@ -14,12 +14,13 @@ from typing import Any
 import numpy as np
 from numpy.lib.mixins import NDArrayOperatorsMixin
 
-from sims.engines.compiled.expression_graph import ExpressionGraph, ExpressionNode
-from sims.engines.compiled.node_arrays import (
+from sims.engines.compiled.expression_graph import (
     BOOLEAN_OPERATIONS,
     OPERATION_ALIASES,
     RESHAPING_FUNCTIONS,
     SWAPPED_COMPARISONS,
+    ExpressionGraph,
+    ExpressionNode,
     NotTraceableError,
     apply_elementwise,
     make_constant_nodes,

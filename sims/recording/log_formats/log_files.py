@@ -21,7 +21,7 @@ from sims.core.simulator import Array, InputError, make_read_only
 from sims.recording.log_formats import hdf5_and_parquet, lerobot_dataset, ros_bags
 from sims.recording.log_formats.column_names import arrays_by_name
 from sims.recording.log_formats.hdf5_and_parquet import make_unreadable_error, read_numeric_columns
-from sims.recording.log_formats.message_table import TIME_COLUMN
+from sims.recording.log_formats.ros_bags import TIME_COLUMN
 from sims.recording.log_formats.text_table import read_text_table
 
 LOG_SUFFIXES = (

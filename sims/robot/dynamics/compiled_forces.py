@@ -19,7 +19,12 @@ from numpy.typing import NDArray
 
 from sims.core.effect import Effect, HiddenState, HiddenStateEffect
 from sims.core.simulator import Array
-from sims.engines.compiled.expression_graph import PER_ELEMENT, PER_EVALUATION, ExpressionGraph
+from sims.engines.compiled.expression_graph import (
+    PER_ELEMENT,
+    PER_EVALUATION,
+    ExpressionGraph,
+    NotTraceableError,
+)
 from sims.engines.compiled.force_program import (
     InstructionList,
     collect_nodes,
@@ -27,7 +32,6 @@ from sims.engines.compiled.force_program import (
     make_input_vector,
 )
 from sims.engines.compiled.kernel import get_kernel
-from sims.engines.compiled.node_arrays import NotTraceableError
 from sims.robot.dynamics.effect_forces import (
     EffectForces,
     compute_effect_forces,

@@ -15,19 +15,19 @@ import numpy as np
 
 from sims.core.effect import ActiveEffects, Effect, Force, Friction, HiddenState, HiddenStateEffect
 from sims.core.simulator import Array
-from sims.robot.dynamics.active_effects import is_evaluated_per_step, select_model_field_effects
-from sims.robot.dynamics.disabled_drives import ForceRanges, Mask, find_working_servos
+from sims.robot.dynamics.drive_limits import ForceRanges, Mask, find_working_servos
 from sims.robot.dynamics.effect_forces import (
     LOAD_DEPENDENT_EFFECTS,
     compute_drive_effect_forces,
+    is_evaluated_per_step,
     is_in_drive,
     make_snapshot,
+    select_model_field_effects,
 )
-from sims.robot.dynamics.hidden_state_integration import advance_state, integrate_state
-from sims.robot.dynamics.midpoint_state import IndexArray
+from sims.robot.dynamics.midpoint_state import IndexArray, advance_state, integrate_state
 from sims.robot.dynamics.mujoco_batch import JointAddresses, MujocoBatch
 from sims.robot.floating_joints import FloatingState
-from sims.robot.friction_constraint import get_friction_constraint
+from sims.robot.integrator_settings import get_friction_constraint
 from sims.robot.robot_system import RobotSystem
 from sims.robot.state_snapshots import RobotSnapshot
 

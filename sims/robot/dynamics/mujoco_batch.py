@@ -22,9 +22,11 @@ import numpy as np
 from sims.core.effect import ActiveEffects
 from sims.core.simulator import Array
 from sims.robot.dynamics.added_elements import AddedElements, add_elements
-from sims.robot.dynamics.disabled_drives import (
+from sims.robot.dynamics.drive_limits import (
     FORCE_FIELDS,
+    ForceLimits,
     ForceRanges,
+    find_stiff_force_limits,
     iterate_constant_stretches,
 )
 from sims.robot.dynamics.midpoint_state import IndexArray, JointStates, Mask, MidpointPredictor
@@ -36,9 +38,8 @@ from sims.robot.dynamics.series_joints import (
     is_series_effect,
     write_series_effects,
 )
-from sims.robot.dynamics.servo_force_limits import ForceLimits, find_stiff_force_limits
 from sims.robot.floating_joints import FloatingJoints, FloatingState
-from sims.robot.friction_constraint import write_friction_form
+from sims.robot.integrator_settings import write_friction_form
 from sims.robot.model_field_effects import (
     CONTACT_FIELDS,
     COUPLING_FIELD,

@@ -16,6 +16,7 @@ from sims.robot.dynamics.applied_inputs import (
     compute_changed_inputs,
 )
 from sims.robot.dynamics.batch_work import BatchInputs, RobotRunBatch
+from sims.robot.dynamics.inverse_dynamics import compute_floating_forces, compute_joint_scales
 from sims.robot.dynamics.linearisation_points import (
     LINEARISATION_INTERVAL_SECONDS,
     LinearisationPoints,
@@ -38,7 +39,6 @@ from sims.robot.dynamics.tangent_propagation import (
 from sims.robot.floating_joints import FloatingState
 from sims.robot.model_field_effects import MODEL_FIELD_EFFECTS
 from sims.robot.mujoco_messages import capture_mujoco_warnings
-from sims.robot.places.typical_forces import compute_floating_forces, compute_joint_scales
 from sims.robot.robot_simulator import RobotSimulator
 from sims.system_simulator import SystemSimulator
 

@@ -22,13 +22,14 @@ from sims.core.simulator import Array
 from sims.engines.time_grid import is_active
 from sims.robot.coupled_drives import find_preceding_joint
 from sims.robot.dynamics.activation_filters import activation_filters
-from sims.robot.dynamics.active_effects import find_active_elements, slice_active_effects
 from sims.robot.dynamics.batch_work import BatchInputs
-from sims.robot.dynamics.disabled_drives import find_working_servos
+from sims.robot.dynamics.drive_limits import find_working_servos
 from sims.robot.dynamics.effect_forces import (
     compute_drive_effect_forces,
+    find_active_elements,
     is_in_drive,
     make_snapshot,
+    slice_active_effects,
 )
 from sims.robot.dynamics.mujoco_batch import MujocoBatch
 from sims.robot.model_field_effects import COUPLING_FIELD, get_coupling_address

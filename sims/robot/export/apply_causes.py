@@ -29,10 +29,10 @@ from sims.robot.dynamics.series_joints import (
     prepare_flanks_for_file,
     write_series_element,
 )
-from sims.robot.export.command_attributes import COMMAND_WRITERS, get_application_order
 from sims.robot.export.mjcf_attributes import (
     ANGLE_ATTRIBUTES,
     ATTRIBUTES_BY_KIND,
+    COMMAND_WRITERS,
     ENUM_ATTRIBUTES,
     FLAG_ATTRIBUTES,
     INTEGER_ATTRIBUTES,
@@ -42,6 +42,7 @@ from sims.robot.export.mjcf_attributes import (
     copy_model_fields,
     find_differing_statements,
     find_missing_statements,
+    get_application_order,
 )
 from sims.robot.export.model_comparison import format_spec
 from sims.robot.fitted_causes import FittedCause, expand_families, is_gravity_compensated

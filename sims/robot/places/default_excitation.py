@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sims.core.system import DefaultRecording
+from sims.robot.dynamics.inverse_dynamics import compute_joint_scales
 from sims.robot.mujoco_messages import capture_mujoco_warnings
-from sims.robot.places.typical_forces import compute_joint_scales
 from sims.robot.robot_model import Actuator, Joint, RobotModel
 
 SWING_AMPLITUDES = {"hinge": 0.4, "slide": 0.1}

@@ -101,7 +101,7 @@ def list_places(
         robot: robot whose places are listed.
         channels: names and units of the channels that it can observe.
     """
-    from sims.robot.places.typical_forces import coefficient_scales
+    from sims.robot.dynamics.inverse_dynamics import coefficient_scales
 
     scales = coefficient_scales(robot)
     kinds = ("joint", "actuator", "body", "channel")

@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 from bench.cli.main import main
 from bench.core.plugin_registries import load_plugins
 from bench.diagnosis.evaluation.coefficient_bounds import bound_of, compute_coefficient_bounds
-from bench.diagnosis.evaluation.time_scale import adapt_to_time_scale
+from bench.diagnosis.evaluation.run_data import adapt_to_time_scale
 from bench.diagnosis.explain import explain
 from bench.diagnosis.extended_robot_files import select_written_causes
 from bench.diagnosis.report.report_data import ParameterChange

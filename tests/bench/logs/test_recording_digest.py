@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from bench.diagnosis.batch.run_batch import list_logs
-from bench.logs.recording_digest import CHUNK_BYTES, compute_recording_digest
+from bench.logs.recording_loading import CHUNK_BYTES, compute_recording_digest
 
 DESCRIPTION = """model = "arm.xml"
 [channels.q.elbow]

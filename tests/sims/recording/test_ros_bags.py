@@ -12,7 +12,7 @@ from bench.logs.recording_loading import load_recording
 from sims.core.simulator import InputError
 from sims.recording.log_formats import ros_bags
 from sims.recording.log_formats.log_files import list_logs, read_log
-from sims.recording.log_formats.message_table import MessageTable
+from sims.recording.log_formats.ros_bags import MessageTable
 from tests.sims.recording.two_joint_arm import ARM
 
 rosbags = pytest.importorskip("rosbags", reason="rosbags is not installed: extra bags")

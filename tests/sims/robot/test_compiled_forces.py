@@ -11,7 +11,7 @@ from sims.core.effect import Coefficient, Force
 from sims.core.simulator import Scenario
 from sims.robot import robot_simulator
 from sims.robot.dynamics import mujoco_batch
-from sims.robot.dynamics.active_effects import is_evaluated_per_step
+from sims.robot.dynamics.effect_forces import is_evaluated_per_step
 from sims.robot.places.effect_places import make_placed_effect
 from tests.sims.robot.sample_arms import ARM
 

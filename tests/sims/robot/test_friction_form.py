@@ -19,8 +19,7 @@ from sims.extended_simulator import (
 )
 from sims.robot.dynamics.run_linearisation import RunLinearisation
 from sims.robot.export.write_model_file import write_model_files
-from sims.robot.friction_constraint import get_friction_constraint
-from sims.robot.integrator_settings import INTEGRATOR_IDS
+from sims.robot.integrator_settings import INTEGRATOR_IDS, get_friction_constraint
 from sims.robot.parsing.read_model_file import read_robot
 from sims.robot.robot_model import RobotModel
 from sims.robot.robot_simulator import make_robot_simulator

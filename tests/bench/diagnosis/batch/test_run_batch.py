@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bench.cli.main import main
-from bench.diagnosis.batch.log_tables import (
+from bench.diagnosis.batch.run_batch import (
     LOG_COLUMNS,
     LogResult,
     format_log_table,

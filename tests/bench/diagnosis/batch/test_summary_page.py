@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import pytest
 
-from bench.diagnosis.batch import log_tables
-from bench.diagnosis.batch.log_tables import LogResult, format_log_table
+from bench.diagnosis.batch import run_batch
+from bench.diagnosis.batch.run_batch import LogResult, format_log_table
 from bench.diagnosis.batch.summary_page import (
     MAX_PANELS,
     BatchPageInput,
@@ -165,9 +165,9 @@ def test_the_printed_figures_show_names_in_full(tmp_path, count):
         ))
         for k in range(count)
     ]  # fmt: skip
-    logs = log_tables.build_log_table(rows, {row.log: tmp_path / row.log for row in rows})
+    logs = run_batch.build_log_table(rows, {row.log: tmp_path / row.log for row in rows})
     logs["before"], logs["after"] = 12.0, 1.2
-    charts = make_summary_charts(logs, log_tables.build_number_table(rows))
+    charts = make_summary_charts(logs, run_batch.build_number_table(rows))
     for panels in (charts.numbers[:MAX_PANELS], charts.held_out):
         drawn = draw_summary_figure(panels, charts.tables, "Each log.")
         assert unreadable(drawn) == []
@@ -180,5 +180,5 @@ def test_a_number_at_a_place_is_named_by_it_in_full():
     known = {"value": 1.0, "low": 0.9, "high": 1.1, "unit": "N*m"}
     found = {"effect": "friction.coulomb@*", "alternatives": [], "coefficients": {}}
     found["coefficients"][f"coefficient@{joint}"] = known
-    (what,) = log_tables.build_number_table([LogResult("day", "d", "named", (found,))])["what"]
+    (what,) = run_batch.build_number_table([LogResult("day", "d", "named", (found,))])["what"]
     assert what == f"friction.coulomb@*: at {joint} [N·m]"

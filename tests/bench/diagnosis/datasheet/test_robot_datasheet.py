@@ -8,8 +8,12 @@ import pytest
 
 from bench.core.plugin_registries import make_robot_simulator
 from bench.diagnosis.datasheet.datasheet import build_datasheet
-from bench.diagnosis.datasheet.sheet_content import SheetContent, format_name, format_short_name
-from bench.diagnosis.datasheet.sheet_rows import SheetRow
+from bench.diagnosis.datasheet.sheet_content import (
+    SheetContent,
+    SheetRow,
+    format_name,
+    format_short_name,
+)
 from bench.diagnosis.datasheet.subject import make_subject
 from bench.logs.joined_recordings import load_joined
 from sims.core.simulator import InputError

@@ -1,6 +1,6 @@
 import numpy as np
 
-from bench.diagnosis.evaluation.simulation_cache import SimulationCache
+from bench.diagnosis.evaluation.run_data import SimulationCache
 
 ROW = np.zeros((2, 1)).nbytes
 

@@ -6,7 +6,7 @@ import matplotlib.image
 import numpy as np
 import pytest
 
-from bench.diagnosis.report.candidate_ranking import (
+from bench.diagnosis.report.cause_text import (
     MAX_SHOWN_CANDIDATES,
     get_candidate_status,
     select_shown_candidates,
@@ -14,12 +14,13 @@ from bench.diagnosis.report.candidate_ranking import (
 from bench.diagnosis.report.explanation_figures import render_figures
 from bench.diagnosis.report.explanation_page import render_report
 from bench.diagnosis.report.figure_panels import (
+    decimate,
     draw_profile_panel,
     select_gap_locations,
     select_informative_profiles,
+    select_worst_run,
 )
 from bench.diagnosis.report.report_data import GapLocation
-from bench.diagnosis.report.run_selection import decimate, select_worst_run
 from bench.figures.figure_files import pdf_figures
 from tests.bench.diagnosis.sample_report_data import evil, make_report
 

@@ -4,16 +4,14 @@ from dataclasses import replace
 
 import pytest
 
-from bench.diagnosis.report.candidate_ranking import (
-    MAX_SHOWN_CANDIDATES,
-    rank_candidates,
-    select_shown_candidates,
-    shorten_effect_name,
-)
 from bench.diagnosis.report.cause_text import (
+    MAX_SHOWN_CANDIDATES,
     format_effect_set,
     format_missing_causes,
     list_place_marks,
+    rank_candidates,
+    select_shown_candidates,
+    shorten_effect_name,
     strip_place,
 )
 from bench.diagnosis.report.report_data import ChannelInfo

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bench.diagnosis.report.candidate_ranking import rank_candidates
+from bench.diagnosis.report.cause_text import rank_candidates
 from bench.diagnosis.report.evidence_tables import build_candidate_table
 from bench.diagnosis.report.explanation_figures import (
     draw_figure,
@@ -14,8 +14,8 @@ from bench.diagnosis.report.explanation_figures import (
     list_figure_names,
 )
 from bench.diagnosis.report.explanation_page import render_report
+from bench.diagnosis.report.figure_panels import select_worst_run
 from bench.diagnosis.report.joint_figure import list_joint_rows
-from bench.diagnosis.report.run_selection import select_worst_run
 from bench.figures import robot_figure as drawing
 from bench.pages.page_table import INITIAL_ROWS
 from tests.bench.diagnosis.report.test_explanation_page import Reader, cells, make_rendered_figure

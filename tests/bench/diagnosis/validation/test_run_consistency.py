@@ -8,8 +8,11 @@ from scipy.integrate import solve_ivp
 
 from bench.cli.main import main
 from bench.diagnosis.explain import explain
-from bench.diagnosis.report.consistency_section import format_consistency
-from bench.diagnosis.report.missing_physics import MISSING_PHYSICS_NAMES, name_missing_physics
+from bench.diagnosis.report.consistency_section import (
+    MISSING_PHYSICS_NAMES,
+    format_consistency,
+    name_missing_physics,
+)
 from bench.logs.joined_recordings import load_joined
 from sims import effects
 from sims.core.simulator import InputError
