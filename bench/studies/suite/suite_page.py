@@ -177,7 +177,7 @@ def describe_losses(tables: SuiteTables) -> Iterator[str]:
 
 
 def _format_ratio(ratio: float) -> str:
-    return f"{ratio:.2g}×" if ratio < 1e4 else "more than 10000×"
+    return f"{float(f'{ratio:.2g}'):g}×" if ratio < 1e4 else "more than 10000×"
 
 
 _TEMPLATE = Path(__file__).with_name("suite_page.html")
