@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -30,15 +31,22 @@ from sims.engines import HIDDEN_STATE_ENGINES, make_engine
 from sims.engines.hidden_states import integrate_with_hidden_states
 from sims.engines.step_inputs import compute_applied_inputs
 from sims.engines.time_grid import (
+    Commands,
+    ScenarioGroups,
     TimeGrid,
     build_time_grid,
     group_by_identity,
     group_scenarios,
     is_active,
+    shifts_time,
 )
 
 MAX_COEFFICIENT_FACTOR = 1e6
 """Factor of its largest plausible value above which a coefficient is refused as a mistake."""
+MAX_STORED_TIME_GRIDS = 8
+"""Maximum number of sets of scenarios whose steps and inputs are stored."""
+MAX_STORED_NUMBERS = 2_000_000
+"""Maximum number of steps, and of each input's values, of a set that is stored (16 MB)."""
 
 
 class SystemSimulator(Simulator):
@@ -76,6 +84,7 @@ class SystemSimulator(Simulator):
         """Create engine and effects, and append the effects' coefficients to the parameters."""
         super().__init__(constants, observe)
         self._declared = self.system()
+        self._stored_steps: dict[tuple[object, ...], tuple[TimeGrid, dict[str, Array]]] = {}
         self.engine = self._make_engine(engine, settings)
         _check_effect_types(effects, fixed)
         self.effects = [self._effect(effect) for effect in effects]
@@ -204,16 +213,8 @@ class SystemSimulator(Simulator):
         runs = group_scenarios(scenarios)
         commands = [self.run_inputs(s) for s in runs.unique_scenarios]
         with np.errstate(all="ignore"):  # batch elements that overflow become NaN
-            plan = build_time_grid(
-                runs,
-                commands,
-                _select_effects(active_effects, (Input, Sensor)),
-                self.engine.largest_step,
-            )
-            inputs = (
-                compute_applied_inputs(plan, runs, commands, _select_effects(active_effects, Input))
-                if self.inputs
-                else {}
+            plan, inputs = self._compute_steps_and_inputs(
+                runs, commands, _select_effects(active_effects, (Input, Sensor))
             )
             sensors = tuple(
                 (effect, c) for effect, c in _select_effects(active_effects, Sensor) if c.any()
@@ -250,6 +251,46 @@ class SystemSimulator(Simulator):
         if sizes.min() < sizes.max():
             observations[np.arange(sizes.max()) >= sizes[runs.scenario_index, None]] = np.nan
         return observations
+
+    def _compute_steps_and_inputs(
+        self, runs: ScenarioGroups, commands: Commands, acting: ActiveEffects
+    ) -> tuple[TimeGrid, dict[str, Array]]:
+        """Return the time grid, and the applied inputs (L, S) by name.
+
+        A search simulates the same runs thousands of times. Without effects on inputs and without
+        shifts of time, steps and inputs depend only on the scenarios, and are stored.
+
+        Args:
+            runs: Scenarios of the batch elements.
+            commands: Inputs of each distinct scenario.
+            acting: Effects on inputs and sensors.
+        """
+        input_effects = _select_effects(acting, Input)
+        is_plain = not any(
+            c.any() and (isinstance(effect, Input) or shifts_time(effect)) for effect, c in acting
+        )
+        if not is_plain or any(s.offset for s in runs.unique_scenarios):
+            plan = build_time_grid(runs, commands, acting, self.engine.largest_step)
+            return plan, (
+                compute_applied_inputs(plan, runs, commands, input_effects) if self.inputs else {}
+            )
+        stored = self._stored_steps.get(runs.contents)
+        if stored is None:
+            rows = runs.one_each
+            plan = build_time_grid(rows, commands, (), self.engine.largest_step)
+            stored = plan, compute_applied_inputs(plan, rows, commands, ()) if self.inputs else {}
+            if len(self._stored_steps) >= MAX_STORED_TIME_GRIDS:
+                del self._stored_steps[next(iter(self._stored_steps))]
+            if plan.steps.size <= MAX_STORED_NUMBERS:
+                self._stored_steps[runs.contents] = stored
+        plan, inputs = stored
+        expanded_plan = replace(
+            plan,
+            steps=runs.expand_rows(plan.steps),
+            ends=runs.expand_rows(plan.ends),
+            rows=runs.expand_rows(plan.rows),
+        )
+        return expanded_plan, {name: runs.expand_rows(values) for name, values in inputs.items()}
 
     def close(self) -> None:
         """Release the resources of the engine."""

@@ -60,17 +60,26 @@ class ScenarioGroups:
     Attributes:
         unique_scenarios: Scenarios that differ in their times or inputs.
         scenario_index: (L,) number of the distinct scenario of each batch element.
+        contents: Hashable content of each distinct scenario; empty if unknown.
     """
 
     unique_scenarios: tuple[Scenario, ...]
     scenario_index: Indices
+    contents: tuple[object, ...] = ()
+
+    @property
+    def one_each(self) -> ScenarioGroups:
+        """Groups of the distinct scenarios with one batch element each."""
+        count = len(self.unique_scenarios)
+        return ScenarioGroups(self.unique_scenarios, np.arange(count), self.contents)
 
     def expand_rows(self, rows: NDArray[Number]) -> NDArray[Number]:
         """Expand rows (N, ...) of the distinct scenarios to rows (L, ...) of the batch elements.
 
-        A single row is broadcast and shares memory.
+        Equal rows that share memory are broadcast.
         """
-        if len(rows) == 1:
+        if len(rows) == 1 or rows.strides[0] == 0:
+            rows = rows[:1]
             return np.broadcast_to(rows, (self.scenario_index.size, *rows.shape[1:]))
         return rows[self.scenario_index]
 
@@ -107,7 +116,8 @@ def group_scenarios(scenarios: Sequence[Scenario], by_initial: bool = False) -> 
         if group == len(distinct):
             distinct.append(scenario)
         groups.append(group)
-    return ScenarioGroups(tuple(distinct), np.array(groups, dtype=np.intp)[object_index])
+    index = np.array(groups, dtype=np.intp)[object_index]
+    return ScenarioGroups(tuple(distinct), index, tuple(by_content))
 
 
 def group_by_identity(scenarios: Sequence[Scenario]) -> tuple[list[Scenario], Indices]:

@@ -285,3 +285,26 @@ def test_elements_with_and_without_a_command_history_share_a_batch():
 def test_times_of_earlier_commands_must_be_negative():
     with pytest.raises(InputError, match="must be negative and increasing"):
         Scenario(STAMPS, {}, {"u": JUMPS}, before={"u": np.array([[-0.1, 0.0], [1.0, 2.0]])})
+
+
+def test_stored_steps_and_inputs_give_the_same_motion_as_new_ones():
+    times, rng = np.arange(30) / 100.0, np.random.default_rng(0)
+    name = Slider.system.inputs[0].name
+    scenarios = [Scenario(times, inputs={name: rng.standard_normal(30)}) for _ in range(3)]
+    slider = Slider(engine="batch", effects=["input.delay"])
+    theta = np.column_stack(
+        [np.full(3, np.mean(p.bounds)) for p in slider.parameters[:-1]] + [np.zeros(3)]
+    )
+    first = slider.simulate_batch(theta, scenarios)
+    assert len(slider._stored_steps) == 1
+    order = [2, 0, 1]
+    again = slider.simulate_batch(theta, [scenarios[i] for i in order])
+    repeated = slider.simulate_batch(theta, scenarios)
+    np.testing.assert_array_equal(again, first[order])
+    np.testing.assert_array_equal(repeated, first)
+    scenarios[0] = replace(scenarios[0], inputs={name: scenarios[0].inputs[name] + 1.0})
+    assert np.abs(slider.simulate_batch(theta, scenarios)[0] - first[0]).max() > 1e-3
+    delayed = theta + np.array([0.0] * (theta.shape[1] - 1) + [0.05])
+    count = len(slider._stored_steps)
+    slider.simulate_batch(delayed, scenarios)
+    assert len(slider._stored_steps) == count
