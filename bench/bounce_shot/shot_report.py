@@ -23,9 +23,9 @@ from bench.bounce_shot.hit_rate_table import (
 )
 from bench.bounce_shot.shot_animation import write_animation
 from bench.bounce_shot.shot_config import ShotConfig
+from bench.bounce_shot.shot_execution import read_shot
 from bench.bounce_shot.shot_figures import draw_figures, select_example_shots
 from bench.bounce_shot.shot_sampling import ShotSetup
-from bench.bounce_shot.shot_store import read_shot
 from bench.figures import style
 from bench.figures.style import FigureFiles
 from bench.pages.chart import PrintedFigure

@@ -17,8 +17,7 @@ import numpy as np
 
 from bench.benchmark.problem.experiment import Experiment
 from bench.benchmark.problem.recorded_runs import ObservedRuns
-from bench.bounce_shot.ball_kinds import BallKind, get_ball_kind
-from bench.bounce_shot.shot_config import ShotConfig
+from bench.bounce_shot.shot_config import BallKind, ShotConfig, get_ball_kind
 from bench.bounce_shot.shot_planner import ShotGeometry
 from bench.bounce_shot.true_world import GRAVITY, InclinedGround, simulate_shot
 from bench.core.random_streams import PUBLIC_SALT, make_rng

@@ -37,6 +37,12 @@ from bench.benchmark.storage.run_status import (
 )
 from bench.bounce_shot import shot_planning, true_world
 from bench.bounce_shot.shot_config import ShotConfig, read_shot_config
+from bench.bounce_shot.shot_execution import (
+    SHOTS_FOLDER,
+    check_shots,
+    list_missing_shots,
+    store_shot,
+)
 from bench.bounce_shot.shot_sampling import (
     RECORDINGS_FOLDER,
     ShotSetup,
@@ -44,7 +50,6 @@ from bench.bounce_shot.shot_sampling import (
     draw_shots,
     record_drop,
 )
-from bench.bounce_shot.shot_store import SHOTS_FOLDER, check_shots, list_missing_shots, store_shot
 from bench.core.plugin_registries import tuners
 from sims.core.simulator import InputError
 from sims.vision import video_files

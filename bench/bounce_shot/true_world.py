@@ -31,7 +31,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.bounce_shot.ball_kinds import BallKind
+from bench.bounce_shot.shot_config import BallKind
 from sims.core.simulator import Array, InputError
 from sims.engines.adapters.mujoco_bodies import compute_damping_ratio
 

@@ -1,12 +1,17 @@
-"""Tables and figures of a misspecification study, and of several studies together."""
+"""Tables and figures of a misspecification study, and of several studies together.
+
+The figures show the bias of a parameter, the prediction of unseen runs, and ranks, in the simulator
+as it is and in the extended one.
+"""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
+import numpy as np
 import pandas as pd
 
 from bench.benchmark.problem.experiment import Experiment
@@ -18,11 +23,270 @@ from bench.benchmark.storage.result_folder import (
     read_configuration,
 )
 from bench.benchmark.storage.run_status import FAILED_OR_SKIPPED_STATUSES
-from bench.figures.style import add_trust_note, write_figure
-from bench.misspecification import misspecification_figures as figures
+from bench.figures.style import (
+    BLUE,
+    VERMILION,
+    ZERO_LINE_GREY,
+    TunerStyles,
+    add_caption,
+    add_trust_note,
+    make_panel_grid,
+    style_axis,
+    write_figure,
+)
 from bench.misspecification import misspecification_scores
 from bench.misspecification.calibration import EXTENDED, MODEL_LABELS, PLAIN
 from sims.core.files import write_atomically
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+_MODELS = ("plain", "extended")
+_MARKER_STYLES: dict[str, dict[str, Any]] = {
+    "plain": {"color": VERMILION, "marker": "s", "markerfacecolor": "white"},
+    "extended": {"color": BLUE, "marker": "o"},
+}
+"""Marker styles by simulator: hollow before, filled after, distinguishable in greyscale."""
+_MODEL_NAMES = {"plain": "simulator as it is", "extended": "extended by explain"}
+_REFERENCE_TUNER = "least_squares"
+"""Tuner whose bias is taken as the model's own, since it finds the best fit if there is one."""
+_PANEL_COLUMNS = 3
+
+
+class StudyResult(Protocol):
+    """Data of one study to draw."""
+
+    @property
+    def experiment(self) -> Experiment:
+        """The experiment of the study."""
+
+    @property
+    def unit(self) -> str:
+        """Unit of the error channel."""
+
+    @property
+    def channel(self) -> str:
+        """Name of the error channel."""
+
+    @property
+    def name(self) -> str:
+        """A short name of the study."""
+
+    def list_tuners(self) -> list[str]:
+        """Return the labels of the tuners in the order of the experiment."""
+
+    def list_targets(self) -> list[str]:
+        """Return the names of the targets."""
+
+
+def draw_bias_figure(studies: Sequence[StudyResult], table: pd.DataFrame) -> Figure:
+    """Draw the signed error of each study's most biased parameter, by tuner.
+
+    That parameter is the one with the largest error of least squares in the original simulator.
+
+    Args:
+        studies: The studies, one panel each.
+        table: Rows of their error tables.
+    """
+    figure, panels = _make_panels(len(studies))
+    for panel, study in zip(panels, studies, strict=False):
+        bias_rows = table[
+            (table["experiment"] == study.experiment.name) & (table["metric"] == "bias")
+        ]
+        parameter = _find_largest_bias(bias_rows)
+        _draw_means(panel, study, bias_rows[bias_rows["parameter"] == parameter])
+        panel.axvline(0.0, color=ZERO_LINE_GREY, linewidth=0.8)
+        panel.set_title(f"{study.name}: {parameter}\n{_format_missing_effects(study)}", fontsize=9)
+        panel.set_xlabel("mean signed error [training widths]", fontsize=8)
+    caption = (
+        "The parameter with the largest error of least squares in the simulator as it is. Point: "
+        f"mean over {_format_target_count(studies)} of the recommendation after the whole budget "
+        "minus the true value. "
+        "Bar: 95 % bootstrap interval. Left and right of zero: too small, too large."
+    )
+    return _finish_figure(
+        figure, panels[0], "Bias of a parameter where an effect is missing", caption
+    )
+
+
+def draw_prediction_figure(studies: Sequence[StudyResult], table: pd.DataFrame) -> Figure:
+    """Draw the prediction error in unseen runs, by tuner.
+
+    Args:
+        studies: The studies, one panel each.
+        table: Rows of their error tables.
+    """
+    figure, panels = _make_panels(len(studies))
+    for panel, study in zip(panels, studies, strict=False):
+        is_of_study = table["experiment"] == study.experiment.name
+        _draw_means(panel, study, table[is_of_study & (table["metric"] == "heldout_error")])
+        panel.set_xscale("log")
+        panel.set_title(f"{study.name}\n{_format_missing_effects(study)}", fontsize=9)
+        panel.set_xlabel(f"RMSE of {study.channel} in unseen runs [{study.unit}]", fontsize=8)
+    caption = (
+        f"Point: mean over {_format_target_count(studies)} of the error of the tuned simulator in "
+        "runs that no tuner saw, without sensor noise. Bar: 95 % bootstrap interval."
+    )
+    heading = "Prediction of unseen runs where an effect is missing"
+    return _finish_figure(figure, panels[0], heading, caption)
+
+
+def draw_rank_slope_figure(
+    systems: Sequence[StudyResult], ranks: pd.DataFrame, ranking: pd.DataFrame
+) -> Figure:
+    """Draw mean ranks in both simulators, one row of panels per metric, one column per system.
+
+    Args:
+        systems: The studies.
+        ranks: Rows of their rank tables.
+        ranking: Rank agreement (Kendall's tau, p-value) of each study and metric.
+    """
+    metrics = {"param_error": "error of the parameters", "heldout_error": "prediction"}
+    width = max(6.0, 2.6 + 1.75 * len(systems))
+    figure, axes = make_panel_grid(len(metrics), len(systems), (width, 6.6), sharey=True)
+    for row, (metric, label) in zip(axes, metrics.items(), strict=True):
+        for panel, study in zip(row, systems, strict=True):
+            study_ranks = ranks[
+                (ranks["experiment"] == study.experiment.name) & (ranks["metric"] == metric)
+            ]
+            _draw_rank_lines(panel, study, study_ranks)
+            agreement = ranking[ranking["experiment"] == study.experiment.name].set_index("metric")
+            tau, p = (float(agreement[column].loc[metric]) for column in ("tau", "p_value"))
+            panel.set_title(f"{study.name}\nτ = {tau:.2f}, p = {p:.2g}", fontsize=8)
+        row[0].set_ylabel(f"mean rank by {label}\n(1 is best)", fontsize=9)
+    axes[0][0].invert_yaxis()
+    handles, labels = axes[0][0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside right center", fontsize=8, frameon=False)
+    caption = (
+        f"Mean over {_format_target_count(systems)} of a tuner's rank on a target (its mean error "
+        "over seeds). τ: Kendall's between the mean ranks in the two simulators; p: that mean "
+        "ranks differ as much where the simulators are exchanged at random target by target."
+    )
+    figure.suptitle("Does the ranking of tuners change with a corrected model?", fontsize=11)
+    add_caption(figure, caption, letters=15)
+    return figure
+
+
+def _make_panels(count: int) -> tuple[Figure, list[Axes]]:
+    """Make a grid of panels, at most three in a row, one per study.
+
+    Args:
+        count: number of studies.
+
+    Returns:
+        The figure and its panels; surplus panels of the last row are empty.
+    """
+    columns = min(count, _PANEL_COLUMNS)
+    rows = -(-count // columns)
+    figure, axes = make_panel_grid(rows, columns, (1.6 + 3.4 * columns, 1.3 + 2.9 * rows))
+    panels = list(np.ravel(axes))
+    for panel in panels[:count]:
+        style_axis(panel)
+    for panel in panels[count:]:
+        panel.set_axis_off()
+    return figure, panels
+
+
+def _draw_means(panel: Axes, study: StudyResult, lines: pd.DataFrame) -> None:
+    """Draw one row per tuner with its mean and 95 % interval in both simulators.
+
+    Args:
+        panel: axes to draw on.
+        study: the study, which determines the order of the tuners.
+        lines: rows of the score table for one metric and study.
+    """
+    tuners = study.list_tuners()
+    # The two simulators are shifted vertically, so that their bars do not overlap.
+    for shift, model in zip((-0.16, 0.16), _MODELS, strict=True):
+        part = lines[lines["model"] == model].set_index("tuner").reindex(tuners)
+        mean = part["mean"].to_numpy(dtype=np.float64)
+        # A mean's own interval contains it except for rounding.
+        bars = [np.maximum(mean - part["low"], 0.0), np.maximum(part["high"] - mean, 0.0)]
+        panel.errorbar(
+            mean,
+            np.arange(len(tuners)) + shift,
+            xerr=np.nan_to_num(np.array(bars, dtype=np.float64)),
+            linestyle="none",
+            markersize=4.5,
+            linewidth=1.1,
+            capsize=2,
+            label=_MODEL_NAMES[model],
+            **_MARKER_STYLES[model],
+        )
+    panel.set_yticks(range(len(tuners)), tuners, fontsize=8)
+    panel.tick_params(axis="x", labelsize=8)
+    panel.invert_yaxis()
+
+
+def _find_largest_bias(lines: pd.DataFrame) -> str:
+    """Return the parameter with the largest bias in the simulator as it is.
+
+    The bias is that of the reference tuner, least squares, or of all tuners if it did not take
+    part.
+
+    Args:
+        lines: rows of the score table of one study, with the metric "bias".
+    """
+    plain_lines = lines[lines["model"] == "plain"]
+    reference = plain_lines[plain_lines["tuner"] == _REFERENCE_TUNER]
+    sizes = (reference if len(reference) else plain_lines).groupby("parameter", sort=False)["mean"]
+    largest = sizes.mean().abs().fillna(0.0)
+    return [str(name) for name in largest.index][int(largest.to_numpy().argmax())]
+
+
+def _draw_rank_lines(panel: Axes, study: StudyResult, ranks: pd.DataFrame) -> None:
+    """Draw a line for each tuner between its mean ranks in the original and extended simulator.
+
+    Crossing lines are tuners whose order changes. Colours are given by rank in the original
+    simulator.
+
+    Args:
+        panel: axes to draw on.
+        study: the study, which determines the styles of the tuners.
+        ranks: rows of the rank table for one metric and study.
+    """
+    style_axis(panel)
+    style = TunerStyles(study.experiment, list(ranks.sort_values("plain", kind="stable")["tuner"]))
+    for tuner, plain_rank, extended_rank in zip(
+        ranks["tuner"], ranks["plain"], ranks["extended"], strict=True
+    ):
+        panel.plot(
+            [0, 1], [plain_rank, extended_rank], markersize=5, **style.get_plot_style(str(tuner))
+        )
+    panel.set_xticks([0, 1], ["as it is", "extended"], fontsize=8)
+    panel.set_xlim(-0.25, 1.25)
+
+
+def _format_missing_effects(study: StudyResult) -> str:
+    """Format which effects the original simulator lacks, and the number of targets."""
+    names = list(study.experiment.world.get("fixed", {}))
+    return f"lacks {', '.join(names) or 'nothing'}; {len(study.list_targets())} targets"
+
+
+def _format_target_count(systems: Sequence[StudyResult]) -> str:
+    """Format the number of targets of all studies, as one number or a range."""
+    counts = sorted({len(study.list_targets()) for study in systems})
+    count_text = " to ".join(str(count) for count in dict.fromkeys((counts[0], counts[-1])))
+    return f"{count_text} targets"
+
+
+def _finish_figure(figure: Figure, panel: Axes, heading: str, caption: str) -> Figure:
+    """Add legend, heading and caption to a figure, and return it.
+
+    Args:
+        figure: the figure.
+        panel: a panel whose legend entries serve for all panels.
+        heading: title of the figure.
+        caption: text below the figure.
+    """
+    handles, labels = panel.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper right", ncols=2, fontsize=8, frameon=False)
+    figure.suptitle(heading, fontsize=11, x=0.01, ha="left")
+    add_caption(figure, caption, letters=14)
+    return figure
+
 
 PrintLine = Callable[[str], None]
 VERDICT_FILE = "explain/verdict.json"
@@ -138,9 +402,9 @@ def _write_tables_and_figures(
     for text in _list_summary_texts(folder, outcomes, frames, is_joint):
         print_line(text)
     drawn_figures = {
-        "bias": figures.draw_bias_figure(outcomes, frames["table"]),
-        "prediction": figures.draw_prediction_figure(outcomes, frames["table"]),
-        "ranks": figures.draw_rank_slope_figure(outcomes, frames["ranks"], frames["ranking"]),
+        "bias": draw_bias_figure(outcomes, frames["table"]),
+        "prediction": draw_prediction_figure(outcomes, frames["table"]),
+        "ranks": draw_rank_slope_figure(outcomes, frames["ranks"], frames["ranking"]),
     }
     for name, figure in drawn_figures.items():
         path = write_figure(add_trust_note(figure, experiment.trusted), folder / "figures" / name)[

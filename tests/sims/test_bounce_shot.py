@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from bench.bounce_shot.ball_kinds import BALL_KINDS, get_ball_kind
+from bench.bounce_shot.shot_config import BALL_KINDS, get_ball_kind
 from bench.bounce_shot.shot_planner import (
     ShotGeometry,
     compute_hoop_crossings,

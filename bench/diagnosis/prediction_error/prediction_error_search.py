@@ -9,7 +9,7 @@ residual of a set is only noise. The order is:
     2. If a force is still missing, fit each of the effects with the largest gains alone, and those
        of the standard joint model (`selection_fits`, `effect_proposals`).
     3. Add effects one by one, to dry friction in either of its forms or to nothing, each chosen by
-       filters with the effect in the model (`forward_growth`).
+       filters with the effect in the model (`competing_models`).
     4. Select again, with effects of many shapes at the joints where a force is missing
        (`selection_fits`).
     5. Simulate elasticity and backlash between a drive and its links (`selection_fits`).
@@ -33,15 +33,13 @@ import numpy as np
 from bench.diagnosis.fitting.fit_state import FitStart, TrajectoryFit
 from bench.diagnosis.fitting.model_set import FittedModel
 from bench.diagnosis.prediction_error.competing_models import (
-    fit_competing_models,
-    fit_single_in_place,
-)
-from bench.diagnosis.prediction_error.effect_proposals import SearchContext
-from bench.diagnosis.prediction_error.forward_growth import (
     add_to_dry_friction,
     add_to_model,
+    fit_competing_models,
+    fit_single_in_place,
     select_in_model,
 )
+from bench.diagnosis.prediction_error.effect_proposals import SearchContext
 from bench.diagnosis.prediction_error.incomplete_model import IdentifiedSet, identify_incomplete
 from bench.diagnosis.prediction_error.library_columns import build_regression_about
 from bench.diagnosis.prediction_error.model_filters import FilteredSet, has_series

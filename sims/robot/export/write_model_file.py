@@ -1,4 +1,4 @@
-"""Write the causes found by explain back into the robot's own model file.
+"""Write a robot's model file with its causes, or a default class with constants of a drive.
 
 An MJCF keeps its author's text: only attributes change, each with a comment that states the reason.
 Where this is impossible (elements that generate several elements, a URDF), MuJoCo writes the model,
@@ -22,15 +22,23 @@ from sims.robot.export.apply_causes import (
     ModifiedModel,
     apply_causes,
 )
-from sims.robot.export.mjcf_attributes import AttributeStatement, find_missing_statements
+from sims.robot.export.mjcf_attributes import (
+    ATTRIBUTES_BY_KIND,
+    AttributeStatement,
+    ModelElement,
+    Values,
+    find_missing_statements,
+    list_all_attributes,
+)
 from sims.robot.export.mjcf_document import (
+    FILE_ELEMENTS,
     MjcfDocument,
     NotEditableError,
     format_heading,
     format_number,
     format_numbers,
 )
-from sims.robot.export.mjcf_writer import MjcfWriter
+from sims.robot.export.mjcf_writer import SHORTCUT_ATTRIBUTES, MjcfWriter, format_attributes
 from sims.robot.export.model_comparison import find_first_difference
 from sims.robot.fitted_causes import expand_families
 from sims.robot.model_field_effects import get_coupling_address, get_write_order
@@ -331,3 +339,136 @@ def compile_mjcf(text: str) -> Any:
     # The discarded spec held all meshes a second time.
     release_free_memory()
     return model
+
+
+_MUJOCO_DEFAULTS: Mapping[str, Values] = {
+    "solreffriction": (0.02, 1.0),
+    "solimpfriction": (0.9, 0.95, 0.001, 0.5, 2.0),
+}
+"""MuJoCo's default values of attributes; all other attributes default to zero."""
+_POSE_ATTRIBUTES = frozenset({"axis", "ref", "springref"})
+"""Attributes that stay with a joint since they depend on its pose."""
+_NONE, _FIXED, _AFFINE = 0.0, 0.0, 1.0
+"""MuJoCo's enumeration values of a position servo: no dynamics, fixed gain, affine bias."""
+
+
+def render_default_class(
+    applied: ModifiedModel, joint: int, actuator: int | None, name: str, notes: Sequence[str] = ()
+) -> str:
+    """Render a default class as ``<default class="NAME">``, with a comment for each cause.
+
+    Args:
+        applied: model with the causes applied.
+        joint: number of the joint in the model.
+        actuator: number of the actuator of the joint; None if there is none.
+        name: name of the class.
+        notes: further comments.
+    """
+    lines = [f'<default class="{name}">', *(f"  {_format_comment(note)}" for note in notes)]
+    elements = [ModelElement("joint", joint)]
+    elements += [] if actuator is None else [ModelElement("actuator", actuator)]
+    for element in elements:
+        cause_comments = applied.comments.get(element, [])
+        lines += [f"  {_format_comment(text)}" for text in dict.fromkeys(cause_comments)]
+        tag, attributes = _format_default_element(
+            element, list_all_attributes(applied.model, element, applied.target_values)
+        )
+        attribute_text = "".join(f' {key}="{value}"' for key, value in attributes.items())
+        lines.append(f"  <{tag}{attribute_text}/>")
+    return "\n".join([*lines, "</default>"])
+
+
+def _format_default_element(
+    element: ModelElement, values: Mapping[str, Values]
+) -> tuple[str, dict[str, str]]:
+    """Return the tag of an element in a default class, and its attributes as text."""
+    class_values = {
+        name: value
+        for name, value in values.items()
+        if name not in _POSE_ATTRIBUTES and not _is_default(name, value)
+    }
+    if element.kind == "joint":
+        if not values["frictionloss"][0]:
+            class_values = {
+                name: value for name, value in class_values.items() if not name.startswith("sol")
+            }
+        return "joint", format_attributes(class_values)
+    ranges = {"ctrlrange": "ctrllimited", "forcerange": "forcelimited"}
+    class_values = {
+        k: v for k, v in class_values.items() if k not in ranges or values[ranges[k]][0]
+    }
+    if not _is_servo(values):
+        return "general", format_attributes(
+            {**class_values, **{k: values[k] for k in ("gaintype", "biastype")}}
+        )
+    gains = {"kp": format_number(values["gainprm"][0]), "kv": format_number(-values["biasprm"][2])}
+    return "position", gains | format_attributes(
+        {k: v for k, v in class_values.items() if not k.startswith(("gain", "bias", "dyn"))}
+    )
+
+
+def _is_default(name: str, values: Values) -> bool:
+    return values == _MUJOCO_DEFAULTS[name] if name in _MUJOCO_DEFAULTS else not any(values)
+
+
+def _is_servo(values: Mapping[str, Values]) -> bool:
+    """Return whether actuator attributes are those of MJCF's ``position`` shortcut."""
+    kinds = values["dyntype"][0], values["gaintype"][0], values["biastype"][0]
+    offset, stiffness = values["biasprm"][:2]
+    return kinds == (_NONE, _FIXED, _AFFINE) and offset == 0 and stiffness == -values["gainprm"][0]
+
+
+def render_model_using_class(
+    robot: RobotModel,
+    applied: ModifiedModel,
+    joint: int,
+    actuator: int | None,
+    name: str,
+    text: str,
+) -> str:
+    """Render the model file with all causes, where a joint and its actuator use the class.
+
+    Args:
+        robot: robot as read from its model file.
+        applied: model with the causes applied.
+        joint: number of the joint in the model.
+        actuator: number of the actuator of the joint; None if there is none.
+        name: name of the class.
+        text: the class, from `render_default_class`.
+
+    Raises:
+        NotEditableError: the rendered file differs from the modified model; states the field.
+    """
+    document = MjcfDocument(applied.text.encode(), robot.path)
+    tags = document.map_to_compiled_ids(applied.model)
+    tag = tags[ModelElement("joint", joint)]
+    tag.new["class"] = name
+    tag.removed |= {a.name for a in ATTRIBUTES_BY_KIND["joint"]} - _POSE_ATTRIBUTES
+    if actuator is not None:
+        element = ModelElement("actuator", actuator)
+        tag = tags[element]
+        tag.new["class"] = name
+        tag.removed |= {a.name for a in ATTRIBUTES_BY_KIND["actuator"]} | set(SHORTCUT_ATTRIBUTES)
+        tag.renamed, _ = _format_default_element(
+            element, list_all_attributes(applied.model, element, applied.target_values)
+        )
+    if not any(element_tag.name in FILE_ELEMENTS for element_tag in document.walk()):
+        for compiler in document.find_elements("compiler"):
+            compiler.removed |= {"meshdir", "texturedir"}
+    document.root.within.insert(
+        0, ([], "<default>\n    " + text.replace("\n", "\n    ") + "\n  </default>")
+    )
+    written_text = document.to_text()
+    difference = find_first_difference(
+        compile_mjcf(written_text), applied.model, EQUAL_NUMBERS_TOLERANCE
+    )
+    if difference:
+        raise NotEditableError(difference)
+    return written_text
+
+
+def _format_comment(text: str) -> str:
+    """Render text as an XML comment."""
+    # Two hyphens would end an XML comment early.
+    escaped_text = text.replace("--", "- -")
+    return f"<!-- {escaped_text} -->"

@@ -7,13 +7,12 @@ import numpy as np
 import pytest
 
 from bench.diagnosis.report.cause_text import rank_candidates
-from bench.diagnosis.report.evidence_tables import build_candidate_table
 from bench.diagnosis.report.explanation_figures import (
     draw_figure,
     get_extreme_pose,
     list_figure_names,
 )
-from bench.diagnosis.report.explanation_page import render_report
+from bench.diagnosis.report.explanation_page import build_candidate_table, render_report
 from bench.diagnosis.report.figure_panels import select_worst_run
 from bench.diagnosis.report.joint_figure import list_joint_rows
 from bench.figures import robot_figure as drawing
