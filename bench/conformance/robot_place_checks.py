@@ -1,4 +1,4 @@
-"""Conformance checks of an effect at the places of a robot: the arm of `robot_arm_fixture`."""
+"""Conformance checks of an effect at the places of a robot: the arm of `sample_subjects`."""
 
 from __future__ import annotations
 

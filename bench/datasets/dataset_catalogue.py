@@ -52,7 +52,7 @@ class DataSet:
         cite: authors and paper.
         provides: names of the files that commands read from its folder.
         files: files to download.
-        conversion: key of `dataset_conversion.CONVERSIONS`; empty if the files are used
+        conversion: key of `dataset_download.CONVERSIONS`; empty if the files are used
             without conversion.
     """
 

@@ -221,8 +221,8 @@ def make_summary_charts(logs: pd.DataFrame, numbers: pd.DataFrame) -> SummaryCha
     """Make the charts of the page.
 
     Args:
-        logs: Table of `summary_tables.build_log_table`.
-        numbers: Table of `summary_tables.build_number_table`.
+        logs: Table of `run_batch.build_log_table`.
+        numbers: Table of `run_batch.build_number_table`.
     """
     across = _make_log_axis(logs)
     # Named logs have the positions 0, 1, 2, ... on their axis.
