@@ -236,6 +236,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.exit(EXIT_ERROR)
     # These imports come after the parser, so that `--help` is fast.
     from bench.figures.figure_files import mark_as_command, pdf_figures
+    from sims.core.freed_memory import keep_freed_memory
     from sims.core.simulator import InputError
 
     if arguments is None:
@@ -246,6 +247,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         gc.set_threshold(GARBAGE_THRESHOLD)
         # The operating system frees the memory at once; Python would search all objects for cycles.
         atexit.register(gc.freeze)
+        keep_freed_memory()
     try:
         with printer.capture_output(), pdf_figures(getattr(options, "pdf", False)):
             answer: CommandResult = options.command(options, printer.print_line)
