@@ -8,8 +8,7 @@ from sims.core.toml_validation import tomllib
 from tests.exams.exam import UndrawableError
 from tests.exams.explain_calls import Outcome
 from tests.exams.recordings import recording_cases
-from tests.exams.recordings.answer_marking import find_answer_errors
-from tests.exams.recordings.recording_cases import RECORDINGS, SHARED
+from tests.exams.recordings.recording_cases import RECORDINGS, SHARED, find_answer_errors
 
 EXPECTED = {
     "verdicts": ["named", "ambiguous"],

@@ -9,6 +9,7 @@ it does not creep.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -16,8 +17,31 @@ from scipy.optimize import brentq
 
 from tests.exams.robots.excitation_signals import Drives, compute_applied_signals
 from tests.exams.robots.friction_laws import held
-from tests.exams.robots.reference_integration import Motion, Run
 from tests.exams.robots.reference_plant import plant
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run: time stamps (T,) that begin at 0, commands (T,) by actuator, and the initial state."""
+
+    times: np.ndarray
+    commands: dict[str, np.ndarray]
+    q: np.ndarray
+    v: np.ndarray
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Positions, velocities and actuator forces at given times, each (T, N).
+
+    For an elastic joint, the position is that of the encoder.
+    """
+
+    times: np.ndarray
+    q: np.ndarray
+    v: np.ndarray
+    force: np.ndarray
+
 
 __all__ = ["Motion", "Run", "World"]
 FINE, COARSE = 1e-3, 2e-3  # Maximum step in s for data, and for simulations that only choose sizes.

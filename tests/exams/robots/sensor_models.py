@@ -12,7 +12,7 @@ def observed(world, run, channels, slips=()):
 
     Args:
         world: `reference_world.World`.
-        run: `reference_integration.Run`.
+        run: `reference_world.Run`.
         channels: names such as q.elbow.
         slips: (joint, time, jump) of a slipping encoder, an unmodelled cause.
     """
