@@ -1,10 +1,10 @@
 """Run an exam of `simgap explain`: ``python -m tests.exams EXAM [options]``.
 
 Exams are systems (ball, pendulum, slider), robots, floating (robots with a floating base), planted
-(one number of a packaged model file), conventions (of logs) and recordings (measured ones). One
-row an answer is added to items.jsonl of the output folder, so that an interrupted exam continues
-where it was; several versions may share a folder. Tables, figures and a page are written at the
-end. ``tests/exams/README.md`` describes the cases and grades.
+(one number of a packaged model file), contacts (one number of a contact), conventions (of logs) and
+recordings (measured ones). One row an answer is added to items.jsonl of the output folder, so that
+an interrupted exam continues where it was; several versions may share a folder. Tables, figures and
+a page are written at the end. ``tests/exams/README.md`` describes the cases and grades.
 """
 
 import argparse
@@ -22,6 +22,7 @@ EXAMS = {
     "robots": "tests.exams.robots.robot_cases",
     "floating": "tests.exams.floating.floating_cases",
     "planted": "tests.exams.planted.planted_cases",
+    "contacts": "tests.exams.contacts.contact_cases",
     "conventions": "tests.exams.conventions.convention_cases",
     "recordings": "tests.exams.recordings.recording_cases",
 }

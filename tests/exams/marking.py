@@ -109,7 +109,7 @@ def mark_answer(hidden_cause, verdict, standard, compare=None, covered=None):
     if covered is None and outcome in ("right", "set", "extra"):
         covered = covered_intervals(hidden_cause.effects, verdict)
     is_number_right = True
-    if standard.number_counts and outcome in ("right", "set"):
+    if standard.number_counts and hidden_cause.effects and outcome in ("right", "set"):
         is_number_right = _is_number_right(hidden_cause, verdict)
     if standard.number_counts and outcome in ("right", "set") and verdict["verdict"] == "partial":
         outcome = "partial"

@@ -222,6 +222,11 @@ def test_a_set_with_a_planted_cause_is_fair_up_to_four_equal_members(members, ra
     assert mark.fair is is_fair
 
 
+def test_a_clean_recording_without_a_cause_is_right_where_numbers_count():
+    mark = mark_answer(HiddenCause("clean", {}), ADEQUATE, planted_cases.STANDARD)
+    assert (mark.outcome, mark.strict) == ("right", True)
+
+
 def test_a_set_without_comparison_is_not_fair():
     answer = estimated(others=("friction.coulomb@elbow",))
     assert not mark_answer(PLANTED, answer, planted_cases.STANDARD).fair

@@ -112,7 +112,9 @@ class AlternativeFinder:
         stored_scores = search.scores_by_effects.get(key)
         if stored_scores is None and not self.simulates:
             return search.best_p_values.get(key, 1.0)
-        scores = stored_scores or search.score_missing_effects(reduced_model)
+        scores = (
+            stored_scores or search.reference_scores or search.score_missing_effects(reduced_model)
+        )
         null_quantiles = dict(zip(scores.effects, scores.null_quantiles.tolist(), strict=True))
         # A score is linear and the gain of a fit is not; either may be more sensitive.
         excess = gain - null_quantiles.get(effect, 0.0)

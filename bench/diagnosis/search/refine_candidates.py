@@ -19,6 +19,7 @@ from bench.diagnosis.fitting.fit_state import FitStart
 from bench.diagnosis.fitting.model_set import FittedModel
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
 from bench.diagnosis.search.candidate_directions import generate_frequency_neighbours
+from bench.diagnosis.search.contact_search import search_in_contact
 from bench.diagnosis.search.effect_search import (
     FAR_EXCESS,
     MAX_P_VALUE_FIRST_EFFECT,
@@ -194,7 +195,9 @@ def search_with_subsampling(search: EffectSearch) -> FittedModel:
         SearchStoppedError: the search had to end early.
     """
     # Thinned runs would begin in contact without an estimate of their initial states.
-    thinned_runs = None if search.evaluator.is_in_contact else thin_runs(search.evaluator)
+    if search.evaluator.is_in_contact:
+        return search_in_contact(search)
+    thinned_runs = thin_runs(search.evaluator)
     if thinned_runs is None:
         return search.run()
     try:

@@ -86,12 +86,17 @@ class ScoredModelSet(ModelSet):
             models.
         best_p_values: p-value of the best score about each model, by its effects.
         superseded_scans: results about models that have been replaced by better fits.
+        reference_scores: scores whose surrogates stand for those of models that are not scored;
+            None if every smaller model is scored.
+        excluded_effects: effects that are not scored.
     """
 
     scores_by_effects: dict[frozenset[str], CandidateScores] = field(default_factory=dict)
     cached_scans: dict[frozenset[str], ModelScan] = field(default_factory=dict)
     best_p_values: dict[frozenset[str], float] = field(default_factory=dict)
     superseded_scans: dict[frozenset[str], ModelScan] = field(default_factory=dict)
+    reference_scores: CandidateScores | None = None
+    excluded_effects: frozenset[str] = frozenset()
 
     @property
     def base_model(self) -> FittedModel:
@@ -265,7 +270,7 @@ class ScoredModelSet(ModelSet):
         These are all effects of the library that are neither in the model nor contained in one of
         its effects.
         """
-        included_effects = set(model.effects)
+        included_effects = {*model.effects, *self.excluded_effects}
         # An effect and one that it contains have no unique solution together.
         for name in model.effects:
             included_effects.update(self.evaluator.available_effects[name].contains)

@@ -1,0 +1,51 @@
+"""Tests of the recordings with contacts, and of `simgap explain` on some of them."""
+
+import json
+
+import numpy as np
+import pytest
+
+from bench.cli.main import main
+from tests.exams.contacts.contact_cases import NOISE, ContactQuestion
+from tests.exams.contacts.contact_robots import replay
+from tests.exams.explain_calls import Outcome
+
+
+def answer(question, folder):
+    """Return the mark of the command's answer to a question."""
+    case = question.draw()
+    case.write(folder)
+    assert main(["explain", str(folder / "log.csv"), "--out", str(folder / "out")]) == 0
+    return case.mark(Outcome(json.loads((folder / "out" / "verdict.json").read_text()), 0))
+
+
+def test_a_sled_is_slowed_by_friction_times_its_normal_force():
+    case = ContactQuestion("single", "sled", "contact.friction", 0).draw()
+    model, mu = case.true_model, case.numbers["friction"] + case.size
+    start = np.array([0.0, -1e-4, 3.0, 0.0])
+    model.dof_damping[:] = 0.0
+    states = replay(model, start, np.zeros((21, 2)))
+    deceleration = (states[10, 2] - states[20, 2]) / 0.1
+    assert deceleration == pytest.approx(9.81 * mu, rel=0.03)
+
+
+def test_a_case_shows_its_discrepancy_and_a_clean_one_has_none():
+    case = ContactQuestion("single", "arm", "contact.friction", 1).draw()
+    assert case.effect == "contact.friction@ground/foot"
+    assert case.gap > 3.0
+    clean = ContactQuestion("clean", "arm", "any", 0).draw()
+    assert clean.gap < 1e-9 / NOISE
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "question",
+    [
+        ContactQuestion("single", "arm", "contact.friction", 1),
+        # The first state of the held-out run has to be found by simulation.
+        ContactQuestion("clean", "hopper", "any", 2),
+    ],
+    ids=lambda question: question.name,
+)
+def test_the_command_names_a_wrong_contact_and_no_other(question, tmp_path):
+    assert answer(question, tmp_path).strict
