@@ -41,7 +41,7 @@ def test_a_case_shows_its_discrepancy_and_a_clean_one_has_none():
 @pytest.mark.parametrize(
     "question",
     [
-        ContactQuestion("single", "arm", "contact.friction", 1),
+        ContactQuestion("single", "hopper", "contact.damping", 1),
         # The first state of the held-out run has to be found by simulation.
         ContactQuestion("clean", "hopper", "any", 2),
     ],
