@@ -149,7 +149,11 @@ class _IdentifiabilityAssessment:
         return projected.reshape(runs * samples, count)
 
     def _assess_free_parameters(self) -> list[ParameterIdentifiability]:
-        """Assess all free parameters from their joint covariance, eq. (1)."""
+        """Assess all free parameters from their joint covariance, eq. (1) of the module docstring.
+
+        Combinations of parameters that the data do not determine (eigenvalues of the correlations
+        below 1e-12) get a very large variance instead of that of the pseudoinverse, which is zero.
+        """
         columns = self.parameters
         scale = np.sqrt(np.einsum("nk,nk->k", columns, columns))
         is_sensitive = scale > 0

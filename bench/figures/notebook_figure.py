@@ -50,6 +50,16 @@ class NotebookFigure(Figure):
     figure would be shown as a line of text.
     """
 
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        """Keep the present setting of hinting, which Matplotlib otherwise reads when it draws."""
+        super().__init__(*args, **kwargs)
+        self._text_hinting = matplotlib.rcParams["text.hinting"]
+
+    def draw(self, renderer: Any) -> None:
+        """Draw the figure with the same letters whenever it is drawn."""
+        with matplotlib.rc_context({"text.hinting": self._text_hinting}):
+            super().draw(renderer)
+
     def _repr_png_(self) -> bytes:
         file = BytesIO()
         self.savefig(file, format="png", bbox_inches="tight")

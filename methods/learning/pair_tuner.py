@@ -106,9 +106,12 @@ class TrainedPairNetwork:
         return estimate_difference(self.weights, self.design, proposed, target)
 
     def make_estimator(self, task: Task) -> Callable[[Array], Array]:
-        """Return the function from one simulation (1, T, C) to h(simulation, target), shape (dim,).
+        """Return the network's estimate h as a function of one simulation (1, T, C).
 
-        The result is NaN if the simulation failed.
+        h(simulation, target) estimates the target's parameters less those of the simulation,
+        (dim,); it is NaN if the simulation failed. `proposed` makes the network's inputs of a
+        simulation and `features` those of the target; they differ only if the target has another
+        sensor.
         """
         is_shared = self.proposed is self.features
         # Samples missing in the target are hidden in the simulation too, so that the true

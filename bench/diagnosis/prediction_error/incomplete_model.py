@@ -214,6 +214,14 @@ def _prune_set(
 ) -> tuple[FilteredSet, dict[str, float]]:
     """Remove the effects that gain too little, the least first, and maximise the likelihood again.
 
+    The gain of an effect is its Wald statistic: the loss in twice the log-likelihood without it, to
+    second order. The likelihood is maximised again only if the removed effects together lose enough
+    to move the other coefficients.
+
+    Args:
+        context: context of the search.
+        current: effects in the model, and the filter that has them.
+
     Returns:
         The remaining set, and the gain of each of its effects.
     """

@@ -118,7 +118,8 @@ class PredictionErrorSearch(EffectSearch):
         """Select effects by regression and fit them by simulation, until only noise is left.
 
         Each further method is slower, so it is tried only if the best model does not explain the
-        runs.
+        runs: dry friction alone, the selected set, effects that regression missed, effects with
+        many shapes, elastic or slack transmissions, and at last one effect in place of several.
         """
         context = self._search_context
         selected = context.columns.select()

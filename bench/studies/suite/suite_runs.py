@@ -50,8 +50,8 @@ TRAINING_COLUMNS = ["cell", "tuner", "fit_simulations", "fit_seconds"]
 SKIPPED_COLUMNS = ["tuner", "reason"]
 _STORED_DIGITS = 4
 """Significant digits of stored errors."""
-_ERROR_PREFIX = "after_"
-"""Beginning of the columns of errors; the number of simulations follows."""
+_ERRORS_COLUMN = "errors"
+"""Column with the list of errors after 0, 1, ... simulations."""
 
 
 @dataclass(frozen=True)
@@ -298,11 +298,12 @@ def write_suite_runs(suite: SuiteRuns, folder: Path) -> list[Path]:
     import pyarrow as pa
     from pyarrow import parquet
 
-    columns = {
-        f"{_ERROR_PREFIX}{k}": _round_values(suite.errors[:, k]) for k in range(suite.budget + 1)
-    }
-    frame = pd.concat([suite.runs, pd.DataFrame(columns)], axis=1)
-    table = pa.Table.from_pandas(frame, preserve_index=False)
+    # Errors of one run hardly change from one simulation to the next, so that one list for each run
+    # takes a tenth of the space of one column for each simulation.
+    values = pa.array(_round_values(suite.errors).reshape(-1))
+    errors = pa.FixedSizeListArray.from_arrays(values, suite.budget + 1)
+    table = pa.Table.from_pandas(suite.runs, preserve_index=False)
+    table = table.append_column(_ERRORS_COLUMN, errors)
     with atomic_replacement(folder / CURVES_FILE) as path:
         parquet.write_table(table, path, compression="zstd", compression_level=15)
     texts = {CELLS_FILE: suite.cells, TRAINING_FILE: suite.training, SKIPPED_FILE: suite.skipped}
@@ -329,15 +330,16 @@ def read_suite_runs(folder: Path) -> SuiteRuns:
     from pyarrow import ArrowException, parquet
 
     try:
-        frame = parquet.read_table(folder / CURVES_FILE).to_pandas()
+        table = parquet.read_table(folder / CURVES_FILE)
+        frame = table.select(RUN_COLUMNS).to_pandas()
         cells, training, skipped = (
             pd.read_csv(folder / name, keep_default_na=False)
             for name in (CELLS_FILE, TRAINING_FILE, SKIPPED_FILE)
         )
-        names = [name for name in frame if str(name).startswith(_ERROR_PREFIX)]
-        errors = frame[names].to_numpy(dtype=np.float64)
+        values = table[_ERRORS_COLUMN].combine_chunks().flatten().to_numpy(zero_copy_only=False)
+        errors = values.astype(np.float64).reshape(len(frame), -1)
         return SuiteRuns(
-            frame[RUN_COLUMNS],
+            frame,
             errors,
             cells[CELL_COLUMNS],
             training[TRAINING_COLUMNS],

@@ -132,6 +132,11 @@ HAS_ACCELERATION = CallbackContext._fields.index("has_acceleration")
 def add_effect_forces(model_at: Any, data_at: Any) -> None:  # noqa: ARG001
     """Add the forces of effects to the present evaluation of the dynamics.
 
+    MuJoCo calls this in each evaluation of a step. At the first evaluation of step k (`stage` 0),
+    the force program computes forces and dry friction at the state in the middle of the step; the
+    further evaluations of a Runge-Kutta step reuse them. The address of the batch element's
+    `CallbackContext` is in MuJoCo's user data; its fields are read as words in their order.
+
     Args:
         model_at: MuJoCo's model; not used.
         data_at: MuJoCo's data.

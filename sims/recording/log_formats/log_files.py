@@ -274,7 +274,14 @@ def _read_npz(path: Path) -> LogFile:
 
 
 def _make_array_log(path: Path, columns: dict[str, Array], texts: dict[str, list[str]]) -> LogFile:
-    """Make a log of arrays, whose entries are named by lists of names in the file."""
+    """Make a log of the arrays of a file, such as an .npz archive.
+
+    Args:
+        path: the file.
+        columns: numbers (T,) or (T, k) by the name of their array.
+        texts: lists of texts in the file. One with as many texts as a matrix has columns, such as
+            joint names, gives these columns further names.
+    """
     if not columns:
         raise InputError(f"{path}: expected columns of numbers, found none")
     named_columns, unlisted = arrays_by_name(

@@ -416,8 +416,9 @@ class TangentModel:
     def _interpolate_to_steps(self, values: Array) -> Array:
         """Interpolate values (N, k) at linearisation points to all steps, (S, k).
 
-        Values are linear between points while a command is constant, and are extrapolated after the
-        last point.
+        A point lies at each change of a command and at regular distances after it. Between two
+        points with the same command, values are linear in time; after the last of them, they are
+        extrapolated.
         """
         slope = values[self._later] - values[self._earlier]
         result: Array = values[self._at.point_of_step] + self._share[:, None] * slope
