@@ -10,6 +10,7 @@ from __future__ import annotations
 import importlib.util
 import inspect
 import re
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -24,6 +25,8 @@ T = TypeVar("T")
 
 _NAME = re.compile(r"[A-Za-z0-9][\w.+-]{0,60}$")
 """Pattern of names that are valid in tables, file names and command lines."""
+_OWN_PACKAGES = ("bench", "methods", "sims")
+"""Packages of simgap."""
 
 
 class PartUnavailableError(InputError):
@@ -112,6 +115,7 @@ class Registry(Generic[T]):
             try:
                 part = self._entry_points[name].load()
             except Exception as error:  # a plugin may fail in any way during import
+                self._refuse_stale_installation(name, error)
                 reason = f"{type(error).__name__}: {error}"
                 raise PartUnavailableError(self.kind, name, reason) from error
             if not self.accepts(part):
@@ -119,6 +123,22 @@ class Registry(Generic[T]):
                 raise PartUnavailableError(self.kind, name, reason)
             self._imported[name] = part
         return self._imported[name]
+
+    def _refuse_stale_installation(self, name: str, error: Exception) -> None:
+        """Raise an error if a part of simgap itself is no longer where the installation says.
+
+        Without the part, a search for causes would be silently incomplete.
+        """
+        module = self._entry_points[name].module
+        # A module that fails during its import, as with another version of a library, is removed.
+        has_moved = (isinstance(error, AttributeError) and module in sys.modules) or (
+            isinstance(error, ModuleNotFoundError) and error.name == module
+        )
+        if has_moved and module.partition(".")[0] in _OWN_PACKAGES:
+            raise InputError(
+                f"{self.kind} {name}: expected in {module}, found {error}: the files of simgap are "
+                "newer than its installation; install it again (pip install -e . in its folder)"
+            ) from error
 
     def describe(self, name: str) -> str:
         """Return one line for a list: the description, or why the part is skipped."""

@@ -81,6 +81,16 @@ def test_entry_that_cannot_be_imported_is_skipped_with_the_reason(monkeypatch):
         broken.get("x")
 
 
+@pytest.mark.parametrize("value", ["sims.effects.gone:Drag", "sims.effects.drag:Gone"])
+def test_a_part_that_an_older_installation_expects_elsewhere_is_an_error(monkeypatch, value):
+    entry = EntryPoint("drag.linear", value, "simgap.effects")
+    monkeypatch.setattr(effects, "_entry_points", {"drag.linear": entry})
+    monkeypatch.setattr(effects, "_imported", {})
+    with pytest.raises(InputError, match=r"effect drag\.linear: .*pip install -e \.") as error:
+        effects.get("drag.linear")
+    assert not isinstance(error.value, PartUnavailableError)
+
+
 def test_every_registered_name_is_the_name_its_class_says():
     for name in tuners.names():
         try:
