@@ -269,7 +269,8 @@ class SystemSimulator(Simulator):
         is_plain = not any(
             c.any() and (isinstance(effect, Input) or shifts_time(effect)) for effect, c in acting
         )
-        if not is_plain or any(s.offset for s in runs.unique_scenarios):
+        has_shift = any(scenario.offset for scenario in runs.unique_scenarios)
+        if not is_plain or has_shift or not runs.contents:
             plan = build_time_grid(runs, commands, acting, self.engine.largest_step)
             return plan, (
                 compute_applied_inputs(plan, runs, commands, input_effects) if self.inputs else {}

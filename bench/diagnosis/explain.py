@@ -740,7 +740,9 @@ class _ExplainRun:
         if self.has_base_parameters and self.tuner is None:
             filtered_runs = self._filter_with_fitted_parameters(filtered_runs)
         evaluator.follow(filtered_runs)
-        for evaluator in [] if self.search_control.is_over() else held_out:
+        if self.search_control.is_over():
+            return
+        for evaluator in held_out:
             # Held-out runs are only simulated; without a filter they begin at their measured
             # values.
             theta = evaluator.get_nominal_theta()

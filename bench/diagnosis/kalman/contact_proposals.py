@@ -432,7 +432,7 @@ DECREASES = (0.75, 0.5, 0.25)
 """Values that are tried, as shares of the largest possible decrease."""
 INCREASES = (0.3, 0.7, 1.5)
 """Values that are tried, relative to the number of the model file."""
-FORCE_SHARE = 0.1
+COMPARED_FORCE_SHARE = 0.1
 """Standard deviation of the missing force when values are compared, as a share of a typical force.
 
 It is large enough for a model that lacks something to follow the data.
@@ -622,17 +622,23 @@ class _ScannedValue(NamedTuple):
     squares: float
 
 
+def _list_effects_at_contacts(search: EffectSearch) -> list[_ScannedValue]:
+    """Return the effects at contacts, each with the coefficient zero."""
+    evaluator = search.evaluator
+    return [
+        # A coefficient is limited below, where the number of the file becomes zero.
+        _ScannedValue(name, 0.0, -compute_coefficient_bounds(evaluator, name)[0][0], np.inf)
+        for name in evaluator.library
+        if evaluator.available_effects[name].at == "contact"
+    ]
+
+
 def _find_likeliest_effect(search: EffectSearch) -> _ScannedValue | None:
     """Return the likeliest of some values of all effects at contacts; None if there are none."""
-    evaluator = search.evaluator
     values = []
-    for name in evaluator.library:
-        if evaluator.available_effects[name].at != "contact":
-            continue
-        # A coefficient is limited below, where the number of the file becomes zero.
-        low, _ = compute_coefficient_bounds(evaluator, name)[0]
-        values += [_ScannedValue(name, share * low, -low, np.inf) for share in DECREASES]
-        values += [_ScannedValue(name, -share * low, -low, np.inf) for share in INCREASES]
+    for start in _list_effects_at_contacts(search):
+        values += [start._replace(coefficient=-share * start.unit) for share in DECREASES]
+        values += [start._replace(coefficient=share * start.unit) for share in INCREASES]
     if not values:
         return None
     likelihoods = _compute_log_likelihoods(search, values)
@@ -655,14 +661,8 @@ def _rank_effects_at_contacts(search: EffectSearch, base: FittedModel) -> list[_
         The best value of each effect that explains a part of the discrepancy, the best effect
         first.
     """
-    evaluator = search.evaluator
     found = []
-    for name in evaluator.library:
-        if evaluator.available_effects[name].at != "contact":
-            continue
-        # A coefficient is limited below, where the number of the file becomes zero.
-        low, _ = compute_coefficient_bounds(evaluator, name)[0]
-        value = _ScannedValue(name, 0.0, -low, np.inf)
+    for value in _list_effects_at_contacts(search):
         for width in SCAN_WIDTHS:
             value = _scan(search, value, width, base.fit.initial_states)
         found.append(value)
@@ -715,7 +715,7 @@ def _compute_log_likelihoods(search: EffectSearch, values: Sequence[_ScannedValu
     evaluator.search_control.check_not_stopped()
     runs = range(len(evaluator.prepared_runs))
     hypotheses = [
-        Hypothesis(run, theta, FORCE_SHARE)
+        Hypothesis(run, theta, COMPARED_FORCE_SHARE)
         for theta in (_add_effect(search, value) for value in values)
         for run in runs
     ]
