@@ -79,17 +79,16 @@ def begin_step(program: ProgramArrays, block: BlockBuffers, w: int) -> None:
             one batch element.
         w: number of slots in use.
     """
-    d = program.flags[DIMENSIONS]
     if program.flags[HAS_FRICTION] == 0:
         compute_frictionless_acceleration(program, block, w, K1)
         return
-    if d == 1 and program.flags[BOUNCES] == 0:
+    friction_coordinate_count = program.flags[FRICTION_COORDINATE_COUNT]
+    if friction_coordinate_count == 1 and program.flags[BOUNCES] == 0:
         begin_step_1d(program, block, w)
         return
     a = block.a
     r = block.r
     limits = program.rows[OUT_LIMIT]
-    friction_coordinate_count = program.flags[FRICTION_COORDINATE_COUNT]
     for i in range(w):
         limit = r[limits, i]
         compute_force_without_friction(program, block, i, K1)
@@ -115,7 +114,9 @@ def begin_step(program: ProgramArrays, block: BlockBuffers, w: int) -> None:
 
 
 def begin_step_1d(program: ProgramArrays, block: BlockBuffers, w: int) -> None:
-    """Compute `begin_step` for one coordinate without ground: the same numbers, without branches.
+    """Compute `begin_step` for dry friction on one coordinate, the first; no ground.
+
+    The numbers are the same; there are no branches, so that the loops over slots are vectorised.
 
     Args:
         program: program of the system and its effects.
@@ -146,6 +147,7 @@ def begin_step_1d(program: ProgramArrays, block: BlockBuffers, w: int) -> None:
         a[F1, i] = friction
         a[K1, i] = 0.0 if is_held else slip_acceleration
         block.n[IS_STICKING, i] = 1 if is_held else 0
+    compute_further_coordinates(program, block, w, K1, F1)
 
 
 def compute_acceleration(
@@ -170,7 +172,7 @@ def compute_acceleration(
     if program.flags[HAS_FRICTION] == 0:
         compute_frictionless_acceleration(program, block, w, row_of_result)
         return
-    if program.flags[DIMENSIONS] == 1 and program.flags[BOUNCES] == 0:
+    if program.flags[FRICTION_COORDINATE_COUNT] == 1 and program.flags[BOUNCES] == 0:
         compute_acceleration_1d(program, block, w, row_of_result, friction_row)
         return
     for i in range(w):
@@ -180,15 +182,15 @@ def compute_acceleration(
 def compute_acceleration_1d(
     program: ProgramArrays, block: BlockBuffers, w: int, row_of_result: int, friction_row: int
 ) -> None:
-    """Compute `compute_acceleration` for one coordinate without ground.
+    """Compute `compute_acceleration` for dry friction on one coordinate, the first; no ground.
 
     Args:
         program: program of the system and its effects.
         block: registers r, numbers a and integers n of the slots; a slot is a column that holds
             one batch element.
         w: number of slots in use.
-        row_of_result: row of the acceleration.
-        friction_row: row of dry friction.
+        row_of_result: first row of the accelerations.
+        friction_row: first row of dry friction.
     """
     a = block.a
     r = block.r
@@ -202,6 +204,29 @@ def compute_acceleration_1d(
         a[EXCESS_AFTER, i] = abs(force) - limit
         a[friction_row, i] = friction
         a[row_of_result, i] = 0.0 if block.n[IS_STICKING, i] != 0 else slip_acceleration
+    compute_further_coordinates(program, block, w, row_of_result, friction_row)
+
+
+def compute_further_coordinates(
+    program: ProgramArrays, block: BlockBuffers, w: int, row_of_result: int, friction_row: int
+) -> None:
+    """Compute the accelerations of the coordinates after the first, which have no dry friction.
+
+    Args:
+        program: program of the system and its effects.
+        block: registers r, numbers a and integers n of the slots; a slot is a column that holds
+            one batch element.
+        w: number of slots in use.
+        row_of_result: first row of the accelerations.
+        friction_row: first row of dry friction.
+    """
+    a = block.a
+    for k in range(1, program.flags[DIMENSIONS]):
+        force_row = program.out[k]
+        for i in range(w):
+            a[DIRECTION + k, i] = 0.0
+            a[friction_row + k, i] = 0.0
+            a[row_of_result + k, i] = block.r[force_row, i] / a[MASS, i]
 
 
 def compute_acceleration_nd(

@@ -44,6 +44,7 @@ from sims.engines.compiled.data_layout import (
     FLOOR,
     FLOOR_LEVEL,
     FORCES_BEGIN,
+    FRICTION_COORDINATE_COUNT,
     HAS_FORCES,
     HAS_FRICTION,
     IN_T,
@@ -290,7 +291,7 @@ def detect_possible_events(program: ProgramArrays, block: BlockBuffers, w: int) 
 def detect_friction_events(program: ProgramArrays, block: BlockBuffers, w: int) -> None:
     """Set MAY_HAVE_EVENT for the elements that may have a friction event in the step just tried.
 
-    In several dimensions it is set for all elements.
+    If friction acts on several coordinates, it is set for all elements.
 
     Args:
         program: program of the system and its effects.
@@ -300,7 +301,7 @@ def detect_friction_events(program: ProgramArrays, block: BlockBuffers, w: int) 
     """
     a = block.a
     n = block.n
-    if program.flags[DIMENSIONS] > 1:
+    if program.flags[FRICTION_COORDINATE_COUNT] > 1:
         for i in range(w):
             n[MAY_HAVE_EVENT, i] = 1
         return

@@ -56,7 +56,7 @@ _INLINED_FUNCTIONS = frozenset(
         *("set_inputs", "record_and_check_remaining", "detect_possible_events"),
         *("detect_friction_events", "is_too_nonlinear", "has_no_pending_event", "nan_maximum"),
         *("nan_minimum", "record_state", "dot", "compute_norm", "begin_step_1d"),
-        "compute_acceleration_1d",
+        *("compute_acceleration_1d", "compute_further_coordinates"),
     }
 )
 """Functions that are inlined, because a call costs more than their body."""

@@ -98,6 +98,18 @@ def test_dry_friction_holds_the_drive_while_the_load_swings_on():
     np.testing.assert_array_equal(x[1:-1][still[:-1] & still[1:]], x[2:][still[:-1] & still[1:]])
 
 
+def test_a_load_without_inertia_changes_no_standstill_or_break_away():
+    pulses = np.where(TIMES % 0.8 < 0.4, 3.0, -3.0) * np.exp(-0.5 * TIMES)
+    friction = {"friction.coulomb": 0.7, "friction.stribeck": (0.4, 0.9, 0.1)}
+    light, bare = (
+        slide({**load, **friction}, pulses, v=-0.4)
+        for load in ({"joint.flexibility": (1e-13, 5.0, 0.1)}, {})
+    )
+    assert 20 < (bare[1] == 0.0).sum() < 150
+    np.testing.assert_array_equal(light[1] == 0.0, bare[1] == 0.0)
+    np.testing.assert_allclose(light, bare, atol=1e-5)
+
+
 @pytest.mark.parametrize(
     "off", [{"joint.flexibility": (0.0, 30.0, 0.1)}, {"joint.backlash": (0.0, 0.3)}]
 )
