@@ -22,11 +22,11 @@ from sims.core.effect import (
     Signal,
 )
 from sims.core.engine import Engine, IntegrationBatch, Trajectories
+from sims.core.plain_values import is_plausible_number
 from sims.core.simulation_counter import SIMULATION_COUNTER
 from sims.core.simulator import Array, Indices, InputError, Parameter, Scenario, Simulator
 from sims.core.system import System
 from sims.core.toml_validation import format_value
-from sims.core.values import is_plausible_number
 from sims.engines import HIDDEN_STATE_ENGINES, make_engine
 from sims.engines.hidden_states import integrate_with_hidden_states
 from sims.engines.step_inputs import compute_applied_inputs

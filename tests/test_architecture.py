@@ -15,7 +15,7 @@ PACKAGES = ("bench", "methods", "sims")
 BENCH_PACKAGES = {
     "api", "benchmark", "bounce_shot", "cli", "conformance", "core", "datasets", "diagnosis",
     "diagnosis_benchmark", "experiments", "figures", "logs", "misspecification", "pages", "schemas",
-    "studies",
+    "studies", "suite",
 }  # fmt: skip
 
 

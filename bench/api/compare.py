@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-import inspect
 import os
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeAlias
 
-from bench.api.comparison_options import ComparisonOptions, StudyOptions
+from bench.api.comparison_options import (
+    ComparisonOptions,
+    StudyOptions,
+    apply_changes,
+    get_tuner_label,
+)
 from bench.benchmark.figures import comparison_charts, comparison_figures
 from bench.benchmark.problem.availability import leave_out_missing_problems
 from bench.benchmark.problem.experiment import Experiment, list_experiment_names, load_experiment
@@ -34,16 +38,13 @@ from bench.benchmark.storage.table_schemas import (
     SHOT_TABLE_COLUMNS,
 )
 from bench.core.options import with_options
-from bench.core.plugin_registries import diagnosers
-from bench.core.plugin_registries import tuners as registered
 from bench.diagnosis_benchmark import table_columns as diagnosis
 from bench.diagnosis_benchmark.diagnosers import language_model
 from bench.figures.figure_files import pdf_figures
 from bench.misspecification.calibration import MODEL_LABELS
 from bench.studies import study
-from methods.tuner import Tuner
 from sims.core.argument_checks import Expected, check_arguments
-from sims.core.simulator import InputError, make_unknown_name_error
+from sims.core.simulator import InputError
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -166,14 +167,14 @@ def build_experiment(
         requested, _list_plugin_files(options), is_trusted, options.isolation
     )
     labels = (
-        None if options.tuners is None else [_get_tuner_label(tuner) for tuner in options.tuners]
+        None if options.tuners is None else [get_tuner_label(tuner) for tuner in options.tuners]
     )
     if options.model_command is not None:
         # Workers inherit the environment.
         os.environ[language_model.COMMAND_VARIABLE] = options.model_command
         labels = [*(labels or ()), language_model.LanguageModel.name]
     changes = {name: getattr(options, name) for name in _EXPERIMENT_OPTIONS}
-    return _apply_changes(complete, labels, options.seeds, changes)
+    return apply_changes(complete, labels, options.seeds, changes)
 
 
 def _list_plugin_files(options: ComparisonOptions) -> list[str]:
@@ -294,61 +295,6 @@ def _report_study(started_study: study.Study, outcome: StudyOutcome) -> Comparis
 
 def _discard_line(_line: str) -> None:
     """Discard a line that the command would print; in Python the tables are available."""
-
-
-def _apply_changes(
-    experiment: Experiment,
-    labels: Sequence[str] | None,
-    seeds: int | None,
-    changes: Mapping[str, float | None],
-) -> Experiment:
-    """Apply changes to an experiment; None leaves a field unchanged.
-
-    Raises:
-        InputError: A tuner or diagnoser does not exist.
-    """
-    if experiment.diagnosis:
-        return _choose_diagnosers(experiment, labels, changes)
-    experiment = experiment.chosen(**changes)
-    if seeds:
-        experiment = experiment.with_seeds(seeds)
-    if labels is None:
-        return experiment
-    known_labels = {*registered.names(), *(entry.label for entry in experiment.tuners)}
-    for label in labels:
-        if label not in known_labels:
-            raise make_unknown_name_error("tuner", label, sorted(known_labels))
-    return experiment.with_tuners(labels)
-
-
-def _choose_diagnosers(
-    experiment: Experiment, labels: Sequence[str] | None, changes: Mapping[str, float | None]
-) -> Experiment:
-    """Apply changes to a comparison of diagnosers, whose targets are benchmark cases."""
-    sample = changes.get("targets")
-    table = dict(experiment.diagnosis)
-    if sample is not None:
-        table["sample"] = sample
-    if labels is not None:
-        for label in labels:
-            if label not in diagnosers.names():
-                raise make_unknown_name_error("diagnoser", label, diagnosers.names())
-        table["diagnosers"] = list(labels)
-    other_changes = {name: value for name, value in changes.items() if name != "targets"}
-    return experiment.chosen(diagnosis=table, **other_changes)
-
-
-def _get_tuner_label(tuner: str | type[Tuner]) -> str:
-    """Return the name under which a tuner runs; a class is registered under its name first.
-
-    Raises:
-        InputError: it is neither a name nor a subclass of Tuner.
-    """
-    if isinstance(tuner, str):
-        return tuner
-    if not (inspect.isclass(tuner) and issubclass(tuner, Tuner)):
-        raise InputError(f"tuners: expected names and subclasses of Tuner, found {tuner!r:.80}")
-    return registered.register(tuner).name
 
 
 class ComparisonResult:

@@ -1,15 +1,20 @@
-"""Options of `simgap compare`, of its Python function and of `simgap.sweep`."""
+"""Options of `simgap compare` and `simgap.sweep`, and the experiment that they change."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import inspect
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, TypeAlias
 
+from bench.benchmark.problem.experiment import Experiment
 from bench.core.options import option
+from bench.core.plugin_registries import diagnosers
+from bench.core.plugin_registries import tuners as registered
 from methods.tuner import Tuner
 from sims.core.argument_checks import Count, Expected, Files, Name, Names, Natural, Seconds
+from sims.core.simulator import InputError, make_unknown_name_error
 
 Tuners: TypeAlias = Annotated[
     Sequence[Name | type[Tuner]],
@@ -88,3 +93,58 @@ class ComparisonOptions(StudyOptions):
     isolation: Name | None = option(None, "ISOLATION", choices=("run", "tuner"))
     cluster: str | None = option(None, "ADDRESS")
     model_command: str | None = option(None, "COMMAND", flags=("--model-command", "--command"))
+
+
+def apply_changes(
+    experiment: Experiment,
+    labels: Sequence[str] | None,
+    seeds: int | None,
+    changes: Mapping[str, float | None],
+) -> Experiment:
+    """Apply changes to an experiment; None leaves a field unchanged.
+
+    Raises:
+        InputError: A tuner or diagnoser does not exist.
+    """
+    if experiment.diagnosis:
+        return _choose_diagnosers(experiment, labels, changes)
+    experiment = experiment.chosen(**changes)
+    if seeds:
+        experiment = experiment.with_seeds(seeds)
+    if labels is None:
+        return experiment
+    known_labels = {*registered.names(), *(entry.label for entry in experiment.tuners)}
+    for label in labels:
+        if label not in known_labels:
+            raise make_unknown_name_error("tuner", label, sorted(known_labels))
+    return experiment.with_tuners(labels)
+
+
+def _choose_diagnosers(
+    experiment: Experiment, labels: Sequence[str] | None, changes: Mapping[str, float | None]
+) -> Experiment:
+    """Apply changes to a comparison of diagnosers, whose targets are benchmark cases."""
+    sample = changes.get("targets")
+    table = dict(experiment.diagnosis)
+    if sample is not None:
+        table["sample"] = sample
+    if labels is not None:
+        for label in labels:
+            if label not in diagnosers.names():
+                raise make_unknown_name_error("diagnoser", label, diagnosers.names())
+        table["diagnosers"] = list(labels)
+    other_changes = {name: value for name, value in changes.items() if name != "targets"}
+    return experiment.chosen(diagnosis=table, **other_changes)
+
+
+def get_tuner_label(tuner: str | type[Tuner]) -> str:
+    """Return the name under which a tuner runs; a class is registered under its name first.
+
+    Raises:
+        InputError: it is neither a name nor a subclass of Tuner.
+    """
+    if isinstance(tuner, str):
+        return tuner
+    if not (inspect.isclass(tuner) and issubclass(tuner, Tuner)):
+        raise InputError(f"tuners: expected names and subclasses of Tuner, found {tuner!r:.80}")
+    return registered.register(tuner).name

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from bench.benchmark.isolation.process_limits import RunEndedError
+from bench.benchmark.isolation.isolation_errors import RunEndedError
 from bench.benchmark.problem.experiment import (
     Experiment,
     TunerEntry,
@@ -19,7 +19,7 @@ from bench.benchmark.problem.robot_experiment import complete_robot_experiment
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.benchmark.runner.experiment_runner import ProgressFactory
 from bench.benchmark.runner.plugin_discovery import load_plugins_for_experiment, must_build_isolated
-from bench.benchmark.runner.sandboxed_tuner import make_tuner_spec
+from bench.benchmark.runner.tuner_process_reuse import make_tuner_spec
 from bench.benchmark.runner.tuner_training import (
     TrainingRequest,
     TrainingResult,

@@ -11,7 +11,7 @@ import pandas as pd
 
 from bench.benchmark.figures import comparison_figures
 from bench.benchmark.figures.comparison_charts import AxisLabels, ComparisonView, make_axis_labels
-from bench.benchmark.isolation.process_limits import ISOLATION_NOTE, without_isolation
+from bench.benchmark.isolation.isolation_errors import ISOLATION_NOTE, without_isolation
 from bench.benchmark.problem.experiment import Experiment
 from bench.benchmark.problem.tuning_problem import TuningProblem, numeric_warnings_silenced
 from bench.benchmark.report_page import headline

@@ -34,8 +34,8 @@ from bench.bounce_shot.shot_planning import (
 from bench.bounce_shot.shot_sampling import ShotSetup
 from bench.bounce_shot.true_world import InclinedGround, simulate_shot
 from sims.core.files import write_atomically
+from sims.core.plain_values import to_json_value
 from sims.core.simulator import Array, InputError
-from sims.core.values import to_json_value
 
 SAMPLING_RATE_HZ = 240.0
 """Sampling rate of a shot, Hz."""

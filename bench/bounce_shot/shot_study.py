@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.benchmark.isolation.linux_syscalls import not_dumpable
-from bench.benchmark.isolation.tuner_client import TunerSpec
+from bench.benchmark.isolation.tuner_proxy import TunerSpec
 from bench.benchmark.problem.experiment import Experiment
 from bench.benchmark.runner.experiment_runner import (
     ProgressFactory,
@@ -19,8 +19,8 @@ from bench.benchmark.runner.experiment_runner import (
     no_progress,
 )
 from bench.benchmark.runner.plugin_discovery import describe_plugins
-from bench.benchmark.runner.sandboxed_tuner import make_tuner_spec
-from bench.benchmark.runner.study_setup import PreparedStudy
+from bench.benchmark.runner.study_creation import PreparedStudy
+from bench.benchmark.runner.tuner_process_reuse import make_tuner_spec
 from bench.benchmark.runner.tuner_training import (
     TrainingRequest,
     TrainingResult,
@@ -85,7 +85,7 @@ class BounceShotStudy:
         Args:
             new: folder, experiment, plugins and salt, from `prepare_study`.
         """
-        from bench.benchmark.runner.run_ids import compute_fingerprint
+        from bench.benchmark.runner.run_fingerprint import compute_fingerprint
 
         experiment = new.experiment
         if read_shot_config(experiment).filmed:
@@ -108,7 +108,7 @@ class BounceShotStudy:
             folder: result folder.
             plugins: further plugin files.
         """
-        from bench.benchmark.runner.run_ids import check_resumable
+        from bench.benchmark.runner.run_fingerprint import check_resumable
 
         study = cls(folder)
         study.plugins = check_resumable(folder, study.configuration, plugins)

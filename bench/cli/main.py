@@ -10,12 +10,9 @@ from __future__ import annotations
 import argparse
 import atexit
 import gc
-import os
 import sys
 from collections.abc import Iterable, Sequence
 from importlib import import_module
-from importlib.util import find_spec
-from pathlib import Path
 from typing import NamedTuple, NoReturn
 
 from bench import __version__
@@ -30,6 +27,7 @@ from bench.cli.output import (
     OutputWriter,
     TextWriter,
 )
+from sims.core.mujoco_import import set_glfw_library
 
 
 class Command(NamedTuple):
@@ -212,7 +210,7 @@ class _Parser(argparse.ArgumentParser):
         """
         from difflib import get_close_matches
 
-        from sims.core.values import truncate_text
+        from sims.core.plain_values import truncate_text
 
         similar_names = get_close_matches(
             name[:_MAX_COMPARED_CHARACTERS], list(known_names), cutoff=0.5
@@ -241,7 +239,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     if arguments is None:
         # Only in simgap's own process: the environment of a calling program is not changed.
-        _name_glfw_library()
+        set_glfw_library()
         mark_as_command()
         # Most objects that a command creates while it loads modules live until its end.
         gc.set_threshold(GARBAGE_THRESHOLD)
@@ -268,24 +266,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         printer.print_error("internal", f"{type(error).__name__}: {error}", EXIT_PROBLEMS_FOUND)
         raise
     return answer.code
-
-
-def _name_glfw_library() -> None:
-    """Set the path of the library of glfw, which MuJoCo imports, to the one glfw would choose.
-
-    Otherwise glfw starts an interpreter for each library that it finds, to get its version. That is
-    a third of the time of ``import mujoco``, in each process of a command.
-    """
-    if not sys.platform.startswith("linux") or "PYGLFW_LIBRARY" in os.environ:
-        return
-    package = find_spec("glfw")
-    if package is None or package.origin is None:
-        return
-    session = os.environ.get("PYGLFW_LIBRARY_VARIANT") or os.environ.get("XDG_SESSION_TYPE", "")
-    variant = "wayland" if session.lower() == "wayland" else "x11"
-    library = Path(package.origin).parent / variant / "libglfw.so"
-    if library.is_file():
-        os.environ["PYGLFW_LIBRARY"] = str(library)
 
 
 def _parse_command_line(words: Sequence[str]) -> argparse.Namespace:

@@ -15,7 +15,7 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext, redi
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
 
-from sims.core.values import to_json_value
+from sims.core.plain_values import to_json_value
 
 if TYPE_CHECKING:
     from bench.studies.study import Study

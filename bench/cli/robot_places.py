@@ -10,7 +10,7 @@ from bench.cli.output import JsonDocument
 from bench.core.plugin_registries import make_robot_simulator
 from bench.logs.recording_summary import format_robot_summary
 from sims import effects
-from sims.core.values import append_unit, format_unit
+from sims.core.plain_values import append_unit, format_unit
 from sims.robot.robot_model import RobotModel
 from sims.robot.robot_simulator import RobotSimulator
 from sims.robot.robot_system import RobotSystem

@@ -157,7 +157,7 @@ def _parse_whole_number(text: str, minimum: int) -> int:
     Raises:
         argparse.ArgumentTypeError: the text is not such a number.
     """
-    from sims.core.values import MAX_INTEGER, truncate_text
+    from sims.core.plain_values import MAX_INTEGER, truncate_text
 
     try:
         value = int(text)
@@ -184,7 +184,7 @@ def parse_seconds(text: str) -> float:
 
 def parse_path(text: str) -> Path:
     """Parse the path of a file or folder, which need not exist."""
-    from sims.core.values import truncate_text
+    from sims.core.plain_values import truncate_text
 
     try:
         Path(text).lstat()

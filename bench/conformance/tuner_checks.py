@@ -12,11 +12,14 @@ from dataclasses import replace
 
 import numpy as np
 
+from bench.benchmark.isolation.isolation_errors import KilledExternallyError, RunEndedError
 from bench.benchmark.isolation.isolation_layers import PROJECT_ROOT
-from bench.benchmark.isolation.process_limits import KilledExternallyError, RunEndedError
-from bench.benchmark.isolation.tuner_client import IsolatedRun, TunerSpec
-from bench.benchmark.runner.sandboxed_tuner import find_preloadable_packages, start_isolated_tuner
+from bench.benchmark.isolation.tuner_proxy import IsolatedRun, TunerSpec
 from bench.benchmark.runner.tuner_loop import RunTrace, drive_tuner
+from bench.benchmark.runner.tuner_process_reuse import (
+    find_preloadable_packages,
+    start_isolated_tuner,
+)
 from bench.conformance.check_base import (
     Check,
     CheckError,

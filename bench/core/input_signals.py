@@ -9,8 +9,8 @@ from collections.abc import Callable
 
 import numpy as np
 
+from sims.core.plain_values import MAX_NUMBER, truncate_text
 from sims.core.simulator import Array, InputError, make_unknown_name_error
-from sims.core.values import MAX_NUMBER, truncate_text
 
 _TAU = 2 * np.pi
 """Radians of one period."""

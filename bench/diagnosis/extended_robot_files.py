@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from bench.diagnosis.report.report_data import ModelFileChange
 from sims.core.freed_memory import release_free_memory
-from sims.core.values import append_unit
+from sims.core.plain_values import append_unit
 from sims.extended_simulator import ExtendedSimulator, FittedValue
 
 if TYPE_CHECKING:

@@ -32,8 +32,8 @@ from bench.diagnosis.fitting.trajectory_fit import compute_state_prior
 from bench.diagnosis.search.candidate_directions import DirectionSet, compute_directions
 from bench.diagnosis.validation.gain_and_intervals import Z95
 from sims.core.effect import ALL_PLACES
+from sims.core.plain_values import format_unit
 from sims.core.simulator import Array
-from sims.core.values import format_unit
 
 IdentifiabilityLevel = Literal["identifiable", "weak", "not identifiable"]
 

@@ -17,16 +17,16 @@ from typing import Any
 
 import numpy as np
 
+from bench.benchmark.isolation.isolation_errors import RunEndedError
 from bench.benchmark.isolation.message_channel import (
     MAX_STATE_BYTES,
     ProtocolError,
     pack_arrays,
     unpack_arrays,
 )
-from bench.benchmark.isolation.process_limits import RunEndedError
-from bench.benchmark.isolation.tuner_client import TunerSpec
 from bench.benchmark.isolation.tuner_processes import START_TIMEOUT_SECONDS, IsolatedProcess
-from bench.benchmark.runner.sandboxed_tuner import get_fork_server, retry_if_killed
+from bench.benchmark.isolation.tuner_proxy import TunerSpec
+from bench.benchmark.runner.tuner_process_reuse import get_fork_server, retry_if_killed
 from bench.core.diagnoser import Answer
 from bench.core.random_streams import make_seed_words
 from bench.diagnosis_benchmark import diagnoser_process

@@ -10,9 +10,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from bench.benchmark.isolation.isolation_errors import RunEndedError
 from bench.benchmark.isolation.linux_syscalls import not_dumpable
-from bench.benchmark.isolation.process_limits import RunEndedError
-from bench.benchmark.isolation.tuner_client import TunerSpec
+from bench.benchmark.isolation.tuner_proxy import TunerSpec
 from bench.benchmark.problem.experiment import Experiment
 from bench.benchmark.runner.code_digest import (
     compute_digest,
@@ -32,9 +32,9 @@ from bench.benchmark.runner.plugin_discovery import (
     load_plugins_for_experiment,
     register_plugins,
 )
-from bench.benchmark.runner.run_ids import check_unchanged
-from bench.benchmark.runner.sandboxed_tuner import find_preloadable_packages
-from bench.benchmark.runner.study_setup import PreparedStudy
+from bench.benchmark.runner.run_fingerprint import check_unchanged
+from bench.benchmark.runner.study_creation import PreparedStudy
+from bench.benchmark.runner.tuner_process_reuse import find_preloadable_packages
 from bench.benchmark.runner.tuner_training import get_weights_folder as trained
 from bench.benchmark.runner.worker_pools import Call, Pool, PoolLostError, make_pool
 from bench.benchmark.storage.result_folder import read_configuration, reveal_salt

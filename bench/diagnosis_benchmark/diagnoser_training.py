@@ -12,13 +12,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bench.benchmark.isolation.tuner_client import TunerSpec
+from bench.benchmark.isolation.tuner_proxy import TunerSpec
 from bench.benchmark.runner.code_digest import (
     compute_digest,
     hash_package_versions,
     hash_source_folders,
 )
-from bench.benchmark.runner.sandboxed_tuner import retry_if_killed
+from bench.benchmark.runner.tuner_process_reuse import retry_if_killed
 from bench.benchmark.runner.tuner_training import get_weights_folder
 from bench.core.random_streams import make_seed_words
 from bench.diagnosis_benchmark.case_evaluation import train_isolated

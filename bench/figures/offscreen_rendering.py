@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.figures.robot_view import Projection
+from bench.figures.camera_view import Projection
 from sims.core.simulator import Array
 
 Image = NDArray[np.uint8]

@@ -20,8 +20,8 @@ from bench.figures.style import (
 )
 from bench.logs.ball_heights import BallHeights
 from bench.logs.signal_statistics import list_recorded_signals
+from sims.core.plain_values import format_unit
 from sims.core.simulator import Array, Simulator
-from sims.core.values import format_unit
 from sims.recording.recording import Recording, Run
 from sims.vision.ball_renderer import RgbImage
 from sims.vision.ball_tracker import BallTrack

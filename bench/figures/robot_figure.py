@@ -1,4 +1,4 @@
-"""Draw a robot at a pose with the places of a verdict marked, rendered or as links and joints.
+"""Draw a robot at a pose, rendered or as links and joints, with places of a verdict marked.
 
 The robot is rendered if this machine can do so, else drawn as links and joints; places are marked
 identically in both. Labels are arranged in columns at both sides, each connected to its place by a
@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from bench.figures.camera_view import Projection, choose_projection, make_posed_data
 from bench.figures.offscreen_rendering import render_robot
-from bench.figures.robot_view import Projection, choose_projection, locate_place, make_posed_data
 from bench.figures.style import BLUE, CAPTION_GREY, NEUTRAL_MARK, NULL_LEVEL_GREY, make_panel_grid
 from bench.figures.text_layout import break_name
-from sims.core.simulator import Array
+from sims.core.simulator import Array, InputError
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -497,3 +497,57 @@ def round_down_length(length: float) -> float:
     """Return the largest of 1, 2, 5 times a power of ten that is at most `length`, in metres."""
     power = 10.0 ** np.floor(np.log10(length))
     return float(max(step * power for step in (1.0, 2.0, 5.0) if step * power <= length))
+
+
+def locate_place(robot: RobotModel, data: Any, kind: str, name: str) -> Array | None:
+    """Return (3,) the position of a place of the robot in metres.
+
+    Args:
+        robot: The robot.
+        data: MuJoCo data at the pose.
+        kind: ``joint``, ``actuator``, ``body`` or ``channel``.
+        name: Name of the place.
+
+    Returns:
+        The position; None if the robot has no such place.
+    """
+    try:
+        if kind == "body":
+            return np.array(data.xipos[robot.body(name).id])
+        if kind == "actuator":
+            joint = robot.actuator(name).joint
+            return None if joint is None else np.array(data.xanchor[robot.joint(joint).id])
+        if kind == "channel":
+            return _place_of_channel(robot, data, name)
+        return np.array(data.xanchor[robot.joint(name).id])
+    except InputError:
+        return None
+
+
+def _place_of_channel(robot: RobotModel, data: Any, name: str) -> Array | None:
+    """Return the position (3,) in the world that belongs to a channel; None if it has none.
+
+    It is that of the joint, or of the body or site on which a sensor is mounted.
+    """
+    import mujoco
+
+    kind, _, place_name = name.partition(".")
+    if kind != "s":
+        return locate_place(robot, data, "joint", place_name)
+    model = robot.compiled
+    row = next((s for s in robot.sensors if s.name == place_name), None)
+    if row is None:
+        return None
+    sensor = int(np.searchsorted(model.sensor_adr, row.address, side="right")) - 1
+    object_id, object_type = int(model.sensor_objid[sensor]), int(model.sensor_objtype[sensor])
+    positions_by_type = {
+        int(mujoco.mjtObj.mjOBJ_SITE): data.site_xpos,
+        int(mujoco.mjtObj.mjOBJ_JOINT): data.xanchor,
+        int(mujoco.mjtObj.mjOBJ_BODY): data.xipos,
+        int(mujoco.mjtObj.mjOBJ_XBODY): data.xpos,
+    }
+    return (
+        np.array(positions_by_type[object_type][object_id])
+        if object_type in positions_by_type
+        else None
+    )

@@ -12,8 +12,8 @@ from bench.core.random_streams import make_rng
 from bench.logs import ball_heights
 from bench.logs.recording_loading import check_film_size
 from sims.core.files import check_absent
+from sims.core.plain_values import LENGTH_RANGE
 from sims.core.simulator import InputError, make_read_only, make_unknown_name_error
-from sims.core.values import LENGTH_RANGE
 from sims.recording.recording import Recording, Run, read_recording, read_system_name
 from sims.recording.recording_writer import write_recording
 from sims.systems.ball import BallSystem

@@ -1,4 +1,4 @@
-"""Load a recording from files or data frames, check its size, and hash its files."""
+"""Load a recording from files or data frames, check its size, and compute its digest."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import hashlib
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, TypeAlias
 
@@ -24,9 +23,10 @@ from bench.core.resource_estimates import (
     get_max_step,
 )
 from sims.core.argument_checks import Expected, Name
+from sims.core.files import hash_file
+from sims.core.plain_values import MAX_NUMBER
 from sims.core.simulator import InputError, Simulator
 from sims.core.toml_validation import check_table
-from sims.core.values import MAX_NUMBER
 from sims.recording.column_mapping import list_mapped_files
 from sims.recording.log_formats.hdf5_and_parquet import group_of
 from sims.recording.log_formats.lerobot_dataset import list_episode_files, split_episode_path
@@ -313,8 +313,6 @@ def _get_simulator_class(name: str, meta: Mapping[str, Any]) -> type[Simulator]:
         raise InputError(f"{name}: {error}") from None
 
 
-CHUNK_BYTES = 1 << 20
-"""Number of bytes read at once; a bag file may be larger than the memory."""
 _INCLUDE = re.compile(rb"<include\s+file\s*=\s*[\"']([^\"']+)[\"']")
 
 
@@ -358,7 +356,7 @@ def read_content(path: Path) -> bytes:
     for file in files if root.suffix.lower() != ".xml" else _list_included_files(root):
         if file.is_file():
             file_stat = file.stat()
-            content.update(_hash_file(file, file_stat.st_mtime_ns, file_stat.st_size))
+            content.update(hash_file(file, file_stat.st_mtime_ns, file_stat.st_size))
     return content.digest()
 
 
@@ -372,16 +370,3 @@ def _list_included_files(model: Path) -> list[Path]:
         files += [file for file in dict.fromkeys(included_files) if file not in files]
         visited_count += 1
     return files
-
-
-@lru_cache(maxsize=256)
-def _hash_file(path: Path, _changed: int, _size: int) -> bytes:
-    """Return the hash of a file; cached, as many logs may use the same file.
-
-    The unused arguments are part of the cache key, so a changed file is hashed again.
-    """
-    digest = hashlib.sha256()
-    with path.open("rb") as file:
-        while chunk := file.read(CHUNK_BYTES):
-            digest.update(chunk)
-    return digest.digest()

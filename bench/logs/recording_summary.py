@@ -12,8 +12,8 @@ from bench.logs.signal_statistics import (
     compute_signal_statistics,
     list_recorded_signals,
 )
+from sims.core.plain_values import format_unit
 from sims.core.simulator import Simulator
-from sims.core.values import format_unit
 from sims.recording.recording import (
     Recording,
     Run,

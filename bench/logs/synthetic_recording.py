@@ -21,10 +21,7 @@ from bench.logs.recording_loading import check_simulation_size
 from sims import effects as library
 from sims.core.argument_checks import Expected, Name, Names, check_arguments
 from sims.core.files import check_absent
-from sims.core.simulator import Array, InputError, Scenario, Simulator
-from sims.core.system import DefaultRecording
-from sims.core.toml_validation import check_known_names
-from sims.core.values import (
+from sims.core.plain_values import (
     MAX_NUMBER,
     MAX_SAMPLING_RATE_HZ,
     MIN_RUN_SECONDS,
@@ -32,6 +29,9 @@ from sims.core.values import (
     is_plausible_number,
     truncate_text,
 )
+from sims.core.simulator import Array, InputError, Scenario, Simulator
+from sims.core.system import DefaultRecording
+from sims.core.toml_validation import check_known_names
 from sims.recording.recording import Recording, Run
 from sims.recording.recording_description import ModelFileReference, get_floating_state_units
 from sims.recording.recording_writer import write_recording

@@ -13,7 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bench.benchmark.comparison import Comparison
+from bench.benchmark.comparison_study import Comparison
 from bench.benchmark.storage.result_folder import (
     CONFIGURATION_FILE,
     read_configuration,
@@ -41,7 +41,7 @@ from sims.extended_simulator import list_effect_coefficients
 if TYPE_CHECKING:
     from bench.benchmark.problem.experiment import Experiment
     from bench.benchmark.runner.experiment_runner import ProgressFactory
-    from bench.benchmark.runner.study_setup import PreparedStudy
+    from bench.benchmark.runner.study_creation import PreparedStudy
     from bench.benchmark.runner.worker_pools import Pool
 
 PrintLine = Callable[[str], None]
@@ -85,7 +85,7 @@ class MisspecificationStudy:
             check_classes_importable,
             prepare_experiment,
         )
-        from bench.benchmark.runner.run_ids import compute_fingerprint
+        from bench.benchmark.runner.run_fingerprint import compute_fingerprint
 
         # Validated before the folder is created: an error of the user leaves no files.
         prepare_experiment(make_base_experiment(new.experiment), new.secret)
@@ -101,7 +101,7 @@ class MisspecificationStudy:
             folder: result folder.
             plugins: further plugin files.
         """
-        from bench.benchmark.runner.run_ids import check_resumable
+        from bench.benchmark.runner.run_fingerprint import check_resumable
 
         study = cls(folder)
         study.plugins = check_resumable(folder, study.configuration, plugins)
@@ -199,7 +199,7 @@ class MisspecificationStudy:
             # A public salt is already part of the experiment.
             secret = read_salt(self.folder, experiment)
             plan = replace(self.get_experiment(model), salt_sha256="")
-            from bench.benchmark.runner.study_setup import prepare_study
+            from bench.benchmark.runner.study_creation import prepare_study
 
             comparison = Comparison.begin(prepare_study(plan, self.plugins, folder, jobs, secret))
         if comparison.results is not None:

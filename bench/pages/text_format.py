@@ -7,7 +7,7 @@ import io
 from collections.abc import Iterable, Sequence
 from math import floor, isfinite, log10
 
-from sims.core.values import SUPERSCRIPT_DIGITS
+from sims.core.plain_values import SUPERSCRIPT_DIGITS
 
 _MIN_FIXED_POINT = 1e-3
 """Magnitude below which numbers are written with a power of ten."""

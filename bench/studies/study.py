@@ -19,10 +19,10 @@ from bench.benchmark.storage.result_folder import (
 from bench.core.random_streams import generate_salt
 
 if TYPE_CHECKING:
-    from bench.benchmark.comparison import PrintLine
+    from bench.benchmark.comparison_study import PrintLine
     from bench.benchmark.problem.experiment import Experiment
     from bench.benchmark.runner.experiment_runner import ProgressFactory
-    from bench.benchmark.runner.study_setup import PreparedStudy
+    from bench.benchmark.runner.study_creation import PreparedStudy
     from bench.benchmark.runner.worker_pools import Pool
     from bench.benchmark.storage.result_folder import FolderConfiguration
     from bench.benchmark.storage.run_status import StudyOutcome, StudyProgress
@@ -123,7 +123,7 @@ def begin_studies(
             behind.
     """
     from bench.benchmark.problem.experiment import expand_sweep
-    from bench.benchmark.runner.study_setup import prepare_study
+    from bench.benchmark.runner.study_creation import prepare_study
 
     def begin(part: Experiment, place: Path | None) -> Study:
         return get_study_class(part).begin(prepare_study(part, plugins, place, jobs, salt))
@@ -172,7 +172,7 @@ def report_jointly(folder: Path, print_line: PrintLine) -> None:
 
         write_joint_report(folder, parts, print_line)
     if experiments and all(experiment.suite for experiment in experiments):
-        from bench.studies.suite.suite_page import report_suite
+        from bench.suite.suite_page import report_suite
 
         report_suite(folder, print_line)
 
@@ -211,7 +211,7 @@ def get_study_class(experiment: Experiment) -> type[Study]:
         from bench.diagnosis_benchmark.diagnoser_study import DiagnosisStudy
 
         return DiagnosisStudy
-    from bench.benchmark.comparison import Comparison
+    from bench.benchmark.comparison_study import Comparison
 
     return Comparison
 

@@ -19,8 +19,8 @@ from typing import Annotated, Any, ParamSpec, TypeVar, Union, get_args, get_orig
 
 import numpy as np
 
+from sims.core.plain_values import truncate_text
 from sims.core.simulator import InputError, make_unknown_name_error
-from sims.core.values import truncate_text
 
 P = ParamSpec("P")
 R = TypeVar("R")

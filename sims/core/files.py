@@ -6,20 +6,26 @@ so that readers never see a partly written file, even after a crash.
 
 from __future__ import annotations
 
+import hashlib
 import os
 import shutil
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from datetime import datetime, timezone
+from functools import lru_cache
 from itertools import islice
 from pathlib import Path
 from typing import IO, Any
 
+from sims.core.plain_values import truncate_text
 from sims.core.simulator import InputError
-from sims.core.values import truncate_text
 
 _MAX_SEARCHED_ENTRIES = 10_000
 """Maximum number of a folder's entries among which similar names are searched."""
+
+
+CHUNK_BYTES = 1 << 20
+"""Number of bytes read at once; a bag file may be larger than the memory."""
 
 
 def require_file(path: Path, wanted: str = "") -> None:
@@ -295,3 +301,16 @@ def open_locked(path: Path, folder: Path) -> IO[str]:
             f"{folder}: another simgap process uses this folder; wait for it, or end it"
         ) from None
     return file
+
+
+@lru_cache(maxsize=256)
+def hash_file(path: Path, _changed: int, _size: int) -> bytes:
+    """Return the hash of a file; cached, as many logs may use the same file.
+
+    The unused arguments are part of the cache key, so a changed file is hashed again.
+    """
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        while chunk := file.read(CHUNK_BYTES):
+            digest.update(chunk)
+    return digest.digest()

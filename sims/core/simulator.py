@@ -15,7 +15,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sims.core.values import (
+from sims.core.plain_values import (
     MAX_MESSAGE_LENGTH,
     MAX_NUMBER,
     MAX_QUOTED_NAME_LENGTH,

@@ -18,8 +18,8 @@ from types import NoneType, UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints, is_typeddict
 
 from sims.core.files import require_file
+from sims.core.plain_values import MAX_INTEGER, MAX_NUMBER, MAX_TITLE_LENGTH, truncate_text
 from sims.core.simulator import InputError, make_unknown_name_error
-from sims.core.values import MAX_INTEGER, MAX_NUMBER, MAX_TITLE_LENGTH, truncate_text
 
 if sys.version_info >= (3, 11):
     import tomllib as tomllib  # re-exported for other modules

@@ -13,9 +13,9 @@ from dataclasses import replace
 import numpy as np
 
 from sims.core.engine import IntegrationBatch, Trajectories
+from sims.core.plain_values import is_plausible_number, truncate_text
 from sims.core.simulator import Indices, InputError
 from sims.core.system import System
-from sims.core.values import is_plausible_number, truncate_text
 from sims.engines.compiled.batch_runner import integrate_batch
 from sims.engines.compiled.data_layout import MAX_COORDINATES
 from sims.engines.compiled.step_size import MAX_PHASE_PER_STEP

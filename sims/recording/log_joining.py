@@ -12,11 +12,11 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from sims.core.plain_values import MAX_NAME_LENGTH, MAX_TIMESTAMP_SECONDS, MIN_RUN_SECONDS
 from sims.core.simulator import Array, InputError, make_read_only
 from sims.core.toml_validation import (
     toml_key,
 )
-from sims.core.values import MAX_NAME_LENGTH, MAX_TIMESTAMP_SECONDS, MIN_RUN_SECONDS
 from sims.recording.column_mapping import RecordingSources
 from sims.recording.csv_table import CsvRun
 from sims.recording.log_formats.log_files import LogFile, read_log

@@ -12,9 +12,9 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
+from sims.core.plain_values import is_plausible_number, to_toml_value
 from sims.core.simulator import Array, InputError, make_unknown_name_error, similar
 from sims.core.toml_validation import check_table, format_value
-from sims.core.values import is_plausible_number, to_toml_value
 from sims.recording.column_mapping import SignalSource
 from sims.recording.csv_table import CsvRun, RecordingTable
 from sims.recording.drive_switches import read_switches

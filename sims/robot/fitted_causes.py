@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sims.core.plain_values import append_unit
 from sims.core.simulator import Array
-from sims.core.values import append_unit
 from sims.extended_simulator import FittedValue
 
 if TYPE_CHECKING:

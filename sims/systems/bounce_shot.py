@@ -22,9 +22,9 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from sims.core.effect import Effect
+from sims.core.plain_values import ANGLE_RANGE, GRAVITY_RANGE, LENGTH_RANGE, MASS_RANGE, RATIO_RANGE
 from sims.core.simulator import Array, Channel, Constant, Parameter
 from sims.core.system import StateSnapshot, System, SystemKind
-from sims.core.values import ANGLE_RANGE, GRAVITY_RANGE, LENGTH_RANGE, MASS_RANGE, RATIO_RANGE
 from sims.system_simulator import SystemSimulator
 
 _LEVEL_ONLY = ("force.bias", "force.periodic", "lift.magnus")

@@ -13,6 +13,13 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from sims.core.effect import Effect
+from sims.core.plain_values import (
+    GAIN_RANGE,
+    GRAVITY_RANGE,
+    LENGTH_RANGE,
+    MASS_RANGE,
+    VOLTAGE_RANGE,
+)
 from sims.core.simulator import Array, Channel, Constant, Parameter
 from sims.core.system import (
     DefaultRecording,
@@ -21,13 +28,6 @@ from sims.core.system import (
     StateSnapshot,
     System,
     SystemKind,
-)
-from sims.core.values import (
-    GAIN_RANGE,
-    GRAVITY_RANGE,
-    LENGTH_RANGE,
-    MASS_RANGE,
-    VOLTAGE_RANGE,
 )
 from sims.system_simulator import SystemSimulator
 

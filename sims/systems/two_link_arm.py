@@ -28,8 +28,8 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any
 
+from sims.core.plain_values import GRAVITY_RANGE, INERTIA_RANGE, LENGTH_RANGE
 from sims.core.simulator import Channel, Constant, Parameter
-from sims.core.values import GRAVITY_RANGE, INERTIA_RANGE, LENGTH_RANGE
 from sims.engines.adapters.bullet_world import NO_LIMIT
 from sims.own_simulator import BulletWorld, OwnSimulator
 

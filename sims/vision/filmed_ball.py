@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from sims.core.plain_values import ANGLE_RANGE, IMAGE_SIZE_RANGE, LENGTH_RANGE
 from sims.core.simulator import Array, Channel, Constant, InputError, Parameter, Scenario, Simulator
-from sims.core.values import ANGLE_RANGE, IMAGE_SIZE_RANGE, LENGTH_RANGE
 from sims.systems.ball import Ball, BallSystem
 from sims.vision import video_files
 from sims.vision.pinhole_camera import PinholeCamera

@@ -16,11 +16,11 @@ from time import perf_counter
 
 import numpy as np
 
-from bench.benchmark.comparison import Comparison
+from bench.benchmark.comparison_study import Comparison
 from bench.benchmark.results_report import REQUIRED_RUN_COLUMNS, write_report
 from bench.benchmark.runner.experiment_runner import prepare_experiment
 from bench.benchmark.runner.result_rows import build_rows, make_status
-from bench.benchmark.runner.study_setup import prepare_study
+from bench.benchmark.runner.study_creation import prepare_study
 from bench.benchmark.runner.tuner_loop import RunTrace
 from bench.benchmark.runner.worker_pools import LocalPool
 from bench.benchmark.runner.worker_tasks import RunOutcome

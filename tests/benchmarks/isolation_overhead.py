@@ -24,10 +24,10 @@ from time import perf_counter, process_time
 import numpy as np
 import psutil
 
-from bench.benchmark.isolation.tuner_client import IsolatedRun, IsolatedTuner
+from bench.benchmark.isolation.tuner_proxy import IsolatedRun, IsolatedTuner
 from bench.benchmark.problem.experiment import TunerEntry
 from bench.benchmark.problem.tuning_problem import TuningProblem
-from bench.benchmark.runner import sandboxed_tuner
+from bench.benchmark.runner import tuner_process_reuse
 from bench.benchmark.runner.tuner_loop import ProposalEvaluator, drive_tuner
 from bench.benchmark.runner.tuner_training import build_tuner
 from bench.benchmark.runner.worker_tasks import RunRequest, execute_run, get_problem
@@ -84,8 +84,8 @@ def evaluation(problem, name):
     )  # fmt: skip
     entry = TunerEntry("random", "random")
     found = {"trusted": [], "sealed": [], "harness": []}
-    with sandboxed_tuner.start_isolated_tuner(
-        sandboxed_tuner.make_tuner_spec(entry), 0, "tuner"
+    with tuner_process_reuse.start_isolated_tuner(
+        tuner_process_reuse.make_tuner_spec(entry), 0, "tuner"
     ) as house:
         child = tuners_process()
         beyond = IsolatedRun(house, make_seed_words(*NAMES), 1e9)
@@ -117,7 +117,7 @@ def orders(experiment, tuner):
     target = get_problem(experiment).draw_targets()[0].blinded
     trusted = RunRequest("run", entry, 0, target, 1)
     return trusted, RunRequest(
-        "run", entry, 0, target, 1, tuned=sandboxed_tuner.make_tuner_spec(entry)
+        "run", entry, 0, target, 1, tuned=tuner_process_reuse.make_tuner_spec(entry)
     )
 
 
@@ -152,7 +152,7 @@ def steps(tuned):
     """Return milliseconds to start a process, to build the tuner in it, and to end it."""
     times = [perf_counter()]
     files = [tuned.file] if tuned.file else []
-    child = sandboxed_tuner.get_fork_server().start_process(
+    child = tuner_process_reuse.get_fork_server().start_process(
         "bench.benchmark.isolation.tuner_server:serve_requests", files
     )
     times.append(perf_counter())
@@ -185,7 +185,7 @@ def main():
         python = peer_libraries.environment(Path(place))
         for number in range(ROUNDS):
             # Start a new fork server, because the first run of a worker is measured too.
-            sandboxed_tuner.close_isolated_processes()
+            tuner_process_reuse.close_isolated_processes()
             rounds.append([
                 evaluation(nothing, "none"),
                 evaluation(spring, "spring, 400 samples"),
@@ -202,7 +202,7 @@ def main():
                     },
                     {"peer": "benchopt", "run_ms": peer_libraries.benchopt_run(python, folder)},
                 ]
-    sandboxed_tuner.close_isolated_processes()
+    tuner_process_reuse.close_isolated_processes()
     for rows in zip(*rounds, strict=True):
         print_medians(rows)
 

@@ -20,6 +20,12 @@ from time import perf_counter
 from typing import Any, NamedTuple
 
 from bench.benchmark.isolation import fork_server
+from bench.benchmark.isolation.isolation_errors import (
+    KilledExternallyError,
+    RunEndedError,
+    describe_exit,
+    with_isolation,
+)
 from bench.benchmark.isolation.isolation_layers import PROJECT_ROOT, list_readable_paths
 from bench.benchmark.isolation.message_channel import (
     MAX_TEXT_BYTES,
@@ -28,12 +34,6 @@ from bench.benchmark.isolation.message_channel import (
     PeerClosedError,
     ProtocolError,
     to_printable,
-)
-from bench.benchmark.isolation.process_limits import (
-    KilledExternallyError,
-    RunEndedError,
-    describe_exit,
-    with_isolation,
 )
 from methods.tuner import Array
 from sims.core.files import lock_file

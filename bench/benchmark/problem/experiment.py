@@ -26,6 +26,7 @@ from bench.benchmark.problem.experiment_tables import (
 from bench.benchmark.problem.recorded_runs import resolve_recording_path
 from bench.core.random_streams import check_commitment
 from sims.core.files import is_existing_file
+from sims.core.plain_values import MAX_DESCRIPTION_LENGTH, MAX_NAME_LENGTH, MAX_SAMPLING_RATE_HZ
 from sims.core.simulator import InputError, make_unknown_name_error
 from sims.core.toml_validation import (
     Range,
@@ -37,7 +38,6 @@ from sims.core.toml_validation import (
     make_error,
     read_toml,
 )
-from sims.core.values import MAX_DESCRIPTION_LENGTH, MAX_NAME_LENGTH, MAX_SAMPLING_RATE_HZ
 
 __all__ = [
     "Experiment",

@@ -19,9 +19,9 @@ from bench.benchmark.problem.recorded_runs import find_recording
 from bench.core.plugin_registries import make_robot_simulator, simulators
 from bench.datasets import dataset_catalogue as datasets
 from sims.core.files import is_existing_file, require_file
+from sims.core.plain_values import truncate_text
 from sims.core.registry import PartUnavailableError
 from sims.core.simulator import InputError, Simulator
-from sims.core.values import truncate_text
 from sims.recording.recording import read_recording
 from sims.recording.recording_description import read_model_reference
 from sims.system_simulator import SystemSimulator

@@ -14,9 +14,10 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
+from bench.benchmark.isolation.isolation_errors import RunEndedError
 from bench.benchmark.isolation.linux_syscalls import not_dumpable
-from bench.benchmark.isolation.process_limits import RunEndedError, import_resource_module
-from bench.benchmark.isolation.tuner_client import TunerSpec
+from bench.benchmark.isolation.process_limits import import_resource_module
+from bench.benchmark.isolation.tuner_proxy import TunerSpec
 from bench.benchmark.problem.experiment import Experiment, TunerEntry
 from bench.benchmark.problem.fisher_information import InformationSpectrum
 from bench.benchmark.problem.targets import Redraws, Target, count_redraws
@@ -29,8 +30,8 @@ from bench.benchmark.runner.result_rows import (
     make_status,
     make_unfinished_outcome,
 )
-from bench.benchmark.runner.run_ids import RunIds
-from bench.benchmark.runner.sandboxed_tuner import make_tuner_spec
+from bench.benchmark.runner.run_fingerprint import RunIds
+from bench.benchmark.runner.tuner_process_reuse import make_tuner_spec
 from bench.benchmark.runner.tuner_training import (
     TrainingRequest,
     TrainingResult,

@@ -13,12 +13,12 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any, ClassVar
 
+from bench.benchmark.isolation.isolation_errors import RunEndedError, with_isolation
 from bench.benchmark.isolation.isolation_layers import AccessPolicy
 from bench.benchmark.isolation.message_channel import MessageChannel, to_printable
-from bench.benchmark.isolation.process_limits import RunEndedError, with_isolation
 from bench.benchmark.problem.experiment import Experiment, TunerEntry
 from bench.benchmark.runner.code_digest import compute_digest, find_named_effects, hash_class_source
-from bench.benchmark.runner.sandboxed_tuner import (
+from bench.benchmark.runner.tuner_process_reuse import (
     get_fork_server,
     make_tuner_spec,
     retry_if_killed,

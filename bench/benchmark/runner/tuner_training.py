@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bench.benchmark.isolation.isolation_errors import RunEndedError
 from bench.benchmark.isolation.message_channel import (
     MAX_STATE_BYTES,
     Message,
@@ -31,9 +32,8 @@ from bench.benchmark.isolation.message_channel import (
     to_printable,
     unpack_arrays,
 )
-from bench.benchmark.isolation.process_limits import RunEndedError
-from bench.benchmark.isolation.tuner_client import TunerSpec, relocate
 from bench.benchmark.isolation.tuner_processes import IsolatedProcess
+from bench.benchmark.isolation.tuner_proxy import TunerSpec, relocate
 from bench.benchmark.problem.experiment import Experiment, TunerEntry
 from bench.benchmark.problem.robot_experiment import get_simulator_class
 from bench.benchmark.problem.training_simulator import CountedTrainingSimulator, RandomisedSimulator
@@ -48,7 +48,7 @@ from bench.benchmark.runner.code_digest import (
     hash_source_folders,
     select_relevant_keys,
 )
-from bench.benchmark.runner.sandboxed_tuner import retry_if_killed, start_isolated_tuner
+from bench.benchmark.runner.tuner_process_reuse import retry_if_killed, start_isolated_tuner
 from bench.core.plugin_registries import tuners
 from bench.core.random_streams import make_seed_words
 from methods.tuner import BudgetExceededError, TrainingCallback, TrainingSimulator, Tuner

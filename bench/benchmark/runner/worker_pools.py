@@ -22,7 +22,7 @@ from dataclasses import dataclass, field
 from time import monotonic
 from typing import TYPE_CHECKING, Any, Protocol
 
-from bench.benchmark.isolation.process_limits import describe_exit
+from bench.benchmark.isolation.isolation_errors import describe_exit
 from bench.benchmark.runner.worker_setup import (
     THREAD_COUNT_VARIABLES,
     WorkerContext,

@@ -17,13 +17,13 @@ from time import perf_counter
 
 import numpy as np
 
-from bench.benchmark.isolation.process_limits import RunEndedError, limited_memory
-from bench.benchmark.isolation.tuner_client import IsolatedRun, TunerSpec, relocate
+from bench.benchmark.isolation.isolation_errors import RunEndedError
+from bench.benchmark.isolation.process_limits import limited_memory
 from bench.benchmark.isolation.tuner_processes import NOTHING_WRITTEN, Written
+from bench.benchmark.isolation.tuner_proxy import IsolatedRun, TunerSpec, relocate
 from bench.benchmark.problem.experiment import Experiment, TunerEntry
 from bench.benchmark.problem.targets import BlindedTarget
 from bench.benchmark.problem.tuning_problem import TuningProblem
-from bench.benchmark.runner.sandboxed_tuner import retry_if_killed, start_isolated_tuner
 from bench.benchmark.runner.tuner_loop import (
     Evaluate,
     ProposalEvaluator,
@@ -31,6 +31,7 @@ from bench.benchmark.runner.tuner_loop import (
     TunerRun,
     drive_tuner,
 )
+from bench.benchmark.runner.tuner_process_reuse import retry_if_killed, start_isolated_tuner
 from bench.benchmark.runner.tuner_training import (
     NOT_REPRODUCIBLE_REASON,
     build_tuner,

@@ -41,9 +41,9 @@ from sims.core.files import (
     make_timestamped_path,
     write_atomically,
 )
+from sims.core.plain_values import to_toml_value
 from sims.core.simulator import InputError
 from sims.core.toml_validation import check_entries, format_value, read_toml
-from sims.core.values import to_toml_value
 from sims.engines import describe_stepping
 
 if TYPE_CHECKING:

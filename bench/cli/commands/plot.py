@@ -58,8 +58,8 @@ def _run_plot(options: argparse.Namespace, print_line: PrintLine) -> CommandResu
     from bench.benchmark.runner.plugin_discovery import load_plugins_for_experiment
     from bench.benchmark.storage.reference_results import find_reference
     from bench.studies.study import list_study_folders, open_study
-    from bench.studies.suite.suite_page import report_suite
-    from bench.studies.suite.suite_runs import is_stored_suite
+    from bench.suite.suite_page import report_suite
+    from bench.suite.suite_runs import is_stored_suite
     from sims.core.simulator import InputError
 
     if len(options.runs) == 1 and is_stored_suite(options.runs[0]):
@@ -78,8 +78,8 @@ def _run_plot(options: argparse.Namespace, print_line: PrintLine) -> CommandResu
         return _report_again(options.runs[0], references, print_line)
     if not options.out:
         raise InputError("several comparisons have a joint result: give its folder with --out DIR")
-    from bench.benchmark.comparison import Comparison
-    from bench.benchmark.multi_problem import compare_across_problems
+    from bench.benchmark.comparison_study import Comparison
+    from bench.suite.multi_problem_statistics import compare_across_problems
 
     for folder in options.runs:
         if not isinstance(study := open_study(folder), Comparison):

@@ -57,7 +57,7 @@ def _run_status(options: argparse.Namespace, print_line: PrintLine) -> CommandRe
 def _print_isolation_layers(print_line: PrintLine) -> list[JsonDocument]:
     """Print which isolation layers are available on this machine."""
     from bench.benchmark.isolation.isolation_layers import ISOLATION_LAYERS
-    from bench.benchmark.runner.sandboxed_tuner import list_active_isolation_layers
+    from bench.benchmark.runner.tuner_process_reuse import list_active_isolation_layers
 
     active_layers = list_active_isolation_layers()
     print_line("isolation layers of a tuner's process on this machine (docs/isolation.md)")

@@ -35,9 +35,10 @@ def _run_verify(options: argparse.Namespace, print_line: PrintLine) -> CommandRe
         The JSON document of the command, and its exit code; EXIT_PROBLEMS_FOUND if a number does
         not follow from the others.
     """
-    from bench.studies.archive_bundle import VERDICT_FILE, verify_archive, verify_explanation
+    from bench.studies.archive_bundle import verify_archive
+    from bench.studies.comparison_verification import verify_comparison
+    from bench.studies.explanation_verification import VERDICT_FILE, verify_explanation
     from bench.studies.study import list_study_folders
-    from bench.studies.verification import verify_comparison
 
     if options.run.is_file():
         archived = verify_archive(options.run, print_line, options.plugin, options.all)

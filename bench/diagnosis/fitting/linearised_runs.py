@@ -10,7 +10,7 @@ from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.gauss_newton import is_finite_response
 from sims.core.simulator import Array
-from sims.robot.dynamics.run_linearisation import RunLinearisation
+from sims.robot.dynamics.linearisation_about_simulation import RunLinearisation
 from sims.robot.dynamics.series_joints import is_series_effect
 from sims.robot.robot_simulator import RobotSimulator
 

@@ -1,8 +1,8 @@
 """Responses of the innovations to every candidate effect, carried through the filter's recursion.
 
 With gain K and whitener W of the filter (`bench.diagnosis.kalman.filter_and_smoother`), a unit of
-candidate k, which adds b to states and ψ to readings (`dynamics.measured_linearisation`, eqs. (3)
-and (4)), changes the predicted state by s and the whitened innovations by -w:
+candidate k, which adds b to states and ψ to readings (`dynamics.linearisation_about_recording`,
+eqs. (3) and (4)), changes the predicted state by s and the whitened innovations by -w:
 
     u_i = ψ_i + H_i s_i,    w_i = W_i u_i,    s_{i+1} = A_i (s_i - K_i u_i) + b_i               (1)
 
@@ -41,8 +41,12 @@ from sims.core.effect import Effect, members_of
 from sims.core.simulator import Array
 from sims.robot.dynamics.effect_forces import TIME_DEPENDENT_EFFECTS
 from sims.robot.dynamics.inverse_dynamics import compute_floating_forces, compute_joint_scales
-from sims.robot.dynamics.measured_linearisation import MeasuredLinear, SingleArray, Trajectory
-from sims.robot.dynamics.run_linearisation import compute_control_changes
+from sims.robot.dynamics.linearisation_about_recording import (
+    MeasuredLinear,
+    SingleArray,
+    Trajectory,
+)
+from sims.robot.dynamics.linearisation_about_simulation import compute_control_changes
 from sims.robot.robot_simulator import RobotSimulator
 
 POSITION_PRIOR, VELOCITY_PRIOR = 1.0, 0.3

@@ -1,7 +1,7 @@
 """Kalman filter and smoother about a measured motion, with process noise by maximum likelihood.
 
 All runs are filtered side by side. With δ the deviation of the state from the motion about which
-the model is linear (`dynamics.measured_linearisation`, eqs. (3) and (4)), and r[i] = y[i] -
+the model is linear (`dynamics.linearisation_about_recording`, eqs. (3) and (4)), and r[i] = y[i] -
 h(x̄[i]),
 
     δ-[i+1] = A_i δ[i] - d_i,        P-[i+1] = A_i P[i] A_iᵀ + G_i Q G_iᵀ + J_i                (1)
@@ -41,7 +41,7 @@ from numpy.typing import NDArray
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.kalman.compiled_recursions import filter_recursion, smoother_recursion
 from sims.core.simulator import Array
-from sims.robot.dynamics.measured_linearisation import IntervalMaps
+from sims.robot.dynamics.linearisation_about_recording import IntervalMaps
 
 Mask = NDArray[np.bool_]
 IndexArray = NDArray[np.intp]

@@ -46,7 +46,7 @@ from bench.diagnosis.prediction_error.selection_fits import (
     MIN_FURTHER_GAIN_SHARE,
 )
 from bench.diagnosis.search.candidate_directions import CandidateDirection
-from bench.diagnosis.search.refit_starts import add_effect_to_start
+from bench.diagnosis.search.start_selection import add_effect_to_start
 from sims.core.simulator import Array
 
 MIN_SECONDS = 8.0

@@ -67,8 +67,8 @@ from bench.diagnosis.prediction_error.simulated_fits import (
 )
 from bench.diagnosis.search.candidate_directions import DirectionSet
 from bench.diagnosis.search.effect_search import EffectSearch
-from bench.diagnosis.search.refit_starts import add_effect_to_start
 from bench.diagnosis.search.score_test import CandidateScores
+from bench.diagnosis.search.start_selection import add_effect_to_start
 from bench.diagnosis.search.verdict_rules import EFFECT_P_VALUE_THRESHOLD
 from sims.core.simulator import Array
 

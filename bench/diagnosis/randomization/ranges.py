@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from bench.diagnosis.extended_robot_files import collect_causes
 from bench.diagnosis.verdict import Verdict
 from bench.pages.text_format import joined
-from sims.core.values import append_unit
+from sims.core.plain_values import append_unit
 from sims.extended_simulator import ExtendedSimulator, FittedValue
 
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ from bench.pages.text_format import sanitise as sanitise
 from sims import effects
 
 # All text functions of explain's pages are imported from this module, including the shared ones.
-from sims.core import values
+from sims.core import plain_values
 from sims.core.simulator import InputError
 from sims.extended_simulator import FittedValue
 
@@ -139,7 +139,7 @@ def format_sentence(text: object) -> str:
 
 def format_unit(unit: str) -> str:
     """Format a unit from a file for print, such as ``kg·m²``; empty for a pure number."""
-    return values.format_unit(sanitise(unit, 60))
+    return plain_values.format_unit(sanitise(unit, 60))
 
 
 def format_label(name: str, unit: str, max_length: int = 30) -> str:
@@ -159,7 +159,7 @@ def format_label(name: str, unit: str, max_length: int = 30) -> str:
 
 def append_unit(text: str, unit: str) -> str:
     """Append a unit to a number."""
-    return values.append_unit(text, sanitise(unit, 60))
+    return plain_values.append_unit(text, sanitise(unit, 60))
 
 
 def format_fitted_value(fitted: FittedValue) -> str:

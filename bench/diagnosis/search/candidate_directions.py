@@ -1,4 +1,4 @@
-"""Candidate effects: their sensitivity directions along the trajectories, and starts of fits.
+"""Sensitivity directions of candidate effects along the trajectories.
 
 The coefficients of an effect scale it (a drag), shape it (a period), or modify it (a wind speed,
 which only matters if there is drag). Each scaling coefficient gives one direction. Shape parameters
@@ -23,18 +23,17 @@ import numpy as np
 
 from bench.diagnosis.evaluation.coefficient_bounds import (
     MIN_CYCLES_PER_RUN,
-    compute_coefficient_bounds,
 )
 from bench.diagnosis.evaluation.noise_model import Mask
 from bench.diagnosis.evaluation.run_data import MAX_DECAY_FACTOR, is_instant
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.diagnosis.fitting.fit_state import FitStart, TrajectoryFit
+from bench.diagnosis.fitting.fit_state import TrajectoryFit
 from bench.diagnosis.fitting.gauss_newton import is_finite_response
 from bench.diagnosis.search.initial_values import (
     EVENT_TIME_COUNT,
     compute_reachable_levels,
     generate_end_stops,
-    generate_equal_travel_end_stops,
+    is_period,
     list_coefficients,
 )
 from sims.core.effect import ALL_PLACES, members_of
@@ -77,10 +76,6 @@ END_STOP_DEPTH_SHARES = (0.005, 0.02, 0.08, 0.2)
 """Depths of end stops that are tried, as shares of the range of the coordinate."""
 END_STOP_STIFFNESS_SHARES = (0.003, 0.03, 0.3, 3.0)
 """Stiffnesses of end stops that are tried, as shares of the largest plausible one."""
-EVENT_TIME_SHIFTS_SAMPLES = (-8, -4, -2, -1, 1, 2, 4, 8)
-"""Shifts of the time of a single event that are tried, in samples."""
-FREQUENCY_SHIFTS_CYCLES = (-1.0, -0.5, 0.5, 1.0)
-"""Shifts of a frequency or period that are tried, in cycles over the longest run."""
 
 
 @dataclass(frozen=True)
@@ -313,7 +308,7 @@ def _make_shape_grid(
         min_frequency = max(low, MIN_CYCLES_PER_RUN / evaluator.longest_duration)
         lowest_frequency = min(min_frequency, high / 2.0)
         return _make_frequency_grid(lowest_frequency, high, evaluator.longest_duration)
-    if _is_period(parameter, travel):
+    if is_period(parameter, travel):
         frequencies = _make_frequency_grid(1.0 / high, 1.0 / low, travel)
         return 1.0 / frequencies
     if is_instant(parameter):
@@ -326,64 +321,6 @@ def _make_shape_grid(
         high = max(min(high, MAX_DECAY_FACTOR * evaluator.longest_duration), 2.0 * low)
         return np.geomspace(low, high, int(np.ceil(np.log2(high / low))) + 1)
     return np.geomspace(low, high, SHAPE_GRID_SIZE)
-
-
-def _is_period(parameter: Parameter, travel: float) -> bool:
-    """Return whether a coefficient is a period over position (in m or rad), and the position moves.
-
-    `travel` is the largest range of the position within one run.
-    """
-    return parameter.name.endswith(".period") and travel > 0
-
-
-def generate_frequency_neighbours(
-    evaluator: RunEvaluator, fit: TrajectoryFit
-) -> Iterator[FitStart]:
-    """Yield starts with shifted periodic effects, event times and end stops.
-
-    Least squares stops at the nearest of the many local minima that such effects have.
-
-    Args:
-        evaluator: the runs.
-        fit: the fitted model.
-    """
-    for name in fit.effects:
-        for c in generate_equal_travel_end_stops(
-            evaluator, name, fit.theta[evaluator.coefficient_slices[name]]
-        ):
-            theta = fit.theta.copy()
-            theta[evaluator.coefficient_slices[name]] = c
-            yield FitStart(fit.effects, theta, fit.initial_states)
-        bounds = compute_coefficient_bounds(evaluator, name)
-        for i, index in enumerate(evaluator.get_coefficient_indices(name)):
-            parameter = evaluator.parameters[index]
-            value = float(fit.theta[index])
-            for shifted_value in _shift_frequency_or_time(
-                evaluator, parameter, value, evaluator.get_effect_travel(name)
-            ):
-                theta = fit.theta.copy()
-                theta[index] = np.clip(shifted_value, *bounds[i])
-                yield FitStart(fit.effects, theta, fit.initial_states)
-
-
-def _shift_frequency_or_time(
-    evaluator: RunEvaluator, parameter: Parameter, value: float, travel: float
-) -> Iterator[float]:
-    """Yield shifted values of a frequency, a period or an event time; nothing for others.
-
-    Frequencies and periods are shifted by parts of a cycle, event times by samples.
-    """
-    if is_instant(parameter):
-        for samples in EVENT_TIME_SHIFTS_SAMPLES:
-            yield value + samples * evaluator.sample_interval
-    for cycles in FREQUENCY_SHIFTS_CYCLES:
-        if parameter.unit == "Hz":
-            yield value + cycles / evaluator.longest_duration
-        elif _is_period(parameter, travel) and value > 0:
-            frequency = 1.0 / value + cycles / travel
-            # Beyond the longest period, the frequency might become negative.
-            lowest = 1.0 / parameter.bounds[1]
-            yield 1.0 / max(frequency, lowest)
 
 
 def _make_frequency_grid(low: float, high: float, extent: float) -> Array:

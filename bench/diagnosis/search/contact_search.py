@@ -16,8 +16,8 @@ import numpy as np
 from bench.diagnosis.fitting.model_set import FittedModel
 from bench.diagnosis.search.candidate_directions import iterate_first_probes
 from bench.diagnosis.search.effect_search import MAX_P_VALUE_FURTHER_EFFECT, EffectSearch
-from bench.diagnosis.search.refit_starts import select_refit_starts
 from bench.diagnosis.search.score_test import SHAPE_COUNT_FOR_MULTISTART
+from bench.diagnosis.search.start_selection import select_refit_starts
 from sims.core.simulator import Array
 
 MAX_COMPETITOR_SIZE = 2.0

@@ -1,4 +1,4 @@
-"""Initial values of effect coefficients: levels that signals reach, end stops, and event times."""
+"""Initial values of effect coefficients: levels of signals, end stops, frequencies, event times."""
 
 from __future__ import annotations
 
@@ -7,8 +7,10 @@ from itertools import product
 
 import numpy as np
 
+from bench.diagnosis.evaluation.coefficient_bounds import compute_coefficient_bounds
 from bench.diagnosis.evaluation.run_data import RunData, is_instant
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.fitting.fit_state import FitStart, TrajectoryFit
 from sims.core.effect import Effect, members_of
 from sims.core.simulator import Array, Parameter
 
@@ -24,6 +26,12 @@ MIN_PROFILE_SECONDS = 0.05
 """Duration in seconds below which the motion profile of a servo is hardly visible."""
 MAX_EVENT_TIME_SUBDIVISIONS = 16
 """Maximum number of times between two tried event times at which a fit starts."""
+
+
+EVENT_TIME_SHIFTS_SAMPLES = (-8, -4, -2, -1, 1, 2, 4, 8)
+"""Shifts of the time of a single event that are tried, in samples."""
+FREQUENCY_SHIFTS_CYCLES = (-1.0, -0.5, 0.5, 1.0)
+"""Shifts of a frequency or period that are tried, in cycles over the longest run."""
 
 
 def list_coefficients(evaluator: RunEvaluator, name: str) -> Sequence[Parameter]:
@@ -244,3 +252,61 @@ def generate_event_times(evaluator: RunEvaluator, name: str, c: Array) -> Iterat
             coefficients = c.copy()
             coefficients[i] = instant
             yield coefficients
+
+
+def generate_frequency_neighbours(
+    evaluator: RunEvaluator, fit: TrajectoryFit
+) -> Iterator[FitStart]:
+    """Yield starts with shifted periodic effects, event times and end stops.
+
+    Least squares stops at the nearest of the many local minima that such effects have.
+
+    Args:
+        evaluator: the runs.
+        fit: the fitted model.
+    """
+    for name in fit.effects:
+        for c in generate_equal_travel_end_stops(
+            evaluator, name, fit.theta[evaluator.coefficient_slices[name]]
+        ):
+            theta = fit.theta.copy()
+            theta[evaluator.coefficient_slices[name]] = c
+            yield FitStart(fit.effects, theta, fit.initial_states)
+        bounds = compute_coefficient_bounds(evaluator, name)
+        for i, index in enumerate(evaluator.get_coefficient_indices(name)):
+            parameter = evaluator.parameters[index]
+            value = float(fit.theta[index])
+            for shifted_value in _shift_frequency_or_time(
+                evaluator, parameter, value, evaluator.get_effect_travel(name)
+            ):
+                theta = fit.theta.copy()
+                theta[index] = np.clip(shifted_value, *bounds[i])
+                yield FitStart(fit.effects, theta, fit.initial_states)
+
+
+def _shift_frequency_or_time(
+    evaluator: RunEvaluator, parameter: Parameter, value: float, travel: float
+) -> Iterator[float]:
+    """Yield shifted values of a frequency, a period or an event time; nothing for others.
+
+    Frequencies and periods are shifted by parts of a cycle, event times by samples.
+    """
+    if is_instant(parameter):
+        for samples in EVENT_TIME_SHIFTS_SAMPLES:
+            yield value + samples * evaluator.sample_interval
+    for cycles in FREQUENCY_SHIFTS_CYCLES:
+        if parameter.unit == "Hz":
+            yield value + cycles / evaluator.longest_duration
+        elif is_period(parameter, travel) and value > 0:
+            frequency = 1.0 / value + cycles / travel
+            # Beyond the longest period, the frequency might become negative.
+            lowest = 1.0 / parameter.bounds[1]
+            yield 1.0 / max(frequency, lowest)
+
+
+def is_period(parameter: Parameter, travel: float) -> bool:
+    """Return whether a coefficient is a period over position (in m or rad), and the position moves.
+
+    `travel` is the largest range of the position within one run.
+    """
+    return parameter.name.endswith(".period") and travel > 0

@@ -18,7 +18,6 @@ from bench.diagnosis.evaluation.search_control import SearchStoppedError
 from bench.diagnosis.fitting.fit_state import FitStart
 from bench.diagnosis.fitting.model_set import FittedModel
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
-from bench.diagnosis.search.candidate_directions import generate_frequency_neighbours
 from bench.diagnosis.search.contact_search import search_in_contact
 from bench.diagnosis.search.effect_search import (
     FAR_EXCESS,
@@ -27,6 +26,7 @@ from bench.diagnosis.search.effect_search import (
     EffectSearch,
     select_by_size,
 )
+from bench.diagnosis.search.initial_values import generate_frequency_neighbours
 from bench.diagnosis.search.lack_of_fit import assess_lack_of_fit
 
 MAX_COMPETITOR_DISTANCE = 30.0

@@ -7,12 +7,15 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.logs.importing.column_assignment import ColumnAssigner
 from bench.logs.importing.description_text import DescriptionWriter
 from bench.logs.importing.import_result import POSITION_UNITS, ImportOptions, ImportResult
 from bench.logs.importing.joint_order import assign_order
 from bench.logs.importing.run_logs import RunLogs, group_logs_by_run
-from bench.logs.importing.signal_assignment import SignalAssignment, assign_velocities
+from bench.logs.importing.signal_assignment import (
+    ColumnAssigner,
+    SignalAssignment,
+    assign_velocities,
+)
 from bench.logs.recording_loading import load_recording
 from sims.core.files import write_files
 from sims.core.simulator import InputError

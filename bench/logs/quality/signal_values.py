@@ -9,8 +9,8 @@ import numpy as np
 
 from bench.logs.quality.noise_estimation import estimate_noise
 from bench.logs.quality.quality_finding import QualityFinding, format_names
+from sims.core.plain_values import append_unit
 from sims.core.simulator import Array, Channel, Simulator
-from sims.core.values import append_unit
 from sims.recording.recording import Recording, Run
 from sims.system_simulator import SystemSimulator
 

@@ -15,8 +15,8 @@ from sims.core.engine import Engine, IntegrationBatch, Trajectories
 from sims.core.simulator import InputError
 from sims.core.system import System
 from sims.engines.adapters import bullet_world
-from sims.engines.external import ball_rollout, joint_rollout, native_contact
-from sims.engines.external.ball_rollout import BallState
+from sims.engines.external import ball_integration, joint_integration
+from sims.engines.external.ball_integration import BallState
 from sims.engines.external.external_engine import (
     RolloutFunction,
     Vector,
@@ -134,12 +134,12 @@ class BulletEngine:
         self._world = bullet_world.PersistentBulletWorld(build)
         if native_settings is not None:
             native_ball = BulletNativeBall(self._world, native_settings)
-            self._rollout = partial(native_contact.integrate_native_ball, native_ball)
+            self._rollout = partial(ball_integration.integrate_native_ball, native_ball)
         elif system.bounces:
-            self._rollout = partial(ball_rollout.integrate_ball, BulletBall(self._world))
+            self._rollout = partial(ball_integration.integrate_ball, BulletBall(self._world))
         else:
             joint = bullet_world.BulletJoint(self._world, cast(BulletJointWorldModule, module))
-            self._rollout = partial(joint_rollout.integrate_joint, joint)
+            self._rollout = partial(joint_integration.integrate_joint, joint)
 
     def integrate(self, batch: IntegrationBatch) -> Trajectories:
         """Integrate all batch elements; see `Engine`."""
@@ -157,7 +157,7 @@ class BulletEngine:
 
 
 class _BulletMover:
-    """Free ball; see `sims.engines.external.ball_rollout.BallBody`."""
+    """Free ball; see `sims.engines.external.ball_integration.BallBody`."""
 
     def __init__(self, world: bullet_world.PersistentBulletWorld) -> None:
         """Start without a body; NaN and -1 are values that must be set before the first step."""
@@ -233,7 +233,7 @@ class _BulletMover:
 class BulletBall(_BulletMover):
     """Ball without spin, on ground with restitution and friction 1.
 
-    See `sims.engines.external.ball_rollout.BallWithImpacts`.
+    See `sims.engines.external.ball_integration.BallWithImpacts`.
     """
 
     def reset_world(self, constants: dict[str, float]) -> None:
@@ -245,7 +245,8 @@ class BulletBall(_BulletMover):
 
     def _set_contact(self, ground: bool) -> None:
         """Switch contact between ball and ground on or off."""
-        # Contact is off in flight, because `ball_rollout` computes when the ball meets the ground.
+        # Contact is off in flight, because `ball_integration` computes when the ball meets the
+        # ground.
         p = bullet_world.import_pybullet()
         floor = p.getBodyUniqueId(0, self._client)
         p.setCollisionFilterPair(floor, self._body, -1, -1, ground, self._client)
@@ -263,7 +264,7 @@ class BulletBall(_BulletMover):
         self.set_step(_IMPACT_STEP_SECONDS)
         # Bullet adds gravity's velocity change of the step before it solves the contact. This is
         # compensated, so that the solver sees v.
-        contact_position = x[0], x[1], self._floor - ball_rollout.CONTACT_PENETRATION
+        contact_position = x[0], x[1], self._floor - ball_integration.CONTACT_PENETRATION
         self.set_state(contact_position, (v[0], v[1], v[2] + self._gravity * _IMPACT_STEP_SECONDS))
         self._set_contact(True)
         _, velocity = self.advance_freely((1,))[0]

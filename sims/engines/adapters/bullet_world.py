@@ -151,7 +151,7 @@ def create_jointed_body(
 
 
 class BulletJoint:
-    """Body on one hinge or guide; see `sims.engines.external.joint_rollout.JointBody`."""
+    """Body on one hinge or guide; see `sims.engines.external.joint_integration.JointBody`."""
 
     def __init__(self, world: PersistentBulletWorld, module: BulletJointWorldModule) -> None:
         """Take the load and gravity functions of the system's world module."""

@@ -30,8 +30,8 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from sims.engines.external import ball_rollout
-from sims.engines.external.ball_rollout import BallState
+from sims.engines.external import ball_integration
+from sims.engines.external.ball_integration import BallState
 from sims.engines.external.external_engine import Vector
 from sims.engines.external.world_interface import MujocoJointWorldModule
 
@@ -79,7 +79,7 @@ class CompiledWorld:
             mujoco = import_mujoco()
             self._model = mujoco.MjModel.from_xml_string(self._compile(constants))
             disabled = mujoco.mjtDisableBit
-            # Joint damping is explicit, as in Bullet and as `external.joint_rollout` assumes.
+            # Joint damping is explicit, as in Bullet and as `external.joint_integration` assumes.
             self._model.opt.disableflags |= disabled.mjDSBL_EULERDAMP
             # A failed element must become NaN; otherwise MuJoCo would reset it, and it would look
             # finished.
@@ -96,7 +96,7 @@ class CompiledWorld:
 
 
 class MujocoJoint:
-    """Body on one hinge or guide; see `sims.engines.external.joint_rollout.JointBody`."""
+    """Body on one hinge or guide; see `sims.engines.external.joint_integration.JointBody`."""
 
     def __init__(self, world: CompiledWorld, module: MujocoJointWorldModule) -> None:
         """Take the load and gravity functions of the system's world module."""
@@ -151,7 +151,7 @@ class MujocoJoint:
 
 
 class MujocoMover:
-    """Ball on three slide joints; see `sims.engines.external.ball_rollout.BallBody`."""
+    """Ball on three slide joints; see `sims.engines.external.ball_integration.BallBody`."""
 
     def __init__(self, world: CompiledWorld) -> None:
         self._world = world
@@ -219,7 +219,7 @@ class MujocoMover:
 class MujocoBall(MujocoMover):
     """Ball whose impact MuJoCo's contact solves in one step.
 
-    See `sims.engines.external.ball_rollout.BallWithImpacts`.
+    See `sims.engines.external.ball_integration.BallWithImpacts`.
     """
 
     def reset_world(self, constants: dict[str, float]) -> None:
@@ -246,7 +246,7 @@ class MujocoBall(MujocoMover):
         """
         self._is_supported = False
         self.set_step(_IMPACT_STEP_SECONDS)
-        self.set_state((x[0], x[1], self._floor - ball_rollout.CONTACT_PENETRATION), v)
+        self.set_state((x[0], x[1], self._floor - ball_integration.CONTACT_PENETRATION), v)
         self._set_contact_parameters(0.0, (1.0 + restitution) * self._inverse_step)  # (3)
         # The impact removes tangential speed mu (1 + e) |vn| (`engines.ground_contact`), in
         # this one step.
@@ -276,7 +276,7 @@ _MAX_DAMPING_RATIO = 2.0
 
 
 class MujocoSoftBall(MujocoMover):
-    """Ball on MuJoCo's soft contact; see `sims.engines.external.native_contact.NativeContactBall`.
+    """Ball on MuJoCo's soft contact; see `external.ball_integration.NativeContactBall`.
 
     Friction is applied as a force: a fraction of the normal force of the previous step.
     """

@@ -13,9 +13,9 @@ from functools import partial
 from typing import cast
 
 from sims.core.engine import Engine, IntegrationBatch, Trajectories
+from sims.core.plain_values import truncate_text
 from sims.core.simulator import InputError
 from sims.core.system import System
-from sims.core.values import truncate_text
 from sims.engines.adapters.mujoco_bodies import (
     CompiledWorld,
     MujocoBall,
@@ -23,7 +23,7 @@ from sims.engines.adapters.mujoco_bodies import (
     MujocoSoftBall,
     import_mujoco,
 )
-from sims.engines.external import ball_rollout, joint_rollout, native_contact
+from sims.engines.external import ball_integration, joint_integration
 from sims.engines.external.external_engine import (
     RolloutFunction,
     integrate_batch,
@@ -60,7 +60,7 @@ def make_engine(
             divided into equal steps not longer than this.
         native_contact: for a bouncing system: use MuJoCo's soft contact, a spring and a damper
             whose damping is chosen for the restitution, stepped and read at first order
-            (`sims.engines.external.native_contact`).
+            (`sims.engines.external.ball_integration`).
         stiffness: with `native_contact`: stiffness of the contact in 1/s^2 (1e5: contacts of 10
             ms).
         threads: number of threads, each of which steps some batch elements; the results do not
@@ -130,12 +130,12 @@ class MujocoEngine:
             rollout: RolloutFunction
             if stiffness is not None:
                 soft_ball = MujocoSoftBall(world, stiffness)
-                rollout = partial(native_contact.integrate_native_ball, soft_ball)
+                rollout = partial(ball_integration.integrate_native_ball, soft_ball)
             elif system.bounces:
-                rollout = partial(ball_rollout.integrate_ball, MujocoBall(world))
+                rollout = partial(ball_integration.integrate_ball, MujocoBall(world))
             else:
                 joint = MujocoJoint(world, cast(MujocoJointWorldModule, module))
-                rollout = partial(joint_rollout.integrate_joint, joint)
+                rollout = partial(joint_integration.integrate_joint, joint)
             self._rollouts.append(rollout)
 
     def integrate(self, batch: IntegrationBatch) -> Trajectories:

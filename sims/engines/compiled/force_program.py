@@ -38,7 +38,7 @@ from sims.engines.compiled.expression_graph import (
 )
 from sims.engines.compiled.kernel import get_kernel
 from sims.engines.compiled.numpy_forces import NUMPY_BLOCK_WIDTH, NumpyForces, lay_out_registers
-from sims.engines.compiled.traced_array import TracedArray
+from sims.engines.compiled.traced_array import TracedArray, collect_nodes, make_input_vector
 
 MAX_REGISTERS = 4000
 """Maximum number of registers of a program."""
@@ -369,22 +369,3 @@ def _sort_nodes(outputs: Sequence[ExpressionNode]) -> list[ExpressionNode]:
             stack.append((node, True))
             stack += [(arg, False) for arg in reversed(node.args)]
     return list(order)
-
-
-def make_input_vector(graph: ExpressionGraph, size: int, changes: int) -> Any:
-    """Return a traced array (1, size) of new inputs with this change frequency.
-
-    Args:
-        graph: graph that contains the nodes.
-        size: number of inputs.
-        changes: change frequency.
-    """
-    nodes = np.empty((1, size), dtype=object)
-    for k in range(size):
-        nodes[0, k] = graph.make_input(changes)
-    return TracedArray(graph, nodes)
-
-
-def collect_nodes(*arrays: TracedArray) -> list[ExpressionNode]:
-    """Return all nodes of traced arrays, in order."""
-    return [node for array in arrays for node in array.nodes.ravel()]

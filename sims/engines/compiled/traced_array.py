@@ -344,3 +344,22 @@ _FUNCTIONS: dict[str, Callable[..., TracedArray]] = {
     "ones_like": lambda x, **_: _fill_like(x, 1.0),
     "full_like": lambda x, value, **_: _fill_like(x, float(value)),
 }
+
+
+def make_input_vector(graph: ExpressionGraph, size: int, changes: int) -> Any:
+    """Return a traced array (1, size) of new inputs with this change frequency.
+
+    Args:
+        graph: graph that contains the nodes.
+        size: number of inputs.
+        changes: change frequency.
+    """
+    nodes = np.empty((1, size), dtype=object)
+    for k in range(size):
+        nodes[0, k] = graph.make_input(changes)
+    return TracedArray(graph, nodes)
+
+
+def collect_nodes(*arrays: TracedArray) -> list[ExpressionNode]:
+    """Return all nodes of traced arrays, in order."""
+    return [node for array in arrays for node in array.nodes.ravel()]

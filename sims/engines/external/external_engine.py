@@ -14,9 +14,9 @@ doi:10.1017/S0962492902000144), with a(x) the acceleration at x:
 
     w = v - h/2 a(x)                                                       (3)
 
-`external.joint_rollout` and `external.ball_rollout` read it in this way: they choose F such that
-the engine's velocity becomes the velocity at x plus half a step of acceleration. Forces are those
-of a force program (`external.external_engine`).
+`external.joint_integration` and `external.ball_integration` read it in this way: they choose F such
+that the engine's velocity becomes the velocity at x plus half a step of acceleration. Forces are
+those of a force program (`external.external_engine`).
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ import numpy as np
 
 from sims.core.effect import ActiveEffects, Contact, Force, Friction
 from sims.core.engine import IntegrationBatch, Trajectories
+from sims.core.plain_values import is_plausible_number, truncate_text
 from sims.core.simulator import Array, Indices, InputError
 from sims.core.system import StateSnapshot, System
-from sims.core.values import is_plausible_number, truncate_text
 from sims.engines.compiled.compilability import get_force_program
 from sims.engines.compiled.data_layout import (
     BOUNCES,

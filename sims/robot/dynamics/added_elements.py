@@ -17,8 +17,8 @@ from sims.robot.coupled_drives import (
     make_coupled_robot,
 )
 from sims.robot.dynamics.series_joints import SeriesJoints, add_series_joints, is_series_effect
+from sims.robot.model_simplification import strip_shapes
 from sims.robot.mujoco_messages import format_mujoco_error
-from sims.robot.reduced_model import strip_shapes
 from sims.robot.robot_model import RobotModel, cache_per_robot
 
 CONTACT_PAIR = "contact"

@@ -25,13 +25,9 @@ from sims.engines.compiled.expression_graph import (
     ExpressionGraph,
     NotTraceableError,
 )
-from sims.engines.compiled.force_program import (
-    InstructionList,
-    collect_nodes,
-    emit_instructions,
-    make_input_vector,
-)
+from sims.engines.compiled.force_program import InstructionList, emit_instructions
 from sims.engines.compiled.kernel import get_kernel
+from sims.engines.compiled.traced_array import collect_nodes, make_input_vector
 from sims.robot.dynamics.effect_forces import (
     EffectForces,
     compute_effect_forces,

@@ -46,9 +46,9 @@ from sims.robot.model_field_effects import (
     MODEL_FIELD_EFFECTS,
     get_write_order,
 )
+from sims.robot.model_simplification import strip_assets
 from sims.robot.mujoco_messages import format_mujoco_error
 from sims.robot.parsing import collision_hulls
-from sims.robot.reduced_model import strip_assets
 from sims.robot.robot_model import RobotModel, cache_per_robot
 
 BATCH_SIZE = 64

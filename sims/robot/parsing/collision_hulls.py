@@ -53,6 +53,10 @@ DOUBLE_PRECISION_GEOM_FIELDS = ("geom_size", "geom_aabb", "geom_rbound")
 Integers = NDArray[np.int32]
 
 
+COMPARED_POSE_COUNT = 20
+"""Number of poses in which contacts of whole meshes and of their hulls are compared."""
+
+
 class Lists(NamedTuple):
     """Lists of integers, concatenated in one array.
 
@@ -436,3 +440,44 @@ def find_colliding_geoms(model: Any) -> NDArray[np.bool_]:
     result: NDArray[np.bool_] = can_collide.any(axis=1)[row_indices.reshape(-1)]
     result[[*model.pair_geom1, *model.pair_geom2]] = True
     return result
+
+
+def has_equal_contacts(
+    model: Any,
+    reduced_model: Any,
+    numbers: Mapping[str, int],
+    joint_ranges: Mapping[int, tuple[float, float]],
+) -> bool:
+    """Return whether contacts with convex hulls equal those with whole meshes, in random poses.
+
+    The test is needed since other versions of MuJoCo may read more of a mesh than hulls contain.
+
+    Args:
+        model: compiled model with whole meshes.
+        reduced_model: model with hulls.
+        numbers: numbers of the whole model's geoms, by geom name.
+        joint_ranges: ranges of hinges and slides in rad or m, by the address of their position.
+    """
+    import mujoco
+
+    rng = np.random.default_rng(0)
+    data, reduced_data = mujoco.MjData(model), mujoco.MjData(reduced_model)
+    geom_numbers = np.array(
+        [numbers[reduced_model.geom(i).name] for i in range(reduced_model.ngeom)]
+    )
+    for _ in range(COMPARED_POSE_COUNT):
+        data.qpos[:] = model.qpos0
+        for address, joint_range in joint_ranges.items():
+            data.qpos[address] = rng.uniform(*joint_range)
+        reduced_data.qpos[:] = data.qpos
+        for posed_model, posed_data in ((model, data), (reduced_model, reduced_data)):
+            mujoco.mj_fwdPosition(posed_model, posed_data)
+        full_contacts, reduced_contacts = data.contact, reduced_data.contact
+        if data.ncon != reduced_data.ncon or not (
+            np.array_equal(full_contacts.geom, geom_numbers[reduced_contacts.geom])
+            and np.array_equal(full_contacts.dist, reduced_contacts.dist)
+            and np.array_equal(full_contacts.pos, reduced_contacts.pos)
+            and np.array_equal(full_contacts.frame, reduced_contacts.frame)
+        ):
+            return False
+    return True

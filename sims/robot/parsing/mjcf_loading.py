@@ -10,7 +10,7 @@ from typing import Any
 from xml.etree.ElementTree import Element
 
 from sims.core.files import is_existing_file
-from sims.core.values import truncate_text
+from sims.core.plain_values import truncate_text
 from sims.robot.parsing.mesh_files import OmittedShapes
 from sims.robot.parsing.xml_files import MAX_ASSET_BYTES, ModelFileReader, find_children, parse_tree
 

@@ -11,8 +11,8 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from sims.core.freed_memory import release_free_memory
+from sims.core.plain_values import MAX_NUMBER, truncate_text
 from sims.core.simulator import InputError
-from sims.core.values import MAX_NUMBER, truncate_text
 from sims.robot.mujoco_messages import (
     capture_mujoco_warnings,
     format_mujoco_error,

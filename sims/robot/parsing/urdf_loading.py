@@ -10,8 +10,8 @@ from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
 
+from sims.core.plain_values import truncate_text
 from sims.core.simulator import InputError, make_unknown_name_error
-from sims.core.values import truncate_text
 from sims.robot.integrator_settings import FRICTION_SOLIMP
 from sims.robot.mujoco_messages import format_item_list, format_mujoco_error, format_name_list
 from sims.robot.parsing import compile_repairs

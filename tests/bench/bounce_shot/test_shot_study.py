@@ -12,7 +12,7 @@ from scipy.stats import binomtest
 
 from bench.api.compare import ComparisonResult
 from bench.benchmark.problem.experiment import list_experiment_names, load_experiment
-from bench.benchmark.runner.study_setup import prepare_study
+from bench.benchmark.runner.study_creation import prepare_study
 from bench.benchmark.runner.tuner_training import TrainingRequest, train_or_load
 from bench.benchmark.runner.worker_pools import PoolLostError
 from bench.bounce_shot import shot_planning, shot_study
@@ -488,7 +488,9 @@ def test_interrupted_it_is_resumed_with_its_own_plugins_and_what_changed_is_refu
     assert resumed("--budget", "5") == 2
     assert "leave out budget" in capsys.readouterr().err
     with monkeypatch.context() as patch:
-        patch.setattr("bench.benchmark.runner.run_ids.hash_source_folders", lambda *_: "0123456789")
+        patch.setattr(
+            "bench.benchmark.runner.run_fingerprint.hash_source_folders", lambda *_: "0123456789"
+        )
         assert resumed() == 2
     assert "its code changed since it was started" in capsys.readouterr().err
     for registry in REGISTRIES:

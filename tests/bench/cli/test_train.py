@@ -11,7 +11,7 @@ import tomli_w
 
 from bench.api.train import DEFAULT_EXPERIMENTS, LossRecorder, default_experiment, select_training
 from bench.benchmark.problem.experiment import TunerEntry, list_experiment_names, load_experiment
-from bench.benchmark.runner.sandboxed_tuner import make_tuner_spec
+from bench.benchmark.runner.tuner_process_reuse import make_tuner_spec
 from bench.benchmark.runner.tuner_training import (
     TrainingRequest,
     WeightsError,

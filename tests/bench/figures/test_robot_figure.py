@@ -9,14 +9,15 @@ from matplotlib.text import Text
 
 from bench.figures import offscreen_rendering
 from bench.figures import robot_figure as robot
+from bench.figures.camera_view import choose_projection, make_posed_data
 from bench.figures.robot_figure import (
     PlaceMark,
     arrange_labels,
     compute_link_segments,
     draw_robot_figure,
+    locate_place,
     round_down_length,
 )
-from bench.figures.robot_view import choose_projection, locate_place, make_posed_data
 from bench.figures.style import render_png
 from tests.bench.figures.figure_robots import ARM6, POSE6, arm2, arm6
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from bench.figures.robot_view import choose_projection, make_posed_data
+from bench.figures.camera_view import choose_projection, make_posed_data
 from tests.bench.figures.figure_robots import POSE6, arm2, arm6, robot
 
 SLIDE_AND_TURN = """

@@ -6,7 +6,7 @@ import pytest
 
 from bench.benchmark.isolation.message_channel import MessageChannel
 from bench.benchmark.problem.experiment import TunerEntry
-from bench.benchmark.runner import sandboxed_tuner
+from bench.benchmark.runner import tuner_process_reuse
 from bench.benchmark.runner.plugin_discovery import load_plugins_for_experiment
 from bench.benchmark.runner.worker_tasks import RunRequest, execute_run, get_problem
 from tests.sample_experiments import spring_experiment
@@ -47,8 +47,8 @@ def test_random_numbers_are_loaded_ahead_and_yet_others_in_each_run(
     load_plugins_for_experiment([str(path)], experiment)
     entry = TunerEntry("careless", "careless")
     target = get_problem(experiment).draw_targets()[0].blinded
-    order = RunRequest("run", entry, 0, target, 2, tuned=sandboxed_tuner.make_tuner_spec(entry))
+    order = RunRequest("run", entry, 0, target, 2, tuned=tuner_process_reuse.make_tuner_spec(entry))
     first, second = (execute_run(experiment, order).trace for _ in range(2))
-    sandboxed_tuner.close_isolated_processes()
+    tuner_process_reuse.close_isolated_processes()
     assert first.status == second.status == "done", first.reason
     assert (first.proposals != second.proposals).all()

@@ -12,10 +12,10 @@ import numpy as np
 import psutil
 import pytest
 
-from bench.benchmark.isolation.process_limits import KilledExternallyError
+from bench.benchmark.isolation.isolation_errors import KilledExternallyError
 from bench.benchmark.isolation.tuner_processes import create_locked_folder, remove_stale_folders
 from bench.benchmark.problem.experiment import TunerEntry
-from bench.benchmark.runner import sandboxed_tuner
+from bench.benchmark.runner import tuner_process_reuse
 from bench.benchmark.runner.plugin_discovery import inspect_plugins, load_plugins_for_experiment
 from bench.benchmark.runner.tuner_training import TrainingRequest, read_weights, train_or_load
 from bench.benchmark.runner.worker_tasks import RunRequest, execute_run, get_problem
@@ -59,7 +59,7 @@ def slow(tmp_path, spring, fresh_registries):
     path.write_text(SLOW)
     experiment = spring_experiment(budget=4, training_budget=5, simulator=spring.name)
     yield experiment, str(path)
-    sandboxed_tuner.close_isolated_processes()
+    tuner_process_reuse.close_isolated_processes()
 
 
 class Killing:
@@ -99,7 +99,7 @@ def test_what_is_killed_is_made_again_with_the_same_result(slow, what):
     assert [tuner["name"] for tuner in known[0].tuners] == ["slow"]
     load_plugins_for_experiment([path], experiment)
     entry = TunerEntry("slow", "slow")
-    lesson = TrainingRequest(entry, 0, sandboxed_tuner.make_tuner_spec(entry))
+    lesson = TrainingRequest(entry, 0, tuner_process_reuse.make_tuner_spec(entry))
     undisturbed = read_weights(train_or_load(experiment, lesson, anew=True).path)
     with Killing(what) as killing:
         disturbed = read_weights(train_or_load(experiment, lesson, anew=True).path)
@@ -107,7 +107,9 @@ def test_what_is_killed_is_made_again_with_the_same_result(slow, what):
     np.testing.assert_array_equal(disturbed["seen"], undisturbed["seen"])
     weights = train_or_load(experiment, lesson).path
     target = get_problem(experiment).draw_targets()[0].blinded
-    order = RunRequest("run", entry, 0, target, 4, weights, sandboxed_tuner.make_tuner_spec(entry))
+    order = RunRequest(
+        "run", entry, 0, target, 4, weights, tuner_process_reuse.make_tuner_spec(entry)
+    )
     undisturbed = execute_run(experiment, order).trace
     with Killing(what) as killing:
         disturbed = execute_run(experiment, order).trace
@@ -127,10 +129,10 @@ def test_a_check_of_the_isolation_is_repeated_as_often_as_a_run(monkeypatch, kil
             case held:
                 return held
 
-    monkeypatch.setattr(sandboxed_tuner, "_find_active_layers", looked)
+    monkeypatch.setattr(tuner_process_reuse, "_find_active_layers", looked)
     # Call the undecorated function, because another test may have cached its result.
-    look = sandboxed_tuner.list_active_isolation_layers.__wrapped__
-    if kills < sandboxed_tuner.MAX_RETRIES:
+    look = tuner_process_reuse.list_active_isolation_layers.__wrapped__
+    if kills < tuner_process_reuse.MAX_RETRIES:
         assert look() == ("process",)
     else:
         with pytest.raises(
@@ -141,8 +143,8 @@ def test_a_check_of_the_isolation_is_repeated_as_often_as_a_run(monkeypatch, kil
 
 ALONE = """
 import sys, time
-from bench.benchmark.runner import sandboxed_tuner
-sandboxed_tuner.get_fork_server()
+from bench.benchmark.runner import tuner_process_reuse
+tuner_process_reuse.get_fork_server()
 print("there", flush=True)
 time.sleep(60)
 """

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from bench.benchmark.isolation.process_limits import RunEndedError
-from bench.benchmark.runner import sandboxed_tuner
+from bench.benchmark.isolation.isolation_errors import RunEndedError
+from bench.benchmark.runner import tuner_process_reuse
 from bench.benchmark.runner.plugin_discovery import load_plugins_for_experiment
 from bench.benchmark.runner.tuner_training import TrainingRequest, read_weights, train_or_load
 from bench.core.plugin_registries import tuners
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.usefixtures("spring", "fresh_registries")
 def cache(tmp_path, monkeypatch):
     monkeypatch.setenv("SIMGAP_CACHE", str(tmp_path / "cache"))
     yield tmp_path / "cache"
-    sandboxed_tuner.close_isolated_processes()
+    tuner_process_reuse.close_isolated_processes()
 
 
 @pytest.fixture
@@ -163,7 +163,7 @@ def test_weights_of_a_trusted_tuner_are_not_those_of_an_isolated_one(experiment)
 
 
 def test_a_training_that_is_made_again_after_a_kill_must_ask_for_the_same(experiment, monkeypatch):
-    from bench.benchmark.isolation.process_limits import KilledExternallyError
+    from bench.benchmark.isolation.isolation_errors import KilledExternallyError
     from bench.benchmark.problem.training_simulator import CountedTrainingSimulator
 
     asked = []
@@ -201,7 +201,7 @@ def test_an_installed_tuner_of_another_package_is_isolated_too(tmp_path, monkeyp
     monkeypatch.setattr(
         tuners, "_entry_points", {e.name: e for e in metadata.entry_points(group="simgap.tuners")}
     )
-    sandboxed_tuner.close_isolated_processes()
+    tuner_process_reuse.close_isolated_processes()
     made = spring_experiment(tuners={"theirs": {}, "random": {}}, targets=1, ranges=["in"], seeds=1)
     load_plugins_for_experiment([], made)
     results = prepare_experiment(made)

@@ -5,7 +5,8 @@ from pathlib import Path
 import pytest
 
 from bench.diagnosis.batch.run_batch import list_logs
-from bench.logs.recording_loading import CHUNK_BYTES, compute_recording_digest
+from bench.logs.recording_loading import compute_recording_digest
+from sims.core.files import CHUNK_BYTES
 
 DESCRIPTION = """model = "arm.xml"
 [channels.q.elbow]

@@ -13,7 +13,7 @@ from bench.benchmark.problem.training_simulator import (
     RandomisedSimulator,
 )
 from bench.benchmark.problem.tuning_problem import TuningProblem
-from bench.benchmark.runner.run_ids import RunIds
+from bench.benchmark.runner.run_fingerprint import RunIds
 from bench.benchmark.runner.tuner_training import compute_training_key
 from sims.core.simulator import InputError
 

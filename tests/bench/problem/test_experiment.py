@@ -12,11 +12,11 @@ from bench.benchmark.problem.experiment import (
 )
 from bench.benchmark.problem.recorded_runs import find_recording
 from bench.benchmark.problem.tuning_problem import TuningProblem
-from bench.benchmark.runner.run_ids import RunIds
+from bench.benchmark.runner.run_fingerprint import RunIds
 from bench.benchmark.runner.tuner_training import compute_training_key
+from sims.core.plain_values import to_toml_value
 from sims.core.simulator import InputError
 from sims.core.toml_validation import tomllib
-from sims.core.values import to_toml_value
 from tests.sample_experiments import SPRING, spring_experiment
 
 

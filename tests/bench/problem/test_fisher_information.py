@@ -5,7 +5,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from bench.benchmark.comparison import Comparison
+from bench.benchmark.comparison_study import Comparison
 from bench.benchmark.problem.experiment import load_experiment, parse_experiment
 from bench.benchmark.problem.fisher_information import (
     STIFF_SIGMA_THRESHOLD,
@@ -15,7 +15,7 @@ from bench.benchmark.problem.fisher_information import (
 )
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.benchmark.results_report import write_report
-from bench.benchmark.runner.study_setup import prepare_study
+from bench.benchmark.runner.study_creation import prepare_study
 from bench.benchmark.statistics.error_curves import select_primary_metric
 from bench.benchmark.storage.result_folder import read_comparison
 from sims.core.simulator import InputError, Parameter

@@ -22,7 +22,7 @@ from bench.benchmark.problem.robot_experiment import (
 )
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.benchmark.runner.code_digest import hash_class_source, hash_effect_sources
-from bench.benchmark.runner.run_ids import RunIds, compute_fingerprint
+from bench.benchmark.runner.run_fingerprint import RunIds, compute_fingerprint
 from bench.benchmark.runner.tuner_training import compute_training_key
 from bench.cli import catalogue
 from bench.cli.catalogue import format_documents

@@ -17,7 +17,7 @@ from bench.benchmark.problem.experiment import (
 )
 from bench.benchmark.runner.code_digest import hash_class_source
 from bench.benchmark.runner.experiment_runner import prepare_experiment
-from bench.benchmark.runner.run_ids import compute_fingerprint
+from bench.benchmark.runner.run_fingerprint import compute_fingerprint
 from bench.benchmark.runner.tuner_training import compute_training_key
 from bench.core.plugin_registries import REGISTRIES, load_plugins, tuners
 from methods.tuner import Tuner
@@ -354,7 +354,7 @@ CHANGES = {
 }
 """A change to each key of an experiment that determines a run or a training."""
 NO_MATTER = {
-    "run_ids": {"training_budget"},
+    "run_fingerprint": {"training_budget"},
     "tuner_training": {"error_channel", "world", "timeout", "memory", "isolation"},
 }
 """For each module, the keys of CHANGES that do not affect its digest."""
@@ -362,7 +362,7 @@ NO_MATTER = {
 
 @pytest.mark.parametrize(
     ("module", "but"),
-    [("run_ids", "RUN_IRRELEVANT_KEYS"), ("tuner_training", "TRAINING_IRRELEVANT_KEYS")],
+    [("run_fingerprint", "RUN_IRRELEVANT_KEYS"), ("tuner_training", "TRAINING_IRRELEVANT_KEYS")],
 )
 def test_every_key_of_an_experiment_matters_or_has_its_reason(module, but):
     """A new key must be listed either with a reason as irrelevant, or in CHANGES, where it changes

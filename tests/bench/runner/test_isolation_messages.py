@@ -5,7 +5,7 @@ import csv
 import pytest
 import tomli_w
 
-from bench.benchmark.isolation.process_limits import ISOLATION_NOTE
+from bench.benchmark.isolation.isolation_errors import ISOLATION_NOTE
 from bench.benchmark.problem.experiment import TunerEntry
 from bench.benchmark.runner.result_rows import Notes
 from bench.cli.main import main

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 import simgap
-from bench.benchmark.comparison import Comparison
+from bench.benchmark.comparison_study import Comparison
 from bench.benchmark.problem.experiment import parse_experiment
 from bench.benchmark.problem.recorded_runs import ObservedRuns
 from bench.benchmark.problem.tuning_problem import TuningProblem
-from bench.benchmark.runner.run_ids import RunIds
-from bench.benchmark.runner.study_setup import prepare_study
+from bench.benchmark.runner.run_fingerprint import RunIds
+from bench.benchmark.runner.study_creation import prepare_study
 from bench.benchmark.storage.result_folder import read_comparison
 from bench.benchmark.storage.run_journal import (
     RunJournal,
@@ -160,7 +160,9 @@ def folder(tmp_path, spring):
     [("hash_source_folders", "code"), ("hash_package_versions", "package versions")],
 )
 def test_changed_code_and_other_packages_are_refused(folder, monkeypatch, function, what):
-    monkeypatch.setattr(f"bench.benchmark.runner.run_ids.{function}", lambda *_: "0123456789")
+    monkeypatch.setattr(
+        f"bench.benchmark.runner.run_fingerprint.{function}", lambda *_: "0123456789"
+    )
     refused(folder, what)
     monkeypatch.undo()
     goes_on(folder)

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from bench.benchmark.runner.study_setup import prepare_study
+from bench.benchmark.runner.study_creation import prepare_study
 from bench.benchmark.statistics.error_curves import RunRowTable
 from bench.benchmark.statistics.expected_running_time import (
     ThresholdEffort,
@@ -216,7 +216,7 @@ def test_tuner_seconds_are_those_up_to_the_threshold():
 def test_a_million_rows_are_read_for_the_table_within_five_seconds(tmp_path):
     import time
 
-    from bench.benchmark.comparison import Comparison
+    from bench.benchmark.comparison_study import Comparison
     from bench.benchmark.results_report import REQUIRED_RUN_COLUMNS
     from bench.benchmark.statistics.error_curves import build_error_table
     from bench.benchmark.storage.result_folder import read_comparison

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from sims import effects as library
 from sims.core.simulator import InputError, Scenario
-from sims.robot.dynamics.run_linearisation import RunLinearisation
+from sims.robot.dynamics.linearisation_about_simulation import RunLinearisation
 from sims.robot.floating_joints import FloatingJoints
 from sims.robot.integrator_settings import IntegratorSettings
 from tests.sims.robot.test_robot_motion import kind_of

@@ -17,7 +17,7 @@ from sims.extended_simulator import (
     read_extended,
     write_extended,
 )
-from sims.robot.dynamics.run_linearisation import RunLinearisation
+from sims.robot.dynamics.linearisation_about_simulation import RunLinearisation
 from sims.robot.export.write_model_file import write_model_files
 from sims.robot.integrator_settings import INTEGRATOR_IDS, get_friction_constraint
 from sims.robot.parsing.read_model_file import read_robot

@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 
 from sims.core.simulator import Scenario
 from sims.extended_simulator import FittedValue
-from sims.robot.dynamics.run_linearisation import RunLinearisation
+from sims.robot.dynamics.linearisation_about_simulation import RunLinearisation
 from sims.robot.export.apply_causes import apply_causes
 from sims.robot.export.round_trip_check import check_written_files
 from sims.robot.export.write_model_file import write_model_files

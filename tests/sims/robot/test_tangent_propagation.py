@@ -6,7 +6,7 @@ import pytest
 from sims import effects as library
 from sims.core.simulator import Scenario
 from sims.robot.dynamics.applied_inputs import compute_step_inputs
-from sims.robot.dynamics.run_linearisation import RunLinearisation
+from sims.robot.dynamics.linearisation_about_simulation import RunLinearisation
 from sims.robot.integrator_settings import IntegratorSettings
 from tests.sims.robot.test_robot_motion import kind_of
 

@@ -8,12 +8,12 @@ import pytest
 
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.logs.joined_recordings import load_joined
-from sims.robot.dynamics.measured_linearisation import (
+from sims.robot.dynamics.linearisation_about_recording import (
     MeasuredLinear,
     Trajectory,
     interpolate_quintic,
 )
-from sims.robot.dynamics.run_linearisation import compute_control_changes
+from sims.robot.dynamics.linearisation_about_simulation import compute_control_changes
 from sims.robot.floating_joints import FloatingState
 
 EXAMPLE = Path(__file__).parents[4] / "examples" / "robot" / "log.csv"
@@ -69,7 +69,7 @@ def added(linear, evaluator, name, c):
 
 @pytest.mark.parametrize("name", EFFECTS)
 def test_the_model_misses_a_motion_by_what_the_missing_effect_adds(evaluator, name):
-    """Eq. (3) of `sims.robot.dynamics.measured_linearisation` with δ = 0: the defects are Σ c b."""
+    """Eq. (3) of `linearisation_about_recording` with δ = 0: the defects are Σ c b."""
     c = np.array(EFFECTS[name])
     linear = motion_with(evaluator, theta_of(evaluator, name, c))
     maps = linear.interval_maps()

@@ -11,7 +11,6 @@ from bench.diagnosis.search.candidate_directions import (
     MAX_FREQUENCIES,
     SHAPE_GRID_SIZE,
     compute_directions,
-    generate_frequency_neighbours,
     simulate_with_effect,
 )
 from bench.diagnosis.search.initial_values import (
@@ -23,6 +22,7 @@ from bench.diagnosis.search.initial_values import (
     MAX_EVENT_TIME_SUBDIVISIONS,
     REFIT_STIFFNESS_FACTORS,
     generate_event_times,
+    generate_frequency_neighbours,
     generate_neighbouring_end_stops,
 )
 from bench.diagnosis.search.score_test import ScoreTest

@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from bench.studies.suite.suite_runs import (
+from bench.suite.suite_runs import (
     CURVES_FILE,
     merge_runs,
     read_suite_runs,
     write_suite_runs,
 )
 from sims.core.simulator import InputError
-from tests.bench.studies.suite.synthetic_suite import make_suite, power_law
+from tests.bench.suite.synthetic_suite import make_suite, power_law
 
 CURVE = power_law(0.123456789, 1.0)
 

@@ -1,4 +1,4 @@
-"""First-order responses of a run's observations to effects (`dynamics.tangent_propagation`)."""
+"""Linearise a robot's model about a simulated run: responses of its observations to effects."""
 
 from __future__ import annotations
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pandas as pd
 
-from bench.studies.suite.suite_runs import (
+from bench.suite.suite_runs import (
     CELL_COLUMNS,
     RUN_COLUMNS,
     SKIPPED_COLUMNS,

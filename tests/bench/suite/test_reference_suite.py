@@ -7,16 +7,16 @@ import pandas as pd
 import pytest
 
 from bench.benchmark.problem.experiment import load_experiment
-from bench.studies.suite.suite_page import (
+from bench.suite.suite_page import (
     LOSS_FACTOR,
     build_guide,
     build_headline,
     describe_losses,
 )
-from bench.studies.suite.suite_runs import read_suite_runs
-from bench.studies.suite.suite_tables import FREE, SuiteTables
+from bench.suite.suite_runs import read_suite_runs
+from bench.suite.suite_statistics import FREE, SuiteTables
 
-FOLDER = Path(__file__).parents[4] / "results" / "reference" / "suite"
+FOLDER = Path(__file__).parents[3] / "results" / "reference" / "suite"
 
 
 @pytest.fixture(scope="module")

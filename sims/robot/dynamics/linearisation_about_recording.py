@@ -1,9 +1,8 @@
-"""Linearisation of a robot's model about a measured motion, from sample to sample.
+"""Linearise a robot's model about a recorded motion, from sample to sample.
 
-`dynamics.run_linearisation` linearises about a simulated motion, which may be far from the data.
-Here the
-motion is given, such as a smoothed measurement, with the state x̄[t] at step t. The model's step F
-differs from it by the defect
+`dynamics.linearisation_about_simulation` linearises about a simulated motion, which may be far from
+the data. Here the motion is given, such as a smoothed measurement, with the state x̄[t] at step t.
+The model's step F differs from it by the defect
 
     d[t] = x̄[t+1] - F(x̄[t], u[t])                                                            (1)
 
@@ -33,6 +32,11 @@ from numpy.typing import NDArray
 from sims.core.effect import ActiveEffects, Input, Sensor, members_of
 from sims.core.simulator import Array, Scenario
 from sims.robot.dynamics.effect_forces import LOAD_DEPENDENT_EFFECTS
+from sims.robot.dynamics.linearisation_about_simulation import (
+    EffectWithCoefficients,
+    RunLinearisation,
+    compute_control_changes,
+)
 from sims.robot.dynamics.linearisation_points import (
     LINEARISATION_INTERVAL_SECONDS,
     TRANSMISSION_FORCE_FIELDS,
@@ -40,11 +44,6 @@ from sims.robot.dynamics.linearisation_points import (
     RobotMotion,
 )
 from sims.robot.dynamics.midpoint_state import IndexArray, forces_are_at_step_end
-from sims.robot.dynamics.run_linearisation import (
-    EffectWithCoefficients,
-    RunLinearisation,
-    compute_control_changes,
-)
 from sims.robot.dynamics.series_joints import is_series_effect
 from sims.robot.dynamics.tangent_propagation import Perturbation
 from sims.robot.floating_joints import FloatingState

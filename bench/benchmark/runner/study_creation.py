@@ -1,4 +1,4 @@
-"""Create a study: its free result folder, its salt, and its isolation layers."""
+"""Create the study of an experiment: its free result folder, salt and isolation layers."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from bench.benchmark.problem.experiment import Experiment
 from bench.benchmark.problem.targets import Redraws
-from bench.benchmark.runner.sandboxed_tuner import list_active_isolation_layers
+from bench.benchmark.runner.tuner_process_reuse import list_active_isolation_layers
 from bench.benchmark.storage.result_folder import (
     FolderConfiguration,
     choose_free_folder,

@@ -1,4 +1,4 @@
-"""Page over several comparisons, report.html of `simgap plot A B --out DIR`."""
+"""Page over several comparisons (report.html of `simgap plot A B --out DIR`)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Values: plain Python values, units as text, and the largest plausible numbers.
+"""Plain Python values: their TOML and JSON forms, units as text, and largest plausible numbers.
 
 Larger values are mistakes, and would cause an overflow or an endless computation later.
 """

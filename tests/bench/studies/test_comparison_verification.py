@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 import tomli_w
 
-from bench.benchmark.runner.study_setup import prepare_study
+from bench.benchmark.runner.study_creation import prepare_study
 from bench.benchmark.storage.result_folder import read_configuration
 from bench.cli.main import main
 from bench.figures.style import TRUSTED_TUNERS_NOTE
@@ -120,7 +120,7 @@ def test_another_salt_is_refused(folder, capsys, old):
 def test_the_salt_is_for_the_owner_alone_until_the_end_and_a_resumed_folder_goes_on_with_it(
     finished_folder, tmp_path, capsys, monkeypatch
 ):
-    from bench.benchmark.comparison import Comparison
+    from bench.benchmark.comparison_study import Comparison
     from bench.benchmark.runner.plugin_discovery import load_plugins_for_experiment
 
     held = read_configuration(finished_folder)
@@ -144,7 +144,7 @@ def test_the_salt_is_for_the_owner_alone_until_the_end_and_a_resumed_folder_goes
 
 
 def test_a_folder_whose_salt_is_gone_is_not_resumed(finished_folder, tmp_path, capsys):
-    from bench.benchmark.comparison import Comparison
+    from bench.benchmark.comparison_study import Comparison
     from bench.benchmark.runner.plugin_discovery import load_plugins_for_experiment
 
     held = read_configuration(finished_folder)

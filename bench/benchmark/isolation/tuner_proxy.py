@@ -1,4 +1,4 @@
-"""Client for a tuner in an isolated process: the tuner and its runs, as the harness uses them."""
+"""Proxy of a tuner in an isolated process: the tuner and its runs, as the harness uses them."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ from bench.benchmark.storage.reference_results import REFERENCE_FOLDERS
 from bench.figures.style import MarkStyle, get_mark_style
 from bench.pages.chart import Axis, Panel, Series
 from bench.pages.html_page import HtmlPage
-from bench.studies.suite.suite_runs import (
+from bench.suite.suite_runs import (
     CURVES_FILE,
     SuiteRuns,
     collect_suite_runs,
@@ -29,7 +29,7 @@ from bench.studies.suite.suite_runs import (
     read_suite_runs,
     write_suite_runs,
 )
-from bench.studies.suite.suite_tables import FREE, SuiteTables
+from bench.suite.suite_statistics import FREE, SuiteTables
 from sims.core.files import write_atomically
 
 GUIDE_COLUMNS = ["property", "value", "cells", "simulations", "best", "best_untrained"]

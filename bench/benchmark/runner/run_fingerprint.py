@@ -1,4 +1,4 @@
-"""Run identifiers that change with everything that determines a run, and with nothing else.
+"""Fingerprint of an experiment and IDs of its runs, which change with all that determines them.
 
 ``cma_es/wide-017/0/3f9ac2d15b`` consists of tuner, target, seed and a hash. The hash covers the
 tuner's options, the simulator with its settings, the target's scenario and observation, budget,

@@ -27,7 +27,7 @@ from bench.benchmark.statistics.paired_tests import (
     correct_holm,
 )
 from bench.core.random_streams import make_rng
-from bench.studies.suite.suite_runs import SuiteRuns
+from bench.suite.suite_runs import SuiteRuns
 from sims.core.simulator import Array
 
 CHECKPOINTS = (1, 3, 10, 30, 100)

@@ -13,11 +13,6 @@ import pandas as pd
 
 from bench.benchmark.figures.comparison_figures import draw_critical_difference_figure
 from bench.benchmark.problem.experiment import Experiment, TunerEntry
-from bench.benchmark.report_page.multi_problem_page import (
-    MultiProblemPageData,
-    make_runtime_panel,
-    render_multi_problem_page,
-)
 from bench.benchmark.results_report import REPORT_FILE, REQUIRED_RUN_COLUMNS
 from bench.benchmark.statistics.comparison_statistics import ComparisonStatistics
 from bench.benchmark.statistics.comparison_tables import add_trust_column
@@ -42,11 +37,17 @@ from bench.figures.style import (
     write_figure_files,
 )
 from bench.pages.chart_figure import draw_chart
+from bench.suite.multi_problem_page import (
+    MultiProblemPageData,
+    make_runtime_panel,
+    render_multi_problem_page,
+)
 from sims.core.files import write_atomically
 from sims.core.simulator import Array, InputError
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
 
 _MIN_TUNERS_FRIEDMAN = 3
 """Minimum number of tuners for Friedman's test."""

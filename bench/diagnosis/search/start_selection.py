@@ -1,4 +1,4 @@
-"""Starts of fits with one more effect: high-scoring effects at the sizes that scores predict."""
+"""Select the starts of fits with one more effect, among high-scoring effects and initial values."""
 
 from __future__ import annotations
 

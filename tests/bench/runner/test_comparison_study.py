@@ -129,7 +129,7 @@ def test_what_changed_is_refused_by_name(finished_folder, tmp_path, capsys, monk
         assert error.count("\n") == 1
     (folder / "experiment.toml").write_text(text)
     monkeypatch.setattr(
-        "bench.benchmark.runner.run_ids.hash_source_folders", lambda *_: "0123456789"
+        "bench.benchmark.runner.run_fingerprint.hash_source_folders", lambda *_: "0123456789"
     )
     assert main(["compare", "--resume", str(folder)]) == 2
     assert "its code changed since it was started" in capsys.readouterr().err
@@ -291,7 +291,7 @@ def test_first_line_says_what_and_where():
 
 
 def test_one_function_tells_which_study_an_experiment_or_a_folder_is(tmp_path, spring):
-    from bench.benchmark.comparison import Comparison
+    from bench.benchmark.comparison_study import Comparison
     from bench.benchmark.problem.experiment import load_experiment
     from bench.bounce_shot.shot_study import BounceShotStudy
     from bench.studies.study import begin_studies, get_study_class, open_study

@@ -44,8 +44,9 @@ from sims.core.simulator import InputError
 
 if TYPE_CHECKING:
     from bench.benchmark.runner.experiment_runner import ExperimentRun, ProgressFactory
-    from bench.benchmark.runner.study_setup import PreparedStudy
+    from bench.benchmark.runner.study_creation import PreparedStudy
     from bench.benchmark.runner.worker_pools import Pool
+
 
 PrintLine = Callable[[str], None]
 
@@ -89,7 +90,7 @@ class Comparison:
             check_classes_importable,
             prepare_experiment,
         )
-        from bench.benchmark.runner.run_ids import compute_fingerprint
+        from bench.benchmark.runner.run_fingerprint import compute_fingerprint
 
         results = prepare_experiment(new.experiment, new.secret)
         # This comes before the folder is created, so that a user error leaves no files behind.
@@ -110,7 +111,7 @@ class Comparison:
             plugins: additional plugin files.
         """
         from bench.benchmark.runner.experiment_runner import prepare_experiment
-        from bench.benchmark.runner.run_ids import check_resumable
+        from bench.benchmark.runner.run_fingerprint import check_resumable
 
         comparison = cls(folder)
         experiment = comparison.configuration.experiment

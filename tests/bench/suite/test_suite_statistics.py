@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from bench.studies.suite.suite_page import (
+from bench.suite.suite_page import (
     build_guide,
     build_headline,
     choose_segments,
@@ -13,8 +13,8 @@ from bench.studies.suite.suite_page import (
     join_segments,
     render_suite_page,
 )
-from bench.studies.suite.suite_tables import COUNTED, FREE, SuiteTables
-from tests.bench.studies.suite.synthetic_suite import BUDGET, make_suite, power_law
+from bench.suite.suite_statistics import COUNTED, FREE, SuiteTables
+from tests.bench.suite.synthetic_suite import BUDGET, make_suite, power_law
 
 CELLS = [f"problem-{number}" for number in range(8)]
 EARLY, LATE = power_law(0.01, 0.1), power_law(0.5, 2.0)  # they cross after about 8 simulations

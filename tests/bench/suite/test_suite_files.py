@@ -15,8 +15,8 @@ from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.core.plugin_registries import tuners
 from bench.studies.archive_bundle import verify_archive, write_bundle
 from bench.studies.study import begin_studies, report_jointly
-from bench.studies.suite import suite_page
-from bench.studies.suite.suite_runs import read_suite_runs, write_suite_runs
+from bench.suite import suite_page
+from bench.suite.suite_runs import read_suite_runs, write_suite_runs
 from sims.core.simulator import InputError
 
 FOLDER = Path(str(resources.files("bench.experiments")))

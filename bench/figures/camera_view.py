@@ -1,4 +1,4 @@
-"""Choose the camera view of a robot that shows most of it, and locate its places.
+"""Camera view of a robot, from the side that shows most of it.
 
 With f forward, r right and u up (orthogonal unit vectors) and c the centre, a point p is projected
 without perspective to
@@ -16,10 +16,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sims.core.simulator import Array, InputError
+from sims.core.simulator import Array
 
 if TYPE_CHECKING:
     from sims.robot.robot_model import RobotModel
+
 
 CANDIDATE_AZIMUTHS_DEG = tuple(range(0, 360, 30))
 """Azimuths in degrees that are tried for a robot that moves in space."""
@@ -213,57 +214,3 @@ def compute_bounding_points(model: Any, data: Any) -> tuple[Array, Array]:
 
 def _is_static_body(model: Any, body: int) -> bool:
     return int(model.body_weldid[body]) == 0
-
-
-def locate_place(robot: RobotModel, data: Any, kind: str, name: str) -> Array | None:
-    """Return (3,) the position of a place of the robot in metres.
-
-    Args:
-        robot: The robot.
-        data: MuJoCo data at the pose.
-        kind: ``joint``, ``actuator``, ``body`` or ``channel``.
-        name: Name of the place.
-
-    Returns:
-        The position; None if the robot has no such place.
-    """
-    try:
-        if kind == "body":
-            return np.array(data.xipos[robot.body(name).id])
-        if kind == "actuator":
-            joint = robot.actuator(name).joint
-            return None if joint is None else np.array(data.xanchor[robot.joint(joint).id])
-        if kind == "channel":
-            return _place_of_channel(robot, data, name)
-        return np.array(data.xanchor[robot.joint(name).id])
-    except InputError:
-        return None
-
-
-def _place_of_channel(robot: RobotModel, data: Any, name: str) -> Array | None:
-    """Return the position (3,) in the world that belongs to a channel; None if it has none.
-
-    It is that of the joint, or of the body or site on which a sensor is mounted.
-    """
-    import mujoco
-
-    kind, _, place_name = name.partition(".")
-    if kind != "s":
-        return locate_place(robot, data, "joint", place_name)
-    model = robot.compiled
-    row = next((s for s in robot.sensors if s.name == place_name), None)
-    if row is None:
-        return None
-    sensor = int(np.searchsorted(model.sensor_adr, row.address, side="right")) - 1
-    object_id, object_type = int(model.sensor_objid[sensor]), int(model.sensor_objtype[sensor])
-    positions_by_type = {
-        int(mujoco.mjtObj.mjOBJ_SITE): data.site_xpos,
-        int(mujoco.mjtObj.mjOBJ_JOINT): data.xanchor,
-        int(mujoco.mjtObj.mjOBJ_BODY): data.xipos,
-        int(mujoco.mjtObj.mjOBJ_XBODY): data.xpos,
-    }
-    return (
-        np.array(positions_by_type[object_type][object_id])
-        if object_type in positions_by_type
-        else None
-    )

@@ -1,4 +1,4 @@
-"""Errors of all runs of a benchmark suite: collected from its folders, stored, and merged.
+"""Collect, store and merge the errors of all runs of a benchmark suite.
 
 A cell is a problem and a range of targets, or a problem before or after its simulator's extension.
 The stored form has one row per run, so that a method can be ranked against methods that were run

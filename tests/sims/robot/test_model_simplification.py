@@ -15,8 +15,8 @@ from sims.core.simulator import Scenario
 from sims.robot.dynamics.mujoco_batch import BatchCache, MujocoBatch, get_batch_cache
 from sims.robot.dynamics.series_joints import add_series_joints
 from sims.robot.integrator_settings import read_integrator_settings
+from sims.robot.model_simplification import strip_assets, strip_shapes
 from sims.robot.parsing.read_model_file import read_robot
-from sims.robot.reduced_model import strip_assets, strip_shapes
 from tests.sims.robot.sample_arms import ARM
 from tests.sims.robot.test_public_model_collections import described
 

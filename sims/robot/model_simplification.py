@@ -1,4 +1,4 @@
-"""The model that is simulated: a robot's model without elements that do not influence its motion.
+"""Simplify a robot's model: remove elements that do not influence its motion.
 
 The batch elements of a simulation copy the whole model, for every candidate that adds joints to it.
 Meshes, textures and geoms that cannot collide take most of the memory and of the compile time. They
@@ -24,6 +24,7 @@ from sims.robot.parsing.collision_hulls import (
     Hull,
     add_hull,
     add_memory_reserve,
+    has_equal_contacts,
     has_large_enough_buffers,
     read_hull,
 )
@@ -50,10 +51,9 @@ GEOM_FIELDS = (
 )  # fmt: skip
 """Fields on which contacts of a geom depend, in addition to its mesh and its contact partners."""
 
-COMPARED_POSE_COUNT = 20
-"""Number of poses in which contacts of whole meshes and of their hulls are compared."""
+
 DEFAULT_JOINT_RANGE = (-1.0, 1.0)
-"""Positions of joints without a range in these poses, in rad or m."""
+"""Range in rad or m of joints without a range, from which compared poses are drawn."""
 
 
 @cache_per_robot
@@ -122,7 +122,16 @@ def _strip_model(robot: RobotModel) -> RobotModel:
     is_equal = _has_equal_motion(model, stripped.compiled, geom_numbers)
     if is_equal and hull_by_mesh:
         is_equal = has_large_enough_buffers(stripped.compiled, model)
-        is_equal = is_equal and _has_equal_contacts(robot, stripped.compiled, geom_numbers)
+        is_equal = is_equal and has_equal_contacts(
+            robot.compiled,
+            stripped.compiled,
+            geom_numbers,
+            {
+                joint.position: joint.range or DEFAULT_JOINT_RANGE
+                for joint in robot.joints
+                if joint.has_one_coordinate
+            },
+        )
     return stripped if is_equal else robot
 
 
@@ -256,40 +265,3 @@ def _has_equal_motion(model: Any, reduced_model: Any, numbers: Mapping[str, int]
         np.array_equal(getattr(model, field)[geom_numbers], getattr(reduced_model, field))
         for field in GEOM_FIELDS
     )
-
-
-def _has_equal_contacts(robot: RobotModel, reduced_model: Any, numbers: Mapping[str, int]) -> bool:
-    """Return whether contacts are equal in random poses within the ranges of the joints.
-
-    The test is needed since other versions of MuJoCo may read more of a mesh than hulls contain.
-
-    Args:
-        robot: robot with the whole model.
-        reduced_model: model with hulls.
-        numbers: numbers of the whole model's geoms, by geom name.
-    """
-    import mujoco
-
-    model = robot.compiled
-    rng = np.random.default_rng(0)
-    data, reduced_data = mujoco.MjData(model), mujoco.MjData(reduced_model)
-    geom_numbers = np.array(
-        [numbers[reduced_model.geom(i).name] for i in range(reduced_model.ngeom)]
-    )
-    for _ in range(COMPARED_POSE_COUNT):
-        data.qpos[:] = model.qpos0
-        for joint in robot.joints:
-            if joint.has_one_coordinate:
-                data.qpos[joint.position] = rng.uniform(*(joint.range or DEFAULT_JOINT_RANGE))
-        reduced_data.qpos[:] = data.qpos
-        for posed_model, posed_data in ((model, data), (reduced_model, reduced_data)):
-            mujoco.mj_fwdPosition(posed_model, posed_data)
-        full_contacts, reduced_contacts = data.contact, reduced_data.contact
-        if data.ncon != reduced_data.ncon or not (
-            np.array_equal(full_contacts.geom, geom_numbers[reduced_contacts.geom])
-            and np.array_equal(full_contacts.dist, reduced_contacts.dist)
-            and np.array_equal(full_contacts.pos, reduced_contacts.pos)
-            and np.array_equal(full_contacts.frame, reduced_contacts.frame)
-        ):
-            return False
-    return True

@@ -1,0 +1,222 @@
+"""Verify that the files of an explanation are valid and consistent (`simgap verify`)."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from bench.benchmark.storage.provenance import compute_sha256, read_environment
+from bench.core.plugin_registries import simulators
+from bench.diagnosis.score_extended import score_model
+from bench.diagnosis.verdict import Verdict
+from bench.schemas import find_violations
+from bench.studies.comparison_verification import VerificationFailure
+from sims.core.files import get_first_line
+from sims.core.simulator import InputError
+from sims.extended_simulator import ExtendedSimulator, open_extended
+
+PrintLine = Callable[[str], None]
+
+VERDICT_FILE = "verdict.json"
+"""File of the verdict in the folder of an explanation."""
+
+EXTENDED_MODEL_FILE = "extended.toml"
+"""File of the extended simulator in the folder of an explanation."""
+
+
+_ERROR_TOLERANCE = 1e-3
+"""Relative tolerance of a held-out error.
+
+Initial states are estimated again, possibly on another machine.
+"""
+
+
+class ExplanationVerification(NamedTuple):
+    """Result of verifying an explanation.
+
+    Attributes:
+        checked: descriptions of what was checked.
+        unchecked: what could not be checked, with the reason.
+        doubts: verification failures.
+    """
+
+    checked: list[str]
+    unchecked: list[str]
+    doubts: list[VerificationFailure]
+
+    def to_document(self) -> dict[str, Any]:
+        """Convert to a JSON document."""
+        doubts = [doubt._asdict() for doubt in self.doubts]
+        return {**self._asdict(), "follows": not self.doubts, "doubts": doubts}
+
+
+def format_result(
+    doubts: Sequence[VerificationFailure], folder: Path, print_line: PrintLine
+) -> None:
+    """Print the doubts (numbers that do not follow from others), at most 20 of them."""
+    for doubt in doubts[:20]:
+        print_line(f"NOT REPRODUCED  {folder}/{doubt}")
+    if len(doubts) > 20:
+        print_line(f"and {len(doubts) - 20} more")
+
+
+def verify_explanation(folder: Path, print_line: PrintLine) -> ExplanationVerification:
+    """Verify that the files of an explanation are valid and consistent.
+
+    If the folder contains the recording, the held-out error is computed again.
+
+    Args:
+        folder: folder of the explanation.
+        print_line: prints a line.
+    """
+    verification = verify_extended_model(folder, print_line)
+    format_result(verification.doubts, folder, print_line)
+    return verification
+
+
+def verify_extended_model(folder: Path, print_line: PrintLine) -> ExplanationVerification:
+    """Check that the verdict and the extended model of an explanation agree.
+
+    The verdict must follow its schema, the extended model must load and have the same values, and
+    its errors on the recording are computed again if the recording is there. A failed check is a
+    doubt; a check that is not possible here, for example without the robot's model file, is listed
+    as unchecked.
+
+    Args:
+        folder: folder of the explanation.
+        print_line: prints one line of text.
+    """
+    verification = ExplanationVerification([], [], [])
+
+    def note(line: str) -> None:
+        verification.checked.append(line)
+        print_line(line)
+
+    verdict = _read_verdict(folder, verification)
+    if verdict is None:
+        return verification
+    note(f"{VERDICT_FILE}: valid for the JSON schema verdict: {verdict.verdict}")
+    try:
+        extended, _, _ = open_extended(folder / EXTENDED_MODEL_FILE, simulators.get)
+    except InputError as error:
+        text = str(error).replace(f"{folder}/", "")
+        # The hash of a robot's model file is known; its absence here is no verification failure.
+        if "model" in text and "no such file" in text:
+            verification.unchecked.append(f"{EXTENDED_MODEL_FILE}: {text}")
+            print_line(f"not checked: {verification.unchecked[-1]}")
+        else:
+            verification.doubts.append(VerificationFailure(EXTENDED_MODEL_FILE, 0, text))
+        return verification
+    note(f"{EXTENDED_MODEL_FILE}: loads as a simulator of {extended.system or extended.name}")
+    verification.doubts.extend(_find_differing_numbers(verdict, extended))
+    if not verification.doubts:
+        note(f"{VERDICT_FILE} and {EXTENDED_MODEL_FILE} have the same values")
+    _score_extended_model(folder, verdict, verification, note)
+    for line in verification.unchecked:
+        print_line(f"not checked: {line}")
+    if not verification.doubts:
+        print_line(
+            "all results are reproducible"
+            if not verification.unchecked
+            else "all results that could be checked are reproducible"
+        )
+    return verification
+
+
+def _read_verdict(folder: Path, verification: ExplanationVerification) -> Verdict | None:
+    """Read the verdict of an explanation; add a doubt and return None if it is not valid."""
+    try:
+        document = json.loads((folder / VERDICT_FILE).read_text(encoding="utf-8"))
+        violations = find_violations(document, "verdict")
+        if not violations:
+            return Verdict.from_document(document)
+    except (OSError, ValueError, RecursionError, KeyError, TypeError) as error:
+        violations = [get_first_line(error)]
+    verification.doubts.extend(VerificationFailure(VERDICT_FILE, 0, line) for line in violations)
+    return None
+
+
+def _find_differing_numbers(
+    verdict: Verdict, extended: ExtendedSimulator
+) -> Iterator[VerificationFailure]:
+    """Yield numbers of the verdict that are missing or different in the extended simulator."""
+    for name, number in verdict.parameters.items():
+        model_value = extended.parameters.get(name)
+        if model_value is not None and not math.isclose(
+            number.value, model_value.value, rel_tol=1e-9
+        ):
+            yield VerificationFailure(
+                VERDICT_FILE,
+                0,
+                f"{name}: {number.value:.9g}, in {EXTENDED_MODEL_FILE} {model_value.value:.9g}",
+            )
+    for cause in verdict.causes:
+        coefficients: Mapping[str, Any] = extended.effects.get(cause.effect, {})
+        for name, number in cause.coefficients.items():
+            value = coefficients[name].value if name in coefficients else math.nan
+            if not math.isclose(number.value, value, rel_tol=1e-9):
+                label = f"{cause.effect} {name}"
+                yield VerificationFailure(
+                    VERDICT_FILE,
+                    0,
+                    f"{label}: {number.value:.9g}, in {EXTENDED_MODEL_FILE} {value:.9g}",
+                )
+
+
+def _score_extended_model(
+    folder: Path, verdict: Verdict, verification: ExplanationVerification, note: PrintLine
+) -> None:
+    """Repeat the held-out error of the extended simulator, if the folder has the recording."""
+    environment = read_environment(folder)
+    stated_error = verdict.heldout.rmse_extended if verdict.heldout else None
+    tables = sorted((folder / RECORDINGS_FOLDER).glob("*.csv"))
+    if stated_error is None:
+        verification.unchecked.append("held-out error: the verdict does not state one")
+        return
+    if len(tables) != 1:
+        location = f"{len(tables)} recordings are" if tables else "the recording is not"
+        verification.unchecked.append(
+            f"held-out error: {location} in it (simgap bundle --with LOG.csv)"
+        )
+        return
+    hashes = {each["file"]: each["sha256"] for each in environment.get("recordings", [])}
+    for path in (tables[0], tables[0].with_suffix(".toml")):
+        if path.name in hashes and path.is_file() and compute_sha256(path) != hashes[path.name]:
+            expected = (
+                f"expected the recording that was explained, SHA-256 {hashes[path.name][:12]}"
+            )
+            verification.doubts.append(
+                VerificationFailure(
+                    f"{RECORDINGS_FOLDER}/{path.name}", 0, f"{expected}; found another"
+                )
+            )
+            return
+    try:
+        result = score_model(folder / EXTENDED_MODEL_FILE, tables[0], held_out=True)
+    except InputError as error:
+        verification.unchecked.append(f"held-out error: {str(error).replace(f'{folder}/', '')}")
+        return
+    assert verdict.heldout is not None
+    units = result["units"]
+    errors_in_unit = [
+        e for name, e in result["rmse"].items() if units[name] == verdict.heldout.unit
+    ]
+    repeated_error = (
+        math.sqrt(sum(e * e for e in errors_in_unit) / len(errors_in_unit))
+        if errors_in_unit
+        else math.nan
+    )
+    if not math.isclose(stated_error, repeated_error, rel_tol=_ERROR_TOLERANCE):
+        difference = (
+            f"rmse_extended on held-out runs: {stated_error:.6g}, recomputed {repeated_error:.6g}"
+        )
+        verification.doubts.append(VerificationFailure(VERDICT_FILE, 0, difference))
+        return
+    note(f"{VERDICT_FILE}: rmse_extended on held-out runs is reproduced: {repeated_error:.6g}")
+
+
+RECORDINGS_FOLDER = "recordings"
+"""Folder of recordings in the archive of an explanation."""
