@@ -130,10 +130,10 @@ class PredictionErrorSearch(EffectSearch):
         if not is_explained(context, best):
             best = select_more_likely(best, fit_quick_selection(context, selected))
         if self._should_continue(best):
-            best = self._add_missing_effects(best, selected, friction)
-        if not is_explained(context, best):
             selected = select_with_shapes(context, selected)
             best = select_more_likely(best, fit_quick_selection(context, selected))
+        if self._should_continue(best):
+            best = self._add_missing_effects(best, selected, friction)
         if not is_explained(context, best) and not self.evaluator.search_control.is_over():
             best = select_more_likely(best, fit_series_effects(context, selected))
         if not best.effects:

@@ -24,7 +24,12 @@ from sims.robot.dynamics.effect_forces import (
     make_snapshot,
     select_model_field_effects,
 )
-from sims.robot.dynamics.midpoint_state import IndexArray, advance_state, integrate_state
+from sims.robot.dynamics.midpoint_state import (
+    IndexArray,
+    advance_state,
+    forces_are_at_step_end,
+    integrate_state,
+)
 from sims.robot.dynamics.mujoco_batch import JointAddresses, MujocoBatch
 from sims.robot.floating_joints import FloatingState
 from sims.robot.integrator_settings import get_friction_constraint
@@ -159,6 +164,24 @@ class LinearisationPoints:
         """True if any output is not a drive force."""
         return bool((self._drives < 0).any())
 
+    @property
+    def has_joints_only(self) -> bool:
+        """Whether the state consists of positions and velocities of joints alone.
+
+        It has no activations, no hidden states of effects, and no floating or unlisted bodies.
+        """
+        return (
+            not self.motion.act.shape[1]
+            and not self.hidden_state_effects
+            and not self._floating
+            and self._mujoco_batch.model.nv == self.motion.x.shape[1]
+        )
+
+    @property
+    def uses_runge_kutta(self) -> bool:
+        """Whether the model's integrator is the classical Runge-Kutta method."""
+        return forces_are_at_step_end(self._mujoco_batch.model)
+
     def step_displaced(
         self, moved: Mapping[str, tuple[int, float]], acting: ActiveEffects, steps: int = 1
     ) -> tuple[Array, Array]:
@@ -194,7 +217,10 @@ class LinearisationPoints:
         return np.concatenate(states), np.concatenate(readings)
 
     def compute_accelerations(
-        self, acting: ActiveEffects, extra_forces: Array | None = None
+        self,
+        acting: ActiveEffects,
+        extra_forces: Array | None = None,
+        moved: Mapping[str, tuple[int, float]] | None = None,
     ) -> tuple[Array, Array]:
         """Compute accelerations (N, E) and readings (N, O) at each point.
 
@@ -204,11 +230,12 @@ class LinearisationPoints:
         Args:
             acting: effects whose elements are in the model.
             extra_forces: (N, E) additional forces; none by default.
+            moved: perturbations, as in `step_displaced`; none by default.
         """
         accelerations, readings = [], []
         applied = self._mujoco_batch.batch.bind("qfrc_applied")
         dofs, begin = self._dofs, 0
-        for n, ids in self._place_points({}, acting):
+        for n, ids in self._place_points(moved or {}, acting):
             if extra_forces is not None:
                 applied[:n, dofs] += extra_forces[begin : begin + n]
                 begin += n

@@ -13,7 +13,15 @@ motion by
     dz_{t+1} = A_t dz_t + B_t (df_t + M_t da_t) + C_t du_t                                     (2)
 
 with the change da_t of the acceleration at the same state by the changed parameters, and the
-inertia matrix M_t
+inertia matrix M_t. For the classical Runge-Kutta method with step h, whose step evaluates the
+dynamics four times, the quotients are those of the acceleration a(q, v, f, u) alone. With
+
+    K = [[0, I], [da/dq, da/dv]],   L = [[0], [da/df]]
+
+held within a step, the method gives (E. Hairer, S. P. Norsett, G. Wanner, Solving Ordinary
+Differential Equations I, 1993, section IV.2 of volume II for the polynomial)
+
+    A = I + P K,   B = P L,   P = h I + h^2 K / 2 + h^3 K^2 / 6 + h^4 K^3 / 24                 (3)
 
 (the tangent or variational equations; J. Guckenheimer, P. Holmes, Nonlinear Oscillations, 1983,
 section 1.3). Effect forces are evaluated along the motion, for all times at once. Changes of
@@ -153,8 +161,8 @@ class TangentModel:
         They are forward differences (1). `displacements` lists the displacements as (quantity,
         index, size). The quantities are q position, v velocity, a activation, w hidden state of an
         effect, p and r displacement and velocity of floating bodies, f force, u control.
-        `quotients` has those of states and readings by the state z, the forces f and the controls
-        u.
+        The
+        changes are those of the state after a step, or of the acceleration for (3).
         """
         joint_count = self._motion.x.shape[1]
         floating_count = self._sizes.size - joint_count
@@ -172,21 +180,32 @@ class TangentModel:
             ],
             "u": [("u", j, CONTROL_DIFFERENCE) for j in range(nu)],
         }
-        quotients: dict[str, tuple[Array, Array]] = {}
-        for kind, columns in displacements.items():
-            states, readings = [], []
-            for name, j, difference in columns:
-                state, reading = self._at.step_displaced({name: (j, difference)}, self._at.acting)
-                states.append((state - self._base_states) / difference)
-                readings.append((reading - self._base_readings) / difference)
-            point_count = self._at.point_steps.size
-            quotients[kind] = (
-                np.stack(states, axis=2) if states else np.zeros((point_count, self.state_size, 0)),
-                np.stack(readings, axis=2)
-                if readings
-                else np.zeros((*self._base_readings.shape, 0)),
+        of_accelerations = self._at.uses_runge_kutta and self._at.has_joints_only
+        base, base_readings = (
+            self._base_accelerations
+            if of_accelerations
+            else (self._base_states, self._base_readings)
+        )
+        quotients: list[tuple[Array, Array]] = []
+        for kind in ("z", "f", "u"):
+            changes = np.zeros((*base.shape, len(displacements[kind])))
+            readings = np.zeros((*base_readings.shape, len(displacements[kind])))
+            for column, (name, j, difference) in enumerate(displacements[kind]):
+                moved = {name: (j, difference)}
+                displaced, read = (
+                    self._at.compute_accelerations(self._at.acting, moved=moved)
+                    if of_accelerations
+                    else self._at.step_displaced(moved, self._at.acting)
+                )
+                changes[:, :, column] = (displaced - base) / difference
+                readings[:, :, column] = (read - base_readings) / difference
+            quotients.append((changes, readings))
+        (by_state, by_force, by_control), of_readings = zip(*quotients, strict=True)
+        if of_accelerations:
+            by_state, by_force, by_control = compute_runge_kutta_step(
+                by_state, by_force, by_control, self._motion.step
             )
-        return DifferenceQuotients(*(quotients[k][i] for i in range(2) for k in ("z", "f", "u")))
+        return DifferenceQuotients(by_state, by_force, by_control, *of_readings)
 
     # -- changes
 
@@ -449,6 +468,31 @@ class TangentModel:
             readings[t] = q.read_states[self._at.point_of_step[t]] @ states[t]
             states[t + 1] = q.states[self._at.point_of_step[t]] @ states[t]
         return np.moveaxis(states, 2, 0), np.moveaxis(readings, 2, 0)
+
+
+def compute_runge_kutta_step(
+    by_state: Array, by_force: Array, by_control: Array, step: float
+) -> tuple[Array, Array, Array]:
+    """Compute the derivatives of a Runge-Kutta step from those of the acceleration, by (3).
+
+    Args:
+        by_state: (N, D, 2 D) derivatives of accelerations by positions and velocities.
+        by_force: (N, D, E) derivatives by forces.
+        by_control: (N, D, nu) derivatives by controls.
+        step: step length h in seconds.
+
+    Returns:
+        Derivatives (N, 2 D, 2 D), (N, 2 D, E) and (N, 2 D, nu) of the state after the step.
+    """
+    points, joints, size = by_state.shape
+    rates = np.zeros((points, size, size))
+    rates[:, :joints, joints:] = np.eye(joints)
+    rates[:, joints:] = by_state
+    scaled = step * rates
+    unit = np.eye(size)
+    propagator = step * (unit + scaled @ (unit / 2 + scaled @ (unit / 6 + scaled / 24)))
+    of_velocity = propagator[:, :, joints:]
+    return unit + propagator @ rates, of_velocity @ by_force, of_velocity @ by_control
 
 
 def _find_neighbours(point_steps: IndexArray, spacing: int) -> IndexArray:

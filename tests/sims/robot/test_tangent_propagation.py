@@ -7,6 +7,7 @@ from sims import effects as library
 from sims.core.simulator import Scenario
 from sims.robot.dynamics.applied_inputs import compute_step_inputs
 from sims.robot.dynamics.linearisation_about_simulation import RunLinearisation
+from sims.robot.dynamics.tangent_propagation import compute_runge_kutta_step
 from sims.robot.integrator_settings import IntegratorSettings
 from tests.sims.robot.test_robot_motion import kind_of
 
@@ -188,3 +189,27 @@ def test_a_delay_of_a_part_of_a_step_is_right_to_the_third_order(late):
         apart.append(simulator.simulate(np.empty((1, 0)), scenario)[0])
     size = np.sqrt(np.square(apart[1]).mean())
     assert np.sqrt(np.square(apart[0] - apart[1]).mean()) < 3e-4 * size
+
+
+def test_a_runge_kutta_step_of_a_linear_joint_has_these_derivatives():
+    """x'' = -w^2 x - c x' + b f by the four evaluations of the method, against equation (3)."""
+    stiffness, damping, gain, h = 90.0, 3.0, 2.5, 0.02
+
+    def step(x, v, f):
+        def rate(y):
+            return np.array([y[1], -stiffness * y[0] - damping * y[1] + gain * f])
+
+        y = np.array([x, v])
+        k1 = rate(y)
+        k2 = rate(y + 0.5 * h * k1)
+        k3 = rate(y + 0.5 * h * k2)
+        k4 = rate(y + h * k3)
+        return y + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+
+    states, forces, controls = compute_runge_kutta_step(
+        np.array([[[-stiffness, -damping]]]), np.array([[[gain]]]), np.zeros((1, 1, 0)), h
+    )
+    np.testing.assert_allclose(states[0, :, 0], step(1.0, 0.0, 0.0), rtol=1e-13)
+    np.testing.assert_allclose(states[0, :, 1], step(0.0, 1.0, 0.0), rtol=1e-13)
+    np.testing.assert_allclose(forces[0, :, 0], step(0.0, 0.0, 1.0), rtol=1e-13)
+    assert controls.shape == (1, 2, 0)
