@@ -155,6 +155,11 @@ class LinearisationPoints:
             mujoco_batch.batch.bind(name)
 
     @property
+    def output_count(self) -> int:
+        """Number of outputs that are read."""
+        return len(self._outputs)
+
+    @property
     def reads_drives(self) -> bool:
         """True if any output is a drive force."""
         return bool((self._drives >= 0).any())
@@ -221,6 +226,7 @@ class LinearisationPoints:
         acting: ActiveEffects,
         extra_forces: Array | None = None,
         moved: Mapping[str, tuple[int, float]] | None = None,
+        midway: bool = False,
     ) -> tuple[Array, Array]:
         """Compute accelerations (N, E) and readings (N, O) at each point.
 
@@ -231,11 +237,13 @@ class LinearisationPoints:
             acting: effects whose elements are in the model.
             extra_forces: (N, E) additional forces; none by default.
             moved: perturbations, as in `step_displaced`; none by default.
+            midway: whether joints have the state in the middle of the steps that a point stands
+                for, instead of that at the point.
         """
         accelerations, readings = [], []
         applied = self._mujoco_batch.batch.bind("qfrc_applied")
         dofs, begin = self._dofs, 0
-        for n, ids in self._place_points(moved or {}, acting):
+        for n, ids in self._place_points(moved or {}, acting, midway):
             if extra_forces is not None:
                 applied[:n, dofs] += extra_forces[begin : begin + n]
                 begin += n
@@ -259,8 +267,19 @@ class LinearisationPoints:
             readings[:, is_drive] += self._drive_effect_forces[:, self._drives[is_drive]]
         return readings
 
+    @cached_property
+    def _midway_state(self) -> tuple[Array, Array]:
+        """Positions and velocities (N, D) in the middle of the steps that each point stands for."""
+        ends = np.append(self.point_steps[1:], len(self.motion.controls))
+        below, above = (self.point_steps + ends) // 2, (self.point_steps + ends + 1) // 2
+        x, v = self.motion.x, self.motion.v
+        return 0.5 * (x[below] + x[above]), 0.5 * (v[below] + v[above])
+
     def _place_points(
-        self, moved: Mapping[str, tuple[int, float]], acting: ActiveEffects
+        self,
+        moved: Mapping[str, tuple[int, float]],
+        acting: ActiveEffects,
+        midway: bool = False,
     ) -> Iterator[tuple[int, IndexArray | None]]:
         """Place the points in the elements of the batch, as many at a time as it has elements.
 
@@ -269,6 +288,7 @@ class LinearisationPoints:
                 v velocity, a activation, w hidden state, p and r displacement and velocity of
                 floating bodies, f force, u control.
             acting: active effects.
+            midway: whether joints have the state of `_midway_state`.
 
         Yields:
             Number n of elements in use, and their indices (None if all are in use).
@@ -299,8 +319,12 @@ class LinearisationPoints:
             if ranges is not None:
                 ranges.write(motion.off[steps])
             batch.state[:] = self._reset_state
-            qpos[:n, joints.positions] = motion.x[steps]
-            qvel[:n, joints.velocities] = motion.v[steps]
+            if midway:
+                x, v = (values[begin : begin + n] for values in self._midway_state)
+            else:
+                x, v = motion.x[steps], motion.v[steps]
+            qpos[:n, joints.positions] = x
+            qvel[:n, joints.velocities] = v
             qpos[:n, floating.positions] = motion.floating_state.pose[steps]
             qvel[:n, floating.velocities] = motion.floating_state.rate[steps]
             ctrl[:n] = motion.controls[steps]

@@ -31,7 +31,7 @@ readings follow in the same way, with separate quotients.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -116,7 +116,7 @@ class TangentModel:
     def __init__(
         self, at: LinearisationPoints, sizes: Array, quotients: DifferenceQuotients | None = None
     ) -> None:
-        """Compute the unperturbed steps at the linearisation points, and the quotients if none fit.
+        """Compute the difference quotients if none fit.
 
         `self._share` (S,) is the time from its linearisation point to each step, as a share of the
         regular distance between points. `self._earlier` and `self._later` (S,) are the indices of
@@ -130,11 +130,25 @@ class TangentModel:
         self._earlier, self._later = _find_neighbours(at.point_steps, at.point_spacing)[
             :, at.point_of_step
         ]
-        self._base_states, self._base_readings = at.step_displaced({}, at.acting)
         # If commands change at other times, the linearisation points differ.
-        if quotients is None or quotients.states.shape[:2] != self._base_states.shape:
+        points_and_states = at.point_steps.size, self.state_size
+        if quotients is None or quotients.states.shape[:2] != points_and_states:
             quotients = self._compute_difference_quotients()
         self.quotients = quotients
+
+    @cached_property
+    def _base_step(self) -> tuple[Array, Array]:
+        """States (N, Z) after an unperturbed step from each point, and readings (N, O)."""
+        return self._at.step_displaced({}, self._at.acting)
+
+    @property
+    def _base_readings(self) -> Array:
+        return (self._base_accelerations if self._differs_accelerations else self._base_step)[1]
+
+    @property
+    def _differs_accelerations(self) -> bool:
+        """Whether the quotients are those of accelerations, by (3)."""
+        return self._at.uses_runge_kutta and self._at.has_joints_only
 
     @cached_property
     def _base_accelerations(self) -> tuple[Array, Array]:
@@ -153,7 +167,10 @@ class TangentModel:
         They are positions, velocities, activations, hidden states of effects, and displacements and
         velocities of floating bodies.
         """
-        return int(self._base_states.shape[1])
+        motion, joints = self._motion, self._motion.x.shape[1]
+        floating = self._sizes.size - joints
+        hidden = len(self._at.hidden_state_effects)
+        return 2 * joints + int(motion.act.shape[1]) + hidden + 2 * floating
 
     def _compute_difference_quotients(self) -> DifferenceQuotients:
         """Compute the derivatives of a step by states, forces and controls at all points.
@@ -180,28 +197,23 @@ class TangentModel:
             ],
             "u": [("u", j, CONTROL_DIFFERENCE) for j in range(nu)],
         }
-        of_accelerations = self._at.uses_runge_kutta and self._at.has_joints_only
-        base, base_readings = (
-            self._base_accelerations
-            if of_accelerations
-            else (self._base_states, self._base_readings)
-        )
+        if self._differs_accelerations:
+            displaced = partial(self._at.compute_accelerations, self._at.acting, midway=True)
+            base, base_readings = displaced()
+        else:
+            displaced = partial(self._at.step_displaced, acting=self._at.acting)
+            base, base_readings = self._base_step
         quotients: list[tuple[Array, Array]] = []
         for kind in ("z", "f", "u"):
             changes = np.zeros((*base.shape, len(displacements[kind])))
             readings = np.zeros((*base_readings.shape, len(displacements[kind])))
             for column, (name, j, difference) in enumerate(displacements[kind]):
-                moved = {name: (j, difference)}
-                displaced, read = (
-                    self._at.compute_accelerations(self._at.acting, moved=moved)
-                    if of_accelerations
-                    else self._at.step_displaced(moved, self._at.acting)
-                )
-                changes[:, :, column] = (displaced - base) / difference
+                changed, read = displaced(moved={name: (j, difference)})
+                changes[:, :, column] = (changed - base) / difference
                 readings[:, :, column] = (read - base_readings) / difference
             quotients.append((changes, readings))
         (by_state, by_force, by_control), of_readings = zip(*quotients, strict=True)
-        if of_accelerations:
+        if self._differs_accelerations:
             by_state, by_force, by_control = compute_runge_kutta_step(
                 by_state, by_force, by_control, self._motion.step
             )
@@ -330,7 +342,7 @@ class TangentModel:
         steps, control_count, reading_count = (
             self._steps,
             q.controls.shape[2],
-            self._base_readings.shape[1],
+            self._at.output_count,
         )
         # The series of one owner are contiguous in memory while they are added up.
         inputs = np.zeros((force_count + control_count, count, steps))
@@ -400,7 +412,7 @@ class TangentModel:
         """
         with self._at.with_batch(finer):
             state, _ = self._at.step_displaced({}, self._at.acting, steps=2)
-        return 2.0 * (state - self._base_states)
+        return 2.0 * (state - self._base_step[0])
 
     @cached_property
     def defects(self) -> Array:
@@ -461,8 +473,8 @@ class TangentModel:
         """
         count = 2 * self._motion.x.shape[1]
         q = self.quotients
-        states = np.zeros((self._steps + 1, self._base_states.shape[1], count))
-        readings = np.zeros((self._steps, self._base_readings.shape[1], count))
+        states = np.zeros((self._steps + 1, self.state_size, count))
+        readings = np.zeros((self._steps, self._at.output_count, count))
         states[0, :count] = np.eye(count)
         for t in range(self._steps):
             readings[t] = q.read_states[self._at.point_of_step[t]] @ states[t]
