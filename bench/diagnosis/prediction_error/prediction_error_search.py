@@ -6,12 +6,12 @@ residual of a set is only noise. The order is:
 
     1. Select effects with few shapes by regression. Fit the dry friction among them first, because
        it is not linear where a joint sticks and then the set (`selection_fits`).
-    2. If a force is still missing, fit each of the effects with the largest gains alone, and those
-       of the standard joint model (`selection_fits`, `effect_proposals`).
-    3. Add effects one by one, to dry friction in either of its forms or to nothing, each chosen by
+    2. If a force is still missing, select again, with effects of many shapes at the joints where it
+       is missing (`selection_fits`).
+    3. Fit each of the effects with the largest gains alone, and those of the standard joint model
+       (`selection_fits`, `effect_proposals`).
+    4. Add effects one by one, to dry friction in either of its forms or to nothing, each chosen by
        filters with the effect in the model (`competing_models`).
-    4. Select again, with effects of many shapes at the joints where a force is missing
-       (`selection_fits`).
     5. Simulate elasticity and backlash between a drive and its links (`selection_fits`).
     6. Try one effect in place of several (`competing_models`).
 
@@ -118,8 +118,9 @@ class PredictionErrorSearch(EffectSearch):
         """Select effects by regression and fit them by simulation, until only noise is left.
 
         Each further method is slower, so it is tried only if the best model does not explain the
-        runs: dry friction alone, the selected set, effects that regression missed, effects with
-        many shapes, elastic or slack transmissions, and at last one effect in place of several.
+        runs: dry friction alone, the selected set, effects with many shapes, effects that
+        regression missed, elastic or slack transmissions, and at last one effect in place of
+        several.
         """
         context = self._search_context
         selected = context.columns.select()

@@ -170,7 +170,8 @@ class TangentModel:
         motion, joints = self._motion, self._motion.x.shape[1]
         floating = self._sizes.size - joints
         hidden = len(self._at.hidden_state_effects)
-        return 2 * (joints + floating) + hidden + int(motion.act.shape[1])
+        size: int = 2 * (joints + floating) + hidden + motion.act.shape[1]
+        return size
 
     def _compute_difference_quotients(self) -> DifferenceQuotients:
         """Compute the derivatives of a step by states, forces and controls at all points.
