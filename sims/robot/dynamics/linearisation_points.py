@@ -171,7 +171,7 @@ class LinearisationPoints:
 
     @property
     def has_joints_only(self) -> bool:
-        """Whether the state consists of positions and velocities of joints alone.
+        """True if the state consists of positions and velocities of joints alone.
 
         It has no activations, no hidden states of effects, and no floating or unlisted bodies.
         """
@@ -184,7 +184,7 @@ class LinearisationPoints:
 
     @property
     def uses_runge_kutta(self) -> bool:
-        """Whether the model's integrator is the classical Runge-Kutta method."""
+        """True if the integrator is the classical Runge-Kutta method."""
         return forces_are_at_step_end(self._mujoco_batch.model)
 
     def step_displaced(
@@ -226,7 +226,7 @@ class LinearisationPoints:
         acting: ActiveEffects,
         extra_forces: Array | None = None,
         moved: Mapping[str, tuple[int, float]] | None = None,
-        midway: bool = False,
+        at_centres: bool = False,
     ) -> tuple[Array, Array]:
         """Compute accelerations (N, E) and readings (N, O) at each point.
 
@@ -237,13 +237,13 @@ class LinearisationPoints:
             acting: effects whose elements are in the model.
             extra_forces: (N, E) additional forces; none by default.
             moved: perturbations, as in `step_displaced`; none by default.
-            midway: whether joints have the state in the middle of the steps that a point stands
+            at_centres: whether joints have the state in the middle of the steps that a point stands
                 for, instead of that at the point.
         """
         accelerations, readings = [], []
         applied = self._mujoco_batch.batch.bind("qfrc_applied")
         dofs, begin = self._dofs, 0
-        for n, ids in self._place_points(moved or {}, acting, midway):
+        for n, ids in self._place_points(moved or {}, acting, at_centres):
             if extra_forces is not None:
                 applied[:n, dofs] += extra_forces[begin : begin + n]
                 begin += n
@@ -268,7 +268,7 @@ class LinearisationPoints:
         return readings
 
     @cached_property
-    def _midway_state(self) -> tuple[Array, Array]:
+    def _interval_centres(self) -> tuple[Array, Array]:
         """Positions and velocities (N, D) in the middle of the steps that each point stands for."""
         ends = np.append(self.point_steps[1:], len(self.motion.controls))
         below, above = (self.point_steps + ends) // 2, (self.point_steps + ends + 1) // 2
@@ -279,7 +279,7 @@ class LinearisationPoints:
         self,
         moved: Mapping[str, tuple[int, float]],
         acting: ActiveEffects,
-        midway: bool = False,
+        at_centres: bool = False,
     ) -> Iterator[tuple[int, IndexArray | None]]:
         """Place the points in the elements of the batch, as many at a time as it has elements.
 
@@ -288,7 +288,7 @@ class LinearisationPoints:
                 v velocity, a activation, w hidden state, p and r displacement and velocity of
                 floating bodies, f force, u control.
             acting: active effects.
-            midway: whether joints have the state of `_midway_state`.
+            at_centres: whether joints have the state of `_interval_centres`.
 
         Yields:
             Number n of elements in use, and their indices (None if all are in use).
@@ -319,8 +319,8 @@ class LinearisationPoints:
             if ranges is not None:
                 ranges.write(motion.off[steps])
             batch.state[:] = self._reset_state
-            if midway:
-                x, v = (values[begin : begin + n] for values in self._midway_state)
+            if at_centres:
+                x, v = (values[begin : begin + n] for values in self._interval_centres)
             else:
                 x, v = motion.x[steps], motion.v[steps]
             qpos[:n, joints.positions] = x

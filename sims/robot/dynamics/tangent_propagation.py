@@ -147,7 +147,7 @@ class TangentModel:
 
     @property
     def _differs_accelerations(self) -> bool:
-        """Whether the quotients are those of accelerations, by (3)."""
+        """True if the quotients are those of accelerations, by (3)."""
         return self._at.uses_runge_kutta and self._at.has_joints_only
 
     @cached_property
@@ -199,7 +199,7 @@ class TangentModel:
             "u": [("u", j, CONTROL_DIFFERENCE) for j in range(nu)],
         }
         if self._differs_accelerations:
-            displaced = partial(self._at.compute_accelerations, self._at.acting, midway=True)
+            displaced = partial(self._at.compute_accelerations, self._at.acting, at_centres=True)
             base, base_readings = displaced()
         else:
             displaced = partial(self._at.step_displaced, acting=self._at.acting)
