@@ -3,8 +3,8 @@
 The model has one coordinate, and events where dry friction stops it. Hidden-state effects add a
 driven mass or an internal state that no sensor shows.
 
-Every law is written here again in plain numbers, those of inputs in `reference_inputs`. Nothing is
-shared with the effect library, which the benchmark tests.
+Every law is written here again in plain numbers, those of signals in `reference_signals`. Nothing
+is shared with the effect library, which the benchmark tests.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
-from bench.diagnosis_benchmark.case_generation.reference_inputs import (
+from bench.diagnosis_benchmark.case_generation.reference_signals import (
     InputSegment,
     compute_applied_input,
 )
@@ -34,6 +34,7 @@ REGION_EDGE_WIDTH = 0.05
 
 
 ResistanceLaw = Callable[[float, float, float], float]
+"""Function from time, position and velocity of a coordinate to a force."""
 GravityForce = Callable[[float], float]
 SegmentResult = tuple[float, Array, Any]
 
@@ -115,6 +116,10 @@ class JointDynamics:
         """
         self.segment, self.middle = segment, 0.5 * (segment.begin + segment.end)
 
+    def drive(self, t: float) -> float:
+        """Return the force of the drive, the applied input, at a time."""
+        return self.segment.evaluate(t)
+
     def compute_force(self, t: float, x: float, v: float, *z: float) -> float:
         """Compute the force on the coordinate, without dry friction.
 
@@ -124,7 +129,7 @@ class JointDynamics:
             v: velocity.
             *z: states of the hidden-state effects.
         """
-        total = self.segment.evaluate(t) + self.weight(x)
+        total = self.drive(t) + self.weight(x)
         for force in self.forces:
             total += force(t, x, v)
         for part, part_states in zip(self.hidden_state_effects, pair_up(z), strict=True):
@@ -336,19 +341,15 @@ def _compute_wave(c: Sequence[float], cycles: float) -> float:
     return c[0] * sin(2 * pi * cycles) + c[1] * cos(2 * pi * cycles)
 
 
-FORCE_EFFECTS: dict[str, Callable[[JointDynamics, list[float]], ResistanceLaw]] = {
+FORCE_EFFECTS: dict[str, Callable[[Any, Sequence[float]], ResistanceLaw]] = {
     "drag.linear": lambda j, c: lambda t, x, v: -c[0] * v,
     "drag.quadratic": lambda j, c: lambda t, x, v: -c[0] * abs(v) * v,
     "friction.direction": lambda j, c: lambda t, x, v: -c[0] * max(v, 0.0) - c[1] * min(v, 0.0),
     "wind": lambda j, c: lambda t, x, v: -c[0] * abs(v - c[1]) * (v - c[1]),
     "gravity.scale": lambda j, c: lambda t, x, v: c[0] * j.weight(x),
     "gravity.tilt": lambda j, c: lambda t, x, v: c[0] * j.gravity * j.sideways(x),
-    "supply.sag": lambda j, c: (
-        lambda t, x, v: j.segment.evaluate(t) * (1 / (1 + c[0] * abs(j.segment.evaluate(t))) - 1)
-    ),
-    "supply.braking": lambda j, c: (
-        lambda t, x, v: -c[0] * j.segment.evaluate(t) * (j.segment.evaluate(t) * v < 0)
-    ),
+    "supply.sag": lambda j, c: lambda t, x, v: j.drive(t) * (1 / (1 + c[0] * abs(j.drive(t))) - 1),
+    "supply.braking": lambda j, c: lambda t, x, v: -c[0] * j.drive(t) * (j.drive(t) * v < 0),
     "spring.linear": lambda j, c: lambda t, x, v: -c[0] * x,
     "spring.cubic": lambda j, c: lambda t, x, v: -c[0] * x**3,
     "force.bias": lambda j, c: lambda t, x, v: c[0],
@@ -362,17 +363,17 @@ FORCE_EFFECTS: dict[str, Callable[[JointDynamics, list[float]], ResistanceLaw]] 
         lambda t, x, v: -c[0] * max(x - c[1], 0.0) if j.latched else 0.0
     ),  # unmodelled: a soft end stop in every other run
 }
-DRY_FRICTION_EFFECTS: dict[str, Callable[[JointDynamics, list[float]], ResistanceLaw]] = {
+DRY_FRICTION_EFFECTS: dict[str, Callable[[Any, Sequence[float]], ResistanceLaw]] = {
     "friction.coulomb": lambda j, c: lambda t, x, v: c[0],
     "friction.stribeck": lambda j, c: lambda t, x, v: c[0] + c[1] * exp(-((v / c[2]) ** 2)),
-    "friction.load": lambda j, c: lambda t, x, v: c[0] * abs(j.segment.evaluate(t) - j.weight(x)),
+    "friction.load": lambda j, c: lambda t, x, v: c[0] * abs(j.drive(t) - j.weight(x)),
     "friction.load_direction": lambda j, c: (
-        lambda t, x, v: abs(c[0] * j.segment.evaluate(t) - c[1] * j.weight(x))
+        lambda t, x, v: abs(c[0] * j.drive(t) - c[1] * j.weight(x))
     ),
     "friction.load_quadratic": lambda j, c: (
         lambda t, x, v: (
-            c[0] * abs(j.segment.evaluate(t) - j.weight(x))
-            + c[1] * compute_transmitted_force(j.segment.evaluate(t), -j.weight(x)) ** 2
+            c[0] * abs(j.drive(t) - j.weight(x))
+            + c[1] * compute_transmitted_force(j.drive(t), -j.weight(x)) ** 2
         )
     ),
     "friction.position": lambda j, c: (

@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.diagnosis_benchmark.case_generation import ball_reference, joint_reference
+from bench.diagnosis_benchmark.case_generation.reference_signals import SENSOR_EFFECTS
 from bench.diagnosis_benchmark.case_generation.true_system import EffectCoefficients, TrueSystem
 from sims import effects as library
 from sims.core.simulator import Array, Scenario
@@ -107,17 +108,10 @@ def simulate_with_scipy(
     observed = states[:, [CHANNELS[true_system.system].index(name) for name in channels]]
     read_column = _get_read_column(true_system.system, channels)
     for name, c in true_system.effects.items():
-        if name == "sensor.gain":
-            observed[:, read_column] *= 1 + c[0]
-        elif name == "sensor.bias":
-            observed[:, read_column] += c[0]
-        elif name == "sensor.drift":
-            observed[:, read_column] += c[0] * grid
-        elif name == "sensor.eccentricity":
-            angle = observed[:, read_column].copy()
-            observed[:, read_column] += c[0] * np.sin(angle) + c[1] * np.cos(angle)
-        elif name == "sensor.slip":
-            observed[:, read_column] += np.where(scenario.times[0] + grid >= c[1], c[0], 0.0)
+        if name in SENSOR_EFFECTS:
+            observed[:, read_column] = SENSOR_EFFECTS[name](
+                observed[:, read_column], c, grid, scenario.times[0] + grid
+            )
         elif name == "sensor.lag":
             observed = _apply_lag(observed, grid, c[0])
     return observed[rows]

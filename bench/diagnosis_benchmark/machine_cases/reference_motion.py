@@ -12,6 +12,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from bench.diagnosis_benchmark.case_generation.reference_signals import (
+    SENSOR_EFFECTS,
+    STEPWISE_INPUT_EFFECTS,
+)
 from bench.diagnosis_benchmark.machine_cases.machine_dynamics import Effects, MachineDynamics
 from sims.core.simulator import Array
 
@@ -235,39 +239,16 @@ def compute_applied_inputs(runs: MachineRuns, plant: MachineDynamics, times: Arr
     run_count, _, joints = runs.commands.shape
     applied_inputs = np.empty((run_count, len(times) - 1, joints))
     for joint, motor in enumerate(plant.motors):
-        input_effects = {
-            name.partition("@")[0]: c
-            for name, c in plant.effects.items()
-            if name.startswith("input.") and name.partition("@")[2] in ("", motor)
-        }
+        input_effects = select_signal_effects(plant.effects, "input.", motor)
         for run in range(run_count):
             levels: Array = runs.commands[run, :, joint]
             for name, c in input_effects.items():
-                levels = np.asarray(_apply_static_effects(name, c[0], levels), dtype=np.float64)
+                if name in STEPWISE_INPUT_EFFECTS:
+                    levels = STEPWISE_INPUT_EFFECTS[name](levels, *c)
             delay = input_effects.get("input.delay", (0.0,))[0]
             lag = input_effects.get("input.lag", (0.0,))[0]
             applied_inputs[run, :, joint] = _average_input(runs.times, levels, times, delay, lag)
     return applied_inputs
-
-
-def _apply_static_effects(name: str, c: float, u: Array) -> Array:
-    """Apply an effect without memory to a command; any other effect leaves it unchanged.
-
-    Args:
-        name: name of the effect.
-        c: its coefficient.
-        u: command, (T,).
-    """
-    match name:
-        case "input.gain":
-            return (1 + c) * u
-        case "input.bias":
-            return u + c
-        case "input.deadband":
-            return np.sign(u) * np.maximum(np.abs(u) - c, 0.0)
-        case "input.saturation":
-            return np.clip(u, -c, c)
-    return u
 
 
 def _average_input(stamps: Array, levels: Array, times: Array, delay: float, lag: float) -> Array:
@@ -340,21 +321,25 @@ def read_encoders(motion: MachineMotion, plant: MachineDynamics, times: Array) -
     lanes, joints = motion.q.shape[1:]
     readings = np.empty((lanes, len(times), joints))
     for joint, channel in enumerate(plant.channels):
-        sensor_effects = select_sensor_effects(plant.effects, channel)
+        sensor_effects = select_signal_effects(plant.effects, "sensor.", channel)
         delayed_times = np.maximum(times - sensor_effects.get("sensor.delay", (0.0,))[0], 0.0)
         values = _interpolate_positions(motion, delayed_times)[:, :, joint].T
-        values = values * (1 + sensor_effects.get("sensor.gain", (0.0,))[0])
-        values = values + sensor_effects.get("sensor.bias", (0.0,))[0]
-        readings[:, :, joint] = values + sensor_effects.get("sensor.drift", (0.0,))[0] * times
+        for name in ("sensor.gain", "sensor.bias", "sensor.drift"):
+            if name in sensor_effects:
+                values = SENSOR_EFFECTS[name](values, sensor_effects[name], times, times)
+        readings[:, :, joint] = values
     return readings
 
 
-def select_sensor_effects(effects: Effects, channel: str) -> dict[str, tuple[float, ...]]:
-    """Select the effects on the sensor of a channel.
+def select_signal_effects(
+    effects: Effects, prefix: str, place: str
+) -> dict[str, tuple[float, ...]]:
+    """Select the effects on one signal.
 
     Args:
         effects: coefficients by name, with or without a place.
-        channel: name of the channel.
+        prefix: begin of the names of the effects, such as ``input.``, or several.
+        place: name of the motor or channel.
 
     Returns:
         Coefficients by name without the place.
@@ -362,7 +347,7 @@ def select_sensor_effects(effects: Effects, channel: str) -> dict[str, tuple[flo
     return {
         name.partition("@")[0]: tuple(c)
         for name, c in effects.items()
-        if name.startswith("sensor.") and name.partition("@")[2] in ("", channel)
+        if name.startswith(prefix) and name.partition("@")[2] in ("", place)
     }
 
 

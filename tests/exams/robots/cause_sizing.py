@@ -38,7 +38,7 @@ class Gauge:
 
     def seen(self, effects):
         """Return noise-free observations in units of the noise, one (T, C) per run."""
-        world = World(self.setting.machine, effects, unmodelled_causes.plant_of(effects), self.step)
+        world = World(self.setting.machine, effects, self.step)
         channels, sigma = self.setting.channels, self.setting.sigma
         return [
             observed(world, run, channels, unmodelled_causes.slips_of(effects, number)) / sigma

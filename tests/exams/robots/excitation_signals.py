@@ -2,82 +2,50 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
-SIGNALS = (
-    "input.gain", "input.bias", "input.deadband", "input.saturation", "input.delay", "input.lag",
-    "input.rate", "servo.derivative", "servo.profile", "input.power",
-)  # fmt: skip
+from bench.diagnosis_benchmark.case_generation.reference_signals import apply_input_effects
+from bench.diagnosis_benchmark.machine_cases.reference_motion import select_signal_effects
+
 COUPLING = "joint.coupling@"
+INPUTS = ("input.", "servo.derivative", "servo.profile")
 
 
-@dataclass
 class AppliedSignal:
     """A command on its way to an actuator.
 
-    The order of the effects is: gain, power, bias, dead band, saturation, rate limit, delay, motion
-    profile of a servo, its D term, lag. The command is constant between time stamps; before the
-    first stamp it has its first value.
+    Effects on inputs act in their order, then the motion profile of a servo, its D term, and a lag.
+    The command is constant between time stamps; before the first stamp it has its first value.
+
+    Args:
+        times: time stamps, s, (T,).
+        command: command, (T,).
+        effects: coefficients by name.
     """
 
-    times: np.ndarray
-    command: np.ndarray
-    gain: float = 0.0
-    bias: float = 0.0
-    deadband: float = 0.0
-    saturation: float = 0.0
-    delay: float = 0.0
-    lag: float = 0.0
-    rate: float = 0.0
-    derivative: float = 0.0
-    profile: float = 0.0
-    power: tuple = (0.0, 0.0)
-    values: np.ndarray = field(init=False)
-    begins: np.ndarray = field(init=False)
-
-    def __post_init__(self):
-        values = self.command * (1 + self.gain)
-        scale, more = self.power
-        values = (1 + scale) * np.sign(values) * np.abs(values) ** (1 + more) + self.bias
-        values = np.sign(values) * np.maximum(np.abs(values) - self.deadband, 0.0)
-        if self.saturation:
-            values = np.clip(values, -self.saturation, self.saturation)
-        begins = self.times
-        if self.rate:
-            values, begins = _slewed(values, begins, self.rate)
-        begins = begins + self.delay
-        if self.profile:
-            values, begins = profiled(values, begins, self.profile)
-        if self.derivative:
-            # The D term takes a rate over `derivative` seconds, so a jump acts for that time.
-            both = np.unique(np.concatenate([begins, begins + self.derivative]))
-            now, before = (_held(begins, values, both - late) for late in (0.0, self.derivative))
+    def __init__(self, times, command, effects):
+        values, begins, self.lag = apply_input_effects(command, times, effects)
+        if "servo.profile" in effects:
+            values, begins = profiled(values, begins, effects["servo.profile"][0])
+        if "servo.derivative" in effects:
+            # The D term takes a rate over `span` seconds, so a jump acts for that time.
+            (span,) = effects["servo.derivative"]
+            both = np.unique(np.concatenate([begins, begins + span]))
+            now, before = (_held(begins, values, both - late) for late in (0.0, span))
             values, begins = 2 * now - before, both
         self.values, self.begins = values, begins
 
     def at(self, t):
         """Return the signal at time t before the lag (zero-order hold)."""
-        place = np.searchsorted(self.begins, t + 1e-9, side="right") - 1
-        return self.values[max(place, 0)]
+        return _held(self.begins, self.values, t)
 
 
 def _held(begins, values, t):
     """Return zero-order-hold values at given times; before the first stamp, the first value."""
     return values[np.maximum(np.searchsorted(begins, t + 1e-9, side="right") - 1, 0)]
-
-
-def _slewed(values, times, limit):
-    """Limit the rate of a signal to `limit` per second; results are held for 1 ms each."""
-    fine = np.arange(times[0], times[-1] + 1e-3, 1e-3)
-    wanted, state, risen = _held(times, values, fine), values[0], []
-    for level in wanted.tolist():
-        moved = min(max(level - state, -limit * 1e-3), limit * 1e-3)
-        risen.append(state + moved - 0.5 * abs(moved) / (limit * 1e-3) * moved)
-        state += moved
-    return np.array(risen), fine
 
 
 def profiled(values, times, limit):
@@ -117,15 +85,12 @@ def _shortest(x, v, limit, t):
 
 def compute_applied_signals(machine, times, commands, effects):
     """Return the applied signal of every actuator of a machine, by name."""
-    signals = {}
-    for drive in machine.drives:
-        numbers = {}
-        for name, c in effects.items():
-            effect, _, place = name.partition("@")
-            if effect in SIGNALS and place == drive.name:
-                numbers[effect.partition(".")[2]] = c[0] if len(c) == 1 else c
-        signals[drive.name] = AppliedSignal(times, commands[drive.name], **numbers)
-    return signals
+    return {
+        drive.name: AppliedSignal(
+            times, commands[drive.name], select_signal_effects(effects, INPUTS, drive.name)
+        )
+        for drive in machine.drives
+    }
 
 
 @dataclass

@@ -1,8 +1,10 @@
 """The true plant: a robot in Pinocchio with its hidden effects.
 
-Equations of motion: M(q) a + n(q, v) = drive - damping v - quadratic |v| v - spring q + bias +
-ripple + friction, with M and n from Pinocchio (J. Carpentier et al., The Pinocchio C++ library, SII
-2019; R. Featherstone, Rigid Body Dynamics Algorithms, 2008). This module defines the other terms.
+Equations of motion: M(q) a + n(q, v) = drive - damping v + forces of effects + dry friction, with M
+and n from Pinocchio (J. Carpentier et al., The Pinocchio C++ library, SII 2019; R. Featherstone,
+Rigid Body Dynamics Algorithms, 2008). The laws of forces and friction at a joint are those of the
+reference simulation of pendulum and slider; this module adds elastic joints, effects on inertias,
+and unmodelled causes of robots.
 """
 
 from __future__ import annotations
@@ -12,22 +14,26 @@ from functools import cached_property, partial
 
 import numpy as np
 
+from bench.diagnosis_benchmark.case_generation.joint_reference import (
+    DRY_FRICTION_EFFECTS,
+    FORCE_EFFECTS,
+)
+
 GRAVITY = 9.81
 
 
-@dataclass(frozen=True)
-class Binding:
-    """Dry friction in a part of a joint's travel: an unmodelled cause."""
+class JointLoad:
+    """Drive force and load of a joint, on which some laws of friction depend."""
 
-    joint: int
-    force: float
-    centre: float
-    half: float
+    driving = against = 0.0
 
-    def limit(self, q):
-        """Return the friction limit; it rises over a tenth of the half width."""
-        inside = (self.half - abs(q[self.joint] - self.centre)) / (0.1 * self.half)
-        return self.force * min(max(inside, 0.0), 1.0)
+    def drive(self, t):
+        """Return the force of the actuator."""
+        return self.driving
+
+    def weight(self, q):
+        """Return the force of gravity and motion that acts against the actuator."""
+        return -self.against
 
 
 @dataclass(frozen=True)
@@ -95,37 +101,22 @@ class Plant:
 
     Attributes:
         model, data: of Pinocchio.
-        damping, quadratic, spring, bias: by joint, (N,).
-        coulomb, extra, speed: dry friction `coulomb + extra exp(-(v / speed)^2)`, (N,).
-        ahead, back: damping of positive and of negative motion, (N,).
-        ripples: (joint, sine, cosine, period).
-        stops: (joint, stiffness at a depth of 0.01, position, loss); a positive stiffness is a stop
-            above the position.
-        uneven: (joint, minimum, sine, cosine, period) of dry friction over the joint.
-        loads: (joint, motor, external, quadratic) of friction by the load of the drive.
-        cold: (joint, dry, viscous, time) of friction that decays.
+        damping, coulomb: damping and dry friction that the file states, by joint, (N,).
+        forces: (joint, law) of forces; a law is a function of time, position and velocity.
+        limits: (joint, law) of dry friction.
+        loads: by joint, the `JointLoad` of its laws of friction by the load of the drive.
         memory: (joint, force, distance) of friction with hysteresis (Dahl).
-        binding, elastic, heated, cogging: objects of these classes, or None.
+        elastic, heated, cogging: objects of these classes, or None.
     """
 
     model: object
-    data: object
     damping: np.ndarray
     coulomb: np.ndarray
-    quadratic: np.ndarray
-    spring: np.ndarray
-    bias: np.ndarray
-    extra: np.ndarray
-    speed: np.ndarray
-    forward: np.ndarray
-    back: np.ndarray
-    ripples: list = field(default_factory=list)
-    stops: list = field(default_factory=list)
-    uneven: list = field(default_factory=list)
-    cold: list = field(default_factory=list)
-    loads: list = field(default_factory=list)
+    data: object = None
+    forces: list = field(default_factory=list)
+    limits: list = field(default_factory=list)
+    loads: dict = field(default_factory=dict)
     memory: list = field(default_factory=list)
-    binding: Binding | None = None
     elastic: Elastic | None = None
     heated: Heated | None = None
     cogging: Cogging | None = None
@@ -140,33 +131,13 @@ class Plant:
     def size(self):
         return self.damping.size
 
-    # These properties are read in every stage of every step, therefore they are cached.
-    @cached_property
-    def springs(self):
-        return bool(self.spring.any())
-
-    @cached_property
-    def drags(self):
-        return bool(self.quadratic.any())
-
-    @cached_property
-    def lopsided(self):
-        return bool((self.forward != self.back).any())
-
-    @cached_property
-    def stribeck(self):
-        return bool(self.extra.any())
-
     @property
     def has_friction(self):
         """Mask (N,) of the joints with dry friction."""
-        has_friction = (self.coulomb > 0) | (self.extra > 0)
-        if self.binding:
-            has_friction[self.binding.joint] = True
+        has_friction = self.coulomb > 0
+        has_friction[[joint for joint, _ in self.limits]] = True
         if self.heated:
             has_friction[self.heated.joint] = True
-        for joint, *_ in self.uneven + self.cold + self.loads:
-            has_friction[joint] = True
         return has_friction
 
     def limit(self, t, q, v, drive=None, heat=0.0):
@@ -178,46 +149,22 @@ class Plant:
             drive: actuator forces (N,), needed if there are `loads`.
             heat: heat of `heated`.
         """
-        limit = self.coulomb
-        if self.stribeck:
-            limit = limit + self.extra * np.exp(-((v / self.speed) ** 2))
-        if self.binding:
-            limit = limit.copy()
-            limit[self.binding.joint] += self.binding.limit(q)
+        limit = self.coulomb.copy()
+        if self.loads:
+            against = self.needed(q, v)
+            for joint, load in self.loads.items():
+                load.driving, load.against = drive[joint], against[joint]
+        for joint, law in self.limits:
+            limit[joint] += law(t, q[joint], v[joint])
         if self.heated:
-            limit = limit.copy()
             limit[self.heated.joint] += self.heated.force * heat
-        if self.uneven or self.cold or self.loads:
-            limit = limit.copy()
-        against = self.needed(q, v) if self.loads else None
-        for joint, motor, external, quadratic in self.loads:
-            one, other = drive[joint], against[joint]
-            through = min(abs(one), abs(other)) if one * other > 0 else 0.0
-            limit[joint] += abs(motor * one + external * other) + quadratic * through**2
-        for joint, least, sine, cosine, period in self.uneven:
-            angle = 2 * np.pi * q[joint] / period
-            limit[joint] += least + np.hypot(sine, cosine)
-            limit[joint] += sine * np.sin(angle) + cosine * np.cos(angle)
-        for joint, dry, viscous, time in self.cold:
-            limit[joint] += (dry + viscous * abs(v[joint])) * np.exp(-t / time)
-        return limit
+        return np.maximum(limit, 0.0)
 
-    def passive(self, q, v):
+    def passive(self, t, q, v):
         """Return joint forces that depend on position and velocity, without dry friction, (N,)."""
-        force = self.bias - self.damping * v
-        if self.springs:
-            force -= self.spring * q
-        if self.drags:
-            force -= self.quadratic * np.abs(v) * v
-        if self.lopsided:
-            force -= self.forward * np.maximum(v, 0.0) + self.back * np.minimum(v, 0.0)
-        for joint, sine, cosine, period in self.ripples:
-            angle = 2 * np.pi * q[joint] / period
-            force[joint] += sine * np.sin(angle) + cosine * np.cos(angle)
-        for joint, stiffness, place, loss in self.stops:
-            side = 1.0 if stiffness > 0 else -1.0
-            depth = max(side * (q[joint] - place), 0.0)
-            force[joint] -= stiffness * depth**1.5 / 0.1 * max(1 + loss * side * v[joint], 0.0)
+        force = -self.damping * v
+        for joint, law in self.forces:
+            force[joint] += law(t, q[joint], v[joint])
         return force
 
     def accelerations(self, q, v, force):
@@ -296,32 +243,35 @@ class FloatingPlant(Plant):
         return np.append(np.asarray(values)[self._order()], 0.0)
 
 
-def plant(machine, effects=None, foreign=None):
+def plant(machine, effects=None):
     """Build the plant of a machine.
 
     Args:
         machine: `exam_robots.Machine` or `floating_robots.Floater`.
-        effects: coefficients by effect@place; effects on signals are ignored.
-        foreign: `Binding`, `Heated`, `Cogging` or None.
+        effects: coefficients by effect@place, or numbers of an unmodelled cause by its name;
+            effects on signals and supplies are ignored.
     """
     model = machine.model()
     damping, coulomb = (np.array(values) for values in zip(*machine.stated(), strict=True))
-    count = damping.size
-    zeros = np.zeros((6, count))
     kind = partial(FloatingPlant, hinges=len(machine.hinges)) if machine.floats else Plant
-    made = kind(model, None, damping, coulomb, *zeros[:4], np.ones(count), *zeros[4:])
+    made = kind(model, damping, coulomb)
     for name, c in (effects or {}).items():
         effect, _, place = name.partition("@")
-        if effect in FORCES:
-            FORCES[effect](made, machine.index(place), c)
+        if effect.startswith("gravity."):
+            _gravity(model, effect, c)
+        elif effect in FORCE_EFFECTS and not effect.startswith("supply."):
+            made.forces.append((machine.index(place), FORCE_EFFECTS[effect](None, c)))
+        elif effect in DRY_FRICTION_EFFECTS:
+            joint = machine.index(place)
+            load = made.loads.setdefault(joint, JointLoad()) if ".load" in effect else None
+            made.limits.append((joint, DRY_FRICTION_EFFECTS[effect](load, c)))
+        elif effect in CHANGES:
+            CHANGES[effect](made, machine.index(place), c)
         elif effect in INERTIAS:
             INERTIAS[effect](made, machine.number(place), c)
-        elif effect.startswith("gravity."):
-            _gravity(model, effect, c)
+        elif effect in UNMODELLED_CAUSES:
+            UNMODELLED_CAUSES[effect](made, *c)
     made.data = made.model.createData()
-    made.binding = foreign if isinstance(foreign, Binding) else None
-    made.heated = foreign if isinstance(foreign, Heated) else None
-    made.cogging = foreign if isinstance(foreign, Cogging) else None
     return made
 
 
@@ -332,48 +282,6 @@ def _gravity(model, effect, c):
     else:
         linear += GRAVITY * np.array([c[0], c[1] if len(c) > 1 else 0.0, 0.0])
     model.gravity.linear = linear
-
-
-def _adds(attribute):
-    def change(plant, joint, c):
-        getattr(plant, attribute)[joint] += c[0]
-
-    return change
-
-
-def _stribeck(plant, joint, c):
-    plant.coulomb[joint] += c[0]
-    plant.extra[joint] += c[1]
-    plant.speed[joint] = c[2]
-
-
-def _direction(plant, joint, c):
-    plant.forward[joint] += c[0]
-    plant.back[joint] += c[1]
-
-
-def _ripple(plant, joint, c):
-    plant.ripples.append((joint, *c))
-
-
-def _stop(plant, joint, c):
-    plant.stops.append((joint, *c))
-
-
-def _uneven(plant, joint, c):
-    plant.uneven.append((joint, *c))
-
-
-def _load(plant, joint, c):
-    plant.loads.append((joint, c[0], c[0], c[1] if len(c) > 1 else 0.0))
-
-
-def _by_side(plant, joint, c):
-    plant.loads.append((joint, *c, 0.0))
-
-
-def _cold(plant, joint, c):
-    plant.cold.append((joint, *c))
 
 
 FLANKS = 2000.0  # Natural frequency of the load on a flank, rad/s; critically damped.
@@ -415,25 +323,30 @@ def _memory(plant, joint, c):
     plant.memory.append((joint, *c))
 
 
-FORCES = {
+CHANGES = {
     "joint.flexibility": _flexible,
     "joint.backlash": _play,
     "friction.hysteresis": _memory,
-    "friction.coulomb": _adds("coulomb"),
-    "friction.load": _load,
-    "friction.load_direction": _by_side,
-    "friction.load_quadratic": _load,
-    "friction.position": _uneven,
-    "friction.warming": _cold,
-    "friction.direction": _direction,
-    "friction.stribeck": _stribeck,
-    "drag.linear": _adds("damping"),
-    "drag.quadratic": _adds("quadratic"),
-    "spring.linear": _adds("spring"),
-    "force.bias": _adds("bias"),
-    "force.ripple": _ripple,
-    "state.limit": _stop,
 }
+"""Effects with states of their own."""
+
+
+def _heat(plant, joint, other, *c):
+    plant.heated = Heated(int(joint), int(other), *c)
+
+
+def _cog(plant, joint, *c):
+    plant.cogging = Cogging(int(joint), *c)
+
+
+def _bind(plant, joint, *c):
+    plant.limits.append((int(joint), DRY_FRICTION_EFFECTS["patch"](None, c)))
+
+
+UNMODELLED_CAUSES = {"heated": _heat, "cogging": _cog, "binding": _bind}
+"""Causes that the library does not contain: friction that the work of another joint heats, a ripple
+with hysteresis, and dry friction in a part of a joint's travel.
+"""
 
 
 def _mass(plant, number, c):

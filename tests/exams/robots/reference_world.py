@@ -54,14 +54,13 @@ class World:
 
     Args:
         machine: robot as its file describes it; it may have a floating base.
-        effects: coefficients by effect@place.
-        foreign: `Binding`, `Heated`, `Cogging` or None.
+        effects: coefficients by effect@place, or numbers of an unmodelled cause by its name.
         step: maximum step, s.
     """
 
-    def __init__(self, machine, effects=None, foreign=None, step=FINE):
+    def __init__(self, machine, effects=None, step=FINE):
         self.machine, self.effects, self.step = machine, dict(effects or {}), step
-        self.plant = plant(machine, self.effects, foreign)
+        self.plant = plant(machine, self.effects)
         self.drives = Drives.of(machine, self.effects)
         if soft := self.plant.elastic:
             self.step = min(step, 0.7 / soft.fastest)  # Runge-Kutta 4 is stable up to about 2.8.
@@ -276,7 +275,7 @@ class _Course:
         q, v = state[:n], state[n : 2 * n]
         if self.elastic:
             return self._elastic_forces(t, state)[0]
-        force = self.drives.forces(self._commands(t), q, v) + self.plant.passive(q, v)
+        force = self.drives.forces(self._commands(t), q, v) + self.plant.passive(t, q, v)
         if self.cogging:
             force[self.cogging.joint] += self.cogging.push(self.tooth, q)
         for (joint, dry, _), w in zip(self.plant.memory, state[self.memory], strict=False):
@@ -289,7 +288,7 @@ class _Course:
         q, v = state[:n].copy(), state[n : 2 * n].copy()
         link = q[soft.joint], v[soft.joint]
         q[soft.joint], v[soft.joint] = self._rotor(state)
-        outer = self.drives.forces(self._commands(t), q, v) + self.plant.passive(q, v)
+        outer = self.drives.forces(self._commands(t), q, v) + self.plant.passive(t, q, v)
         through = soft.through(q[soft.joint] - link[0], v[soft.joint] - link[1])
         rotor = outer[soft.joint] - through
         outer[soft.joint] = through

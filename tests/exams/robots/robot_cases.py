@@ -174,8 +174,7 @@ def bare_case(name, effects):
 
 def record(case, setting):
     """Return the recorded channels of every run, (T, C)."""
-    rng, effects = rng_of(case.name, "noise"), {} if case.kind == "foreign" else case.effects
-    world = World(setting.machine, effects, unmodelled_causes.plant_of(case.effects))
+    rng, world = rng_of(case.name, "noise"), World(setting.machine, case.effects)
     values = []
     for number_of_run, run in enumerate(setting.runs):
         slips = unmodelled_causes.slips_of(case.effects, number_of_run)

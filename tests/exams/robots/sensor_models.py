@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from bench.diagnosis_benchmark.case_generation.reference_signals import SENSOR_EFFECTS
+from bench.diagnosis_benchmark.machine_cases.reference_motion import select_signal_effects
+
 NOISES = ("white", "ar1", "quantised")
 
 
@@ -17,9 +20,10 @@ def observed(world, run, channels, slips=()):
         slips: (joint, time, jump) of a slipping encoder, an unmodelled cause.
     """
     skew = world.effects.get("clock.skew", (0.0,))[0]
+    effects = {name: select_signal_effects(world.effects, "sensor.", name) for name in channels}
     instants = {}
     for name in channels:
-        late = world.effects.get(f"sensor.delay@{name}", (0.0,))[0]
+        late = effects[name].get("sensor.delay", (0.0,))[0]
         instants[name] = np.maximum(run.times * (1 + skew) - late, 0.0)
     grid = np.unique(np.concatenate(list(instants.values())))
     motion = world.move(run, grid)
@@ -32,10 +36,8 @@ def observed(world, run, channels, slips=()):
         for slipping, instant, jump in slips if kind == "q" else ():
             if slipping == index:
                 column = column + jump * (run.times >= instant)
-        gain = world.effects.get(f"sensor.gain@{name}", (0.0,))[0]
-        bias = world.effects.get(f"sensor.bias@{name}", (0.0,))[0]
-        sine, cosine = world.effects.get(f"sensor.eccentricity@{name}", (0.0, 0.0))
-        column = column + sine * np.sin(column) + cosine * np.cos(column)
-        jump, instant = world.effects.get(f"sensor.slip@{name}", (0.0, 0.0))
-        columns.append(column * (1 + gain) + bias + jump * (run.times >= instant))
+        for effect, c in effects[name].items():
+            if effect in SENSOR_EFFECTS:
+                column = SENSOR_EFFECTS[effect](column, c, run.times, run.times)
+        columns.append(column)
     return np.column_stack(columns)

@@ -10,7 +10,7 @@ from tests.exams.robots import reference_answers, robot_models
 from tests.exams.robots.exam_robots import Drive, Machine
 from tests.exams.robots.excitation_signals import Drives
 from tests.exams.robots.friction_laws import held
-from tests.exams.robots.reference_plant import Binding, Cogging, Heated
+from tests.exams.robots.reference_plant import Cogging
 from tests.exams.robots.reference_world import Run, World, _Course
 
 pytest.importorskip("pinocchio", reason="pin has no wheel here")
@@ -307,7 +307,7 @@ def test_a_shaft_turns_two_joints_and_one_battery_serves_all_drives():
 def test_friction_follows_the_load_of_another_drive():
     """Friction follows the heat of another joint, which grows with its work and decays in time."""
     machine = robot_models.machine("arm2-motor", np.random.default_rng(1))
-    world = World(machine, foreign=Heated(1, 0, 0.5, 0.2, 1.0))
+    world = World(machine, {"heated": (1, 0, 0.5, 0.2, 1.0)})
     run = driven(machine, 0.5, stamps=np.arange(101) / 100)
     motion, bare = world.move(run, run.times), World(machine).move(run, run.times)
     apart = np.abs(motion.q - bare.q).max(axis=1)
@@ -331,12 +331,12 @@ def test_friction_with_teeth_lags_by_half_a_tooth():
 
 
 def test_a_binding_range_has_friction_only_within_it():
-    world = World(roller(), foreign=Binding(0, 0.5, 3.0, 0.5))
+    world = World(roller(), {"binding": (0, 0.5, 3.0, 0.5)})
     start = Run(STAMPS, {"m_axle": 0 * STAMPS}, np.zeros(1), np.array([2.0]))
     v = world.move(start, STAMPS).v[:, 0]
-    assert v[STAMPS < 1.2].tolist() == [2.0] * int(np.sum(STAMPS < 1.2))
-    # Friction rises and falls over a tenth of the half width, which counts half.
-    assert v[-1] ** 2 == pytest.approx(4.0 - 2 * 0.5 * 0.95 / 0.4, rel=1e-4)
+    np.testing.assert_allclose(v[STAMPS < 1.15], 2.0, rtol=1e-5)
+    # The work of friction is that over the width of the range, with soft borders too.
+    assert v[-1] ** 2 == pytest.approx(4.0 - 2 * 0.5 * 1.0 / 0.4, rel=1e-4)
 
 
 def test_commands_are_delayed_and_filtered_as_stated():

@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from tests.exams.robots.reference_plant import Binding, Cogging, Heated
-
 
 def drawn(cause, joint, setting, rng):
     """Return a function from strength to keyword arguments, the hidden cause of a question.
@@ -68,20 +66,6 @@ def _slip(joint, setting, rng):
 
 
 DRAWN = {"heated": _heated, "cogging": _cogging, "binding": _binding, "slip": _slip}
-
-
-def plant_of(effects):
-    """Return the unmodelled cause that acts in the plant, or None."""
-    if "heated" in effects:
-        joint, other, *rest = effects["heated"]
-        return Heated(int(joint), int(other), *rest)
-    if "cogging" in effects:
-        joint, *rest = effects["cogging"]
-        return Cogging(int(joint), *rest)
-    if "binding" in effects:
-        joint, *rest = effects["binding"]
-        return Binding(int(joint), *rest)
-    return None
 
 
 def slips_of(effects, number):

@@ -1,8 +1,8 @@
-"""Input of a run as applied to the plant of the reference simulation, after all input effects."""
+"""Laws of inputs and sensors in the reference simulations: commands as applied, and readings."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import copysign, exp, inf
 
@@ -52,8 +52,6 @@ def compute_applied_input(
 ) -> list[InputSegment]:
     """Compute the first input as applied to the plant, from time 0 to `end_time`.
 
-    A lag must follow the nonlinear input effects.
-
     Args:
         scenario: the run.
         effects: the hidden effects.
@@ -64,7 +62,43 @@ def compute_applied_input(
     """
     if "u" not in scenario.inputs:
         return [InputSegment(0.0, end_time, 0.0, effects.get("input.bias", [0.0])[0], 0.0)]
-    levels, edges, lag = np.array(scenario.inputs["u"]), scenario.times - scenario.times[0], 0.0
+    levels, edges, lag = apply_input_effects(
+        np.array(scenario.inputs["u"]), scenario.times - scenario.times[0], effects
+    )
+    changes = np.flatnonzero(np.diff(levels)) + 1
+    starts, targets = [0.0, *edges[changes]], [levels[0], *levels[changes]]
+    segments, state = [], levels[0]
+    for start, end, target in zip(starts, [*starts[1:], inf], targets, strict=True):
+        if start < end_time:
+            segments.append(
+                InputSegment(
+                    float(start), float(min(end, end_time)), float(state), float(target), lag
+                )
+            )
+            state = segments[-1].evaluate(segments[-1].end)
+    return segments
+
+
+def apply_input_effects(
+    levels: Array, edges: Array, effects: EffectCoefficients
+) -> tuple[Array, Array, float]:
+    """Apply hidden effects to a command that is held between samples, in their order.
+
+    A lag must follow the nonlinear input effects; its exponential approach is left to the caller.
+
+    Args:
+        levels: command at each sample.
+        edges: time of each sample, s.
+        effects: the hidden effects.
+
+    Returns:
+        Levels and begins of the parts in which the command is constant, and the time constant of
+        the lag, s; 0 for none.
+
+    Raises:
+        NotImplementedError: a nonlinear input effect follows a lag.
+    """
+    lag = 0.0
     if "input.hold" in effects:
         levels, edges = _interpolate_input(levels, edges, effects["input.hold"][0])
     for name, c in effects.items():
@@ -78,18 +112,7 @@ def compute_applied_input(
             levels, edges = _limit_input_rate(levels, edges, c[0])
         elif name in STEPWISE_INPUT_EFFECTS:
             levels = STEPWISE_INPUT_EFFECTS[name](levels, *c)
-    changes = np.flatnonzero(np.diff(levels)) + 1
-    starts, targets = [0.0, *edges[changes]], [levels[0], *levels[changes]]
-    segments, state = [], levels[0]
-    for start, end, target in zip(starts, [*starts[1:], inf], targets, strict=True):
-        if start < end_time:
-            segments.append(
-                InputSegment(
-                    float(start), float(min(end, end_time)), float(state), float(target), lag
-                )
-            )
-            state = segments[-1].evaluate(segments[-1].end)
-    return segments
+    return levels, edges, lag
 
 
 def _interpolate_input(levels: Array, edges: Array, share: float) -> tuple[Array, Array]:
@@ -165,3 +188,13 @@ STEPWISE_INPUT_EFFECTS: dict[str, Callable[..., Array]] = {
     "input.power": lambda u, gain, power: (1 + gain) * np.sign(u) * np.abs(u) ** (1 + power),
     "backlash": _apply_backlash,
 }
+"""Input effects without memory, except `backlash`: functions of the levels and coefficients."""
+SENSOR_EFFECTS: dict[str, Callable[[Array, Sequence[float], Array, Array], Array]] = {
+    "sensor.gain": lambda y, c, elapsed, times: y * (1 + c[0]),
+    "sensor.bias": lambda y, c, elapsed, times: y + c[0],
+    "sensor.drift": lambda y, c, elapsed, times: y + c[0] * elapsed,
+    "sensor.eccentricity": lambda y, c, elapsed, times: y + (c[0] * np.sin(y) + c[1] * np.cos(y)),
+    "sensor.slip": lambda y, c, elapsed, times: y + np.where(times >= c[1], c[0], 0.0),
+}
+"""Sensor effects without memory: functions of readings (T,), coefficients, seconds since the first
+sample, and times of the recording."""
