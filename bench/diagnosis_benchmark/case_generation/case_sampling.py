@@ -20,6 +20,7 @@ from bench.diagnosis_benchmark.case_generation import (
     effect_sizing,
 )
 from bench.diagnosis_benchmark.case_generation.benchmark_case import BenchmarkCase, make_case_rng
+from bench.diagnosis_benchmark.case_generation.cause_sizes import find_strength_for_size
 from bench.diagnosis_benchmark.case_generation.recording_conditions import (
     ANY_CONDITIONS,
     RecordingConditions,
@@ -279,10 +280,10 @@ def find_coefficients(
             setting, {name: compute_coefficients(strength)}
         ),
     )
-    strength = effect_sizing.find_strength_for_size(
+    found = find_strength_for_size(
         compute_residual, target_size, effect_coefficients.get_max_strength(name)
     )
-    return None if strength is None else compute_coefficients(strength)
+    return None if found is None else compute_coefficients(found[0])
 
 
 def _draw_pair(
@@ -372,13 +373,14 @@ def _draw_unmodelled(
             ]
         )
 
-    strength = effect_sizing.find_strength_for_size(
+    found = find_strength_for_size(
         effect_sizing.make_gap_function(setting, observed),
         target_size,
         effect_coefficients.MAX_STRENGTH,
     )
-    if strength is None:
+    if found is None:
         return None
+    strength, _ = found
     _, unexplained = competing_effects.find_best_effect(setting, observed(strength))
     hidden_case = replace(
         case,

@@ -19,10 +19,7 @@ from bench.diagnosis_benchmark.case_generation.reference_simulation import (
 )
 from sims.core.simulator import Array
 
-SIZE_TOLERANCE = 0.03  # relative tolerance of the size
-MAX_STRENGTH_FACTOR = 8.0  # maximum factor of the strength per step, so that the fit can follow
 FINITE_DIFFERENCE_STEP = 1e-5  # finite-difference step, as a fraction of a parameter's scale
-FIRST_STRENGTH = 1e-3  # first strength to try
 DIVERGED_VALUE = 1e30  # in units of the noise: larger values count as diverged
 
 
@@ -233,66 +230,3 @@ def make_gap_function(
         return fitted.rms_residual
 
     return compute_size
-
-
-def find_strength_for_size(
-    compute_residual: Callable[[float], float],
-    target_size: float,
-    largest: float,
-) -> float | None:
-    """Find the strength at which the size has the requested value.
-
-    The method is the secant method on logarithmic scales, within a bracket as soon as there is one.
-
-    Args:
-        compute_residual: size as a function of the strength, increasing from zero.
-        target_size: requested size.
-        largest: maximum strength.
-
-    Returns:
-        The strength, or None if it is not below `largest`.
-    """
-    # Bracket: (strength, size) below and above the requested size.
-    low, high, strength = (0.0, 0.0), (np.inf, np.inf), FIRST_STRENGTH
-    for _ in range(12):
-        size = compute_residual(strength)
-        if abs(size / target_size - 1) < SIZE_TOLERANCE:
-            return strength
-        if size < target_size:
-            # Too small even if the size grew with the square of the strength.
-            if strength >= largest or size * (largest / strength) ** 2 < target_size:
-                return None
-            low = strength, size
-        else:  # also if it is NaN or infinite
-            high = strength, size
-        strength = float(min(_choose_next_strength(low, high, target_size), largest))
-    return None
-
-
-def _choose_next_strength(
-    low: tuple[float, float], high: tuple[float, float], target_size: float
-) -> float:
-    """Return the next strength to try.
-
-    Without a strength below, the size is assumed to be proportional to it. Without a strength
-    above, the strength grows by at most `MAX_STRENGTH_FACTOR`. With both, it is interpolated on
-    logarithmic scales, or halved there if the bracket is very wide or the upper size is not finite.
-
-    Args:
-        low: strength and size below the requested size; strength 0 if there is none.
-        high: strength and size above it; infinite strength if there is none.
-        target_size: requested size.
-    """
-    if not low[0]:
-        return (
-            high[0] * min(max(target_size / high[1], 1e-2), 0.9)
-            if np.isfinite(high[1])
-            else high[0] / 5
-        )
-    if not np.isfinite(high[0]):
-        return low[0] * min(target_size / max(low[1], 1e-9), MAX_STRENGTH_FACTOR)
-    if not np.isfinite(high[1]) or high[0] / low[0] > MAX_STRENGTH_FACTOR**2:
-        return float(np.sqrt(low[0] * high[0]))
-    log_position = float(np.log(target_size / low[1]) / np.log(high[1] / low[1]))
-    limited_position = min(max(log_position, 0.05), 0.95)
-    return float(low[0] * (high[0] / low[0]) ** limited_position)

@@ -13,7 +13,11 @@ from functools import lru_cache
 import numpy as np
 
 from bench.diagnosis_benchmark.case_generation.benchmark_case import BenchmarkCase, make_case_rng
-from bench.diagnosis_benchmark.case_generation.effect_sizing import find_strength_for_size
+from bench.diagnosis_benchmark.case_generation.cause_sizes import (
+    compute_orthonormal_basis,
+    compute_rms,
+    find_strength_for_size,
+)
 from bench.diagnosis_benchmark.case_generation.recording_conditions import (
     ANY_CONDITIONS,
     RequestedConditions,
@@ -211,8 +215,8 @@ def _find_sized_coefficients(
         effects, foreign = (causes, {}) if is_modelled else ({}, causes)
         return gauge.compute_residual_size(conditions.simulate_readings(effects, foreign))
 
-    strength = find_strength_for_size(compute_size, target_size, 1.0)
-    return None if strength is None else compute_coefficients(strength)
+    found = find_strength_for_size(compute_size, target_size, 1.0)
+    return None if found is None else compute_coefficients(found[0])
 
 
 def _hide_two_effects(
@@ -381,7 +385,7 @@ class _ResidualGauge:
             state_columns[r, :, r] = slopes[r, len(parameters) :].T
         columns = np.column_stack([shared, state_columns.reshape(runs * slopes.shape[2], -1)])
         self.bare = readings[:, 0].reshape(runs, len(conditions.runs.times), joints)
-        self._basis = _compute_orthonormal_basis(columns)
+        self._basis = compute_orthonormal_basis(columns)
 
     def compute_residual_size(self, readings: Array) -> float:
         """Compute the size of the change in readings by a hidden cause; infinite if they diverge.
@@ -405,38 +409,18 @@ class _ResidualGauge:
             residual = residual - projected_direction * (projected_direction @ residual) / (
                 projected_direction @ projected_direction
             )
-        return float(np.sqrt(np.mean(residual**2)) / self.conditions.noise_sigmas)
+        return compute_rms(residual) / self.conditions.noise_sigmas
 
     def _compute_size(self, change: Array) -> float:
         """Return the RMS of a flattened change in units of the noise, parameters projected out."""
         if not np.isfinite(change).all():
             return float("inf")
-        return float(
-            np.sqrt(np.mean(self._project_out_parameters(change) ** 2))
-            / self.conditions.noise_sigmas
-        )
+        return compute_rms(self._project_out_parameters(change)) / self.conditions.noise_sigmas
 
     def _project_out_parameters(self, change: Array) -> Array:
         """Subtract from a change (RTN,) the part that parameters and initial states explain."""
         residual: Array = change - self._basis @ (self._basis.T @ change)
         return residual
-
-
-def _compute_orthonormal_basis(columns: Array) -> Array:
-    """Compute an orthonormal basis of the span of columns by a singular value decomposition.
-
-    Directions with a singular value below 1e-6 of the largest are left out, because they come from
-    columns that are nearly dependent.
-
-    Args:
-        columns: columns, (N, P).
-    """
-    scale = np.sqrt(np.square(columns).sum(axis=0))
-    left_vectors, singular_values, _ = np.linalg.svd(
-        columns / np.where(scale > 0, scale, 1.0), full_matrices=False
-    )
-    basis: Array = left_vectors[:, singular_values > 1e-6 * singular_values[0]]
-    return basis
 
 
 EQUIVALENT_CAUSES: dict[str, tuple[frozenset[str], ...]] = {

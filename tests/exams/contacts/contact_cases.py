@@ -13,6 +13,7 @@ from functools import cached_property
 import mujoco
 import numpy as np
 
+from bench.diagnosis_benchmark.case_generation.cause_sizes import compute_rms
 from tests.exams import exam
 from tests.exams.answer_rows import conditions_text, hidden_text, number
 from tests.exams.contacts.contact_robots import (
@@ -25,7 +26,7 @@ from tests.exams.contacts.contact_robots import (
 from tests.exams.exam import Exam, Target, UndrawableError
 from tests.exams.marking import HiddenCause, Standard, mark_answer
 from tests.exams.planted.planted_cases import position_unit
-from tests.exams.planted.planted_motion import HELD_OUT, RATE, RUNS, SAMPLES, rms
+from tests.exams.planted.planted_motion import HELD_OUT, RATE, RUNS, SAMPLES
 from tests.exams.robot_files import signal_unit, write_robot_recording
 
 CONTACT = "ground/foot"
@@ -168,7 +169,7 @@ class ContactCase(exam.Case):
             (replay(self.model, motion.states[0], motion.commands) - motion.states)
             for motion in self.motions.values()
         ]
-        return rms(np.concatenate(errors)[:, : self.model.nq]) / NOISE
+        return compute_rms(np.concatenate(errors)[:, : self.model.nq]) / NOISE
 
     @cached_property
     def growth(self):

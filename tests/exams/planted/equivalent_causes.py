@@ -13,13 +13,10 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from tests.exams.planted.planted_motion import HELD_OUT, RATE, RUNS, SAMPLES, Change, Run, rms
+from bench.diagnosis_benchmark.case_generation.cause_sizes import compute_rms, fit_coefficients
+from tests.exams.planted.planted_motion import HELD_OUT, RATE, RUNS, SAMPLES, Change, Run
 
-MAX_STEPS = 12  # Maximum number of Levenberg-Marquardt steps.
-MAX_TRIALS = 8  # Maximum number of damping values that are tried in one step.
-FIRST_DAMPING = 1e-3
-NUDGE = 1e-3  # Finite-difference step, in units of the scaled coefficients.
-CONVERGED = 1e-4  # Scaled step at which a fit has converged.
+STEPS = 12  # Maximum number of steps of a fit.
 
 
 def held_out_ratios(item, names):
@@ -41,7 +38,7 @@ class _Comparison:
         self.runs, states = item.performance
         self.measured = item.measured()
         truth = {name: self.experiment.channels(states[name]) for name in RUNS}
-        self.true_parameter_error = rms(self._residual(HELD_OUT, truth[HELD_OUT]))
+        self.true_parameter_error = compute_rms(self._residual(HELD_OUT, truth[HELD_OUT]))
 
     def ratio(self, name):
         effect, _, place = name.partition("@")
@@ -94,36 +91,8 @@ class _Comparison:
             )
 
         begin = np.tile(form.begin, (len(places), 1)).ravel()
-        numbers = levenberg_marquardt(residual, begin, (lowest / scales).ravel())
-        return rms(residual(numbers, [HELD_OUT]))
-
-
-def levenberg_marquardt(residual, numbers, lowest):
-    """Minimise the sum of squares of `residual(numbers)` subject to lower bounds."""
-    now, damping = residual(numbers), FIRST_DAMPING
-    for _ in range(MAX_STEPS):
-        jacobian = np.stack(
-            [(residual(numbers + NUDGE * unit) - now) / NUDGE for unit in np.eye(numbers.size)], 1
-        )
-        normal, gradient = jacobian.T @ jacobian, jacobian.T @ now
-        scaling = np.diag(np.diag(normal) + 1e-12)
-        for _ in range(MAX_TRIALS):
-            trial = np.maximum(
-                numbers - np.linalg.solve(normal + damping * scaling, gradient), lowest
-            )
-            result = residual(trial)
-            # The comparison is false for values that are not finite.
-            if result @ result <= now @ now:
-                break
-            damping *= 8
-        else:
-            return numbers
-        damping /= 5
-        step = np.abs(trial - numbers).max()
-        numbers, now = trial, result
-        if step < CONVERGED:
-            break
-    return numbers
+        bounds = (lowest / scales).ravel(), np.inf
+        return compute_rms(residual(fit_coefficients(residual, begin, *bounds, STEPS), [HELD_OUT]))
 
 
 @dataclass(frozen=True)

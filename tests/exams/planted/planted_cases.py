@@ -14,6 +14,11 @@ from functools import cached_property
 import mujoco
 import numpy as np
 
+from bench.diagnosis_benchmark.case_generation.cause_sizes import (
+    compute_orthonormal_basis,
+    compute_rms,
+    find_strength_for_size,
+)
 from tests.exams import exam
 from tests.exams.answer_rows import conditions_text, hidden_text, number
 from tests.exams.exam import Exam, Target, UndrawableError
@@ -31,7 +36,6 @@ from tests.exams.planted.planted_motion import (
     Simulator,
     mass_matrix,
     reference,
-    rms,
 )
 from tests.exams.planted.planted_robots import ROBOTS, MissingModelError
 from tests.exams.robot_files import signal_unit, write_robot_recording
@@ -49,7 +53,6 @@ STATE_STEP = 1e-5  # Finite-difference step of an initial state, rad, m, rad/s o
 # Maximum growth of a deviation of the initial positions; above it, the motion is chaotic.
 MAX_GROWTH = 4.0
 MAX_SERVO_STEP = 1.0  # Maximum of kv * timestep / inertia for a servo with a force limit.
-MAX_SIZINGS = 8  # Maximum number of simulated sizes per place.
 STANDARD = Standard(max_set=4, largest_fair_set=4, number_counts=True)
 GAP_TOLERANCE = 0.15  # Accepted relative difference between the wanted and the reached discrepancy.
 
@@ -330,9 +333,7 @@ class Experiment:
         bases = {}
         for name, response in self.state_responses.items():
             matrix = (response / self.sigma[:, None]).reshape(-1, response.shape[-1])
-            scales = np.linalg.norm(matrix, axis=0)
-            left, singular, _ = np.linalg.svd(matrix[:, scales > 0] / scales[scales > 0], False)
-            bases[name] = left[:, singular > 1e-6 * singular[0]]
+            bases[name] = compute_orthonormal_basis(matrix)
         return bases
 
     def gaps(self, change):
@@ -342,7 +343,7 @@ class Experiment:
             flat, basis = values.ravel(), self.state_bases[name]
             plain.append(flat)
             fitted.append(flat - basis @ (basis.T @ flat))
-        return rms(np.concatenate(fitted)), rms(np.concatenate(plain))
+        return compute_rms(np.concatenate(fitted)), compute_rms(np.concatenate(plain))
 
     @cached_property
     def nominal_peaks(self):
@@ -478,32 +479,21 @@ def _largest(experiment, kind, place, sign, torques):
 def _sized(experiment, kind, place, largest, wanted):
     """Return (size, gap, plain gap) near the wanted gap; None if the place cannot show one."""
 
-    def gaps(size):
+    def gaps(share):
+        size = float(f"{share * largest:.3g}")
         try:
-            return experiment.gaps(Change(kind, place, float(f"{size:.3g}")))
+            return size, *experiment.gaps(Change(kind, place, size))
         except ObstructedMotionError:
-            return None
+            return size, np.inf, np.inf
 
-    if largest == 0:
-        return None
-    size, low, high = 0.1 * largest, 0.0, largest
-    for _ in range(MAX_SIZINGS):
-        found = gaps(size)
-        if found is None or found[0] > wanted * (1 + GAP_TOLERANCE):
-            high = size
-        elif found[0] < wanted * (1 - GAP_TOLERANCE):
-            if size == largest:  # Even the largest change shows less than wanted.
-                break
-            low = size
-        else:
-            break
-        guess = size * wanted / found[0] if found and found[0] > 0 else size / 3
-        guess = largest if abs(guess) >= abs(largest) else guess
-        inside = abs(low) < abs(guess) < abs(high) or (guess == largest and high == largest)
-        size = guess if inside else (low + high) / 2
-    if found is None or not GAP[0] <= found[0] <= GAP[1]:
-        return None
-    return float(f"{size:.3g}"), float(found[0]), float(found[1])
+    # If the largest change shows less than wanted, the smallest visible size is tried.
+    for target in (wanted, 1.2 * GAP[0]) if largest else ():
+        found = find_strength_for_size(
+            lambda share: gaps(share)[1], target, 1.0, 0.1, np.inf, GAP_TOLERANCE
+        )
+        if found is not None:
+            return gaps(found[0])
+    return None
 
 
 EXAM = Exam(

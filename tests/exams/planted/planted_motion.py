@@ -224,7 +224,3 @@ def mass_matrix(model, pose):
     mass = np.zeros((model.nv, model.nv))
     mujoco.mj_fullM(model, data, mass)
     return mass
-
-
-def rms(values):
-    return float(np.sqrt(np.mean(np.square(values))))

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
+from bench.diagnosis_benchmark.case_generation.cause_sizes import fit_coefficients
 from tests.exams.planted.equivalent_causes import (
     FORMS,
     PLACES,
     held_out_ratios,
-    levenberg_marquardt,
 )
 from tests.exams.planted.planted_cases import STANDARD
 from tests.exams.planted.planted_motion import EFFECTS
@@ -49,7 +49,7 @@ def test_the_fit_finds_a_minimum_at_a_bound():
     def residual(x):
         return np.array([x[0] - 3.0, 2 * x[1] + 4.0])
 
-    free = levenberg_marquardt(residual, np.zeros(2), np.full(2, -np.inf))
+    free = fit_coefficients(residual, np.zeros(2), np.full(2, -np.inf), np.inf, 12)
     assert free == pytest.approx([3.0, -2.0], abs=1e-4)
-    bounded = levenberg_marquardt(residual, np.zeros(2), np.array([-np.inf, -0.5]))
+    bounded = fit_coefficients(residual, np.zeros(2), np.array([-np.inf, -0.5]), np.inf, 12)
     assert bounded == pytest.approx([3.0, -0.5], abs=1e-4)

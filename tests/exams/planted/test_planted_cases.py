@@ -7,9 +7,10 @@ import mujoco
 import numpy as np
 import pytest
 
+from bench.diagnosis_benchmark.case_generation.cause_sizes import compute_rms
 from tests.exams.exam import UndrawableError
 from tests.exams.planted.planted_cases import GAP, PlantedQuestion, questions
-from tests.exams.planted.planted_motion import Change, rms
+from tests.exams.planted.planted_motion import Change
 from tests.exams.planted.planted_robots import ROBOTS, MissingModelError, Robot
 from tests.exams.runner import digest
 
@@ -66,7 +67,7 @@ def errors(model, item, path):
                 data.ctrl[index] = row[f"u.{model.actuator(index).name}"]
             for _ in range(round(0.01 / model.opt.timestep)):
                 mujoco.mj_step(model, data)
-    return rms(differences)
+    return compute_rms(np.array(differences))
 
 
 @pytest.mark.parametrize(

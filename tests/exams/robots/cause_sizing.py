@@ -8,13 +8,15 @@ from __future__ import annotations
 
 import numpy as np
 
+from bench.diagnosis_benchmark.case_generation.cause_sizes import (
+    compute_orthonormal_basis,
+    compute_rms,
+    find_strength_for_size,
+)
 from tests.exams.robots import unmodelled_causes
 from tests.exams.robots.reference_world import COARSE, World
 from tests.exams.robots.sensor_models import observed
 
-ACCURATE = 0.03  # Relative tolerance of the size that is reached.
-LARGEST, LEAP = 1.0, 8.0
-NARROW = 0.98  # Stop the search when the bracket of strengths is narrower than this ratio.
 NUDGE = 1e-3  # Finite-difference step of an initial state, rad or rad/s.
 SETTLED = 1.2  # Seconds after which a servo no longer depends on its initial state.
 
@@ -75,7 +77,9 @@ class Gauge:
         try:
             changes = self.change(effects)
             others = beyond or [np.zeros_like(change) for change in changes]
-            return rms(np.concatenate([c - b for c, b in zip(changes, others, strict=True)]))
+            return compute_rms(
+                np.concatenate([c - b for c, b in zip(changes, others, strict=True)])
+            )
         except (RuntimeError, ValueError, np.linalg.LinAlgError):
             return np.inf  # The simulation diverged.
 
@@ -98,12 +102,7 @@ class Gauge:
                 seen = observed(world, moved, self.setting.channels) / self.setting.sigma
                 column[:count] = (seen - base[:count]) / NUDGE
                 columns.append(column.ravel())
-        basis, sizes, _ = np.linalg.svd(np.column_stack(columns), full_matrices=False)
-        return basis[:, sizes > 1e-9 * sizes[0]]
-
-
-def rms(values):
-    return float(np.sqrt(np.mean(np.square(values))))
+        return compute_orthonormal_basis(np.column_stack(columns))
 
 
 def left(change, others):
@@ -113,42 +112,11 @@ def left(change, others):
     """
     others = [other for other in others if np.isfinite(other).all()]
     if not others:
-        return rms(change)
+        return compute_rms(change)
     solution = np.linalg.lstsq(np.column_stack(others), change, rcond=None)[0]
-    return rms(change - np.column_stack(others) @ solution)
+    return compute_rms(change - np.column_stack(others) @ solution)
 
 
-def sized(gap, wanted, first=0.03):
-    """Return (strength, gap) at which `gap(strength)` is `wanted`, or None.
-
-    `gap` grows from zero. The result is None if the strength would be `LARGEST` or more. The method
-    is the secant method on logarithmic scales, inside a bracket once there is one.
-    """
-    low, high, strength = (0.0, 0.0), (np.inf, np.inf), first
-    for _ in range(12):
-        now = gap(strength)
-        if abs(now / wanted - 1) < ACCURATE:
-            return strength, now
-        if now < wanted:
-            if strength >= LARGEST:
-                return None
-            low = strength, now
-        else:
-            high = strength, now
-        if low[0] > NARROW * high[0]:
-            return None  # The discrepancy jumps, for example because a servo begins to oscillate.
-        strength = float(min(_between(low, high, wanted), LARGEST))
-    return None
-
-
-def _between(low, high, wanted):
-    """Return the next strength to try, given (strength, gap) below and above the wanted one."""
-    if not low[0]:
-        known = np.isfinite(high[1])
-        return high[0] * min(max(wanted / high[1], 1e-2), 0.9) if known else high[0] / 5
-    if not np.isfinite(high[0]):
-        return low[0] * min(max(1.02 * wanted / max(low[1], 1e-9), 1.05), LEAP)
-    if not np.isfinite(high[1]) or high[0] / low[0] > LEAP**2:
-        return np.sqrt(low[0] * high[0])
-    share = np.log(wanted / low[1]) / np.log(high[1] / low[1])
-    return low[0] * (high[0] / low[0]) ** min(max(share, 0.05), 0.95)
+def sized(gap, wanted):
+    """Return (strength, gap) at which `gap(strength)` is `wanted`; None if it is not below 1."""
+    return find_strength_for_size(gap, wanted, 1.0, first=0.03, max_exponent=np.inf)

@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from tests.exams.robots import cause_sizing, planted_effects
+from bench.diagnosis_benchmark.case_generation.cause_sizes import compute_rms, fit_coefficients
+from tests.exams.robots import planted_effects
 from tests.exams.robots.cause_sizing import Gauge
 
 ROUNDS = 5
 SHAPES = 4  # Shapes that are drawn for an effect with shape parameters; the best one counts.
 FIRST = 0.05  # Start of the fit, as a fraction of the largest plausible value.
-NUDGE = 0.02
 
 
 class CompetingCauses:
@@ -81,26 +81,19 @@ class CompetingCauses:
         return effects, free * len(shapes)
 
     def _fitted(self, of, count, others):
-        numbers = np.full(count, FIRST)
-        for _ in range(ROUNDS):
-            now = self._change(of(numbers) | others)
-            columns = []
-            for i in range(count):
-                moved = numbers.copy()
-                moved[i] += NUDGE
-                columns.append((self._change(of(moved) | others) - now) / NUDGE)
-            slope = np.column_stack(columns)
-            step = np.linalg.lstsq(slope, self.wanted - now, rcond=None)[0]
-            numbers = np.clip(numbers + np.clip(step, -0.3, 0.3), -1.0, 2.0)
-            if np.abs(step).max() < 1e-3:
-                break
-        return self._error(of(numbers) | others)
+        def residual(numbers):
+            return self._change(of(numbers) | others) - self.wanted
+
+        bounds = np.full(count, -1.0), np.full(count, 2.0)
+        return self._error(
+            of(fit_coefficients(residual, np.full(count, FIRST), *bounds, ROUNDS)) | others
+        )
 
     def _change(self, effects):
         return np.concatenate(self.fitted.change(effects))
 
     def _error(self, effects):
-        return cause_sizing.rms(self.unseen - np.concatenate(self.held.change(effects)))
+        return compute_rms(self.unseen - np.concatenate(self.held.change(effects)))
 
 
 FREE = {

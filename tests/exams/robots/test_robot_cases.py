@@ -9,9 +9,9 @@ import tomllib
 
 pytest.importorskip("pinocchio", reason="pin has no wheel here")
 
+from bench.diagnosis_benchmark.case_generation.cause_sizes import compute_rms
 from bench.diagnosis_benchmark.case_generation.recording_conditions import SensorNoise
 from tests.exams.robots import (
-    cause_sizing,
     planted_effects,
     robot_cases,
     unmodelled_causes,
@@ -52,7 +52,7 @@ def test_the_size_excludes_what_initial_states_absorb(item):
     base = [seen.copy() for seen in gauge.base]
     for seen, basis in zip(base, gauge.free, strict=True):
         seen += (7.0 * basis[:, 0]).reshape(seen.shape)
-    assert cause_sizing.rms(np.concatenate(gauge.beyond_states(base))) < 1e-9
+    assert compute_rms(np.concatenate(gauge.beyond_states(base))) < 1e-9
     assert all(basis.shape[1] == 2 * len(setting.machine.joints) for basis in gauge.free)
 
 

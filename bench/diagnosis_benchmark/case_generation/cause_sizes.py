@@ -1,0 +1,152 @@
+"""Sizes of hidden causes: RMS residuals, the part that initial states explain, and the strength.
+
+All generators of cases use these functions with their own simulations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from sims.core.simulator import Array
+
+MAX_STRENGTH_FACTOR = 8.0  # maximum factor of the strength per step, so that a fit can follow
+FIRST_DAMPING = 1e-3  # first damping factor of the Levenberg-Marquardt method
+MAX_DAMPING_TRIALS = 8  # maximum number of damping factors tried in one step
+CONVERGED_STEP = 1e-4  # step at which a fit has converged, in scaled units
+FINITE_DIFFERENCE_STEP = 1e-3  # in scaled units
+
+
+def compute_rms(values: Array) -> float:
+    """Compute the root mean square of all values."""
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def compute_orthonormal_basis(columns: Array) -> Array:
+    """Compute an orthonormal basis of the span of columns by a singular value decomposition.
+
+    Directions with a singular value below 1e-6 of the largest are left out, because they come from
+    columns that are nearly dependent.
+
+    Args:
+        columns: columns, (N, P).
+    """
+    scale = np.sqrt(np.square(columns).sum(axis=0))
+    left_vectors, singular_values, _ = np.linalg.svd(
+        columns / np.where(scale > 0, scale, 1.0), full_matrices=False
+    )
+    basis: Array = left_vectors[:, singular_values > 1e-6 * singular_values[0]]
+    return basis
+
+
+def fit_coefficients(
+    compute_residual: Callable[[Array], Array], start: Array, low: Array, high: Array, steps: int
+) -> Array:
+    """Minimise a sum of squares within bounds by the Levenberg-Marquardt method.
+
+    Args:
+        compute_residual: residual (N,) as a function of the scaled coefficients.
+        start: scaled coefficients at which the fit begins, (P,).
+        low: lower bounds, (P,).
+        high: upper bounds, (P,).
+        steps: maximum number of steps.
+
+    Returns:
+        The fitted coefficients, (P,).
+    """
+    numbers, residual, damping = start, compute_residual(start), FIRST_DAMPING
+    for _ in range(steps):
+        columns = [
+            (compute_residual(numbers + FINITE_DIFFERENCE_STEP * unit) - residual)
+            / FINITE_DIFFERENCE_STEP
+            for unit in np.eye(numbers.size)
+        ]
+        jacobian = np.stack(columns, axis=1)
+        normal_matrix, gradient = jacobian.T @ jacobian, jacobian.T @ residual
+        scaling = np.diag(np.diag(normal_matrix) + 1e-12)
+        for _ in range(MAX_DAMPING_TRIALS):
+            step = np.linalg.solve(normal_matrix + damping * scaling, gradient)
+            trial = np.clip(numbers - step, low, high)
+            trial_residual = compute_residual(trial)
+            # The comparison is false for values that are not finite.
+            if trial_residual @ trial_residual <= residual @ residual:
+                break
+            damping *= 8
+        else:
+            return numbers
+        damping /= 5
+        has_converged = np.abs(trial - numbers).max() < CONVERGED_STEP
+        numbers, residual = trial, trial_residual
+        if has_converged:
+            break
+    return numbers
+
+
+def find_strength_for_size(
+    compute_residual: Callable[[float], float],
+    target_size: float,
+    largest: float,
+    first: float = 1e-3,
+    max_exponent: float = 2.0,
+    tolerance: float = 0.03,
+) -> tuple[float, float] | None:
+    """Find the strength at which the size of a cause has the requested value.
+
+    The method is the secant method on logarithmic scales, within a bracket as soon as there is one.
+
+    Args:
+        compute_residual: size as a function of the strength, increasing from zero.
+        target_size: requested size.
+        largest: maximum strength.
+        first: first strength to try.
+        max_exponent: power of the strength faster than which the size does not grow; infinite if
+            nothing is known. It ends the search early if the requested size cannot be reached.
+        tolerance: relative tolerance of the size.
+
+    Returns:
+        The strength and the size there; None if the strength is not below `largest`.
+    """
+    # Bracket: (strength, size) below and above the requested size.
+    low, high, strength = (0.0, 0.0), (np.inf, np.inf), first
+    for _ in range(12):
+        size = compute_residual(strength)
+        if abs(size / target_size - 1) < tolerance:
+            return strength, size
+        if size < target_size:
+            if strength >= largest or size * (largest / strength) ** max_exponent < target_size:
+                return None
+            low = strength, size
+        else:  # also if it is NaN or infinite
+            high = strength, size
+        strength = float(min(_choose_next_strength(low, high, target_size), largest))
+    return None
+
+
+def _choose_next_strength(
+    low: tuple[float, float], high: tuple[float, float], target_size: float
+) -> float:
+    """Return the next strength to try.
+
+    Without a strength below, the size is assumed to be proportional to it. Without a strength
+    above, the strength grows by at most `MAX_STRENGTH_FACTOR`. With both, it is interpolated on
+    logarithmic scales, or halved there if the bracket is very wide or the upper size is not finite.
+
+    Args:
+        low: strength and size below the requested size; strength 0 if there is none.
+        high: strength and size above it; infinite strength if there is none.
+        target_size: requested size.
+    """
+    if not low[0]:
+        return (
+            high[0] * min(max(target_size / high[1], 1e-2), 0.9)
+            if np.isfinite(high[1])
+            else high[0] / 5
+        )
+    if not np.isfinite(high[0]):
+        return low[0] * min(target_size / max(low[1], 1e-9), MAX_STRENGTH_FACTOR)
+    if not np.isfinite(high[1]) or high[0] / low[0] > MAX_STRENGTH_FACTOR**2:
+        return float(np.sqrt(low[0] * high[0]))
+    log_position = float(np.log(target_size / low[1]) / np.log(high[1] / low[1]))
+    limited_position = min(max(log_position, 0.05), 0.95)
+    return float(low[0] * (high[0] / low[0]) ** limited_position)
