@@ -9,8 +9,8 @@ a page are written at the end. ``tests/exams/README.md`` describes the cases and
 
 import argparse
 import sys
-from importlib import import_module
 from pathlib import Path
+from pkgutil import resolve_name
 
 from tests.exams import exam_report
 from tests.exams.answer_rows import write_table
@@ -18,20 +18,20 @@ from tests.exams.explain_calls import ExplainCall, version_of
 from tests.exams.runner import run_exam, select_questions
 
 EXAMS = {
-    "systems": "tests.exams.systems.system_cases",
-    "robots": "tests.exams.robots.robot_cases",
-    "floating": "tests.exams.floating.floating_cases",
-    "planted": "tests.exams.planted.planted_cases",
-    "contacts": "tests.exams.contacts.contact_cases",
-    "conventions": "tests.exams.conventions.convention_cases",
-    "recordings": "tests.exams.recordings.recording_cases",
+    "systems": "tests.exams.systems.system_cases:EXAM",
+    "robots": "tests.exams.robots.robot_cases:EXAM",
+    "floating": "tests.exams.robots.robot_cases:FLOATING_EXAM",
+    "planted": "tests.exams.planted.planted_cases:EXAM",
+    "contacts": "tests.exams.contacts.contact_cases:EXAM",
+    "conventions": "tests.exams.conventions.convention_cases:EXAM",
+    "recordings": "tests.exams.recordings.recording_cases:EXAM",
 }
-"""Module of each exam; it has a constant EXAM."""
+"""Module and constant of each exam."""
 
 
 def main(arguments):
     given = _parser().parse_args(arguments)
-    exam = import_module(EXAMS[given.exam]).EXAM
+    exam = resolve_name(EXAMS[given.exam])
     try:
         questions = select_questions(
             exam, given.only, given.count, given.quick, given.spread, given.seed

@@ -56,7 +56,7 @@ class CompetingCauses:
         """Yield (function from scaled numbers to effects, count of numbers) for each shape."""
         effect, _, place = name.partition("@")
         machine = self.setting.machine
-        known = planted_effects.effects("servo" if machine.drives[0].kp else "motor")
+        known = planted_effects.effects(machine.name)
         places = planted_effects.places(machine, effect) if effect in known else []
         chosen = [p for p in places if (p if place == "*" else p == place)]
         draws = SHAPES if effect in planted_effects.SHAPES else 1

@@ -54,8 +54,25 @@ FAR = {  # Coefficients at strength 1 of effects that do not depend on the scale
 }  # fmt: skip
 
 
-def effects(drive):
-    """Return the effects that can be hidden in a machine with this drive, motor or servo."""
+FLOATING = (
+    "friction.coulomb", "friction.stribeck", "drag.linear", "spring.linear", "force.bias",
+    "inertia.armature", "mass.scale", "mass.offset", "inertia.scale", "input.gain", "input.bias",
+    "input.delay", "input.lag", "sensor.gain", "sensor.delay",
+)  # fmt: skip
+"""Effects of robots with a floating base."""
+FLOATING_ROBOTS = {
+    "satellite": ("input.deadband",),
+    "dropped": ("actuator.stiffness", "actuator.damping"),
+    "hung": ("gravity.scale", "input.deadband"),
+}
+"""Further effects by robot with a floating base."""
+
+
+def effects(robot):
+    """Return the effects that can be hidden in a robot, such as arm2-motor."""
+    kind, _, drive = robot.partition("-")
+    if kind in FLOATING_ROBOTS:
+        return FLOATING + FLOATING_ROBOTS[kind]
     inputs = BOTH + (MOTOR if drive == "motor" else SERVO)
     return JOINT + BODY + inputs + CHANNEL + WORLD
 
@@ -67,13 +84,12 @@ def places(machine, effect):
     if effect.startswith(("friction.load", "joint.")):
         return [machine.joints[joint] for joint in machine.driven]
     if effect in JOINT:
-        return list(machine.joints)
+        return list(machine.hinges)
     if effect in BODY:
-        return list(machine.bodies)
-    if effect == "sensor.eccentricity":
-        return [f"q.{joint}" for joint in machine.joints if machine.unit(joint) == "rad"]
+        return list(dict.fromkeys(machine.bodies))
     if effect in CHANNEL:
-        return [f"q.{joint}" for joint in machine.joints]
+        is_limited = effect == "sensor.eccentricity"
+        return [f"q.{j}" for j in machine.hinges if not is_limited or machine.unit(j) == "rad"]
     if effect in WORLD:
         return [""]
     shared = [""] * (effect == "supply.sag" and len(machine.drives) > 1)

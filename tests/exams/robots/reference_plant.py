@@ -178,6 +178,10 @@ class Plant:
         mass = pinocchio.crba(self.model, self.data, q)
         return np.triu(mass) + np.triu(mass, 1).T
 
+    def moved_inertia(self, q):
+        """Return the inertia that each joint moves while the others are locked, (N,)."""
+        return np.diag(self.inertia(np.asarray(q)))
+
     def needed(self, q, v):
         """Return n(q, v): forces at which all accelerations are zero, (N,)."""
         import pinocchio
@@ -215,6 +219,10 @@ class FloatingPlant(Plant):
         order, whole = self._order(), np.eye(self.size)
         whole[:-1, :-1] = super().inertia(self._pose(q))[np.ix_(order, order)]
         return whole
+
+    def moved_inertia(self, q):
+        """Return the inertia that each joint moves while the others are free, (N,)."""
+        return 1.0 / np.diag(np.linalg.inv(self.inertia(q)))
 
     def needed(self, q, v):
         return self._padded(super().needed(*self._reordered(q, v)))

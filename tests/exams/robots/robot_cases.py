@@ -15,12 +15,12 @@ import numpy as np
 from tests.exams import exam
 from tests.exams.answer_rows import conditions_text, hidden_text, number
 from tests.exams.exam import Exam, Target, UndrawableError
-from tests.exams.floating import floating_robots, floating_settings
 from tests.exams.marking import HiddenCause, Standard, mark_answer
 from tests.exams.robot_files import signal_unit, write_robot_recording
 from tests.exams.robots import (
     cause_sizing,
     exam_settings,
+    floating_robots,
     planted_effects,
     reference_plant,
     unmodelled_causes,
@@ -35,6 +35,7 @@ KINDS = ("clean", "single", "family", "double", "foreign", "numerics")
 CLEAN, DOUBLE, FOREIGN, FAMILY, NUMERICS = 24, 4, 2, 2, 2
 """Questions for each robot and drive: clean, double, each unmodelled cause, each family, numerics.
 """
+FLOATING_CLEAN = 40  # Clean questions for each robot with a floating base.
 ATTEMPTS = 6  # Maximum number of drawings of a question whose cause is not visible.
 MAX_COMPETING_CAUSES = 6  # Maximum number of other causes of a set that are refitted.
 QUICK = (
@@ -150,10 +151,7 @@ def rng_of(name, purpose):
 def setting_of(name):
     """Return the setting in which the case of this name was drawn."""
     kind, robot, *_ = name.split("/")
-    rng = rng_of(name, "setting")
-    if robot in floating_robots.NAMES:
-        return floating_settings.setting(robot, rng)
-    return exam_settings.setting(robot, rng, coarse=kind == "numerics")
+    return exam_settings.setting(robot, rng_of(name, "setting"), coarse=kind == "numerics")
 
 
 @lru_cache(maxsize=2)
@@ -242,8 +240,7 @@ def simpler_changes(hidden, gauge):
 
 
 def _drawn_effect(item, effect, rng):
-    names = planted_effects.effects(item.robot.partition("-")[2])
-    return str(rng.choice(names)) if effect == "any" else effect
+    return str(rng.choice(planted_effects.effects(item.robot))) if effect == "any" else effect
 
 
 def _sized(item, effect, setting, rng, taken=()):
@@ -293,11 +290,7 @@ def _double(item, setting, effect, rng):
         return None
     name = next(iter(first[0]))
     taken = (name.partition("@")[2],)
-    pool = [
-        e
-        for e in planted_effects.effects(item.robot.partition("-")[2])
-        if e != name.partition("@")[0]
-    ]
+    pool = [e for e in planted_effects.effects(item.robot) if e != name.partition("@")[0]]
     second_effect = str(rng.choice(pool))
     if not [p for p in planted_effects.places(setting.machine, second_effect) if p not in taken]:
         return None
@@ -328,18 +321,18 @@ def _foreign(item, setting, effect, rng):
         return None
     hidden = of(found[0])
     change = np.concatenate(gauge.change(hidden))
-    beyond = min(cause_sizing.left(change, [other]) for other in _near(setting, joint, gauge, rng))
+    others = _near(item.robot, setting, joint, gauge, rng)
+    beyond = min(cause_sizing.left(change, [other]) for other in others)
     shown = replace(item, effects=hidden, size=found[1], beyond=beyond)
     return shown if beyond >= MIN_RESIDUAL_WITHOUT_CAUSE else None
 
 
-def _near(setting, joint, gauge, rng):
+def _near(robot, setting, joint, gauge, rng):
     """Yield the changes (N,) that effects at one joint cause."""
     machine = setting.machine
     at = {machine.joints[joint], machine.bodies[joint], f"q.{machine.joints[joint]}"}
     at |= {d.name for d in machine.drives if d.joint == machine.joints[joint]} | {""}
-    drive = "servo" if machine.drives[0].kp else "motor"
-    for effect in planted_effects.effects(drive):
+    for effect in planted_effects.effects(robot):
         for place in sorted(at & set(planted_effects.places(machine, effect))):
             c = planted_effects.shape(effect, place, setting, rng)(0.05)
             yield np.concatenate(gauge.change({planted_effects.named(effect, place): c}))
@@ -357,7 +350,7 @@ def _round(robot, index):
     """Yield the questions of one index for a robot."""
     yield RobotQuestion("clean", robot, "any", index)
     if index < 1:
-        for effect in planted_effects.effects(robot.partition("-")[2]):
+        for effect in planted_effects.effects(robot):
             yield RobotQuestion("single", robot, effect, index)
     if index < FAMILY:
         for effect in planted_effects.FAMILIES:
@@ -371,6 +364,16 @@ def _round(robot, index):
         yield RobotQuestion("numerics", robot, "any", index)
 
 
+def floating_questions(seed=0):
+    """Return all questions about robots with a floating base."""
+    sheet = []
+    for robot in floating_robots.NAMES:
+        sheet += [RobotQuestion("clean", robot, "any", index) for index in range(FLOATING_CLEAN)]
+        sheet += [RobotQuestion("single", robot, e, 0) for e in planted_effects.effects(robot)]
+        sheet += [RobotQuestion("foreign", robot, cause, 0) for cause in planted_effects.FOREIGN]
+    return sheet
+
+
 def quick():
     """Return a few questions about two robots."""
     # Index 1 gives clean cases that end after the first test, as nine out of ten do.
@@ -382,7 +385,7 @@ def spread():
     chosen = []
     for drive in ("motor", "servo"):
         robots = [name for name in NAMES if name.endswith(drive)]
-        for place, effect in enumerate(planted_effects.effects(drive)):
+        for place, effect in enumerate(planted_effects.effects(robots[0])):
             chosen.append(RobotQuestion("single", robots[place % len(robots)], effect, 0))
         for place, robot in enumerate(robots):
             chosen += [RobotQuestion(kind, robot, "any", 0) for kind in ("clean", "double")]
@@ -408,4 +411,11 @@ EXAM = Exam(
     "Pinocchio and the integrator of `tests/exams/robots`: in each one hidden cause, a family, "
     "two, one that the library does not have, a time step that is too coarse, or none.",
     questions, TARGETS, quick, spread, ("effect", "system", "noise"), cpu_limit=900.0,
+)  # fmt: skip
+FLOATING_EXAM = Exam(
+    "Causes hidden in robots with a floating base",
+    "Hulls in space with an arm, falling trunks with two legs, and bodies on a ball joint, "
+    "simulated by Pinocchio and the integrator of `tests/exams/robots`.",
+    floating_questions, (TARGETS[0], TARGETS[3], replace(TARGETS[6], min_share=None)),
+    groups=("effect", "system", "noise"), cpu_limit=900.0,
 )  # fmt: skip

@@ -88,7 +88,7 @@ def test_noise_has_the_stated_size(kind):
 def test_every_effect_can_be_drawn_at_every_place(item):
     setting = robot_cases.setting_of(item.name)
     rng = np.random.default_rng(0)
-    for effect in planted_effects.effects("servo"):
+    for effect in planted_effects.effects("arm2-servo"):
         for place in planted_effects.places(setting.machine, effect):
             c = planted_effects.shape(effect, place, setting, rng)(0.1)
             assert np.isfinite(c).all()

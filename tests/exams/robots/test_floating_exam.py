@@ -9,10 +9,9 @@ import pytest
 pytest.importorskip("pinocchio", reason="pin has no wheel here")
 
 from bench.cli.main import main
-from tests.exams.floating import floating_robots, floating_settings
-from tests.exams.floating.floating_cases import FloatingQuestion
+from tests.exams.robots import exam_settings, floating_robots
 from tests.exams.robots.reference_world import Run, World
-from tests.exams.robots.robot_cases import bare_case, setting_of, write_setting
+from tests.exams.robots.robot_cases import RobotQuestion, bare_case, setting_of, write_setting
 
 SECONDS = 1.5
 
@@ -25,7 +24,7 @@ def machine(request):
 def make_zero_command_run(machine):
     """Return a run with zero commands."""
     rng, hinges = np.random.default_rng(6), len(machine.hinges)
-    pose, rate = floating_settings._draw_base_state(machine, rng)
+    pose, rate = exam_settings.draw_base_state(machine, rng)
     q = np.concatenate([rng.uniform(-0.4, 0.4, hinges), pose])
     v = np.concatenate([rng.uniform(-1.0, 1.0, hinges), rate])
     times = np.arange(0.0, SECONDS, 0.01)
@@ -118,7 +117,7 @@ def test_a_chaotic_held_out_run_is_no_gap(tmp_path):
     Errors of its initial state grow by a factor of 1,400. A fit with derivatives at the wrong state
     ends at twice the noise.
     """
-    case = FloatingQuestion("clean", "hung-motor", "any", 27).draw()
+    case = RobotQuestion("clean", "hung-motor", "any", 27).draw()
     setting = setting_of(case.name)
     log = write_setting(case, replace(setting, runs=setting.runs[3:]), tmp_path)
     assert main(["explain", str(log), "--out", str(tmp_path / "out")]) == 0
