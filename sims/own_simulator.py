@@ -20,7 +20,7 @@ from sims.core.engine import Engine
 from sims.core.plain_values import is_plausible_number, truncate_text
 from sims.core.simulator import Array, Channel, InputError, Parameter
 from sims.core.system import SYSTEM_KINDS, StateSnapshot, System, SystemKind
-from sims.engines.adapters.bullet_world import import_pybullet
+from sims.engines.external.bullet_world import import_pybullet
 from sims.own_simulator_engine import OwnSimulatorEngine, find_level_effect, make_level_effects
 from sims.system_simulator import SystemSimulator
 

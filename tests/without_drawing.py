@@ -20,11 +20,11 @@ COMMAND = [sys.executable, "-c", _CODE]
 @contextmanager
 def undrawn():
     """Make comparisons in this process draw nothing within the block."""
-    from bench.benchmark import results_report
+    from bench.benchmark import comparison_report
 
-    before = results_report._render_figures, results_report.render_page
-    results_report._render_figures, results_report.render_page = lambda *_: {}, lambda _: ""
+    before = comparison_report._render_figures, comparison_report.render_page
+    comparison_report._render_figures, comparison_report.render_page = lambda *_: {}, lambda _: ""
     try:
         yield
     finally:
-        results_report._render_figures, results_report.render_page = before
+        comparison_report._render_figures, comparison_report.render_page = before

@@ -15,16 +15,16 @@ from bench.api.comparison_options import (
     apply_changes,
     get_tuner_label,
 )
-from bench.benchmark.figures import comparison_charts, comparison_figures
-from bench.benchmark.problem.availability import leave_out_missing_problems
+from bench.benchmark import comparison_charts, comparison_figures
 from bench.benchmark.problem.experiment import Experiment, list_experiment_names, load_experiment
+from bench.benchmark.problem.missing_requirements import leave_out_missing_problems
 from bench.benchmark.problem.robot_experiment import (
     complete_robot_experiment,
     make_robot_experiment,
 )
 from bench.benchmark.problem.tuning_problem import TuningProblem
+from bench.benchmark.runner.comparison_resources import check_comparison_size
 from bench.benchmark.runner.plugin_discovery import load_plugins_for_experiment
-from bench.benchmark.runner.resource_checks import check_comparison_size
 from bench.benchmark.statistics.comparison_tables import build_tables
 from bench.benchmark.storage.csv_reader import CsvTable
 from bench.benchmark.storage.reference_results import find_reference

@@ -13,7 +13,7 @@ from bench.core.options import with_options
 from bench.core.plugin_registries import simulators
 from bench.diagnosis import explain as explaining
 from bench.diagnosis.datasheet.datasheet import DataSheet, build_datasheet
-from bench.diagnosis.datasheet.subject import make_subject
+from bench.diagnosis.datasheet.datasheet_subject import make_subject
 from bench.diagnosis.explain_options import ExplainOptions
 from bench.diagnosis.explanation import Explanation
 from bench.diagnosis.search.verdict_rules import VERDICT_MEANINGS

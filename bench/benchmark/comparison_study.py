@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from bench.benchmark.storage.csv_reader import RunsTable
-from bench.benchmark.storage.integrity_checks import (
+from bench.benchmark.storage.result_file_consistency import (
     check_plan,
     check_rows_match_statuses,
     check_runs,
@@ -333,8 +333,8 @@ class Comparison:
         Raises:
             InputError: nothing has been written yet, or the results are damaged.
         """
+        from bench.benchmark.comparison_report import write_report
         from bench.benchmark.problem.tuning_problem import TuningProblem
-        from bench.benchmark.results_report import write_report
 
         results = self.results
         problem = results.problem if results else TuningProblem(self.configuration.experiment)

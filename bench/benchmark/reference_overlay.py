@@ -6,15 +6,15 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from bench.benchmark.figures import comparison_figures
-from bench.benchmark.figures.comparison_charts import make_axis_labels
-from bench.benchmark.figures.comparison_figures import (
+from bench.benchmark import comparison_figures
+from bench.benchmark.comparison_charts import make_axis_labels
+from bench.benchmark.comparison_figures import (
     FIGURE_FILES,
     OVERLAYABLE_FIGURES,
     check_references_allowed,
 )
+from bench.benchmark.comparison_report import REQUIRED_RUN_COLUMNS
 from bench.benchmark.problem.tuning_problem import TuningProblem
-from bench.benchmark.results_report import REQUIRED_RUN_COLUMNS
 from bench.benchmark.storage.reference_results import ReferenceResult
 from bench.benchmark.storage.result_folder import read_comparison
 from bench.figures.style import write_figure

@@ -25,14 +25,14 @@ from bench.benchmark.storage.table_schemas import (
 )
 from bench.bounce_shot.shot_config import ShotConfig
 from bench.bounce_shot.shot_planner import compute_hoop_crossings, simulate_flights
-from bench.bounce_shot.shot_planning import (
+from bench.bounce_shot.shot_sampling import ShotSetup
+from bench.bounce_shot.true_world import InclinedGround, simulate_shot
+from bench.bounce_shot.tuned_shots import (
     TunedModel,
     get_planning_constants,
     get_planning_theta,
     make_planning_simulator,
 )
-from bench.bounce_shot.shot_sampling import ShotSetup
-from bench.bounce_shot.true_world import InclinedGround, simulate_shot
 from sims.core.files import write_atomically
 from sims.core.plain_values import to_json_value
 from sims.core.simulator import Array, InputError
@@ -220,7 +220,7 @@ def store_shot(
         folder: result folder of the study.
         setup: ball, scene and release error.
         settings: the [shot] table of the study.
-        models: models as returned by `bench.bounce_shot.shot_planning.tune_and_plan`.
+        models: models as returned by `bench.bounce_shot.tuned_shots.tune_and_plan`.
         visible_share: fraction of the drop's sample times at which its recording has a height.
     """
     rows = [{**row, "seen": visible_share} for row in build_shot_rows(setup, settings, models)]

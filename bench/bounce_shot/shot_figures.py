@@ -15,13 +15,13 @@ from bench.bounce_shot.hit_rate_table import make_success_panel
 from bench.bounce_shot.shot_config import ShotConfig
 from bench.bounce_shot.shot_execution import ShotResult, execute_shot
 from bench.bounce_shot.shot_planner import ShotGeometry
-from bench.bounce_shot.shot_planning import (
+from bench.bounce_shot.shot_sampling import ShotSetup
+from bench.bounce_shot.tuned_shots import (
     EXPLAIN_METHOD,
     EXPLAIN_SUFFIX,
     UNTUNED_METHOD,
     TunedModel,
 )
-from bench.bounce_shot.shot_sampling import ShotSetup
 from bench.figures.style import (
     BLACK,
     BLUE,

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from bench.benchmark.problem.experiment import Experiment
-from bench.benchmark.problem.recorded_runs import ObservedRuns
+from bench.benchmark.problem.recording_observations import ObservedRuns
 from bench.bounce_shot.shot_config import BallKind, ShotConfig, get_ball_kind
 from bench.bounce_shot.shot_planner import ShotGeometry
 from bench.bounce_shot.true_world import GRAVITY, InclinedGround, simulate_shot

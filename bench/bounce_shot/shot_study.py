@@ -35,7 +35,7 @@ from bench.benchmark.storage.run_status import (
     StudyOutcome,
     StudyProgress,
 )
-from bench.bounce_shot import shot_planning, true_world
+from bench.bounce_shot import true_world, tuned_shots
 from bench.bounce_shot.shot_config import ShotConfig, read_shot_config
 from bench.bounce_shot.shot_execution import (
     SHOTS_FOLDER,
@@ -304,7 +304,7 @@ class _ShotStages:
         """
         learned_entries = [e for e in self._experiment.tuners if tuners.get(e.tuner).learned]
         experiments = [
-            shot_planning.make_tuning_experiment(self._experiment, self._settings, entry)
+            tuned_shots.make_tuning_experiment(self._experiment, self._settings, entry)
             for entry in learned_entries
         ]
         calls: list[Call] = [
@@ -339,10 +339,10 @@ class _ShotStages:
         calls: list[Call] = []
         for index in recorded:
             setup = self._missing_shots[index]
-            inputs = shot_planning.ShotInputs(
+            inputs = tuned_shots.ShotInputs(
                 setup.name, self._paths[index], setup.scene, weights, self._tuned, self._hidden
             )
-            calls.append((shot_planning.tune_and_plan, (self._experiment, self._settings, inputs)))
+            calls.append((tuned_shots.tune_and_plan, (self._experiment, self._settings, inputs)))
         step = self._progress("shooting", len(self._missing_shots))
         for index, error in recording_errors.items():
             status = "no recording" if isinstance(error, InputError) else "crashed"
@@ -383,7 +383,7 @@ def _make_failed_models(
     if isinstance(error, TimeoutError):
         status = "timeout"
     make_failed_model = partial(
-        shot_planning.TunedModel,
+        tuned_shots.TunedModel,
         effects={},
         simulations=0,
         seconds=math.nan,
@@ -392,9 +392,9 @@ def _make_failed_models(
     )
     labels = [entry.label for entry in experiment.tuners]
     methods = [
-        shot_planning.UNTUNED_METHOD,
+        tuned_shots.UNTUNED_METHOD,
         *labels,
-        shot_planning.EXPLAIN_METHOD,
-        *(label + shot_planning.EXPLAIN_SUFFIX for label in labels),
+        tuned_shots.EXPLAIN_METHOD,
+        *(label + tuned_shots.EXPLAIN_SUFFIX for label in labels),
     ]
     return [vars(make_failed_model(method=method, restitution=math.nan)) for method in methods]

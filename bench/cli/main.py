@@ -145,7 +145,7 @@ COMMANDS = (
     ),
     Command(
         "track",
-        "track:add_track_arguments",
+        "film:add_track_arguments",
         "track a ball in a video, and write a recording",
         "simgap track drop.mp4 --ball-diameter 0.067 --out drop.csv",
     ),

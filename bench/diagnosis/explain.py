@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from bench.benchmark.runner.worker_setup import limit_to_one_thread
+from bench.benchmark.runner.worker_pools import limit_to_one_thread
 from bench.core.random_streams import make_rng
 from bench.diagnosis.conventions.unit_check import Subject, find_imitated_unit, find_wrong_units
+from bench.diagnosis.evaluation.forked_workers import ForkedWorkerPool
 from bench.diagnosis.evaluation.noise_floor import (
     INTEGRATION_ERROR_SHARE,
     NoiseFloor,
@@ -24,7 +25,6 @@ from bench.diagnosis.evaluation.noise_floor import (
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.evaluation.search_control import STAGES, SearchStoppedError
-from bench.diagnosis.evaluation.worker_pool import ForkedWorkerPool
 from bench.diagnosis.experiment_design.next_run import NextRunDesign, design_next_run
 from bench.diagnosis.explain_options import ExplainOptions
 from bench.diagnosis.explanation import Explanation
@@ -42,6 +42,7 @@ from bench.diagnosis.fitting.fit_state import FitStart
 from bench.diagnosis.fitting.model_set import MAX_ITERATIONS
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
 from bench.diagnosis.friction_form_verdict import has_dry_friction, is_likelier_soft, make_soft_kind
+from bench.diagnosis.identifiability import freeze_unidentified_parameters
 from bench.diagnosis.numerics_cause import (
     CoarseStepFinding,
     Reusable,
@@ -49,7 +50,6 @@ from bench.diagnosis.numerics_cause import (
     is_finer_model_better,
     is_finer_step_better,
 )
-from bench.diagnosis.parameter_freezing import freeze_unidentified_parameters
 from bench.diagnosis.report_data_builder import DiagnosisReportDataBuilder
 from bench.diagnosis.search.diagnose import DiagnosisResult, answer, diagnose
 from bench.diagnosis.search.effect_search import EffectSearch
@@ -58,9 +58,9 @@ from bench.diagnosis.search.verdict_rules import INDISTINGUISHABLE_LOG_LIKELIHOO
 from bench.diagnosis.validation.held_out_runs import CrossValidation, HeldOutRuns, Validation
 from bench.diagnosis.verdict import RecordingFault
 from bench.diagnosis.verdict_builder import VerdictBuilder
-from bench.logs.importing.sample_thinning import leave_out_settling, thin_recording
+from bench.logs.importing.sample_selection import leave_out_settling, thin_recording
 from bench.logs.joined_recordings import load_joined
-from bench.logs.quality.sampling_clock import check_recording_plausible
+from bench.logs.quality.clock_checks import check_recording_plausible
 from bench.logs.recording_loading import check_recording_size
 from bench.logs.segmentation import segment_recording
 from bench.pages.text_format import joined

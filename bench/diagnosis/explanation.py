@@ -13,7 +13,7 @@ from bench.diagnosis.extended_robot_files import (
     build_robot_files,
     find_model_file_changes,
 )
-from bench.diagnosis.randomization.ranges import RandomizationRanges, list_randomization_ranges
+from bench.diagnosis.randomization_ranges import RandomizationRanges, list_randomization_ranges
 from bench.diagnosis.report import explanation_figures
 from bench.diagnosis.report.consistency_section import AGREEMENT_COLUMNS, build_consistency_rows
 from bench.diagnosis.report.explanation_page import render_report
@@ -114,7 +114,7 @@ class Explanation:
         contents |= {folder / name: text for name, text in self._robot_files.contents.items()}
         if ranges:
             # This import is needed only if ranges are requested.
-            from bench.diagnosis.randomization.range_files import build_range_files
+            from bench.diagnosis.randomization_files import build_range_files
 
             range_contents = build_range_files(self.ranges, self.extended, folder)
             contents |= {folder / name: text for name, text in range_contents.items()}

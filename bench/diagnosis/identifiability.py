@@ -19,7 +19,7 @@ White noise is assumed, and the derivatives are those of the model that fits the
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -27,9 +27,12 @@ import numpy as np
 
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.fitting.base_fit import FINAL_ITERATIONS, BaseFit
 from bench.diagnosis.fitting.fit_state import TrajectoryFit
-from bench.diagnosis.fitting.trajectory_fit import compute_state_prior
+from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter, compute_state_prior
 from bench.diagnosis.search.candidate_directions import DirectionSet, compute_directions
+from bench.diagnosis.search.diagnose import find_unidentified_parameters
+from bench.diagnosis.search.effect_search import EffectSearch
 from bench.diagnosis.validation.gain_and_intervals import Z95
 from sims.core.effect import ALL_PLACES
 from sims.core.plain_values import format_unit
@@ -397,3 +400,56 @@ def _share_of_range(number: ParameterIdentifiability) -> float:
     width = number.high - number.low
     with np.errstate(over="ignore"):
         return float(np.nan_to_num(number.half) / width) if width > 0 else 0.0
+
+
+MAX_REFITS = 4
+"""Maximum number of refits with more frozen numbers; the last one freezes all remaining ones."""
+
+
+def freeze_unidentified_parameters(
+    evaluator: RunEvaluator,
+    noise: NoiseModel,
+    base: BaseFit,
+    searching: Callable[[BaseFit], EffectSearch],
+) -> BaseFit:
+    """Freeze at the nominal value all free numbers that the data cannot identify.
+
+    Args:
+        evaluator: Run evaluator of the runs.
+        noise: Noise of each channel.
+        base: Fitted base model.
+        searching: Function that begins a search from a base model, which gives its covariance.
+
+    Returns:
+        The base model, fitted without these numbers.
+    """
+    for iteration in range(MAX_REFITS):
+        search = searching(base)
+        unidentified = find_unidentified_parameters(search, search.base_model)
+        unidentified_indices = [
+            i
+            for i in evaluator.base_indices.tolist()
+            if evaluator.parameters[i].name in unidentified
+        ]
+        if not unidentified_indices:
+            break
+        # `unidentified` is sorted by the width of the intervals.
+        unidentified_indices.sort(key=lambda i: unidentified.index(evaluator.parameters[i].name))
+        frozen_indices = (
+            unidentified_indices
+            if iteration == MAX_REFITS - 1
+            else unidentified_indices[: (len(unidentified_indices) + 1) // 2]
+        )
+        theta = base.fit.theta.copy()
+        theta[frozen_indices] = evaluator.get_nominal_theta()[frozen_indices]
+        base = replace(
+            base, unidentified_parameters=base.unidentified_parameters | frozenset(frozen_indices)
+        )
+        start = replace(base.fit.make_start(), theta=theta)
+        base = replace(
+            base,
+            fit=TrajectoryFitter(evaluator, noise, base.fixed_parameters).fit_models(
+                [start], FINAL_ITERATIONS
+            )[0],
+        )
+    return base

@@ -9,7 +9,7 @@ from typing import Protocol
 
 import pandas as pd
 
-from bench.benchmark.results_report import REPORT_FILE
+from bench.benchmark.comparison_report import REPORT_FILE
 from bench.benchmark.storage.result_folder import FolderConfiguration
 from bench.diagnosis_benchmark import diagnoser_figures
 from bench.diagnosis_benchmark.answer_rows import SKIPPED_STATUS, build_answer_rows

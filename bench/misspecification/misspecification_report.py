@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 import pandas as pd
 
+from bench.benchmark.comparison_report import format_failures
 from bench.benchmark.problem.experiment import Experiment
-from bench.benchmark.results_report import format_failures
 from bench.benchmark.statistics.comparison_tables import add_trust_column, build_tables
 from bench.benchmark.storage.result_folder import (
     FolderConfiguration,

@@ -6,19 +6,27 @@ Names and titles come from files and plugins. A template writes them like any ot
 
 from __future__ import annotations
 
+import marshal
+import os
 import shlex
+import sys
 from base64 import b64encode
 from collections.abc import Iterable
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
+from types import CodeType
 from typing import TYPE_CHECKING
 
+import jinja2
+from jinja2.bccache import Bucket, BytecodeCache
 from markupsafe import Markup, escape
 
 from bench.pages.text_format import format_number, format_p_value, format_percent, sanitise
 
 if TYPE_CHECKING:
     from jinja2 import Environment, Template
+
 
 TEMPLATES = Path(__file__).parent / "templates"
 """Folder of the templates that all pages share."""
@@ -42,8 +50,6 @@ def _get_environment() -> Environment:
     """
     # Commands that write no page do not load Jinja2.
     from jinja2 import Environment, FunctionLoader, StrictUndefined
-
-    from bench.pages.compiled_templates import CompiledTemplates
 
     environment = Environment(
         loader=FunctionLoader(_read_template),
@@ -103,3 +109,39 @@ def format_document(text: str, max_length: int = MAX_DOCUMENT_LENGTH) -> Markup:
     # `sanitise` removes leading spaces, so they are added again.
     indented = (" " * (len(line) - len(line.lstrip())) + sanitise(line, 1000) for line in lines)
     return escape("\n".join(indented))
+
+
+class CompiledTemplates(BytecodeCache):
+    """Cache of compiled templates; without permission to write, they are compiled every time.
+
+    Args:
+        folder: Folder of the compiled templates.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    def load_bytecode(self, bucket: Bucket) -> None:
+        """Load the code of a template, if it was compiled from the same source."""
+        with suppress(OSError, ValueError, EOFError, TypeError):
+            content = self._get_path(bucket).read_bytes()
+            checksum = bucket.checksum.encode()
+            code = marshal.loads(content[len(checksum) :]) if content.startswith(checksum) else None
+            bucket.code = code if isinstance(code, CodeType) else None
+
+    def dump_bytecode(self, bucket: Bucket) -> None:
+        """Store the compiled code of a template on disk, for reuse in the next process."""
+        if sys.dont_write_bytecode or bucket.code is None:
+            return
+        path = self._get_path(bucket)
+        # Another process may load the file while it is written.
+        temporary = path.with_suffix(f".{os.getpid()}")
+        with suppress(OSError):
+            self._folder.mkdir(exist_ok=True)
+            temporary.write_bytes(bucket.checksum.encode() + marshal.dumps(bucket.code))
+            temporary.replace(path)
+
+    def _get_path(self, bucket: Bucket) -> Path:
+        # Bytecode depends on the version of Python and on that of Jinja2.
+        name = f"{bucket.key}.{sys.implementation.cache_tag}-{jinja2.__version__}"
+        return self._folder / f"{name}.bin"

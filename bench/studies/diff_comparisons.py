@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from bench.benchmark.results_report import REQUIRED_RUN_COLUMNS
+from bench.benchmark.comparison_report import REQUIRED_RUN_COLUMNS
 from bench.benchmark.statistics.error_curves import RunCurves, RunRowTable, select_primary_metric
 from bench.benchmark.statistics.paired_tests import compare_pair, compute_log_errors, correct_holm
 from bench.benchmark.storage.provenance import read_environment

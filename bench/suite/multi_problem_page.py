@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from bench.benchmark.comparison_page import SIGNIFICANCE_LEVEL
 from bench.benchmark.problem.experiment import Experiment
-from bench.benchmark.report_page.comparison_page import SIGNIFICANCE_LEVEL
 from bench.benchmark.statistics.comparison_statistics import ComparisonStatistics
 from bench.benchmark.statistics.error_curves import select_checkpoints
 from bench.figures.style import PANEL_TITLES, FigureFiles, MarkStyle, get_mark_style

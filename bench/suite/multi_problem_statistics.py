@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from bench.benchmark.figures.comparison_figures import draw_critical_difference_figure
+from bench.benchmark.comparison_figures import draw_critical_difference_figure
+from bench.benchmark.comparison_report import REPORT_FILE, REQUIRED_RUN_COLUMNS
 from bench.benchmark.problem.experiment import Experiment, TunerEntry
-from bench.benchmark.results_report import REPORT_FILE, REQUIRED_RUN_COLUMNS
 from bench.benchmark.statistics.comparison_statistics import ComparisonStatistics
 from bench.benchmark.statistics.comparison_tables import add_trust_column
 from bench.benchmark.statistics.error_curves import RunCurves

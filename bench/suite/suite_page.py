@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 from pandas.api.types import is_numeric_dtype
 
-from bench.benchmark.results_report import REPORT_FILE
+from bench.benchmark.comparison_report import REPORT_FILE
 from bench.benchmark.storage.reference_results import REFERENCE_FOLDERS
 from bench.figures.style import MarkStyle, get_mark_style
 from bench.pages.chart import Axis, Panel, Series

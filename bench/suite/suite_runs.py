@@ -15,8 +15,8 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from bench.benchmark.comparison_report import REQUIRED_RUN_COLUMNS
 from bench.benchmark.problem.experiment import Experiment
-from bench.benchmark.results_report import REQUIRED_RUN_COLUMNS
 from bench.benchmark.statistics.comparison_statistics import ComparisonStatistics
 from bench.benchmark.storage.result_folder import CONFIGURATION_FILE, read_comparison
 from bench.benchmark.storage.run_journal import SEGMENTS_FOLDER

@@ -1,4 +1,4 @@
-"""Call third-party packages without output, warnings or changes of global random generators."""
+"""Call libraries without side effects: no output or warnings, own random states, determinism."""
 
 from __future__ import annotations
 
@@ -6,10 +6,29 @@ import io
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stdout
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from methods.learning.deterministic_torch import deterministic_training
+if TYPE_CHECKING:
+    pass
+
+
+@contextmanager
+def deterministic_training() -> Iterator[None]:
+    """Make torch reproducible: one thread, so that sums have a fixed order.
+
+    Other runs can use the machine's other cores.
+    """
+    import torch
+
+    threads = torch.get_num_threads()
+    # A sum that is distributed over threads depends on their number.
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 @contextmanager

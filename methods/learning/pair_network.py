@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from methods.learning.deterministic_torch import deterministic_training
+from methods.learning.library_isolation import deterministic_training
 from methods.tuner import Array
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from methods.learning.nlopt_search import minimise_with_nlopt
+from methods.learning.library_optimisers import minimise_with_nlopt
 from methods.tuner import Task, Tuner, TunerGenerator, from_callback
 
 

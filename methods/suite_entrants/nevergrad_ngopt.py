@@ -10,7 +10,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from methods.learning.nevergrad_optimiser import tune_with_nevergrad
+from methods.learning.library_optimisers import tune_with_nevergrad
 from methods.tuner import Task, Tuner, TunerGenerator
 
 

@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from methods.learning.optuna_study import tune_with_optuna
+from methods.learning.library_optimisers import tune_with_optuna
 from methods.tuner import Task, Tuner, TunerGenerator
 
 

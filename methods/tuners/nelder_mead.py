@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from methods.learning.nlopt_search import minimise_with_nlopt
+from methods.learning.library_optimisers import minimise_with_nlopt
 from methods.tuner import Array, Task, Tuner, TunerGenerator, from_callback
 
 

@@ -7,7 +7,7 @@ With u the command, w the applied input and c the coefficient:
 * (1) gain: w = (1 + c) u
 * (2) bias: w = u + c
 * (3) delay: w(t) = u(t - c)
-* (4) lag: c dw/dt = u - w; the plant receives its mean over each step (`effects.first_order_lag`)
+* (4) lag: c dw/dt = u - w; the plant receives its mean over each step (`effects.input_effects`)
 * (5) dead band: w = u - clip(u, -c, c)
 * (6) saturation: w = clip(u, -c, c)
 * (7) backlash: w is constant while |u - w| <= c / 2, otherwise the nearer flank pushes it
@@ -23,7 +23,62 @@ import numpy as np
 
 from sims.core.effect import Coefficient, Input, Signal
 from sims.core.simulator import Array
-from sims.effects.first_order_lag import apply_recursion, compute_lag_response, shift_by_one_step
+
+_MIN_TIME_CONSTANT = 1e-12
+"""Smallest time constant in seconds; such a lag has no effect on any step."""
+
+
+def compute_lag_response(steps: Array, lag: Array) -> tuple[Array, Array]:
+    """Return the remaining weight of an old value at the end of each step and in its mean.
+
+    They are exp(-h / T) at the end, and its mean m over the step (3).
+
+    Args:
+        steps: (L, S) lengths h in seconds.
+        lag: (L, 1) time constants T in seconds.
+
+    Returns:
+        Both weights (L, S).
+    """
+    ratio = steps / np.maximum(lag, _MIN_TIME_CONSTANT)
+    # a step of zero length, where an element waits, keeps the old value: the limit of m is 1
+    divisor = np.where(ratio > 0, ratio, 1.0)
+    # expm1, since 1 - exp has cancellation if steps are much shorter than the lag
+    mean = np.where(ratio > 0, -np.expm1(-ratio) / divisor, 1.0)
+    return np.exp(-ratio), mean
+
+
+def apply_recursion(decay: Array, additions: Array, start: Array) -> Array:
+    """Return the recursion y[k] = decay[k] y[k - 1] + gained[k].
+
+    Args:
+        decay: (L, S) factors.
+        additions: (L, S) additions.
+        start: (L, 1) value y[-1].
+
+    Returns:
+        Values y (L, S).
+    """
+    # rows are contiguous in memory, and the additions become the result
+    result = np.ascontiguousarray(additions.T)
+    decay_rows = np.ascontiguousarray(decay.T)
+    state: Array = start[:, 0]
+    # step by step: a closed form would divide by products of decays, which underflow
+    for row, factor in zip(result, decay_rows, strict=True):
+        row += factor * state
+        state = row
+    return result.T
+
+
+def shift_by_one_step(values: Array, start: Array) -> Array:
+    """Return the value (L, S) before each step.
+
+    Args:
+        values: (L, S) values at the end of each step.
+        start: (L, 1) value before the first step.
+    """
+    return np.concatenate([start, values[:, :-1]], axis=1)
+
 
 _FORCE_UNITS = ("m/s^2", "N", "N*m")
 """Units of an input that is a force, on the three kinds of system; an input may have another."""
@@ -265,7 +320,7 @@ class InputRateLimit(Input):
 
 def _apply_lag(signal: Signal, lag: Array) -> Array:
     """Return means (L, S) of the lagged input (4) over each step; `lag` (L, 1) is in seconds."""
-    # the command is constant over a step, so (2) of sims.effects.first_order_lag gives the value at
+    # the command is constant over a step, so (2) of sims.effects.input_effects gives the value at
     # its end
     decay, mean = compute_lag_response(signal.steps, lag)
     step_end_values = apply_recursion(decay, (1.0 - decay) * signal.values, signal.start)

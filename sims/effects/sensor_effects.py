@@ -5,7 +5,7 @@ With y the true value, r the recorded value, t the time stamp and c the coeffici
 * (1) gain: r = (1 + c) y
 * (2) bias: r = y + c
 * (3) delay: r(t) = y(t - c)
-* (4) lag: c dr/dt = y - r (`sims.effects.first_order_lag`)
+* (4) lag: c dr/dt = y - r (`sims.effects.input_effects`)
 * (5) drift: r(t) = y(t) + c t
 * (6) clock: r(t) = y((1 + c) t)
 * (7) eccentricity: r = y + a sin y + b cos y, y an angle
@@ -25,7 +25,7 @@ import numpy as np
 
 from sims.core.effect import Coefficient, Sensor, Signal
 from sims.core.simulator import Array
-from sims.effects.first_order_lag import apply_recursion, compute_lag_response, shift_by_one_step
+from sims.effects.input_effects import apply_recursion, compute_lag_response, shift_by_one_step
 
 _SECONDS = ("s", "s", "s")
 """Seconds, on every kind of system."""
@@ -239,6 +239,6 @@ def _apply_lag(signal: Signal, lag: Array) -> Array:
     """
     decay, mean = compute_lag_response(signal.steps, lag)
     old = shift_by_one_step(signal.values, signal.start)
-    # (4) of sims.effects.first_order_lag without its first term, which is the recursion
+    # (4) of sims.effects.input_effects without its first term, which is the recursion
     increments = signal.values - decay * old - mean * (signal.values - old)
     return apply_recursion(decay, increments, signal.start)

@@ -15,8 +15,8 @@ from sims.core.system import System
 
 ENGINE_MODULES = {
     "batch": "sims.engines.batch",
-    "mujoco": "sims.engines.adapters.mujoco_engine",
-    "pybullet": "sims.engines.adapters.bullet_engine",
+    "mujoco": "sims.engines.external.mujoco_engine",
+    "pybullet": "sims.engines.external.bullet_engine",
 }
 """Module of each engine by name; a module is imported when its engine is first requested."""
 HIDDEN_STATE_ENGINES = ("batch",)

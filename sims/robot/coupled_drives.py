@@ -21,7 +21,7 @@ from sims.robot.robot_model import COUPLING_TENDON_SUFFIX, Joint, RobotModel, ca
 
 COUPLING_EFFECT = "joint.coupling"
 COUPLING_PLACEHOLDER = ("", COUPLING_EFFECT)
-"""Entry for all coupled drives in the list of added elements (`dynamics.added_elements`).
+"""Entry for all coupled drives in the list of added elements (`dynamics.series_joints`).
 
 One model has a tendon for each drive that can be coupled; c is zero where none is.
 """

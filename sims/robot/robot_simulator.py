@@ -30,7 +30,6 @@ from sims.robot.dynamics.activation_filters import (
     is_rk4_integrator,
     select_initial_activations,
 )
-from sims.robot.dynamics.added_elements import AddedElements, group_by_added_elements
 from sims.robot.dynamics.applied_inputs import (
     SAME_INSTANT_SHARE,
     STEP_COUNT_TOLERANCE,
@@ -66,6 +65,7 @@ from sims.robot.dynamics.mujoco_batch import (
     get_batch_cache,
 )
 from sims.robot.dynamics.sensor_sampling import DriveSensorModel, sample_readings
+from sims.robot.dynamics.series_joints import AddedElements, group_by_added_elements
 from sims.robot.floating_joints import FloatingJoints, FloatingState
 from sims.robot.friction_form import FrictionForm
 from sims.robot.integrator_settings import (

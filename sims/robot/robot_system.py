@@ -15,7 +15,7 @@ from sims.core.simulator import Array, Channel, InputError, Parameter, make_unkn
 from sims.core.system import StateSnapshot, System, SystemKind
 from sims.robot.contact_pairs import PAIR_SEPARATOR
 from sims.robot.dynamics.activation_filters import activation_filters
-from sims.robot.dynamics.added_elements import find_compile_error, list_added_elements
+from sims.robot.dynamics.series_joints import find_compile_error, list_added_elements
 from sims.robot.floating_joints import FloatingJoints
 from sims.robot.model_field_effects import MODEL_FIELD_EFFECTS
 from sims.robot.places import effect_places

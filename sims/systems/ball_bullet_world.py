@@ -35,7 +35,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from sims.engines.adapters import bullet_world
+from sims.engines.external import bullet_world
 
 
 def build(client: int, constants: Mapping[str, float]) -> int:

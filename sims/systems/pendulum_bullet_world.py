@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 
-from sims.engines.adapters import bullet_world
+from sims.engines.external import bullet_world
 
 OPEN_LOOP = True
 """True if the torque depends on the input alone."""

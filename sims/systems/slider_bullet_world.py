@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from sims.engines.adapters import bullet_world
+from sims.engines.external import bullet_world
 
 OPEN_LOOP = True
 """True if the force depends on the input alone."""

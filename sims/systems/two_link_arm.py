@@ -30,7 +30,7 @@ from typing import Any
 
 from sims.core.plain_values import GRAVITY_RANGE, INERTIA_RANGE, LENGTH_RANGE
 from sims.core.simulator import Channel, Constant, Parameter
-from sims.engines.adapters.bullet_world import NO_LIMIT
+from sims.engines.external.bullet_world import NO_LIMIT
 from sims.own_simulator import BulletWorld, OwnSimulator
 
 _IDENTITY_QUATERNION = (0.0, 0.0, 0.0, 1.0)

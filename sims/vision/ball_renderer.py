@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import ConvexHull
 
 from sims.core.simulator import Array, make_read_only
-from sims.engines.adapters import bullet_world
+from sims.engines.external import bullet_world
 from sims.vision.pinhole_camera import PinholeCamera
 
 _MIN_CONTRAST = 0.3

@@ -19,11 +19,11 @@ import pandas as pd
 
 from bench.benchmark.problem.experiment import load_experiment
 from bench.benchmark.problem.experiment_tables import TunerEntry
-from bench.benchmark.problem.recorded_runs import ObservedRuns
+from bench.benchmark.problem.recording_observations import ObservedRuns
 from bench.benchmark.problem.training_simulator import RandomisedSimulator
 from bench.benchmark.problem.tuning_problem import TuningProblem
+from bench.benchmark.runner.run_in_worker import RunRequest, execute_run
 from bench.benchmark.runner.tuner_training import TrainingRequest, train_or_load
-from bench.benchmark.runner.worker_tasks import RunRequest, execute_run
 from bench.core.random_streams import make_rng
 from sims.core.files import write_atomically
 

@@ -17,9 +17,9 @@ import numpy as np
 
 from bench.benchmark.problem.experiment import TunerEntry
 from bench.benchmark.problem.tuning_problem import TuningProblem
-from bench.benchmark.runner.result_rows import build_rows
+from bench.benchmark.runner.run_in_worker import RunOutcome, RunRequest
+from bench.benchmark.runner.run_scoring import build_rows
 from bench.benchmark.runner.tuner_loop import ProposalEvaluator, drive_tuner
-from bench.benchmark.runner.worker_tasks import RunOutcome, RunRequest
 from bench.core.plugin_registries import load_plugins
 from methods.tuner import Task, Tuner
 from tests.conftest import PLUGINS

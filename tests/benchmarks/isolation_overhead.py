@@ -28,9 +28,9 @@ from bench.benchmark.isolation.tuner_proxy import IsolatedRun, IsolatedTuner
 from bench.benchmark.problem.experiment import TunerEntry
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.benchmark.runner import tuner_process_reuse
+from bench.benchmark.runner.run_in_worker import RunRequest, execute_run, get_problem
 from bench.benchmark.runner.tuner_loop import ProposalEvaluator, drive_tuner
 from bench.benchmark.runner.tuner_training import build_tuner
-from bench.benchmark.runner.worker_tasks import RunRequest, execute_run, get_problem
 from bench.core.plugin_registries import load_plugins
 from bench.core.random_streams import make_rng, make_seed_words
 from methods.tuner import Task

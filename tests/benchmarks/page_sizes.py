@@ -16,10 +16,10 @@ from time import perf_counter, process_time
 import numpy as np
 import pandas as pd
 
-from bench.benchmark.figures.comparison_charts import AxisLabels, ComparisonView
+from bench.benchmark.comparison_charts import AxisLabels, ComparisonView
+from bench.benchmark.comparison_page import ComparisonReportData, render_page
+from bench.benchmark.comparison_report import _render_figures
 from bench.benchmark.problem.experiment import load_experiment
-from bench.benchmark.report_page.comparison_page import ComparisonReportData, render_page
-from bench.benchmark.results_report import _render_figures
 from bench.benchmark.statistics.comparison_statistics import ComparisonStatistics
 from bench.benchmark.statistics.comparison_tables import build_tables
 from bench.benchmark.storage.result_folder import StoredComparison

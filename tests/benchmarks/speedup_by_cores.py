@@ -14,7 +14,7 @@ import time
 from collections import Counter
 from pathlib import Path
 
-from bench.diagnosis.evaluation.worker_pool import ForkedWorkerPool
+from bench.diagnosis.evaluation.forked_workers import ForkedWorkerPool
 from bench.diagnosis.explain import explain
 from tests.simulation_arguments import simulation_spec, write
 

@@ -9,8 +9,8 @@ import pandas as pd
 import pytest
 import tomli_w
 
+from bench.benchmark.comparison_figures import FIGURE_FILES
 from bench.benchmark.comparison_study import Comparison
-from bench.benchmark.figures.comparison_figures import FIGURE_FILES
 from bench.benchmark.problem.experiment import load_experiment
 from bench.benchmark.runner.study_creation import prepare_study
 from bench.benchmark.statistics.error_curves import ERROR_METRICS
@@ -20,8 +20,8 @@ from bench.benchmark.storage.run_status import FAILED_OR_SKIPPED_STATUSES
 from bench.bounce_shot.hit_rate_table import RESULT_COLUMNS as SHOT_COLUMNS
 from bench.bounce_shot.shot_config import read_shot_config
 from bench.bounce_shot.shot_execution import build_shot_rows
-from bench.bounce_shot.shot_planning import TunedModel
 from bench.bounce_shot.shot_sampling import draw_shots
+from bench.bounce_shot.tuned_shots import TunedModel
 from bench.cli.main import main
 from sims.core.toml_validation import read_toml
 from sims.vision.pinhole_camera import FilmDescription, PinholeCamera, format_camera_file

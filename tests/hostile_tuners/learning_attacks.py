@@ -90,7 +90,7 @@ class ProcessSearch(HonestLearner):
     name = "behind"
 
     def fit(self, simulator, rng, budget):
-        from bench.benchmark.runner import worker_tasks
+        from bench.benchmark.runner import run_in_worker
 
         held = [
             one
@@ -106,7 +106,7 @@ class ProcessSearch(HonestLearner):
         while frame is not None:
             held += [value for value in frame.f_locals.values() if hasattr(value, "cube")]
             frame = frame.f_back
-        held += [problem for _, problem in worker_tasks._problems.values()]
+        held += [problem for _, problem in run_in_worker._problems.values()]
         self.found = len([one for one in held if hasattr(one, "_problem") or hasattr(one, "cube")])
         super().fit(simulator, rng, budget)
 

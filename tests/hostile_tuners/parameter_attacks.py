@@ -63,9 +63,9 @@ class ProblemOfWorker(Cheat):
     name = "problem-of-worker"
 
     def find(self, task):
-        from bench.benchmark.runner import worker_tasks
+        from bench.benchmark.runner import run_in_worker
 
-        problems = [problem for _, problem in worker_tasks._problems.values()]
+        problems = [problem for _, problem in run_in_worker._problems.values()]
         return [point for problem in problems for point in matching(problem.draw_targets(), task)]
 
 

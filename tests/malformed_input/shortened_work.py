@@ -50,7 +50,7 @@ SHORT = {
     "bench.cli.commands.compare._run_study": _closed,
     "bench.benchmark.runner.dask_cluster.ClusterPool": _nobody,
     "bench.datasets.dataset_download._download_content": _no_network,
-    "bench.benchmark.results_report.build_tables": _cut,
+    "bench.benchmark.comparison_report.build_tables": _cut,
     "bench.studies.comparison_verification.build_tables": _cut,
     "bench.suite.multi_problem_statistics.ComparisonCollection.build_tables": _cut,
     "bench.benchmark.storage.provenance.distributions": _nothing,

@@ -131,7 +131,7 @@ def bases(folder: Path) -> dict[str, Path]:
                 comparison.results.run_sink.close()
             else:
                 comparison.run(jobs=0)
-                with patch("bench.benchmark.results_report._render_figures", return_value={}):
+                with patch("bench.benchmark.comparison_report._render_figures", return_value={}):
                     comparison.report(lambda _: None)
     path = folder / "learned.toml"
     path.write_bytes(toml(LEARNED))

@@ -11,7 +11,7 @@ from sims.core.simulator import InputError, Parameter, Scenario
 from sims.core.system import System
 from sims.effects.friction import CoulombFriction
 from sims.engines.batch import make_engine
-from sims.engines.compiled import compilability
+from sims.engines.compiled import force_program
 from sims.systems.ball import Ball
 from sims.systems.pendulum import Pendulum
 from sims.systems.servo import Servo
@@ -29,10 +29,10 @@ T = np.arange(201) / 100
 
 
 @pytest.fixture(autouse=True, params=["traced", "evaluated"])
-def force_program(request, monkeypatch):
+def force_evaluation(request, monkeypatch):
     """Run each test with traced forces, and with forces that NumPy evaluates."""
     if request.param == "evaluated":
-        monkeypatch.setattr(compilability, "_get_tracer", lambda *_: None)
+        monkeypatch.setattr(force_program, "_get_tracer", lambda *_: None)
 
 
 @pytest.mark.slow

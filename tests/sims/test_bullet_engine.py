@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from sims.core.simulator import InputError, Scenario
-from sims.engines.adapters import bullet_world
+from sims.engines.external import bullet_world
 from sims.systems.ball import Ball
 from sims.systems.pendulum import Pendulum
 from sims.systems.servo import Servo
@@ -47,7 +47,7 @@ def test_import_is_lazy_and_quiet():
     )
     assert lazy.stdout == "False\n"
     used = python(
-        "from sims.engines.adapters import bullet_world\n"
+        "from sims.engines.external import bullet_world\n"
         "print('before', flush=True); bullet_world.import_pybullet(); print('after')"
     )
     assert (used.stdout, used.stderr) == ("before\nafter\n", "")
@@ -57,7 +57,7 @@ def test_import_survives_closed_streams():
     assert (
         python(
             "import os; os.close(1); "
-            "from sims.engines.adapters import bullet_world; bullet_world.import_pybullet()"
+            "from sims.engines.external import bullet_world; bullet_world.import_pybullet()"
         ).returncode
         == 0
     )

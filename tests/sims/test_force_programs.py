@@ -11,15 +11,15 @@ from sims.core.effect import Coefficient, Force, Friction
 from sims.core.simulator import InputError, Scenario
 from sims.engines import make_engine
 from sims.engines.batch import BatchEngine
-from sims.engines.compiled import compilability
-from sims.engines.compiled.expression_graph import (
+from sims.engines.compiled import force_program
+from sims.engines.compiled.kernel import get_kernel
+from sims.engines.compiled.traced_array import (
     OPERATION_CODES,
     PER_ELEMENT,
     ExpressionGraph,
     NotTraceableError,
+    TracedArray,
 )
-from sims.engines.compiled.kernel import get_kernel
-from sims.engines.compiled.traced_array import TracedArray
 from sims.systems.ball import Ball
 from sims.systems.pendulum import Pendulum
 from sims.systems.slider import Slider
@@ -144,7 +144,7 @@ def test_an_exception_in_an_evaluated_effect_reaches_the_caller(error):
 def test_an_effect_with_many_array_operations_is_traced(monkeypatch, capsys):
     traced = simulate_slider(ManyOperations)
     assert capsys.readouterr().err == ""
-    monkeypatch.setattr(compilability, "_get_tracer", lambda *_: None)
+    monkeypatch.setattr(force_program, "_get_tracer", lambda *_: None)
     np.testing.assert_allclose(traced, simulate_slider(ManyOperations), rtol=1e-12)
 
 
@@ -217,7 +217,7 @@ def test_damaged_batches_end_in_the_same_state_with_evaluated_forces(system, mon
     with np.errstate(all="ignore"):
         batches = list(damaged_batches(batch, np.random.default_rng(11)))
         traced = [engine.integrate(batch) for batch in batches]
-        monkeypatch.setattr(compilability, "_get_tracer", lambda *_: None)
+        monkeypatch.setattr(force_program, "_get_tracer", lambda *_: None)
         evaluated = [engine.integrate(batch) for batch in batches]
     for found, expected in zip(evaluated, traced, strict=True):
         np.testing.assert_allclose(found.x, expected.x, rtol=1e-9, atol=1e-10)

@@ -11,13 +11,12 @@ import pytest
 
 from sims.core.simulator import InputError
 from sims.engines.compiled import (
-    code_cache,
     data_layout,
-    expression_graph,
     interpreter,
     kernel,
     kernel_build,
-    llvm_code,
+    machine_code,
+    traced_array,
 )
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -40,13 +39,13 @@ def test_the_cache_name_depends_on_every_compiled_source_file():
 
 def test_a_damaged_cache_file_is_made_again(tmp_path):
     path = tmp_path / "deep" / "code.bin"
-    assert code_cache.read_cached(path) is None
-    assert code_cache.make_cached(path, lambda: b"code", fail_if_called) == b"code"
-    assert code_cache.make_cached(path, fail_if_called, fail_if_called) == b"code"
+    assert machine_code.read_cached(path) is None
+    assert machine_code.make_cached(path, lambda: b"code", fail_if_called) == b"code"
+    assert machine_code.make_cached(path, fail_if_called, fail_if_called) == b"code"
     data = path.read_bytes()
     path.write_bytes(data[:-1] + bytes([data[-1] ^ 1]))
-    assert code_cache.read_cached(path) is None
-    assert code_cache.make_cached(path, lambda: b"anew", fail_if_called) == b"anew"
+    assert machine_code.read_cached(path) is None
+    assert machine_code.make_cached(path, lambda: b"anew", fail_if_called) == b"anew"
 
 
 def test_an_interrupted_compilation_leaves_no_file(tmp_path):
@@ -55,20 +54,20 @@ def test_an_interrupted_compilation_leaves_no_file(tmp_path):
 
     path = tmp_path / "code.bin"
     with pytest.raises(KeyboardInterrupt):
-        code_cache.make_cached(path, interrupted, fail_if_called)
+        machine_code.make_cached(path, interrupted, fail_if_called)
     assert [p.name for p in tmp_path.iterdir()] == ["code.lock"]
 
 
 def test_one_process_compiles_while_others_wait_and_a_killed_one_blocks_none(tmp_path):
     code = (
         "import os, sys, time; from pathlib import Path; "
-        "from sims.engines.compiled import code_cache\n"
+        "from sims.engines.compiled import machine_code\n"
         "path = Path(sys.argv[1])\n"
         "def make():\n"
         "    path.with_name('at-it').touch()\n"
         "    time.sleep(float(sys.argv[2]))\n"
         "    return str(os.getpid()).encode()\n"
-        "print(code_cache.make_cached(path, make, lambda: print('waits')).decode())\n"
+        "print(machine_code.make_cached(path, make, lambda: print('waits')).decode())\n"
     )
 
     def start_process(seconds):
@@ -106,8 +105,8 @@ def test_a_compiler_that_fails_is_reported_in_one_line(monkeypatch, tmp_path, ca
 
 
 def test_code_that_cannot_be_stored_is_compiled_again(monkeypatch, tmp_path, capsys):
-    path = code_cache.get_cache_folder() / f"stepping-{kernel._compute_cache_key()}.bin"
-    code = code_cache.read_cached(path)
+    path = machine_code.get_cache_folder() / f"stepping-{kernel._compute_cache_key()}.bin"
+    code = machine_code.read_cached(path)
     (tmp_path / "file").touch()
     monkeypatch.setenv("SIMGAP_COMPILED", str(tmp_path / "file"))
     monkeypatch.setattr(kernel_build, "build_kernel", lambda *_: code)
@@ -116,11 +115,11 @@ def test_code_that_cannot_be_stored_is_compiled_again(monkeypatch, tmp_path, cap
 
 
 def test_code_with_a_missing_symbol_is_not_loaded():
-    path = code_cache.get_cache_folder() / f"stepping-{kernel._compute_cache_key()}.bin"
-    code = llvm_code.MachineCode.unpack(code_cache.read_cached(path))
-    assert llvm_code.MachineCode.unpack(code.pack()) == code
-    with pytest.raises(llvm_code.CodeNotLoadableError, match="frobnicate"):
-        llvm_code.load_machine_code(code._replace(needs=(*code.needs, "frobnicate")))
+    path = machine_code.get_cache_folder() / f"stepping-{kernel._compute_cache_key()}.bin"
+    code = machine_code.MachineCode.unpack(machine_code.read_cached(path))
+    assert machine_code.MachineCode.unpack(code.pack()) == code
+    with pytest.raises(machine_code.CodeNotLoadableError, match="frobnicate"):
+        machine_code.load_machine_code(code._replace(needs=(*code.needs, "frobnicate")))
 
 
 def test_loading_the_kernel_does_not_import_numba():
@@ -180,7 +179,7 @@ def test_arrays_of_wrong_shape_are_refused(name, value):
 
 def test_instructions_are_checked_and_run_on_any_number_of_slots():
     run_by = kernel.get_kernel()
-    ops = {name: code for code, name in enumerate(expression_graph.OPERATIONS)}
+    ops = {name: code for code, name in enumerate(traced_array.OPERATIONS)}
     code = np.array([[ops["add"], 2, 0, 1, 0], [ops["tanh"], 3, 2, 2, 2]], dtype=np.int64)
     for size in (1, 5, 64, 130):
         r = np.zeros((4, size))

@@ -11,7 +11,7 @@ import pytest
 
 from sims.core.effect import Coefficient, Force
 from sims.core.simulator import InputError, Scenario
-from sims.engines.adapters.mujoco_bodies import compute_damping_ratio
+from sims.engines.external.mujoco_bodies import compute_damping_ratio
 from sims.systems.ball import Ball
 from sims.systems.pendulum import Pendulum
 from sims.systems.servo import Servo
@@ -25,10 +25,10 @@ def test_import_is_lazy():
     code = (
         "import sys\nfrom sims.systems.ball import Ball\nball = Ball(engine='mujoco')\n"
         "print('mujoco' in sys.modules, "
-        "sys.modules['sims.engines.adapters.mujoco_engine'].__name__)"
+        "sys.modules['sims.engines.external.mujoco_engine'].__name__)"
     )
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert found.stdout == "False sims.engines.adapters.mujoco_engine\n"
+    assert found.stdout == "False sims.engines.external.mujoco_engine\n"
 
 
 def test_instability_is_silent_and_writes_no_file(tmp_path, monkeypatch):

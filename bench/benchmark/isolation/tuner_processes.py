@@ -37,7 +37,7 @@ from bench.benchmark.isolation.message_channel import (
 )
 from methods.tuner import Array
 from sims.core.files import lock_file
-from sims.engines.compiled import code_cache as compiled
+from sims.engines.compiled import machine_code as compiled
 
 _FOLDER_PREFIX = "simgap-tuner-"
 

@@ -23,7 +23,7 @@ from bench.benchmark.problem.experiment_tables import (
     compute_problem_hash,
     parse_entries,
 )
-from bench.benchmark.problem.recorded_runs import resolve_recording_path
+from bench.benchmark.problem.recording_observations import resolve_recording_path
 from bench.core.random_streams import check_commitment
 from sims.core.files import is_existing_file
 from sims.core.plain_values import MAX_DESCRIPTION_LENGTH, MAX_NAME_LENGTH, MAX_SAMPLING_RATE_HZ

@@ -15,7 +15,7 @@ from bench.benchmark.problem.experiment import (
     check_name,
 )
 from bench.benchmark.problem.experiment_tables import TunerEntry
-from bench.benchmark.problem.recorded_runs import find_recording
+from bench.benchmark.problem.recording_observations import find_recording
 from bench.core.plugin_registries import make_robot_simulator, simulators
 from bench.datasets import dataset_catalogue as datasets
 from sims.core.files import is_existing_file, require_file

@@ -17,7 +17,7 @@ import numpy as np
 from bench.benchmark.problem import targets
 from bench.benchmark.problem.experiment import Experiment
 from bench.benchmark.problem.fisher_information import InformationSpectrum, compute_spectrum
-from bench.benchmark.problem.recorded_runs import RecordedRuns, load_recorded_runs
+from bench.benchmark.problem.recording_observations import RecordedRuns, load_recorded_runs
 from bench.benchmark.problem.robot_experiment import (
     complete_robot_experiment,
     get_simulator_class,

@@ -21,7 +21,7 @@ from typing import Any
 
 from bench import __version__
 from bench.benchmark.problem.experiment import Experiment
-from bench.benchmark.problem.recorded_runs import find_recording
+from bench.benchmark.problem.recording_observations import find_recording
 from sims import effects
 from sims.core.simulator import InputError
 

@@ -24,13 +24,14 @@ from bench.benchmark.problem.targets import Redraws, Target, count_redraws
 from bench.benchmark.problem.tuning_problem import TuningProblem, numeric_warnings_silenced
 from bench.benchmark.runner.code_digest import list_effect_names
 from bench.benchmark.runner.plugin_discovery import describe_plugins, must_build_isolated
-from bench.benchmark.runner.result_rows import (
+from bench.benchmark.runner.run_fingerprint import RunIds
+from bench.benchmark.runner.run_in_worker import RunOutcome, RunRequest, execute_run
+from bench.benchmark.runner.run_scoring import (
     Notes,
     build_rows,
     make_status,
     make_unfinished_outcome,
 )
-from bench.benchmark.runner.run_fingerprint import RunIds
 from bench.benchmark.runner.tuner_process_reuse import make_tuner_spec
 from bench.benchmark.runner.tuner_training import (
     TrainingRequest,
@@ -46,7 +47,6 @@ from bench.benchmark.runner.worker_pools import (
     WorkerDiedError,
     make_pool,
 )
-from bench.benchmark.runner.worker_tasks import RunOutcome, RunRequest, execute_run
 from bench.benchmark.storage.run_status import RunStatus
 from bench.core.plugin_registries import PartUnavailableError, Registry, effects, simulators, tuners
 from sims.core.simulator import InputError

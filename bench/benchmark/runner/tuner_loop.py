@@ -21,7 +21,7 @@ from bench.benchmark.isolation.message_channel import to_points
 from methods.tuner import Array, Evaluation, Proposal, Task
 
 if TYPE_CHECKING:
-    from bench.benchmark.problem.recorded_runs import ObservedRuns
+    from bench.benchmark.problem.recording_observations import ObservedRuns
     from bench.benchmark.problem.tuning_problem import TuningProblem
 
 

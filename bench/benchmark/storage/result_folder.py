@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from bench import __version__
 from bench.benchmark.problem.experiment import Experiment, parse_experiment
 from bench.benchmark.problem.targets import Redraws
-from bench.benchmark.storage.integrity_checks import check_files, check_table
 from bench.benchmark.storage.provenance import describe_machine, get_utc_time, list_package_versions
+from bench.benchmark.storage.result_file_consistency import check_files, check_table
 from bench.benchmark.storage.run_journal import SEGMENTS_FOLDER, RunJournal, read_plan
 from bench.benchmark.storage.run_status import STATUS_COLUMN_NAMES
 from bench.benchmark.storage.table_schemas import (

@@ -1,7 +1,7 @@
 """Declaration of every column and key in the files of a result folder.
 
 `storage.cell_validation` checks the cells of a column, `storage.csv_reader` the rows of a run, and
-`storage.integrity_checks` the consistency between files. A column that is added later is
+`storage.result_file_consistency` the consistency between files. A column that is added later is
 `required=False` and has a `default`, so that older folders can still be read.
 """
 

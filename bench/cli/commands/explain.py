@@ -156,7 +156,7 @@ def _run_explain_batch(options: argparse.Namespace, print_line: PrintLine) -> Co
     )
     from bench.cli.progress_display import ProgressDisplay
     from bench.core.resource_estimates import count_available_cores
-    from bench.diagnosis.batch.run_batch import (
+    from bench.diagnosis.many_logs import (
         LOGS_TABLE_FILE,
         LogResult,
         explain_batch,
@@ -164,7 +164,7 @@ def _run_explain_batch(options: argparse.Namespace, print_line: PrintLine) -> Co
         list_logs,
         summarise_causes,
     )
-    from bench.diagnosis.batch.summary_page import BatchPageInput, write_summary_page
+    from bench.diagnosis.many_logs_page import BatchPageInput, write_summary_page
     from sims.core.files import make_timestamped_path
 
     settings = {

@@ -1,11 +1,12 @@
-"""Command `simgap film`: film a run of a recording of a ball."""
+"""Commands `simgap film` and `simgap track`: film a recorded ball, and track the ball in a film."""
 
 from __future__ import annotations
 
 import argparse
+import sys
 
 from bench.cli.output import CommandResult, PrintLine
-from bench.cli.shared_options import add_force_option, add_out_option, parse_path
+from bench.cli.shared_options import add_force_option, add_out_option, add_pdf, parse_path
 
 
 def add_film_arguments(parser: argparse.ArgumentParser) -> None:
@@ -63,3 +64,51 @@ def run_film(options: argparse.Namespace, print_line: PrintLine) -> CommandResul
             "pixels": options.size,
         }
     )
+
+
+def add_track_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `simgap track`."""
+    parser.add_argument(
+        "video",
+        metavar="VIDEO",
+        type=parse_path,
+        help="a film of one dropped ball by a fixed camera",
+    )
+    add_out_option(parser, "new file for the recording", "NAME.csv", required=True)
+    parser.add_argument(
+        "--ball-diameter", metavar="M", type=float, help="the ball's diameter in metres"
+    )
+    parser.add_argument(
+        "--fps", metavar="F", type=float, help="frames per second (default: the file's time stamps)"
+    )
+    parser.add_argument(
+        "--scale",
+        choices=("camera", "diameter", "fall"),
+        help="source of the scale in metres (default: VIDEO.camera.toml if it exists, else the "
+        "diameter if given, else the fall)",
+    )
+    add_pdf(parser)
+    parser.set_defaults(command=run_track)
+
+
+def run_track(options: argparse.Namespace, print_line: PrintLine) -> CommandResult:
+    """Track a ball; write the recording and its figure.
+
+    Args:
+        options: Options of `simgap track`.
+        print_line: Prints a line of text.
+    """
+    from bench.figures.recording_figure import render_track_figure
+    from bench.logs.film_tracking import track_film
+
+    diameter, fps, scale = options.ball_diameter, options.fps, options.scale
+    track = track_film(
+        options.video, options.out, render_track_figure, diameter, fps, scale, options.pdf
+    )
+    for note in track.notes:
+        print(f"simgap: {options.video}: {note}", file=sys.stderr)
+    for line in track.lines:
+        print_line(line)
+    endings = (".csv", ".toml", ".png", ".pdf") if options.pdf else (".csv", ".toml", ".png")
+    files = [options.out.with_suffix(ending) for ending in endings]
+    return CommandResult({**track.to_document(), "recording": options.out, "files": files})

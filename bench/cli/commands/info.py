@@ -103,7 +103,7 @@ def _read_memory_size() -> int | None:
 def _describe_engines() -> Iterator[JsonDocument]:
     """List every engine; each package is imported, since an installed one may not work."""
     from bench import __version__
-    from sims.engines.adapters import bullet_world, mujoco_bodies
+    from sims.engines.external import bullet_world, mujoco_bodies
 
     loads = {"pybullet": bullet_world.import_pybullet, "mujoco": mujoco_bodies.import_mujoco}
     yield {"name": "batch", "version": __version__, "missing": None}

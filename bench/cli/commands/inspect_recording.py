@@ -80,9 +80,9 @@ def _run_inspect(options: argparse.Namespace, print_line: PrintLine) -> CommandR
     from bench.core.plugin_registries import load_plugins
     from bench.figures.recording_figure import write_recording_figure
     from bench.logs import recording_summary, signal_statistics
+    from bench.logs.quality.clock_checks import find_anomalies, find_log_anomalies
     from bench.logs.quality.log_quality import check_log_quality
     from bench.logs.quality.pose_check import find_missing_base_poses
-    from bench.logs.quality.sampling_clock import find_anomalies, find_log_anomalies
     from bench.logs.recording_loading import load_recording
     from bench.logs.recording_summary import format_summary
     from sims.core.simulator import InputError

@@ -53,11 +53,11 @@ def _run_list(options: argparse.Namespace, print_line: PrintLine) -> CommandResu
     if (options.what == "places") != (options.model is not None):
         raise InputError("list places and --model FILE go together")
     if options.model is not None:
-        from bench.cli import robot_places
+        from bench.cli import catalogue
 
-        for line in robot_places.format_places(options.model):
+        for line in catalogue.format_places(options.model):
             print_line(line)
-        return CommandResult({"places": robot_places.list_places(options.model)})
+        return CommandResult({"places": catalogue.list_places(options.model)})
     if options.what is None:
         if not options.json:
             raise InputError(f"expected one of {', '.join(_LISTS)}; with --json all are listed")

@@ -76,8 +76,8 @@ def _run_train(options: argparse.Namespace, print_line: PrintLine) -> CommandRes
         The JSON document of the command, and its exit code (0).
     """
     from bench.api.train import LossRecorder, run_training, select_training
+    from bench.benchmark.runner.comparison_resources import check_training_size
     from bench.benchmark.runner.experiment_runner import count_seeds
-    from bench.benchmark.runner.resource_checks import check_training_size
     from bench.cli.progress_display import ProgressBars
     from methods.learning.training_data import TrainingBudgetTooSmallError
     from sims.core.simulator import InputError

@@ -7,13 +7,13 @@ from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
-from bench.diagnosis.datasheet import sheet_content
+from bench.diagnosis.datasheet import datasheet_content
+from bench.diagnosis.datasheet.datasheet_content import SheetContent, build_sheet_rows
+from bench.diagnosis.datasheet.datasheet_figure import render_diagram, render_pdf
+from bench.diagnosis.datasheet.datasheet_subject import SheetSubject, make_subject
 from bench.diagnosis.datasheet.detection_limits import compute_detection_limits
 from bench.diagnosis.datasheet.drive_diagram import DriveDiagram
-from bench.diagnosis.datasheet.drive_figure import render_diagram, render_pdf
 from bench.diagnosis.datasheet.mjcf_class import CLASS_FILE, MjcfFiles, build_mjcf
-from bench.diagnosis.datasheet.sheet_content import SheetContent, build_sheet_rows
-from bench.diagnosis.datasheet.subject import SheetSubject, make_subject
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.report.wording import (
     append_unit,
@@ -23,7 +23,7 @@ from bench.diagnosis.report.wording import (
     joined,
 )
 from bench.diagnosis.verdict import Verdict
-from bench.logs.importing.sample_thinning import leave_out_settling
+from bench.logs.importing.sample_selection import leave_out_settling
 from bench.logs.segmentation import segment_recording
 from bench.pages.chart import PrintedFigure
 from bench.pages.html_page import HtmlPage
@@ -73,13 +73,13 @@ def render_page(
         class_file=CLASS_FILE,
         class_text=mjcf.contents.get(CLASS_FILE, ""),
         notes=mjcf.notes,
-        format_confounding=sheet_content.format_confounding,
-        format_detection_limit=sheet_content.format_detection_limit,
-        format_evidence=sheet_content.format_evidence,
+        format_confounding=datasheet_content.format_confounding,
+        format_detection_limit=datasheet_content.format_detection_limit,
+        format_evidence=datasheet_content.format_evidence,
         format_fitted_value=format_fitted_value,
-        format_name=sheet_content.format_name,
-        format_prediction_interval=sheet_content.format_prediction_interval,
-        part=sheet_content.title,
+        format_name=datasheet_content.format_name,
+        format_prediction_interval=datasheet_content.format_prediction_interval,
+        part=datasheet_content.title,
         sentence=format_sentence,
         with_unit=append_unit,
     )

@@ -19,7 +19,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from bench.diagnosis.datasheet.subject import SheetSubject
+from bench.diagnosis.datasheet.datasheet_subject import SheetSubject
 from sims import effects as library
 from sims.core.effect import Effect, Force, Friction, HiddenStateEffect
 from sims.core.simulator import Array

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bench.diagnosis.datasheet.sheet_content import SheetContent
+from bench.diagnosis.datasheet.datasheet_content import SheetContent
 from bench.diagnosis.extended_robot_files import collect_causes
 from sims import effects as library
 from sims.core.effect import Friction

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bench.diagnosis.evaluation.forked_workers import ForkedWorkerPool
 from bench.diagnosis.evaluation.noise_model import Mask
 from bench.diagnosis.evaluation.run_data import (
     RunData,
@@ -19,7 +20,6 @@ from bench.diagnosis.evaluation.run_data import (
     take_first_samples,
 )
 from bench.diagnosis.evaluation.search_control import SearchControl
-from bench.diagnosis.evaluation.worker_pool import ForkedWorkerPool
 from sims import effects as library
 from sims.core.effect import Effect, Input, Sensor, members_of
 from sims.core.simulator import Array, InputError, Parameter, Scenario, make_unknown_name_error

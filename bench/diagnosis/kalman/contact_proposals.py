@@ -39,7 +39,6 @@ from bench.diagnosis.search.contact_search import exclude_laws_with_many_shapes
 from bench.diagnosis.search.effect_search import EffectSearch
 from bench.diagnosis.search.model_moves import MAX_REFITTED_CANDIDATES
 from sims.core.simulator import Array
-from sims.robot.dynamics.added_elements import group_by_added_elements
 from sims.robot.dynamics.batch_work import RobotRunBatch
 from sims.robot.dynamics.effect_forces import (
     is_evaluated_per_step,
@@ -48,6 +47,7 @@ from sims.robot.dynamics.effect_forces import (
     slice_active_effects,
 )
 from sims.robot.dynamics.inverse_dynamics import compute_joint_scales
+from sims.robot.dynamics.series_joints import group_by_added_elements
 from sims.robot.floating_joints import FloatingState
 from sims.robot.mujoco_messages import capture_mujoco_warnings
 from sims.robot.robot_simulator import LINEARISATION_BATCH_SIZE, RobotSimulator

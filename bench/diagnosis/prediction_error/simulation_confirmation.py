@@ -20,7 +20,7 @@ from bench.diagnosis.prediction_error.regression_selection import compute_p_valu
 from bench.diagnosis.search.alternative_causes import AlternativeFinder, CauseEvidence
 from bench.diagnosis.search.diagnose import DiagnosisResult, Inquiry, compute_gap_closed
 from bench.diagnosis.search.effect_search import EffectSearch
-from bench.diagnosis.search.held_out_validation import HeldOutValidation
+from bench.diagnosis.search.held_out_model_choice import HeldOutValidation
 from bench.diagnosis.search.lack_of_fit import assess_lack_of_fit
 from bench.diagnosis.search.verdict_rules import DiagnosisState, decide_verdict, is_unexplained
 from bench.diagnosis.validation.held_out_runs import Validation

@@ -13,7 +13,7 @@ import numpy as np
 
 from bench.diagnosis.fitting.model_set import FittedModel
 from bench.diagnosis.search.effect_search import EffectSearch
-from bench.diagnosis.search.held_out_validation import HeldOutValidation
+from bench.diagnosis.search.held_out_model_choice import HeldOutValidation
 from bench.diagnosis.search.model_moves import MAX_RICHER_LAW_EXCESS_RATIO
 from bench.diagnosis.search.score_test import estimate_tail_p_value
 from bench.diagnosis.search.verdict_rules import (

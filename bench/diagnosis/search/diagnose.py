@@ -19,7 +19,7 @@ from bench.diagnosis.fitting.model_set import EffectNames, FittedModel
 from bench.diagnosis.search import verdict_rules
 from bench.diagnosis.search.alternative_causes import AlternativeFinder, CauseEvidence
 from bench.diagnosis.search.effect_search import EffectSearch
-from bench.diagnosis.search.held_out_validation import HeldOutValidation
+from bench.diagnosis.search.held_out_model_choice import HeldOutValidation
 from bench.diagnosis.search.lack_of_fit import (
     LackOfFitResult,
     assess_lack_of_fit,

@@ -13,7 +13,7 @@ import numpy as np
 
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.diagnosis.evaluation.run_thinning import thin_runs
+from bench.diagnosis.evaluation.run_subsampling import thin_runs
 from bench.diagnosis.evaluation.search_control import SearchStoppedError
 from bench.diagnosis.fitting.fit_state import FitStart
 from bench.diagnosis.fitting.model_set import FittedModel

@@ -7,13 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from bench.logs.quality import (
-    clock_drift,
-    pose_check,
-    sampling_clock,
-    signal_values,
-    velocity_consistency,
-)
+from bench.logs.quality import clock_checks, pose_check, signal_checks, velocity_consistency
 from bench.logs.quality.quality_finding import QualityFinding
 from sims.core.simulator import Simulator
 from sims.recording.recording import Recording
@@ -29,11 +23,11 @@ def check_log_quality(recording: Recording, kind: type[Simulator]) -> Iterator[Q
     Returns:
         Findings in the order of the checks.
     """
-    yield from sampling_clock.check_intervals(recording)
-    yield from sampling_clock.check_repeated_samples(recording)
-    yield from clock_drift.check_clock_drift(recording, kind)
-    yield from signal_values.check_quantisation(recording, kind)
-    yield from signal_values.check_saturation(recording, kind)
-    yield from signal_values.check_standstill(recording, kind)
+    yield from clock_checks.check_intervals(recording)
+    yield from clock_checks.check_repeated_samples(recording)
+    yield from clock_checks.check_clock_drift(recording, kind)
+    yield from signal_checks.check_quantisation(recording, kind)
+    yield from signal_checks.check_saturation(recording, kind)
+    yield from signal_checks.check_standstill(recording, kind)
     yield from velocity_consistency.check_velocities(recording, kind)
     yield from pose_check.find_overlaps(recording, kind)

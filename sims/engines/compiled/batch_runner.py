@@ -10,9 +10,8 @@ import numpy as np
 from sims.core.effect import Contact, Effect, Force, Friction
 from sims.core.engine import IntegrationBatch, Trajectories
 from sims.core.simulator import Array, Indices
-from sims.engines.compiled.compilability import get_force_program
 from sims.engines.compiled.data_layout import FRICTION_COORDINATE_COUNT, HAS_FRICTION, BatchArrays
-from sims.engines.compiled.force_program import ForceProgram, NumpyForceProgram
+from sims.engines.compiled.force_program import ForceProgram, NumpyForceProgram, get_force_program
 from sims.engines.compiled.kernel import get_kernel
 from sims.engines.compiled.kernel_entry import FLY_ELEMENTS, STEP_BLOCK, STEP_IN_LOCKSTEP
 from sims.engines.compiled.step_size import MAX_STEP_DIVISIONS

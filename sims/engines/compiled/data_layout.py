@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sims.core.effect import Effect, Force, Friction
 from sims.core.system import System
-from sims.engines.compiled.expression_graph import EXTERNAL
+from sims.engines.compiled.traced_array import EXTERNAL
 
 Array = NDArray[Any]
 FloatArray = NDArray[np.float64]

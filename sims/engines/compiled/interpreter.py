@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sims.engines.compiled.data_layout import FloatArray, IntTable
-from sims.engines.compiled.expression_graph import EXTERNAL, OPERATION_CODES
+from sims.engines.compiled.traced_array import EXTERNAL, OPERATION_CODES
 
 if TYPE_CHECKING:
 

@@ -1,7 +1,7 @@
 """Compiled kernel of the batch engine: loaded from the user's cache, or compiled once.
 
 numba translates the functions (`kernel_build`), which takes 20 s. The machine code is stored
-(`code_cache`) and loaded with llvmlite alone (`llvm_code`), in a few hundredths of a second and
+and loaded with llvmlite alone (`machine_code`), in a few hundredths of a second and
 without numba.
 """
 
@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from sims.core.simulator import InputError
-from sims.engines.compiled import code_cache, kernel_entry, llvm_code
+from sims.engines.compiled import kernel_entry, machine_code
 from sims.engines.compiled.data_layout import (
     Array,
     BatchArrays,
@@ -34,11 +34,11 @@ from sims.engines.compiled.data_layout import (
 KERNEL_SOURCE_MODULES = (
     *("accelerations", "ballistic_motion", "data_layout", "element_clock", "element_stepping"),
     "events",
-    *("expression_graph", "interpreter", "kernel_build", "kernel_entry", "llvm_code"),
+    *("interpreter", "kernel_build", "kernel_entry", "machine_code", "traced_array"),
     *("lockstep_stepping", "mujoco_callback", "step_size"),
 )
 """Modules of this package on which the compiled code depends."""
-_COMPILER_MODULES = ("kernel_build", "llvm_code")
+_COMPILER_MODULES = ("kernel_build", "machine_code")
 """Modules of this package that compile functions of other packages."""
 _COMPILE_SECONDS = 20
 """Approximate compilation time in seconds."""
@@ -250,8 +250,8 @@ def _load_stored(
         InputError: the compiler or its machine code cannot be used.
     """
     try:
-        code = llvm_code.MachineCode.unpack(_get_machine_code(name, compile_code))
-        return llvm_code.load_machine_code(code, pointers)
+        code = machine_code.MachineCode.unpack(_get_machine_code(name, compile_code))
+        return machine_code.load_machine_code(code, pointers)
     # A compiler that does not match this Python or its NumPy may raise any error.
     except Exception as error:
         text = (str(error) or type(error).__name__).splitlines()[0]
@@ -267,13 +267,13 @@ def _get_machine_code(name: str, compile_code: Callable[[], bytes]) -> bytes:
     Compilation takes about 20 s, so the code is stored in the user's cache. If the cache cannot
     be written, each process compiles again.
     """
-    folder = code_cache.get_cache_folder()
+    folder = machine_code.get_cache_folder()
     path = folder / name
-    data = code_cache.read_cached(path)
+    data = machine_code.read_cached(path)
     if data is not None:
         return data
     try:
-        return code_cache.make_cached(path, compile_code, _report_wait)
+        return machine_code.make_cached(path, compile_code, _report_wait)
     except OSError as error:
         _print_line(
             f"machine code cannot be stored in {folder} ({error.strerror or error}), so each"
@@ -324,7 +324,7 @@ def _hash_sources(sources: Sequence[Path], further_text: str = "") -> str:
     digest = hashlib.sha256()
     for source in sources:
         digest.update(source.read_bytes())
-    digest.update(repr(llvm_code.describe_processor()).encode())
+    digest.update(repr(machine_code.describe_processor()).encode())
     digest.update(further_text.encode())
     return digest.hexdigest()[:24]
 

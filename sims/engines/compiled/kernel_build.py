@@ -27,8 +27,8 @@ from sims.engines.compiled import (
     events,
     interpreter,
     kernel_entry,
-    llvm_code,
     lockstep_stepping,
+    machine_code,
     mujoco_callback,
     step_size,
 )
@@ -107,7 +107,7 @@ def _run_compiler(*arguments: Any) -> bytes:
     )
     if process.returncode:
         error_lines = process.stderr.decode(errors="replace").strip().splitlines()
-        raise llvm_code.CodeNotLoadableError(
+        raise machine_code.CodeNotLoadableError(
             error_lines[-1] if error_lines else f"its compiler failed: {process.returncode}"
         )
     return process.stdout
@@ -119,7 +119,7 @@ def main(offsets: Mapping[str, int] | None = None, module: str = "", entry: str 
         emitted = emit_module(module, entry)
     else:
         emitted = emit_llvm() if offsets is None else emit_callback(offsets)
-    sys.stdout.buffer.write(llvm_code.compile_llvm(*emitted).pack())
+    sys.stdout.buffer.write(machine_code.compile_llvm(*emitted).pack())
 
 
 def emit_llvm() -> tuple[str, str]:

@@ -32,7 +32,7 @@ from sims.engines.compiled.data_layout import (
     ProgramArrays,
     make_flags,
 )
-from sims.engines.compiled.expression_graph import EXTERNAL
+from sims.engines.compiled.traced_array import EXTERNAL
 
 NUMPY_BLOCK_WIDTH = 1024
 """Number of slots of a block: a call of NumPy costs more than its rows."""

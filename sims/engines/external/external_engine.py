@@ -33,7 +33,6 @@ from sims.core.engine import IntegrationBatch, Trajectories
 from sims.core.plain_values import is_plausible_number, truncate_text
 from sims.core.simulator import Array, Indices, InputError
 from sims.core.system import StateSnapshot, System
-from sims.engines.compiled.compilability import get_force_program
 from sims.engines.compiled.data_layout import (
     BOUNCES,
     HAS_FRICTION,
@@ -49,7 +48,7 @@ from sims.engines.compiled.data_layout import (
     OUT_LIMIT,
     OUT_MU,
 )
-from sims.engines.compiled.force_program import ForceProgram, NumpyForceProgram
+from sims.engines.compiled.force_program import ForceProgram, NumpyForceProgram, get_force_program
 
 TIME_TOLERANCE = 1e-6
 """Largest deviation of sample times from the engine's steps, as a fraction of an interval.

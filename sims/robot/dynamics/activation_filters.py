@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sims.core.simulator import Array, Scenario
-from sims.effects.first_order_lag import apply_recursion
+from sims.effects.input_effects import apply_recursion
 from sims.robot.integrator_settings import RK4_INTEGRATOR_ID
 from sims.robot.robot_model import Actuator, RobotModel, cache_per_robot, filters
 

@@ -19,15 +19,16 @@ from numpy.typing import NDArray
 
 from sims.core.effect import Effect, HiddenState, HiddenStateEffect
 from sims.core.simulator import Array
-from sims.engines.compiled.expression_graph import (
+from sims.engines.compiled.force_program import InstructionList, emit_instructions
+from sims.engines.compiled.kernel import get_kernel
+from sims.engines.compiled.traced_array import (
     PER_ELEMENT,
     PER_EVALUATION,
     ExpressionGraph,
     NotTraceableError,
+    collect_nodes,
+    make_input_vector,
 )
-from sims.engines.compiled.force_program import InstructionList, emit_instructions
-from sims.engines.compiled.kernel import get_kernel
-from sims.engines.compiled.traced_array import collect_nodes, make_input_vector
 from sims.robot.dynamics.effect_forces import (
     EffectForces,
     compute_effect_forces,

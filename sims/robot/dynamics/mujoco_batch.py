@@ -21,7 +21,6 @@ import numpy as np
 
 from sims.core.effect import ActiveEffects
 from sims.core.simulator import Array
-from sims.robot.dynamics.added_elements import AddedElements, add_elements
 from sims.robot.dynamics.drive_limits import (
     FORCE_FIELDS,
     ForceLimits,
@@ -33,6 +32,8 @@ from sims.robot.dynamics.midpoint_state import IndexArray, JointStates, Mask, Mi
 from sims.robot.dynamics.series_joints import (
     USED_FIELDS,
     WRITTEN_FIELDS,
+    AddedElements,
+    add_elements,
     compute_rest_positions,
     convert_flank_parameters,
     is_series_effect,

@@ -15,18 +15,18 @@ from bench.benchmark.problem.experiment import list_experiment_names, load_exper
 from bench.benchmark.runner.study_creation import prepare_study
 from bench.benchmark.runner.tuner_training import TrainingRequest, train_or_load
 from bench.benchmark.runner.worker_pools import PoolLostError
-from bench.bounce_shot import shot_planning, shot_study
+from bench.bounce_shot import shot_study, tuned_shots
 from bench.bounce_shot.hit_rate_table import ALL_BALLS, build_result_table, compute_wilson_interval
 from bench.bounce_shot.shot_config import read_shot_config
 from bench.bounce_shot.shot_execution import execute_shot
-from bench.bounce_shot.shot_planning import (
+from bench.bounce_shot.shot_sampling import build_pixel_runs, draw_shot, draw_shots, record_drop
+from bench.bounce_shot.true_world import InclinedGround, simulate_shot
+from bench.bounce_shot.tuned_shots import (
     ShotInputs,
     TunedModel,
     select_transferable_effects,
     tune_and_plan,
 )
-from bench.bounce_shot.shot_sampling import build_pixel_runs, draw_shot, draw_shots, record_drop
-from bench.bounce_shot.true_world import InclinedGround, simulate_shot
 from bench.cli import main
 from bench.core.plugin_registries import REGISTRIES
 from sims.core.simulator import InputError
@@ -167,7 +167,7 @@ def test_on_vision_a_tuner_learns_restitution_from_rows_and_never_where_the_came
     settings, path = read_shot_config(experiment), tmp_path / "drop.csv"
     assert settings.rows == ("tunenet-vision",)
     watching, metres = (
-        shot_planning.make_tuning_experiment(experiment, settings, entry)
+        tuned_shots.make_tuning_experiment(experiment, settings, entry)
         for entry in experiment.tuners
     )
     assert (watching.simulator, watching.observe, metres.simulator) == (
@@ -196,7 +196,7 @@ def test_on_vision_a_tuner_learns_restitution_from_rows_and_never_where_the_came
         known = ShotInputs(dealt.name, path, dealt.scene, weights)
         recording = read_recording(path, Ball, whole=True)
         by_rows, by_metres = (
-            shot_planning._tune_model(experiment, settings, entry, known, recording, {})
+            tuned_shots._tune_model(experiment, settings, entry, known, recording, {})
             for entry in experiment.tuners
         )
         assert by_rows.restitution == pytest.approx(by_metres.restitution, abs=0.06)
@@ -242,7 +242,7 @@ def test_untuned_misses_where_restitution_differs_and_tuned_hits(experiment, tmp
     def broken(_):
         return TunedModel("explain", 0.5, {}, 0, 0.0, "crashed", "no"), {}
 
-    monkeypatch.setattr(shot_planning, "_explain_drop", broken)
+    monkeypatch.setattr(tuned_shots, "_explain_drop", broken)
     settings = read_shot_config(experiment)
     dealt = draw_shot(experiment, settings, "rubber", 1)
     path = tmp_path / "drop.csv"
@@ -356,7 +356,7 @@ def explained(_):
 @pytest.fixture
 def crashing(tmp_path, monkeypatch, fresh_registries):
     """Return the arguments of a study with a failing tuner; explain and figures are stubs."""
-    monkeypatch.setattr(shot_planning, "_explain_drop", explained)
+    monkeypatch.setattr(tuned_shots, "_explain_drop", explained)
     monkeypatch.setattr("bench.bounce_shot.shot_report.draw_figures", lambda *_: {})
     monkeypatch.setattr("bench.bounce_shot.shot_report.write_animation", lambda *_: "animation")
     path = tmp_path / "mine.toml"
@@ -464,14 +464,14 @@ def test_interrupted_it_is_resumed_with_its_own_plugins_and_what_changed_is_refu
     out = tmp_path / "out"
     path = tmp_path / "mine.toml"
     path.write_text(path.read_text().replace("targets = 1", "targets = 2"))
-    shoot = shot_planning.tune_and_plan
+    shoot = tuned_shots.tune_and_plan
 
     def interrupted(experiment, settings, known):
         if known.name.endswith("001"):
             raise KeyboardInterrupt
         return shoot(experiment, settings, known)
 
-    monkeypatch.setattr(shot_planning, "tune_and_plan", interrupted)
+    monkeypatch.setattr(tuned_shots, "tune_and_plan", interrupted)
     assert main.main(["compare", *crashing, "--out", str(out)]) == 130
     said = capsys.readouterr()
     assert "simgap: interrupted; 1 of 2 shots are made and stored" in said.err
@@ -479,7 +479,7 @@ def test_interrupted_it_is_resumed_with_its_own_plugins_and_what_changed_is_refu
     assert len(pd.read_csv(out / "status.csv")) == 6, "what there is is reported"
     assert main.main(["status", str(out)]) == 1
     assert "missing    golf-001" in capsys.readouterr().out
-    monkeypatch.setattr(shot_planning, "tune_and_plan", shoot)
+    monkeypatch.setattr(tuned_shots, "tune_and_plan", shoot)
     first = (out / "shots" / "golf-000.json").read_bytes()
 
     def resumed(*options):

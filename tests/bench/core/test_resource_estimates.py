@@ -8,7 +8,10 @@ import tomli_w
 
 import simgap
 from bench.benchmark.problem.experiment import load_experiment
-from bench.benchmark.runner.resource_checks import check_comparison_size, estimate_comparison_need
+from bench.benchmark.runner.comparison_resources import (
+    check_comparison_size,
+    estimate_comparison_need,
+)
 from bench.cli.main import main
 from bench.core.resource_estimates import (
     FORCE_HINT,
@@ -17,7 +20,7 @@ from bench.core.resource_estimates import (
     check_feasible,
     get_machine_resources,
 )
-from bench.logs.quality.sampling_clock import check_recording_plausible, find_anomalies
+from bench.logs.quality.clock_checks import check_recording_plausible, find_anomalies
 from bench.logs.recording_loading import load_recording as recorded
 from sims.core.simulator import InputError
 

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from bench.benchmark.problem.availability import availability
 from bench.benchmark.problem.experiment import list_experiment_names, load_experiment
+from bench.benchmark.problem.missing_requirements import availability
 from bench.cli.main import main
 from bench.datasets import dataset_catalogue
 from bench.datasets.dataset_catalogue import SourceFile

@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 
 from bench.cli.main import main
 from bench.diagnosis.explain import explain
-from bench.logs.quality.sampling_clock import check_recording_plausible
+from bench.logs.quality.clock_checks import check_recording_plausible
 from bench.logs.recording_loading import load_recording
 from sims.core.simulator import InputError, Scenario
 from sims.recording.recording import read_recording

@@ -6,9 +6,9 @@ import sys
 import pytest
 
 from bench.api import explain as api
-from bench.diagnosis.evaluation import run_evaluator, worker_pool
+from bench.diagnosis.evaluation import forked_workers, run_evaluator
+from bench.diagnosis.evaluation.forked_workers import ForkedWorkerPool
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.diagnosis.evaluation.worker_pool import ForkedWorkerPool
 from bench.diagnosis.explain import explain
 from bench.diagnosis.fitting import trajectory_fit
 from sims.core.simulator import InputError
@@ -19,11 +19,11 @@ from tests.bench.diagnosis.explained_samples import recording
 @pytest.mark.skipif(sys.platform != "linux", reason="workers are forked on Linux alone")
 def test_the_answer_is_the_same_to_the_last_bit_with_one_two_and_eight(monkeypatch):
     # Use small chunks and force workers for all of them, so that the pool is tested.
-    monkeypatch.setattr(worker_pool, "can_fork", lambda: True)
+    monkeypatch.setattr(forked_workers, "can_fork", lambda: True)
     monkeypatch.setattr(RunEvaluator, "is_cheap_to_split", True)
     monkeypatch.setattr(trajectory_fit, "GROUP_COST_SAMPLES", 10_000)
     monkeypatch.setattr(run_evaluator, "MAX_CHUNK_SAMPLES", 4_000)
-    monkeypatch.setattr(worker_pool, "PARALLEL_THRESHOLD_SECONDS", 0.0)
+    monkeypatch.setattr(forked_workers, "PARALLEL_THRESHOLD_SECONDS", 0.0)
     shared = []
     usual = ForkedWorkerPool._distribute
 

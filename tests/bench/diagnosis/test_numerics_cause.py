@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from bench.diagnosis.evaluation.worker_pool import ForkedWorkerPool
+from bench.diagnosis.evaluation.forked_workers import ForkedWorkerPool
 from bench.diagnosis.explain import _ExplainRun, explain
 from bench.diagnosis.explain_options import ExplainOptions
 from bench.diagnosis.fitting.base_fit import fit_base_model

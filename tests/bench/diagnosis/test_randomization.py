@@ -16,7 +16,7 @@ import pytest
 from bench.cli.main import main
 from bench.core.plugin_registries import make_robot_simulator
 from bench.diagnosis.explanation import Explanation
-from bench.diagnosis.randomization.range_files import COLUMNS, build_range_files
+from bench.diagnosis.randomization_files import COLUMNS, build_range_files
 from bench.diagnosis.report import explanation_figures
 from bench.diagnosis.verdict import Verdict
 from bench.schemas import load_schema

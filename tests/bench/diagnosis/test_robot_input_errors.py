@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from bench.diagnosis.explain import explain
-from bench.logs.quality.sampling_clock import check_recording_plausible
+from bench.logs.quality.clock_checks import check_recording_plausible
 from bench.logs.recording_loading import load_recording
 from sims.core.simulator import InputError, Scenario
 from tests.bench.diagnosis.arm_model import ARM

@@ -3,7 +3,7 @@
 import numpy as np
 import pandas as pd
 
-from bench.benchmark.figures.comparison_charts import AxisLabels
+from bench.benchmark.comparison_charts import AxisLabels
 from bench.benchmark.problem.experiment import load_experiment
 from bench.benchmark.storage.result_folder import StoredComparison
 

@@ -7,8 +7,8 @@ import pandas as pd
 import pytest
 from matplotlib.figure import Figure
 
-from bench.benchmark.figures import comparison_figures
-from bench.benchmark.figures.comparison_figures import (
+from bench.benchmark import comparison_figures
+from bench.benchmark.comparison_figures import (
     FIGURE_FILES,
     draw_figure,
     list_figure_names,

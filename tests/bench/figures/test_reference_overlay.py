@@ -7,7 +7,7 @@ import shutil
 import numpy as np
 import pytest
 
-from bench.benchmark.figures.comparison_figures import draw_figure
+from bench.benchmark.comparison_figures import draw_figure
 from bench.benchmark.storage.reference_results import find_reference, list_reference_names
 from bench.figures.style import ERROR_FLOOR, REFERENCE_GREYS, make_reference_id
 from sims.core.simulator import InputError

@@ -12,7 +12,7 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
 import bench
-from bench.benchmark.figures.comparison_figures import (
+from bench.benchmark.comparison_figures import (
     draw_critical_difference_figure,
     draw_figure,
     list_figure_names,

@@ -8,7 +8,7 @@ from bench.benchmark.isolation.message_channel import MessageChannel
 from bench.benchmark.problem.experiment import TunerEntry
 from bench.benchmark.runner import tuner_process_reuse
 from bench.benchmark.runner.plugin_discovery import load_plugins_for_experiment
-from bench.benchmark.runner.worker_tasks import RunRequest, execute_run, get_problem
+from bench.benchmark.runner.run_in_worker import RunRequest, execute_run, get_problem
 from tests.sample_experiments import spring_experiment
 
 GLOBAL = """

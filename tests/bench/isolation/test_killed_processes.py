@@ -17,8 +17,8 @@ from bench.benchmark.isolation.tuner_processes import create_locked_folder, remo
 from bench.benchmark.problem.experiment import TunerEntry
 from bench.benchmark.runner import tuner_process_reuse
 from bench.benchmark.runner.plugin_discovery import inspect_plugins, load_plugins_for_experiment
+from bench.benchmark.runner.run_in_worker import RunRequest, execute_run, get_problem
 from bench.benchmark.runner.tuner_training import TrainingRequest, read_weights, train_or_load
-from bench.benchmark.runner.worker_tasks import RunRequest, execute_run, get_problem
 from sims.core.simulator import InputError
 from tests.kill_and_resume import ISOLATION_PROCESSES, below
 from tests.sample_experiments import spring_experiment

@@ -71,7 +71,7 @@ def test_a_run_that_is_made_again_after_a_kill_must_ask_for_the_same(name, monke
     made = experiment(name)
     undisturbed = outcome(made).trace
     monkeypatch.setattr(Killing, "calls", 0)
-    monkeypatch.setattr("bench.benchmark.runner.worker_tasks.ProposalEvaluator", Killing)
+    monkeypatch.setattr("bench.benchmark.runner.run_in_worker.ProposalEvaluator", Killing)
     trace = outcome(made).trace
     if name == "random":
         assert Killing.calls == 2 + 4

@@ -13,7 +13,7 @@ import simgap
 from bench.cli.main import main
 from bench.core.plugin_registries import make_robot_simulator
 from bench.logs.importing.joint_order import order_of_commands
-from bench.logs.quality.sampling_clock import check_recording_plausible
+from bench.logs.quality.clock_checks import check_recording_plausible
 from bench.logs.recording_loading import load_recording
 from sims.core.simulator import InputError, Scenario
 

@@ -151,11 +151,11 @@ def test_drift(kind, ppm):
 
 def test_an_interval_of_drift_holds():
     """In clean logs, the estimated drift is within two sigmas of zero in about 95 % of cases."""
-    from bench.logs.quality import clock_drift
+    from bench.logs.quality import clock_checks
 
     inside = 0
     for seed in range(24):
-        (one,) = clock_drift._estimate_run_drifts(run_of(seed, seconds=12.0), "u.m_hip", "q.hip")
+        (one,) = clock_checks._estimate_run_drifts(run_of(seed, seconds=12.0), "u.m_hip", "q.hip")
         inside += abs(one.drift) < 2 * one.error
     assert inside >= 20
 

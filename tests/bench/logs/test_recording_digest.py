@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from bench.diagnosis.batch.run_batch import list_logs
+from bench.diagnosis.many_logs import list_logs
 from bench.logs.recording_loading import compute_recording_digest
 from sims.core.files import CHUNK_BYTES
 

@@ -19,7 +19,7 @@ from bench.benchmark.problem.experiment import (
     load_experiment,
     parse_experiment,
 )
-from bench.benchmark.problem.recorded_runs import make_scenario
+from bench.benchmark.problem.recording_observations import make_scenario
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.benchmark.runner.study_creation import prepare_study
 from bench.cli.main import main

@@ -11,9 +11,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from bench.benchmark.figures import comparison_figures
-from bench.benchmark.figures.comparison_charts import ComparisonView
-from bench.benchmark.report_page.comparison_page import (
+from bench.benchmark import comparison_figures
+from bench.benchmark.comparison_charts import ComparisonView
+from bench.benchmark.comparison_page import (
     ComparisonReportData,
     render_page,
     write_conclusion,

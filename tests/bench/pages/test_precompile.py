@@ -2,13 +2,13 @@ import sys
 
 import jinja2
 
-from bench.pages import compiled_templates, page_template
+from bench.pages import page_template
 from bench.pages.precompile import BENCH, precompile
 
 
 def test_no_page_compiles_a_template_after_the_installation(tmp_path, monkeypatch):
-    stored = compiled_templates.CompiledTemplates(tmp_path)
-    monkeypatch.setattr(compiled_templates, "CompiledTemplates", lambda _: stored)
+    stored = page_template.CompiledTemplates(tmp_path)
+    monkeypatch.setattr(page_template, "CompiledTemplates", lambda _: stored)
     monkeypatch.setattr(sys, "dont_write_bytecode", False)
     page_template._get_environment.cache_clear()
     try:

@@ -10,7 +10,7 @@ from bench.benchmark.problem.experiment import (
     load_experiment,
     parse_experiment,
 )
-from bench.benchmark.problem.recorded_runs import find_recording
+from bench.benchmark.problem.recording_observations import find_recording
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.benchmark.runner.run_fingerprint import RunIds
 from bench.benchmark.runner.tuner_training import compute_training_key

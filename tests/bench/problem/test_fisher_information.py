@@ -5,6 +5,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from bench.benchmark.comparison_report import write_report
 from bench.benchmark.comparison_study import Comparison
 from bench.benchmark.problem.experiment import load_experiment, parse_experiment
 from bench.benchmark.problem.fisher_information import (
@@ -14,7 +15,6 @@ from bench.benchmark.problem.fisher_information import (
     compute_spectrum_from_jacobian,
 )
 from bench.benchmark.problem.tuning_problem import TuningProblem
-from bench.benchmark.results_report import write_report
 from bench.benchmark.runner.study_creation import prepare_study
 from bench.benchmark.statistics.error_curves import select_primary_metric
 from bench.benchmark.storage.result_folder import read_comparison

@@ -189,7 +189,7 @@ def test_any_file_of_the_rooms_that_make_runs_changes_keys_and_ids(tmp_path, mon
         files = [file for file in tmp_path.rglob("*") if file.is_file()]
         for told in (
             "methods/learning/input_features.py",
-            "sims/engines/adapters/mujoco_engine.py",
+            "sims/engines/external/mujoco_engine.py",
             "bench/core/random_streams.py",
         ):
             assert tmp_path / told in files

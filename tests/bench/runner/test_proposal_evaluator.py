@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from bench.benchmark.problem.recorded_runs import ObservedRuns
+from bench.benchmark.problem.recording_observations import ObservedRuns
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.benchmark.runner.tuner_loop import ProposalEvaluator
 from tests.sample_experiments import spring_experiment

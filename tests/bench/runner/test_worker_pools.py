@@ -11,8 +11,13 @@ import pytest
 
 from bench.benchmark.isolation.process_limits import limited_memory
 from bench.benchmark.runner.plugin_discovery import Plugin
-from bench.benchmark.runner.worker_pools import MAX_RETRIES, LocalPool, WorkerDiedError
-from bench.benchmark.runner.worker_setup import WorkerContext, ignore_interrupts
+from bench.benchmark.runner.worker_pools import (
+    MAX_RETRIES,
+    LocalPool,
+    WorkerContext,
+    WorkerDiedError,
+    ignore_interrupts,
+)
 from sims.core.simulator import InputError
 from tests.conftest import PLUGINS
 

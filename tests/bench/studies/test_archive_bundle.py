@@ -10,8 +10,8 @@ import zipfile
 import pytest
 import tomli_w
 
-from bench.benchmark.storage import hashed_archive as archives
 from bench.cli.main import main
+from bench.studies import archive_bundle as archives
 from tests.conftest import PLUGINS
 from tests.sample_experiments import SPRING
 

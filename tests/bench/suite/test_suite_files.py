@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench.benchmark.problem.availability import leave_out_missing_problems
 from bench.benchmark.problem.experiment import expand_sweep, load_experiment
 from bench.benchmark.problem.experiment_tables import compute_problem_hash
+from bench.benchmark.problem.missing_requirements import leave_out_missing_problems
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.core.plugin_registries import tuners
 from bench.studies.archive_bundle import verify_archive, write_bundle

@@ -12,8 +12,8 @@ from mujoco.batch import Batch
 
 from sims.robot import model_field_effects
 from sims.robot.coupled_drives import COUPLING_PLACEHOLDER
-from sims.robot.dynamics.added_elements import add_elements
 from sims.robot.dynamics.mujoco_batch import make_batch_spec
+from sims.robot.dynamics.series_joints import add_elements
 from sims.robot.robot_model import RobotModel
 from tests.sims.robot.sample_arms import ARM, robot
 

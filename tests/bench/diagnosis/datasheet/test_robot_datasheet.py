@@ -8,13 +8,13 @@ import pytest
 
 from bench.core.plugin_registries import make_robot_simulator
 from bench.diagnosis.datasheet.datasheet import build_datasheet
-from bench.diagnosis.datasheet.sheet_content import (
+from bench.diagnosis.datasheet.datasheet_content import (
     SheetContent,
     SheetRow,
     format_name,
     format_short_name,
 )
-from bench.diagnosis.datasheet.subject import make_subject
+from bench.diagnosis.datasheet.datasheet_subject import make_subject
 from bench.logs.joined_recordings import load_joined
 from sims.core.simulator import InputError
 from sims.extended_simulator import FittedValue

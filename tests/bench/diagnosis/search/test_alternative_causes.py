@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from bench.diagnosis.search.alternative_causes import AlternativeFinder
-from bench.diagnosis.search.held_out_validation import HeldOutValidation
+from bench.diagnosis.search.held_out_model_choice import HeldOutValidation
 from bench.diagnosis.search.verdict_rules import INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
 from tests.bench.diagnosis.search.search_models import held_out, model, search_of
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bench.diagnosis.evaluation import run_thinning
+from bench.diagnosis.evaluation import run_subsampling
 from bench.diagnosis.evaluation.search_control import SearchControl, SearchStoppedError
 from bench.diagnosis.search import refine_candidates
 from bench.diagnosis.search.effect_search import EffectSearch
@@ -17,8 +17,8 @@ WITH_FRICTION = {"effects": ["friction.coulomb=0.3"], "observe": ["x"], "noise":
 @pytest.fixture(autouse=True)
 def _short(monkeypatch):
     """Lower the sample limits so that short runs are thinned."""
-    monkeypatch.setattr(run_thinning, "MIN_SAMPLES_TO_THIN", 600)
-    monkeypatch.setattr(run_thinning, "MIN_THINNED_SAMPLES", 100)
+    monkeypatch.setattr(run_subsampling, "MIN_SAMPLES_TO_THIN", 600)
+    monkeypatch.setattr(run_subsampling, "MIN_THINNED_SAMPLES", 100)
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +37,7 @@ def test_what_few_samples_show_is_fitted_to_all_of_them(search, log, monkeypatch
     assert found.effects == ("friction.coulomb",)
     assert found.fit.simulated.shape == search.evaluator.observed.shape
     assert search.settled_effects == {"friction.coulomb"}
-    monkeypatch.setattr(run_thinning, "MIN_SAMPLES_TO_THIN", 10_000)
+    monkeypatch.setattr(run_subsampling, "MIN_SAMPLES_TO_THIN", 10_000)
     usual = searched(log, SIGMA)[0]
     same = refine_best_model(usual, search_with_subsampling(usual))
     assert same.effects == found.effects

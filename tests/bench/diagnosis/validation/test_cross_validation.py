@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import simgap
-from bench.benchmark.problem.recorded_runs import load_recorded_runs
+from bench.benchmark.problem.recording_observations import load_recorded_runs
 from bench.diagnosis.explain import explain
 from bench.diagnosis.fitting.base_fit import fit_base_model
 from bench.diagnosis.fitting.fit_state import FitStart

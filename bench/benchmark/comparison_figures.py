@@ -1,0 +1,389 @@
+"""Printed figures of comparisons: charts of the page, spectra of targets, and mean ranks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from bench.benchmark.comparison_charts import (
+    CHARTS,
+    AxisLabels,
+    ComparisonView,
+    list_directional_metrics,
+)
+from bench.benchmark.problem.experiment import Experiment
+from bench.benchmark.problem.fisher_information import STIFF_SIGMA_THRESHOLD
+from bench.benchmark.statistics.comparison_statistics import ComparisonStatistics
+from bench.benchmark.statistics.comparison_tables import IDENTIFIABILITY_COLUMNS
+from bench.benchmark.statistics.error_floor import ERROR_FLOOR
+from bench.benchmark.statistics.training_amortisation import TARGETS_PER_TRAINING
+from bench.benchmark.storage.result_folder import StoredComparison
+from bench.figures.style import (
+    BLUE,
+    CAPTION_GREY,
+    MEDIAN_LINE_CAPTION,
+    NEUTRAL_MARK,
+    REFERENCE_GREYS,
+    VERMILION,
+    TunerStyles,
+    add_caption,
+    add_trust_note,
+    finish_figure,
+    get_colour,
+    make_panel_grid,
+    make_reference_id,
+    style_axis,
+)
+from bench.pages.chart import Panel
+from bench.pages.chart_figure import draw_chart, select_first_panels
+from sims.core.simulator import Array, InputError, make_unknown_name_error
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from bench.benchmark.storage.reference_results import ReferenceResult
+
+
+_MIN_DRAWN_SIGMA = 1e-6
+"""Standard deviation in training widths below which values are drawn at the edge."""
+_MAX_DRAWN_SIGMA = 1e4
+"""Standard deviation in training widths above which values are drawn at the edge."""
+_MIN_LABELLED_SHARE = 0.05
+"""Minimum share of a parameter in a direction that is written."""
+_RANGE_LABELS = {
+    "in": "true parameters in training range",
+    "wide": "true parameters in bounds",
+    "real": "recording, at nominal values",
+}
+_RANGE_MARKERS = (("o", BLUE), ("^", VERMILION))
+"""Markers and colours of the ranges, in their order."""
+
+
+def draw_spectra_figure(experiment: Experiment, table: pd.DataFrame) -> Figure:
+    """Draw the standard deviations along all directions, and the parameters in each direction.
+
+    Left: 1 sigma of every direction, one marker per target. Right: share of each parameter in each
+    direction.
+
+    Args:
+        experiment: The experiment.
+        table: Rows of identifiability.csv.
+    """
+    names = [c for c in table.columns if c not in IDENTIFIABILITY_COLUMNS]
+    size = (4.8 + 0.8 * len(names), 2.2 + 0.4 * len(names))
+    figure, axes = make_panel_grid(1, 2, size, width_ratios=[1, 1.25])
+    _draw_spectra(axes[0, 0], table, len(names))
+    _draw_direction_shares(axes[0, 1], table, names)
+    figure.suptitle(f"{experiment.title or experiment.name}: what the data identify", fontsize=11)
+    is_real = set(table["range"]) == {"real"}
+    evaluation_point = "the nominal parameters" if is_real else "each target's true parameters"
+    caption = (
+        f"From the Fisher information at {evaluation_point} (Cramér–Rao bound). "
+        f"Stiff: 1 sigma below {STIFF_SIGMA_THRESHOLD:g} of the training width (dashed). "
+        "Right: mean over targets of the squared component."
+    )
+    add_caption(figure, caption, letters=15)
+    return figure
+
+
+def _draw_spectra(axis: Axes, table: pd.DataFrame, directions: int) -> None:
+    """Draw every target's smallest possible standard error (1 sigma) along each direction.
+
+    A direction is a combination of parameters; stiff ones are determined by the data, sloppy ones
+    are not. The ranges of targets are drawn side by side.
+    """
+    ranges = list(dict.fromkeys(table["range"]))
+    for range_index, (kind, (marker, colour)) in enumerate(
+        zip(ranges, _RANGE_MARKERS, strict=False)
+    ):
+        range_rows = table[table["range"] == kind]
+        targets = range_rows["target"].nunique()
+        # Markers of one direction lie side by side within 0.3, the ranges 0.4 apart.
+        target_indices = range_rows.groupby("direction").cumcount()
+        target_offsets = (
+            (target_indices / (targets - 1) - 0.5) * 0.3 if targets > 1 else 0.0 * target_indices
+        )
+        x_values = (
+            range_rows["direction"] + target_offsets + (range_index - 0.5 * (len(ranges) - 1)) * 0.4
+        )
+        axis.plot(
+            x_values,
+            # A direction without effect on the data has an infinite sigma and is drawn at the edge.
+            range_rows["sigma"].clip(_MIN_DRAWN_SIGMA, _MAX_DRAWN_SIGMA),
+            marker,
+            color=colour,
+            markersize=3.5,
+            alpha=0.75,
+            linestyle="none",
+            label=_RANGE_LABELS.get(kind, kind) + ("" if kind == "real" else f" (n = {targets})"),
+        )
+    axis.axhline(STIFF_SIGMA_THRESHOLD, color=CAPTION_GREY, linewidth=0.8, linestyle="--")
+    for name, text_offset in (("sloppy", 3), ("stiff", -9)):
+        axis.annotate(
+            name,
+            (0.01, STIFF_SIGMA_THRESHOLD),
+            (0, text_offset),
+            xycoords=("axes fraction", "data"),
+            textcoords="offset points",
+            fontsize=8,
+        )
+    axis.set_yscale("log")
+    # Extra space for the legend.
+    axis.set_ylim(bottom=axis.get_ylim()[0] / 10)
+    axis.set_xticks(range(1, directions + 1))
+    axis.set_xlabel("direction, the stiffest first")
+    axis.set_ylabel("smallest possible 1 sigma of an estimate\n[training widths]")
+    style_axis(axis)
+    axis.legend(fontsize=7.5, frameon=False, loc="lower right")
+
+
+def _draw_direction_shares(axis: Axes, table: pd.DataFrame, names: list[str]) -> None:
+    """Draw the shares of the parameters in each direction, as a grid of numbers."""
+    # A direction has length 1: its squared components are shares, independent of their signs.
+    squares = table.set_index("direction")[names] ** 2
+    shares = squares.groupby(level=0).mean().to_numpy().T
+    axis.imshow(shares, cmap="Greys", vmin=0.0, vmax=1.0, aspect="auto")
+    for row, column in np.argwhere(shares >= _MIN_LABELLED_SHARE):
+        share = float(shares[row, column])
+        axis.text(
+            column,
+            row,
+            f"{share:.2f}".lstrip("0") if share < 0.995 else "1",
+            ha="center",
+            va="center",
+            fontsize=8,
+            color="white" if share > 0.55 else "black",
+        )
+    axis.set_xticks(range(len(names)), [str(i + 1) for i in range(len(names))])
+    axis.set_yticks(range(len(names)), names, fontsize=8)
+    axis.set_xlabel("direction")
+    axis.set_title("share of each parameter", fontsize=9)
+
+
+FIGURE_FILES: Mapping[str, str] = {
+    "error": "error-vs-simulations",
+    "misfit": "misfit-vs-simulations",
+    "distance": "error-vs-distance",
+    "runtime": "runtime-distribution",
+    "cost": "who-wins-at-which-cost",
+    "amortisation": "amortisation",
+    "spectra": "identifiability",
+    "directions": "stiff-sloppy-prediction",
+}
+"""File name of every figure by its name, in the order in which they are written."""
+
+OVERLAYABLE_FIGURES = ("error", "misfit", "directions")
+"""Figures of errors against simulations, which can show references in grey."""
+
+
+class _Layout(NamedTuple):
+    """Layout and texts of a printed figure.
+
+    Attributes:
+        caption: Caption, in which ``{level}`` and ``{thresholds}`` are replaced.
+        size: Width and height of a panel in inches; None for the usual size.
+        legend: Title of the legend.
+        rows: Facet whose values are rows of panels; empty for one row.
+        horizontal: Whether categories are from top to bottom.
+    """
+
+    caption: str = MEDIAN_LINE_CAPTION
+    size: tuple[float, float] | None = None
+    legend: str = "best over all targets first"
+    rows: str = ""
+    horizontal: bool = False
+
+
+_LAYOUTS = {
+    "error": _Layout(),
+    "misfit": _Layout(),
+    "distance": _Layout(f"{MEDIAN_LINE_CAPTION} n: number of targets."),
+    "runtime": _Layout("{thresholds}"),
+    "cost": _Layout(
+        "To reach an error of {level:.2g} and stay below it: ERT × seconds of a simulation + "
+        "seconds of "
+        f"the tuner as measured; training shared by {TARGETS_PER_TRAINING} targets. "
+        "The strip names the tuner that needs the least time."
+    ),
+    "amortisation": _Layout(
+        "To reach an error of {level:.2g} and stay below it. A mark: from this number of targets "
+        "on, the "
+        "training and the expected simulations (ERT) of the trained tuner are fewer than those of "
+        "the tuner that searches. At once: the search never reaches the error. Never: not within "
+        "10 000 targets. Bar: 95 % bootstrap interval over targets.",
+        (4.3, 3.0),
+        "trained tuner",
+        horizontal=True,
+    ),
+    "directions": _Layout(
+        f"{MEDIAN_LINE_CAPTION} A sloppy direction is one that the target's data do not identify.",
+        (4.0, 2.4),
+        rows="error",
+    ),
+}
+
+
+def list_figure_names(stored: StoredComparison) -> list[str]:
+    """List the names of the figures that a comparison's data allow; empty without a run."""
+    experiment, runs = stored.experiment, stored.runs
+    if runs.empty:
+        return []
+    has_wide_range = "wide" in experiment.ranges
+    has_data = {
+        "error": True,
+        # Without a true system other than the simulator, the misfit is only the sensor noise.
+        "misfit": bool(experiment.world),
+        "distance": has_wide_range
+        and bool(runs.loc[runs["range"] == "wide", "outside"].gt(0).any()),
+        "runtime": True,
+        "cost": True,
+        "amortisation": any(simulations for simulations, _ in stored.costs.values()),
+        "spectra": stored.spectra is not None,
+        "directions": bool(list_directional_metrics(stored)),
+    }
+    return [name for name in FIGURE_FILES if has_data[name]]
+
+
+def draw_figure(
+    stored: StoredComparison,
+    labels: AxisLabels,
+    name: str,
+    statistics: ComparisonStatistics | None = None,
+    references: Sequence[ReferenceResult] = (),
+) -> Figure:
+    """Draw one figure of a comparison.
+
+    Args:
+        stored: The comparison, as read by `bench.benchmark.storage.result_folder.read_comparison`.
+        labels: Axis labels, see `make_axis_labels`.
+        name: One of `list_figure_names(stored)`.
+        statistics: Result of `ComparisonStatistics(stored)`, to share it between several figures.
+        references: Reference results that are drawn in grey, if the figure is one of
+            `OVERLAYABLE_FIGURES`.
+
+    Raises:
+        InputError: The comparison has no figure of that name, or a reference cannot be drawn.
+    """
+    if name not in (figure_names := list_figure_names(stored)):
+        raise make_unknown_name_error("figure", name, figure_names)
+    if references:
+        check_references_allowed(stored, name, references)
+    if name == "spectra":
+        assert stored.spectra is not None
+        figure = draw_spectra_figure(stored.experiment, stored.spectra)
+    else:
+        view = ComparisonView(stored, labels, statistics or ComparisonStatistics(stored))
+        figure = _draw_chart_figure(view, name, references)
+    return add_trust_note(figure, stored.experiment.trusted)
+
+
+def check_references_allowed(
+    stored: StoredComparison, name: str, references: Sequence[ReferenceResult]
+) -> None:
+    """Reject references that cannot be drawn in a figure.
+
+    Args:
+        stored: The comparison.
+        name: Name of the figure.
+        references: Reference results.
+
+    Raises:
+        InputError: They are of another problem, there are too many, or the figure shows no errors
+            against simulations.
+    """
+    if name not in OVERLAYABLE_FIGURES:
+        raise InputError(
+            f"figure {name}: expected one of {', '.join(OVERLAYABLE_FIGURES)} before a reference"
+        )
+    if len(references) > len(REFERENCE_GREYS):
+        raise InputError(
+            f"expected {len(REFERENCE_GREYS)} references at most, found {len(references)}"
+        )
+    for reference in references:
+        reference.find_mismatches(stored.experiment)
+
+
+def _draw_chart_figure(
+    view: ComparisonView, name: str, references: Sequence[ReferenceResult]
+) -> Figure:
+    """Draw the figure called `name`, one of `CHARTS`, with the same panels as on the report page.
+
+    `references` are the results of other comparisons; they are drawn in grey behind those of
+    `view`.
+    """
+    chart, layout = CHARTS[name](view), _LAYOUTS[name]
+    panels = select_first_panels(chart.panels, (chart.side_by_side, layout.rows))
+    columns = len({panel.facets[chart.side_by_side] for panel in panels}) if layout.rows else 0
+    figure, axes = draw_chart(panels, chart.tables, columns, layout.size, layout.horizontal)
+    notes = {name: note.replace("; ", "\n") for name, note in chart.notes.items()}
+    style = TunerStyles(view.experiment, view.statistics.order, references, notes)
+    for axis, panel in zip(axes, panels, strict=True):
+        for reference in references:
+            _draw_reference_lines(axis, panel, reference, style)
+    caption = layout.caption.format(
+        level=view.statistics.reference_level,
+        thresholds=format_threshold_caption(view.statistics.runtime_thresholds),
+    )
+    finish_figure(figure, axes, style, view.experiment, caption, layout.legend)
+    return figure
+
+
+def format_threshold_caption(thresholds: Array) -> str:
+    """Return a caption that explains a runtime distribution over these thresholds."""
+    span = f"from {thresholds[0]:.2g} to {thresholds[-1]:.2g} on a logarithmic scale"
+    return (
+        f"{len(thresholds)} thresholds {span}. "
+        "Reached: the recommendation's error stays at or below it from there on. "
+        "A failed run reaches none."
+    )
+
+
+def _draw_reference_lines(
+    axis: Axes, panel: Panel, reference: ReferenceResult, style: TunerStyles
+) -> None:
+    """Draw each tuner's median of a reference, at the simulation counts of its table."""
+    conditions = panel.series[0].where
+    for tuner in reference.tuners:
+        curve = reference.get_curve(
+            tuner, conditions["range"], conditions["metric"], style.experiment.budget
+        )
+        if len(curve):
+            medians = np.maximum(curve["median"].to_numpy(dtype=np.float64), ERROR_FLOOR)
+            line_style = style.get_reference_style(reference, tuner)
+            axis.plot(
+                curve["simulations"], medians, gid=make_reference_id(reference, tuner), **line_style
+            )
+
+
+def draw_critical_difference_figure(
+    ranked: pd.DataFrame, p_values: pd.DataFrame, friedman: float
+) -> Figure:
+    """Draw the critical-difference diagram: mean ranks over problems.
+
+    Bars join tuners that do not differ significantly at 5 %.
+
+    Args:
+        ranked: Ranks, one row per problem, one column per tuner.
+        p_values: P-values of Nemenyi's test of each pair of tuners.
+        friedman: P-value of Friedman's test.
+    """
+    from scikit_posthocs import critical_difference_diagram
+
+    figure, axes = make_panel_grid(1, 1, (8.5, 1.6 + 0.28 * ranked.shape[1]))
+    axis = axes[0, 0]
+    # Each tuner has its colour of every other figure; text stays dark, since light colours are hard
+    # to read.
+    colours = {str(name): get_colour(index) for index, name in enumerate(ranked.columns)}
+    artists = critical_difference_diagram(
+        ranked.mean(axis=0), p_values, ax=axis, label_props={"fontsize": 9}, color_palette=colours
+    )
+    for label in artists["labels"]:
+        label.set_color(NEUTRAL_MARK)
+    tests = f"Friedman p = {friedman:.2g}; bars: Nemenyi p > 0.05"
+    axis.set_title(f"Mean rank over {len(ranked)} problems, 1 is best ({tests})", fontsize=10)
+    return figure

@@ -1,0 +1,185 @@
+"""Find what an experiment needs and this machine lacks: a data set, packages, tuners."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from bench.benchmark.problem.experiment import Experiment, expand_sweep
+from bench.benchmark.problem.recording_observations import find_recording
+from bench.benchmark.problem.robot_experiment import find_missing_model_file
+from bench.core.plugin_registries import PartUnavailableError, simulators, tuners
+from bench.datasets import dataset_catalogue as datasets
+from bench.datasets.dataset_catalogue import DataSet
+from sims.core.simulator import InputError
+from sims.engines import ENGINE_MODULES, missing_packages
+
+
+@dataclass(frozen=True)
+class Availability:
+    """Missing requirements of an experiment.
+
+    Attributes:
+        data_set: missing data set that a command of the project downloads; None if none is missing.
+        skipped: why the experiment cannot run here; empty if it can run, or if only the data set is
+            missing.
+        tuners: reason by label of each tuner that cannot run here and is left out.
+    """
+
+    data_set: DataSet | None
+    skipped: str
+    tuners: Mapping[str, str]
+
+
+def availability(experiment: Experiment) -> Availability:
+    """Find what is missing for an experiment, or for all experiments that it names."""
+    if experiment.experiments:
+        return _combine_availability(experiment)
+    data_set = _find_missing_data_set(experiment)
+    missing_file = (
+        ""
+        if data_set
+        else find_missing_model_file(experiment) or _explain_missing_recording(experiment)
+    )
+    return Availability(
+        data_set,
+        missing_file
+        or _explain_missing_simulator(experiment)
+        or _explain_missing_engine(experiment),
+        _explain_missing_tuners(experiment),
+    )
+
+
+def leave_out_missing_problems(suite: Experiment) -> tuple[Experiment, dict[str, str]]:
+    """Leave out the problems of a suite that cannot run on this machine.
+
+    Args:
+        suite: experiment; one that is not a suite is returned unchanged.
+
+    Returns:
+        The suite without these problems, and the reason for each of them by name.
+
+    Raises:
+        InputError: no problem can run on this machine.
+    """
+    if not (suite.suite and suite.experiments):
+        return suite, {}
+    available_files, reasons = [], {}
+    for file in suite.experiments:
+        for problem in expand_sweep(suite.chosen(experiments=(file,))):
+            missing = availability(problem)
+            if missing.data_set:
+                reasons[problem.name] = missing.data_set.advice
+            elif missing.skipped:
+                reasons[problem.name] = missing.skipped
+            elif file not in available_files:
+                available_files.append(file)
+    if not available_files:
+        missing_text = "; ".join(f"{name} {reason}" for name, reason in reasons.items())
+        raise InputError(f"{suite.suite}: no problem can run here: {missing_text}")
+    return suite.chosen(experiments=tuple(available_files)), reasons
+
+
+def _combine_availability(experiment: Experiment) -> Availability:
+    """Combine what is missing for the experiments that this one names.
+
+    Only the first missing data set is reported; the others follow when it has been downloaded.
+    A suite leaves out the problems that cannot run, see `leave_out_missing_problems`: something is
+    missing for it only if no problem can run.
+    """
+    availability_by_name = {
+        part_experiment.name: availability(part_experiment)
+        for part_experiment in expand_sweep(experiment)
+    }
+    runnable = {
+        n: part for n, part in availability_by_name.items() if not (part.data_set or part.skipped)
+    }
+    if experiment.suite and runnable:
+        availability_by_name = runnable
+    data_sets = [part.data_set for part in availability_by_name.values() if part.data_set]
+    skipped = [
+        f"{name} {part.skipped}" for name, part in availability_by_name.items() if part.skipped
+    ]
+    missing_tuners = {
+        label: reason
+        for part in availability_by_name.values()
+        for label, reason in part.tuners.items()
+    }
+    return Availability(next(iter(data_sets), None), "; ".join(skipped), missing_tuners)
+
+
+def _explain_missing_simulator(experiment: Experiment) -> str:
+    """Return why the experiment's registered simulator cannot be used here.
+
+    The text is empty if it can be used, or if the simulator is not a registered one.
+    """
+    if experiment.model or experiment.simulator not in simulators.names():
+        return ""
+    try:
+        simulators.get(experiment.simulator)
+    except PartUnavailableError as error:
+        return error.reason
+    return ""
+
+
+def _find_missing_data_set(experiment: Experiment) -> DataSet | None:
+    """Return the data set that an experiment needs and that is missing here."""
+    required_files = [("robot", experiment.model)] if experiment.model else []
+    if experiment.recording:
+        required_files.append(("recording", experiment.recording.path))
+    for kind, path in required_files:
+        data_set = datasets.find_providing_data_set(kind, path)
+        if data_set and datasets.find(kind, path) is None:
+            return data_set
+    return None
+
+
+def _explain_missing_recording(experiment: Experiment) -> str:
+    """Return why the recording of an experiment cannot be read here; empty if it can."""
+    if not experiment.recording:
+        return ""
+    try:
+        find_recording(experiment.recording.path)
+    except InputError as error:
+        return str(error)
+    return ""
+
+
+def _explain_missing_engine(experiment: Experiment) -> str:
+    """Return why an engine of an experiment cannot be used here; empty if all can.
+
+    The engines are those of the tuned simulator and of the simulator that makes the targets.
+    """
+    settings = [experiment.settings, *([experiment.world] if experiment.world else [])]
+    engines = [str(each.get("engine") or _get_default_engine(experiment)) for each in settings]
+    packages = sorted(
+        {
+            package
+            for name in engines
+            if name in ENGINE_MODULES
+            for package in missing_packages(name)
+        }
+    )
+    if not packages:
+        return ""
+    return f"needs {', '.join(packages)}, not installed (pip install {' '.join(packages)})"
+
+
+def _get_default_engine(experiment: Experiment) -> str:
+    """Return the default engine of an experiment; empty if its simulator is not known."""
+    if experiment.model:
+        return "mujoco"
+    if experiment.simulator not in simulators.names():
+        return ""
+    return str(getattr(simulators.get(experiment.simulator), "default_engine", ""))
+
+
+def _explain_missing_tuners(experiment: Experiment) -> Mapping[str, str]:
+    """Return the reason by label for each tuner of an experiment that cannot run here."""
+    reasons = {}
+    for entry in experiment.tuners:
+        try:
+            tuners.get(entry.tuner)
+        except PartUnavailableError as error:
+            reasons[entry.label] = error.reason
+    return reasons

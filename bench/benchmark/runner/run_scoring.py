@@ -1,0 +1,212 @@
+"""Score a run in the parent process, build its result rows, and collect notes for tuner authors."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from dataclasses import dataclass, field
+from statistics import median
+from typing import Any
+
+import numpy as np
+
+from bench.benchmark.problem.fisher_information import InformationSpectrum
+from bench.benchmark.problem.targets import Target
+from bench.benchmark.problem.tuning_problem import TuningProblem
+from bench.benchmark.runner.run_in_worker import RunOutcome, RunRequest
+from bench.benchmark.runner.tuner_loop import RunTrace
+from bench.benchmark.storage.run_status import RunStatus
+
+
+def make_unfinished_outcome(
+    problem: TuningProblem, target: Target, status: str, reason: str
+) -> RunOutcome:
+    """Make the outcome of a run that ended without a trace.
+
+    It has no simulations, and its only recommendation is the start.
+
+    Args:
+        problem: tuning problem.
+        target: target of the run.
+        status: status of the run.
+        reason: reason of the status.
+    """
+    no_values, start = np.empty(0), target.blinded.start[None]
+    trace = RunTrace(status, reason, start[:0], no_values, start, no_values, no_values)
+    return RunOutcome(trace, np.full((1, len(problem.channels)), np.nan), None, 0.0)
+
+
+def make_status(problem: TuningProblem, order: RunRequest, outcome: RunOutcome) -> RunStatus:
+    """Make the status row of a run.
+
+    Args:
+        problem: tuning problem.
+        order: request of the run.
+        outcome: outcome of the run.
+    """
+    trace = outcome.trace
+    return RunStatus(
+        run=order.run,
+        tuner=order.entry.label,
+        simulator=problem.experiment.simulator,
+        target=order.target.name,
+        seed=order.seed,
+        status=trace.status,
+        reason=trace.reason,
+        simulations=len(trace.losses),
+        seconds=outcome.seconds,
+        trusted=problem.experiment.trusted,
+    )
+
+
+def build_rows(
+    problem: TuningProblem,
+    order: RunRequest,
+    target: Target,
+    outcome: RunOutcome,
+    spectrum: InformationSpectrum | None = None,
+) -> dict[str, Any]:
+    """Build the columns of runs.parquet for one run, with a row for each k = 0..simulations.
+
+    Args:
+        problem: tuning problem.
+        order: request of the run.
+        target: target with its true parameters.
+        outcome: outcome of the run.
+        spectrum: Fisher-information spectrum of the target; if given, parameter errors along stiff
+            and along sloppy directions are added.
+
+    Returns:
+        Values by column name.
+    """
+    trace = outcome.trace
+    k = len(trace.losses)
+    columns: dict[str, Any] = {
+        "run": [order.run] * (k + 1),
+        "experiment": [problem.experiment.name] * (k + 1),
+        "tuner": [order.entry.label] * (k + 1),
+        "simulator": [problem.experiment.simulator] * (k + 1),
+        "target": [target.blinded.name] * (k + 1),
+        "seed": [order.seed] * (k + 1),
+        "range": [target.blinded.range] * (k + 1),
+        "trusted": [problem.experiment.trusted] * (k + 1),
+        "k": np.arange(k + 1),
+        "loss": _prepend_nan(trace.losses),
+    }
+    columns |= _build_parameter_columns(problem, target, outcome)
+    if spectrum is not None and target.truth is not None:
+        # Directions combine parameters, which therefore need a common unit: training widths.
+        parameter_errors = problem.cube.to_physical(trace.recommendations) - target.truth
+        widths = parameter_errors / problem.cube.compute_training_widths()
+        columns["stiff_error"], columns["sloppy_error"] = spectrum.compute_directional_errors(
+            widths
+        )
+    columns["obs_error"] = outcome.obs_rmse[:, problem.error_channel]
+    # All runs of a comparison have the same columns, so that their rows form one table.
+    unknown_errors = np.full((k + 1, len(problem.channels)), np.nan)
+    heldout = unknown_errors if outcome.heldout_rmse is None else outcome.heldout_rmse
+    columns["heldout_error"] = heldout[:, problem.error_channel]
+    for i, channel in enumerate(problem.channels):
+        columns[f"obs_error_{channel.name}"] = outcome.obs_rmse[:, i]
+        # Without noise the error cannot be measured in units of the noise.
+        noise = problem.noise[i] if problem.noise[i] > 0 else np.nan
+        columns[f"obs_error_{channel.name}_in_noise"] = outcome.obs_rmse[:, i] / noise
+        columns[f"heldout_error_{channel.name}"] = heldout[:, i]
+    columns["tuner_seconds"] = _prepend_nan(trace.tuner_seconds)
+    columns["simulator_seconds"] = _prepend_nan(trace.simulator_seconds)
+    return columns
+
+
+def _build_parameter_columns(
+    problem: TuningProblem, target: Target, outcome: RunOutcome
+) -> dict[str, Any]:
+    """Build columns of parameter errors, proposals, recommendations and true parameters."""
+    cube = problem.cube
+    recommended = cube.to_physical(outcome.trace.recommendations)
+    proposed = cube.to_physical(outcome.trace.proposals)
+    # A recording has no known true parameters, so its parameter errors are NaN.
+    truth = np.full(cube.dim, np.nan) if target.truth is None else target.truth
+    errors = np.abs(recommended - truth)
+    columns: dict[str, Any] = {
+        "param_error": (errors / cube.compute_training_widths()).mean(axis=1)
+    }
+    if cube.dim == 1:
+        columns["param_abs_error"] = errors[:, 0]
+    columns["outside"] = np.full(
+        len(errors),
+        np.nan if target.truth is None else problem.compute_distance_from_training(target.truth),
+    )
+    for i, parameter in enumerate(cube.parameters):
+        columns[f"proposal_{parameter.name}"] = _prepend_nan(proposed[:, i])
+        columns[f"recommendation_{parameter.name}"] = recommended[:, i]
+        columns[f"true_{parameter.name}"] = np.full(len(errors), truth[i])
+    return columns
+
+
+def _prepend_nan(values: Any) -> Any:
+    """Prepend NaN, for k = 0 before any simulation, to the values of simulations 1..k."""
+    return np.concatenate([[np.nan], values])
+
+
+SLOW_IMPORTS = 1.0
+"""Minimum import time of a run, in seconds, for suggesting one process for several runs."""
+_MAX_NAMED_FILES = 3
+"""Maximum number of file names in a note."""
+
+
+@dataclass
+class _OfTuner:
+    """Information about the runs of one tuner."""
+
+    files: int = 0
+    names: dict[str, None] = field(default_factory=dict)
+    unnamed: bool = False
+    import_seconds: list[float] = field(default_factory=list)
+
+
+@dataclass
+class Notes:
+    """Collected information of runs, by tuner label.
+
+    Attributes:
+        isolation: isolation of the experiment, ``run`` or ``tuner``.
+    """
+
+    isolation: str
+    _tuners: dict[str, _OfTuner] = field(default_factory=lambda: defaultdict(_OfTuner))
+
+    def add(self, label: str, outcome: RunOutcome) -> None:
+        """Add the information of one run.
+
+        Args:
+            label: label of the tuner.
+            outcome: outcome of the run.
+        """
+        tuner = self._tuners[label]
+        written = outcome.written
+        tuner.files += written.files
+        tuner.names |= dict.fromkeys(written.names)
+        tuner.unnamed = tuner.unnamed or written.files > len(written.names)
+        if outcome.import_seconds:
+            tuner.import_seconds.append(outcome.import_seconds)
+
+    def lines(self) -> list[str]:
+        """Return a line for each tuner whose files were discarded or whose imports are slow."""
+        lines = []
+        for label, tuner in self._tuners.items():
+            if tuner.files:
+                files = "1 file" if tuner.files == 1 else f"{tuner.files} files"
+                names = ", ".join(list(tuner.names)[:_MAX_NAMED_FILES])
+                suffix = ", …" if tuner.unnamed or len(tuner.names) > _MAX_NAMED_FILES else ""
+                were = "was" if tuner.files == 1 else "were"
+                lines.append(
+                    f"{files} written by tuner {label} ({names}{suffix}) {were} discarded with its "
+                    "sandbox"
+                )
+            seconds = median(tuner.import_seconds or [0.0])
+            runs = len(tuner.import_seconds)
+            if self.isolation == "run" and runs > 1 and seconds >= SLOW_IMPORTS:
+                lines.append(
+                    f"tuner {label}: its imports take {seconds:.1f} s in each of {runs} runs; with "
+                    "--isolation tuner, all runs of one seed share them"
+                )
+        return lines

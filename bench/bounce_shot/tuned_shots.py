@@ -1,0 +1,389 @@
+"""Plan a shot in the model that each tuner has fitted to the recording of a drop.
+
+No code in this module uses the true ball. The models are those of the tuners, in the original
+simulator and in the one that `explain` extended from the same recording, and the fit of `explain`
+itself. Heights are shifted as if every ball had the radius of the experiment, so that one trained
+network serves all balls. Vision tuners get pixel rows instead (`bounce_shot.shot_sampling`).
+"""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from bench.benchmark.isolation.tuner_proxy import TunerSpec, relocate
+from bench.benchmark.problem.experiment import Experiment, TunerEntry
+from bench.benchmark.problem.recording_observations import ObservedRuns, make_scenario
+from bench.benchmark.problem.targets import BlindedTarget
+from bench.benchmark.runner.run_in_worker import RunRequest, execute_run, get_problem
+from bench.bounce_shot.shot_config import ShotConfig
+from bench.bounce_shot.shot_planner import ShotGeometry, ShotPlan, plan_shot
+from bench.bounce_shot.shot_sampling import build_pixel_runs, make_pixel_experiment
+from sims.core.simulator import Array, InputError, Scenario
+from sims.recording.recording import Recording, read_recording
+from sims.systems.ball import Ball as BallSimulator
+from sims.systems.bounce_shot import BounceShot, ShotSystem
+
+UNTUNED_METHOD = "nominal"
+"""Method without tuning."""
+EXPLAIN_METHOD = "explain"
+"""Method that uses the fit of explain itself."""
+EXPLAIN_SUFFIX = " + explain"
+"""Suffix of the label of a tuner that tunes the simulator extended by explain."""
+EffectCoefficients = Mapping[str, Sequence[float]]
+
+
+@dataclass(frozen=True)
+class TunedModel:
+    """Tuned simulator and the shot planned in it.
+
+    Attributes:
+        method: label of the method.
+        restitution: tuned restitution.
+        effects: coefficients of the effects that explain added and that act on the shot.
+        simulations: number of simulations used on this target.
+        seconds: time used.
+        status: as in status.csv; ``no plan`` if the model reaches the hoop from no height.
+        reason: explanation of the status.
+        height: planned drop height, m; NaN if there is none.
+        margin: planned distance to the rim, m.
+    """
+
+    method: str
+    restitution: float
+    effects: EffectCoefficients
+    simulations: int
+    seconds: float
+    status: str
+    reason: str = ""
+    height: float = float("nan")
+    margin: float = float("nan")
+
+
+@dataclass(frozen=True)
+class ShotInputs:
+    """Input of a method for a shot.
+
+    Attributes:
+        name: name of the shot.
+        recording: recording of the ball's drop.
+        scene: incline and hoop.
+        weights: files of trained weights, by tuner.
+        tuned: specifications of the tuners that run in isolated processes, by label.
+        hidden: folders that isolated tuners must not read.
+    """
+
+    name: str
+    recording: Path
+    scene: ShotGeometry
+    weights: Mapping[str, Path]
+    tuned: Mapping[str, TunerSpec] = field(default_factory=dict)
+    hidden: tuple[str, ...] = ()
+
+    def list_files(self) -> tuple[Path, ...]:
+        """List the files that another machine needs."""
+        plugins = {Path(tuned.file) for tuned in self.tuned.values() if tuned.file}
+        description_file = self.recording.with_suffix(".toml")
+        return self.recording, description_file, *self.weights.values(), *sorted(plugins)
+
+    def relocate(self, paths: Mapping[Path, Path]) -> ShotInputs:
+        """Return a copy for another machine, where the files have other paths."""
+        weights = {label: paths[path] for label, path in self.weights.items()}
+        tuned = {label: relocate(tuner_spec, paths) for label, tuner_spec in self.tuned.items()}
+        return replace(self, recording=paths[self.recording], weights=weights, tuned=tuned)
+
+
+def tune_and_plan(
+    experiment: Experiment, settings: ShotConfig, inputs: ShotInputs
+) -> list[dict[str, Any]]:
+    """Tune all methods to a recording, and plan a shot with each.
+
+    Args:
+        experiment: the experiment.
+        settings: its [shot] table.
+        inputs: input of the methods.
+
+    Returns:
+        Fields of a `TunedModel` for each method.
+    """
+    recording = read_recording(inputs.recording, BallSimulator, whole=True)
+    models = [TunedModel(UNTUNED_METHOD, _get_nominal_restitution(), {}, 0, 0.0, "done")]
+    models += [
+        _tune_model(experiment, settings, entry, inputs, recording, {})
+        for entry in experiment.tuners
+    ]
+    explained, active_effects = _explain_drop(inputs.recording)
+    models.append(explained)
+    # If explain failed, there is no extended simulator to tune.
+    if explained.status == "done":
+        extended_models = [
+            _tune_model(experiment, settings, entry, inputs, recording, active_effects)
+            for entry in experiment.tuners
+        ]
+        models += [
+            replace(model, method=model.method + EXPLAIN_SUFFIX, effects=explained.effects)
+            for model in extended_models
+        ]
+    radius = _get_run_constants(recording)["radius"]
+    return [asdict(_plan_shot(model, settings, inputs.scene, radius)) for model in models]
+
+
+def _get_nominal_restitution() -> float:
+    """Return the nominal restitution of the ball simulator, which an untuned model has."""
+    return BallSimulator.system.parameters[0].nominal
+
+
+def _tune_model(
+    experiment: Experiment,
+    settings: ShotConfig,
+    entry: TunerEntry,
+    inputs: ShotInputs,
+    recording: Recording,
+    effects: EffectCoefficients,
+) -> TunedModel:
+    """Run a tuner on the recorded drop, in the simulator with given effects.
+
+    Args:
+        experiment: the experiment.
+        settings: its [shot] table.
+        entry: the tuner.
+        inputs: input of the methods.
+        recording: recording of the ball's drop.
+        effects: coefficients of the effects that explain found; empty for the original simulator.
+
+    Returns:
+        The tuned model without a plan; with the status "crashed" if the experiment or recording
+        cannot be used.
+    """
+    label, radius = entry.label, _get_run_constants(recording)["radius"]
+    experiment = make_tuning_experiment(experiment, settings, entry)
+    if effects:
+        fixed = {name: list(values) for name, values in effects.items()}
+        experiment = experiment.chosen(settings={**experiment.settings, "fixed": fixed})
+    try:
+        problem = get_problem(experiment)
+        start = problem.cube.to_unit_cube(np.array([p.nominal for p in problem.cube.parameters]))
+        observed_runs = (
+            build_pixel_runs(recording, experiment, radius)
+            if label in settings.rows
+            else _make_observed_runs(recording, experiment)
+        )
+        no_runs = ObservedRuns((), np.empty((0, observed_runs.observed.shape[1])))
+        target = BlindedTarget(inputs.name, "real", start, observed_runs, no_runs)
+        request = RunRequest(
+            label,
+            entry,
+            0,
+            target,
+            entry.budget or experiment.budget,
+            inputs.weights.get(entry.label),
+            inputs.tuned.get(entry.label),
+            inputs.hidden,
+        )
+        outcome = execute_run(experiment, request)
+    except InputError as error:
+        return TunedModel(label, _get_nominal_restitution(), {}, 0, 0.0, "crashed", str(error))
+    trace = outcome.trace
+    tuned_value = float(problem.cube.to_physical(trace.recommendations[-1])[0])
+    return TunedModel(
+        label, tuned_value, {}, len(trace.losses), outcome.seconds, trace.status, trace.reason
+    )
+
+
+def make_tuning_experiment(
+    experiment: Experiment, settings: ShotConfig, entry: TunerEntry
+) -> Experiment:
+    """Adapt the experiment to a tuner: to pixel rows if the tuner uses them.
+
+    Args:
+        experiment: the experiment.
+        settings: its [shot] table.
+        entry: the tuner.
+    """
+    return (
+        make_pixel_experiment(experiment, settings) if entry.label in settings.rows else experiment
+    )
+
+
+def _make_observed_runs(recording: Recording, experiment: Experiment) -> ObservedRuns:
+    """Convert the recorded run to fitting data of the experiment's simulator.
+
+    The ball is released at rest at time 0, even if it is first seen later. Heights are shifted to
+    the radius of the experiment, because one trained network serves balls of all sizes.
+
+    Args:
+        recording: recording of the ball's drop.
+        experiment: the experiment.
+    """
+    (run,) = recording.runs
+    scenario = make_scenario(run, BallSimulator(observe=["z"]), recording.constants)
+    # The radius of the experiment replaces that of the ball: one network serves balls of all sizes.
+    radius = experiment.fixed["radius"]
+    shift = radius - _get_run_constants(recording)["radius"]
+    z = run.channels["z"] + shift
+    visible_heights = run.channels["z"][np.isfinite(run.channels["z"])]
+    # Released at rest at t = 0, the ball has the speed g t when it is first seen.
+    speed = scenario.constants.get("gravity", _get_run_constants(recording)["gravity"]) * float(
+        run.times[0]
+    )
+    first = {"z": float(visible_heights[0]), "vz": -speed, **scenario.initial}
+    initial = {**first, "z": first["z"] + shift}
+    shifted_scenario = Scenario(
+        scenario.times, initial, {}, {**scenario.constants, "radius": radius}
+    )
+    return ObservedRuns((shifted_scenario,), z[:, None])
+
+
+def _get_run_constants(recording: Recording) -> dict[str, float]:
+    """Return the constants of the recorded run, with defaults of the system."""
+    return {**BallSimulator().constant_values, **recording.constants, **recording.runs[0].constants}
+
+
+def _explain_drop(recording: Path) -> tuple[TunedModel, EffectCoefficients]:
+    """Run explain on the recording of the drop; its fit is a model of its own.
+
+    An error of explain does not stop the other methods: the model then has the status "crashed".
+
+    Args:
+        recording: CSV file of the recording.
+
+    Returns:
+        Its model, with the effects that act on the shot, and all effects that it found.
+    """
+    from bench.diagnosis.explain import explain
+
+    started = perf_counter()
+    try:
+        explanation = explain(recording)
+    except Exception:  # the failure of one method is a row of the table
+        last = traceback.format_exc()
+        return TunedModel(
+            EXPLAIN_METHOD,
+            _get_nominal_restitution(),
+            {},
+            0,
+            perf_counter() - started,
+            "crashed",
+            last,
+        ), {}
+    all_effects = {
+        name: tuple(number.value for number in numbers.values())
+        for name, numbers in explanation.extended.effects.items()
+    }
+    acting_effects = select_transferable_effects(
+        all_effects, explanation.extended.constants.get("gravity", 9.81)
+    )
+    reason = f"{explanation.verdict}: {', '.join(all_effects) or 'nothing'}"
+    restitution = explanation.extended.parameters["restitution"].value
+    seconds = perf_counter() - started
+    simulations = explanation.answer.simulations
+    model = TunedModel(
+        EXPLAIN_METHOD, restitution, acting_effects, simulations, seconds, "done", reason
+    )
+    return model, all_effects
+
+
+def select_transferable_effects(
+    effects: EffectCoefficients, gravity: float
+) -> dict[str, tuple[float, ...]]:
+    """Select the effects of a drop that act on a shot.
+
+    They are effects of the ball and the air, not of the camera. A constant vertical force is
+    converted to a change of gravity.
+
+    Args:
+        effects: coefficients by name.
+        gravity: gravitational acceleration, m/s^2.
+    """
+    from sims import effects as library
+
+    carried: dict[str, tuple[float, ...]] = {}
+    for name, values in effects.items():
+        kind = library.get_effect(name)
+        # A constant acceleration c along z is a change of gravity by -c / g.
+        if name == "force.bias":
+            carried["gravity.scale"] = (-values[0] / gravity,)
+        elif kind.hook in ("force", "contact") and kind.fits(ShotSystem):
+            carried[name] = tuple(values)
+    return carried
+
+
+def make_planning_simulator(model: TunedModel) -> BounceShot:
+    """Make the simulator in which a shot is planned, a bounce shot with the effects of a model.
+
+    Args:
+        model: tuned model; its effects act with fixed coefficients.
+    """
+    return BounceShot(fixed={name: list(values) for name, values in model.effects.items()})
+
+
+def get_planning_constants(settings: ShotConfig, radius: float) -> dict[str, float]:
+    """Return the constants of a ball that the planner assumes.
+
+    Args:
+        settings: the [shot] table.
+        radius: radius of the ball, m.
+    """
+    return {
+        "radius": radius,
+        "friction": settings.planned_friction,
+        "inertia_ratio": settings.planned_inertia,
+    }
+
+
+def get_planning_theta(model: TunedModel) -> Array:
+    """Return the parameters of the planning simulator, (1,): the tuned restitution."""
+    return np.array([model.restitution])
+
+
+def plan_shot_in_model(
+    model: TunedModel, settings: ShotConfig, scene: ShotGeometry, radius: float
+) -> ShotPlan:
+    """Plan a shot in a model.
+
+    Args:
+        model: the tuned model.
+        settings: the [shot] table.
+        scene: incline and hoop.
+        radius: radius of the ball, m.
+    """
+    constants = get_planning_constants(settings, radius)
+    return plan_shot(
+        make_planning_simulator(model),
+        get_planning_theta(model),
+        scene,
+        constants,
+        settings.heights,
+    )
+
+
+def _plan_shot(
+    model: TunedModel, settings: ShotConfig, scene: ShotGeometry, radius: float
+) -> TunedModel:
+    """Plan a shot in a tuned model, and store the planned drop height and distance to the rim.
+
+    A method that crashed has no model and gets no plan. A finished method whose model reaches the
+    hoop from no height gets the status "no plan".
+
+    Args:
+        model: the tuned model.
+        settings: the [shot] table.
+        scene: incline and hoop.
+        radius: radius of the ball, m.
+    """
+    if model.status == "crashed":
+        return model
+    plan = plan_shot_in_model(model, settings, scene, radius)
+    if not plan.is_found and model.status in ("done", "converged"):
+        return replace(
+            model,
+            status="no plan",
+            reason="the model does not reach the hoop's plane from any height",
+        )
+    return replace(model, height=plan.height, margin=plan.rim_margin)

@@ -1,0 +1,579 @@
+"""Rows and content of a data sheet for any output format, and its text."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+
+from bench.diagnosis.datasheet.datasheet_subject import (
+    PLACE_KIND_TITLES,
+    ModelFileValue,
+    SheetSubject,
+)
+from bench.diagnosis.datasheet.detection_limits import DetectionLimit, DetectionLimits
+from bench.diagnosis.datasheet.drive_diagram import DriveDiagram, compute_drive_diagram
+from bench.diagnosis.report.wording import (
+    append_unit,
+    format_effect_name,
+    format_fitted_value,
+    format_number,
+    format_p_value,
+    format_percent,
+    joined,
+    sanitise,
+)
+from bench.diagnosis.validation.gain_and_intervals import Z95
+from bench.diagnosis.verdict import Cause, Verdict
+from sims import effects as library
+from sims.core.effect import ALL_PLACES
+from sims.extended_simulator import ExtendedSimulator, FittedValue
+from sims.recording.recording import Recording
+
+QuantityState = Literal["found", "fitted", "derived", "not shown"]
+DERIVATIVE_STEP_SHARE = 1e-6
+"""Relative step of a parameter for the derivatives of derived quantities."""
+
+
+@dataclass(frozen=True)
+class SheetRow:
+    """Row of the sheet: one number.
+
+    Attributes:
+        name: Name of the effect here, with its coefficient if it has several; or of the parameter.
+        says: Name in words.
+        part: ``joint``, ``actuator``, ``channel``, or ``system`` for a parameter of a system.
+        state: ``found`` for a cause, ``fitted`` for a parameter, ``derived`` for a number that
+            follows from others, or ``not shown``.
+        unit: Unit of the number.
+        number: Value with its 95 % interval; None if it is not shown.
+        stated: Value in the model file; None if the file has none.
+        detection_limit: Detection limit of an effect that is not shown.
+        p_value: Probability of a gain like that of the cause if it were absent.
+        share: Share of the held-out gap that the cause closes alone; None if not measured.
+        alternatives: Effects that explain the data as well.
+        prediction_half_width: Half the 95 % interval for a log, or a run, that is not yet recorded;
+            None if unknown.
+        strongest: Whether it is the force limit of the drive, at rest.
+    """
+
+    name: str
+    says: str
+    part: str
+    state: QuantityState
+    unit: str
+    number: FittedValue | None = None
+    stated: float | None = None
+    detection_limit: DetectionLimit | None = None
+    p_value: float | None = None
+    share: float | None = None
+    alternatives: tuple[str, ...] = ()
+    prediction_half_width: float | None = None
+    strongest: bool = False
+
+    def to_document(self) -> dict[str, Any]:
+        """Return the row as TOML data, which has no null."""
+        row: dict[str, Any] = {"state": self.state, "says": self.says, "unit": self.unit}
+        row["part"] = self.part
+        if self.number is not None:
+            row |= self.number.to_table()
+        if self.prediction_half_width is not None:
+            row["another"] = self.prediction_half_width
+        if self.stated is not None:
+            row["stated"] = self.stated
+        if self.detection_limit is not None:
+            row |= self.detection_limit.to_document()
+        if self.p_value is not None:
+            row["p_value"] = self.p_value
+        if self.share is not None:
+            row["heldout_gain"] = self.share
+        if self.alternatives:
+            row["alternatives"] = list(self.alternatives)
+        return row
+
+
+def build_sheet_rows(
+    subject: SheetSubject, extended: ExtendedSimulator, verdict: Verdict, limits: DetectionLimits
+) -> tuple[SheetRow, ...]:
+    """Build the rows of a sheet.
+
+    Args:
+        subject: Joint or system.
+        extended: Extended simulator.
+        verdict: Verdict with the evidence.
+        limits: Covariance and detection limits.
+
+    Returns:
+        Derived quantities, parameters, causes, then effects that are not shown.
+    """
+    rows = _Rows(subject, extended, verdict, limits)
+    return (*rows.derived(), *rows.parameters(), *rows.causes(), *rows.absent())
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Builder of the rows of a data sheet, from a verdict and the detection limits."""
+
+    subject: SheetSubject
+    extended: ExtendedSimulator
+    verdict: Verdict
+    detection_limits: DetectionLimits
+
+    def derived(self) -> Iterator[SheetRow]:
+        """Yield quantities derived from the system's parameters, by error propagation."""
+        parameters = self.extended.parameters
+        values = {name: number.value for name, number in parameters.items()}
+        values_by_name = {**self.extended.constants, **values}
+        free = [name for name in self.detection_limits.free if name in values]
+        indices = [self.detection_limits.free.index(name) for name in free]
+        covariance = self.detection_limits.covariance[np.ix_(indices, indices)]
+        for derived in self.subject.kind.system.derived:
+            try:
+                value = derived.of(values_by_name)
+            except (KeyError, ZeroDivisionError):
+                # A constant that differs between runs has no single value.
+                continue
+            slopes = []
+            for name in free:
+                step = DERIVATIVE_STEP_SHARE * (abs(values_by_name[name]) or 1.0)
+                slopes.append(
+                    (derived.of({**values_by_name, name: values_by_name[name] + step}) - value)
+                    / step
+                )
+            gradient = np.array(slopes)
+            half_width = Z95 * float(np.sqrt(max(gradient @ covariance @ gradient, 0.0)))
+            number = FittedValue(value, derived.unit, value - half_width, value + half_width)
+            row = SheetRow(derived.name, derived.says, "system", "derived", derived.unit, number)
+            yield replace(row, strongest=derived.strongest)
+
+    def parameters(self) -> Iterator[SheetRow]:
+        """Yield the parameters of the system, or the free numbers of the robot's file here."""
+        if not self.subject.joint:
+            for parameter in self.subject.kind.parameters:
+                nominal = FittedValue(parameter.nominal, parameter.unit, None, None)
+                # A parameter that is not in the file has its nominal value.
+                number = self.extended.parameters.get(parameter.name, nominal)
+                description = parameter.says or parameter.name
+                row = _make_fitted_row(
+                    parameter.name, description, "system", "fitted", number, None
+                )
+                yield replace(
+                    row,
+                    prediction_half_width=self.detection_limits.prediction_half_widths.get(
+                        parameter.name
+                    ),
+                )
+            return
+        for name, number in self.extended.parameters.items():
+            # The coefficient of an effect with several has its name after a point.
+            effect, _, place_and_coefficient = name.partition("@")
+            local_place = next(
+                (
+                    own_place
+                    for own_place in self.subject.places
+                    if place_and_coefficient
+                    in (own_place, f"{own_place}.{_get_coefficient_part(place_and_coefficient)}")
+                ),
+                "",
+            )
+            if local_place:
+                row = self._make_effect_row(f"{effect}@{local_place}", name, number, "fitted")
+                yield self._add_prediction_interval(row, f"{effect}@{local_place}", name)
+
+    def causes(self) -> Iterator[SheetRow]:
+        """Yield the diagnosed causes; members of a family that may be zero here are not shown."""
+        for name, numbers in self.extended.effects.items():
+            local_coefficients = list(self.subject.localise_effect(name, numbers))
+            for effect, coefficient, number in local_coefficients:
+                if number.value == 0:
+                    # A coefficient of zero means that the effect is absent; its detection limit is
+                    # computed.
+                    continue
+                has_several = (
+                    sum(other_effect == effect for other_effect, _, _ in local_coefficients) > 1
+                )
+                label = f"{effect} {coefficient}" if has_several else effect
+                row = self._make_effect_row(effect, label, number, "found", self._find_cause(name))
+                if _may_be_zero(number):
+                    yield self._make_hidden_row(row, effect, number)
+                    continue
+                place_suffix = (
+                    "" if name.partition("@")[2] != ALL_PLACES else f"@{effect.partition('@')[2]}"
+                )
+                parameter = name if len(numbers) == 1 else f"{name}.{coefficient}{place_suffix}"
+                yield self._add_prediction_interval(row, effect, parameter)
+
+    def _add_prediction_interval(self, row: SheetRow, effect: str, parameter: str) -> SheetRow:
+        """Add to a row the interval of its value for a run that is not yet recorded.
+
+        It is known only if several runs or logs identify the value. For a number of the model file
+        it is converted to the unit of that number.
+        """
+        half_width, file_value = (
+            self.detection_limits.prediction_half_widths.get(parameter),
+            self.subject.get_model_file_value(effect),
+        )
+        if half_width is None or file_value is None:
+            return replace(row, prediction_half_width=half_width)
+        return replace(row, prediction_half_width=file_value.compute_half_width(half_width))
+
+    def _make_hidden_row(self, row: SheetRow, effect: str, number: FittedValue) -> SheetRow:
+        """Build the row of a cause at other places that is not shown here."""
+        detection_limit = _make_limit_from_interval(
+            number, self.subject.get_model_file_value(effect)
+        )
+        return SheetRow(
+            row.name,
+            row.says,
+            row.part,
+            "not shown",
+            row.unit,
+            stated=row.stated,
+            detection_limit=detection_limit,
+        )
+
+    def absent(self) -> Iterator[SheetRow]:
+        """Yield the effects that are not in the model, with their detection limits."""
+        for (effect, coefficient), detection_limit in self.detection_limits.limits.items():
+            has_several = len({c for e, c in self.detection_limits.limits if e == effect}) > 1
+            label = f"{effect} {coefficient}" if has_several else effect
+            placed_effect = library.find_effect(effect, self.subject.kind.system)
+            c = next(c for c in placed_effect.coefficients if c.name == coefficient)
+            unit = c.unit_on(self.subject.kind.system, self.extended.observe) or "1"
+            yield self._make_absent_effect_row(effect, label, unit, detection_limit)
+
+    def _make_absent_effect_row(
+        self, effect: str, label: str, unit: str, detection_limit: DetectionLimit
+    ) -> SheetRow:
+        """Build the row of an effect that is not in the model, with its detection limit.
+
+        If the effect changes a number of the model file, the limit is converted to the unit of that
+        number. `label` is the name of the row, and `unit` the unit of the coefficient.
+        """
+        file_value = self.subject.get_model_file_value(effect)
+        value = None
+        if file_value is not None:
+            unit, value = file_value.unit, file_value.value
+            detection_limit = replace(
+                detection_limit,
+                size=file_value.compute_half_width(detection_limit.size),
+                estimate_if_fitted=file_value.compute_half_width(
+                    detection_limit.estimate_if_fitted
+                ),
+            )
+        alternatives = tuple(c.effect for c in self.verdict.causes if effect in c.alternatives)
+        description = format_effect_name(effect.partition("@")[0])
+        part = library.find_effect(effect, self.subject.kind.system).at
+        return SheetRow(
+            label,
+            description,
+            part,
+            "not shown",
+            unit,
+            stated=value,
+            detection_limit=detection_limit,
+            alternatives=alternatives,
+        )
+
+    def _make_effect_row(
+        self,
+        effect: str,
+        label: str,
+        number: FittedValue,
+        state: QuantityState,
+        cause: Cause | None = None,
+    ) -> SheetRow:
+        """Build the row of a fitted parameter or a diagnosed cause.
+
+        Args:
+            effect: Effect with its place, as ``name@place``.
+            label: Name of the row.
+            number: Fitted coefficient of the effect. If the effect changes a number of the model
+                file, the row has the resulting total of that number instead.
+            state: State of the quantity, such as ``fitted`` or ``found``.
+            cause: Cause in the verdict, for its p-value and alternatives; None for a parameter.
+        """
+        placed_effect = library.find_effect(effect, self.subject.kind.system)
+        file_value = self.subject.get_model_file_value(effect)
+        if file_value is not None:
+            number = file_value.compute_total(number)
+        row = _make_fitted_row(
+            label,
+            format_effect_name(effect.partition("@")[0]),
+            placed_effect.at,
+            state,
+            number,
+            file_value,
+        )
+        if cause is None:
+            return row
+        gains = [c.heldout_gain for c in self.verdict.candidates if c.effect == cause.effect]
+        share = next(iter(gains), None)
+        return replace(row, p_value=cause.p_value, share=share, alternatives=cause.alternatives)
+
+    def _find_cause(self, name: str) -> Cause | None:
+        return next((c for c in self.verdict.causes if c.effect == name), None)
+
+
+def _make_fitted_row(
+    name: str,
+    description: str,
+    part: str,
+    state: QuantityState,
+    number: FittedValue,
+    file_value: Any,
+) -> SheetRow:
+    """Build a row with a fitted value and, unless `file_value` is None, the model file's value."""
+    nominal = None if file_value is None else file_value.value
+    return SheetRow(name, description, part, state, number.unit, number, nominal)
+
+
+def _get_coefficient_part(place: str) -> str:
+    return place.rpartition(".")[2]
+
+
+def _may_be_zero(number: FittedValue) -> bool:
+    """Return whether zero lies in the 95 % interval of a coefficient; False without an interval."""
+    if number.low is None or number.high is None:
+        return False
+    return number.low <= 0 <= number.high
+
+
+def _make_limit_from_interval(
+    number: FittedValue, file_value: ModelFileValue | None
+) -> DetectionLimit:
+    low, high = number.low or 0.0, number.high or 0.0
+    size = max(abs(low), abs(high))
+    return DetectionLimit(size if file_value is None else file_value.compute_half_width(size))
+
+
+FORMAT_VERSION = 1
+"""Format version of sheet.toml."""
+
+NAMES_IN_TERMINAL = 5
+"""Maximum number of effects that the terminal names as not shown by the data."""
+
+
+@dataclass(frozen=True)
+class SheetContent:
+    """Content of a data sheet.
+
+    Attributes:
+        name: Name on the sheet.
+        subject: Joint or system that it describes.
+        recording: Logs.
+        verdict: Verdict of the diagnosis.
+        extended: Extended simulator.
+        rows: Numbers of the sheet.
+    """
+
+    name: str
+    subject: SheetSubject
+    recording: Recording
+    verdict: Verdict
+    extended: ExtendedSimulator
+    rows: tuple[SheetRow, ...]
+
+    def document(self) -> dict[str, Any]:
+        """Return the content of sheet.toml."""
+        rows_by_name = {row.name: row.to_document() for row in self.rows}
+        joint = {"joint": self.subject.joint} if self.subject.joint else {}
+        return {
+            "format": FORMAT_VERSION,
+            "name": self.name,
+            "system": self.subject.kind.name,
+            **joint,
+            "recording": self.recording.title or self.recording.path.stem,
+            "runs": [run.name for run in self.recording.training()],
+            "verdict": self.verdict.verdict,
+            "elsewhere": list(self.elsewhere()),
+            "quantities": rows_by_name,
+            **self._describe_rest(),
+        }
+
+    def _describe_rest(self) -> dict[str, Any]:
+        """Return the diagram of a drive; without a drive, the dry friction that holds the joint."""
+        if self.diagram is not None:
+            return {"diagram": self.diagram.to_document()}
+        rest_diagram = self.rest
+        return {
+            "rest": {
+                "unit": rest_diagram.unit,
+                "laws": list(rest_diagram.laws),
+                "breakaway": rest_diagram.breakaway,
+            }
+        }
+
+    @cached_property
+    def is_driven(self) -> bool:
+        """Return whether a drive acts here; without one there is no diagram."""
+        return self.subject.is_driven(self.recording)
+
+    @property
+    def diagram(self) -> DriveDiagram | None:
+        """Diagram of where the joint moves, holds and slips; None without a drive."""
+        return self.rest if self.is_driven else None
+
+    def explain_missing_diagram(self) -> str:
+        """Return why there is no diagram, and what is known of the joint at rest instead."""
+        reason = "the log has no input"
+        if self.subject.joint:
+            reason = (
+                f"joint {self.subject.joint} has no actuator in the model, and no force in the log"
+            )
+        rest_diagram = self.rest
+        if rest_diagram.laws and rest_diagram.breakaway > 0:
+            force = append_unit(format_number(rest_diagram.breakaway), rest_diagram.unit)
+            friction_text = (
+                f"At rest, dry friction holds loads up to {force} ({joined(rest_diagram.laws)})"
+            )
+        else:
+            friction_text = "No friction law was found that holds it at rest"
+        return (
+            f"There is no drive: {reason}. Therefore this sheet has no drive and back-drive "
+            "diagram, and "
+            "no numbers of a drive; the table shows the other effects on the joint. "
+            f"{friction_text}."
+        )
+
+    @cached_property
+    def rest(self) -> DriveDiagram:
+        """Diagram of where the joint moves, holds and slips, also without a drive."""
+        force_limits = [row.number.value for row in self.rows if row.strongest and row.number]
+        return compute_drive_diagram(self.subject, self.extended, next(iter(force_limits), None))
+
+    def elsewhere(self) -> Iterator[str]:
+        """Yield causes of the model that act at other places, or in the world."""
+        for name, numbers in self.extended.effects.items():
+            if not any(True for _ in self.subject.localise_effect(name, numbers)):
+                yield name
+
+    def lines(self) -> list[str]:
+        """Format the sheet as text: numbers first, then the effects that are not shown."""
+        lines = [f"{sanitise(self.name, 80)}: {self.verdict.verdict}"]
+        identified = [row for row in self.rows if row.number is not None]
+        lines += [
+            f"  {sanitise(r.name, 60)} = {format_fitted_value(r.number)}"
+            for r in identified
+            if r.number
+        ]
+        all_absent_names = [row.name for row in self.rows if row.number is None]
+        absent_names, unnamed_count = (
+            all_absent_names[:NAMES_IN_TERMINAL],
+            len(all_absent_names) - NAMES_IN_TERMINAL,
+        )
+        if unnamed_count > 0:
+            absent_names = [
+                *absent_names,
+                f"{unnamed_count} more (the sheet gives the detection limit of each)",
+            ]
+        lines.append(
+            f"not detected in these data: {sanitise(joined(absent_names), 2000) or 'nothing'}"
+        )
+        return lines
+
+
+UNJUDGED_P_VALUE = 0.05
+"""P-value above which a cause is on the sheet only because the search ended before it was tested.
+"""
+
+
+def title(row: SheetRow, is_driven: bool) -> str:
+    """Return the title of the part of the table that a row belongs to.
+
+    Args:
+        row: Row of the sheet.
+        is_driven: Whether a drive acts on the joint or system.
+    """
+    if row.part == "system":
+        return "Motor" if is_driven else "System"
+    return PLACE_KIND_TITLES[row.part]
+
+
+def format_prediction_interval(row: SheetRow) -> str:
+    """Format half the prediction interval for a run or log that is not yet recorded."""
+    return (
+        ""
+        if row.prediction_half_width is None
+        else f"± {format_number(row.prediction_half_width, 2)}"
+    )
+
+
+def format_name(row: SheetRow) -> str:
+    """Return the name of the row in words."""
+    if row.part == "system":
+        return row.name.replace("_", " ")
+    # The sheet shows the value itself, not its difference from the model file.
+    return row.says if row.stated is None else re.sub("^(wrong|misplaced) ", "", row.says)
+
+
+def format_short_name(row: SheetRow) -> str:
+    """Return the name of the row without the joint or actuator that the whole sheet describes."""
+    effect, _, placed_name = row.name.partition("@")
+    if not placed_name:
+        return row.name
+    place, _, coefficient = placed_name.partition(" ")
+    channel = place.partition(".")[0] if row.part == "channel" else ""
+    return " ".join(part for part in (effect, coefficient, channel) if part)
+
+
+def format_evidence(row: SheetRow, is_short: bool = False) -> str:
+    """Format the evidence for a number on the sheet.
+
+    Args:
+        row: Row of the sheet.
+        is_short: Whether to use the short form for print.
+    """
+    if row.state == "derived":
+        return "computed from the numbers below"
+    if row.state == "fitted":
+        return (
+            "fitted"
+            if row.number and row.number.low is not None
+            else "not identified by these data"
+        )
+    is_judged = row.p_value is None or row.p_value <= UNJUDGED_P_VALUE
+    unjudged_text = "not tested" if is_short else "the search ended before it was tested"
+    parts = [format_p_value(row.p_value) if is_judged else unjudged_text]
+    if row.share is not None:
+        closed_share = format_percent(row.share)
+        parts.append(
+            f"{closed_share} held out"
+            if is_short
+            else f"alone it closes {closed_share} of the held-out gap"
+        )
+    if row.alternatives:
+        parts.append(f"{joined(row.alternatives, 'or')} explains the data equally well")
+    return "; ".join(parts)
+
+
+def format_detection_limit(row: SheetRow) -> str:
+    """Format in words how large an absent effect could be without being detected."""
+    detection_limit = row.detection_limit
+    if detection_limit is None or detection_limit.size == float("inf"):
+        return "none: the data do not depend on it"
+    size = format_number(detection_limit.size, 2)
+    if detection_limit.is_unbounded:
+        return append_unit(f"± {size}", row.unit) + ", larger than any plausible value"
+    if detection_limit.limit:
+        return append_unit(f"none {detection_limit.limit} {size}", row.unit)
+    if detection_limit.is_nonzero_if_fitted:
+        return (
+            append_unit(
+                f"{format_number(detection_limit.estimate_if_fitted, 2)} ± {size}", row.unit
+            )
+            + ", not diagnosed"
+        )
+    return append_unit(f"0 ± {size}", row.unit)
+
+
+def format_confounding(row: SheetRow) -> str:
+    """Format confounded parameters, and causes that the effect might replace."""
+    parts = list(row.detection_limit.confounded_with) if row.detection_limit else []
+    if row.alternatives:
+        parts.append(f"possible alternative to {joined(row.alternatives, 'or')}")
+    return ", ".join(parts)

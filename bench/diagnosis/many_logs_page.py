@@ -1,0 +1,314 @@
+"""Page of many logs that are explained separately: the values of the template `many_logs.html`."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from math import isfinite
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import pandas as pd
+
+from bench.diagnosis import many_logs
+from bench.diagnosis.many_logs import LOGS_TABLE_FILE, LogResult, format_cause
+from bench.diagnosis.report.wording import (
+    append_unit,
+    format_effect_name,
+    format_number,
+    format_sentence,
+    joined,
+)
+from bench.figures import style
+from bench.figures.style import add_caption
+from bench.figures.text_layout import break_name
+from bench.pages.chart import Axis, Panel, PrintedFigure, ReferenceLine, Series
+from bench.pages.chart_figure import draw_chart
+from bench.pages.html_page import HtmlPage
+from sims.core.files import write_atomically
+from sims.core.simulator import InputError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+_TEMPLATE = Path(__file__).with_name("many_logs.html")
+_NAMED_LETTERS = 120
+"""Maximum total number of characters of log names on an axis; with more, the logs are numbered."""
+MAX_NAMED = 6
+"""Maximum number of causes, and of failed logs, that are listed before the tables."""
+MAX_PANELS = 4
+"""Maximum number of numbers that the printed figure shows."""
+_TITLE_LINE = 34
+"""Maximum line length of a panel's title, in characters."""
+_NAME_HEIGHT = 0.3
+"""Height of a log in the printed figures, in inches."""
+_VERDICT_ORDER = ("named", "ambiguous", "partial", "adequate", "unknown", "unidentifiable")
+_BEFORE = style.make_mark_style(style.VERMILION, (), "s")
+_AFTER = style.make_mark_style(style.BLUE, (), "o")
+
+
+@dataclass(frozen=True)
+class BatchPageInput:
+    """Input of the page in addition to the result rows.
+
+    Attributes:
+        out: Output folder of the batch.
+        folders: Folder of each log's explanation, by log.
+        recordings: Path of each recording, by log.
+        words: Words of the command that continues the batch.
+        left: Number of logs that are not explained yet.
+    """
+
+    out: Path
+    folders: Mapping[str, Path]
+    recordings: Mapping[str, Path]
+    words: Sequence[str]
+    left: int = 0
+
+
+def write_summary_page(rows: Sequence[LogResult], batch: BatchPageInput) -> Path:
+    """Write the page next to the table.
+
+    Args:
+        rows: Result of each log.
+        batch: Input of the page in addition to the rows.
+
+    Returns:
+        Path of the page.
+
+    Raises:
+        InputError: The page cannot be written.
+    """
+    path = batch.out / many_logs.REPORT_FILE
+    try:
+        write_atomically(path, render_summary_page(rows, batch))
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror})") from None
+    return path
+
+
+def render_summary_page(rows: Sequence[LogResult], batch: BatchPageInput) -> str:
+    """Render the page as HTML.
+
+    Args:
+        rows: Result of each log, in the order given.
+        batch: Input of the page in addition to the rows.
+    """
+    logs = many_logs.build_log_table(rows, batch.folders)
+    numbers = many_logs.build_number_table(rows)
+    charts = make_summary_charts(logs, numbers)
+    page = HtmlPage()
+    tables = {"each": logs, "logs": many_logs.read_log_table(rows), **charts.tables}
+    for name, table in tables.items():
+        page.add_table(name, table)
+    closed_shares = logs["gap_closed"][logs["causes"] != ""].dropna()
+    return page.render(
+        _TEMPLATE,
+        rows=rows,
+        batch=batch,
+        table_file=LOGS_TABLE_FILE,
+        verdicts=_format_verdicts(rows),
+        causes=_list_causes(rows, numbers, batch),
+        closed=_ClosedShare(
+            closed_shares.median(), closed_shares.min(), closed_shares.max(), len(closed_shares)
+        )
+        if len(closed_shares)
+        else None,
+        failed=[row for row in rows if row.error],
+        is_numbered=not charts.has_names,
+        number_panels=charts.numbers,
+        number_figure=_make_printed_figure(
+            charts.numbers[:MAX_PANELS],
+            charts.tables,
+            "numbers",
+            "Each number of the causes over the logs.",
+            "Point: the value from one log. Bar: its 95 % interval.",
+        ),
+        held_out_panels=charts.held_out,
+        held_out_figure=_make_printed_figure(
+            charts.held_out,
+            charts.tables,
+            "held-out",
+            "Error on held-out runs of each log before and after, in noise floors.",
+            "Dashed: the noise floor, the best that any model can reach.",
+        ),
+        MAX_NAMED=MAX_NAMED,
+        MAX_PANELS=MAX_PANELS,
+    )
+
+
+class _ClosedShare(NamedTuple):
+    """Share of the gap that the causes close: median and range, and the number of logs."""
+
+    median: float
+    low: float
+    high: float
+    log_count: int
+
+
+def _format_verdicts(rows: Sequence[LogResult]) -> str:
+    """Count the logs with each verdict in words, for example "2 adequate, 1 unknown".
+
+    Logs that could not be explained have no verdict; they are counted at the end.
+    """
+    counts = Counter(row.verdict for row in rows if row.verdict)
+    ordered_verdicts = [
+        *_VERDICT_ORDER,
+        *(verdict for verdict in counts if verdict not in _VERDICT_ORDER),
+    ]
+    parts = [f"{counts[verdict]} {verdict}" for verdict in ordered_verdicts if counts[verdict]]
+    failed = sum(1 for row in rows if row.error)
+    if failed:
+        parts.append(f"{failed} could not be explained")
+    return joined(parts)
+
+
+class _CommonCause(NamedTuple):
+    """Cause in words, its name, its logs and their recordings, and the ranges of its numbers."""
+
+    text: str
+    name: str
+    logs: list[str]
+    recordings: list[Path]
+    ranges: str
+
+
+def _list_causes(
+    rows: Sequence[LogResult], numbers: pd.DataFrame, batch: BatchPageInput
+) -> list[_CommonCause]:
+    """List the causes over all logs, the most common first."""
+    counts = Counter(format_cause(cause) for row in rows for cause in row.causes)
+    causes = []
+    for name, _ in counts.most_common():
+        logs = [row.log for row in rows if name in map(format_cause, row.causes)]
+        text = joined([format_effect_name(part) for part in name.split(" or ")], "or")
+        recordings = [batch.recordings[log] for log in logs]
+        ranges = _format_ranges(numbers[numbers["cause"] == name])
+        causes.append(_CommonCause(format_sentence(text)[:-1], name, logs, recordings, ranges))
+    return causes
+
+
+def _format_ranges(numbers: pd.DataFrame) -> str:
+    """Format the range of each coefficient of a cause, such as ``: 0.3 to 0.7 N``."""
+    parts = []
+    for name, values in numbers.groupby("name", sort=False):
+        ends = dict.fromkeys(
+            format_number(end) for end in (values["value"].min(), values["value"].max())
+        )
+        label = "" if name == "coefficient" else f"{many_logs.place_of(str(name))} "
+        parts.append(label + append_unit(" to ".join(ends), str(values["unit"].iloc[0])))
+    return f": {joined(parts)}" if parts else ""
+
+
+class SummaryCharts(NamedTuple):
+    """Charts of the page.
+
+    Attributes:
+        numbers: Panels of each number of a cause over the logs, the most common first.
+        held_out: Panel of the errors on held-out runs; empty without errors.
+        tables: Tables of the panels.
+        has_names: Whether the logs have their names on the axis.
+    """
+
+    numbers: list[Panel]
+    held_out: list[Panel]
+    tables: dict[str, pd.DataFrame]
+    has_names: bool
+
+
+def make_summary_charts(logs: pd.DataFrame, numbers: pd.DataFrame) -> SummaryCharts:
+    """Make the charts of the page.
+
+    Args:
+        logs: Table of `run_batch.build_log_table`.
+        numbers: Table of `run_batch.build_number_table`.
+    """
+    across = _make_log_axis(logs)
+    # Named logs have the positions 0, 1, 2, ... on their axis.
+    first = 1 if across.names else 0
+    errors = logs[["number", "log", "before", "after"]]
+    tables = {
+        "found": numbers.assign(place=numbers["number"] - first),
+        "held-out": errors.assign(place=errors["number"] - first),
+    }
+    number_panels = _make_number_panels(numbers, across)
+    held_out_panels = _make_held_out_panels(logs, across)
+    return SummaryCharts(number_panels, held_out_panels, tables, bool(across.names))
+
+
+def _make_log_axis(logs: pd.DataFrame) -> Axis:
+    """Make the axis of the logs: with their names if they fit, otherwise with their numbers."""
+    names = [str(name) for name in logs["log"]]
+    if len(names) * max(map(len, names), default=0) <= _NAMED_LETTERS:
+        return Axis("log", names=tuple(names))
+    return Axis("log, by its number", scales=("linear",), ends=(0.5, len(logs) + 0.5))
+
+
+def _make_number_panels(numbers: pd.DataFrame, across: Axis) -> list[Panel]:
+    """Make a panel for each number of a cause, the most common first."""
+    panels = []
+    for label_with_cause in dict.fromkeys(numbers["what"].astype(str)):
+        name, _, label = label_with_cause.rpartition(": ")
+        series = (
+            Series(
+                "each log", "value", _AFTER, {"what": label_with_cause}, "low", "high", "points"
+            ),
+        )
+        value_axis = Axis(label, scales=("linear",))
+        panels.append(
+            Panel(name, "found", "place", series, across, value_axis, {"number": label_with_cause})
+        )
+    return panels
+
+
+def _make_held_out_panels(logs: pd.DataFrame, across: Axis) -> list[Panel]:
+    """Make the panel of the errors on held-out runs, in noise floors; none without errors."""
+    errors = logs[["before", "after"]]
+    log_count = int(errors.map(lambda error: isfinite(error) and error > 0).all(axis=1).sum())
+    if not log_count:
+        return []
+    series = (
+        Series("before: tuned simulation", "before", _BEFORE, draw="points"),
+        Series("after: with the causes found", "after", _AFTER, draw="points"),
+    )
+    error_axis = Axis("error on held-out runs [noise floors]", "log", holds=(1.0,))
+    title = "One log" if log_count == 1 else f"{log_count} logs"
+    rules = (ReferenceLine(1.0, "noise floor"),)
+    return [Panel(title, "held-out", "place", series, across, error_axis, rules=rules)]
+
+
+def draw_summary_figure(
+    panels: Sequence[Panel], tables: Mapping[str, pd.DataFrame], caption: str
+) -> Figure:
+    """Draw the printed version of a chart, with the logs from top to bottom.
+
+    Args:
+        panels: Panels of the chart.
+        tables: Tables of the panels.
+        caption: Caption below the figure.
+    """
+    height = 1.2 + _NAME_HEIGHT * len(panels[0].across.names) if panels[0].across.names else 4.0
+    figure, axes = draw_chart(panels, tables, size=(3.4, height), horizontal=True)
+    for axis, panel in zip(axes, panels, strict=True):
+        axis.set_title(break_name(panel.title, _TITLE_LINE), fontsize=8.5, parse_math=False)
+    if len(panels[0].series) > 1:
+        entries = axes[0].get_legend_handles_labels()
+        figure.legend(*entries, loc="outside upper center", fontsize=8, frameon=False)
+    add_caption(figure, caption, letters=17)
+    return figure
+
+
+def _make_printed_figure(
+    panels: Sequence[Panel],
+    tables: Mapping[str, pd.DataFrame],
+    name: str,
+    alternative: str,
+    caption: str,
+) -> PrintedFigure | None:
+    """Render the printed version of a chart; None without panels."""
+    if not panels:
+        return None
+    files = style.render_all_formats(draw_summary_figure(panels, tables, caption))
+    return PrintedFigure(files.svg, files.pdf, alternative, name)

@@ -1,0 +1,543 @@
+"""Check the clock of a recording: jitter, lost samples, impossible stamps, drift of the sensors.
+
+The time in which a coordinate moves is estimated twice. From the recording: the shortest lag T
+after which its values x differ by as much as their spread,
+
+    mean (x(t + T) - x(t))^2 >= var x                                      (1)
+
+and from the system: at rest in the recorded positions, driven by the recorded inputs, its own
+forces would move it equally far within
+
+    T' = (var x / mean a^2)^(1/4)                                          (2)
+
+with its acceleration a at nominal parameters. An oscillation has T = 1.05/w and T' = 1/w. Dust,
+friction and a wrong mass change the ratio a few times, milliseconds read as seconds a thousand
+times; then the sampling interval exceeds (2), too, which nobody would record on purpose.
+
+The response of a position y to a command u is modelled as linear with finite memory,
+
+    p(t) = c + d t + sum_k h_k <u>_k(t),  <u>_k the mean of u over the k-th interval before t  (1)
+
+so that slow and fast commands each have the lag that the drive gives them. A position whose delay
+grows by a share e of the time is
+
+    y(t) = p(t - T - e t) = p - (T + e t) p' + ...                                             (2)
+
+Least squares for T and e finds the shift at which the two are most similar (the maximum of the
+cross-correlation, to first order; C. Knapp, G. Carter, IEEE Trans. ASSP 24(4), 320, 1976). The
+standard error of e is computed from sums over blocks longer than the memory, since the residual of
+(1) is not white (W. Newey, K. West, Econometrica 55, 703, 1987).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from bench.core.resource_estimates import FORCE_HINT
+from bench.logs.importing.normalised_positions import check_normalised_positions
+from bench.logs.quality import pose_check
+from bench.logs.quality.noise_estimation import SIGMA_PER_MEDIAN
+from bench.logs.quality.pose_check import find_missing_base_poses
+from bench.logs.quality.quality_finding import Anomaly, QualityFinding, format_names
+from sims.core.simulator import Array, InputError, Simulator
+from sims.core.system import StateSnapshot, System
+from sims.recording.recording import Recording, Run
+from sims.system_simulator import SystemSimulator
+
+JITTER_THRESHOLD = 0.02
+"""Smallest jitter that is reported, 1 sigma, as a fraction of the sampling interval."""
+LOST_SAMPLE_SHARE_THRESHOLD = 0.002
+"""Smallest share of lost or repeated samples that is reported."""
+INTEGER_INTERVAL_TOLERANCE = 0.3
+"""Tolerance for lost samples, as a fraction of the sampling interval.
+
+An interval that is so close to a whole multiple of the median interval has lost the samples
+between.
+"""
+FAST_SIGNAL_STEPS = 5.0
+"""Smallest change of a signal per sample that counts as fast motion, in quantisation steps.
+
+A signal that changes this fast does not repeat its value by coincidence.
+"""
+SIGNIFICANCE_SIGMAS = 4.0
+"""Detection threshold in standard deviations."""
+
+
+def check_intervals(recording: Recording) -> Iterator[QualityFinding]:
+    """Find irregular sampling intervals (jitter) and lost samples, summarised over all runs."""
+    jittered, jitters, lost_count, sample_count, lossy = [], [], 0, 0, []
+    for run in recording.runs:
+        steps = np.diff(_select_timestamps(run))
+        if steps.size < 2:
+            continue
+        ratios = steps / np.median(steps)
+        counts = np.maximum(np.round(ratios), 1.0)
+        deviations = ratios - counts
+        jitter = SIGMA_PER_MEDIAN * float(np.median(np.abs(deviations - np.median(deviations))))
+        jitters.append(jitter)
+        if jitter > JITTER_THRESHOLD:
+            jittered.append(run.name)
+        run_lost_count = int(
+            (counts - 1)[np.abs(deviations) < max(INTEGER_INTERVAL_TOLERANCE, 3.0 * jitter)].sum()
+        )
+        # If the clock jitters strongly, a long interval means a lost sample only if no short
+        # interval compensates for it.
+        run_lost_count = min(run_lost_count, max(int(ratios.sum()) - steps.size, 0))
+        if run_lost_count < SIGNIFICANCE_SIGMAS * jitter * steps.size**0.5:
+            run_lost_count = 0
+        lost_count, sample_count = (
+            lost_count + run_lost_count,
+            sample_count + steps.size + run_lost_count,
+        )
+        if run_lost_count:
+            lossy.append(run.name)
+    if jittered:
+        yield QualityFinding(
+            "clock",
+            f"intervals vary by {max(jitters):.0%} of one (1 sigma) in {format_names(jittered)}",
+            "every sample is simulated at its own stamp, so use the times of measurement as "
+            "stamps, not the times of writing",
+        )
+    if sample_count and lost_count > LOST_SAMPLE_SHARE_THRESHOLD * sample_count:
+        yield QualityFinding(
+            "clock",
+            f"{lost_count} samples ({lost_count / sample_count:.1%}) are lost in "
+            f"{format_names(lossy)}",
+            "nothing is interpolated, but commands in the gaps are not known: log commands "
+            "in a separate file, or at a lower rate",
+        )
+
+
+def _select_timestamps(run: Run) -> Array:
+    """Return the sample times of the sensor that was read most often.
+
+    The sample times of a run also contain those of commands and of other sensors, which have their
+    own clocks. All sample times are returned if they are at least as regular: the missing samples
+    of the sensor are then empty cells.
+    """
+    recorded_masks = [np.isfinite(values) for values in run.channels.values()]
+    is_recorded = max(
+        recorded_masks, key=lambda mask: int(mask.sum()), default=np.ones(run.times.size, np.bool_)
+    )
+    sensor_times = run.times[is_recorded]
+    return (
+        run.times
+        if _compute_uneven_share(run.times) <= _compute_uneven_share(sensor_times)
+        else sensor_times
+    )
+
+
+def _compute_uneven_share(times: Array) -> float:
+    """Return the share of intervals that differ from the median interval by more than 1 %."""
+    steps = np.diff(times)
+    if not steps.size:
+        return 1.0
+    median_step = float(np.median(steps))
+    return float(np.mean(np.abs(steps - median_step) > 0.01 * median_step))
+
+
+def check_repeated_samples(recording: Recording) -> Iterator[QualityFinding]:
+    """Find samples that repeat the previous one in every channel although the system moves.
+
+    Such samples were not measured anew, and look like a delay.
+    """
+    repeated_count, sample_count, runs = 0, 0, []
+    for run in recording.runs:
+        count, expected = _count_stale_samples(run)
+        if count > expected + SIGNIFICANCE_SIGMAS * np.sqrt(max(expected, 1.0)):
+            repeated_count += count
+            runs.append(run.name)
+        sample_count += run.times.size
+    if repeated_count > LOST_SAMPLE_SHARE_THRESHOLD * sample_count:
+        yield QualityFinding(
+            "clock",
+            f"{repeated_count} samples ({repeated_count / sample_count:.1%}) repeat the one before "
+            f"in every channel while it moves, in {format_names(runs)}",
+            "leave these rows out: a value that is one interval old looks like a delay",
+        )
+
+
+def _count_stale_samples(run: Run) -> tuple[int, float]:
+    """Count samples that repeat the previous one during fast motion.
+
+    Returns:
+        The count, and its expected value under the null hypothesis.
+    """
+    signals = [values for values in run.channels.values() if np.isfinite(values).sum() > 3]
+    if not signals or run.times.size < 4:
+        return 0, 0.0
+    changes = np.array([_count_quantisation_steps(values) for values in signals])
+    is_unchanged = np.nan_to_num(changes, nan=0.0) == 0
+    neighbour_changes = np.maximum(np.abs(changes[:, :-2]), np.abs(changes[:, 2:]))
+    moving = (
+        np.nan_to_num(np.max(neighbour_changes, axis=0, initial=0.0), nan=0.0) >= FAST_SIGNAL_STEPS
+    )
+    is_stale = is_unchanged.all(axis=0)[1:-1] & moving
+    # A signal whose noise spans several steps repeats its value half as often as it changes by one
+    # step in either direction.
+    is_nearly_stale = (np.abs(np.nan_to_num(changes, nan=9.0)) < 1.5).all(axis=0)[1:-1] & moving
+    one_step_count = int(is_nearly_stale.sum()) - int(is_stale.sum())
+    return int(is_stale.sum()), one_step_count / max(3.0 ** len(signals) - 1.0, 1.0)
+
+
+def _count_quantisation_steps(values: Array) -> Array:
+    """Return the (T - 1,) changes of a signal in units of its smallest change."""
+    changes = np.diff(values)
+    sizes = np.abs(changes[np.isfinite(changes)])
+    nonzero_sizes = sizes[sizes > 1e-9 * np.max(sizes, initial=0.0)]
+    if not nonzero_sizes.size:
+        return np.zeros_like(changes)
+    # Without quantisation the smallest change is tiny, so that any motion is many steps.
+    return np.asarray(np.round(changes / nonzero_sizes.min()), dtype=np.float64)
+
+
+TIME_UNIT_RATIO_THRESHOLD = 300.0
+"""Ratio of the two times (1) and (2) above which a unit is wrong."""
+DRIVEN_SYSTEM_FACTOR = 10.0
+"""Minimum ratio of the sampling interval to (2) for a certain anomaly of a driven system.
+
+A driven system may be moved arbitrarily slowly.
+"""
+MIN_MOTION_SHARE = 0.01
+"""Minimum spread of a coordinate for this check, as a fraction of its usual size."""
+MAX_GAP_RATIO = 100.0
+"""Ratio of a gap to the rest of its run above which the run is rejected.
+
+The samples before such a gap do not determine the motion after it.
+"""
+_MIN_CHECKED_SAMPLES = 10
+"""Minimum number of samples of a run that is checked."""
+_TIME_UNITS = {1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds"}
+
+
+def check_recording_plausible(
+    recording: Recording, kind: type[Simulator], force: bool = False
+) -> list[str]:
+    """Reject impossible time stamps and impossible robot positions; return lesser anomalies.
+
+    Args:
+        recording: Recording as it was read.
+        kind: Simulator class of its system.
+        force: Whether the user insists.
+
+    Returns:
+        Texts of the anomalies, to be shown to the user.
+
+    Raises:
+        InputError: An anomaly is certain and `force` is False; the message is one line.
+    """
+    # Positions first: their wrong units make stamps look implausible, but not vice versa.
+    anomalies = [
+        *find_log_anomalies(recording),
+        *pose_check.check_poses(recording, kind),
+        *find_anomalies(recording, kind),
+        *find_missing_base_poses(recording, kind),
+        *(
+            Anomaly(overlap.text_line, False)
+            for overlap in pose_check.find_overlaps(recording, kind)
+        ),
+    ]
+    for oddity in anomalies:
+        if oddity.certain and not force:
+            raise InputError(f"{recording.path}: {oddity.text}, {FORCE_HINT}")
+    return [oddity.text for oddity in anomalies]
+
+
+def find_log_anomalies(recording: Recording) -> Iterator[Anomaly]:
+    """Yield the omissions from a recording's logs, and units that they do not state."""
+    yield from (Anomaly(note, False) for note in recording.notes)
+    yield from check_normalised_positions(recording)
+
+
+def find_anomalies(recording: Recording, kind: type[Simulator]) -> Iterator[Anomaly]:
+    """Yield the anomalies of time stamps, at most one for each run.
+
+    Args:
+        recording: Recording to check.
+        kind: Simulator class of its system.
+    """
+    for run in recording.runs:
+        if run.times.size < _MIN_CHECKED_SAMPLES:
+            continue
+        anomaly = _check_gap(run) or _check_time_scale(recording, run, kind)
+        if anomaly is not None:
+            yield anomaly
+
+
+def _check_gap(run: Run) -> Anomaly | None:
+    """Find a gap that is more than `MAX_GAP_RATIO` times as long as the rest of the run.
+
+    Such a run probably consists of two. Return None if there is no such gap.
+    """
+    intervals = np.diff(run.times)
+    place = int(intervals.argmax())
+    gap = float(intervals[place])
+    sampled_seconds = float(intervals.sum()) - gap
+    if gap <= MAX_GAP_RATIO * sampled_seconds:
+        return None
+    gap_text = f"{gap:.4g} s without a sample from t = {run.times[place]:.6g} s on"
+    sampled_text = f"in a run that has samples for {sampled_seconds:.4g} s"
+    return Anomaly(
+        f"run {run.name}: {gap_text}, {sampled_text}; split it there into two runs", True
+    )
+
+
+def _check_time_scale(recording: Recording, run: Run, kind: type[Simulator]) -> Anomaly | None:
+    """Find a run in which every coordinate moves far more slowly or far faster than expected.
+
+    All coordinates share the stamps, so a coordinate that moves as expected clears them; another
+    one may belong to a link without inertia in the model file.
+    """
+    # The forces of a system with its own stepping are not accessible.
+    if not issubclass(kind, SystemSimulator) or (kind.own_engine and not kind.has_model):
+        return None
+    system = kind.system()
+    interval = float(np.median(np.diff(run.times)))
+    if kind.has_model:
+        accelerations = pose_check.compute_static_accelerations(run, kind)
+    else:
+        accelerations = _compute_rest_accelerations(recording, run, system)
+    # A servo holds its position by force, so large forces at rest are normal.
+    is_driven = kind.has_model and _has_inputs(run)
+    typical_sizes = {channel.name: channel.scale for channel in system.channels}
+    doubtful: Anomaly | None = None
+    for column, name in enumerate(system.coordinates):
+        x = run.channels.get(name)
+        if x is None:
+            continue
+        spread = float(np.nanstd(x))
+        rms_acceleration = float(np.sqrt(np.nanmean(accelerations[:, column] ** 2)))
+        if not (spread > MIN_MOTION_SHARE * typical_sizes.get(name, 1.0) and rms_acceleration > 0):
+            continue
+        expected_seconds = (spread / rms_acceleration) ** 0.5  # Equation (2).
+        recorded_seconds = interval * _estimate_lag(x)
+        ratio = recorded_seconds / expected_seconds
+        if 0 < ratio < 1 / TIME_UNIT_RATIO_THRESHOLD:
+            moves = (
+                f"{name} moves in {recorded_seconds:.3g} s as {kind.name} would within "
+                f"{expected_seconds:.2g} s"
+            )
+            doubtful = doubtful or Anomaly(
+                f"run {run.name}: {moves}; are the stamps seconds?", False
+            )
+            continue
+        if ratio < TIME_UNIT_RATIO_THRESHOLD or interval < (
+            DRIVEN_SYSTEM_FACTOR * expected_seconds if is_driven else expected_seconds
+        ):
+            return None
+        unit = min(_TIME_UNITS, key=lambda factor: abs(np.log(ratio / factor)))
+        moves = (
+            f"{name} takes {recorded_seconds:.3g} s to move as {kind.name} would within "
+            f"{expected_seconds:.2g} s"
+        )
+        interval_text = f"samples lie {interval:.3g} s apart"
+        remedy = f"are the stamps {_TIME_UNITS[unit]}? then divide t by {unit:g}"
+        certain = not _has_inputs(run) or interval >= DRIVEN_SYSTEM_FACTOR * expected_seconds
+        doubtful = doubtful or Anomaly(
+            f"run {run.name}: {moves}, and {interval_text}; {remedy}", certain
+        )
+    return doubtful
+
+
+def _has_inputs(run: Run) -> bool:
+    return any(np.any(signal) for signal in run.inputs.values())
+
+
+def _compute_rest_accelerations(recording: Recording, run: Run, system: System) -> Array:
+    """Compute the accelerations (T, D) that the system's forces cause at the recorded positions.
+
+    The system is at rest, so drag and friction do not act; D is the number of coordinates.
+    """
+    count = run.times.size
+    values = {**recording.constants, **run.constants}
+    constants = {c.name: np.full((count, 1), values.get(c.name, c.value)) for c in system.constants}
+    theta = np.tile([p.nominal for p in system.parameters], (count, 1))
+    default = [np.full(count, system.states[name]) for name in system.coordinates]
+    columns = [
+        run.channels.get(name, default_position)
+        for name, default_position in zip(system.coordinates, default, strict=True)
+    ]
+    x = np.stack(columns, axis=1)
+    zeros = np.zeros((count, 1))
+    inputs = {c.name: zeros for c in system.inputs}
+    inputs |= {name: signal[:, None] for name, signal in run.inputs.items()}
+    moment = StateSnapshot(system, theta, constants, zeros, x, np.zeros_like(x), inputs)
+    with np.errstate(all="ignore"):
+        accelerations: Array = system.force(moment) / system.mass(theta, constants)
+    return accelerations
+
+
+def _estimate_lag(x: Array) -> float:
+    """Return the shortest lag in samples after which values differ by their spread (1).
+
+    Returns 0 if the first lag exceeds the spread already, since motion between samples is not
+    recorded.
+    """
+    variance = float(np.nanvar(x))
+    lag, previous_lag = 1, 0
+    while lag < x.size:
+        differences = x[lag:] - x[:-lag]
+        differences = differences[np.isfinite(differences)]
+        if differences.size and float(np.mean(differences**2)) >= variance:
+            return float(previous_lag)
+        previous_lag, lag = lag, 2 * lag
+    return float(previous_lag)
+
+
+MAX_COMPARED_INSTANTS = 8000
+"""Maximum number of times of a run at which command and position are compared."""
+LAG_BIN_EDGES = (-2, -1, 0, 1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)
+"""Bounds of the intervals of equation (1), in grid steps before the time considered."""
+BLOCK_COUNT = 4
+"""Minimum number of blocks of a run for estimating the standard error of its drift."""
+STUDENT_T_FACTORS = (
+    9.0,
+    9.0,
+    9.0,
+    2.7,
+    1.9,
+    1.6,
+    1.43,
+    1.35,
+    1.3,
+    1.25,
+    1.2,
+    1.18,
+    1.16,
+    1.14,
+    1.12,
+    1.1,
+    1.05,
+)
+"""Correction factors of the standard error, indexed by the number of blocks.
+
+They are the factors by which an error from few blocks is too small (Student's t at 95 %, one block
+lost).
+"""
+MODEL_ERROR_SHARE = 0.01
+"""Relative error of the drift from truncating equation (2)."""
+MIN_EXPLAINED_VARIANCE = 0.9
+"""Minimum share of a position's variance that equation (1) must explain."""
+MIN_REPORTED_DRIFT = 2e-5
+"""Smallest reported drift (dimensionless); ordinary quartz clocks differ by less."""
+
+
+class _Estimate(NamedTuple):
+    """Relative clock drift and its standard error, both dimensionless."""
+
+    drift: float
+    error: float
+
+
+def check_clock_drift(recording: Recording, kind: type[Simulator]) -> Iterator[QualityFinding]:
+    """Find the clock drift, pooled over all runs and driven coordinates, if it is significant.
+
+    Args:
+        recording: Recording to check.
+        kind: Simulator class of its system.
+
+    Returns:
+        At most one finding.
+    """
+    estimates = [
+        estimate
+        for command, position in _list_driven_positions(kind)
+        for run in recording.runs
+        if command in run.inputs and position in run.channels
+        for estimate in _estimate_run_drifts(run, command, position)
+    ]
+    if not estimates:
+        return
+    drift, error = _pool_estimates(estimates)
+    if abs(drift) < max(MIN_REPORTED_DRIFT, SIGNIFICANCE_SIGMAS * error):
+        return
+    word = "fast" if drift > 0 else "slow"
+    yield QualityFinding(
+        "drift",
+        f"the sensors' clock runs {1e6 * abs(drift):.3g} ppm (±{2e6 * error:.2g}) {word} against "
+        "the commands'",
+        "stamp both with one clock; the effect clock.skew of simgap explain estimates and "
+        "removes it",
+    )
+
+
+def _list_driven_positions(kind: type[Simulator]) -> list[tuple[str, str]]:
+    """Return pairs of an input and a position that it drives, by channel name."""
+    if not issubclass(kind, SystemSimulator):
+        return []
+    if kind.has_model:
+        robot: Any = kind
+        return [(f"u.{a.name}", f"q.{a.joint}") for a in robot.robot.actuators if a.joint]
+    return [(u.name, name) for u in kind.inputs for name in kind.system.coordinates]
+
+
+def _estimate_run_drifts(run: Run, command: str, position: str) -> Iterator[_Estimate]:
+    """Estimate the drift of the sensors' clock against the commands' clock in one run, by eq. (2).
+
+    The position is predicted by means of past commands, eq. (1). A drift makes the delay grow with
+    time t, so that the error of the prediction has a part proportional to t times the velocity.
+    Nothing is yielded if the commands explain too little of the motion.
+    """
+    t, u, y = run.times, run.inputs[command], run.channels[position]
+    is_recorded = np.isfinite(y)
+    if is_recorded.sum() < 2 * len(LAG_BIN_EDGES) or not (np.nanstd(y) > 0 and np.std(u) > 0):
+        return
+    step = max(float(np.median(np.diff(t))), float(t[-1] - t[0]) / MAX_COMPARED_INSTANTS)
+    grid = np.arange(t[0], t[-1], step)
+    positions = np.interp(grid, t[is_recorded], y[is_recorded])
+    past_command_means = _average_over_intervals(np.interp(grid, t, u))
+    fitted_part = slice(LAG_BIN_EDGES[-1], len(grid) + LAG_BIN_EDGES[0])
+    time = (grid - grid.mean())[fitted_part]
+    positions, past_command_means = positions[fitted_part], past_command_means[fitted_part]
+    if time.size < BLOCK_COUNT * LAG_BIN_EDGES[-1] or not np.std(positions) > 0:
+        return
+    regressors = np.column_stack([np.ones_like(time), time, past_command_means])
+    coefficients, *_ = np.linalg.lstsq(regressors, positions, rcond=1e-10)
+    predicted = regressors @ coefficients  # Equation (1).
+    if np.var(positions - predicted) > (1.0 - MIN_EXPLAINED_VARIANCE) * np.var(positions):
+        return
+    rate = np.gradient(predicted, step)
+    basis, _ = np.linalg.qr(np.column_stack([regressors, rate]))
+    delay_response = -time * rate
+    delay_response = delay_response - basis @ (basis.T @ delay_response)
+    response_power = float(delay_response @ delay_response)
+    if not response_power > 0:
+        return
+    drift = float(delay_response @ positions) / response_power
+    residual = positions - basis @ (basis.T @ positions) - drift * delay_response
+    block_sums = np.add.reduceat(
+        delay_response * residual, np.arange(0, time.size, LAG_BIN_EDGES[-1])
+    )
+    error = (
+        STUDENT_T_FACTORS[min(len(block_sums), len(STUDENT_T_FACTORS) - 1)]
+        * float(np.sqrt(block_sums @ block_sums))
+        / response_power
+    )
+    yield _Estimate(drift, float(np.hypot(error, MODEL_ERROR_SHARE * drift)))
+
+
+def _average_over_intervals(u: Array) -> Array:
+    """Return the (N, K) means of a command over the intervals of equation (1)."""
+    total = np.concatenate([[0.0], np.cumsum(u)])
+    samples = np.arange(u.size)
+    columns = []
+    for begin, end in pairwise(LAG_BIN_EDGES):
+        first, last = (np.clip(samples - bound + 1, 0, u.size) for bound in (end, begin))
+        columns.append((total[last] - total[first]) / (end - begin))
+    return np.column_stack(columns)
+
+
+def _pool_estimates(estimates: list[_Estimate]) -> _Estimate:
+    """Return the weighted mean; scale its error up if estimates scatter more than their errors."""
+    drifts, errors = np.array(estimates).T
+    weights = np.maximum(errors, 1e-12) ** -2.0
+    drift = float(weights @ drifts / weights.sum())
+    error = float(weights.sum() ** -0.5)
+    if len(estimates) > 1:
+        scatter = float(weights @ (drifts - drift) ** 2) / (len(estimates) - 1)
+        error *= max(scatter, 1.0) ** 0.5
+    return _Estimate(drift, error)

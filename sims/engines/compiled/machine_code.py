@@ -1,0 +1,210 @@
+"""Machine code: compile LLVM's intermediate code, load the result, and cache it on disk.
+
+The name of a file contains a hash of everything on which the code depends. One process compiles the
+code while the others wait.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import hashlib
+import json
+import os
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from sims.core.files import lock_file
+
+_owners: list[Any] = []
+"""Owners of the loaded code, which lives as long as the process."""
+_NEVER_CALLED = ("numba_", "NRT_")
+"""Prefixes of the names of numba's error handling, which is never called."""
+
+
+class CodeNotLoadableError(Exception):
+    """Machine code cannot be loaded in this process."""
+
+
+class MachineCode(NamedTuple):
+    """Machine code of one function.
+
+    Attributes:
+        name: name of the function.
+        needs: names of the external symbols that it uses.
+        body: object file.
+    """
+
+    name: str
+    needs: Sequence[str]
+    body: bytes
+
+    def pack(self) -> bytes:
+        """Return the code as bytes for the cache."""
+        return json.dumps([self.name, list(self.needs)]).encode() + b"\0" + self.body
+
+    @classmethod
+    def unpack(cls, data: bytes) -> MachineCode:
+        """Restore code from the bytes of `pack`."""
+        head, body = data.split(b"\0", 1)
+        name, symbols = json.loads(head)
+        return cls(name, tuple(symbols), body)
+
+
+def describe_processor() -> list[str]:
+    """Return what the code depends on in addition to its source.
+
+    Returns:
+        llvmlite's version, and name and features of the processor.
+    """
+    import llvmlite
+    import llvmlite.binding as llvm
+
+    features = llvm.get_host_cpu_features().flatten()
+    return [llvmlite.__version__, llvm.get_host_cpu_name(), features]
+
+
+def compile_llvm(text: str, name: str) -> MachineCode:
+    """Compile intermediate code to machine code for the present processor.
+
+    Args:
+        text: LLVM intermediate code.
+        name: name of the function.
+
+    Returns:
+        The machine code.
+    """
+    import llvmlite.binding as llvm
+
+    module = llvm.parse_assembly(text)
+    module.verify()
+    for symbol in (*module.functions, *module.global_variables):
+        if not symbol.is_declaration and symbol.name != name:
+            symbol.linkage = "internal"  # so that inlined functions are not also emitted
+    target = _make_target(llvm)
+    tuning = llvm.create_pipeline_tuning_options(speed_level=3)
+    tuning.loop_vectorization = True
+    builder = llvm.create_pass_builder(target, tuning)
+    builder.getModulePassManager().run(module, builder)
+    symbols = [
+        symbol.name
+        for symbol in (*module.functions, *module.global_variables)
+        if symbol.is_declaration and not symbol.name.startswith("llvm.")
+    ]
+    return MachineCode(name, symbols, target.emit_object(module))
+
+
+def load_machine_code(code: MachineCode, pointers: int = 1) -> Callable[..., None]:
+    """Load the machine code of a function.
+
+    The code was compiled earlier, perhaps by another process. Only llvmlite is needed to load
+    it.
+
+    Args:
+        code: machine code.
+        pointers: number of pointer arguments of the function.
+
+    Returns:
+        The function.
+
+    Raises:
+        CodeNotLoadableError: a required symbol is missing; LLVM itself would end the process.
+    """
+    import llvmlite.binding as llvm
+
+    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _make_target(llvm))
+    abort_function = ctypes.CFUNCTYPE(None)(os.abort)
+    for symbol in code.needs:
+        if symbol.startswith(_NEVER_CALLED):
+            llvm.add_symbol(symbol, ctypes.cast(abort_function, ctypes.c_void_p).value)
+        elif not llvm.address_of_symbol(symbol):
+            raise CodeNotLoadableError(f"{symbol} is missing")
+    engine.add_object_file(llvm.ObjectFileRef.from_data(code.body))
+    engine.finalize_object()
+    _owners.append((engine, abort_function))
+    kind = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * pointers)
+    return kind(engine.get_function_address(code.name))
+
+
+def _make_target(llvm: Any) -> Any:
+    """Return the target machine of the present processor."""
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    return llvm.Target.from_default_triple().create_target_machine(
+        cpu=llvm.get_host_cpu_name(),
+        features=llvm.get_host_cpu_features().flatten(),
+        opt=3,
+        jit=True,
+    )
+
+
+_DIGEST_BYTES = hashlib.sha256().digest_size
+
+
+def get_cache_folder() -> Path:
+    """Return the cache folder: $SIMGAP_COMPILED, else simgap/ in the user's cache folder."""
+    if stated_folder := os.environ.get("SIMGAP_COMPILED"):
+        return Path(stated_folder)
+    return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "simgap"
+
+
+def read_cached(path: Path) -> bytes | None:
+    """Return the cached content; None if it does not exist or is damaged."""
+    try:
+        data = path.read_bytes()
+    except OSError:
+        return None
+    content = data[_DIGEST_BYTES:]
+    return content if hashlib.sha256(content).digest() == data[:_DIGEST_BYTES] else None
+
+
+def make_cached(path: Path, make: Callable[[], bytes], report_wait: Callable[[], None]) -> bytes:
+    """Return the cached content of a file, made by one of all processes that request it.
+
+    Args:
+        path: path of the file.
+        make: function that makes the content if it does not exist.
+        report_wait: called once if another process is making the content.
+
+    Returns:
+        The content.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with _hold_lock(path.with_suffix(".lock"), report_wait):
+        # Another process may have made it meanwhile.
+        content = read_cached(path)
+        if content is None:
+            content = make()
+            _write_atomically(path, content)
+    return content
+
+
+def _write_atomically(path: Path, content: bytes) -> None:
+    """Write a file atomically, with the hash of its content."""
+    # The temporary name is fixed, so that the file of a killed process is overwritten by the next.
+    partial = path.with_suffix(".part")
+    try:
+        partial.write_bytes(hashlib.sha256(content).digest() + content)
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def _hold_lock(path: Path, report_wait: Callable[[], None]) -> Iterator[None]:
+    """Hold an exclusive lock between processes, so that only one of them compiles.
+
+    If another process has the lock, `report_wait` is called before waiting. Without fcntl
+    (Windows) there is no lock, and several processes may compile.
+    """
+    with path.open("w") as lock:
+        try:
+            lock_file(lock)
+        except BlockingIOError:
+            report_wait()
+            lock_file(lock, is_blocking=True)
+        yield

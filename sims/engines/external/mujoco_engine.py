@@ -1,0 +1,173 @@
+"""MuJoCo engine: forces through ``qfrc_applied``, impacts through its contact solver.
+
+The module ``<system>_mujoco_world`` in the system's package writes the world of a system; its
+interface is specified in `sims.engines.external.world_interface`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Iterator
+from functools import partial
+from typing import cast
+
+from sims.core.engine import Engine, IntegrationBatch, Trajectories
+from sims.core.plain_values import truncate_text
+from sims.core.simulator import InputError
+from sims.core.system import System
+from sims.engines.external import ball_integration, joint_integration
+from sims.engines.external.external_engine import (
+    RolloutFunction,
+    integrate_batch,
+    resolve_time_step,
+)
+from sims.engines.external.mujoco_bodies import (
+    CompiledWorld,
+    MujocoBall,
+    MujocoJoint,
+    MujocoSoftBall,
+    import_mujoco,
+)
+from sims.engines.external.world_interface import (
+    MujocoJointWorldModule,
+    MujocoWorldModule,
+    find_world_module,
+)
+
+REQUIRED_PACKAGES = ("mujoco",)
+
+_CONTACT_STIFFNESS = 1e5
+"""Default stiffness of the native contact in 1/s^2: contacts then last 10 ms."""
+_MAX_THREADS = 1024
+_DEFAULT_STEP = 2e-3
+"""MuJoCo's default time step in seconds."""
+
+
+def make_engine(
+    system: type[System],
+    *,
+    time_step: float | None = None,
+    native_contact: bool = False,
+    stiffness: float | None = None,
+    threads: int = 1,
+) -> Engine:
+    """Make the MuJoCo engine for one simulator.
+
+    Args:
+        system: system that the engine will integrate.
+        time_step: longest step in seconds (2 ms with `native_contact`); each sampling interval is
+            divided into equal steps not longer than this.
+        native_contact: for a bouncing system: use MuJoCo's soft contact, a spring and a damper
+            whose damping is chosen for the restitution, stepped and read at first order
+            (`sims.engines.external.ball_integration`).
+        stiffness: with `native_contact`: stiffness of the contact in 1/s^2 (1e5: contacts of 10
+            ms).
+        threads: number of threads, each of which steps some batch elements; the results do not
+            depend on it. Use 1 if other processes use the other cores.
+
+    Returns:
+        The engine.
+
+    Raises:
+        InputError: a setting is not valid.
+    """
+    if native_contact and time_step is None:
+        time_step = _DEFAULT_STEP
+    step = resolve_time_step(time_step, system)
+    if not (isinstance(threads, int) and 1 <= threads <= _MAX_THREADS):
+        raise InputError(
+            f"threads must be a whole number from 1 to {_MAX_THREADS}, "
+            f"found {truncate_text(str(threads))}"
+        )
+    if not native_contact:
+        if stiffness is not None:
+            raise InputError(
+                "setting stiffness applies to MuJoCo's native contact only: set"
+                " native_contact = true"
+            )
+        return MujocoEngine(system, step, threads=threads)
+    if not system.bounces:
+        raise InputError(f"system {system.name} does not bounce: leave native_contact out")
+    if stiffness is not None and not 0 < stiffness < math.inf:
+        raise InputError(f"stiffness must be a positive number, found {stiffness}")
+    return MujocoEngine(system, step, stiffness or _CONTACT_STIFFNESS, threads)
+
+
+class MujocoEngine:
+    """MuJoCo engine for one system.
+
+    Batch elements are integrated one after the other, in one world for each thread.
+    """
+
+    name: str = "mujoco"
+    requires: tuple[str, ...] = REQUIRED_PACKAGES
+
+    def __init__(
+        self,
+        system: type[System],
+        largest_step: float,
+        stiffness: float | None = None,
+        threads: int = 1,
+    ) -> None:
+        """Choose how batch elements are integrated, with one world and rollout function per thread.
+
+        With `stiffness`, MuJoCo's own soft contact moves a ball. Otherwise a system that
+        bounces gets impacts at their exact times, and any other system is a body on a
+        joint. If the system has no world for MuJoCo, only the reason is stored.
+        """
+        self.largest_step = largest_step
+        self._worlds: list[CompiledWorld] = []
+        self._rollouts: list[RolloutFunction] = []
+        protocol = MujocoWorldModule if system.bounces else MujocoJointWorldModule
+        module, self._reason = find_world_module(system, "mujoco_world", protocol)
+        if module is None:
+            return
+        self._worlds = [
+            CompiledWorld(cast(MujocoWorldModule, module).model) for _ in range(threads)
+        ]
+        for world in self._worlds:
+            rollout: RolloutFunction
+            if stiffness is not None:
+                soft_ball = MujocoSoftBall(world, stiffness)
+                rollout = partial(ball_integration.integrate_native_ball, soft_ball)
+            elif system.bounces:
+                rollout = partial(ball_integration.integrate_ball, MujocoBall(world))
+            else:
+                joint = MujocoJoint(world, cast(MujocoJointWorldModule, module))
+                rollout = partial(joint_integration.integrate_joint, joint)
+            self._rollouts.append(rollout)
+
+    def integrate(self, batch: IntegrationBatch) -> Trajectories:
+        """Integrate all batch elements; see `Engine`."""
+        assert self._rollouts, "a system that the engine refuses"
+        with _suppress_warnings():
+            return integrate_batch(batch, self._rollouts, self.close)
+
+    def find_unsupported_reason(self, system: type[System]) -> str:  # noqa: ARG002
+        """Return why the engine cannot integrate the system; see `Engine`."""
+        return self._reason
+
+    def close(self) -> None:
+        """Release the MuJoCo worlds; the next integration makes new ones."""
+        for world in self._worlds:
+            world.close()
+
+
+@contextlib.contextmanager
+def _suppress_warnings() -> Iterator[None]:
+    """Suppress MuJoCo's warnings of instability, which it would write to a file.
+
+    Unstable batch elements become NaN.
+    """
+    mujoco = import_mujoco()
+    previous_handler = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(_ignore_warning)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(previous_handler)
+
+
+def _ignore_warning(message: str) -> None:
+    """Ignore a warning."""

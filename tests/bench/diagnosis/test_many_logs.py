@@ -1,0 +1,154 @@
+"""Tests of the separate explanation of many logs: a folder per log, one table, no repeated work."""
+
+import csv
+import hashlib
+import json
+
+import numpy as np
+import pytest
+
+from bench.cli.main import main
+from bench.diagnosis.many_logs import (
+    LOG_COLUMNS,
+    LogResult,
+    format_log_table,
+    summarise_causes,
+)
+from sims.core.simulator import Scenario
+from sims.recording.recording import Recording, Run
+from sims.recording.recording_writer import write_recording
+from sims.systems.slider import Slider
+from tests.local_cluster import cluster
+
+NOISE = 1e-3
+
+
+def log(folder, name, friction, seed):
+    """Write runs of a driven slider with dry friction and encoder noise; return the path."""
+    rng, times = np.random.default_rng(seed), np.arange(150) / 50.0
+    simulator = Slider(observe=["x"], effects=["friction.coulomb"])
+    runs = []
+    for number in range(3):
+        force = 3 * np.sin(3 * times + number)
+        seen = simulator.simulate(np.array([[1.4, friction]]), Scenario(times, {}, {"u": force}))
+        x = seen[0, :, 0] + NOISE * rng.standard_normal(150)
+        runs.append(Run(str(number), times, {"x": x}, {"u": force}, {}, {}, number == 2))
+    path = folder / f"{name}.csv"
+    about = Recording(path, "slider", "", {}, {"x": NOISE}, tuple(runs))
+    write_recording(path, about, Slider)
+    return path
+
+
+@pytest.fixture
+def logs(tmp_path):
+    return [log(tmp_path, f"day{k}", 0.3 + 0.1 * k, k) for k in range(3)]
+
+
+def rows_of(out):
+    with (out / "logs.csv").open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def explain(logs, out, *more):
+    return main(["explain", *map(str, logs), "--each", "--out", str(out), *more])
+
+
+@pytest.mark.slow
+def test_every_log_has_its_folder_and_its_row(logs, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert explain(logs, out, "--jobs", "2") == 0
+    rows = rows_of(out)
+    assert tuple(rows[0]) == LOG_COLUMNS
+    assert [(r["log"], r["verdict"], r["cause"]) for r in rows] == [
+        (f"day{k}", "named", "friction.coulomb") for k in range(3)
+    ]
+    for k, row in enumerate(rows):
+        assert float(row["low"]) < 0.3 + 0.1 * k < float(row["high"])
+        verdict = json.loads((out / row["log"] / "verdict.json").read_text())
+        number = verdict["causes"][0]["coefficients"]["coefficient"]
+        assert float(row["value"]) == number["value"]
+        assert (out / row["log"] / "report.html").exists()
+    said = capsys.readouterr().out
+    assert "friction.coulomb: in 3 of 3 logs, 0.3" in said
+    assert f"report  {out / 'report.html'}" in said
+    page = (out / "report.html").read_text(encoding="utf-8")
+    assert "3 logs, each explained separately" in page
+    assert page.count('<a href="day') == 3
+    environment = json.loads((out / "environment.json").read_text())
+    assert environment["settings"]["each"] is True
+    named = [(one["file"], one["sha256"]) for one in environment["recordings"]]
+    assert [name for name, _ in named] == [
+        file for k in range(3) for file in (f"day{k}.csv", f"day{k}.toml")
+    ]
+    assert named[2][1] == hashlib.sha256(logs[1].read_bytes()).hexdigest()
+
+
+@pytest.mark.slow
+def test_a_log_that_cannot_be_explained_costs_no_other_and_what_is_there_stays(logs, tmp_path):
+    out, bad = tmp_path / "out", tmp_path / "bad.csv"
+    bad.write_text("nothing\n")
+    bad.with_suffix(".toml").write_text('system = "slider"\n')
+    assert explain([*logs[:2], bad], out, "--jobs", "1") == 1
+    first = rows_of(out)
+    assert [row["verdict"] for row in first] == ["named", "named", ""]
+    assert "1 could not be explained" in (out / "report.html").read_text(encoding="utf-8")
+    assert "bad.toml" in first[2]["error"]
+    stamps = [(out / f"day{k}" / "verdict.json").stat().st_mtime_ns for k in range(2)]
+    # After the repair, only the bad log and the added log are explained.
+    log(tmp_path, "bad2", 0.5, 9)
+    bad.write_bytes((tmp_path / "bad2.csv").read_bytes())
+    bad.with_suffix(".toml").write_bytes((tmp_path / "bad2.toml").read_bytes())
+    assert explain([*logs, bad], out, "--jobs", "1") == 0
+    assert [row["log"] for row in rows_of(out)] == ["day0", "day1", "day2", "bad"]
+    page = (out / "report.html").read_text(encoding="utf-8")
+    assert "<strong>4 named</strong>" in page
+    again = [(out / f"day{k}" / "verdict.json").stat().st_mtime_ns for k in range(2)]
+    assert again == stamps
+    # A changed option (here the seed) invalidates all stored results.
+    assert explain(logs[:1], out, "--jobs", "1", "--seed", "3") == 0
+    assert (out / "day0" / "verdict.json").stat().st_mtime_ns != stamps[0]
+
+
+def test_foreign_files_are_not_changed(logs, tmp_path, capsys):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "logs.json").write_text('{"mine": 1}')
+    assert explain(logs[:1], out) == 2
+    assert "name another folder" in capsys.readouterr().err
+    assert (out / "logs.json").read_text() == '{"mine": 1}'
+    (out / "logs.json").rename(out / "mine.json")
+    assert explain(logs[:1], out) == 2
+    assert "not empty" in capsys.readouterr().err
+    assert [path.name for path in out.iterdir()] == ["mine.json"]
+
+
+def test_a_cluster_needs_many_logs(logs, tmp_path, capsys):
+    assert main(["explain", str(logs[0]), "--cluster", "tcp://127.0.0.1:1"]) == 2
+    assert "--each" in capsys.readouterr().err
+
+
+def test_names_that_look_like_formulas_are_text_and_numbers_have_their_range():
+    def cause(value):
+        number = {"value": value, "low": None, "high": None, "unit": "N"}
+        return {"effect": "force.bias@a", "alternatives": ["x"], "coefficients": {"k": number}}
+
+    rows = [
+        LogResult("=cmd()", "d", "named", (cause(1.0),)),
+        LogResult("b", "d", "named", (cause(3.5),)),
+    ]
+    assert "\n'=cmd()," in format_log_table(rows)
+    assert summarise_causes(rows) == ["force.bias@a or x: in 2 of 2 logs, k 1 to 3.5 N"]
+
+
+@pytest.mark.slow
+def test_a_cluster_finds_what_this_machine_finds(logs, tmp_path):
+    here, there = tmp_path / "here", tmp_path / "there"
+    assert explain(logs[:2], here, "--jobs", "1") == 0
+    with cluster(tmp_path) as running:
+        assert explain(logs[:2], there, "--cluster", running.address) == 0
+    untimed = [
+        [{k: v for k, v in row.items() if k != "seconds"} for row in rows_of(out)]
+        for out in (here, there)
+    ]
+    assert untimed[0] == untimed[1]
+    assert (there / "day1" / "report.html").exists()
