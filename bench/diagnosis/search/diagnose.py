@@ -29,6 +29,7 @@ from bench.diagnosis.search.refine_candidates import (
     list_competing_models,
     refine_best_model,
     search_with_subsampling,
+    select_decisive,
 )
 from bench.diagnosis.search.verdict_rules import (
     DiagnosisState,
@@ -326,7 +327,7 @@ def _validate_on_held_out(
     parts = [m for m in models if set(m.effects) < names]
     singles = [m for m in models if len(m.effects) == 1]
     singles.sort(key=lambda m: -m.penalised_log_likelihood)
-    competing_models = list_competing_models(search, model)
+    competing_models = select_decisive(search, model, list_competing_models(search, model))
     validation = HeldOutValidation(held_out)
     # All models are evaluated together, so that initial states start from those of the nearest
     # model.

@@ -9,6 +9,8 @@ all samples only if these show more than the thinned runs did.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from bench.diagnosis.evaluation.noise_model import NoiseModel
@@ -55,9 +57,11 @@ def refine_best_model(search: EffectSearch, model: FittedModel) -> FittedModel:
     # Periodic effects have dozens of local minima.
     if neighbour_starts:
         search.refit_from_segments(size)
-    competing_models = list_competing_models(search, model)
     submodels = list_submodels(search, model)
     noise = _estimate_model_noise(search, model)
+    competing_models = list_competing_models(search, model)
+    if noise is None:
+        competing_models = select_decisive(search, model, competing_models)
     compared_models = [model]
     # With structure in the residual, merit only compares how well models mimic it, so no competing
     # model replaces the model.
@@ -137,6 +141,25 @@ def list_competing_models(search: EffectSearch, model: FittedModel) -> list[Fitt
     ]
 
 
+def select_decisive(
+    search: EffectSearch, model: FittedModel, competing_models: Sequence[FittedModel]
+) -> list[FittedModel]:
+    """Return the competing models whose comparison with a model can change the answer.
+
+    Far from the noise, no competing model replaces the model. They only show what may stand in
+    place of one of its effects, so those that differ in several effects are left out.
+
+    Args:
+        search: the search, with all fitted models.
+        model: the model to compare with.
+        competing_models: models with as many effects, from `list_competing_models`.
+    """
+    if search.compute_excess_residual(model) < FAR_EXCESS:
+        return list(competing_models)
+    names = set(model.effects)
+    return [m for m in competing_models if len(names - set(m.effects)) <= 1]
+
+
 def _is_competitive(search: EffectSearch, other_model: FittedModel, model: FittedModel) -> bool:
     """Return whether two models are close in merit or in excess residual.
 
@@ -211,8 +234,9 @@ def _search_subsampled(search: EffectSearch, thinned_runs: RunEvaluator) -> Fitt
 
     If all samples show more effects than the thinned runs did, the search is repeated on them.
     """
-    # If the scores of the base model, which all merits need anyway, show nothing, no search is
-    # needed.
+    # All merits on all samples need the scores of the base model.
+    search.score_missing_effects(search.base_model)
+    # If they show nothing, no search is needed.
     if search.is_complete(search.base_model, MAX_P_VALUE_FIRST_EFFECT):
         return search.run()
     rng = search.make_rng("fewer samples")
@@ -259,9 +283,10 @@ def _collect_full_fit_starts(
     They are the result, models that explain the data nearly as well, models without one of its
     effects, and the best models of a single effect.
     """
+    competing_models = list_competing_models(subsampled_search, subsampled_model)
     selected_models = [
         subsampled_model,
-        *list_competing_models(subsampled_search, subsampled_model),
+        *select_decisive(subsampled_search, subsampled_model, competing_models),
         *list_submodels(subsampled_search, subsampled_model),
     ]
     selected_models += [

@@ -422,8 +422,10 @@ class ScoredModelSet(ModelSet):
             model: the model.
             p_value_threshold: p-value threshold of the scores.
         """
-        return self.score_missing_effects(model).p_value > p_value_threshold and self.is_noise_like(
-            model
+        # The residual is tested first, because scores need thousands of simulations.
+        return (
+            self.is_noise_like(model)
+            and self.score_missing_effects(model).p_value > p_value_threshold
         )
 
     def is_noise_like(self, model: FittedModel) -> bool:

@@ -7,10 +7,12 @@ import pytest
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.search import refine_candidates as settling
 from bench.diagnosis.search.refine_candidates import (
+    FAR_EXCESS,
     MAX_COMPETITOR_DISTANCE,
     MAX_COMPETITOR_EXCESS_RATIO,
     list_competing_models,
     refine_best_model,
+    select_decisive,
 )
 from tests.bench.diagnosis.search.search_models import model, search_of
 
@@ -86,3 +88,11 @@ def test_a_competitor_of_a_pair_also_starts_from_the_shared_effects(monkeypatch)
     of_rival = [s.theta.tolist() for s in begun if s.effects == ("a", "c")]
     assert of_rival == [[1.1, 2.2, 0.0, 4.0], [1.0, 2.0, 0.0, 4.0]]
     assert len([s for s in begun if s.effects == ("a", "b")]) == 1
+
+
+@pytest.mark.parametrize(("excess", "count"), [(FAR_EXCESS, 2), (0.9 * FAR_EXCESS, 3)])
+def test_far_from_noise_only_competitors_of_one_effect_decide(excess, count):
+    best, neighbour, other = model("a", "b"), model("b", "c"), model("c", "d")
+    search = search_of(best, neighbour, other, excess={m.effects: excess for m in (best,)})
+    found = select_decisive(search, best, [best, neighbour, other])
+    assert found == [best, neighbour, other][:count]
