@@ -40,7 +40,7 @@ from bench.benchmark.storage.table_schemas import (
 from bench.core.options import with_options
 from bench.diagnosis_benchmark import table_columns as diagnosis
 from bench.diagnosis_benchmark.diagnosers import language_model
-from bench.figures.figure_files import pdf_figures
+from bench.figures.figure_settings import pdf_figures
 from bench.misspecification.calibration import MODEL_LABELS
 from bench.studies import study
 from sims.core.argument_checks import Expected, check_arguments

@@ -20,7 +20,8 @@ from bench.benchmark.problem.fisher_information import STIFF_SIGMA_THRESHOLD
 from bench.benchmark.statistics.training_amortisation import TARGETS_PER_TRAINING
 from bench.benchmark.statistics.tuner_ranking import BEST, EQUAL, SIGNIFICANCE
 from bench.benchmark.storage.run_status import FAILED_OR_SKIPPED_STATUSES, FAILED_STATUSES
-from bench.figures.style import TRUSTED_TUNERS_NOTE, FigureFiles
+from bench.figures.figure_output import FigureFiles
+from bench.figures.style import TRUSTED_TUNERS_NOTE
 from bench.pages.chart import PrintedFigure
 from bench.pages.html_page import HtmlPage
 from bench.pages.text_format import format_number, joined

@@ -30,12 +30,8 @@ from bench.benchmark.storage.result_folder import (
 )
 from bench.benchmark.storage.run_journal import SEGMENTS_FOLDER, read_plan
 from bench.benchmark.storage.run_status import FAILED_OR_SKIPPED_STATUSES
-from bench.figures.style import (
-    TRUSTED_TUNERS_NOTE,
-    FigureFiles,
-    render_all_formats,
-    write_figure_files,
-)
+from bench.figures.figure_output import FigureFiles, render_all_formats, write_figure_files
+from bench.figures.style import TRUSTED_TUNERS_NOTE
 from sims.core.files import write_atomically
 
 REQUIRED_RUN_COLUMNS = (

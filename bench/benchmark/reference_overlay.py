@@ -17,7 +17,7 @@ from bench.benchmark.comparison_report import REQUIRED_RUN_COLUMNS
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.benchmark.storage.reference_results import ReferenceResult
 from bench.benchmark.storage.result_folder import read_comparison
-from bench.figures.style import write_figure
+from bench.figures.figure_output import write_figure
 from sims.core.simulator import InputError
 
 

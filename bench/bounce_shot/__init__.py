@@ -2,6 +2,6 @@
 
 The shot is executed in another simulator, the true world. `shot_config` reads the experiment's
 [shot] table, `shot_sampling` draws balls, scenes and release errors and records the drops,
-`shot_planning` converts a recording to models and plans without knowing the ball, `shot_execution`
+`tuned_shots` converts a recording to models and plans without knowing the ball, `shot_execution`
 executes the shots, `shot_study` runs all steps, `hit_rate_table` and `shot_figures` report them.
 """

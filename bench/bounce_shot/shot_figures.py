@@ -22,6 +22,7 @@ from bench.bounce_shot.tuned_shots import (
     UNTUNED_METHOD,
     TunedModel,
 )
+from bench.figures.figure_output import FigureFiles, render_all_formats
 from bench.figures.style import (
     BLACK,
     BLUE,
@@ -29,10 +30,8 @@ from bench.figures.style import (
     GREY,
     INCLINE_GREY,
     VERMILION,
-    FigureFiles,
     add_trust_note,
     make_panel_grid,
-    render_all_formats,
 )
 from bench.pages.chart_figure import draw_chart
 from sims.core.simulator import Array

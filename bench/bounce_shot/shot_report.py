@@ -26,8 +26,8 @@ from bench.bounce_shot.shot_config import ShotConfig
 from bench.bounce_shot.shot_execution import read_shot
 from bench.bounce_shot.shot_figures import draw_figures, select_example_shots
 from bench.bounce_shot.shot_sampling import ShotSetup
-from bench.figures import style
-from bench.figures.style import FigureFiles
+from bench.figures import figure_output
+from bench.figures.figure_output import FigureFiles
 from bench.pages.chart import PrintedFigure
 from bench.pages.html_page import HtmlPage
 from sims.core.files import write_atomically
@@ -142,7 +142,7 @@ def write_report(study: ReportableShotStudy, print_line: Callable[[str], None]) 
         write_atomically(folder / f"{name}.csv", frame.to_csv(index=False, float_format="%.6g"))
     pictures = draw_figures(study.experiment, study.config, study.shots, stored, rows, lines)
     figures = [
-        style.write_figure_files(folder / "figures" / name, picture.png, picture.pdf)[0]
+        figure_output.write_figure_files(folder / "figures" / name, picture.png, picture.pdf)[0]
         for name, picture in pictures.items()
     ]
     write_atomically(

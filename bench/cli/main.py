@@ -233,7 +233,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         printer.print_error("usage", str(error), EXIT_ERROR)
         sys.exit(EXIT_ERROR)
     # These imports come after the parser, so that `--help` is fast.
-    from bench.figures.figure_files import mark_as_command, pdf_figures
+    from bench.figures.figure_settings import mark_as_command, pdf_figures
     from sims.core.freed_memory import keep_freed_memory
     from sims.core.simulator import InputError
 

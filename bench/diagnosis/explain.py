@@ -38,8 +38,8 @@ from bench.diagnosis.fitting.base_fit import (
     fit_wider,
     use_bounds,
 )
-from bench.diagnosis.fitting.fit_state import FitStart
-from bench.diagnosis.fitting.model_set import MAX_ITERATIONS
+from bench.diagnosis.fitting.fitted_models import MAX_ITERATIONS
+from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
 from bench.diagnosis.friction_form_verdict import has_dry_friction, is_likelier_soft, make_soft_kind
 from bench.diagnosis.identifiability import freeze_unidentified_parameters
@@ -446,8 +446,8 @@ class _ExplainRun:
         if not self.kind.has_model:
             return _SearchResult(base, search, self._find_causes(search), rng)
         # This import is needed for robots only.
+        from bench.diagnosis.prediction_error.dry_friction_fits import SoftFrictionError
         from bench.diagnosis.prediction_error.prediction_error_search import PredictionErrorSearch
-        from bench.diagnosis.prediction_error.selection_fits import SoftFrictionError
 
         stiff_evaluators = _RunEvaluators(self.kind, self.fitting, self.validation)
         try:
@@ -784,7 +784,7 @@ class _ExplainRun:
         """Return the runs, filtered with base parameters from a prediction-error fit."""
         # These imports are needed for robots only.
         from bench.diagnosis.kalman.likelihood_fit import identify_base
-        from bench.diagnosis.prediction_error.incomplete_model import is_long
+        from bench.diagnosis.prediction_error.identification_without_simulation import is_long
 
         evaluator = self.fitting
         declared_bounds = {p.name: p.bounds for p in evaluator.parameters}

@@ -16,13 +16,18 @@ from bench.diagnosis.extended_robot_files import (
 from bench.diagnosis.randomization_ranges import RandomizationRanges, list_randomization_ranges
 from bench.diagnosis.report import explanation_figures
 from bench.diagnosis.report.consistency_section import AGREEMENT_COLUMNS, build_consistency_rows
+from bench.diagnosis.report.effect_and_unit_text import (
+    format_fitted_value,
+    format_percent,
+    joined,
+    sanitise,
+)
 from bench.diagnosis.report.explanation_page import render_report
 from bench.diagnosis.report.report_data import DiagnosisReportData
 from bench.diagnosis.report.summary_text import format_early_stop, format_interval, has_gap_closed
-from bench.diagnosis.report.wording import format_fitted_value, format_percent, joined, sanitise
 from bench.diagnosis.search.verdict_rules import VerdictName
 from bench.diagnosis.verdict import Cause, Verdict
-from bench.figures.figure_files import pdf_figures
+from bench.figures.figure_settings import pdf_figures
 from bench.pages.html_page import make_iframe
 from bench.pages.text_format import format_csv
 from sims import extended_simulator as extending

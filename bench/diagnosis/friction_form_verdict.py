@@ -14,8 +14,8 @@ from typing import Any
 
 from bench.core.random_streams import make_rng
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.diagnosis.fitting.fit_state import FitStart
-from bench.diagnosis.fitting.model_set import FittedModel, ModelSet
+from bench.diagnosis.fitting.fitted_models import FittedModel, ModelSet
+from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
 from sims.core.effect import Effect, Friction, members_of
 from sims.core.simulator import Array
 from sims.system_simulator import SystemSimulator

@@ -28,7 +28,7 @@ import numpy as np
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.base_fit import FINAL_ITERATIONS, BaseFit
-from bench.diagnosis.fitting.fit_state import TrajectoryFit
+from bench.diagnosis.fitting.levenberg_marquardt_state import TrajectoryFit
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter, compute_state_prior
 from bench.diagnosis.search.candidate_directions import DirectionSet, compute_directions
 from bench.diagnosis.search.diagnose import find_unidentified_parameters

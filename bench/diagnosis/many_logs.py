@@ -21,8 +21,8 @@ import pandas as pd
 
 from bench.benchmark.runner.worker_pools import Pool
 from bench.diagnosis.explain import explain
-from bench.diagnosis.report.wording import append_unit, format_label
-from bench.figures.figure_files import is_pdf_wanted
+from bench.diagnosis.report.effect_and_unit_text import append_unit, format_label
+from bench.figures.figure_settings import is_pdf_wanted
 from bench.logs.joined_recordings import make_log_names
 from bench.logs.recording_loading import compute_recording_digest, read_content
 from bench.pages.text_format import format_csv

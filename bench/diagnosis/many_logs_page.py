@@ -13,14 +13,14 @@ import pandas as pd
 
 from bench.diagnosis import many_logs
 from bench.diagnosis.many_logs import LOGS_TABLE_FILE, LogResult, format_cause
-from bench.diagnosis.report.wording import (
+from bench.diagnosis.report.effect_and_unit_text import (
     append_unit,
     format_effect_name,
     format_number,
     format_sentence,
     joined,
 )
-from bench.figures import style
+from bench.figures import figure_output, style
 from bench.figures.style import add_caption
 from bench.figures.text_layout import break_name
 from bench.pages.chart import Axis, Panel, PrintedFigure, ReferenceLine, Series
@@ -222,8 +222,8 @@ def make_summary_charts(logs: pd.DataFrame, numbers: pd.DataFrame) -> SummaryCha
     """Make the charts of the page.
 
     Args:
-        logs: Table of `run_batch.build_log_table`.
-        numbers: Table of `run_batch.build_number_table`.
+        logs: Table of `many_logs.build_log_table`.
+        numbers: Table of `many_logs.build_number_table`.
     """
     across = _make_log_axis(logs)
     # Named logs have the positions 0, 1, 2, ... on their axis.
@@ -310,5 +310,5 @@ def _make_printed_figure(
     """Render the printed version of a chart; None without panels."""
     if not panels:
         return None
-    files = style.render_all_formats(draw_summary_figure(panels, tables, caption))
+    files = figure_output.render_all_formats(draw_summary_figure(panels, tables, caption))
     return PrintedFigure(files.svg, files.pdf, alternative, name)

@@ -11,6 +11,7 @@ from bench.diagnosis import residual_analysis
 from bench.diagnosis.fitting.base_fit import BaseFit
 from bench.diagnosis.identifiability import ParameterIdentifiability, assess_identifiability
 from bench.diagnosis.report.cause_text import format_effect_set
+from bench.diagnosis.report.effect_and_unit_text import END, format_file_change
 from bench.diagnosis.report.report_data import (
     ChannelInfo,
     DataSplit,
@@ -18,7 +19,6 @@ from bench.diagnosis.report.report_data import (
     GapLocation,
     ParameterChange,
 )
-from bench.diagnosis.report.wording import END, format_file_change
 from bench.diagnosis.search.diagnose import DiagnosisResult
 from bench.diagnosis.search.effect_search import EffectSearch
 from bench.diagnosis.search.verdict_rules import STRUCTURE_P_VALUE_THRESHOLD

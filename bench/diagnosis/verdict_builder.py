@@ -22,7 +22,7 @@ from bench.diagnosis.experiment_design.discriminating_run import (
     DiscriminatingRun,
     propose_discriminating_run,
 )
-from bench.diagnosis.fitting.model_set import EffectNames, FittedModel
+from bench.diagnosis.fitting.fitted_models import EffectNames, FittedModel
 from bench.diagnosis.friction_form_verdict import add_solver_parameters, get_friction_form
 from bench.diagnosis.search import verdict_rules
 from bench.diagnosis.search.alternative_causes import CauseEvidence

@@ -28,7 +28,8 @@ from bench.diagnosis_benchmark.result_tables import (
 )
 from bench.diagnosis_benchmark.training_costs import read_training_costs
 from bench.diagnosis_benchmark.wrong_answers import build_failure_table
-from bench.figures.style import FigureFiles, add_trust_note, render_all_formats, write_figure_files
+from bench.figures.figure_output import FigureFiles, render_all_formats, write_figure_files
+from bench.figures.style import add_trust_note
 from sims.core.files import write_atomically
 
 ANSWERS_TABLE_FILE = "items.csv"

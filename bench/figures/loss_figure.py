@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bench.figures.style import BLUE, ORANGE, make_panel_grid, write_figure
+from bench.figures.figure_output import write_figure
+from bench.figures.style import BLUE, ORANGE, make_panel_grid
 from sims.core.simulator import Array
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from typing import Any
 
 import matplotlib.artist
 
-from bench.figures.figure_files import is_command
+from bench.figures.figure_settings import is_command
 
 
 @contextmanager

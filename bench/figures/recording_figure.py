@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from bench.figures.figure_output import render_png_and_pdf, write_figure
 from bench.figures.style import (
     BLUE,
     HELD_OUT_GREY,
@@ -15,8 +16,6 @@ from bench.figures.style import (
     RUN_SEPARATOR_GREY,
     RUST,
     make_panel_grid,
-    render_png_and_pdf,
-    write_figure,
 )
 from bench.logs.ball_heights import BallHeights
 from bench.logs.signal_statistics import list_recorded_signals

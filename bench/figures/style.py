@@ -1,4 +1,4 @@
-"""Style and output of all figures: palette, markers, canvas, legend, files.
+"""Style of all figures: palette, markers, canvas, panels, legend, caption.
 
 The style is made for print: every tuner has its own marker and line style in addition to its
 colour, and colours differ in lightness. No figure is made by pyplot, so that a notebook's backend,
@@ -7,18 +7,11 @@ settings and open figures are unchanged.
 
 from __future__ import annotations
 
-import re
 import textwrap
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from io import BytesIO
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from bench.benchmark.statistics.error_floor import ERROR_FLOOR
-from bench.figures.figure_files import encode_png, is_pdf_wanted
-from sims.core.files import write_all_atomically
-from sims.core.simulator import InputError
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -104,9 +97,6 @@ _LINES = (
     (0, (8, 2)),
 )
 
-_LONG_NUMBER_PATTERN = re.compile(rb"\b[1-9]\d*\.\d{3,}\b")
-"""Pattern of a number in an SVG file with needless digits; numbers below 1 are scales."""
-
 _DASHES: dict[Any, tuple[float, ...]] = {"-": (), "--": (3.7, 1.6), "-.": (6.4, 1.6, 1.0, 1.6)}
 """Dashes of Matplotlib's named line styles, in line widths."""
 
@@ -129,9 +119,6 @@ def get_line_style(place: int) -> Any:
     """Return the line style of the tuner or diagnoser at this index."""
     return _LINES[place % len(_LINES)]
 
-
-DPI = 160
-"""Resolution of the PNG files in dots per inch."""
 
 MEDIAN_LINE_CAPTION = (
     "Line: median over targets of the recommendation's error (mean over seeds). "
@@ -412,140 +399,3 @@ def add_trust_note(figure: Figure, trusted: bool) -> Figure:
             figure, f"{TRUSTED_TUNERS_NOTE.capitalize()}. {figure.get_supxlabel()}", letters=17
         )
     return figure
-
-
-def render_png(figure: Figure, dpi: int = DPI) -> bytes:
-    """Render a figure as the bytes of a PNG file."""
-    file = _Pixels()
-    figure.savefig(file, format="rgba", dpi=dpi)
-    return encode_png(file.getbuffer(), *file.shape, dpi=dpi)
-
-
-class _Pixels(BytesIO):
-    """The pixels of a figure as Matplotlib's renderer writes them.
-
-    Attributes:
-        shape: Height and width as rounded by the renderer.
-    """
-
-    shape: tuple[int, int] = (0, 0)
-
-    def write(self, pixels: Any) -> int:
-        """Store the pixels (H, W, 4), which are written in one call."""
-        height, width, _ = memoryview(pixels).shape or (0, 0, 0)
-        self.shape = height, width
-        return super().write(pixels)
-
-
-def render_pdf(figure: Figure) -> bytes:
-    """Render a figure as the bytes of a PDF file."""
-    file = BytesIO()
-    # Without a date the file is identical whenever it is made.
-    figure.savefig(file, format="pdf", metadata={"CreationDate": None})
-    return file.getvalue()
-
-
-def render_svg(figure: Figure) -> bytes:
-    """Render a figure as the bytes of an SVG file."""
-    from matplotlib import rc_context
-
-    file = BytesIO()
-    # Without a date and random names the file is identical whenever it is made.
-    with rc_context({"svg.hashsalt": "simgap"}):
-        figure.savefig(file, format="svg", metadata={"Date": None})
-    # A hundredth of a point is finer than any printer's resolution; longer numbers would double the
-    # size.
-    return _LONG_NUMBER_PATTERN.sub(
-        lambda match: f"{float(match[0]):.2f}".encode(), file.getvalue()
-    )
-
-
-def render_png_and_pdf(figure: Figure, dpi: int = DPI) -> tuple[bytes, bytes | None]:
-    """Render a figure as PNG, and as PDF if requested (`bench.figures.figure_files`).
-
-    Returns:
-        The bytes of the PNG file, and those of the PDF file or None.
-    """
-    with _lay_out_once(figure, dpi):
-        return render_png(figure, dpi), _render_pdf_if_wanted(figure)
-
-
-def render_all_formats(figure: Figure, dpi: int = DPI) -> FigureFiles:
-    """Render a figure as PNG, as SVG for a page, and as PDF if requested."""
-    with _lay_out_once(figure, dpi):
-        return FigureFiles(
-            render_png(figure, dpi), render_svg(figure), _render_pdf_if_wanted(figure)
-        )
-
-
-class FigureFiles(NamedTuple):
-    """One figure as the bytes of its files; `render_pdf` is None if no PDF is requested."""
-
-    png: bytes
-    svg: bytes
-    pdf: bytes | None = None
-
-
-def _render_pdf_if_wanted(figure: Figure) -> bytes | None:
-    return render_pdf(figure) if is_pdf_wanted() else None
-
-
-@contextmanager
-def _lay_out_once(figure: Figure, dpi: int) -> Iterator[None]:
-    """Compute the layout of a figure once for all files that are written in the `with` block."""
-    engine, screen = figure.get_layout_engine(), figure.dpi
-    try:
-        if engine is not None:
-            # savefig would draw the figure once more for the layout of each file.
-            figure.set_dpi(dpi)
-            engine.execute(figure)
-            figure.set_dpi(screen)
-            figure.set_layout_engine(None)
-        yield
-    finally:
-        figure.set_dpi(screen)
-        figure.set_layout_engine(engine)
-
-
-def write_figure(figure: Figure, path: Path, dpi: int = DPI) -> list[Path]:
-    """Write a figure as PNG, and as PDF if requested: all files or none.
-
-    Missing folders are made.
-
-    Args:
-        figure: Figure to write.
-        path: Path of the files without file extension.
-        dpi: Resolution of the PNG in dots per inch.
-
-    Returns:
-        Paths of the files, the PNG first.
-
-    Raises:
-        InputError: The folder cannot be made or written to.
-    """
-    return write_figure_files(path, *render_png_and_pdf(figure, dpi))
-
-
-def write_figure_files(path: Path, as_png: bytes, as_pdf: bytes | None) -> list[Path]:
-    """Write a figure's files, all or none.
-
-    Args:
-        path: Path of the files without file extension.
-        as_png: Content of the PNG file.
-        as_pdf: Content of the PDF file; None for no such file.
-
-    Returns:
-        Paths of the files, the PNG first.
-
-    Raises:
-        InputError: The folder cannot be made or written to.
-    """
-    contents = {path.with_name(f"{path.name}.png"): as_png}
-    if as_pdf is not None:
-        contents[path.with_name(f"{path.name}.pdf")] = as_pdf
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_all_atomically(contents)
-    except OSError as error:
-        raise InputError(f"{path.parent}: cannot be written ({error.strerror})") from None
-    return list(contents)

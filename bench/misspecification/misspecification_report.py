@@ -23,6 +23,7 @@ from bench.benchmark.storage.result_folder import (
     read_configuration,
 )
 from bench.benchmark.storage.run_status import FAILED_OR_SKIPPED_STATUSES
+from bench.figures.figure_output import write_figure
 from bench.figures.style import (
     BLUE,
     VERMILION,
@@ -32,7 +33,6 @@ from bench.figures.style import (
     add_trust_note,
     make_panel_grid,
     style_axis,
-    write_figure,
 )
 from bench.misspecification import misspecification_scores
 from bench.misspecification.calibration import EXTENDED, MODEL_LABELS, PLAIN

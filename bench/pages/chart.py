@@ -12,7 +12,8 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any, Literal
 
-from bench.figures.style import FigureFiles, MarkStyle
+from bench.figures.figure_output import FigureFiles
+from bench.figures.style import MarkStyle
 
 Scale = Literal["linear", "log", "symlog"]
 """Scale of an axis; symlog is linear from 0 to 1 and logarithmic above."""

@@ -14,7 +14,8 @@ from bench.benchmark.comparison_page import SIGNIFICANCE_LEVEL
 from bench.benchmark.problem.experiment import Experiment
 from bench.benchmark.statistics.comparison_statistics import ComparisonStatistics
 from bench.benchmark.statistics.error_curves import select_checkpoints
-from bench.figures.style import PANEL_TITLES, FigureFiles, MarkStyle, get_mark_style
+from bench.figures.figure_output import FigureFiles
+from bench.figures.style import PANEL_TITLES, MarkStyle, get_mark_style
 from bench.pages.chart import Axis, Panel, PrintedFigure, Series
 from bench.pages.html_page import HtmlPage
 from sims.core.simulator import Array

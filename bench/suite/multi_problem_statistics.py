@@ -28,14 +28,8 @@ from bench.benchmark.statistics.tuner_ranking import (
     compute_problem_ranks,
 )
 from bench.benchmark.storage.result_folder import read_comparison
-from bench.figures.style import (
-    FigureFiles,
-    TunerStyles,
-    add_trust_note,
-    finish_figure,
-    render_all_formats,
-    write_figure_files,
-)
+from bench.figures.figure_output import FigureFiles, render_all_formats, write_figure_files
+from bench.figures.style import TunerStyles, add_trust_note, finish_figure
 from bench.pages.chart_figure import draw_chart
 from bench.suite.multi_problem_page import (
     MultiProblemPageData,

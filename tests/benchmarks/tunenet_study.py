@@ -19,15 +19,8 @@ from bench.benchmark.problem.experiment import load_experiment
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.benchmark.runner.tuner_loop import ProposalEvaluator, drive_tuner
 from bench.core.random_streams import make_rng
-from bench.figures.style import (
-    BLACK,
-    BLUE,
-    CONNECTOR_GREY,
-    ORANGE,
-    VERMILION,
-    make_panel_grid,
-    write_figure,
-)
+from bench.figures.figure_output import write_figure
+from bench.figures.style import BLACK, BLUE, CONNECTOR_GREY, ORANGE, VERMILION, make_panel_grid
 from methods.learning.input_features import FeatureConfig
 from methods.learning.pair_network import PUBLISHED_DESIGN, PairNetworkDesign
 from methods.learning.pair_tuner import PairTuner, TrainedPairNetwork

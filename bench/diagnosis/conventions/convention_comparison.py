@@ -40,18 +40,18 @@ from bench.diagnosis.evaluation.coefficient_bounds import get_bounds_by_index
 from bench.diagnosis.evaluation.noise_floor import compute_noise_floor
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.diagnosis.fitting.fit_state import TrajectoryFit
+from bench.diagnosis.fitting.levenberg_marquardt_state import TrajectoryFit
 from bench.diagnosis.friction_form_verdict import make_soft_kind
 from bench.diagnosis.identifiability import join_first_names
 from bench.diagnosis.kalman.candidate_responses import MAX_LINEARISATIONS, FollowedRuns
 from bench.diagnosis.kalman.likelihood_fit import maximise_innovation_likelihood
 from bench.diagnosis.kalman.measured_states import compute_joint_forces, has_joint_forces
-from bench.diagnosis.prediction_error.library_columns import group_coefficients
-from bench.diagnosis.prediction_error.model_filters import (
+from bench.diagnosis.prediction_error.filters_with_effects import (
     GAUSS_NEWTON_STEPS,
     MANY_SHAPES,
     make_soft_friction_models,
 )
+from bench.diagnosis.prediction_error.regression_columns import group_coefficients
 from bench.diagnosis.prediction_error.regression_selection import identify
 from bench.diagnosis.search.candidate_directions import iterate_first_probes
 from bench.diagnosis.search.lack_of_fit import list_hat_effects

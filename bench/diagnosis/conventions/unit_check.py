@@ -35,7 +35,7 @@ from bench.diagnosis.fitting.base_fit import (
     compute_lowest_start_cost,
     fit_base_model,
 )
-from bench.diagnosis.fitting.fit_state import TrajectoryFit
+from bench.diagnosis.fitting.levenberg_marquardt_state import TrajectoryFit
 from bench.diagnosis.identifiability import join_first_names
 from bench.diagnosis.verdict import Cause, RecordingFault
 from sims.core.simulator import Array, InputError

@@ -15,7 +15,7 @@ from bench.diagnosis.datasheet.detection_limits import compute_detection_limits
 from bench.diagnosis.datasheet.drive_diagram import DriveDiagram
 from bench.diagnosis.datasheet.mjcf_class import CLASS_FILE, MjcfFiles, build_mjcf
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.diagnosis.report.wording import (
+from bench.diagnosis.report.effect_and_unit_text import (
     append_unit,
     format_fitted_value,
     format_number,

@@ -17,7 +17,7 @@ from bench.diagnosis.datasheet.datasheet_subject import (
 )
 from bench.diagnosis.datasheet.detection_limits import DetectionLimit, DetectionLimits
 from bench.diagnosis.datasheet.drive_diagram import DriveDiagram, compute_drive_diagram
-from bench.diagnosis.report.wording import (
+from bench.diagnosis.report.effect_and_unit_text import (
     append_unit,
     format_effect_name,
     format_fitted_value,

@@ -21,7 +21,7 @@ from bench.diagnosis.datasheet.datasheet_content import (
     title,
 )
 from bench.diagnosis.datasheet.drive_diagram import DriveDiagram
-from bench.diagnosis.report.wording import (
+from bench.diagnosis.report.effect_and_unit_text import (
     append_unit,
     format_fitted_value,
     format_number,
@@ -29,8 +29,8 @@ from bench.diagnosis.report.wording import (
     format_unit,
     sanitise,
 )
-from bench.figures import style
-from bench.figures.figure_files import is_pdf_wanted
+from bench.figures import figure_output, style
+from bench.figures.figure_settings import is_pdf_wanted
 from bench.figures.text_layout import POINTS, measure_text_width
 
 if TYPE_CHECKING:
@@ -74,7 +74,8 @@ def render_diagram(diagram: DriveDiagram) -> tuple[bytes, bytes | None]:
     with _apply_sheet_style():
         figure, axes = style.make_panel_grid(1, 1, (5.4, 4.6))
         draw_diagram(axes[0, 0], diagram)
-        return style.render_svg(figure), style.render_pdf(figure) if is_pdf_wanted() else None
+        pdf = figure_output.render_pdf(figure) if is_pdf_wanted() else None
+        return figure_output.render_svg(figure), pdf
 
 
 def draw_diagram(axes: Axes, diagram: DriveDiagram) -> None:
@@ -127,7 +128,7 @@ def draw_diagram(axes: Axes, diagram: DriveDiagram) -> None:
 def render_pdf(content: SheetContent) -> bytes:
     """Render the sheet as a PDF of one page."""
     with _apply_sheet_style():
-        return style.render_pdf(draw_sheet(content))
+        return figure_output.render_pdf(draw_sheet(content))
 
 
 def draw_sheet(content: SheetContent) -> Figure:

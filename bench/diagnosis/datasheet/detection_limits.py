@@ -31,9 +31,9 @@ from bench.core.random_streams import make_rng
 from bench.diagnosis.evaluation.noise_floor import compute_noise_floor
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.diagnosis.fitting.fit_state import FitStart, TrajectoryFit
-from bench.diagnosis.fitting.gauss_newton import compute_schur_complement
-from bench.diagnosis.fitting.model_set import ModelSet
+from bench.diagnosis.fitting.fitted_models import ModelSet
+from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart, TrajectoryFit
+from bench.diagnosis.fitting.levenberg_marquardt_step import compute_schur_complement
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
 from bench.diagnosis.identifiability import CONFOUNDING_CORRELATION, MIN_DETECTABLE_LIMIT_SIGMAS
 from bench.diagnosis.score_extended import build_theta

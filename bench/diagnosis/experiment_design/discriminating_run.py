@@ -27,7 +27,7 @@ from bench.diagnosis.experiment_design.candidate_runs import (
     StatedLimits,
     read_model_file_limits,
 )
-from bench.diagnosis.fitting.model_set import FittedModel, ModelSet
+from bench.diagnosis.fitting.fitted_models import FittedModel, ModelSet
 from sims.core.simulator import Array, Scenario
 
 MIN_DISCRIMINATION_SIGMAS = 2.0

@@ -20,7 +20,7 @@ from bench.diagnosis.experiment_design.information_gain import (
     RunValue,
     get_sort_key,
 )
-from bench.diagnosis.fitting.model_set import FittedModel, ModelSet
+from bench.diagnosis.fitting.fitted_models import FittedModel, ModelSet
 from sims.core.simulator import Array
 
 MAX_VARIATION_ROUNDS = 2

@@ -22,7 +22,7 @@ from bench.diagnosis.experiment_design.candidate_runs import (
     Interval,
     read_model_file_limits,
 )
-from bench.diagnosis.fitting.model_set import FittedModel
+from bench.diagnosis.fitting.fitted_models import FittedModel
 from bench.logs.quality.pose_check import find_contacts
 from sims.core.simulator import Array, Scenario
 

@@ -22,7 +22,7 @@ from bench.core.random_streams import make_rng
 from bench.diagnosis.evaluation.coefficient_bounds import MAX_RANGE_FACTOR_MODEL_FILE, bound_of
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.diagnosis.fitting.fit_state import FitStart, TrajectoryFit
+from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart, TrajectoryFit
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
 from sims.core.simulator import Array, Parameter
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.diagnosis.fitting.gauss_newton import is_finite_response
+from bench.diagnosis.fitting.levenberg_marquardt_step import is_finite_response
 from sims.core.simulator import Array
 from sims.robot.dynamics.linearisation_about_simulation import RunLinearisation
 from sims.robot.dynamics.series_joints import is_series_effect

@@ -1,9 +1,9 @@
 """Least-squares fit of trajectories with shared parameters and initial states of each run.
 
 Levenberg-Marquardt for many models at once, so that one engine call serves all of them. A single
-step of one model is in `gauss_newton`. AR(1) noise is whitened first (`noise_model`), so the fit is
-a generalised least-squares fit. Parallel fits share their best cost between rounds, and those that
-fall far behind are stopped.
+step of one model is in `levenberg_marquardt_step`. AR(1) noise is whitened first (`noise_model`),
+so the fit is a generalised least-squares fit. Parallel fits share their best cost between rounds,
+and those that fall far behind are stopped.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ import numpy as np
 from bench.diagnosis.evaluation.coefficient_bounds import get_bounds_by_index
 from bench.diagnosis.evaluation.noise_model import Mask, NoiseModel, whiten
 from bench.diagnosis.evaluation.run_evaluator import MIN_CHUNK_SIZE, Indices, RunEvaluator
-from bench.diagnosis.fitting.fit_state import (
+from bench.diagnosis.fitting.levenberg_marquardt_state import (
     MAX_DAMPING,
     FitPoint,
     FitStart,
     FitState,
     TrajectoryFit,
 )
-from bench.diagnosis.fitting.gauss_newton import (
+from bench.diagnosis.fitting.levenberg_marquardt_step import (
     INITIAL_PARAMETER_STEP,
     INITIAL_STATE_STEP,
     build_displaced_inputs,
@@ -517,7 +517,7 @@ class TrajectoryFitter:
     def _compute_state_deviation(self, states: Array) -> Array:
         """Return initial states minus their guesses (R, s), in prior standard deviations.
 
-        Their squares are a term of the cost, eq. (1) of `gauss_newton`.
+        Their squares are a term of the cost, eq. (1) of `levenberg_marquardt_step`.
         """
         deviation: Array = (states - self.evaluator.initial_state_guesses) / compute_state_prior(
             self.evaluator
@@ -536,7 +536,8 @@ class TrajectoryFitter:
     def _compute_cost(self, simulated: Array, states: Array, sample_mask: Mask) -> float:
         """Return the sum of squares of the whitened residual and of the state deviations.
 
-        It is the cost, eq. (1) of `gauss_newton`, and infinite if the simulation was abandoned.
+        It is the cost, eq. (1) of `levenberg_marquardt_step`, and infinite if the simulation was
+        abandoned.
         """
         residual = self._compute_residual(simulated, sample_mask)
         # An abandoned batch element is NaN, which cannot be compared.

@@ -32,8 +32,8 @@ import numpy as np
 from bench.diagnosis.evaluation.coefficient_bounds import compute_coefficient_bounds
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.evaluation.search_control import SearchStoppedError
-from bench.diagnosis.fitting.fit_state import FitStart
-from bench.diagnosis.fitting.model_set import FittedModel
+from bench.diagnosis.fitting.fitted_models import FittedModel
+from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
 from bench.diagnosis.kalman.measured_states import estimate_measured_states
 from bench.diagnosis.search.contact_search import exclude_laws_with_many_shapes
 from bench.diagnosis.search.effect_search import EffectSearch

@@ -15,14 +15,20 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bench.diagnosis.fitting.fit_state import FitStart
-from bench.diagnosis.fitting.model_set import MAX_ITERATIONS, FittedModel
+from bench.diagnosis.fitting.fitted_models import MAX_ITERATIONS, FittedModel
+from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
+from bench.diagnosis.prediction_error.dry_friction_fits import (
+    check_filter,
+    check_fit,
+    is_friction_sufficient,
+    make_dry_friction_start,
+)
 from bench.diagnosis.prediction_error.effect_proposals import (
     MAX_REGRESSION_PROPOSALS,
     SearchContext,
 )
-from bench.diagnosis.prediction_error.model_filters import (
+from bench.diagnosis.prediction_error.filters_with_effects import (
     GAUSS_NEWTON_STEPS,
     JOINT_MODEL,
     SERVO_MODEL,
@@ -32,21 +38,17 @@ from bench.diagnosis.prediction_error.model_filters import (
     list_joint_model_effects,
 )
 from bench.diagnosis.prediction_error.regression_selection import Selected
-from bench.diagnosis.prediction_error.selection_fits import (
-    MAX_IMPROVED_SIZE,
-    MIN_FURTHER_GAIN_SHARE,
-    check_filter,
-    check_fit,
-    is_friction_sufficient,
-    make_dry_friction_start,
-    refine_single_effects,
-)
 from bench.diagnosis.prediction_error.simulated_fits import (
+    MIN_FURTHER_GAIN_SHARE,
     fit_filtered,
     is_explained,
     make_replacing_start,
     remove_idle_effects,
     select_more_likely,
+)
+from bench.diagnosis.prediction_error.single_effect_fits import (
+    MAX_IMPROVED_SIZE,
+    refine_single_effects,
 )
 from sims.core.simulator import Array
 

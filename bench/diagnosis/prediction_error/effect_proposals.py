@@ -17,11 +17,10 @@ from bench.diagnosis.evaluation.coefficient_bounds import (
     get_bounds_by_index,
 )
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.diagnosis.fitting.fit_state import FitStart
+from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
 from bench.diagnosis.kalman.candidate_responses import FollowedRuns
 from bench.diagnosis.kalman.likelihood_fit import compute_likelihood_step
-from bench.diagnosis.prediction_error.library_columns import LibraryColumns, build_regression_about
-from bench.diagnosis.prediction_error.model_filters import (
+from bench.diagnosis.prediction_error.filters_with_effects import (
     JOINT_MODEL,
     SERVO_MODEL,
     FilteredSet,
@@ -29,6 +28,10 @@ from bench.diagnosis.prediction_error.model_filters import (
     get_joint_name,
     get_servo_input,
     offset_from_command,
+)
+from bench.diagnosis.prediction_error.regression_columns import (
+    LibraryColumns,
+    build_regression_about,
 )
 from bench.diagnosis.search.effect_search import EffectSearch
 from bench.diagnosis.search.start_selection import add_effect_to_start

@@ -5,22 +5,23 @@ fitted to whole simulated runs (output errors), which decide. The search ends as
 residual of a set is only noise. The order is:
 
     1. Select effects with few shapes by regression. Fit the dry friction among them first, because
-       it is not linear where a joint sticks and then the set (`selection_fits`).
+       it is not linear where a joint sticks (`dry_friction_fits`), and then the set
+       (`simulated_fits`).
     2. If a force is still missing, select again, with effects of many shapes at the joints where it
-       is missing (`selection_fits`).
+       is missing (`simulated_fits`).
     3. Fit each of the effects with the largest gains alone, and those of the standard joint model
-       (`selection_fits`, `effect_proposals`).
+       (`single_effect_fits`, `effect_proposals`).
     4. Add effects one by one, to dry friction in either of its forms or to nothing, each chosen by
        filters with the effect in the model (`competing_models`).
-    5. Simulate elasticity and backlash between a drive and its links (`selection_fits`).
+    5. Simulate elasticity and backlash between a drive and its links (`single_effect_fits`).
     6. Try one effect in place of several (`competing_models`).
 
 If a long recording shows that the model stays incomplete, filters alone identify its effects
-(`incomplete_model`), and nothing of the above is done.
+(`identification_without_simulation`), and nothing of the above is done.
 
 `PredictionErrorSearch.fit_competing_models` then fits the sets that are nearly as good, because
-they may be equivalent. All steps share filters with effects in the model (`model_filters`), columns
-of regressions (`library_columns`) and fits (`simulated_fits`).
+they may be equivalent. All steps share filters with effects in the model (`filters_with_effects`),
+columns of regressions (`regression_columns`) and fits (`simulated_fits`).
 """
 
 from __future__ import annotations
@@ -30,8 +31,8 @@ from functools import cached_property
 
 import numpy as np
 
-from bench.diagnosis.fitting.fit_state import FitStart, TrajectoryFit
-from bench.diagnosis.fitting.model_set import FittedModel
+from bench.diagnosis.fitting.fitted_models import FittedModel
+from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart, TrajectoryFit
 from bench.diagnosis.prediction_error.competing_models import (
     add_to_dry_friction,
     add_to_model,
@@ -39,31 +40,36 @@ from bench.diagnosis.prediction_error.competing_models import (
     fit_single_in_place,
     select_in_model,
 )
+from bench.diagnosis.prediction_error.dry_friction_fits import (
+    check_fit,
+    check_selection,
+    fit_dry_friction,
+)
 from bench.diagnosis.prediction_error.effect_proposals import SearchContext
-from bench.diagnosis.prediction_error.incomplete_model import IdentifiedSet, identify_incomplete
-from bench.diagnosis.prediction_error.library_columns import build_regression_about
-from bench.diagnosis.prediction_error.model_filters import FilteredSet, has_series
+from bench.diagnosis.prediction_error.filters_with_effects import FilteredSet, has_series
+from bench.diagnosis.prediction_error.identification_without_simulation import (
+    IdentifiedSet,
+    identify_incomplete,
+)
+from bench.diagnosis.prediction_error.regression_columns import build_regression_about
 from bench.diagnosis.prediction_error.regression_selection import (
     Selected,
     compute_p_value_of_gain,
     score_by_regression,
 )
-from bench.diagnosis.prediction_error.selection_fits import (
-    check_fit,
-    check_selection,
-    fit_dry_friction,
-    fit_quick_selection,
-    fit_selection,
-    fit_series_effects,
-    fit_single_effects,
-    select_with_shapes,
-)
 from bench.diagnosis.prediction_error.simulated_fits import (
     fit_by_simulation,
+    fit_quick_selection,
+    fit_selection,
     is_explained,
     is_nearly_explained,
     remove_idle_effects,
     select_more_likely,
+    select_with_shapes,
+)
+from bench.diagnosis.prediction_error.single_effect_fits import (
+    fit_series_effects,
+    fit_single_effects,
 )
 from bench.diagnosis.search.candidate_directions import DirectionSet
 from bench.diagnosis.search.effect_search import EffectSearch

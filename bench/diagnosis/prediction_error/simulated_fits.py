@@ -1,4 +1,4 @@
-"""Fit sets of effects to whole simulated runs, and decide whether they explain these runs.
+"""Fit selected sets of effects to whole simulated runs, and decide whether they explain them.
 
 The cost of a fit is not smooth where joints stick and where servos are at force limits, so a fit
 may stop in a local minimum. It is restarted from nearby coefficients.
@@ -7,20 +7,28 @@ may stop in a local minimum. It is restarted from nearby coefficients.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.base_fit import compute_start_costs
-from bench.diagnosis.fitting.fit_state import FitStart
+from bench.diagnosis.fitting.fitted_models import FittedModel
+from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
 from bench.diagnosis.fitting.linearised_runs import compute_state_jacobian
-from bench.diagnosis.fitting.model_set import FittedModel
 from bench.diagnosis.friction_form_verdict import has_dry_friction
 from bench.diagnosis.prediction_error.effect_proposals import SearchContext
-from bench.diagnosis.prediction_error.model_filters import FilteredSet
+from bench.diagnosis.prediction_error.filters_with_effects import (
+    FilteredSet,
+    acts_at_joint,
+    has_many_shapes,
+)
+from bench.diagnosis.prediction_error.regression_selection import Selected
 from bench.diagnosis.search.verdict_rules import INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
 from sims.core.effect import members_of
 from sims.core.simulator import Array
+from sims.robot.dynamics.effect_forces import TIME_DEPENDENT_EFFECTS
+from sims.robot.model_field_effects import MODEL_FIELD_EFFECTS
 
 NEARBY_FACTORS = (0.8, 0.9, 0.96, 0.98, 0.99, 1.01, 1.02, 1.04, 1.1, 1.2)
 """Factors of a coefficient at which a fit looks for a lower cost nearby."""
@@ -30,6 +38,17 @@ NEARLY_EXPLAINED_SHARE = 0.1
 """Maximum excess, as a share of that of the base model, at which effects are only added."""
 NEGLIGIBLE_EXCESS, NEGLIGIBLE_EXCESS_SHARE = 0.1, 0.005
 """Maximum excess at which the search ends: absolute, and as a share of that of the base model."""
+
+
+MAX_SURPLUS = 2
+"""Maximum number of consecutive effects with too little gain before a selection is cut."""
+MAX_SLOW_EFFECTS = 2
+"""Maximum number of effects in a set that is fitted by simulation although this is slow."""
+MIN_FURTHER_GAIN_SHARE = 0.01
+"""Minimum gain of a further effect, as a share of the gain of the set.
+
+The model of a real robot is never complete, and long recordings show this with certainty.
+"""
 
 
 def fit_by_simulation(context: SearchContext, start: FitStart) -> FittedModel:
@@ -244,3 +263,112 @@ def make_replacing_start(
     theta[evaluator.coefficient_slices[new_effect]] = coefficients
     remaining = (name for name in model.effects if name not in removed_effects)
     return FitStart((*remaining, new_effect), theta, model.fit.initial_states)
+
+
+def fit_quick_selection(context: SearchContext, selected: Selected) -> FittedModel:
+    """Fit the selected set by simulation, without effects that gain little.
+
+    It is not fitted if simulation is slow and the filter shows that a force is still missing.
+
+    Args:
+        context: context of the search.
+        selected: the selection.
+
+    Returns:
+        The fitted model, or the base model if simulation is slow and a force is still missing.
+    """
+    useful_selection = drop_surplus_effects(context, selected)
+    is_slow = len(useful_selection.groups) > MAX_SLOW_EFFECTS and is_slow_to_simulate(
+        context, useful_selection.effects
+    )
+    if is_slow and selected.followed.has_missing_force:
+        return context.search.base_model
+    return fit_selection(context, useful_selection)
+
+
+def fit_selection(context: SearchContext, selected: Selected) -> FittedModel:
+    """Fit the selected set by simulation, and drop effects that do not pay there.
+
+    Args:
+        context: context of the search.
+        selected: the selection.
+    """
+    base = context.search.base_model
+    if not selected.groups:
+        return base
+    start = context.columns.start(selected.groups, selected.coefficients)
+    states = context.filters.estimate_first_states(selected.followed)
+    fitted = fit_by_simulation(context, replace(start, initial_states=states))
+    if not np.isfinite(fitted.fit.cost):
+        return base
+    fitted = remove_idle_effects(context, fitted)
+    if selected.shows_steps:
+        fitted = context.search.correct_step_errors(fitted)
+    return select_more_likely(fitted, base)
+
+
+def drop_surplus_effects(context: SearchContext, selected: Selected) -> Selected:
+    """Drop the last effects of a selection that gain little with the set in a filter's model.
+
+    Far from the base model, the linear regression is wrong.
+
+    Args:
+        context: context of the search.
+        selected: the selection.
+    """
+    filters = context.filters
+    base_log_likelihood = filters.base.log_likelihood
+    best_net_gain, best_count, best_gain = 0.0, 0, 0.0
+    best_coefficients: list[Array] = []
+    for count in range(1, len(selected.groups) + 1):
+        if count > best_count + MAX_SURPLUS:
+            break
+        groups = selected.groups[:count]
+        coefficients = selected.regression.solve(groups)[1]
+        theta = context.columns.start(groups, coefficients).theta
+        gain = 2.0 * (filters.log_likelihood(theta) - base_log_likelihood)
+        penalty = sum(filters.penalty(group.effect) for group in groups)
+        min_gain = MIN_FURTHER_GAIN_SHARE * max(best_gain, 0.0) * (count - best_count)
+        if gain - penalty > best_net_gain and gain - best_gain > min_gain:
+            best_net_gain, best_count, best_gain, best_coefficients = (
+                gain - penalty,
+                count,
+                gain,
+                coefficients,
+            )
+    return replace(selected, groups=selected.groups[:best_count], coefficients=best_coefficients)
+
+
+def is_slow_to_simulate(context: SearchContext, names: Sequence[str]) -> bool:
+    """Return whether effects are slow to simulate.
+
+    This is the case if forces are computed in every step, or have their own states.
+    """
+    effects = [context.evaluator.available_effects[name] for name in names]
+    return any(
+        member.of not in MODEL_FIELD_EFFECTS
+        and member.hook in ("force", "hidden")
+        and member.of not in TIME_DEPENDENT_EFFECTS
+        for effect in effects
+        for member in members_of(effect)
+    )
+
+
+def select_with_shapes(context: SearchContext, selected: Selected) -> Selected:
+    """Select again with effects of many shapes, at the joints where a force is missing.
+
+    Args:
+        context: context of the search.
+        selected: the previous selection.
+    """
+    evaluator, joints = context.evaluator, np.flatnonzero(selected.followed.missing_forces).tolist()
+    effects_with_shapes = [
+        n for n in evaluator.library if has_many_shapes(n) and acts_at_joint(evaluator, n, joints)
+    ]
+    if not effects_with_shapes:
+        return selected
+    evaluator.search_control.begin_stage(
+        f"testing {len(effects_with_shapes)} effects with several coefficients", 1
+    )
+    context.columns.add(effects_with_shapes)
+    return context.columns.select()

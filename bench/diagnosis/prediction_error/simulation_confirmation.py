@@ -13,8 +13,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from bench.diagnosis.fitting.model_set import FittedModel
-from bench.diagnosis.prediction_error.incomplete_model import IdentifiedSet
+from bench.diagnosis.fitting.fitted_models import FittedModel
+from bench.diagnosis.prediction_error.identification_without_simulation import IdentifiedSet
 from bench.diagnosis.prediction_error.prediction_error_search import PredictionErrorSearch
 from bench.diagnosis.prediction_error.regression_selection import compute_p_value_of_gain
 from bench.diagnosis.search.alternative_causes import AlternativeFinder, CauseEvidence

@@ -8,8 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bench.diagnosis.report.report_data import DiagnosisReportData
-from bench.diagnosis.report.wording import (
+from bench.diagnosis.report.effect_and_unit_text import (
     ALL_PLACES,
     append_unit,
     format_effect,
@@ -24,6 +23,7 @@ from bench.diagnosis.report.wording import (
     sanitise,
     split_effect_name,
 )
+from bench.diagnosis.report.report_data import DiagnosisReportData
 from bench.diagnosis.verdict import Candidate, Cause
 from bench.figures.robot_figure import PlaceMark
 from sims.extended_simulator import FittedValue

@@ -9,8 +9,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
-from bench.diagnosis.report.report_data import DiagnosisReportData
-from bench.diagnosis.report.wording import (
+from bench.diagnosis.report.effect_and_unit_text import (
     append_unit,
     format_estimate,
     format_number,
@@ -19,6 +18,7 @@ from bench.diagnosis.report.wording import (
     joined,
     sanitise,
 )
+from bench.diagnosis.report.report_data import DiagnosisReportData
 from bench.diagnosis.validation.gain_and_intervals import Z95
 from bench.diagnosis.validation.run_consistency import (
     SIGNIFICANCE_LEVEL,

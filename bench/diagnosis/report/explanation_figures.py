@@ -2,7 +2,7 @@
 
 They are readable in print without colour: before is dashed with open squares, and after is solid
 with filled circles. Each figure is rendered as PNG, and as PDF and SVG if vector graphics are
-requested (`bench.figures.figure_files`). Texts from files are never parsed as mathematics.
+requested (`bench.figures.figure_settings`). Texts from files are never parsed as mathematics.
 """
 
 from __future__ import annotations
@@ -22,6 +22,12 @@ from bench.diagnosis.report.cause_text import (
     rank_candidates,
     select_shown_candidates,
     shorten_effect_name,
+)
+from bench.diagnosis.report.effect_and_unit_text import (
+    format_number,
+    format_p_value,
+    format_percent,
+    sanitise,
 )
 from bench.diagnosis.report.figure_panels import (
     BASE_MODEL_LINE,
@@ -44,10 +50,9 @@ from bench.diagnosis.report.figure_panels import (
 )
 from bench.diagnosis.report.joint_figure import draw_joint_figure, is_robot
 from bench.diagnosis.report.report_data import DataSplit, DiagnosisReportData
-from bench.diagnosis.report.wording import format_number, format_p_value, format_percent, sanitise
 from bench.diagnosis.verdict import Candidate
-from bench.figures import style
-from bench.figures.figure_files import is_pdf_wanted
+from bench.figures import figure_output
+from bench.figures.figure_settings import is_pdf_wanted
 from bench.figures.robot_figure import compute_joint_positions, draw_robot_figure
 from bench.figures.style import (
     BLUE,
@@ -427,9 +432,9 @@ def render_figures(report: DiagnosisReportData) -> dict[str, RenderedFigure]:
         figures = {name: _FIGURE_FUNCTIONS[name](report) for name in list_figure_names(report)}
         rendered = {}
         for name, figure in figures.items():
-            png, pdf = style.render_png_and_pdf(figure, DPI)
+            png, pdf = figure_output.render_png_and_pdf(figure, DPI)
             rendered[name] = RenderedFigure(
-                png, pdf, style.render_svg(figure) if is_pdf_wanted() else None
+                png, pdf, figure_output.render_svg(figure) if is_pdf_wanted() else None
             )
         if report.robot is not None and "robot" in rendered:
             positions = tuple(

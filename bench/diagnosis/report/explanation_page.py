@@ -26,6 +26,21 @@ from bench.diagnosis.report.consistency_section import (
     build_agreement_rows,
     format_consistency,
 )
+from bench.diagnosis.report.effect_and_unit_text import (
+    ALL_PLACES,
+    append_unit,
+    format_effect,
+    format_effect_name,
+    format_label,
+    format_number,
+    format_percent,
+    format_sentence,
+    format_unit,
+    get_place_kind,
+    joined,
+    sanitise,
+    split_effect_name,
+)
 from bench.diagnosis.report.explanation_figures import RenderedFigure
 from bench.diagnosis.report.figure_panels import (
     MAX_LABEL_LENGTH,
@@ -59,21 +74,6 @@ from bench.diagnosis.report.summary_text import (
     get_held_out_unit,
     has_absorbed_gap,
     has_gap_closed,
-)
-from bench.diagnosis.report.wording import (
-    ALL_PLACES,
-    append_unit,
-    format_effect,
-    format_effect_name,
-    format_label,
-    format_number,
-    format_percent,
-    format_sentence,
-    format_unit,
-    get_place_kind,
-    joined,
-    sanitise,
-    split_effect_name,
 )
 from bench.diagnosis.verdict import Cause
 from bench.figures.text_layout import shorten_name

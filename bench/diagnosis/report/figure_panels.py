@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from bench.diagnosis.report.effect_and_unit_text import format_label, sanitise
 from bench.diagnosis.report.report_data import (
     DataSplit,
     DiagnosisReportData,
@@ -17,7 +18,6 @@ from bench.diagnosis.report.report_data import (
     ResidualProfile,
 )
 from bench.diagnosis.report.summary_text import list_data_splits
-from bench.diagnosis.report.wording import format_label, sanitise
 from bench.figures.style import (
     BLUE,
     CONNECTOR_GREY,

@@ -16,8 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bench.diagnosis.identifiability import ParameterIdentifiability
-from bench.diagnosis.report.report_data import DiagnosisReportData
-from bench.diagnosis.report.wording import (
+from bench.diagnosis.report.effect_and_unit_text import (
     ALL_PLACES,
     append_unit,
     format_effect,
@@ -28,6 +27,7 @@ from bench.diagnosis.report.wording import (
     sanitise,
     split_effect_name,
 )
+from bench.diagnosis.report.report_data import DiagnosisReportData
 from bench.diagnosis.verdict import Cause
 
 MAX_NAMED_CAUSES = 6

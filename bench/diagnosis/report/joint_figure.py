@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from bench.diagnosis.report.cause_text import list_place_marks
+from bench.diagnosis.report.effect_and_unit_text import ALL_PLACES, format_number, sanitise
 from bench.diagnosis.report.figure_panels import (
     BASE_MODEL_LINE,
     EXTENDED_MODEL_LINE,
@@ -24,7 +25,6 @@ from bench.diagnosis.report.figure_panels import (
     shorten_label,
 )
 from bench.diagnosis.report.report_data import DiagnosisReportData
-from bench.diagnosis.report.wording import ALL_PLACES, format_number, sanitise
 from bench.figures.style import (
     BLUE,
     CAPTION_GREY,

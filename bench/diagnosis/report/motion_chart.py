@@ -9,11 +9,16 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from bench.diagnosis.report.effect_and_unit_text import (
+    format_label,
+    format_number,
+    format_unit,
+    sanitise,
+)
 from bench.diagnosis.report.figure_panels import has_extended_model, select_worst_run
 from bench.diagnosis.report.joint_figure import QUANTITY_LABELS, is_robot, list_joint_rows
 from bench.diagnosis.report.report_data import DataSplit, DiagnosisReportData
 from bench.diagnosis.report.summary_text import list_data_splits
-from bench.diagnosis.report.wording import format_label, format_number, format_unit, sanitise
 from bench.figures.style import BLACK, BLUE, VERMILION, MarkStyle, make_mark_style
 from bench.figures.text_layout import shorten_name
 from bench.pages.chart import Axis, AxisSpan, Panel, Series, TooltipLine

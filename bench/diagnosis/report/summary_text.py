@@ -22,14 +22,7 @@ from bench.diagnosis.report.cause_text import (
     strip_place,
 )
 from bench.diagnosis.report.consistency_section import format_consistency
-from bench.diagnosis.report.report_data import (
-    ChannelInfo,
-    DataSplit,
-    DiagnosisReportData,
-    GapLocation,
-    ParameterChange,
-)
-from bench.diagnosis.report.wording import (
+from bench.diagnosis.report.effect_and_unit_text import (
     END,
     append_unit,
     at_bound,
@@ -43,6 +36,13 @@ from bench.diagnosis.report.wording import (
     is_parameter_error,
     joined,
     sanitise,
+)
+from bench.diagnosis.report.report_data import (
+    ChannelInfo,
+    DataSplit,
+    DiagnosisReportData,
+    GapLocation,
+    ParameterChange,
 )
 from bench.diagnosis.verdict import Cause, HeldOutResult, RecordingFault, Verdict
 from sims.core.simulator import Array

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.diagnosis.fitting.model_set import FittedModel
+from bench.diagnosis.fitting.fitted_models import FittedModel
 from bench.diagnosis.search.effect_search import EffectSearch
 from bench.diagnosis.search.held_out_model_choice import HeldOutValidation
 from bench.diagnosis.search.model_moves import MAX_RICHER_LAW_EXCESS_RATIO

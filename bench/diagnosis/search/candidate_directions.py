@@ -27,8 +27,8 @@ from bench.diagnosis.evaluation.coefficient_bounds import (
 from bench.diagnosis.evaluation.noise_model import Mask
 from bench.diagnosis.evaluation.run_data import MAX_DECAY_FACTOR, is_instant
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.diagnosis.fitting.fit_state import TrajectoryFit
-from bench.diagnosis.fitting.gauss_newton import is_finite_response
+from bench.diagnosis.fitting.levenberg_marquardt_state import TrajectoryFit
+from bench.diagnosis.fitting.levenberg_marquardt_step import is_finite_response
 from bench.diagnosis.search.initial_values import (
     EVENT_TIME_COUNT,
     compute_reachable_levels,

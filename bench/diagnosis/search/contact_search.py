@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from bench.diagnosis.fitting.model_set import FittedModel
+from bench.diagnosis.fitting.fitted_models import FittedModel
 from bench.diagnosis.search.candidate_directions import iterate_first_probes
 from bench.diagnosis.search.effect_search import MAX_P_VALUE_FURTHER_EFFECT, EffectSearch
 from bench.diagnosis.search.score_test import SHAPE_COUNT_FOR_MULTISTART

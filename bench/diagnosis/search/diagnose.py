@@ -15,9 +15,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bench.diagnosis.evaluation.search_control import EarlyStop, SearchStoppedError
-from bench.diagnosis.fitting.model_set import EffectNames, FittedModel
+from bench.diagnosis.fitting.fitted_models import EffectNames, FittedModel
 from bench.diagnosis.search import verdict_rules
 from bench.diagnosis.search.alternative_causes import AlternativeFinder, CauseEvidence
+from bench.diagnosis.search.competing_refits import (
+    list_competing_models,
+    refine_best_model,
+    select_decisive,
+)
 from bench.diagnosis.search.effect_search import EffectSearch
 from bench.diagnosis.search.held_out_model_choice import HeldOutValidation
 from bench.diagnosis.search.lack_of_fit import (
@@ -25,12 +30,7 @@ from bench.diagnosis.search.lack_of_fit import (
     assess_lack_of_fit,
     assess_residual_size,
 )
-from bench.diagnosis.search.refine_candidates import (
-    list_competing_models,
-    refine_best_model,
-    search_with_subsampling,
-    select_decisive,
-)
+from bench.diagnosis.search.subsampled_search import search_with_subsampling
 from bench.diagnosis.search.verdict_rules import (
     DiagnosisState,
     VerdictName,

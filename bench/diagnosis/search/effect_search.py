@@ -15,8 +15,8 @@ from functools import cached_property
 
 import numpy as np
 
-from bench.diagnosis.fitting.fit_state import FitStart
-from bench.diagnosis.fitting.model_set import FittedModel, ModelSet
+from bench.diagnosis.fitting.fitted_models import FittedModel, ModelSet
+from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
 from bench.diagnosis.fitting.multiple_shooting import (
     forgets_initial_state,
     join_segment_fits,

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from bench.diagnosis.fitting.model_set import EffectNames, FittedModel
+from bench.diagnosis.fitting.fitted_models import EffectNames, FittedModel
 from bench.diagnosis.search.effect_search import MAX_PAIR_EXCESS_SHARE_OF_SINGLE, EffectSearch
 from bench.diagnosis.search.lack_of_fit import LackOfFitResult
 from bench.diagnosis.search.verdict_rules import (

@@ -10,7 +10,7 @@ import numpy as np
 from bench.diagnosis.evaluation.coefficient_bounds import compute_coefficient_bounds
 from bench.diagnosis.evaluation.run_data import RunData, is_instant
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.diagnosis.fitting.fit_state import FitStart, TrajectoryFit
+from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart, TrajectoryFit
 from sims.core.effect import Effect, members_of
 from sims.core.simulator import Array, Parameter
 

@@ -32,7 +32,7 @@ import numpy as np
 
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.evaluation.surrogate_residuals import draw_surrogates
-from bench.diagnosis.fitting.model_set import FittedModel, ModelSet
+from bench.diagnosis.fitting.fitted_models import FittedModel, ModelSet
 from bench.diagnosis.search.candidate_directions import (
     CandidateDirection,
     DirectionSet,

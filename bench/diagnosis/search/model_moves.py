@@ -13,8 +13,8 @@ from itertools import chain
 
 import numpy as np
 
-from bench.diagnosis.fitting.fit_state import FitStart
-from bench.diagnosis.fitting.model_set import FittedModel
+from bench.diagnosis.fitting.fitted_models import FittedModel
+from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
 from bench.diagnosis.search.scored_models import ScoredModelSet
 from sims.core.simulator import Array
 

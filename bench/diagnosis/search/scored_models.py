@@ -16,8 +16,8 @@ import numpy as np
 from bench.diagnosis.evaluation.noise_model import Mask, NoiseModel, compute_portmanteau_p_value
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.evaluation.surrogate_residuals import draw_surrogates
-from bench.diagnosis.fitting.fit_state import FitStart, TrajectoryFit
-from bench.diagnosis.fitting.model_set import FittedModel, ModelSet
+from bench.diagnosis.fitting.fitted_models import FittedModel, ModelSet
+from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart, TrajectoryFit
 from bench.diagnosis.search.candidate_directions import DirectionSet, compute_directions
 from bench.diagnosis.search.score_test import (
     CandidateScores,

@@ -11,8 +11,8 @@ from bench.diagnosis.evaluation.coefficient_bounds import compute_coefficient_bo
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.base_fit import FIT_HORIZONS
-from bench.diagnosis.fitting.fit_state import FitStart, KnownJacobian
-from bench.diagnosis.fitting.model_set import EffectNames, FittedModel
+from bench.diagnosis.fitting.fitted_models import EffectNames, FittedModel
+from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart, KnownJacobian
 from bench.diagnosis.search.candidate_directions import DirectionSet
 from bench.diagnosis.search.initial_values import (
     generate_event_times,

@@ -23,13 +23,13 @@ import numpy as np
 
 from bench.diagnosis.evaluation.noise_model import NoiseModel, whiten
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.diagnosis.fitting.fit_state import TrajectoryFit
-from bench.diagnosis.fitting.gauss_newton import (
+from bench.diagnosis.fitting.fitted_models import FittedModel, ModelSet
+from bench.diagnosis.fitting.levenberg_marquardt_state import TrajectoryFit
+from bench.diagnosis.fitting.levenberg_marquardt_step import (
     compute_difference_steps,
     compute_schur_complement,
     hold_known_states,
 )
-from bench.diagnosis.fitting.model_set import FittedModel, ModelSet
 from bench.diagnosis.fitting.trajectory_fit import compute_state_prior
 from sims.core.simulator import Array
 

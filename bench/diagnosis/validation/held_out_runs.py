@@ -22,8 +22,8 @@ import numpy as np
 
 from bench.diagnosis.evaluation.noise_model import Mask, NoiseModel, maximise_likelihood
 from bench.diagnosis.evaluation.run_evaluator import Indices, RunEvaluator
-from bench.diagnosis.fitting.fit_state import FitStart, KnownJacobian, TrajectoryFit
-from bench.diagnosis.fitting.model_set import count_identified_states
+from bench.diagnosis.fitting.fitted_models import count_identified_states
+from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart, KnownJacobian, TrajectoryFit
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
 from sims.core.simulator import Array
 

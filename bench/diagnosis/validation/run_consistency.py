@@ -49,7 +49,7 @@ import numpy as np
 from bench.benchmark.statistics.chi_squared import chi_squared_tail
 from bench.diagnosis.evaluation.noise_model import whiten
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.diagnosis.fitting.model_set import FittedModel, ModelSet
+from bench.diagnosis.fitting.fitted_models import FittedModel, ModelSet
 from bench.diagnosis.fitting.trajectory_fit import compute_state_prior
 from bench.diagnosis.validation.gain_and_intervals import Z95, compute_fisher_blocks
 from sims.core.simulator import Array

@@ -21,7 +21,7 @@ import numpy as np
 
 from bench.core.diagnoser import Answer, Diagnoser, DiagnosisCase, NamedCause
 from bench.diagnosis.evaluation.coefficient_bounds import compute_coefficient_bounds
-from bench.diagnosis.fitting.fit_state import FitStart, TrajectoryFit
+from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart, TrajectoryFit
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
 from bench.diagnosis.search.candidate_directions import compute_directions
 from bench.diagnosis_benchmark.diagnosers.regression_evidence import (

@@ -9,7 +9,8 @@ import pandas as pd
 
 from bench.benchmark.problem.experiment import Experiment
 from bench.diagnosis_benchmark.result_tables import PRIMARY_METRIC
-from bench.figures.style import FigureFiles, MarkStyle, get_mark_style
+from bench.figures.figure_output import FigureFiles
+from bench.figures.style import MarkStyle, get_mark_style
 from bench.pages.chart import PrintedFigure, Series
 
 

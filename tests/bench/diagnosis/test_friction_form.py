@@ -14,8 +14,8 @@ from bench.diagnosis import explain as explaining
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.base_fit import fit_base_model
-from bench.diagnosis.fitting.fit_state import FitStart
-from bench.diagnosis.fitting.model_set import ModelSet
+from bench.diagnosis.fitting.fitted_models import ModelSet
+from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
 from bench.diagnosis.friction_form_verdict import (
     choose_friction_form,
     get_friction_form,

@@ -15,7 +15,8 @@ from bench.diagnosis_benchmark.result_tables import build_all_tables
 from bench.diagnosis_benchmark.table_columns import read_table
 from bench.diagnosis_benchmark.training_costs import read_training_costs
 from bench.diagnosis_benchmark.wrong_answers import build_failure_table
-from bench.figures.style import make_panel_grid, render_all_formats
+from bench.figures.figure_output import render_all_formats
+from bench.figures.style import make_panel_grid
 from bench.pages.text_format import format_percent
 from tests.browser import Opened
 from tests.docs.documentation_pages import ROOT

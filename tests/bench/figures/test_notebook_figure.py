@@ -3,9 +3,9 @@ import sys
 
 LOADED = """
 import sys
-from bench.figures import figure_files
+from bench.figures import figure_settings
 if sys.argv[1] == "command":
-    figure_files.mark_as_command()
+    figure_settings.mark_as_command()
 from bench.figures.notebook_figure import NotebookFigure
 import matplotlib.artist
 from matplotlib.axes import Axes

@@ -10,6 +10,7 @@ from matplotlib.text import Text
 from bench.figures import offscreen_rendering
 from bench.figures import robot_figure as robot
 from bench.figures.camera_view import choose_projection, make_posed_data
+from bench.figures.figure_output import render_png
 from bench.figures.robot_figure import (
     PlaceMark,
     arrange_labels,
@@ -18,7 +19,6 @@ from bench.figures.robot_figure import (
     locate_place,
     round_down_length,
 )
-from bench.figures.style import render_png
 from tests.bench.figures.figure_robots import ARM6, POSE6, arm2, arm6
 
 MARKS = (

@@ -19,10 +19,11 @@ from bench.benchmark.comparison_figures import (
 )
 from bench.benchmark.statistics.tuner_ranking import compute_nemenyi_p_values
 from bench.diagnosis.report import explanation_figures
-from bench.figures import loss_figure, style
-from bench.figures.figure_files import pdf_figures
+from bench.figures import figure_output, loss_figure, style
+from bench.figures.figure_output import render_all_formats, render_png, write_figure
+from bench.figures.figure_settings import pdf_figures
 from bench.figures.recording_figure import draw_recording_figure, draw_track_figure
-from bench.figures.style import make_panel_grid, render_all_formats, render_png, write_figure
+from bench.figures.style import make_panel_grid
 from bench.logs.ball_heights import BallHeights
 from bench.logs.recording_loading import load_recording
 from sims.core.simulator import InputError
@@ -129,9 +130,9 @@ def test_files_are_whole_and_the_same_whenever_they_are_made(tmp_path):
 
 def test_a_pdf_is_made_only_where_one_is_asked_for(tmp_path, monkeypatch):
     rendered = []
-    plain = style.render_pdf
+    plain = figure_output.render_pdf
     monkeypatch.setattr(
-        style, "render_pdf", lambda figure: rendered.append(figure) or plain(figure)
+        figure_output, "render_pdf", lambda figure: rendered.append(figure) or plain(figure)
     )
     assert [path.name for path in write_figure(loss(), tmp_path / "loss")] == ["loss.png"]
     assert render_all_formats(loss()).pdf is None

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from bench.figures import style
+from bench.figures import figure_output, style
 from bench.pages.chart import (
     Axis,
     AxisSpan,
@@ -54,7 +54,10 @@ def make_printed_figure():
     figure, axes = style.make_panel_grid(1, 1, (5.5, 4.6))
     axes[0, 0].plot(STEPS, np.sqrt(STEPS), color=style.BLUE)
     return PrintedFigure(
-        style.render_svg(figure), style.render_pdf(figure), 'curves with "quotes" & <b>', "error"
+        figure_output.render_svg(figure),
+        figure_output.render_pdf(figure),
+        'curves with "quotes" & <b>',
+        "error",
     )
 
 

@@ -23,7 +23,7 @@ from bench.benchmark.comparison_page import (
 from bench.benchmark.statistics.comparison_statistics import ComparisonStatistics
 from bench.benchmark.statistics.comparison_tables import build_tables
 from bench.benchmark.statistics.training_amortisation import build_time_per_target_table
-from bench.figures.style import render_all_formats
+from bench.figures.figure_output import render_all_formats
 from bench.pages.text_format import format_number
 from tests.bench.figures.sample_comparisons import BUDGET, LABELS, stored
 from tests.browser import WIDTHS, Opened

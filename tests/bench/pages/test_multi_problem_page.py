@@ -9,7 +9,8 @@ from bench.benchmark.statistics.comparison_statistics import ComparisonStatistic
 from bench.benchmark.statistics.tuner_ranking import MIN_PROBLEMS_FOR_RANKS
 from bench.bounce_shot.hit_rate_table import build_result_table, compute_wilson_interval
 from bench.bounce_shot.shot_report import render_page
-from bench.figures.style import make_panel_grid, render_all_formats
+from bench.figures.figure_output import render_all_formats
+from bench.figures.style import make_panel_grid
 from bench.suite.multi_problem_page import render_multi_problem_page
 from bench.suite.multi_problem_statistics import ComparisonCollection, LoadedComparison
 from tests.bench.figures.sample_comparisons import stored

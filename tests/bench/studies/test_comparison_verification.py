@@ -193,13 +193,13 @@ def test_trusted_runs_are_marked_in_every_table_and_figure(tmp_path, capsys, mon
         tomli_w.dumps({**SPRING, "targets": 2, "seeds": 1, "budget": 3, "tuners": ["random"]})
     )
     titles = []
-    from bench.figures import style
+    from bench.figures import figure_output
 
-    plain = style.render_png
+    plain = figure_output.render_png
     monkeypatch.setattr(
-        style,
+        figure_output,
         "render_png",
-        lambda f, dpi=style.DPI: titles.append(f.get_suptitle()) or plain(f, 40),
+        lambda f, dpi=figure_output.DPI: titles.append(f.get_suptitle()) or plain(f, 40),
     )
     command = ["compare", str(tmp_path / "e.toml"), *PLUGIN, "--out", str(tmp_path / "out")]
     assert main([*command, "--trust", "--jobs", "1"]) == 0

@@ -159,15 +159,15 @@ def test_workers_end_with_a_parent_that_is_killed():
     code = textwrap.dedent(r"""
         import os, time
         from types import SimpleNamespace
-        from bench.diagnosis.evaluation import worker_pool
+        from bench.diagnosis.evaluation import forked_workers
         from bench.diagnosis.evaluation.search_control import SearchControl
         def task(world, number):
             os.write(1, f"{os.getpid()}\n".encode())
             time.sleep(60)
-        worker_pool.PARALLEL_THRESHOLD_SECONDS = 0.0
+        forked_workers.PARALLEL_THRESHOLD_SECONDS = 0.0
         control = SearchControl()
         world = SimpleNamespace(simulation_count=0, search_control=control, worker_pool=None)
-        worker_pool.ForkedWorkerPool(2).map(world, task, [(1,), (2,)])
+        forked_workers.ForkedWorkerPool(2).map(world, task, [(1,), (2,)])
     """)
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as parent:
         try:

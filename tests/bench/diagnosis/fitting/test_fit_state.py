@@ -4,7 +4,12 @@ import numpy as np
 import pytest
 
 from bench.diagnosis.evaluation.integrator_check import MAX_CORRECTED_ERROR, StepRefinement
-from bench.diagnosis.fitting.fit_state import FitPoint, FitStart, FitState, KnownJacobian
+from bench.diagnosis.fitting.levenberg_marquardt_state import (
+    FitPoint,
+    FitStart,
+    FitState,
+    KnownJacobian,
+)
 from sims.robot.integrator_settings import IntegratorSettings
 
 RNG = np.random.default_rng(4)

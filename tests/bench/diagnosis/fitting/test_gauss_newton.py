@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from bench.diagnosis.fitting.gauss_newton import compute_gauss_newton_step
+from bench.diagnosis.fitting.levenberg_marquardt_step import compute_gauss_newton_step
 
 NONE = np.zeros(3, dtype=bool)
 """Mask of active bounds: none."""

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bench.diagnosis.fitting.fit_state import FitStart
+from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
 from bench.diagnosis.fitting.multiple_shooting import (
     SEGMENTS_PER_RUN,
     join_segment_fits,
@@ -13,7 +13,7 @@ from bench.diagnosis.fitting.multiple_shooting import (
 )
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
 from bench.diagnosis.search import effect_search, model_moves
-from bench.diagnosis.search.refine_candidates import refine_best_model
+from bench.diagnosis.search.competing_refits import refine_best_model
 from sims.systems.ball import Ball
 from sims.systems.pendulum import Pendulum
 from sims.systems.servo import Servo

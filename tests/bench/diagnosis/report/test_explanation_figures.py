@@ -21,7 +21,7 @@ from bench.diagnosis.report.figure_panels import (
     select_worst_run,
 )
 from bench.diagnosis.report.report_data import GapLocation
-from bench.figures.figure_files import pdf_figures
+from bench.figures.figure_settings import pdf_figures
 from tests.bench.diagnosis.sample_report_data import evil, make_report
 
 NAMES = ["overview", "where", "candidates"]

@@ -17,7 +17,7 @@ import pytest
 from bench.diagnosis.report.explanation_figures import render_figures
 from bench.diagnosis.report.explanation_page import render_report
 from bench.figures import robot_figure as drawing
-from bench.figures.figure_files import pdf_figures
+from bench.figures.figure_settings import pdf_figures
 from bench.pages.html_page import make_iframe
 from bench.pages.text_format import format_number
 from tests.bench.diagnosis.report.test_explanation_page import make_rendered_figure

@@ -14,6 +14,11 @@ from bench.diagnosis.report.cause_text import (
     shorten_effect_name,
     strip_place,
 )
+from bench.diagnosis.report.effect_and_unit_text import (
+    format_effect,
+    format_effect_name,
+    is_parameter_error,
+)
 from bench.diagnosis.report.report_data import ChannelInfo
 from bench.diagnosis.report.summary_text import (
     format_detectable_gap,
@@ -21,7 +26,6 @@ from bench.diagnosis.report.summary_text import (
     format_headline,
     format_summary,
 )
-from bench.diagnosis.report.wording import format_effect, format_effect_name, is_parameter_error
 from bench.diagnosis.verdict import Cause
 from tests.bench.diagnosis.robot_report_data import (
     COULOMB,

@@ -4,6 +4,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from bench.diagnosis.report.effect_and_unit_text import (
+    format_effect,
+    format_effect_name,
+    format_estimate,
+    format_number,
+    format_p_value,
+    format_percent,
+    format_sentence,
+    format_unit,
+    joined,
+)
 from bench.diagnosis.report.report_data import ChannelInfo, DataSplit, ParameterChange
 from bench.diagnosis.report.summary_text import (
     compute_detectable_gap,
@@ -14,17 +25,6 @@ from bench.diagnosis.report.summary_text import (
     format_summary,
     get_held_out_unit,
     has_absorbed_gap,
-)
-from bench.diagnosis.report.wording import (
-    format_effect,
-    format_effect_name,
-    format_estimate,
-    format_number,
-    format_p_value,
-    format_percent,
-    format_sentence,
-    format_unit,
-    joined,
 )
 from tests.bench.diagnosis.sample_report_data import (
     DRAG,

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from bench.diagnosis.evaluation.noise_model import Likelihood
-from bench.diagnosis.fitting.model_set import FittedModel
+from bench.diagnosis.fitting.fitted_models import FittedModel
 from bench.diagnosis.validation.held_out_runs import HeldOutFit
 from tests.bench.diagnosis.explained_samples import linear_fit
 

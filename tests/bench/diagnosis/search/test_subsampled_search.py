@@ -5,9 +5,10 @@ import pytest
 
 from bench.diagnosis.evaluation import run_subsampling
 from bench.diagnosis.evaluation.search_control import SearchControl, SearchStoppedError
-from bench.diagnosis.search import refine_candidates
+from bench.diagnosis.search import competing_refits, subsampled_search
+from bench.diagnosis.search.competing_refits import refine_best_model
 from bench.diagnosis.search.effect_search import EffectSearch
-from bench.diagnosis.search.refine_candidates import refine_best_model, search_with_subsampling
+from bench.diagnosis.search.subsampled_search import search_with_subsampling
 from tests.bench.diagnosis.explained_samples import recording, searched
 
 SIGMA = [0.003]
@@ -48,7 +49,7 @@ def test_what_few_samples_show_is_fitted_to_all_of_them(search, log, monkeypatch
 
 def test_where_all_samples_show_more_the_search_is_made_on_all(search, monkeypatch):
     monkeypatch.setattr(
-        refine_candidates, "_is_confirmed_by_all_samples", lambda search, model: False
+        subsampled_search, "_is_confirmed_by_all_samples", lambda search, model: False
     )
     asked = []
     run = EffectSearch.run
@@ -68,7 +69,7 @@ def test_what_shows_nothing_is_not_searched_with_fewer_samples(monkeypatch):
         "slider", runs=2, seconds=1.5, rate=400.0, seed=3, observe=["x"], noise=["x=0.003"]
     )
     search, base = searched(clean, SIGMA)
-    monkeypatch.setattr(refine_candidates, "refine_best_model", None)
+    monkeypatch.setattr(competing_refits, "refine_best_model", None)
     assert search_with_subsampling(search) is base
 
 

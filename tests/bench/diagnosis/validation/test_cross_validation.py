@@ -9,7 +9,7 @@ import simgap
 from bench.benchmark.problem.recording_observations import load_recorded_runs
 from bench.diagnosis.explain import explain
 from bench.diagnosis.fitting.base_fit import fit_base_model
-from bench.diagnosis.fitting.fit_state import FitStart
+from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
 from bench.diagnosis.report.summary_text import format_summary
 from bench.diagnosis.validation.held_out_runs import CrossValidation, HeldOutRuns

@@ -1,4 +1,4 @@
-"""Damped Gauss-Newton step for shared parameters and initial states, and its difference steps.
+"""Levenberg-Marquardt step for shared parameters and initial states, and its difference steps.
 
 Run i has the residual r_i. The shared parameters x change it by A_i, and the initial state z_i of
 the run changes it by B_i. The prior of z_i has mean g_i and standard deviation π. The cost is
@@ -33,7 +33,7 @@ import numpy as np
 
 from bench.diagnosis.evaluation.noise_model import Mask, NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import Indices
-from bench.diagnosis.fitting.fit_state import FitStart
+from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
 from sims.core.simulator import Array
 
 MIN_DIAGONAL = 1e-12

@@ -1,4 +1,4 @@
-"""Identify the model of a long recording by prediction errors alone, if it stays incomplete.
+"""Identify the model of a long recording by one-step prediction errors, without simulating runs.
 
 A model of a real robot is never complete. Simulated over a long run without feedback, the forces
 that it lacks add up to a drift, so a fit of the simulation is biased, and every trial is slow. A
@@ -26,8 +26,8 @@ import numpy as np
 from bench.diagnosis.evaluation.coefficient_bounds import get_bounds_by_index
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.base_fit import Bounds, compute_range_around
-from bench.diagnosis.fitting.fit_state import FitStart
-from bench.diagnosis.fitting.model_set import FittedModel
+from bench.diagnosis.fitting.fitted_models import FittedModel
+from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
 from bench.diagnosis.kalman.candidate_responses import Columns, FollowedRuns
 from bench.diagnosis.kalman.likelihood_fit import (
@@ -36,15 +36,13 @@ from bench.diagnosis.kalman.likelihood_fit import (
     maximise_innovation_likelihood,
 )
 from bench.diagnosis.prediction_error.effect_proposals import SearchContext
-from bench.diagnosis.prediction_error.library_columns import (
+from bench.diagnosis.prediction_error.filters_with_effects import FilteredSet, has_many_shapes
+from bench.diagnosis.prediction_error.regression_columns import (
     build_regression_about,
     group_coefficients,
 )
-from bench.diagnosis.prediction_error.model_filters import FilteredSet, has_many_shapes
-from bench.diagnosis.prediction_error.selection_fits import (
-    MAX_IMPROVED_SIZE,
-    MIN_FURTHER_GAIN_SHARE,
-)
+from bench.diagnosis.prediction_error.simulated_fits import MIN_FURTHER_GAIN_SHARE
+from bench.diagnosis.prediction_error.single_effect_fits import MAX_IMPROVED_SIZE
 from bench.diagnosis.search.candidate_directions import CandidateDirection
 from bench.diagnosis.search.start_selection import add_effect_to_start
 from sims.core.simulator import Array

@@ -22,7 +22,7 @@ from bench.core.random_streams import make_rng
 from bench.diagnosis.evaluation.noise_model import Likelihood, Mask, NoiseModel, maximise_likelihood
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.base_fit import FIT_HORIZONS
-from bench.diagnosis.fitting.fit_state import FitStart, TrajectoryFit
+from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart, TrajectoryFit
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter, compute_state_prior
 from sims.core.simulator import Array
 

@@ -17,10 +17,10 @@ from bench.diagnosis.evaluation.coefficient_bounds import (
     compute_coefficient_bounds,
 )
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.diagnosis.fitting.fit_state import FitStart, KnownJacobian
-from bench.diagnosis.fitting.model_set import FittedModel
+from bench.diagnosis.fitting.fitted_models import FittedModel
+from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart, KnownJacobian
 from bench.diagnosis.kalman.candidate_responses import Columns, FollowedRuns
-from bench.diagnosis.prediction_error.model_filters import (
+from bench.diagnosis.prediction_error.filters_with_effects import (
     FilteredSet,
     ModelFilters,
     has_many_shapes,

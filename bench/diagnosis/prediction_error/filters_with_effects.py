@@ -20,8 +20,8 @@ from bench.diagnosis.evaluation.coefficient_bounds import (
 )
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.diagnosis.fitting.fit_state import FitStart
-from bench.diagnosis.fitting.model_set import FittedModel
+from bench.diagnosis.fitting.fitted_models import FittedModel
+from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
 from bench.diagnosis.friction_form_verdict import has_soft_form, make_soft_kind
 from bench.diagnosis.kalman.candidate_responses import FollowedRuns
 from bench.diagnosis.kalman.likelihood_fit import maximise_innovation_likelihood

@@ -1,10 +1,7 @@
-"""Search long recordings on thinned runs first, and refit the best model and its competitors.
+"""Refit the best model of a search and the competing models of the same size to convergence.
 
 The search tests few candidates about each model, and stops fits that fall behind. A diagnosed cause
 must be compared with all competing models, each at its own optimum.
-
-The model found and its close competing models are fitted to all samples. The search is repeated on
-all samples only if these show more than the thinned runs did.
 """
 
 from __future__ import annotations
@@ -14,20 +11,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from bench.diagnosis.evaluation.noise_model import NoiseModel
-from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.diagnosis.evaluation.run_subsampling import thin_runs
-from bench.diagnosis.evaluation.search_control import SearchStoppedError
-from bench.diagnosis.fitting.fit_state import FitStart
-from bench.diagnosis.fitting.model_set import FittedModel
-from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
-from bench.diagnosis.search.contact_search import search_in_contact
-from bench.diagnosis.search.effect_search import (
-    FAR_EXCESS,
-    MAX_P_VALUE_FIRST_EFFECT,
-    MAX_P_VALUE_FURTHER_EFFECT,
-    EffectSearch,
-    select_by_size,
-)
+from bench.diagnosis.fitting.fitted_models import FittedModel
+from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
+from bench.diagnosis.search.effect_search import FAR_EXCESS, EffectSearch
 from bench.diagnosis.search.initial_values import generate_frequency_neighbours
 from bench.diagnosis.search.lack_of_fit import assess_lack_of_fit
 
@@ -202,120 +188,3 @@ def _estimate_model_noise(search: EffectSearch, model: FittedModel) -> NoiseMode
     sigma = np.maximum(model.likelihood.sigma, 1e-300)
     # Correlations are never negative, as in the score test.
     return NoiseModel(sigma, np.maximum(model.likelihood.phi, 0.0))
-
-
-MAX_SINGLE_EFFECT_REFITS = 6
-"""Number of best single-effect models that are fitted to all samples in addition."""
-
-
-def search_with_subsampling(search: EffectSearch) -> FittedModel:
-    """Return the model of all effects that the data show; long runs are thinned first.
-
-    Args:
-        search: the search, which contains the fitted base model.
-
-    Raises:
-        SearchStoppedError: the search had to end early.
-    """
-    # Thinned runs would begin in contact without an estimate of their initial states.
-    if search.evaluator.is_in_contact:
-        return search_in_contact(search)
-    thinned_runs = thin_runs(search.evaluator)
-    if thinned_runs is None:
-        return search.run()
-    try:
-        return _search_subsampled(search, thinned_runs)
-    finally:
-        thinned_runs.close()
-
-
-def _search_subsampled(search: EffectSearch, thinned_runs: RunEvaluator) -> FittedModel:
-    """Search on thinned runs, which is faster, then confirm the result on all samples.
-
-    If all samples show more effects than the thinned runs did, the search is repeated on them.
-    """
-    # All merits on all samples need the scores of the base model.
-    search.score_missing_effects(search.base_model)
-    # If they show nothing, no search is needed.
-    if search.is_complete(search.base_model, MAX_P_VALUE_FIRST_EFFECT):
-        return search.run()
-    rng = search.make_rng("fewer samples")
-    search_arguments = (
-        thinned_runs,
-        search.noise,
-        search.fixed_parameters,
-        rng,
-        search.is_noise_stated,
-    )
-    subsampled_search = EffectSearch(*search_arguments, thorough=search.thorough)
-    subsampled_search.refit_models([search.base_model.fit.make_start()])
-    try:
-        subsampled_model = refine_best_model(subsampled_search, subsampled_search.run())
-    except SearchStoppedError:
-        _adopt_subsampled_models(search, subsampled_search.get_best_so_far())
-        raise
-    starts = _collect_full_fit_starts(subsampled_search, subsampled_model)
-    if starts:
-        search.refit_models(starts)
-    model = _select_full_model(search, subsampled_model)
-    if not _is_confirmed_by_all_samples(search, model):
-        return search.run()
-    search.settled_effects = frozenset(model.effects)
-    search.best_supported_model = model
-    return model
-
-
-def _adopt_subsampled_models(search: EffectSearch, model: FittedModel) -> None:
-    """Store the model that the thinned runs support; simulate it on all samples without a fit.
-
-    It is used if the time limit ends the search on the thinned runs.
-    """
-    fitter = TrajectoryFitter(search.evaluator, search.noise, search.fixed_parameters)
-    (fit,) = fitter.fit_models([model.fit.make_start()], iterations=0)
-    search.best_supported_model = search.add_fit(fit)
-
-
-def _collect_full_fit_starts(
-    subsampled_search: EffectSearch, subsampled_model: FittedModel
-) -> list[FitStart]:
-    """Collect the models of the search on thinned runs from which fits to all samples start.
-
-    They are the result, models that explain the data nearly as well, models without one of its
-    effects, and the best models of a single effect.
-    """
-    competing_models = list_competing_models(subsampled_search, subsampled_model)
-    selected_models = [
-        subsampled_model,
-        *select_decisive(subsampled_search, subsampled_model, competing_models),
-        *list_submodels(subsampled_search, subsampled_model),
-    ]
-    selected_models += [
-        subsampled_search.remove_effect(subsampled_model, name) for name in subsampled_model.effects
-    ]
-    selected_models += select_by_size(subsampled_search, 1)[:MAX_SINGLE_EFFECT_REFITS]
-    # A dictionary, because the lists overlap and each model is fitted once.
-    starts = {model.effects: model.fit.make_start() for model in selected_models if model.effects}
-    return list(starts.values())
-
-
-def _select_full_model(search: EffectSearch, subsampled_model: FittedModel) -> FittedModel:
-    """Return the fit to all samples of the model that was found.
-
-    Near the noise, return the best model of its size, because thinned runs distinguish models less
-    well.
-    """
-    model = search.models[frozenset(subsampled_model.effects)]
-    best = search.get_best(len(subsampled_model.effects))
-    if best is None or search.compute_excess_residual(model) >= FAR_EXCESS:
-        return model
-    return best
-
-
-def _is_confirmed_by_all_samples(search: EffectSearch, model: FittedModel) -> bool:
-    """Return whether all samples support the model without any further effect."""
-    # Far from the noise, more samples of the same runs show nothing new.
-    if search.compute_excess_residual(model) >= FAR_EXCESS:
-        return True
-    return search.is_complete(
-        model, MAX_P_VALUE_FURTHER_EFFECT if model.effects else MAX_P_VALUE_FIRST_EFFECT
-    )

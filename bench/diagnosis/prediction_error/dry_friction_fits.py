@@ -1,0 +1,263 @@
+"""Fit the dry friction of a selection before other effects, and test whether it has a soft form.
+
+The force of dry friction is not linear in its limit where a joint sticks or creeps. Filters compare
+whether it has MuJoCo's soft form.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bench.diagnosis.fitting.fitted_models import FittedModel
+from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
+from bench.diagnosis.friction_form_verdict import (
+    has_dry_friction,
+    is_likelier_soft,
+    replace_by_stateless_friction,
+)
+from bench.diagnosis.prediction_error.effect_proposals import MIN_GAIN_SHARE, SearchContext
+from bench.diagnosis.prediction_error.regression_selection import Selected
+from bench.diagnosis.prediction_error.simulated_fits import (
+    drop_surplus_effects,
+    fit_by_simulation,
+    is_explained,
+    remove_idle_effects,
+)
+from bench.diagnosis.search.verdict_rules import INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
+from sims.robot.model_field_effects import MODEL_FIELD_EFFECTS
+
+FIRST_ITERATIONS = 5
+"""Maximum number of steps of the first fit of dry friction."""
+
+
+MIN_LEAD_SHARE = 0.1
+"""Minimum lead in log-likelihood of soft dry friction over a selection that is far less likely.
+
+It is a share of the gain over the base model.
+"""
+
+
+class SoftFrictionError(Exception):
+    """Dry friction of these data has MuJoCo's soft form: search with a simulator of that form.
+
+    Attributes:
+        start: the model whose filter shows this; None if a simulation does.
+        is_preliminary: whether only filters show this, before any fit.
+    """
+
+    def __init__(self, start: FitStart | None = None, is_preliminary: bool = False) -> None:
+        super().__init__()
+        self.start, self.is_preliminary = start, is_preliminary
+
+
+def check_selection(context: SearchContext, selected: Selected) -> None:
+    """Raise `SoftFrictionError` if soft dry friction explains the runs better than a selection.
+
+    It compares log-likelihoods of filters, before anything but dry friction is fitted.
+
+    Args:
+        context: context of the search.
+        selected: the selection.
+
+    Raises:
+        SoftFrictionError: soft friction is likelier than the selection.
+    """
+    filters = context.filters
+    if filters.is_soft or not filters.base.has_missing_force:
+        return
+    stiff_friction = make_dry_friction_start(context, selected)
+    # Stiff friction that explains the runs needs no comparison.
+    if stiff_friction.effects and is_explained(
+        context, context.search.fit_one(stiff_friction, FIRST_ITERATIONS)
+    ):
+        return
+    soft_start = _find_soft_friction(context)
+    if soft_start is None:
+        return
+    soft_log_likelihood = filters.log_likelihood(soft_start.theta, is_soft=True)
+    gain = soft_log_likelihood - filters.base.log_likelihood
+    # Another effect at the joint that promises more is fitted first.
+    if not gain > max(context.proposals.compute_largest_gain_of_others(soft_start.effects[0]), 0.0):
+        return
+    if _is_far_less_likely(context, selected, soft_log_likelihood):
+        raise SoftFrictionError(soft_start, is_preliminary=True)
+    useful_selection = drop_surplus_effects(context, selected)
+    log_likelihood = filters.log_likelihood(
+        context.columns.start(useful_selection.groups, useful_selection.coefficients).theta
+    )
+    check_filter(context, log_likelihood, is_preliminary=True)
+
+
+def _find_soft_friction(context: SearchContext) -> FitStart | None:
+    """Return the likeliest model of soft dry friction at the joint where regression shows friction.
+
+    Returns:
+        The model; None if the gain of dry friction by regression is far below the largest gain, or
+        if friction is already soft.
+    """
+    columns, evaluator = context.columns, context.evaluator
+    regression = columns.base_regression
+    gains, groups = regression.gains([]), regression.groups
+    friction_groups = [
+        i
+        for i in np.argsort(-gains, kind="stable").tolist()
+        if gains[i] > MIN_GAIN_SHARE * gains.max()
+        and groups[i].effect.startswith("friction.coulomb@")
+        and not groups[i].effect.endswith("@*")
+        and groups[i].effect in evaluator.library
+    ]
+    if not friction_groups:
+        return None
+    best_group = groups[friction_groups[0]]
+    (coefficient,) = columns.coefficients(best_group, regression.solve([best_group])[1][0])
+    return context.filters.find_soft_friction(
+        best_group.effect, float(np.copysign(1.0, coefficient))
+    )
+
+
+def _is_far_less_likely(context: SearchContext, selected: Selected, log_likelihood: float) -> bool:
+    """Return whether a selection is far less likely than another model.
+
+    The likelihood of the selection is that of the regression, and that of a filter with its first
+    effect.
+
+    Args:
+        context: context of the search.
+        selected: the selection.
+        log_likelihood: log-likelihood of the other model.
+    """
+    base = context.filters.base.log_likelihood
+    limit = log_likelihood - MIN_LEAD_SHARE * max(log_likelihood - base, 0.0)
+    if not max(base, selected.log_likelihood) < limit:
+        return False
+    first = context.columns.start(selected.groups[:1], selected.coefficients[:1])
+    return context.filters.log_likelihood(first.theta) < limit
+
+
+def check_filter(
+    context: SearchContext, log_likelihood: float, is_preliminary: bool = False
+) -> None:
+    """Raise `SoftFrictionError` if soft dry friction is likelier than a model with its filter.
+
+    Args:
+        context: context of the search.
+        log_likelihood: log-likelihood of the filter.
+        is_preliminary: whether nothing has been fitted yet.
+
+    Raises:
+        SoftFrictionError: soft friction is likelier.
+    """
+    soft_start = _find_soft_friction(context)
+    if soft_start is None:
+        return
+    soft_log_likelihood = context.filters.log_likelihood(soft_start.theta, is_soft=True)
+    if soft_log_likelihood > log_likelihood + 0.5 * INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO:
+        raise SoftFrictionError(soft_start, is_preliminary)
+
+
+def check_fit(context: SearchContext, model: FittedModel) -> None:
+    """Raise `SoftFrictionError` if a fitted model is likelier with soft dry friction.
+
+    It is refitted with the same effects in the soft form.
+
+    Args:
+        context: context of the search.
+        model: the fitted model.
+
+    Raises:
+        SoftFrictionError: the soft form is likelier.
+    """
+    if is_likelier_soft(context.search, model, INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO):
+        raise SoftFrictionError
+
+
+def fit_dry_friction(context: SearchContext, selected: Selected) -> FittedModel:
+    """Fit the dry friction of a selection alone.
+
+    Args:
+        context: context of the search.
+        selected: the selection.
+
+    Returns:
+        The fitted model, or the base model if the selection has no friction or leaves no force
+        missing.
+    """
+    friction = make_dry_friction_start(context, selected)
+    if not friction.effects or not selected.followed.has_missing_force:
+        return context.search.base_model
+    fitted_before = context.search.models.get(frozenset(friction.effects))
+    if fitted_before is not None and is_explained(context, fitted_before):
+        return remove_idle_effects(context, fitted_before)
+    if fitted_before is not None and np.isfinite(fitted_before.fit.cost):
+        friction = fitted_before.fit.make_start()
+    fitted = fit_by_simulation(context, friction)
+    return remove_idle_effects(context, fitted) if is_explained(context, fitted) else fitted
+
+
+def make_dry_friction_start(context: SearchContext, selected: Selected) -> FitStart:
+    """Return a start with only the dry friction of a selection, in its form without a state.
+
+    A family replaces its members.
+
+    Args:
+        context: context of the search.
+        selected: the selection.
+    """
+    evaluator, filters = context.evaluator, context.filters
+    start = context.columns.start(selected.groups, selected.coefficients)
+    stateless_names, stateless_theta = replace_by_stateless_friction(
+        evaluator, start.effects, start.theta
+    )
+    model_field_effects = [
+        name for name in stateless_names if name.partition("@")[0] in MODEL_FIELD_EFFECTS
+    ]
+    friction = [name for name in model_field_effects if has_dry_friction(evaluator, [name])]
+    contained = {part for name in friction for part in evaluator.available_effects[name].contains}
+    names = tuple(name for name in friction if name not in contained)
+    theta = filters.reference.copy()
+    for name in names:
+        theta[evaluator.coefficient_slices[name]] = stateless_theta[
+            evaluator.coefficient_slices[name]
+        ]
+    return FitStart(names, theta, filters.estimate_first_states(filters.base))
+
+
+def is_friction_sufficient(
+    context: SearchContext, selected: Selected, friction: FittedModel
+) -> bool:
+    """Return whether dry friction without a state follows the data as well as the selection.
+
+    Args:
+        context: context of the search.
+        selected: the selection.
+        friction: its dry friction, fitted alone.
+
+    Raises:
+        SoftFrictionError: the friction has MuJoCo's soft form.
+    """
+    filters = context.filters
+    start = context.columns.start(selected.groups, selected.coefficients)
+    _, stateless_theta = replace_by_stateless_friction(
+        context.evaluator, start.effects, start.theta
+    )
+    stiff_log_likelihood = filters.log_likelihood(stateless_theta)
+    soft_log_likelihood = (
+        -np.inf if filters.is_soft else filters.log_likelihood(stateless_theta, is_soft=True)
+    )
+    selected_log_likelihood = (
+        -np.inf
+        if np.array_equal(stateless_theta, start.theta)
+        else filters.log_likelihood(start.theta)
+    )
+    if (
+        not max(stiff_log_likelihood, soft_log_likelihood)
+        > selected_log_likelihood - 0.5 * INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
+    ):
+        return False
+    if (
+        soft_log_likelihood
+        > max(stiff_log_likelihood, selected_log_likelihood)
+        + 0.5 * INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
+    ):
+        check_fit(context, friction)
+    return True

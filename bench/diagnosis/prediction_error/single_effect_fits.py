@@ -1,0 +1,126 @@
+"""Fit single effects alone by simulation, joint flexibility and backlash included.
+
+A servo at its limit is not linear, so a regression misjudges effects there. The effects that are
+most likely missing are therefore simulated alone, as one batch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from bench.diagnosis.fitting.fitted_models import FittedModel
+from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
+from bench.diagnosis.prediction_error.dry_friction_fits import check_filter, check_fit
+from bench.diagnosis.prediction_error.effect_proposals import SearchContext
+from bench.diagnosis.prediction_error.filters_with_effects import (
+    JOINT_MODEL,
+    SERVO_MODEL,
+    acts_at_joint,
+)
+from bench.diagnosis.prediction_error.regression_selection import Selected
+from bench.diagnosis.prediction_error.simulated_fits import (
+    fit_by_simulation,
+    fit_nearby,
+    is_at_noise,
+    is_explained,
+    is_nearly_explained,
+    is_slow_to_simulate,
+    list_nearby_starts,
+    remove_idle_effects,
+    select_lowest_of_each,
+    select_more_likely,
+)
+from sims.robot.dynamics.series_joints import is_series_effect
+
+MAX_REFINED = 3
+"""Maximum number of effects that are fitted alone to convergence."""
+MAX_IMPROVED_SIZE = 3
+"""Maximum number of coefficients of an effect that is refined alone or improved by a filter."""
+
+
+def fit_single_effects(context: SearchContext) -> FittedModel:
+    """Fit each of the proposed effects alone.
+
+    Returns:
+        The best model, or the base model if none explains the runs.
+
+    Raises:
+        SoftFrictionError: dry friction is likelier in MuJoCo's soft form.
+    """
+    search, filters = context.search, context.filters
+    states = filters.estimate_first_states(filters.base)
+    starts = context.proposals.of(filters.empty_set, len(JOINT_MODEL + SERVO_MODEL))
+    fitted, best = list[FittedModel](), search.base_model
+    for is_slow in (False, True):
+        # Slow effects are fitted only if no other effect explains the runs.
+        group = [one for one in starts if is_slow_to_simulate(context, one.effects) == is_slow]
+        if group and not is_explained(context, best):
+            fitted += search.fit_all([replace(start, initial_states=states) for start in group])
+            best = max(fitted, key=lambda model: model.penalised_log_likelihood)
+    if not is_explained(context, best):
+        best = select_more_likely(best, refine_single_effects(context, fitted))
+    if is_explained(context, best):
+        return remove_idle_effects(context, best)
+    check_filter(context, filters.get_filter(best).log_likelihood)
+    check_fit(context, best)
+    return search.base_model
+
+
+def refine_single_effects(context: SearchContext, fitted: Sequence[FittedModel]) -> FittedModel:
+    """Fit some effects alone to convergence, and return the model with the highest merit.
+
+    Those with the lowest cost are fitted first. Fits may stop in local minima where joints stick
+    and at force limits, and likelihoods with coloured noise are unreliable if the residual is
+    large.
+
+    Args:
+        context: context of the search.
+        fitted: models with a single effect.
+    """
+    starts: list[FitStart] = []
+    for model in fitted:
+        (name,) = model.effects
+        if len(context.evaluator.get_coefficient_indices(name)) <= MAX_IMPROVED_SIZE:
+            starts += [model.fit.make_start(), *list_nearby_starts(context, model, name)]
+    best = context.search.base_model
+    for _, start in select_lowest_of_each(context, starts)[:MAX_REFINED]:
+        refined = fit_by_simulation(context, start)
+        if not is_at_noise(context, refined) and is_nearly_explained(context, refined):
+            refined = fit_nearby(context, refined, refined.effects[0])
+        best = select_more_likely(best, refined)
+        if is_explained(context, best) or context.evaluator.search_control.is_over():
+            break
+    return best
+
+
+def fit_series_effects(context: SearchContext, selected: Selected) -> FittedModel:
+    """Fit elastic joints and backlash between drive and links at the most affected joint.
+
+    These effects have their own states, so each shape is simulated.
+
+    Args:
+        context: context of the search.
+        selected: the selection, whose missing forces determine the joint.
+    """
+    evaluator, search = context.evaluator, context.search
+    joints = selected.followed.joints_by_loss[:1]
+    names = [
+        name for name in evaluator.library if is_series_effect(evaluator.available_effects[name])
+    ]
+    probes = context.columns.probes(
+        [name for name in names if acts_at_joint(evaluator, name, joints)]
+    )
+    if not probes:
+        return search.base_model
+    evaluator.search_control.begin_stage(
+        "testing elasticity and backlash between drives and links", len(probes)
+    )
+    starts = []
+    for probe in probes:
+        theta = context.filters.make_theta_with(probe.effect, probe.coefficients)
+        starts.append(FitStart((probe.effect,), theta, evaluator.initial_state_guesses))
+    fitted = search.fit_all([start for _, start in select_lowest_of_each(context, starts)])
+    return fit_by_simulation(
+        context, max(fitted, key=lambda model: model.penalised_log_likelihood).fit.make_start()
+    )
