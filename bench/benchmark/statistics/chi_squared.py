@@ -1,7 +1,8 @@
-"""Tail of the chi-squared distribution with a whole number of degrees of freedom."""
+"""Tail and quantiles of the chi-squared distribution with a whole number of degrees of freedom."""
 
 from __future__ import annotations
 
+from functools import lru_cache
 from math import erfc, exp, fsum, inf, lgamma, log, sqrt
 
 
@@ -39,3 +40,29 @@ def chi_squared_tail(freedom: int, statistic: float) -> float:
         for i in range(1 if half_remainder else 0, (freedom + 1) // 2)
     ]
     return min(1.0, fsum([erfc(sqrt(h)) if half_remainder else 0.0, *terms]))
+
+
+@lru_cache(maxsize=1024)
+def chi_squared_quantile(freedom: int, tail: float) -> float:
+    """Return the statistic that a chi-squared variable exceeds with a given probability.
+
+    It is the inverse of `chi_squared_tail`, by bisection to the last digits of a float.
+
+    Args:
+        freedom: degrees of freedom, at least 1.
+        tail: probability, above 0 and at most 1.
+
+    Raises:
+        ValueError: `freedom` is below 1, or `tail` is not a probability above 0.
+    """
+    if not 0.0 < tail <= 1.0:
+        raise ValueError(f"expected a probability above 0 and at most 1, found {tail}")
+    low, high = 0.0, float(max(freedom, 1))
+    while chi_squared_tail(freedom, high) > tail:
+        low, high = high, 2.0 * high
+    while low < (middle := (low + high) / 2.0) < high:
+        if chi_squared_tail(freedom, middle) > tail:
+            low = middle
+        else:
+            high = middle
+    return high

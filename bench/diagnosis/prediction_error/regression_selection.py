@@ -37,8 +37,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtrc, chdtri
 
+from bench.benchmark.statistics.chi_squared import chi_squared_quantile, chi_squared_tail
 from bench.diagnosis.kalman.candidate_responses import Columns, FollowedRuns
 from bench.diagnosis.search.candidate_directions import CandidateDirection
 from bench.diagnosis.search.score_test import (
@@ -352,7 +352,7 @@ def compute_p_value_of_gain(gain: float, coefficients: int, candidates: int) -> 
         coefficients: number of coefficients of each candidate.
         candidates: number of candidates.
     """
-    return min(candidates * float(chdtrc(coefficients, max(gain, 0.0))), 1.0)
+    return min(candidates * chi_squared_tail(coefficients, gain), 1.0)
 
 
 def score_by_regression(
@@ -378,10 +378,11 @@ def score_by_regression(
         degrees_of_freedom = max(len(regression.groups[i].column_indices) for i in group_indices)
         shapes = len(group_indices)
         null_quantiles.append(
-            float(chdtri(degrees_of_freedom, 1.0 - NULL_QUANTILE ** (1.0 / shapes)))
+            chi_squared_quantile(degrees_of_freedom, 1.0 - NULL_QUANTILE ** (1.0 / shapes))
         )
-        uniform = rng.random(NULL_DRAWS) ** (1.0 / shapes)
-        null_draws.append(chdtri(degrees_of_freedom, 1.0 - uniform))
+        null_draws.append(
+            rng.chisquare(degrees_of_freedom, (NULL_DRAWS, shapes)).max(axis=1, initial=0.0)
+        )
         p_values.append(compute_p_value_of_gain(largest_gain, degrees_of_freedom, shapes))
         peak: DirectionGroup = regression.groups[max(group_indices, key=lambda i: gains[i])]
         peaks.append(((peak, regression.solve([peak])[1][0]),))

@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -35,6 +36,7 @@ BACKENDS = {
     "matplotlib.backends.backend_svg",
 }
 """Modules of Matplotlib that are needed only for vector graphics and notebooks."""
+ROOT = Path(__file__).resolve().parents[3]
 RUN = """
 import json, sys
 import bench.cli.main
@@ -74,6 +76,13 @@ def test_explain_loads_no_package_that_it_does_not_need(swing, tmp_path):
     assert {path.suffix for path in (tmp_path / "out").iterdir()} == {
         ".csv", ".html", ".json", ".png", ".toml",
     }  # fmt: skip
+
+
+def test_explain_of_a_robot_loads_mujoco_but_no_other_large_package(tmp_path):
+    log = ROOT / "examples/robot/log.csv"
+    modules = loaded("explain", log, "--jobs", 1, "--out", tmp_path / "out")
+    assert modules >= ROBOTS
+    assert modules & (HEAVY | BACKENDS) == {"mujoco"}
 
 
 @pytest.mark.slow
