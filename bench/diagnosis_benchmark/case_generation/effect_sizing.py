@@ -137,7 +137,9 @@ class NuisanceFitter:
         normal_matrix = slope.T @ slope
         diagonal = np.diag(normal_matrix)
         normal_matrix = normal_matrix + np.diag(damping * diagonal + 1e-9 * diagonal.max())
-        return np.asarray(np.linalg.solve(normal_matrix, slope.T @ residual), dtype=np.float64)
+        with np.errstate(invalid="ignore"):  # a simulation that diverges has an infinite residual
+            gradient = slope.T @ residual
+        return np.asarray(np.linalg.solve(normal_matrix, gradient), dtype=np.float64)
 
     def linearise(self, observed: Array, theta: Array, starts: Array) -> tuple[Array, Array]:
         """Compute the residual and its Jacobian by finite differences.
